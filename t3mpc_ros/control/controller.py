@@ -223,9 +223,8 @@ class Controller:
         self.parameters = parameters
         self._pose_reference = PoseReference()
         self._pose = PoseController(parameters.pose)
-        largest = BodyTwist(parameters.limits.linear, parameters.limits.angular)
         self._keep_out = (
-            KeepOut(parameters.keep_out, largest, obstacles)
+            KeepOut(parameters.keep_out, _largest(parameters.limits), obstacles)
             if parameters.keep_out.enabled
             else None
         )
@@ -256,13 +255,7 @@ class Controller:
         self._sample_reference = TypedKernel(sample_reference)
         self._watchdog = InputWatchdog(parameters.watchdog)
         self._response = ResponseMonitor(parameters.watchdog, self._period)
-        limits = parameters.limits
-        self._trajectory = ReferenceTrajectory(
-            BodyTwist(
-                JUMP_DETECTION_FACTOR * limits.linear_acceleration,
-                JUMP_DETECTION_FACTOR * limits.angular_acceleration,
-            )
-        )
+        self._trajectory = ReferenceTrajectory(_least_jump(parameters.limits))
         self._snapshots: deque[tuple[Any, Any]] = deque(maxlen=SNAPSHOT_COUNT)
         """Weights, oldest first."""
         self._steps_since_snapshot = 0
@@ -350,6 +343,9 @@ class Controller:
         self._body.configure(parameters.body)
         self._pose.parameters = parameters.pose
         self._actuation.configure(parameters.limits)
+        self._trajectory.set_jump(_least_jump(parameters.limits))
+        if self._keep_out is not None:
+            self._keep_out.limits = _largest(parameters.limits)
         self._sampling = Sampling.of(parameters)
 
     def enable(self, on: bool) -> None:
@@ -369,8 +365,13 @@ class Controller:
         self._disturbed, self._before_disturbance = False, None
         self._snapshots.clear()
         self._set_dead_time(self.parameters.speed_filter.dead_time)
+        self._steps_since_snapshot = 0
         self._stop()
+        self._response.reset()
+        self._pose.reset()
+        self._place = ORIGIN
         self._last_stamp_ns = None
+        self.status = self._make_status(0, Reason.NO_ODOMETRY, np.full(2, math.nan))
         if self._keep_out is not None:
             self._keep_out.reset()
 
@@ -418,6 +419,8 @@ class Controller:
                 self._keep_out.reset()
 
         finite = odometry.is_finite()
+        if finite:
+            self._place = odometry.pose
         effect_ns = stamp + self._dead_time_ns
         if not self._moving:
             self._ahead_ns = self._plan_ahead(effect_ns)
@@ -514,7 +517,6 @@ class Controller:
         """Change the plan from ``begin`` to ``end`` (rad/s) by pose loop and keep-out."""
         parameters, geometry = self.parameters, self.parameters.geometry
         horizon = self._actuation.dead_time + parameters.speed_filter.lag
-        self._place = odometry.pose
         reference = self._pose_reference.at(odometry.stamp_ns + round(horizon * NANOSECONDS))
         if reference is None:
             return
@@ -655,6 +657,7 @@ class Controller:
         self._trajectory.clear()
         self._pose_reference.clear()
         self._jumps.clear()
+        self._announced.clear()
 
     def _stop(self) -> None:
         if self._moving or np.any(self._actuation.command):
@@ -866,6 +869,19 @@ def sample_reference(
 def hold_newest(stamp_ns: int, newest_ns: int, hold_ns: float) -> int:
     """Return the instant to interpolate at: the newest sample holds for ``hold_ns``."""
     return newest_ns if 0 < stamp_ns - newest_ns <= hold_ns else stamp_ns
+
+
+def _largest(limits: LimitParameters) -> BodyTwist:
+    """Return the largest |v| and |omega| of a command."""
+    return BodyTwist(limits.linear, limits.angular)
+
+
+def _least_jump(limits: LimitParameters) -> BodyTwist:
+    """Return the accelerations (m/s², rad/s²) above which the reference jumps."""
+    return BodyTwist(
+        JUMP_DETECTION_FACTOR * limits.linear_acceleration,
+        JUMP_DETECTION_FACTOR * limits.angular_acceleration,
+    )
 
 
 def _as_array(wheels: WheelSpeeds) -> Array:

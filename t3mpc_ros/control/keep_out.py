@@ -161,7 +161,8 @@ class KeepOut:
         mounts = np.array(parameters.mounts).reshape(-1, 3)
         self.map = FreeSpaceMap(parameters.map, mounts, known.segments, known.circles)
         """What is known of the floor."""
-        self._limits = limits
+        self.limits = limits
+        """Replaceable at run time."""
         self._nearest = np.zeros((SECTORS, 4))
         self._rows = np.zeros((2 * SECTORS + 4, 3))
         self._find_nearest = TypedKernel(find_nearest)
@@ -290,7 +291,7 @@ class KeepOut:
         count = write_conditions(
             self._nearest, parameters.distance, parameters.ahead, parameters.rate, self._rows
         )
-        limits = self._limits
+        limits = self.limits
         for sign in (1.0, -1.0):
             self._rows[count] = sign, 0.0, limits.linear
             self._rows[count + 1] = 0.0, sign / TURN_WEIGHT, limits.angular

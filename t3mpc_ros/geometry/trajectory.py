@@ -72,6 +72,10 @@ class ReferenceTrajectory:
         """The samples."""
         self.clear()
 
+    def set_jump(self, jump: BodyTwist) -> None:
+        """Use other body accelerations (m/s², rad/s²) above which two samples are a jump."""
+        self.buffer.jump[:] = jump
+
     def clear(self) -> None:
         """Remove every sample."""
         self.buffer.bounds[:] = 0

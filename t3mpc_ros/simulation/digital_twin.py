@@ -333,6 +333,9 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         self._disturbance.parameters = parameters.disturbance
         self._white_noise.parameters = parameters.noise
         self._imu.parameters = parameters.imu
+        if parameters.range_sensor != self._ranges.parameters:
+            self._ranges.parameters = parameters.range_sensor
+        self._battery.parameters = parameters.battery
         self._update_faults()
         self._update_load()
 

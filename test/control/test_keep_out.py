@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.free_space_map import CLEARINGS, FREE, OCCUPIED, UNKNOWN
 from t3mpc_ros.control.keep_out import (
     Activity,
@@ -16,7 +17,7 @@ from t3mpc_ros.control.keep_out import (
 )
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import advance_pose
-from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose
+from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State
 
 LIMITS = BodyTwist(0.35, 4.5)
 PERIOD = 0.01
@@ -140,3 +141,17 @@ def test_drive_that_does_not_answer_is_paused():
     assert twists[100].linear == pytest.approx(0.2)
     assert [each for each in twists[205:275] if each != (0.0, 0.0)] == []
     assert keep_out.activity is Activity.STUCK_DRIVE
+
+
+def test_a_reading_counts_at_the_pose_of_the_last_odometry():
+    """A robot that had been carried while its controller was disabled marked the wrong floor."""
+    controller = Controller(
+        StepperControllerParameters.from_dict({'pose.enabled': True, 'keep_out.enabled': True})
+    )
+    place = Pose(0.5, -0.3, 1.0)
+    for stamp, pose in enumerate((ORIGIN, place, Pose(math.nan, 0.0, 0.0))):
+        controller.step(State(stamp, pose, STANDSTILL))
+    controller.add_range(0, 0.4)
+    wanted = KeepOut(KeepOutParameters(), BodyTwist(0.35, 4.5))
+    wanted.add_reading(0, 0.4, place)
+    assert np.array_equal(controller.keep_out.map.grid.cells, wanted.map.grid.cells)

@@ -211,6 +211,8 @@ def run_patrol(
                 y + scenario.position_noise * float(noise[1]),
                 wrap_angle(yaw + scenario.yaw_noise * float(noise[2])),
             )
+        if k < rest:
+            pose = ORIGIN  # where it is placed, known without noise
         clock.observe(state.stamp_ns, pose)
         controller.enable(k >= rest)
         for sensor, reading in enumerate(state.ranges):

@@ -1,0 +1,1363 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""How to build and to use each object with a state: for test_fresh_state.py.
+
+A drive uses the object in all ways that change it, for longer than its buffers are long.
+"""
+
+from collections.abc import Callable
+import math
+import random
+from types import SimpleNamespace
+
+import numpy as np
+
+from support.fresh_state import Configured, Operation, Stateful
+from t3mpc_ros.chaos.path_source import (
+    PathClock,
+    PathReferenceParameters,
+    PortraitSource,
+    TwistSource,
+    WaitParameters,
+)
+from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
+from t3mpc_ros.chaos.solver import FractionalSolver
+from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
+from t3mpc_ros.chaos.system import hyperchaotic_system
+from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
+from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
+from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParameters
+from t3mpc_ros.control.control_law import (
+    Certificate,
+    LawParameters,
+    Nt3fsMpcController,
+    Nt3fsMpcParameters,
+)
+from t3mpc_ros.control.controller import (
+    Controller,
+    ControllerParameters,
+    StepperControllerParameters,
+    SwitchingTracker,
+)
+from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
+from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
+from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
+from t3mpc_ros.control.pose_controller import (
+    PoseController,
+    PoseLoopParameters,
+    PoseReference,
+)
+from t3mpc_ros.control.speed_filter import SpeedFilterParameters, SpeedKalmanFilter
+from t3mpc_ros.control.watchdog import InputWatchdog, ResponseMonitor, WatchdogParameters
+from t3mpc_ros.emulator.event_queue import EventQueue
+from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultInjection
+from t3mpc_ros.emulator.link.serial_line import SerialLine
+from t3mpc_ros.emulator.plant import Plant
+from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
+from t3mpc_ros.fuzzy.sets import FuzzyParameters
+from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, SimulatedTime
+from t3mpc_ros.geometry.trajectory import ReferenceTrajectory
+from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, WheelSpeeds
+from t3mpc_ros.mpc.predictive_controller import PredictiveController, PredictiveParameters
+from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters
+from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
+from t3mpc_ros.robot.interface import RobotCommand
+from t3mpc_ros.robot.slip_monitor import SlipMonitor
+from t3mpc_ros.robot.wheel_odometry import WheelOdometry, WheelOdometryParameters
+from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
+from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultParameters, FaultSchedule
+from t3mpc_ros.simulation.plant.disturbances import (
+    Disturbance,
+    DisturbanceParameters,
+    NoiseParameters,
+    SpeedNoise,
+)
+from t3mpc_ros.simulation.plant.paper_plant import (
+    DisturbedPlant,
+    PaperRobot,
+    PaperRobotParameters,
+)
+from t3mpc_ros.simulation.sensors.battery import SimulatedBattery, SimulatedBatteryParameters
+from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters
+from t3mpc_ros.simulation.sensors.range_sensor import (
+    SimulatedRangeSensorParameters,
+    SimulatedRangeSensors,
+)
+from t3mpc_ros.simulation.transport_delay import TransportDelay
+
+BODY_PARAMETERS = BodyCorrectionParameters()
+PERIOD, PERIOD_NS = 0.01, 10_000_000
+GEOMETRY = WheelGeometry()
+Random = random.Random
+
+
+def pair(r: Random, size: float = 5.0) -> np.ndarray:
+    """Return two numbers, now and then zero or far beyond every limit."""
+    scale = r.choice((size, size, size, 0.0, 0.02 * size, 20.0 * size))
+    return np.array([scale * r.gauss(0.0, 1.0), scale * r.gauss(0.0, 1.0)])
+
+
+def pose(r: Random, size: float = 0.5) -> Pose:
+    """Return a random pose."""
+    return Pose(r.gauss(0.0, size), r.gauss(0.0, size), r.uniform(-math.pi, math.pi))
+
+
+def gap(r: Random) -> float:
+    """Return a period, now and then a long one, s."""
+    return r.choice((PERIOD, PERIOD, PERIOD, 0.9 * PERIOD, 3.1 * PERIOD, 0.3))
+
+
+def properties(thing: object, *names: str) -> list[object]:
+    """Return what the named properties are now; arrays are copied."""
+    found = [getattr(thing, name) for name in names]
+    return [each.copy() if isinstance(each, np.ndarray) else each for each in found]
+
+
+# -- control --------------------------------------------------------------------------------------
+
+
+def drive_watchdog(watchdog, r, start=None):
+    """Give stamps with gaps, stale references, and states that diverge."""
+    stamp, found = r.randrange(10**9) if start is None else start, []
+    for _ in range(60):
+        stamp += round(1e9 * gap(r))
+        if r.random() < 0.7:
+            watchdog.reference_received()
+        found.append(watchdog.elapsed(stamp))
+        speed = r.choice((1.0, 1.0, 1.0, 1.0, 1.0, 100.0))
+        found.append(
+            watchdog.decide(
+                stamp, finite=r.random() < 0.9, known=r.random() < 0.9, speed=speed, error=0.0
+            )
+        )
+    # Two endings: within the stop of a diverging state, and with a reference of now.
+    watchdog.reference_received()
+    found.append(
+        watchdog.decide(stamp, finite=True, known=True, speed=r.choice((1.0, 99.0)), error=0.0)
+    )
+    return found
+
+
+def jump_back(watchdog):
+    """Give a stamp of before the start."""
+    watchdog.elapsed(-(10**9))
+    watchdog.elapsed(-2 * 10**9)
+
+
+def drive_response(monitor, r):
+    """Give commands, and measured speeds that follow them for a while, or do not."""
+    found, follows, command = [], True, np.zeros(2)
+    for _ in range(r.randrange(40, 120)):
+        if r.random() < 0.2:
+            follows = not follows
+        if r.random() < 0.2:
+            command = pair(r)
+        monitor.add_command(*command.tolist())
+        measured = command if follows else np.zeros(2)
+        found.append((monitor.update(*measured.tolist()), monitor.counts, monitor.last_command))
+    for _ in range(25):  # it ends with evidence against any decision
+        monitor.add_command(9.0, 9.0)
+        follows = monitor.responsive if _ < 19 else not monitor.responsive
+        measured = (9.0, 9.0) if follows else (0.0, 0.0)
+        found.append((monitor.update(*measured), monitor.counts))
+    return found
+
+
+def drive_filter(kalman, r):
+    """Send commands and measure speeds."""
+    found = []
+    for _ in range(20):
+        kalman.update(pair(r), pair(r), gap(r), sent=r.random() < 0.9)
+        found += properties(kalman, 'speeds', 'disturbance', 'predicted', 'dead_time', 'gain')
+    return found
+
+
+def drive_actuation(actuation, r):
+    """Measure, and command speeds, accelerations and the commands of a replay."""
+    found = []
+    for _ in range(20):
+        actuation.observe(pair(r), gap(r))
+        r.choice((actuation.send_acceleration, actuation.send_speeds, actuation.set_command))(
+            pair(r, 8.0)
+        )
+        found += properties(
+            actuation,
+            'speeds',
+            'predicted',
+            'disturbance',
+            'twist',
+            'command',
+            'applied',
+            'limited',
+        )
+    return found
+
+
+def drive_body(body, r):
+    """Turn with wheels other than the nominal ones, with gaps."""
+    found, yaw, sent = [], r.uniform(-3.0, 3.0), np.zeros(2)
+    for k in range(120):
+        elapsed = gap(r) if r.random() < 0.1 else PERIOD
+        wanted = np.array([6.0 + 3.0 * math.sin(0.1 * k), 2.0]) + 0.1 * pair(r, 0.1)
+        yaw += elapsed * 1.1 * (sent[0] - sent[1]) * 0.5 * 0.035 / 0.0735 + r.gauss(0.0, 1e-4)
+        learn = r.random() < 0.9
+        found.append(body.step(yaw, elapsed, wanted, wanted, sent, 0.02, learn=learn))
+        found += [body.authority, body.yaw_error]
+        sent = wanted
+    return found
+
+
+def make_body(parameters=BODY_PARAMETERS):
+    """Return the correction of the default robot."""
+    return BodyCorrection(parameters, 0.035, 0.0735, PERIOD)
+
+
+def drive_shaper(shaper, r):
+    """Give a reference with gaps."""
+    found = []
+    for _ in range(20):
+        shaper.step(pair(r), gap(r))
+        found += properties(shaper, 'reference', 'rate', 'active', 'lead_ns')
+    return found
+
+
+def drive_certificate(certificate, r):
+    """Give errors."""
+    return [certificate.update(pair(r), LawParameters(), 9.0, gap(r)) for _ in range(20)]
+
+
+def drive_law(law, r):
+    """Track, with limits now and then."""
+    found, speeds = [], pair(r, 3.0)
+    for k in range(160):
+        reference = np.array([4.0 * math.sin(0.03 * k), 3.0])
+        speeds = 0.9 * speeds + 0.1 * reference + 0.02 * pair(r, 1.0)
+        found.append(law.step(speeds, reference, np.zeros(2), PERIOD).copy())
+        if r.random() < 0.2:
+            law.set_applied(0.5 * law.command, saturated=True)
+        else:
+            law.set_applied(law.command, saturated=False)
+        found += [law.terms.copy(), law.certificate, law.ultimate_bound, law.friction.copy()]
+        found += [law.predictive.skill, law.predictive.authority, law.predictive.prediction]
+    return found
+
+
+def drive_tracker(tracker, r):
+    """Track a reference with jumps, known and unknown."""
+    found, now = [], r.randrange(10**9)
+    for k in range(150):
+        now += PERIOD_NS
+        reference = np.array([4.0 if k % 50 < 25 else -4.0, 3.0])
+        if k % 25 == 10:
+            tracker.transition.announce(now + 15 * PERIOD_NS, np.array([8.0, 0.0]), np.zeros(2))
+        if r.random() < 0.02:
+            tracker.transition.withdraw(now)
+        speeds = reference + 0.1 * pair(r, 1.0)
+        found.append(tracker.step(now, speeds, reference, reference, PERIOD).copy())
+        tracker.set_applied(found[-1], saturated=r.random() < 0.1)
+    return found
+
+
+def drive_jumps(transition, r):
+    """Announce, withdraw and pass jumps; it ends within one."""
+    found, now, level = [], r.randrange(10**9), 0.0
+    for k in range(60):
+        now += PERIOD_NS
+        reference = np.array([level + 0.1 * k, -level])
+        transition.step(now, reference, reference + 0.1)
+        found += properties(transition, 'reachable', 'rate', 'offset', 'offset_next', 'active')
+        found.append(transition.future_jumps(now, 0.05, 4))
+        if r.random() < 0.15 or k == 57:
+            transition.announce(now + r.choice((-1, 1, 5)) * PERIOD_NS, pair(r, 3.0), pair(r, 1.0))
+        if r.random() < 0.03:
+            found.append(transition.pop_passed(now))
+        if r.random() < 0.03:
+            transition.withdraw(now)
+    return found
+
+
+def drive_estimator(estimator, r):
+    """Measure a servo with another dead time, friction and a disturbance."""
+    found, speeds, sent = [], np.zeros(2), [np.zeros(2)] * 6
+    for k in range(300):
+        command = np.array([4.0 * math.sin(0.11 * k), 5.0 * math.cos(0.07 * k)])
+        speeds = speeds + 0.4 * (sent[-4] - speeds)
+        measured = speeds + (pair(r, 3.0) if 200 < k < 230 else 0.05 * pair(r, 1.0))
+        sent.append(command)
+        found.append(estimator.step(measured, command, gap(r) if r.random() < 0.05 else PERIOD))
+        found += properties(
+            estimator, 'dead_time', 'dead_time_in_use', 'standard_deviation', 'noise_ratio'
+        )
+    return found
+
+
+def drive_keep_out(keep_out, r):
+    """Drive towards walls, look around, be stuck, and fail to move."""
+    found, at = [], pose(r, 0.1)
+    for k in range(400):
+        keep_out.add_reading(
+            r.randrange(8), r.choice((0.3, 0.6, math.inf, -math.inf, math.nan)), at
+        )
+        twist = keep_out.step(BodyTwist(0.25, r.gauss(0.0, 0.3)), at, 0.05)
+        found += [twist, keep_out.activity, keep_out.changed]
+        found.append(keep_out.guide((0.2, r.gauss(0.0, 0.2)), at))
+        if k % 200 < 100:
+            yaw = at.yaw + 0.05 * twist.angular
+            move = 0.05 * twist.linear
+            at = Pose(at.x + move * math.cos(yaw), at.y + move * math.sin(yaw), yaw)
+    return found
+
+
+def make_keep_out():
+    """Return a keep-out before a known wall, which is soon stuck."""
+    parameters = KeepOutParameters.from_dict({'stuck_time': 1.0, 'map.half_size': 1.5})
+    wall = Obstacles(np.array([[0.5, -1.0, 0.5, 1.0]]), np.array([[-0.5, 0.5, 0.1]]))
+    return KeepOut(parameters, BodyTwist(0.3, 3.0), wall)
+
+
+def drive_map(free_map, r):
+    """Add readings of every kind."""
+    for _ in range(60):
+        free_map.add_reading(
+            r.randrange(8), r.choice((0.2, 0.5, math.inf, -math.inf)), pose(r, 0.2)
+        )
+    free_map.mark_free(*pair(r, 0.3).tolist(), 0.2)
+
+
+def drive_pose_reference(reference, r):
+    """Add poses, some of them again, more than are kept."""
+    stamp, found = r.randrange(100), []
+    for _ in range(40):
+        stamp += r.choice((10, 10, 10, -30))
+        reference.add(State(stamp, pose(r), BodyTwist(0.0, 0.0)))
+        found.append(reference.at(stamp - r.randrange(100)))
+    return found
+
+
+def drive_pose_controller(controller, r):
+    """Leave the reference, and come back; it ends on the way."""
+    found = []
+    for k in range(20):
+        away = Pose(*(0.1 * pair(r, 1.0)).tolist(), 0.1) if k < 19 else Pose(1.0, 0.0, 0.0)
+        found += [controller.step(ORIGIN, away, BodyTwist(0.2, 0.1)), controller.rejoining]
+        found.append(controller.error)
+    return found
+
+
+def drive_controller(controller, r):
+    """Track jumps and curves with gaps, restarts, and a robot that does not follow."""
+    found, speeds, at = [], np.zeros(2), pose(r, 0.1)
+    now = r.randrange(10**9)
+    for k in range(r.randrange(230, 300)):
+        now += round(1e9 * gap(r)) if r.random() < 0.01 else PERIOD_NS
+        if r.random() < 0.004:
+            now -= 10**9  # the clock of the robot restarts
+        target = BodyTwist(0.15 if k % 80 < 40 else -0.1, 1.5 * math.sin(0.05 * k))
+        if k % 150 < 140:
+            ahead = State(now + 20 * PERIOD_NS, Pose(at.x + 0.05, at.y, at.yaw), target)
+            found.append(controller.add_reference(ahead))
+        controller.add_range(r.randrange(8), r.choice((0.4, math.inf, math.nan)))
+        command = np.array(controller.actuation.command)
+        share = 0.0 if 150 < k < 185 else 0.7
+        speeds = speeds + share * (command - speeds) + 0.02 * pair(r, 1.0)
+        twist = BodyTwist(0.0175 * (speeds[0] + speeds[1]), 0.238 * (speeds[0] - speeds[1]))
+        yaw = at.yaw + 0.011 * twist.angular
+        x, y = (
+            at.x + PERIOD * twist.linear * math.cos(yaw),
+            at.y + PERIOD * twist.linear * math.sin(yaw),
+        )
+        at = Pose(x, y, yaw)
+        if r.random() < 0.01:
+            twist = BodyTwist(math.nan, 0.0)
+        command, status = controller.step(State(now, at, twist))
+        found += [command, status.reason, status.scalars, controller.disturbed, controller.gain]
+        found += properties(controller.dead_time, 'dead_time', 'standard_deviation')
+        if r.random() < 0.01:
+            controller.enable(False)
+        elif r.random() < 0.3:
+            controller.enable(True)
+        if r.random() < 0.005:
+            found.append(controller.check_odometry(now, now + 10**9))
+    controller.enable(r.random() < 0.5)
+    return found
+
+
+def make_controller(
+    table=StepperControllerParameters, **values: object
+) -> Callable[[], Controller]:
+    """Return what makes a controller; its predictor has little to learn."""
+    quick = {'predictive.excitation.duration': 20.0, 'predictive.dither': 0.5}
+    parameters = table.from_dict({**quick, **{k.replace('__', '.'): v for k, v in values.items()}})
+    return lambda: Controller(parameters)
+
+
+# -- mpc, fuzzy -----------------------------------------------------------------------------------
+
+QUICK = PredictiveParameters.from_dict({'excitation.duration': 20.0, 'dither': 0.5})
+
+
+def drive_predictive(controller, r):
+    """Give errors with known jumps, and apply less than v_p."""
+    found = []
+    for k in range(130):
+        found.append(controller.step(np.array([math.sin(0.05 * k), 1.0]) + 0.02 * pair(r, 1.0)))
+        found += properties(controller, 'skill', 'authority', 'prediction', 'step_response')
+        found += properties(controller, 'known_error', 'due', 'status')
+        if r.random() < 0.1:
+            controller.notify_applied(0.5 * found[0])
+        if r.random() < 0.03:
+            controller.notify_jump(pair(r, 3.0))
+    return found
+
+
+def other_weights(controller):
+    """Return weights of another seed."""
+    return PredictiveController(
+        PredictiveParameters.from_dict({'excitation.duration': 20.0, 'seed': 5}), PERIOD, 15.0
+    ).get_weights()
+
+
+WEIGHTS = other_weights(None)
+
+
+def drive_fuzzy(fuzzy, r):
+    """Evaluate and adapt."""
+    found = []
+    for _ in range(20):
+        found += [fuzzy.evaluate(pair(r)), fuzzy.basis, fuzzy.coefficients, fuzzy.radius]
+        fuzzy.adapt(pair(r, 1.0), gap(r))
+    return found
+
+
+# -- chaos ----------------------------------------------------------------------------------------
+
+CHAOS = {'settle': 1.0, 'switching.times': (0.5, 1.0), 'switching.blend': 0.2, 'ramp': 0.3}
+
+
+def drive_clock(clock, r):
+    """Give samples of the reference and poses of a robot that lags behind."""
+    found, stamp = [], 10**9
+    for k in range(100):
+        stamp += PERIOD_NS
+        clock.add_reference(stamp + 5 * PERIOD_NS, Pose(0.01 * k, 0.0, 0.0))
+        clock.observe(stamp, Pose(0.004 * k + r.gauss(0.0, 0.01), 0.0, 0.0))
+        found.append(clock.rate)
+    return found
+
+
+def drive_source(source, r):
+    """Take samples, at a rate that changes."""
+    return [source.advance(r.choice((1.0, 1.0, 0.5, 0.0))) for _ in range(60)]
+
+
+def make_portrait():
+    """Return a chaotic path with new seeds after random times."""
+    parameters = PathReferenceParameters.from_dict(
+        {'settle': 1.0, 'reseed.shortest': 0.3, 'reseed.longest': 0.5, 'source': 'portrait'}
+    )
+    return PortraitSource(parameters, GEOMETRY, ORIGIN, 3, lambda: 8)
+
+
+def drive_twist(source, r):
+    """Command twists, some of which expire."""
+    found = []
+    for _ in range(100):
+        if r.random() < 0.1:
+            found.append(source.set_target(BodyTwist(*pair(r, 0.3).tolist())))
+        found.append(source.advance(r.choice((1.0, 0.5))))
+    source.set_target(BodyTwist(0.2, 1.0))
+    return found
+
+
+def drive_reference(reference, r):
+    """Take samples."""
+    return [reference.advance() for _ in range(r.randrange(120, 150))]
+
+
+def drive_solver(solver, r):
+    """Advance."""
+    return [(solver.advance(r.randrange(1, 9)), solver.rate, solver.time) for _ in range(9)]
+
+
+def drive_schedule(schedule, r):
+    """Ask for modes in any order."""
+    times = [r.choice((r.uniform(0.0, 60.0), 12.0, 24.0)) for _ in range(20)]
+    return [(schedule.at(time), schedule.switches_until(time)) for time in times]
+
+
+# -- robot, geometry ------------------------------------------------------------------------------
+
+
+def drive_limiter(limiter, r):
+    """Command, stop and release in any order, with gaps; it ends while it follows a command."""
+    found, now = [], max(limiter._clock_ns or 0, 0)
+    for _ in range(60):
+        now += round(1e9 * gap(r))
+        stamp = now - r.choice((0, 0, 0, 10**7, -(10**7), 3 * 10**8))
+        wheels = WheelSpeeds(*pair(r, 8.0).tolist())
+        if r.random() < 0.05:
+            wheels = WheelSpeeds(math.nan, 0.0)
+        act = r.random()
+        if act < 0.7:
+            found.append(limiter.accept(RobotCommand(wheels, stamp), now))
+        elif act < 0.75:
+            limiter.stop('because', now)
+        elif act < 0.8:
+            limiter.latch('because', now)
+        elif act < 0.9:
+            found.append(limiter.release(now))
+        elif act < 0.92:
+            limiter.assume_standstill()
+        found.append(limiter.advance(now, PERIOD))
+        found += properties(limiter, 'estop', 'timed_out', 'reason')
+        found.append(limiter.remaining_ns(now))
+    limiter.release(now)
+    limiter.accept(RobotCommand(WheelSpeeds(5.0, 3.0), now), now)
+    found.append(limiter.advance(now, PERIOD))
+    return found
+
+
+def latch_and_release(limiter):
+    """Latch the emergency stop and release it, long after the history."""
+    limiter.latch('because', 10**11)
+    limiter.release(10**11)
+
+
+def drive_gyro(odometry, r):
+    """Stand, turn, slip, be pushed, and lose the sensor; it ends in the middle of a standstill."""
+    found, pushed = [], r.randrange(100, 140)
+    for k in range(650):
+        phase = k % 400
+        turn = 0.0 if phase < 250 else 0.05
+        gyro = 0.02 + 0.75 * turn * 0.238 / PERIOD + r.gauss(0.0, 1e-3)
+        if pushed < phase < pushed + 5 or 330 < phase < r.choice((330, 360)):
+            gyro += 2.0
+        absent = 300 < phase < 305
+        odometry.update(turn, -0.5 * turn, None if absent else gyro, PERIOD, r.choice((0.0, 1e-6)))
+        found += properties(
+            odometry, 'pose', 'covariance', 'bias', 'bias_std', 'calibrated', 'slipping_for'
+        )
+    slips = r.random() < 0.5
+    for _ in range(r.randrange(20, 40)):
+        odometry.update(0.1 * slips, 0.0, 0.02 + r.gauss(0.0, 1e-3), PERIOD)
+    return found
+
+
+def drive_slip(monitor, r):
+    """Slip, and command motion."""
+    found = []
+    for k in range(60):
+        command = RobotCommand(WheelSpeeds(*pair(r).tolist()), 0)
+        found.append(monitor.update(r.choice((0.0, 2.0)), r.choice((1.0, 1.0, 1.0, 0.0)), 0.1 * k))
+        found.append(monitor.rejects(command, 0.1 * k))
+    monitor.update(2.0, 1.0, 7.0)
+    return found
+
+
+def drive_wheels(odometry, r):
+    """Turn the wheels."""
+    found = []
+    for _ in range(20):
+        odometry.update(*pair(r, 0.3).tolist(), r.choice((0.0, 1e-6)))
+        odometry.update_from_speeds(WheelSpeeds(*pair(r).tolist()), gap(r), 0.04)
+        found += properties(odometry, 'pose', 'covariance')
+    return found
+
+
+def drive_scheduler(scheduler, r):
+    """Call late and early."""
+    found, now = [], 10**9 + r.randrange(10**9)
+    for _ in range(30):
+        now += r.choice((PERIOD_NS, PERIOD_NS - 1000, PERIOD_NS + 999, 10**9))
+        found += [scheduler.due(now), scheduler.lateness(now), scheduler.skipped]
+    return found
+
+
+def drive_time(clock, r):
+    """Let the steady clock run, with other factors; it ends while it runs."""
+    steady = 10**9
+    found = [clock.due(steady)]
+    for _ in range(30):
+        steady += round(1e9 * gap(r))
+        if r.random() < 0.2:
+            clock.set_real_time_factor(r.choice((0.0, 1.0, 7.0)), steady)
+        if clock.real_time_factor == 0.0:
+            found.append(clock.step(r.randrange(3)))
+        found += [clock.due(steady), clock.now_ns(steady)]
+    clock.set_real_time_factor(2.0, steady)
+    found.append(clock.due(steady))
+    return found
+
+
+def drive_factor(factor, r):
+    """Let both clocks run."""
+    found, steady = [], 0
+    for _ in range(30):
+        steady += r.randrange(10**9)
+        factor.update(2 * steady, steady)
+        found.append(factor.value)
+    return found
+
+
+def drive_trajectory(trajectory, r):
+    """Add samples with jumps and restarts, more than are kept."""
+    stamp, found = r.randrange(10**9), []
+    for _ in range(80):
+        stamp += r.choice((PERIOD_NS,) * 9 + (-5 * PERIOD_NS,))
+        trajectory.add(State(stamp, ORIGIN, BodyTwist(*pair(r, 0.05).tolist())))
+        found += [trajectory.at(stamp - r.randrange(10**8)), trajectory.newest_ns]
+        if r.random() < 0.1:
+            found.append(trajectory.pop_jumps())
+    return found
+
+
+# -- simulation, emulator -------------------------------------------------------------------------
+
+
+def drive_robot(robot, r):
+    """Drive, stop, latch, and let time jump; it ends at rest."""
+    found, now = [], robot._now_ns()
+    for _ in range(25):
+        now += r.choice((PERIOD_NS,) * 8 + (3 * PERIOD_NS, 15 * 10**6, -(10**9), 10**10))
+        now = max(now, 0)
+        found.append(robot.apply(RobotCommand(WheelSpeeds(*pair(r, 3.0).tolist()), now), now))
+        act = r.random()
+        if act < 0.05:
+            robot.stop('because', now)
+        elif act < 0.1:
+            robot.latch_estop('because', now)
+        elif act < 0.3:
+            found.append(robot.release_estop(now))
+        elif act < 0.35:
+            found.append(robot.reset_odometry(now))
+        found.append(robot.advance(now))
+    robot.stop('the end', now)
+    found.append(robot.advance(now + 4 * 10**8))
+    return found
+
+
+def drive_transport(delay, r):
+    """Send commands with any delay, more than fit."""
+    found, now = [], max(delay._clock_ns or 0, 0)
+    for k in range(r.choice((30, 1100))):
+        now += PERIOD_NS
+        command = RobotCommand(WheelSpeeds(float(k), 0.0), now)
+        delay.send(command, now, r.choice((0.0, 0.05, 20.0)), 0.02, 0.2)
+        if r.random() < 0.2:
+            found += [delay.arrived(now), delay.next_ns, delay.counts[:4]]
+    delay.send(RobotCommand(WheelSpeeds(1.0, 0.0), now), now, 1.0, 0.0, 0.0)
+    return found
+
+
+def drive_faults(schedule, r):
+    """Ask for faults at any time, with few dynamic tables."""
+    tables = FaultParameters(), FaultParameters(command_delay=0.1), FaultParameters(gyro_dead=True)
+    times = [r.choice((0.0, 1.0, 1.5, 2.0, 3.0, r.uniform(-1.0, 4.0))) for _ in range(30)]
+    return [schedule.at(time, r.choice(tables)) for time in times]
+
+
+def drive_disturbance(disturbance, r):
+    """Draw and evaluate."""
+    found = []
+    for k in range(30):
+        disturbance.draw(gap(r))
+        found += [disturbance.torque(0.1 * k), disturbance.walk.copy()]
+    return found
+
+
+def drive_imu(imu, r):
+    """Measure, most often at one period."""
+    found = []
+    for _ in range(30):
+        filtered = np.array([[0.0, r.gauss(0.0, 1.0)] for _ in range(3)])
+        found.append(imu.measure(filtered, PERIOD, r.choice((0.0, 0.3))))
+        found += [imu.bias, imu.counts]
+    return found
+
+
+def drive_ranges(ranges, r):
+    """Measure what is due."""
+    found = []
+    for _ in range(30):
+        for sensor in ranges.due(gap(r)):
+            ranges.measure(sensor, r.choice((0.05, 0.3, 0.7, math.inf)))
+        found += [ranges.readings, ranges.counts, ranges.periods]
+    return found
+
+
+def drive_battery(battery, r):
+    """Draw power, with sags about both thresholds."""
+    return [
+        (
+            battery.draw(r.uniform(0.0, 30.0), 1.0, r.uniform(0.0, 5.0)),
+            battery.low,
+            battery.collapsed,
+        )
+        for _ in range(60)
+    ]
+
+
+def drive_disturbed(plant, r):
+    """Command wheel speeds."""
+    found = []
+    for _ in range(20):
+        plant.run(tuple(pair(r, 3.0).tolist()), 10, braking=r.random() < 0.1)
+        found += [plant.measure(PERIOD), plant.wheels, plant.plant.pose]
+    return found
+
+
+def drive_plant(plant, r):
+    """Issue pulses."""
+    found = []
+    for _ in range(40):
+        plant.set_motors(r.random() < 0.9, r.random() < 0.9)
+        found.append(plant.run(1000 * r.randrange(1, 9), r.uniform(0.0, 9.0), 5.0))
+        plant.imu_absent = r.random() < 0.1
+        found += properties(
+            plant, 'pulses', 'pose', 'wheels', 'registers', 'adc_counts', 'until_sample_us'
+        )
+    plant.imu_absent = False
+    return found
+
+
+def make_line():
+    """Return a serial line with faults, and what it has delivered."""
+    events, delivered = EventQueue(0), []
+    faults = FaultInjection(lambda: events.now_ns, 1)
+    for name in ('reorder', 'split', 'flip_bits'):
+        faults.add(Fault(name, 0.0, math.inf, 0.3), 0)
+    return SimpleNamespace(
+        line=SerialLine(events, faults, delivered.append), events=events, delivered=delivered
+    )
+
+
+def drive_line(bench, r):
+    """Send blocks; some are under way at the end, one is held."""
+    del bench.delivered[:]
+    for _ in range(20):
+        bench.line.send(r.randbytes(r.randrange(1, 40)))
+        bench.events.run_to(bench.events.now_ns + r.randrange(10**6))
+    return list(bench.delivered)
+
+
+def clear_line(bench):
+    """Clear the line, and wait for what may still arrive."""
+    bench.line.clear()
+    del bench.delivered[:]
+    bench.events.run_to(10**12)
+
+
+def drive_injection(faults, r):
+    """Add faults of each kind, and let random ones occur."""
+    found = []
+    for _ in range(60):
+        kind = r.choice(FAULT_KINDS)
+        if r.random() < 0.5:
+            faults.add(Fault(kind.name, 0.0, r.choice((1e-9, 1.0, math.inf))), 0)
+        found += [faults.occurs(kind.name), faults.interval(kind.name), faults.active(kind.name)]
+    return found
+
+
+# -- the table ------------------------------------------------------------------------------------
+
+LAST = (
+    '._output.command',
+    '._output.estimate',
+    '._output.terms',
+    '.fuzzy._phi',
+    '.fuzzy.tables.phi',
+)
+"""What the last step of the law has written."""
+ALPHA = '.fuzzy.tables.coefficients', '.fuzzy._coefficients', '._friction.coefficients'
+MACHINE = tuple(
+    f'._{each}.{name}'
+    for each in ('predictors[0].state', 'predictors[1].state', 'wheels[0]', 'wheels[1]')
+    for name in (
+        *('history.persistence_mse', 'history.prediction_mse', 'machine.output_weights'),
+        *('machine.visible_weights', 'rls.information', 'rls.power'),
+    )
+)
+SKILL = '.signals.skills', '._skill'
+RAMPS = '._plan.rate', '._plan.reachable', '._transitions'
+BODY_SKILL = tuple(
+    f'{name}[{k}]' for name in ('._memory', '._state.sums') for k in (5, 6, 7, 12, 14)
+)
+BODY_OLD = tuple(f'{name}[{k}]' for name in ('._memory', '._state.sums') for k in (0, 9))
+
+
+def below(name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the paths below an attribute."""
+    return tuple(f'{name}{path}' for path in paths)
+
+
+def all_of(thing: object, *without: str) -> tuple[str, ...]:
+    """Return the paths of all attributes but some."""
+    return tuple(f'.{name}' for name in vars(thing) if name not in without)
+
+
+COUNTS = '._arrived', '._lost', '._sent', '._dropped', '._generator'
+IMU_TUNING = '._colour', '._dt', '._walk_step'
+BODY = (
+    *('._arrays.state', '._arrays.modes', '._arrays.totals', '._state', '._modes', '._now'),
+    '.steps_done',
+)
+TWIN = DigitalTwinParameters.from_dict(
+    {'noise.variance': 0.04, 'faults.command_loss': 0.2, 'faults.slippery': 0.02}
+)
+PAPER = PaperRobotParameters.from_dict({'noise.variance': 0.04})
+SPEEDS = np.array([2.0, 1.0])
+FRESH = {
+    # control
+    VelocityActuation: Stateful(
+        lambda: VelocityActuation(
+            SpeedFilterParameters(), LimitParameters(), GEOMETRY, 'velocity', PERIOD
+        ),
+        drive_actuation,
+        {
+            'reset': Operation(lambda a: a.reset(SPEEDS)),
+            'reset with a command': Operation(lambda a: a.reset(SPEEDS, np.ones(2))),
+        },
+    ),
+    SpeedKalmanFilter: Stateful(
+        lambda: SpeedKalmanFilter(SpeedFilterParameters(), 'velocity', PERIOD),
+        drive_filter,
+        {
+            'reset': Operation(lambda f: f.reset(SPEEDS)),
+            'set_dead_time': Operation(
+                lambda f: f.set_dead_time(0.0437), kept=('.state',), continued=('._commands',)
+            ),
+        },
+    ),
+    BodyCorrection: Stateful(
+        make_body,
+        drive_body,
+        {
+            'reset': Operation(lambda b: b.reset()),
+            'restart': Operation(
+                lambda b: b.restart(),
+                kept=('.fuzzy.tables.coefficients', '.fuzzy._coefficients', *BODY_SKILL),
+                scratch=(*BODY_OLD, '.fuzzy._phi', '.fuzzy.tables.phi'),
+            ),
+        },
+    ),
+    CommandShaper: Stateful(
+        lambda: CommandShaper(CommandShaperParameters(), PERIOD),
+        drive_shaper,
+        {'reset': Operation(lambda s: s.reset(SPEEDS), scratch=('.reference', '.rate'))},
+    ),
+    Certificate: Stateful(
+        Certificate, drive_certificate, {'reset': Operation(lambda c: c.reset())}
+    ),
+    DeadTimeEstimator: Stateful(
+        lambda: DeadTimeEstimator(SpeedFilterParameters(), PERIOD, friction=True),
+        drive_estimator,
+        {
+            'reset': Operation(
+                lambda e: e.reset(SPEEDS),
+                kept=tuple(f'.state[{row}]' for row in range(11, 18)),
+                continued=('.state[0]', '.state[18]'),
+            )
+        },
+    ),
+    JumpTransition: Stateful(
+        lambda: JumpTransition(JumpTransitionParameters(), 0.02, PERIOD),
+        drive_jumps,
+        {'reset': Operation(lambda t: t.reset(), scratch=RAMPS)},
+    ),
+    KeepOut: Stateful(
+        make_keep_out,
+        drive_keep_out,
+        {'reset': Operation(lambda k: k.reset(), scratch=('._nearest', '._rows'))},
+    ),
+    PoseReference: Stateful(
+        lambda: PoseReference(16), drive_pose_reference, {'clear': Operation(lambda p: p.clear())}
+    ),
+    PoseController: Stateful(
+        lambda: PoseController(PoseLoopParameters()),
+        drive_pose_controller,
+        {'reset': Operation(lambda p: p.reset())},
+    ),
+    InputWatchdog: Stateful(
+        lambda: InputWatchdog(WatchdogParameters()),
+        drive_watchdog,
+        {'reset': Operation(lambda w: w.reset()), 'jump back': Operation(jump_back)},
+    ),
+    ResponseMonitor: Stateful(
+        lambda: ResponseMonitor(WatchdogParameters(), PERIOD),
+        drive_response,
+        {'reset': Operation(lambda m: m.reset())},
+    ),
+    Nt3fsMpcController: Stateful(
+        lambda: Nt3fsMpcController(Nt3fsMpcParameters(predictive=QUICK)),
+        drive_law,
+        {
+            'reset': Operation(
+                lambda c: c.reset(),
+                kept=(*ALPHA, *below('.predictive', MACHINE)),
+                continued=below('.predictive', SKILL),
+                scratch=LAST,
+            ),
+            'reset_estimate': Operation(
+                lambda c: (c.reset(), c.reset_estimate()),
+                kept=below('.predictive', MACHINE),
+                continued=below('.predictive', SKILL),
+                scratch=LAST[:3],
+            ),
+        },
+    ),
+    SwitchingTracker: Stateful(
+        lambda: SwitchingTracker(Nt3fsMpcParameters(predictive=QUICK), 'velocity'),
+        drive_tracker,
+        {
+            'reset': Operation(
+                lambda t: t.reset(),
+                kept=below('.law', (*ALPHA, *below('.predictive', MACHINE))),
+                continued=below('.law.predictive', SKILL),
+                scratch=(*below('.law', LAST), *below('.transition', RAMPS)),
+            )
+        },
+    ),
+    Controller: Stateful(
+        make_controller(pose__enabled=True, keep_out__enabled=True),
+        drive_controller,
+        {
+            'reset': Operation(
+                lambda c: c.reset(),
+                kept=('._watchdog.enabled',),
+                scratch=(
+                    *('._ahead_ns', '._sampled', '._shaper', '._keep_out._nearest'),
+                    *below('._tracker.transition', RAMPS),
+                    *('._tracker.law._output.command', '._tracker.law._output.terms'),
+                    *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
+                ),
+            )
+        },
+    ),
+    # mpc, fuzzy
+    PredictiveController: Stateful(
+        lambda: PredictiveController(QUICK, PERIOD, 15.0),
+        drive_predictive,
+        {
+            'reset': Operation(lambda c: c.reset(), kept=MACHINE, continued=SKILL),
+            'pretrain': Operation(lambda c: c.pretrain()),
+            'set_weights': Operation(lambda c: c.set_weights(WEIGHTS)),
+        },
+    ),
+    FuzzyEstimator: Stateful(
+        lambda: FuzzyEstimator(FuzzyParameters(), AdaptationParameters()),
+        drive_fuzzy,
+        {'reset': Operation(lambda f: f.reset())},
+    ),
+    # chaos
+    PathClock: Stateful(
+        lambda: PathClock(WaitParameters()),
+        drive_clock,
+        {
+            'a restart of the reference': Operation(
+                lambda c: c.add_reference(0, ORIGIN),
+                kept=('._held', '._nearest', '._set_off', '._stamp_ns', '._start', '.rate'),
+            )
+        },
+    ),
+    PortraitSource: Stateful(
+        make_portrait,
+        drive_source,
+        {
+            'reseed': Operation(
+                lambda s: s.reseed(7),
+                kept=('._path._carried', '._path._last', '._path._tail', '._timing'),
+            )
+        },
+    ),
+    TwistSource: Stateful(
+        lambda: TwistSource(PathReferenceParameters(), ORIGIN),
+        drive_twist,
+        {
+            'a twist that is not finite': Operation(
+                lambda s: s.set_target(BodyTwist(math.nan, 0.0)), kept=('._pose', '._twist')
+            )
+        },
+    ),
+    ChaoticReference: Stateful(
+        lambda: ChaoticReference(ReferenceParameters.from_dict(CHAOS), GEOMETRY),
+        drive_reference,
+        {
+            'reset': Operation(lambda c: c.reset()),
+            'reset to a seed': Operation(lambda c: c.reset(1 << 100)),
+        },
+    ),
+    FractionalSolver: Stateful(
+        lambda: FractionalSolver(hyperchaotic_system(), 1e-3, np.ones(4)),
+        drive_solver,
+        {
+            'reset': Operation(lambda s: s.reset()),
+            'reset to a state': Operation(lambda s: s.reset(np.array([1.0, 2.0, 3.0, 4.0]))),
+        },
+    ),
+    SwitchingSchedule: Stateful(
+        lambda: SwitchingSchedule(SwitchingParameters(kind='random', blend=1.0), 3),
+        drive_schedule,
+        {'at the start': Operation(lambda s: s.at(0.0))},
+    ),
+    # robot, geometry
+    CommandLimiter: Stateful(
+        lambda: CommandLimiter(CommandLimiterParameters(), GEOMETRY),
+        drive_limiter,
+        {
+            'latch and release': Operation(latch_and_release, kept=('._ramp',)),
+            'stop': Operation(lambda x: x.stop('because', 10**11), kept=('._ramp',)),
+            'jump back': Operation(
+                lambda x: (x.stop('because', -1), x.stop('because', -2)), continued=('._ramp',)
+            ),
+        },
+    ),
+    GyroOdometry: Stateful(
+        lambda: GyroOdometry(GyroOdometryParameters(), GEOMETRY),
+        drive_gyro,
+        {
+            'reset': Operation(
+                lambda o: o.reset(Pose(1.0, 2.0, 3.0)),
+                kept=('._memory',),
+                continued=('._covariance[3]', '._drift[3]'),
+            ),
+            'forget_bias': Operation(
+                lambda o: o.forget_bias(),
+                # The response of the gyro's filter to the steps, and for how long they rest.
+                kept=('._pose', *(f'._memory[{k}]' for k in (2, 3, 4, 5, 9))),
+                continued=(
+                    *(f'._{m}[{k}]' for m in ('covariance', 'drift') for k in (0, 1, 2)),
+                    '._covariance[4]',
+                ),
+                # Not read before the bias is known again.
+                scratch=tuple(f'._memory[{k}]' for k in (6, 7, 8)),
+            ),
+        },
+    ),
+    SlipMonitor: Stateful(
+        SlipMonitor,
+        drive_slip,
+        {'reset': Operation(lambda m: m.reset(), scratch=('._last_motion_command',))},
+    ),
+    WheelOdometry: Stateful(
+        lambda: WheelOdometry(WheelOdometryParameters(), GEOMETRY),
+        drive_wheels,
+        {'reset': Operation(lambda o: o.reset(Pose(1.0, 2.0, 3.0)))},
+    ),
+    SampleScheduler: Stateful(
+        lambda: SampleScheduler(100.0, slack=0.002),
+        drive_scheduler,
+        {
+            'reset': Operation(lambda s: s.reset()),
+            'jump back': Operation(lambda s: s.due(5 * 10**8)),
+        },
+    ),
+    SimulatedTime: Stateful(
+        lambda: SimulatedTime(100.0, 1.0),
+        drive_time,
+        {
+            'set_real_time_factor': Operation(
+                lambda t: t.set_real_time_factor(3.0, 10**10),
+                kept=('._next',),
+                scratch=('._anchor',),
+            )
+        },
+    ),
+    RealTimeFactor: Stateful(
+        RealTimeFactor, drive_factor, {'restart': Operation(lambda f: f.restart())}
+    ),
+    ReferenceTrajectory: Stateful(
+        lambda: ReferenceTrajectory(BodyTwist(2.0, 20.0), 16),
+        drive_trajectory,
+        {'clear': Operation(lambda t: t.clear(), scratch=('.buffer.samples', '.buffer.stamps'))},
+    ),
+    # simulation, emulator
+    PaperRobot: Stateful(
+        lambda: PaperRobot(PAPER),
+        drive_robot,
+        {
+            'reset_odometry': Operation(
+                lambda x: x._reset_odometry(),
+                kept=all_of(PaperRobot(PAPER), '_odometry'),
+            )
+        },
+    ),
+    DigitalTwin: Stateful(
+        lambda: DigitalTwin(TWIN),
+        drive_robot,
+        {
+            'reset_odometry': Operation(
+                lambda x: x._reset_odometry(),
+                kept=(*all_of(DigitalTwin(TWIN), '_odometry'), '._odometry._memory'),
+                continued=('._odometry._covariance[3]', '._odometry._drift[3]'),
+            ),
+            'a loss of power': Operation(
+                lambda x: x._lose_power(),
+                kept=all_of(
+                    DigitalTwin(TWIN),
+                    *(
+                        '_odometry',
+                        '_drivetrain',
+                        '_imu',
+                        '_slip_monitor',
+                        '_channel',
+                        '_counters',
+                    ),
+                    *('_limiter', '_boots_until', '_limited_command'),
+                ),
+                continued=(
+                    *below('._drivetrain', BODY),
+                    *('._imu._generator', '._channel._generator', '._channel._clock_ns'),
+                    *below('._channel', COUNTS[:3]),
+                    *('._limiter._ramp', '._limiter._estop', '._limited_command'),
+                    *('._odometry._pose', *(f'._odometry._memory[{k}]' for k in (2, 3, 5, 9))),
+                    *(f'._odometry._covariance[{k}]' for k in (0, 1, 2)),
+                ),
+                scratch=('._channel._cleared', *below('._imu', IMU_TUNING)),
+            ),
+        },
+    ),
+    TransportDelay: Stateful(
+        lambda: TransportDelay(np.random.default_rng(1)),
+        drive_transport,
+        {
+            'clear': Operation(
+                lambda d: d.clear(), kept=('._clock_ns', *COUNTS), scratch=('._cleared',)
+            ),
+            'jump back': Operation(
+                lambda d: (d.arrived(-1), d.arrived(-2)), kept=COUNTS, scratch=('._cleared',)
+            ),
+        },
+    ),
+    FaultSchedule: Stateful(
+        lambda: FaultSchedule(
+            (FaultEvent(1.0, 'command_loss', 0.5, 1.0), FaultEvent(1.5, 'brown_out', True))
+        ),
+        drive_faults,
+        {'at the start': Operation(lambda s: s.at(0.5, FaultParameters()))},
+    ),
+    SimulatedImu: Stateful(
+        lambda: SimulatedImu(SimulatedImuParameters(), np.random.default_rng(1)),
+        drive_imu,
+        {
+            'restart': Operation(
+                lambda i: i.restart(), continued=('._generator',), scratch=IMU_TUNING
+            )
+        },
+    ),
+    Plant: Stateful(
+        lambda: Plant(TWIN),
+        drive_plant,
+        {
+            'boot': Operation(
+                lambda p: p.boot(16),
+                kept=all_of(Plant(TWIN), '_drivetrain', '_issued', '_imu', '_motor'),
+                continued=(
+                    *below('._drivetrain', BODY),
+                    '._imu._generator',
+                    '._drivetrain._arrays.filtered',
+                ),
+                scratch=below('._imu', IMU_TUNING),
+            )
+        },
+    ),
+    SerialLine: Stateful(
+        make_line,
+        drive_line,
+        {
+            'clear': Operation(
+                clear_line,
+                kept=('.line._faults.generators', '.events._numbers', '.line._events._numbers'),
+            )
+        },
+    ),
+    FaultInjection: Stateful(
+        lambda: FaultInjection(lambda: 0, 1),
+        drive_injection,
+        {
+            'clear': Operation(
+                lambda f: [f.clear(kind.name) for kind in FAULT_KINDS], continued=('.generators',)
+            )
+        },
+    ),
+}
+
+NEVER_RESET = {
+    # Made anew for each run or path.
+    **dict.fromkeys(('InputMonitor', 'PathTiming', '_CurveBuilder', 'GivenPathSource'), 'one run'),
+    # Their state is that of an entry of the table, which contains them.
+    'Predictor': 'part of PredictiveController',
+    'PortraitPath': 'part of PortraitSource',
+    'FreeSpaceMap': 'part of KeepOut',
+    'Drivetrain': 'part of DigitalTwin and Plant',
+    'PaperPlant': 'part of PaperRobot',
+    'FixedStepRobot': 'base of PaperRobot and DigitalTwin',
+    # Only their parameters change: see CONFIGURED.
+    **dict.fromkeys(
+        ('Disturbance', 'SpeedNoise', 'SimulatedBattery', 'SimulatedRangeSensors'), 'no reset'
+    ),
+    'DisturbedPlant': 'no reset',
+    # The state is in the memory of the C core: see test_core_fresh_state.py.
+    **dict.fromkeys(('Board', 'Motion', 'RobotBoard', 'Dongle', 'Emulator'), 'C core'),
+    **dict.fromkeys(('c_short_Array_7', 'c_ushort_Array_9'), 'C core'),
+    **dict.fromkeys(('EventQueue', 'RadioChannel', '_Exchange'), 'one emulator, never reset'),
+    **dict.fromkeys(('PtyPort', '_ConsolePort', 'StopTimeMonitor'), 'one process, never reset'),
+    # No state that changes.
+    **dict.fromkeys(('Arena', 'StateArray', '_OnceLoader', '_Loader'), 'constant'),
+}
+"""Classes without an entry in FRESH, and why."""
+
+
+# -- parameters -----------------------------------------------------------------------------------
+
+
+def assign(thing: object, parameters: object) -> None:
+    """Replace the attribute ``parameters``."""
+    thing.parameters = parameters
+
+
+def configure(thing: object, parameters: object) -> None:
+    """Call ``configure``."""
+    thing.configure(parameters)
+
+
+LATE = (
+    *('*._signals.bound', '*._signals.walk_share'),  # with the next torque
+    '*._ramp.rate',  # with the next command
+    *('*._dt', '*._colour', '*._walk_step'),  # with the next measurement
+    *('*._voltage', '._supply', '._reports'),  # with the next draw, and the next report
+)
+
+
+COMMANDS = 'linear.', 'angular.', 'wheel.', 'cmd_', 'odometry.'
+
+
+def drive_with(drive, *seeds):
+    """Return a drive that uses an object with each of some seeds."""
+    return lambda thing, r: [drive(thing, Random(f'{r.random()} {seed}')) for seed in seeds]
+
+
+CONFIGURED = {
+    VelocityActuation: Configured(
+        LimitParameters(),
+        lambda p: VelocityActuation(SpeedFilterParameters(), p, GEOMETRY, 'velocity', PERIOD),
+        configure,
+        drive_actuation,
+    ),
+    BodyCorrection: Configured(
+        BodyCorrectionParameters(), make_body, configure, drive_body, elsewhere=('enabled',)
+    ),
+    JumpTransition: Configured(
+        JumpTransitionParameters(),
+        lambda p: JumpTransition(p, 0.02, PERIOD),
+        configure,
+        drive_jumps,
+        elsewhere=('preview',),
+    ),
+    FuzzyEstimator: Configured(
+        AdaptationParameters(),
+        lambda p: FuzzyEstimator(FuzzyParameters(), p),
+        configure,
+        drive_fuzzy,
+    ),
+    PredictiveController: Configured(
+        QUICK, lambda p: PredictiveController(p, PERIOD, 15.0), configure, drive_predictive
+    ),
+    PoseController: Configured(
+        PoseLoopParameters(), PoseController, assign, drive_with(drive_pose_controller, 1, 2, 3)
+    ),
+    'Controller with keep-out': Configured(
+        StepperControllerParameters.from_dict(
+            {
+                'pose.enabled': True,
+                'keep_out.enabled': True,
+                'keep_out.map.half_size': 1.0,
+                'predictive.excitation.duration': 10.0,
+                'fuzzy.sets': 3,
+            }
+        ),
+        Controller,
+        configure,
+        drive_controller,
+        elsewhere=tuple(
+            spec.name for spec in ControllerParameters.specs() if spec.name != 'body.enabled'
+        ),
+        triggers=('estimate_dead_time',),
+        late=('.status',),
+        settle=lambda controller: controller.law.predictive.pretrain(),
+    ),
+    Controller: Configured(
+        ControllerParameters.from_dict(
+            {'predictive.excitation.duration': 10.0, 'fuzzy.sets': 3, 'friction.gamma': 5.0}
+        ),
+        Controller,
+        configure,
+        drive_controller,
+        elsewhere=(*COMMANDS, 'adaptation.', 'predictive.', 'pose.', 'body.'),
+        triggers=('estimate_dead_time',),
+        late=('.status',),
+        # Pretrained weights are those of the gain before.
+        settle=lambda controller: controller.law.predictive.pretrain(),
+    ),
+    CommandLimiter: Configured(
+        CommandLimiterParameters(max_stopping_time=5.0),
+        lambda p: CommandLimiter(p, GEOMETRY),
+        assign,
+        drive_limiter,
+    ),
+    WheelOdometry: Configured(
+        WheelOdometryParameters(), lambda p: WheelOdometry(p, GEOMETRY), assign, drive_wheels
+    ),
+    GyroOdometry: Configured(
+        GyroOdometryParameters(), lambda p: GyroOdometry(p, GEOMETRY), assign, drive_gyro
+    ),
+    Disturbance: Configured(
+        DisturbanceParameters(),
+        lambda p: Disturbance(p, np.random.default_rng(1)),
+        assign,
+        drive_disturbance,
+        late=LATE,
+    ),
+    SpeedNoise: Configured(
+        NoiseParameters(),
+        lambda p: SpeedNoise(p, np.random.default_rng(1)),
+        assign,
+        lambda noise, r: [noise.measure(WheelSpeeds(1.0, 2.0)) for _ in range(9)],
+    ),
+    SimulatedImu: Configured(
+        SimulatedImuParameters(),
+        lambda p: SimulatedImu(p, np.random.default_rng(1)),
+        assign,
+        drive_imu,
+        late=LATE,
+    ),
+    SimulatedRangeSensors: Configured(
+        SimulatedRangeSensorParameters(),
+        lambda p: SimulatedRangeSensors(p, np.random.default_rng(1)),
+        assign,
+        drive_ranges,
+    ),
+    SimulatedBattery: Configured(
+        SimulatedBatteryParameters(), SimulatedBattery, assign, drive_battery, late=LATE
+    ),
+    DisturbedPlant: Configured(
+        PAPER,
+        DisturbedPlant,
+        configure,
+        drive_disturbed,
+        elsewhere=COMMANDS,
+        late=LATE,
+    ),
+    PaperRobot: Configured(PAPER, PaperRobot, configure, drive_robot, late=LATE),
+    DigitalTwin: Configured(
+        TWIN,
+        DigitalTwin,
+        configure,
+        drive_robot,
+        elsewhere=(*COMMANDS, 'imu.', 'range_sensor.', 'battery.', 'drive.', 'slip_stop'),
+        triggers=('faults.brown_out', 'faults.wheel_blocked'),
+        late=LATE,
+    ),
+}
+"""Objects whose parameters are replaceable at run time."""

@@ -1,0 +1,56 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""After a reset an object is as a new one, and with other parameters as one built with them.
+
+Every class with a state is in a table, and the whole state is compared, not only what a test of
+one class would think of: `Controller.reset` kept the status of its last step, its count of steps
+since the last snapshot and the place at which range readings were entered into the map.
+"""
+
+import pytest
+from support.fresh_state import check_configured, check_fresh, check_round_trip, classes_of
+from support.stateful_objects import CONFIGURED, FRESH, NEVER_RESET
+
+PACKAGES = 'control', 'mpc', 'fuzzy', 'chaos', 'robot', 'geometry', 'simulation', 'emulator'
+SLOW = 'PortraitSource', 'FuzzyEstimator', 'Controller', 'KeepOut', 'DigitalTwin'
+CASES = [
+    pytest.param(
+        entry,
+        operation,
+        id=f'{kind.__name__}, {name}',
+        marks=pytest.mark.slow if kind.__name__ in SLOW else (),
+    )
+    for kind, entry in FRESH.items()
+    for name, operation in entry.operations.items()
+]
+OF_PARAMETERS = [
+    pytest.param(entry, id=getattr(kind, '__name__', kind)) for kind, entry in CONFIGURED.items()
+]
+
+
+def test_every_class_with_a_state_is_in_a_table():
+    classes = classes_of(PACKAGES)
+    assert classes.keys() == {kind.__name__ for kind in FRESH} ^ NEVER_RESET.keys()
+    replaceable = {
+        name
+        for name, kind in classes.items()
+        if hasattr(kind, 'configure') or 'eplaceable at run time' in (kind.__doc__ or '')
+    }
+    parts = {'Nt3fsMpcController', 'SwitchingTracker', 'FixedStepRobot'}  # of Controller, of twins
+    assert replaceable - parts <= {getattr(kind, '__name__', kind) for kind in CONFIGURED}
+
+
+@pytest.mark.parametrize(('entry', 'operation'), CASES)
+def test_a_used_object_is_as_new(entry, operation):
+    check_fresh(entry, operation)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('entry', OF_PARAMETERS)
+def test_replaced_parameters_are_those_of_a_new_object(entry):
+    check_configured(entry)
+
+
+@pytest.mark.parametrize('entry', OF_PARAMETERS)
+def test_parameters_that_are_replaced_and_restored_leave_no_trace(entry):
+    check_round_trip(entry)
