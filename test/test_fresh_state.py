@@ -52,5 +52,5 @@ def test_replaced_parameters_are_those_of_a_new_object(entry):
 
 
 @pytest.mark.parametrize('entry', OF_PARAMETERS)
-def test_parameters_that_are_replaced_and_restored_leave_no_trace(entry):
+def test_replaced_and_restored_parameters_leave_no_trace(entry):
     check_round_trip(entry)
