@@ -11,27 +11,36 @@ import re
 import signal
 
 import pytest
-from support.processor_wait import ProcessorWait
+from support import processor_wait
+from support.waiting import TIMEOUTS, Processes
 
 from t3mpc_ros.cli.private_graph import PrivateGraph
-from t3mpc_ros.cli.process_group import ProcessGroup
 
 ROOT = Path(__file__).resolve().parent
 DEFAULT = ('geometry', 'parameters', 'robot', 'fuzzy', 'test_launch_files.py')
 """What ``colcon test``, and pytest without arguments, runs; scripts/check runs all."""
 
 MAX_WAIT = 0.3
-"""Largest share of the time with work to do that the nodes of a test may wait for a processor."""
-PROGRAM_ERRORS = TypeError, AttributeError, NameError, ImportError, SystemError
-"""What no lack of processor time can raise."""
-WAIT = pytest.StashKey[ProcessorWait]()
+"""Largest share of the time with work to do that processes of a test may wait for a processor."""
+WAIT = pytest.StashKey[processor_wait.ProcessorWait]()
+PROCESSOR_WAIT = 'processor wait'
+"""Property of the report of a test with nodes: this share."""
 INCONCLUSIVE = 'inconclusive'
-"""Title of the section of a report that holds the failure."""
+"""Outcome of a test, and title of the section of its report that holds the time-out."""
+INCONCLUSIVE_CODE = 6
+"""Exit code of a run in which nothing failed and something was inconclusive; pytest has 0 to 5."""
+OUTCOMES = {'skipped': 'skipped', 'passed': 'passed', INCONCLUSIVE: INCONCLUSIVE} | dict.fromkeys(
+    ('failed', 'error'), 'failed'
+)
+"""Outcomes of a test by those of its phases, the worst of which, the last here, counts."""
 
 
 def pytest_addoption(parser):
     parser.addoption(
         '--part', type=_part, metavar='K/N', help='run part K of N of the selected tests'
+    )
+    parser.addoption(
+        '--outcomes', type=Path, metavar='FILE', help='append OUTCOME NAME of each test to FILE'
     )
 
 
@@ -114,7 +123,7 @@ def _keep(config, items, kept):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_setup(item):
-    item.stash[WAIT] = ProcessorWait()
+    item.stash[WAIT] = processor_wait.begin()
     return (yield from _skip_without_compiler())
 
 
@@ -135,27 +144,75 @@ def _skip_without_compiler():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item, call):
-    """A failure of nodes that had no processor is inconclusive: their time is that of the wall."""
+    """A wait that timed out is inconclusive where processes had no processor; nothing else is."""
     report = yield
-    timely = item.get_closest_marker('ros') and not isinstance(
-        call.excinfo and call.excinfo.value, PROGRAM_ERRORS
-    )
-    share = item.stash[WAIT].share() if report.failed and timely else 0.0
-    if share > MAX_WAIT:
-        text = f'its nodes waited for a processor for {share:.0%} of their time'
-        failure = f'{item.nodeid}: {text}\n{report.longreprtext}'
+    wait = item.stash[WAIT]
+    if report.when == 'call' and item.get_closest_marker('ros'):
         # Worker processes send reports, and nothing else, to the process that writes the summary.
+        report.user_properties.append((PROCESSOR_WAIT, wait.share()))
+    error = call.excinfo and call.excinfo.value
+    if report.failed and isinstance(error, TIMEOUTS) and _share_at(error, wait) > MAX_WAIT:
+        share = f'{_share_at(error, wait):.0%}'
+        text = f'its processes waited for a processor for {share} of their time'
+        failure = f'{item.nodeid}: {text}\n{report.longreprtext}'
         report.sections.append((INCONCLUSIVE, failure))
         report.outcome, report.longrepr = 'skipped', (str(item.path), 0, f'inconclusive: {text}')
     return report
 
 
+def _share_at(error, wait):
+    """Return the share when an error was raised: that of a shared fixture is raised again."""
+    if not hasattr(error, 'processor_wait'):
+        error.processor_wait = wait.share()
+    return error.processor_wait
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_report_teststatus(report):
+    if [*getattr(report, 'get_sections', lambda title: ())(INCONCLUSIVE)]:
+        return INCONCLUSIVE, 'I', INCONCLUSIVE.upper()
+    return None
+
+
+def pytest_sessionfinish(session):
+    """Write the outcomes; end with a code of its own if something is inconclusive."""
+    config = session.config
+    if hasattr(config, 'workerinput'):
+        return
+    reports = config.pluginmanager.get_plugin('terminalreporter').stats
+    if path := config.option.outcomes:
+        outcomes = {
+            report.nodeid: outcome
+            for phase, outcome in OUTCOMES.items()
+            for report in reports.get(phase, ())
+        }
+        with path.open('a') as target:
+            target.writelines(f'{outcome} {name}\n' for name, outcome in outcomes.items())
+    if session.exitstatus == pytest.ExitCode.OK and reports.get(INCONCLUSIVE):
+        session.exitstatus = INCONCLUSIVE_CODE
+
+
 def pytest_terminal_summary(terminalreporter):
-    """List what was inconclusive."""
-    skipped = terminalreporter.stats.get('skipped', [])
-    if texts := [text for report in skipped for _, text in report.get_sections(INCONCLUSIVE)]:
+    """List what was inconclusive, and the tests with nodes that waited longest."""
+    reports = terminalreporter.stats
+    if inconclusive := reports.get(INCONCLUSIVE):
         terminalreporter.section('inconclusive: the machine is too busy; repeat when it is not')
+        texts = [text for report in inconclusive for _, text in report.get_sections(INCONCLUSIVE)]
         terminalreporter.write_line('\n\n'.join(texts))
+    shares = sorted(
+        (value, report.nodeid)
+        for phase in OUTCOMES
+        for report in reports.get(phase, ())
+        for name, value in getattr(report, 'user_properties', ())
+        if name == PROCESSOR_WAIT
+    )
+    if shares:
+        terminalreporter.write_line(
+            f'processor wait of {len(shares)} tests with nodes: '
+            f'median {shares[len(shares) // 2][0]:.0%}, above the limit of {MAX_WAIT:.0%}: '
+            f'{sum(share > MAX_WAIT for share, _ in shares)}; largest: '
+            + ', '.join(f'{share:.0%} {name}' for share, name in shares[:-4:-1])
+        )
 
 
 @pytest.fixture
@@ -183,7 +240,7 @@ def ros(graph):
 @pytest.fixture
 def processes(graph, tmp_path):
     """Return a process group; processes that still run at the end are killed."""
-    started = ProcessGroup(tmp_path / 'log', os.environ)
+    started = Processes(tmp_path / 'log', os.environ)
     yield started
     for name in list(started.running()):
         started.kill(name)

@@ -17,6 +17,7 @@ import pytest
 from support.checkout import EXECUTABLES, clean_environment, copy_package
 from support.launch_files import nodes_of
 from support.long_tests import few_of
+from support.waiting import wait_for_end, wait_for_text
 import yaml
 
 from t3mpc_ros.nodes.registry import NODES
@@ -106,17 +107,13 @@ class Process:
     def output(self):
         return self._log.read_text(errors='replace')
 
-    def wait_ready(self, seconds=180.0):
-        deadline = time.monotonic() + seconds
-        while f'{self._name} ready' not in self.output():
-            assert self._process.poll() is None, f'{self._name} exited early:\n{self.output()}'
-            assert time.monotonic() < deadline, f'{self._name} is not ready:\n{self.output()}'
-            time.sleep(0.05)
+    def wait_ready(self):
+        wait_for_text(self._process, self.output, f'{self._name} ready', 180.0)
 
     def interrupt(self):
         """Return the exit code after SIGINT."""
         self._process.send_signal(signal.SIGINT)
-        return self._process.wait(15.0)
+        return wait_for_end(self._process)
 
 
 @pytest.fixture(scope='module')

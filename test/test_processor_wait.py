@@ -1,7 +1,8 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The measure by which a failure on an overloaded machine is called inconclusive."""
+"""What is inconclusive on an overloaded machine: a wait that timed out, and nothing else."""
 
+import ast
 import os
 from pathlib import Path
 import subprocess
@@ -9,44 +10,167 @@ import sys
 import time
 
 import pytest
+from support import processor_wait, waiting
 from support.processor_wait import ProcessorWait, descendants
 
 pytestmark = pytest.mark.slow
 
 TESTS = Path(__file__).resolve().parent
-STARVED = """
+CERTAIN = """
 import time
 import pytest
+from support.waiting import ProcessTimeoutError, communicate, run, wait_until
 
-def fail_slowly(error):
-    end = time.monotonic() + 1.0
+SLEEP = ['sleep', '60']
+
+def busy():
+    end = time.monotonic() + {busy}
     while time.monotonic() < end:
         pass
-    raise error('the story of the failure')
 
-@pytest.mark.ros
-def test_with_nodes():
-    fail_slowly(RuntimeError)
+def test_value():
+    busy()
+    seed = 3
+    assert seed == 4
 
-def test_without_nodes():
-    fail_slowly(RuntimeError)
+def test_exception():
+    busy()
+    raise ValueError('the robot drove through the wall')
 
-@pytest.mark.ros
-def test_with_a_broken_callback():
-    fail_slowly(TypeError)
+def test_program_error():
+    busy()
+    1 / 0
+"""
+WAITS = """
+@pytest.fixture
+def waited():
+    busy()
+    raise ProcessTimeoutError('the story of the fixture')
+
+@pytest.fixture(scope='module')
+def shared():
+    busy()
+    wait_until(lambda: False, 'the story of the shared fixture', 0.0)
+
+def test_wait():
+    busy()
+    wait_until(lambda: False, 'the story of the failure', 0.0)
+
+def test_wait_in_a_fixture(waited):
+    pass
+
+def test_wait_in_a_shared_fixture(shared):
+    pass
+
+def test_wait_in_a_shared_fixture_again(shared):
+    pass
+
+def test_command():
+    busy()
+    run(SLEEP, 0.0)
+
+def test_wrong_value_after_a_wait():
+    busy()
+    with pytest.raises(Exception):
+        run(SLEEP, 0.0)
+    assert not 'sound'
+
+def test_sound():
+    busy()
+"""
+STARVED = """
+from support import processor_wait
+shares = iter([{shares}])
+processor_wait.ProcessorWait.share = lambda self: next(shares, 0.9)
 """
 BUSY = 'import time\nwhile True: time.monotonic()'
 
 
 @pytest.fixture
 def busy():
-    """Leave a further process half a processor."""
-    count = -(-3 * len(os.sched_getaffinity(0)) // 2)
+    """Leave a further process half a processor or less."""
+    count = max(4, -(-3 * len(os.sched_getaffinity(0)) // 2))
     started = [subprocess.Popen([sys.executable, '-c', BUSY]) for _ in range(count)]
     yield {process.pid for process in started}
     for process in started:
         process.kill()
         process.wait()
+
+
+def run_pytest(folder, text, *words, shares=''):
+    """Return the completed run of a file of tests, and the outcomes by name."""
+    (folder / 'test_starved.py').write_text(f'{text}\npytestmark = pytest.mark.ros\n')
+    plugins = ['-p', 'conftest']
+    if shares is not None:
+        (folder / 'starved.py').write_text(STARVED.format(shares=shares))
+        plugins += ['-p', 'starved']
+    words = ['-c', TESTS.parent / 'pyproject.toml', *plugins, '--outcomes', 'outcomes', *words]
+    paths = map(str, (TESTS, TESTS.parent, folder))
+    done = waiting.run(
+        [sys.executable, '-m', 'pytest', *map(str, words), 'test_starved.py'],
+        cwd=folder,
+        env=os.environ | {'PYTHONPATH': os.pathsep.join(paths)},
+    )
+    lines = (folder / 'outcomes').read_text().splitlines()
+    (folder / 'outcomes').unlink()
+    found = [line.partition(' ')[::2] for line in lines]
+    return done, {name.rpartition('::')[2]: outcome for outcome, name in found}
+
+
+def test_certain_faults_fail_on_a_busy_machine(busy, tmp_path):
+    """They were three skips, and no failure."""
+    done, outcomes = run_pytest(tmp_path, CERTAIN.format(busy=0.7), '-n', 2, shares=None)
+    assert done.returncode == 1
+    assert '3 failed' in done.stdout
+    assert set(outcomes.values()) == {'failed'}
+    assert len(outcomes) == 3
+
+
+@pytest.mark.parametrize('workers', [0, 1])
+def test_only_a_timeout_of_a_wait_is_inconclusive(workers, tmp_path):
+    """With worker processes nothing was listed at the end: the failure was a mere skip."""
+    done, outcomes = run_pytest(tmp_path, CERTAIN.format(busy=0.0) + WAITS, '-n', workers)
+    assert done.returncode == 1
+    inconclusive = {name for name, outcome in outcomes.items() if outcome == 'inconclusive'}
+    assert inconclusive == {
+        'test_wait',
+        'test_command',
+        'test_wait_in_a_fixture',
+        'test_wait_in_a_shared_fixture',
+        'test_wait_in_a_shared_fixture_again',
+    }
+    failed = {name for name, outcome in outcomes.items() if outcome == 'failed'}
+    assert failed == {
+        'test_value',
+        'test_exception',
+        'test_program_error',
+        'test_wrong_value_after_a_wait',
+    }
+    assert outcomes['test_sound'] == 'passed'
+    assert '4 failed, 1 passed, 5 inconclusive' in done.stdout
+    listed = done.stdout.partition('inconclusive: the machine is too busy')[2]
+    assert '::test_wait: its processes waited for a processor for 90%' in listed
+    for words in ('failure', 'fixture', 'shared fixture'):
+        assert f'the story of the {words}' in listed
+    assert 'processor wait of 7 tests with nodes: median 90%, above the limit of 30%: 7' in listed
+
+
+def test_a_run_with_inconclusive_tests_alone_has_a_code_of_its_own(tmp_path):
+    text = CERTAIN.format(busy=0.0) + WAITS
+    done, outcomes = run_pytest(tmp_path, text, '-k', 'test_wait or test_sound')
+    assert (done.returncode, len(outcomes)) == (6, 5)
+    done, outcomes = run_pytest(tmp_path, text, '-k', 'test_sound')
+    assert (done.returncode, outcomes) == (0, {'test_sound': 'passed'})
+
+
+def test_a_timeout_on_a_quiet_machine_is_a_failure(tmp_path):
+    text = CERTAIN.format(busy=0.0) + WAITS
+    done, outcomes = run_pytest(tmp_path, text, '-k', 'test_wait', shares='0.3, ' * 20)
+    assert done.returncode == 1
+    assert {*outcomes.values()} == {'failed'}
+
+
+# -- the measure ----------------------------------------------------------------------------------
 
 
 def test_processes_that_share_a_processor_wait_for_it(busy):
@@ -58,34 +182,114 @@ def test_processes_that_share_a_processor_wait_for_it(busy):
     assert 0.3 < wait.share() < 1.0
 
 
-@pytest.mark.parametrize('workers', [0, 1])
-def test_only_a_failure_of_nodes_is_inconclusive(busy, workers, tmp_path):
-    """With worker processes nothing was listed at the end: the failure was a mere skip.
-
-    A callback with a wrong signature was inconclusive on a busy machine.
-    """
-    path = tmp_path / 'test_starved.py'
-    path.write_text(STARVED)
-    words = ['-c', TESTS.parent / 'pyproject.toml', '-p', 'conftest', '-n', workers, path]
-    done = subprocess.run(
-        [sys.executable, '-m', 'pytest', *map(str, words)],
-        cwd=tmp_path,
-        env=os.environ | {'PYTHONPATH': f'{TESTS}{os.pathsep}{TESTS.parent}'},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 1
-    assert '2 failed, 1 skipped' in done.stdout
-    listed = done.stdout.partition('inconclusive: the machine is too busy')[2]
-    assert '::test_with_nodes: its nodes waited for a processor' in listed
-    assert 'the story of the failure' in listed
-
-
 def test_what_sleeps_does_not_wait():
-    sleeper = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(60)'])
-    time.sleep(0.3)
+    sleeper = subprocess.Popen(['sleep', '60'])
     assert sleeper.pid in descendants(os.getpid())
-    assert ProcessorWait().share() <= 1.0
     sleeper.kill()
     sleeper.wait()
     assert sleeper.pid not in descendants(os.getpid())
+
+
+@pytest.fixture
+def times(monkeypatch):
+    """Return the times of threads that are measured, by thread."""
+    found = {}
+    monkeypatch.setattr(processor_wait, 'thread_times', lambda pids: dict(found))
+    return found
+
+
+def test_a_test_has_the_time_since_its_start(times):
+    """A process of an earlier test counted from its start."""
+    times['old'] = processor_wait.ProcessorTime(100, 900)
+    wait = ProcessorWait()
+    assert wait.share() == 0.0
+    times['old'] = processor_wait.ProcessorTime(160, 900)
+    times['new'] = processor_wait.ProcessorTime(20, 20)
+    assert wait.share() == 0.2
+
+
+def test_a_process_that_has_ended_counts_as_last_noted(times):
+    """It counted 0: what was killed for its delay was no sign of a busy machine."""
+    wait = processor_wait.begin()
+    times['command'] = processor_wait.ProcessorTime(20, 60)
+    with pytest.raises(waiting.WaitTimeoutError):
+        waiting.wait_until(lambda: False, 'no answer', 0.0)
+    times.clear()
+    assert wait.share() == 0.75
+
+
+@pytest.mark.parametrize('end', ['kill', 'stop'])
+def test_what_the_fixture_ends_is_noted_before(end, tmp_path, monkeypatch):
+    wait = processor_wait.begin()
+    noted = []
+    monkeypatch.setattr(wait, 'note', lambda: noted.append(group.running()))
+    program = tmp_path / 'lib' / 't3mpc_ros' / 'sleeper'
+    program.parent.mkdir(parents=True)
+    program.write_text('#!/bin/sh\nexec sleep 60\n')
+    program.chmod(0o755)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    group = waiting.Processes(tmp_path / 'log', os.environ)
+    group.start('sleeper')
+    getattr(group, end)('sleeper')
+    assert noted == [('sleeper',)]
+
+
+# -- no other waits -------------------------------------------------------------------------------
+
+CLOCKS = {'monotonic', 'monotonic_ns', 'perf_counter', 'perf_counter_ns', 'time', 'time_ns'}
+COMMANDS = {'run', 'call', 'check_call', 'check_output', 'wait', 'communicate'}
+
+
+def waits(text):
+    """Return the lines of a Python file with a wait of its own that can time out."""
+    found = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.While | ast.For):
+            inner = [*ast.walk(node)]
+            reads_clock = any(
+                isinstance(each, ast.Call)
+                and isinstance(each.func, ast.Attribute)
+                and (each.func.attr in CLOCKS or each.func.attr in ('sleep', 'spin_once'))
+                for each in inner
+            )
+            # A bare raise passes an error on.
+            ends = any(
+                isinstance(each, ast.Assert) or (isinstance(each, ast.Raise) and each.exc)
+                for each in inner
+            )
+            if reads_clock and ends:
+                found.add(node.lineno)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            owner = ast.unparse(node.func.value)
+            limited = any(keyword.arg == 'timeout' for keyword in node.keywords)
+            of_process = node.func.attr == 'wait' and owner.endswith(('process', 'child'))
+            if (node.func.attr in COMMANDS and limited) or (of_process and node.args):
+                found.add(node.lineno)
+        if isinstance(node, ast.Attribute | ast.Name) and 'TimeoutExpired' in ast.unparse(node):
+            found.add(node.lineno)
+    return sorted(found)
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'while not ready():\n    assert time.monotonic() < end',
+        'while not ready():\n    if time.time() > end:\n        raise TimeoutError\n    spin()',
+        'while True:\n    now = time.monotonic()\n    assert now < end',
+        'for _ in range(9):\n    time.sleep(0.1)\nelse:\n    raise ValueError',
+        'process.wait(timeout=3)',
+        'self._process.wait(3.0)',
+        'demo.communicate(timeout=3)',
+        'subprocess.run(words, timeout=3)',
+        'try:\n    f()\nexcept subprocess.TimeoutExpired:\n    pass',
+    ],
+)
+def test_waits_are_found(text):
+    assert waits(text)
+
+
+def test_every_wait_of_a_test_is_one_that_can_be_inconclusive():
+    """Other time-outs would be failures on a busy machine."""
+    own = {TESTS / 'support' / 'waiting.py'}
+    found = {path.name: waits(path.read_text()) for path in TESTS.rglob('*.py') if path not in own}
+    assert {name: lines for name, lines in found.items() if lines} == {}

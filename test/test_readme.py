@@ -15,10 +15,10 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from support.launch_files import arguments_of, nodes_of
+from support.waiting import run, wait_for_end, wait_for_text
 import yaml
 
 from t3mpc_ros.cli import bag, emulator, robot
@@ -317,9 +317,7 @@ def test_the_controller_of_the_tutorial_runs(tmp_path):
     """Its table comes from the command of the tutorial, which another test runs."""
     script = tmp_path / 'my_controller.py'
     script.write_text(_own_controller())
-    done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, timeout=240, check=False
-    )
+    done = run([sys.executable, script], 240.0)
     assert done.returncode == 0, done.stderr
     (error,) = re.findall(r'^\| with switches \| ([0-9.]+) \| rad/s \|$', done.stdout, re.M)
     assert float(error) < 0.5
@@ -339,19 +337,19 @@ def _boards(command, output):
         return
     if command == BRIDGE:
         with _started(EMULATOR.split(), output, output / 'emulator.txt') as process:
-            _wait_until(process, output / 'emulator.txt', 'stop with Ctrl-C')
+            wait_for_text(process, (output / 'emulator.txt').read_text, 'stop with Ctrl-C', 120.0)
             yield
         return
     key = ['--key', 'robot.key'] if 'robot.key' in command and 'write' not in command else []
     log = output / 'boards.txt'
     with _started([*BOARDS.split(), *key], output, log) as process:
-        _wait_until(process, log, 'stop with Ctrl-C')
+        wait_for_text(process, log.read_text, 'stop with Ctrl-C', 120.0)
         if command != SET:  # the boards are erased at every start
             (output / 'robot.yaml').unlink(missing_ok=True)
             subprocess.run([ROOT / SET.split()[0], *SET.split()[1:]], cwd=output, check=True)
         yield
         process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=30) == 0, log.read_text()
+        assert wait_for_end(process) == 0, log.read_text()
 
 
 def _commands_by_page():
@@ -393,9 +391,9 @@ def _work(command, output, tmp_path):
     with _started(arguments, output, log) as process:
         if endless:
             ready = 'stop with Ctrl-C' if 't3mpc' in arguments else f'{arguments[1]} ready'
-            _wait_until(process, log, ready)
+            wait_for_text(process, log.read_text, ready, 120.0)
             process.send_signal(signal.SIGINT)
-        code = process.wait(timeout=240)
+        code = wait_for_end(process, 240.0)
     # On a busy machine the round trip is long, and ping fails with a report; so does a demo, whose
     # robot was stopped or whose odometry was late.
     output_text = log.read_text()
@@ -436,11 +434,3 @@ def _started(arguments, folder, log):
     finally:
         process.kill()
         process.wait()
-
-
-def _wait_until(process, log, text):
-    deadline = time.monotonic() + 120.0
-    while text not in log.read_text():
-        assert process.poll() is None, log.read_text()
-        assert time.monotonic() < deadline, log.read_text()
-        time.sleep(0.05)

@@ -11,11 +11,11 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 
 import pytest
 from support.checkout import EXECUTABLES, ROOT, clean_environment, copy_package
 from support.long_tests import few_of
+from support.waiting import communicate, run, wait_until
 
 from t3mpc_ros.cli.main import _parser as cli_parser
 
@@ -127,8 +127,9 @@ class Checkout:
             'preexec_fn': lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         }
 
-    def run(self, *arguments, timeout=None, **extra):
-        return subprocess.run(**self.command(*arguments, **extra), timeout=timeout)
+    def run(self, *arguments, **extra):
+        options = self.command(*arguments, **extra)
+        return run(options.pop('args'), **options)
 
     def done(self):
         """Return the logged calls since the last call; kernels and package go side by side."""
@@ -213,7 +214,7 @@ def test_a_moved_checkout_or_new_python_gets_a_new_environment(checkout, tmp_pat
 def test_two_scripts_at_once_set_up_once(checkout):
     both = [subprocess.Popen(**checkout.command('t3mpc')) for _ in range(2)]
     for process in both:
-        output, errors = process.communicate(timeout=30)
+        output, errors = communicate(process)
         assert (process.returncode, output) == (0, 't3mpc got \n'), errors
     assert checkout.done() == SET_UP
 
@@ -260,12 +261,10 @@ def test_a_signal_ends_the_set_up_and_its_commands(number, checkout):
     slow = checkout.beside('slow')
     slow.touch()
     script = subprocess.Popen(**checkout.command('t3mpc'))
-    deadline = time.monotonic() + 30.0
-    while not (pid := slow.read_text().strip()):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_until(lambda: slow.read_text().strip())
+    pid = slow.read_text().strip()
     script.send_signal(number)
-    _, errors = script.communicate(timeout=30)  # the pipe ends with the last process of the set-up
+    _, errors = communicate(script)  # the pipe ends with the last process of the set-up
     assert script.returncode == 128 + number
     assert 'stopped' in errors
     assert not Path('/proc', pid).exists()
@@ -393,7 +392,7 @@ def test_a_failed_installation_ends_the_compilation(checkout):
     text = (checkout.bin / 'python3').read_text().replace('note package', 'exit 1')
     (checkout.bin / 'python3').write_text(text)
     # The pipe ends with the last process.
-    done = checkout.run('t3mpc', timeout=50)
+    done = checkout.run('t3mpc')
     assert done.returncode == 1
     assert 'error: the package could not be installed' in done.stderr
 

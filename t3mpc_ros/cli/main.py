@@ -27,13 +27,19 @@ from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
 
 if TYPE_CHECKING:
+    from t3mpc_ros.evaluation.bag_report.verdict import Verdict
     from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition
 
 
 SECONDS = bounded_float(1.0, 86_400.0, 'seconds')
 
-UNSOUND = 3
-"""Exit code of a demo that was recorded but is no valid measurement."""
+UNSOUND, TOO_SLOW = 3, 4
+"""Exit codes of a demo that was recorded but is no valid measurement."""
+DEMO_EXIT_CODES = """\
+Exit code: 0 sound; 1 failed; 2 wrong use; 128 + N ended by signal N; the run is recorded, but no
+valid measurement: 3 the robot did not follow, or data is missing; 4 the machine was too slow,
+which may be why: repeat it."""
+"""The last words of the help of the demo."""
 
 PROGRAMS = {
     'bag': 'inspect, report, animate, recover, replay, compare bags, and train from them',
@@ -95,7 +101,14 @@ def _demo(options: argparse.Namespace) -> int:
     print(figures.summary())
     if not options.headless:
         webbrowser.open(figures.report.resolve().as_uri())
-    return 0 if figures.verdict.sound else UNSOUND
+    return _demo_exit_code(figures.verdict)
+
+
+def _demo_exit_code(verdict: 'Verdict') -> int:
+    if verdict.sound:
+        return 0
+    # No lack of time damages a recording.
+    return TOO_SLOW if verdict.slow and not verdict.damage else UNSOUND
 
 
 def _new_run(folder: Path) -> Path:
@@ -191,7 +204,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
 
-    demo = commands.add_parser('demo', help='run all nodes as processes, record, report')
+    demo = commands.add_parser(
+        'demo',
+        help='run all nodes as processes, record, report',
+        epilog=DEMO_EXIT_CODES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     demo.add_argument('--duration', type=SECONDS, default=60.0, help='seconds (default 60)')
     demo.add_argument('--output', type=Path, help='folder (default runs/<time>)')
     demo.add_argument('--headless', action='store_true', help='no bar, no browser')

@@ -23,6 +23,10 @@ class ProcessError(RuntimeError):
     """An executable that did not start, or ended when it should not have."""
 
 
+class ProcessTimeoutError(ProcessError):
+    """An executable that did not become ready, or did not end, in time."""
+
+
 class StopRequestedError(ProcessError):
     """A stop was requested while the processes were being started, watched or stopped."""
 
@@ -157,7 +161,9 @@ class ProcessGroup:
         Raises
         ------
         ProcessError
-            It ended, or did not print them within ``seconds``; the text ends with its last lines.
+            It ended; the text ends with its last lines.
+        ProcessTimeoutError
+            It did not print them within ``seconds``.
         """
         begin = time.monotonic()
         deadline, shown = begin + seconds, begin
@@ -174,7 +180,7 @@ class ProcessGroup:
                     f'"{words}":\n' + self._tail(name)
                 )
             if time.monotonic() > deadline:
-                raise ProcessError(
+                raise ProcessTimeoutError(
                     f'{name} did not print "{words}" within {seconds:g} s:\n' + self._tail(name)
                 )
             time.sleep(0.05)
@@ -208,7 +214,7 @@ class ProcessGroup:
 
         Raises
         ------
-        ProcessError
+        ProcessTimeoutError
             It did not end in time and was killed.
         """
         process = self._processes[name]
@@ -218,7 +224,7 @@ class ProcessGroup:
             self._raise_if_requested()
             if time.monotonic() > deadline:
                 self.kill(name)
-                raise ProcessError(
+                raise ProcessTimeoutError(
                     f'{name} did not end within {seconds:g} s of signal {number}:\n'
                     + self._tail(name)
                 )

@@ -16,6 +16,7 @@ import zlib
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
+from support import waiting
 
 from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.qos import QosProfile, profiles_to_yaml
@@ -59,7 +60,8 @@ def install_npm(folder):
     # No lock file: it would carry the address of whatever registry made it. The versions in
     # package.json are exact instead, and no package may run a script of its own.
     options = ['--no-package-lock', '--no-audit', '--no-fund', '--ignore-scripts']
-    subprocess.run(['npm', 'install', *options], cwd=folder, check=True, timeout=300)
+    done = waiting.run(['npm', 'install', *options], 300.0, cwd=folder)
+    assert done.returncode == 0, done.stderr
     return ['node', 'check.mjs']
 
 
@@ -78,7 +80,7 @@ def check(request, tmp_path_factory):
 
     def run(*paths):
         words = [*command, *map(str, paths)]
-        return subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=120)
+        return waiting.run(words, 120.0, cwd=folder)
 
     return run
 

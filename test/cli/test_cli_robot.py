@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 import pytest
+from support.waiting import communicate
 
 from t3mpc_ros.cli import calibrate
 from t3mpc_ros.cli import robot as cli
@@ -35,7 +36,7 @@ def ports(tmp_path):
     assert any('robot console' in line for line in child.stdout)
     yield str(dongle), str(robot)
     child.send_signal(signal.SIGTERM)
-    output, _ = child.communicate(timeout=20)
+    output, _ = communicate(child)
     assert output.endswith('t3mpc emulator: stopped\n')
     assert 'Traceback' not in output
     assert not dongle.is_symlink()

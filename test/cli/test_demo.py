@@ -11,9 +11,9 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 
 import pytest
+from support.waiting import communicate, wait_until
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli import process_group
@@ -24,7 +24,6 @@ from t3mpc_ros.cli.private_graph import DOMAINS, NoDomainError, PrivateGraph, us
 pytestmark = pytest.mark.slow
 
 NODES = ('recorder', 'controller', 'sim_robot', 'reference_generator')
-TIMEOUT = 30.0
 
 STAND_IN = """#!{python}
 import os, pathlib, signal, sys, time
@@ -86,13 +85,6 @@ def read_until(demo, text):
         assert line, f'the demo has ended without "{text}"'
 
 
-def wait_until(condition):
-    deadline = time.monotonic() + TIMEOUT
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
 def alive(folder):
     """Return the names of the stand-ins that still run."""
     found = []
@@ -128,7 +120,7 @@ def test_a_signal_ends_the_demo_and_all_nodes(phase, number, tmp_path):
     expected = 2 if phase == 'start' else 4
     wait_until(lambda: len(list(tmp_path.glob('*.pid'))) == expected)
     demo.send_signal(number)
-    _, errors = demo.communicate(timeout=TIMEOUT)
+    _, errors = communicate(demo)
     assert demo.returncode == 128 + number
     assert 'Traceback' not in errors
     assert 'stopped' in errors
@@ -140,7 +132,7 @@ def test_nodes_that_ignore_the_signal_are_killed(tmp_path):
     demo = start_demo(tmp_path, environment)
     read_until(demo, 'running')
     demo.send_signal(signal.SIGTERM)
-    demo.communicate(timeout=TIMEOUT)
+    communicate(demo)
     assert demo.returncode == 128 + signal.SIGTERM
     assert alive(tmp_path) == []
 
@@ -150,7 +142,7 @@ def test_a_signal_while_the_nodes_are_stopped_ends_the_demo(tmp_path):
     demo = start_demo(tmp_path, stand_ins(tmp_path, ignored=(signal.SIGINT,)), '--duration', '1')
     wait_until((tmp_path / 'reference_generator.asked').exists)
     demo.send_signal(signal.SIGHUP)
-    demo.communicate(timeout=TIMEOUT)
+    communicate(demo)
     assert demo.returncode == 128 + signal.SIGHUP
     assert alive(tmp_path) == []
 
@@ -160,7 +152,7 @@ def test_the_nodes_of_a_killed_demo_end_with_it(tmp_path):
     read_until(demo, 'running')
     assert sorted(alive(tmp_path)) == sorted(NODES)
     demo.kill()
-    demo.communicate(timeout=TIMEOUT)
+    communicate(demo)
     wait_until(lambda: not alive(tmp_path))
 
 
@@ -171,7 +163,7 @@ def test_an_interrupted_demo_says_how_to_get_the_report(tmp_path):
     bag.mkdir()
     (bag / 'bag_0.mcap').write_bytes(b'')
     demo.send_signal(signal.SIGINT)
-    _, errors = demo.communicate(timeout=TIMEOUT)
+    _, errors = communicate(demo)
     assert f't3mpc bag report {bag}' in errors
 
 
@@ -198,7 +190,7 @@ def test_the_demo_names_what_it_waits_for_and_its_own_domain(tmp_path):
     demos = [start_demo(each, stand_ins(each), '--duration', '1') for each in folders]
     domains = []
     for folder, demo in zip(folders, demos, strict=True):
-        _, errors = demo.communicate(timeout=TIMEOUT)
+        _, errors = communicate(demo)
         lines = [line.strip() for line in errors.splitlines()]
         expected = [f'starting {name}' for name in NODES] + ['waiting for discovery']
         assert [line for line in lines if line in expected] == expected
@@ -272,7 +264,7 @@ def test_two_demos_at_once_do_not_meet(graph, tmp_path):
         demos.append(start_demo(tmp_path / str(i), os.environ, '--duration', '3'))
     bags = []
     for i, demo in enumerate(demos):
-        _, errors = demo.communicate(timeout=240)
+        _, errors = communicate(demo, 240.0)
         assert 'drawing the report' in errors, errors
         bags.append(tmp_path / str(i) / 'run' / 'bag')
     stamps = []

@@ -4,11 +4,11 @@
 
 from dataclasses import replace
 import math
-import subprocess
 import sys
 
 import numpy as np
 import pytest
+from support import waiting
 from support.control_loops import GEOMETRY, LEAD, PERIOD, Loop, ServoLoop, make_state
 
 from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
@@ -480,11 +480,5 @@ print({name for name in after if after[name] != before[name]} or 'nothing')
 @pytest.mark.slow
 def test_after_the_warm_up_no_step_compiles(parameters):
     """A separate process, because other tests compile in this one."""
-    done = subprocess.run(
-        [sys.executable, '-c', COMPILES, parameters],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
+    done = waiting.run([sys.executable, '-c', COMPILES, parameters], 300.0)
     assert done.stdout.strip() == 'nothing', done.stdout + done.stderr

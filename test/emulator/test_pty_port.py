@@ -11,6 +11,7 @@ import sys
 import termios
 
 import pytest
+from support.waiting import communicate
 
 from t3mpc_ros.cli import emulator, robot
 from t3mpc_ros.emulator.pty_port import PtyPort, PtyPortError
@@ -38,7 +39,7 @@ class Process:
     def stop(self, number):
         """Send a signal; return the exit code and the remaining output."""
         self.child.send_signal(number)
-        output, errors = self.child.communicate(timeout=20)
+        output, errors = communicate(self.child)
         assert errors == ''
         return self.child.returncode, output
 

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Several nodes in one process."""
 
-import time
-
 import numpy as np
 import pytest
 import rclpy
-from support.ros_graph import TIMEOUT, diagnostic, is_ok
+from support.ros_graph import diagnostic, is_ok
+from support.waiting import wait_until
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.nodes import composed
@@ -43,16 +42,13 @@ def test_composed_runs_with_stamped_commands_in_any_order(order, compose, tmp_pa
     """An early subscription of the recorder must not fix the type of cmd_vel in the process."""
 
     def spin_until(condition):
-        while not condition():
-            assert time.monotonic() < deadline
-            executor.spin_once(timeout_sec=0.05)
+        wait_until(condition, step=lambda: executor.spin_once(timeout_sec=0.05))
 
     nodes = compose('enable_stamped_cmd_vel:=true', *filter(None, [order]))
     assert nodes.keys() == set(NODES) - {'radio_bridge', 'player'}
     executor = make_executor()
     for node in nodes.values():
         executor.add_node(node)
-    deadline = time.monotonic() + TIMEOUT
     spin_until(lambda: is_ok(nodes['sim_robot'], 'following commands'))
     spin_until(lambda: nodes['recorder'].count_subscribers('cmd_vel') > 1)
     expected = 'geometry_msgs/msg/TwistStamped'

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from support.launch_files import arguments_of, nodes_of
+from support.waiting import wait_for_end, wait_for_text
 import yaml
 
 from t3mpc_ros.bag.reader import open_bag
@@ -200,11 +201,7 @@ class Launch:
         return dict.fromkeys(clean, 0) | {name: int(code) for name, code in died}
 
     def wait_for(self, words, seconds=600.0):  # a busy machine compiles the kernels for minutes
-        deadline = time.monotonic() + seconds
-        while words not in self.output():
-            assert self.process.poll() is None, self.output()
-            assert time.monotonic() < deadline, self.output()
-            time.sleep(0.05)
+        wait_for_text(self.process, self.output, words, seconds)
 
 
 @pytest.fixture
@@ -251,7 +248,7 @@ def end(launch, to_group=False):
     """Interrupt a launch; return the exit codes after checking that nothing is left."""
     pids = launch.pids()
     (os.killpg if to_group else os.kill)(launch.process.pid, signal.SIGINT)
-    assert launch.process.wait(timeout=30.0) == 0, launch.output()
+    assert wait_for_end(launch.process) == 0, launch.output()
     assert not [name for name, pid in pids.items() if Path('/proc', str(pid)).exists()]
     codes = launch.ends()
     assert set(codes) == set(pids)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from support import waiting
 from support.long_tests import few_of
 
 from t3mpc_ros.cli.process_group import executable
@@ -67,9 +68,7 @@ def test_a_missing_library_is_one_line_with_its_remedy(
 ):
     """It was a traceback."""
     without(library)
-    done = subprocess.run(
-        [executable(name), *arguments], capture_output=True, text=True, timeout=60, cwd=tmp_path
-    )
+    done = waiting.run([executable(name), *arguments], cwd=tmp_path)
     assert done.returncode == 1
     lines = [line for line in done.stderr.splitlines() if not line.startswith('[')]
     assert len(lines) == 1, done.stderr

@@ -13,12 +13,12 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from support import node_cost_bench
 from support.long_tests import few_of
-from support.ros_graph import TIMEOUT, speed, stamp
+from support.ros_graph import speed, stamp
+from support.waiting import Processes, wait_until
 
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
 from t3mpc_ros.bag.run.journal import Event
 from t3mpc_ros.cli.private_graph import PrivateGraph
-from t3mpc_ros.cli.process_group import ProcessGroup
 from t3mpc_ros.evaluation.process_replay.comparison import Tolerances, compare
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
@@ -95,10 +95,7 @@ class Observer:
 
     def wait(self, condition, problem):
         """Wait for a condition."""
-        deadline = time.monotonic() + TIMEOUT
-        while not condition():
-            assert time.monotonic() < deadline, problem
-            self._executor.spin_once(timeout_sec=0.1)
+        wait_until(condition, problem, step=lambda: self._executor.spin_once(timeout_sec=0.1))
 
     def close(self):
         self._executor.shutdown()
@@ -166,7 +163,7 @@ def run(tmp_path_factory):
     with PrivateGraph() as private, pytest.MonkeyPatch.context() as patch:
         for name, value in private.environment().items():
             patch.setenv(name, value)
-        processes, observer = ProcessGroup(folder / 'log', private.environment()), Observer()
+        processes, observer = Processes(folder / 'log', private.environment()), Observer()
         try:
             return Run(folder, processes, observer)
         finally:

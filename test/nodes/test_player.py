@@ -13,7 +13,6 @@ import subprocess
 import sys
 import termios
 import threading
-import time
 
 from geometry_msgs.msg import Twist
 from mcap.reader import make_reader
@@ -26,6 +25,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.ros_graph import LATCHED, diagnostic, diagnostic_level, odometry, reason, twist
+from support.waiting import wait_until
 
 from t3mpc_ros.bag.merged_reader import MergedReader
 from t3mpc_ros.bag.qos import QosProfile
@@ -419,13 +419,18 @@ class Terminal:
 
     def until(self, pattern):
         """Read until the terminal shows ``pattern``; return the match, discard the text."""
-        deadline = time.monotonic() + 15.0
-        while not (match := re.search(pattern, self.text)):
-            assert time.monotonic() < deadline, f'no {pattern} in {self.text!r}'
-            if select.select([self.master], [], [], 0.1)[0]:
-                self.text += os.read(self.master, 4096).decode()
+        wait_until(
+            lambda: re.search(pattern, self.text),
+            lambda: f'no {pattern} in {self.text!r}',
+            step=self._read,
+        )
+        match = re.search(pattern, self.text)
         self.text = self.text[match.end() :]
         return match
+
+    def _read(self):
+        if select.select([self.master], [], [], 0.05)[0]:
+            self.text += os.read(self.master, 4096).decode()
 
     def press(self, keys):
         os.write(self.master, keys)
@@ -434,11 +439,11 @@ class Terminal:
         return termios.tcgetattr(self.slave)
 
     def wait(self):
-        deadline = time.monotonic() + 20.0
-        while self.process.poll() is None:
-            assert time.monotonic() < deadline, f'it does not end: {self.text!r}'
-            if select.select([self.master], [], [], 0.05)[0]:
-                self.text += os.read(self.master, 4096).decode()
+        wait_until(
+            lambda: self.process.poll() is not None,
+            lambda: f'it does not end: {self.text!r}',
+            step=self._read,
+        )
         return self.process.returncode
 
     def close(self):

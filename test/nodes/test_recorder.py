@@ -13,11 +13,11 @@ from mcap.reader import make_reader
 from nav_msgs.msg import Odometry
 import pytest
 from rcl_interfaces.msg import Log
-from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Int32, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import LATCHED, CommandSource, diagnostic_level, reason, twist
+from support.waiting import wait_for_acknowledgement
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.run.model_file import find_model, load_model, save_model
@@ -120,7 +120,7 @@ def test_messages_replaced_in_the_dds_queue_are_counted(harness, tmp_path):
     harness.spin_until(lambda: values(recorder)['messages'] == 1)
     for i in range(1500):  # no executor spins; the queue holds 1000 messages
         text.publish(String(data=str(i)))
-    assert text.wait_for_all_acked(Duration(seconds=10))
+    wait_for_acknowledgement(text)
     harness.spin_until(lambda: values(recorder)['messages'] == 1001)
     assert values(recorder)['lost'] == 500
     assert diagnostic_level(recorder) == WARN

@@ -15,10 +15,10 @@ import pytest
 import rclpy
 from rclpy.serialization import serialize_message
 from support.long_tests import few_of
+from support.waiting import Processes, wait_until
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery.recover_bag import recover_bag
-from t3mpc_ros.cli.process_group import ProcessGroup
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import qos
 
@@ -73,13 +73,6 @@ def source(ros):
     publishing.close()
 
 
-def wait_until(met, seconds=30.0):
-    deadline = time.monotonic() + seconds
-    while not met():
-        assert time.monotonic() < deadline, 'timeout'
-        time.sleep(0.02)
-
-
 @dataclass
 class KilledRecorder:
     """A killed recorder: its bag, and the times of subscription and kill, ns."""
@@ -95,7 +88,7 @@ def kill_in_sequence(root, slot, source, turns):
     result = []
     for turn in range(turns):
         name = f'slot_{slot}_{turn}'
-        processes = ProcessGroup(root / f'log_{name}', os.environ)
+        processes = Processes(root / f'log_{name}', os.environ)
         bag = root / name
         try:
             processes.start(

@@ -8,12 +8,12 @@ import signal
 import time
 
 import pytest
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray
 from support.long_tests import few_of
 from support.recorder_bench import run
+from support.waiting import wait_for_acknowledgement, wait_until
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery.finalize_file import finalize_file
@@ -46,11 +46,8 @@ class NumberPublisher:
         self.sent = []
         """Time of publication of each number, ns since 1970."""
 
-    def wait_for_recorder(self, seconds=20.0):
-        deadline = time.monotonic() + seconds
-        while not self._publisher.get_subscription_count():
-            assert time.monotonic() < deadline, 'no recorder'
-            time.sleep(0.05)
+    def wait_for_recorder(self):
+        wait_until(self._publisher.get_subscription_count, 'no recorder')
 
     def publish(self, count, period=0.01):
         for _ in range(count):
@@ -62,8 +59,8 @@ class NumberPublisher:
     def _ballast(self):
         return [self._random.random() for _ in range(self.ballast)]
 
-    def acknowledged(self):
-        return self._publisher.wait_for_all_acked(Duration(seconds=10))
+    def wait_for_acknowledgement(self):
+        wait_for_acknowledgement(self._publisher)
 
     def close(self):
         self._node.destroy_node()
@@ -103,7 +100,7 @@ def test_messages_before_a_signal_are_in_the_bag(number, processes, publisher, t
     start(processes, tmp_path / 'bag')
     publisher.wait_for_recorder()
     publisher.publish(900, period=0.0)
-    assert publisher.acknowledged()
+    publisher.wait_for_acknowledgement()
     assert processes.stop('recorder', number) == 0
     assert numbers(tmp_path / 'bag') == list(range(900))
 

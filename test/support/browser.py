@@ -4,12 +4,11 @@
 
 import json
 import shutil
-import time
 
 import pytest
 
-WAIT = 60.0
-"""Longest wait for a change of the page on a busy machine, s."""
+from support.waiting import wait_until
+
 WIDTHS = 'return document.documentElement.scrollWidth'
 SIZES = {360: 800, 768: 1024, 1440: 1000}
 
@@ -58,10 +57,7 @@ class Browser:
         return self.driver.execute_script(script, *values)
 
     def wait(self, condition, what):
-        deadline = time.monotonic() + WAIT
-        while not condition():
-            assert time.monotonic() < deadline, what() if callable(what) else what
-            time.sleep(0.1)
+        wait_until(condition, what)
 
     def show_as(self, width, height, scheme='light'):
         """Show the page in a window of that size, and wait until its parts fit into it.

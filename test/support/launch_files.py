@@ -15,6 +15,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 import types
 from unittest import mock
 
@@ -218,14 +219,13 @@ def _run(nodes):
             print(f'[INFO] [{node.executable}-{number}]: process started with pid [{process.pid}]')
         sys.stdout.flush()
         while running:
+            time.sleep(0.02)
             if stopped:
                 stopped.clear()
                 for process in running.values():
                     process.send_signal(signal.SIGINT)
             for name, process in list(running.items()):
-                try:
-                    code = process.wait(0.02)
-                except subprocess.TimeoutExpired:
+                if (code := process.poll()) is None:
                     continue
                 del running[name]
                 if code:

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""How long this process and its children waited for a processor."""
+"""How long this process and its descendants waited for a processor."""
 
 import os
 from pathlib import Path
@@ -10,24 +10,24 @@ PROC = Path('/proc')
 
 
 class ProcessorTime(NamedTuple):
-    """Time of all threads of some processes, ns."""
+    """Time of a thread since its start, ns."""
 
     running: int
     waiting: int
-    """Time in which they could have run, but had no processor."""
+    """Time in which it could have run, but had no processor."""
 
 
-def processor_time(pids):
-    """Return the time of these processes since their start; those that have ended count 0."""
-    running = waiting = 0
+def thread_times(pids):
+    """Return the times of the living threads of these processes by thread."""
+    found = {}
     for pid in pids:
         try:
             for thread in (PROC / str(pid) / 'task').iterdir():
                 words = (thread / 'schedstat').read_text().split()
-                running, waiting = running + int(words[0]), waiting + int(words[1])
+                found[thread.name] = ProcessorTime(int(words[0]), int(words[1]))
         except OSError:
             continue
-    return ProcessorTime(running, waiting)
+    return found
 
 
 def descendants(pid):
@@ -47,19 +47,55 @@ def descendants(pid):
     return found
 
 
+def _has_children():
+    try:
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    except ChildProcessError:
+        return False
+    return True
+
+
 class ProcessorWait:
-    """Measures how busy others kept the processors, from now on."""
+    """Measures how busy others kept the processors, from now on.
+
+    A thread that has ended counts as of the last :meth:`note` before its end.
+    """
 
     def __init__(self):
-        self._start = processor_time([os.getpid()])
+        self._last = {}
+        self.note()
+        self._first = dict(self._last)
+
+    def note(self):
+        """Measure this process and its descendants."""
+        pid = os.getpid()
+        self._last |= thread_times([pid, *(descendants(pid) if _has_children() else ())])
 
     def share(self):
         """Return the share of the time with work to do that was spent waiting, from 0 to 1.
 
-        Of this process since the start of the measurement, and of its living descendants since
-        theirs. 0 where the kernel does not count it.
+        0 where the kernel does not count it.
         """
-        own, others = processor_time([os.getpid()]), processor_time(descendants(os.getpid()))
-        waiting = own.waiting - self._start.waiting + others.waiting
-        running = own.running - self._start.running + others.running
+        self.note()
+        spans = [
+            (last.running - first.running, last.waiting - first.waiting)
+            for thread, last in self._last.items()
+            for first in [self._first.get(thread, ProcessorTime(0, 0))]
+        ]
+        running, waiting = (sum(column) for column in zip(*spans, strict=True))
         return waiting / max(waiting + running, 1)
+
+
+_of_test = []
+
+
+def begin():
+    """Return the measurement of a test that begins now."""
+    _of_test[:] = [ProcessorWait()]
+    return _of_test[0]
+
+
+def note():
+    """Measure the processes of the running test, before they end."""
+    for wait in _of_test:
+        wait.note()

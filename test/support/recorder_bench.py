@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 
+from support.waiting import communicate
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.cli.process_group import ProcessGroup
@@ -73,7 +74,7 @@ def run(
         begin, used = time.monotonic(), processor_time(pid)
         assert publisher.stdout.readline() == 'end\n'
         elapsed, used = time.monotonic() - begin, processor_time(pid) - used
-        sent = int(publisher.communicate(timeout=30.0)[0])
+        sent = int(communicate(publisher)[0])
     finally:
         publisher.kill()
         publisher.wait()

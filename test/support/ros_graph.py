@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Harness for node tests: nodes of the package and a probe node in one executor over real DDS."""
 
-import time
-
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
@@ -14,6 +12,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
+from support.waiting import wait_until
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import conversions
 from t3mpc_ros.nodes.common.base_node import OK
@@ -36,9 +35,6 @@ NODE_CLASSES = {
     'composed': ComposedNode,
 }
 """Classes of all nodes by executable."""
-
-TIMEOUT = 90.0
-"""Timeout of a condition on a busy machine, s; usually a fraction of it passes."""
 
 LATCHED = QoSProfile(
     depth=1000,
@@ -97,10 +93,7 @@ class NodeHarness:
 
     def spin_until(self, condition, description=''):
         """Spin until ``condition`` holds."""
-        deadline = time.monotonic() + TIMEOUT
-        while not condition():
-            assert time.monotonic() < deadline, f'timeout: {description or condition}'
-            self._executor.spin_once(timeout_sec=0.05)
+        wait_until(condition, description, step=lambda: self._executor.spin_once(timeout_sec=0.05))
 
     def subscribe(self, message_type, topic, qos=100):
         """Return a list to which the messages of a topic are appended."""

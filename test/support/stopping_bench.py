@@ -25,8 +25,8 @@ from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 import rclpy
 
+from support.waiting import Processes, WaitTimeoutError, wait_until
 from t3mpc_ros.cli.private_graph import PrivateGraph
-from t3mpc_ros.cli.process_group import ProcessGroup
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.emulator.pty_port import PtyPort, serve
 from t3mpc_ros.geometry.types import NANOSECONDS
@@ -122,14 +122,10 @@ class DrivenRobot:
         """Begin a fault of the emulator at its next update."""
         self._faults.append(fault)
 
-    def drive(self, timeout=40.0):
+    def drive(self):
         """Drive at full speed, from a random phase of the cycle on."""
         self.speed = FULL
-        end = time.monotonic() + timeout
-        while not self._at_full_speed():
-            if time.monotonic() > end:
-                raise TimeoutError(f'{self.name} does not reach full speed')
-            time.sleep(0.02)
+        wait_until(self._at_full_speed, f'{self.name} does not reach full speed')
         time.sleep(random.uniform(0.0, 0.04))
 
     def _at_full_speed(self):
@@ -294,12 +290,16 @@ class SimulatedRobot:
         """Suspend the process; its publisher ends meanwhile."""
         message = Twist()
         message.linear.x = FULL
-        end = time.monotonic() + 40.0
-        while not self._truth or self._truth[-1].twist.twist.linear.x < 0.98 * FULL:
-            if time.monotonic() > end:
-                raise TimeoutError('sim_robot does not reach full speed')
+
+        def publish():
             self._publisher.publish(message)
             self._spin(0.02)
+
+        wait_until(
+            lambda: self._truth and self._truth[-1].twist.twist.linear.x >= 0.98 * FULL,
+            'sim_robot does not reach full speed',
+            step=publish,
+        )
         pid = self._processes.pid('twin')
         os.kill(pid, signal.SIGSTOP)
         try:
@@ -334,7 +334,7 @@ def repeat(measure, trials, robots=()):
     results, disturbed = [], 0
     while len(results) < trials:
         if disturbed > 3 * trials + 10:
-            raise TimeoutError('the machine is too busy to measure')
+            raise WaitTimeoutError('the machine is too busy to measure')
         for robot in robots:
             robot.forget()
         try:
@@ -345,10 +345,10 @@ def repeat(measure, trials, robots=()):
 
 
 @contextmanager
-def bench(folder: Path, environment: dict[str, str]) -> Iterator[tuple[object, ProcessGroup]]:
+def bench(folder: Path, environment: dict[str, str]) -> Iterator[tuple[object, Processes]]:
     """Yield a node and a process group; the processes end at the end."""
     os.environ.update(environment)
-    processes = ProcessGroup(folder / 'log', environment)
+    processes = Processes(folder / 'log', environment)
     rclpy.init(args=[])
     node = rclpy.create_node('stopping_bench')
     try:

@@ -1,0 +1,168 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""``scripts/check`` with a Python of the test: stages, repetition, exit codes, summary."""
+
+import json
+import os
+from pathlib import Path
+import re
+import shutil
+import signal
+import subprocess
+import sys
+
+import pytest
+from support.waiting import communicate, run, wait_until
+
+ROOT = Path(__file__).resolve().parent.parent
+ENVIRONMENT = """
+set -euo pipefail
+ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
+PYTHON="$ROOT/python"
+say() { printf '%s\\n' "$*" >&2; }
+"""
+PYTHON = """#!{python} -IS
+import json, os, signal, sys, time
+_, _, module, *words = sys.argv
+with open('calls', 'a') as calls:
+    calls.write(json.dumps([module, *words]) + '\\n')
+plan = json.load(open('plan'))
+stage = ' '.join([module, *words[:1]]) if module == 'ruff' else module
+if module == 'pytest':
+    number = sum(json.loads(line)[0] == 'pytest' for line in open('calls'))
+    stage = 'again' if words[2:4] == ['-n', '0'] else f'pytest {{number}}'
+code, *lines = plan.get(stage, [0])
+with open(words[1] if module == 'pytest' else os.devnull, 'a') as outcomes:
+    outcomes.writelines(line + '\\n' for line in lines)
+if code == 'wait':
+    signal.signal(signal.SIGINT, lambda *_: sys.exit(2))
+    open('waiting', 'w').close()
+    time.sleep(60.0)
+if code < 0:
+    os.kill(os.getpid(), -code)
+sys.exit(code)
+"""
+"""Notes its arguments; outcomes and exit code of each stage are in the file ``plan``."""
+
+A, B = 'test/test_a.py::test_one[a b]', 'test/test_a.py::test_two[a b-\\n]'
+WAITED = [6, 'passed x', f'inconclusive {A}', f'inconclusive {B}']
+FAILURE = [1, 'passed x', 'failed test/test_b.py::test_three']
+CASES = [
+    # plan of the stages, exit code, texts of the summary
+    ({}, 0, ['passed']),
+    ({'ruff check': [1]}, 1, ['failed stage: ruff: lint (exit code 1)']),
+    ({'ruff format': [1]}, 1, ['failed stage: ruff: format (exit code 1)']),
+    ({'mypy': [1]}, 1, ['failed stage: mypy (exit code 1)']),
+    ({'mypy': [6], 'pytest 1': WAITED, 'again': [0, f'passed {A}', f'passed {B}']}, 1, []),
+    ({'pytest 1': FAILURE}, 1, ['failed: test/test_b.py::test_three', 'failed: exit code 1']),
+    ({'pytest 1': [2]}, 1, []),
+    ({'pytest 1': [5]}, 1, []),
+    ({'pytest 1': [-signal.SIGSEGV]}, 1, ['(exit code 139)']),
+    ({'pytest 1': [6, 'passed x']}, 1, []),
+    (
+        {'pytest 1': WAITED, 'again': [0, f'passed {A}', f'passed {B}']},
+        0,
+        [f'passed when repeated, inconclusive before: {A}', 'passed'],
+    ),
+    (
+        {'pytest 1': WAITED, 'again': [1, f'failed {A}', f'passed {B}']},
+        1,
+        [f'failed when repeated, inconclusive before: {A}'],
+    ),
+    (
+        {'pytest 1': WAITED, 'again': [6, f'inconclusive {A}', f'passed {B}']},
+        4,
+        [f'inconclusive when repeated, inconclusive before: {A}', 'inconclusive: 1 tests'],
+    ),
+    ({'pytest 1': WAITED, 'again': [0, f'skipped {A}', f'passed {B}']}, 4, []),
+    ({'pytest 1': WAITED, 'again': [0]}, 4, ['inconclusive: 2 tests']),
+    ({'pytest 1': WAITED, 'again': [4]}, 1, []),
+    ({'pytest 1': WAITED, 'again': [-9, f'passed {A}', f'passed {B}']}, 1, []),
+    (
+        {'pytest 1': [1, *FAILURE[1:], *WAITED[1:]], 'again': [0, f'passed {A}', f'passed {B}']},
+        1,
+        ['failed: test/test_b.py::test_three', f'passed when repeated, inconclusive before: {B}'],
+    ),
+    ({'mypy': [1], 'pytest 1': WAITED, 'again': [6, f'inconclusive {A}', f'passed {B}']}, 1, []),
+]
+LATER = [({f'pytest {number}': FAILURE}, 1, ['test_three']) for number in (2, 3)] + [
+    (
+        {f'pytest {number}': WAITED, 'again': [6, f'inconclusive {A}', f'inconclusive {B}']},
+        4,
+        ['inconclusive: 2 tests'],
+    )
+    for number in (2, 3)
+]
+"""The same in later stages, which a run without arguments has."""
+STAGES = ['ruff', 'ruff', 'mypy', 'pytest']
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """Return a function that runs ``scripts/check``: plan, arguments, exit code, stages, text."""
+    scripts = tmp_path / 'a checkout' / 'scripts'
+    scripts.mkdir(parents=True)
+    (scripts / 'environment.sh').write_text(ENVIRONMENT)
+    shutil.copy(ROOT / 'scripts' / 'check', scripts)
+    (scripts.parent / 'python').write_text(PYTHON.format(python=sys.executable))
+    (scripts.parent / 'python').chmod(0o755)
+    return scripts.parent
+
+
+def check(checkout, plan, *arguments):
+    """Return the completed process, and the calls of Python."""
+    (checkout / 'plan').write_text(json.dumps(plan))
+    (checkout / 'calls').unlink(missing_ok=True)
+    done = run([checkout / 'scripts' / 'check', *arguments])
+    calls = [json.loads(line) for line in (checkout / 'calls').read_text().splitlines()]
+    return done, calls
+
+
+@pytest.mark.parametrize(
+    'arguments, stages, cases',
+    [
+        ([], [*STAGES, 'pytest', 'pytest'], CASES + LATER),
+        (['--quick'], STAGES, CASES),
+        (['-k', 'some test'], STAGES, CASES),
+        (['--long', '2/7'], ['pytest'], [case for case in CASES if {*case[0]} <= {'pytest 1'}]),
+    ],
+    ids=['all', 'quick', 'arguments', 'long'],
+)
+@pytest.mark.slow
+def test_every_stage_runs_and_the_exit_code_says_what_remains(arguments, stages, cases, checkout):
+    """A stage that failed ended the run, and a skip in place of a failure was a pass."""
+    for plan, code, texts in cases:
+        done, calls = check(checkout, plan, *arguments)
+        assert done.returncode == code, (plan, done.stderr)
+        for text in texts:
+            assert re.search(rf'^.*{re.escape(text)}.*$', done.stderr, re.M), (plan, done.stderr)
+        again = [words for words in calls if words[3:5] == ['-n', '0']]
+        expected = [[A, B]] if 'again' in plan else []
+        assert [words[5:] for words in again] == expected
+        assert sorted(call[0] for call in calls if call not in again) == sorted(stages), plan
+        assert again == calls[len(calls) - len(again) :]  # at the end, when nothing runs beside it
+
+
+def test_the_documented_exit_codes_are_produced():
+    text = (ROOT / 'scripts' / 'check').read_text()
+    (words,) = re.findall(r'Exit code: (.*?)128 \+ N', text.replace('\n# ', ' '))
+    assert {int(number) for number in re.findall(r'(?:^|; )(\d)', words)} == {c[1] for c in CASES}
+    rows = (ROOT / 'CONTRIBUTING.md').read_text()
+    assert all(f'exit code {code}' in rows for code in (1, 4))
+
+
+def test_ctrl_c_ends_the_run_at_once(checkout):
+    """For pytest it is a failure, after which the next stage would begin."""
+    (checkout / 'plan').write_text(json.dumps({'pytest 1': ['wait']}))
+    process = subprocess.Popen(
+        [checkout / 'scripts' / 'check'],
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    wait_until((checkout / 'waiting').exists)
+    os.killpg(process.pid, signal.SIGINT)
+    communicate(process)
+    assert process.returncode == 128 + signal.SIGINT
+    calls = (checkout / 'calls').read_text().splitlines()
+    assert sum('"pytest"' in call for call in calls) == 1
