@@ -157,7 +157,13 @@ configure_uv() {
     *.proxy) export ALL_PROXY="${ALL_PROXY:-$value}" ;;
     esac
   done < <("$BASE_PYTHON" -m pip config list 2>/dev/null)
+  # A cache that cannot be written, as in a read-only home folder, is an error to uv.
+  [ -z "$UV" ] || writable_folder "$("$UV" cache dir 2>/dev/null)" ||
+    export UV_CACHE_DIR="$VENV/uv/cache"
 }
+
+# Return whether a file can be made in folder $1, which is made if necessary.
+writable_folder() { mkdir -p "$1" 2>/dev/null && [ -w "$1" ]; }
 
 # Install $1, named by the other arguments in the language of pip.
 install() {
@@ -232,6 +238,8 @@ unset_other_ros() {
   export AMENT_PREFIX_PATH="$VENV"
 }
 
+# Without a locale of UTF-8, or with one that is not installed, Python reads its path files as ASCII.
+[ "$(locale charmap 2>/dev/null)" = UTF-8 ] || export LC_ALL=C.UTF-8
 unset_other_ros
 # With it every start would compile the package again, and every run of pytest all tests.
 unset PYTHONDONTWRITEBYTECODE

@@ -6,6 +6,7 @@ from collections import defaultdict
 import contextlib
 from hashlib import sha256
 from importlib.metadata import distribution
+import os
 from pathlib import Path
 import shutil
 import sys
@@ -41,6 +42,16 @@ def link_data_files(environment: Path, source: Path) -> None:
             link.symlink_to(source / file)
 
 
+def shorten_path(environment: Path, source: Path) -> None:
+    """Write the path of an editable installation relative to the environment.
+
+    Python reads path files in the encoding of the locale: with ``LC_ALL=C`` no program started in
+    a checkout whose path has other letters than ASCII.
+    """
+    for file in environment.glob('lib/python*/site-packages/__editable__.t3mpc_ros-*.pth'):
+        file.write_text(f'{os.path.relpath(source, file.parent)}\n', encoding='utf-8')
+
+
 def link_copies(environment: Path) -> None:
     """Keep one file of equal shared libraries: wheels cannot contain links, and hold copies."""
     libraries = defaultdict(list)
@@ -59,4 +70,5 @@ def link_copies(environment: Path) -> None:
 if __name__ == '__main__':
     move_executables(Path(sys.prefix))
     link_data_files(Path(sys.prefix), Path(__file__).resolve().parent.parent)
+    shorten_path(Path(sys.prefix), Path(__file__).resolve().parent.parent)
     link_copies(Path(sys.prefix))

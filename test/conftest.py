@@ -12,6 +12,7 @@ import signal
 
 import pytest
 from support import processor_wait
+from support.missing_tools import list_missing, skip
 from support.waiting import TIMEOUTS, Processes
 
 from t3mpc_ros.cli.private_graph import PrivateGraph
@@ -138,7 +139,7 @@ def _skip_without_compiler():
         return (yield)
     except Exception as error:
         if type(error).__name__ == 'CompilerMissingError':
-            pytest.skip(str(error))
+            skip('C compiler')
         raise
 
 
@@ -193,7 +194,8 @@ def pytest_sessionfinish(session):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """List what was inconclusive, and the tests with nodes that waited longest."""
+    """List what was not installed, what was inconclusive, and the tests that waited longest."""
+    list_missing(terminalreporter)
     reports = terminalreporter.stats
     if inconclusive := reports.get(INCONCLUSIVE):
         terminalreporter.section('inconclusive: the machine is too busy; repeat when it is not')

@@ -155,7 +155,7 @@ def test_only_a_timeout_of_a_wait_is_inconclusive(workers, tmp_path):
     assert 'processor wait of 7 tests with nodes: median 90%, above the limit of 30%: 7' in listed
 
 
-def test_a_run_with_inconclusive_tests_alone_has_a_code_of_its_own(tmp_path):
+def test_inconclusive_tests_alone_have_an_exit_code_of_their_own(tmp_path):
     text = CERTAIN.format(busy=0.0) + WAITS
     done, outcomes = run_pytest(tmp_path, text, '-k', 'test_wait or test_sound')
     assert (done.returncode, len(outcomes)) == (6, 5)

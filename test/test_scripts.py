@@ -15,6 +15,7 @@ import sys
 import pytest
 from support.checkout import EXECUTABLES, ROOT, clean_environment, copy_package
 from support.long_tests import few_of
+from support.signals import attend
 from support.waiting import communicate, run, wait_until
 
 from t3mpc_ros.cli.main import _parser as cli_parser
@@ -45,6 +46,7 @@ exec(sys.argv[2])' "$here" "$2" ;;
 '-m ensurepip')
   note ensurepip
   >"$(dirname "$0")/pip" ;;
+'cache dir') echo "$beside/cache" ;;
 '-m pip config list') [ ! -e "$beside/pip_settings" ] || cat "$beside/pip_settings" ;;
 *'pip install'*'--target '*' uv')
   note uv
@@ -70,6 +72,7 @@ exec(sys.argv[2])' "$here" "$2" ;;
 *finish_install.py)
   mkdir -p "$VENV/lib/t3mpc_ros"
   mv "$VENV/bin/t3mpc" "$VENV/lib/t3mpc_ros/t3mpc" ;;
+*missing_tools.py*) cat "$2" >&2 ;;
 -m\ ruff* | -m\ mypy* | -m\ pytest*) echo "$*" >>"$beside/checks" ;;
 *main\ compile)
   note compile
@@ -89,8 +92,8 @@ class Checkout:
         self.notes = folder / 'notes'
         self.bin = folder / 'bin'
         self.python(self.bin, '3.12.3')
-        tools = 'bash cat chmod cp dirname env flock grep mkdir mv readlink rm setsid sha256sum'
-        tools += ' sleep tail uname'
+        tools = 'bash cat chmod cp dirname env flock grep locale mkdir mktemp mv readlink rm'
+        tools += ' sed setsid sha256sum sleep sort tail uname'
         for tool in tools.split():
             (self.bin / tool).symlink_to(shutil.which(tool))
         # The sleep between two looks at a command is shortened.
@@ -123,8 +126,7 @@ class Checkout:
             'stdout': subprocess.PIPE,
             'stderr': subprocess.PIPE,
             'text': True,
-            # A background process of a shell ignores SIGINT, and so would the script.
-            'preexec_fn': lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+            'preexec_fn': attend,
         }
 
     def run(self, *arguments, **extra):

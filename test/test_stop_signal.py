@@ -12,8 +12,16 @@ import pytest
 from t3mpc_ros.stop_signal import SIGNALS, StopSignal
 
 
+@pytest.fixture
+def hangup():
+    """Have SIGHUP end the process: under nohup it is ignored."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.parametrize('number', SIGNALS)
-def test_the_first_signal_is_kept(number):
+def test_the_first_signal_is_kept(number, hangup):
     before = [signal.getsignal(each) for each in SIGNALS]
     with StopSignal() as stop:
         assert not stop()

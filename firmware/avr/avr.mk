@@ -27,7 +27,10 @@ PYTHON ?= python3
 
 .PHONY: simavr flash flash-dongle
 
+# Everything for the boards depends on it.
 $(AVR_SETTINGS): always
+	@command -v $(firstword $(AVR_CC)) > /dev/null || { echo 'error: $(AVR_CC) is not installed' >&2; \
+	    echo 'remedy: sudo apt-get install gcc-avr avr-libc binutils-avr' >&2; exit 127; }
 	@$(call keep,avr.settings,$(AVR_CC) $(AVR_BOARD_FLAGS) $(ROBOT_MCU) $(DONGLE_MCU))
 
 avr: $(BUILD)/dongle.elf $(BUILD)/robot.elf $(BUILD)/dongle.hex $(BUILD)/robot.hex

@@ -27,11 +27,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         key = read_key(options.key) if options.key is not None else b''
-        emulator = Emulator(_parameters(options), key, options.seed, erased=options.erased)
-        if options.loss:
-            emulator.schedule_fault(Fault('loss', 0.0, math.inf, options.loss))
-        for text in options.fault:
-            emulator.schedule_fault(parse_fault(text))
+        parameters = _parameters(options)
+        faults = [Fault('loss', 0.0, math.inf, options.loss)] if options.loss else []
+        faults += map(parse_fault, options.fault)
+        emulator = Emulator(parameters, key, options.seed, erased=options.erased)
+        for fault in faults:
+            emulator.schedule_fault(fault)
     except (
         FaultError,
         FirmwareLibraryError,

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 from support import waiting
+from support.missing_tools import find, needs, skip
 
 from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.qos import QosProfile, profiles_to_yaml
@@ -31,37 +32,41 @@ STEP = 10_000_000
 DETAILS = {'settings': {'law.gain': '8.0', 'note': 'µ ∞'}, 'provenance': {'version': '0'}}
 
 
+def home(folder):
+    """Return an environment with a home folder that can be written: Go and npm do so."""
+    usual = os.environ.get('HOME', '')
+    return {**os.environ, 'HOME': usual if os.access(usual, os.W_OK) else str(folder)}
+
+
 def build_go(folder):
     """Return the command of the Go program; skip if it cannot be built."""
-    go = shutil.which(
-        'go', path=os.pathsep.join([os.environ.get('PATH', ''), '/usr/local/go/bin'])
-    )
-    if go is None:
-        pytest.skip('go is not installed')
+    needs('go')
+    go = find('go')
     for path in (SOURCES / 'go').iterdir():
         shutil.copy(path, folder)
     # The versions and hashes are in go.mod and go.sum; the toolchain is the one that is there.
-    environment = {**os.environ, 'GOTOOLCHAIN': 'local', 'GOFLAGS': '-mod=readonly'}
+    environment = {**home(folder), 'GOTOOLCHAIN': 'local', 'GOFLAGS': '-mod=readonly'}
     options = {'cwd': folder, 'env': environment, 'timeout': 600}
     fetch = [go, 'mod', 'download', 'github.com/foxglove/mcap/go/mcap']
     fetched = subprocess.run(fetch, capture_output=True, text=True, **options)
     if fetched.returncode:
-        pytest.skip(f'the Go modules cannot be had: {fetched.stderr.strip()[-300:]}')
+        print(fetched.stderr)
+        skip('modules of Go')
     subprocess.run([go, 'build', '-o', 'mcap_check', '.'], check=True, **options)
     return [str(folder / 'mcap_check')]
 
 
 def install_npm(folder):
-    """Return the command of the JavaScript program."""
-    if not (shutil.which('node') and shutil.which('npm')):
-        pytest.skip('node or npm is not installed')
+    """Return the command of the JavaScript program; skip if its packages cannot be had."""
+    needs('node', 'npm')
     for name in ('package.json', 'check.mjs'):
         shutil.copy(SOURCES / name, folder)
     # No lock file: it would carry the address of whatever registry made it. The versions in
     # package.json are exact instead, and no package may run a script of its own.
     options = ['--no-package-lock', '--no-audit', '--no-fund', '--ignore-scripts']
-    done = waiting.run(['npm', 'install', *options], 300.0, cwd=folder)
-    assert done.returncode == 0, done.stderr
+    words = ['npm', 'install', *options]
+    if waiting.run(words, 300.0, cwd=folder, env=home(folder)).returncode:
+        skip('packages of npm')
     return ['node', 'check.mjs']
 
 

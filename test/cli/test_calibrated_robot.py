@@ -12,9 +12,9 @@ import sys
 import numpy as np
 import pytest
 from support.avr_bench import on_avr
-from support.avr_boards import missing_tools
 from support.calibration_bench import CalibrationBench, Person
 from support.emulator_bench import RobotBench
+from support.missing_tools import AVR, needing
 import yaml
 
 from t3mpc_ros.cli import calibrate
@@ -37,7 +37,7 @@ SETUP = (
 )
 
 
-NEEDS_TOOLS = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+NEEDS_TOOLS = needing(*AVR)
 
 
 @pytest.fixture(params=['emulator', pytest.param('avr', marks=[pytest.mark.long, NEEDS_TOOLS])])

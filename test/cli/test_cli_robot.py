@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 import pytest
+from support.missing_tools import needs
 from support.waiting import communicate
 
 from t3mpc_ros.cli import calibrate
@@ -24,6 +25,7 @@ from t3mpc_ros.robot.calibration import Recording
 @pytest.fixture
 def ports(tmp_path):
     """Yield the paths of both ports of an emulator process."""
+    needs('C compiler')
     dongle, robot = tmp_path / 'dongle', tmp_path / 'robot'
     command = [sys.executable, '-m', 't3mpc_ros.cli.emulator', '--link', str(dongle)]
     child = subprocess.Popen(

@@ -13,6 +13,7 @@ import subprocess
 import sys
 
 import pytest
+from support.signals import attend
 from support.waiting import communicate, wait_until
 
 from t3mpc_ros.bag.reader import open_bag
@@ -25,7 +26,10 @@ pytestmark = pytest.mark.slow
 
 NODES = ('recorder', 'controller', 'sim_robot', 'reference_generator')
 
-STAND_IN = """#!{python}
+# No path with a blank can stand behind "#!".
+STAND_IN = """#!/bin/sh
+'''exec' '{python}' "$0" "$@"
+'''
 import os, pathlib, signal, sys, time
 name = pathlib.Path(sys.argv[0]).name
 pathlib.Path('{folder}', name + '.pid').write_text(str(os.getpid()))
@@ -76,6 +80,7 @@ def start_demo(folder, environment, *arguments):
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
+        preexec_fn=attend,
     )
 
 

@@ -12,8 +12,8 @@ import shlex
 
 import pytest
 from support.avr_bench import on_avr
-from support.avr_boards import missing_tools
 from support.emulator_bench import RobotBench
+from support.missing_tools import AVR, needing
 from support.tool_bench import START_NS, ToolBench
 import yaml
 
@@ -94,9 +94,7 @@ class Walk:
             'avr',
             marks=[
                 pytest.mark.long,
-                pytest.mark.skipif(
-                    bool(missing_tools()), reason=f'not installed: {missing_tools()}'
-                ),
+                needing(*AVR),
             ],
         ),
     ]

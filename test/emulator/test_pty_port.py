@@ -11,6 +11,7 @@ import sys
 import termios
 
 import pytest
+from support.missing_tools import needs
 from support.waiting import communicate
 
 from t3mpc_ros.cli import emulator, robot
@@ -46,6 +47,7 @@ class Process:
 
 @pytest.fixture
 def start():
+    needs('C compiler')
     started = []
 
     def run(*arguments):
@@ -176,6 +178,7 @@ def test_invalid_arguments_are_reported_before_the_start(arguments, text, tmp_pa
 
 
 def test_a_failed_robot_link_removes_the_other_link(tmp_path, capsys):
+    needs('C compiler')
     thesis, path = tmp_path / 'thesis', tmp_path / 'dongle'
     thesis.write_text('chapter 1')
     assert emulator.main(['--link', str(path), '--robot-link', str(thesis)]) == 2

@@ -12,8 +12,8 @@ import random
 
 import pytest
 from support.avr_bench import on_avr
-from support.avr_boards import missing_tools
 from support.emulator_bench import MS, Bench, check_followed
+from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.protocol.codec import decode_from_dongle, encode
 from t3mpc_ros.radio.protocol.frames import Command, Poll, Refusal, Transmit
@@ -24,7 +24,7 @@ HALF_STEP = 0.035 * math.tau / 400
 """m"""
 REST = 0.45
 """s after the last executed command"""
-NEEDS_TOOLS = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+NEEDS_TOOLS = needing(*AVR)
 LONG_AVR = pytest.param('avr', marks=[NEEDS_TOOLS, pytest.mark.long])
 KEY = bytes(range(16))
 

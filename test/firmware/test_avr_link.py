@@ -18,17 +18,17 @@ from support.avr_boards import (
     Boards,
     build,
     drive,
-    missing_tools,
     odometry_agrees,
 )
 from support.long_tests import few_of
+from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import codec
 from t3mpc_ros.radio.protocol.frames import Ping, Poll, Pong, Transmit
 from t3mpc_ros.radio.protocol.framing import encode_frame
 
-pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+pytestmark = needing(*AVR)
 
 FIRST_PHASE = 1700
 """us; the next command reaches the robot 2.7 ms after the last state was sampled"""

@@ -9,9 +9,9 @@ from support.avr_boards import (
     ROBOT,
     Boards,
     drive,
-    missing_tools,
     odometry_agrees,
 )
+from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.protocol import codec
 from t3mpc_ros.radio.protocol.frames import (
@@ -23,7 +23,7 @@ from t3mpc_ros.radio.protocol.frames import (
     Transmit,
 )
 
-pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+pytestmark = needing(*AVR)
 
 EXTERNAL_RESET, WATCHDOG_RESET = 2, 8
 TIMER_0_INTERRUPTS = 0x6E  # TIMSK0 of the ATmega2560

@@ -3,14 +3,15 @@
 """Faults that the firmware has to find by itself, in simavr: no error bit reports them."""
 
 import pytest
-from support.avr_boards import DONGLE, IMU, ROBOT, Boards, build, missing_tools, request
+from support.avr_boards import DONGLE, IMU, ROBOT, Boards, build, request
 from support.long_tests import few_of
+from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.protocol import codec
 from t3mpc_ros.radio.protocol.frames import Ping, Poll, StatusFlag
 from t3mpc_ros.radio.protocol.framing import encode_frame
 
-pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+pytestmark = needing(*AVR)
 
 LINE_RATE = 50_000
 """Bytes per second."""

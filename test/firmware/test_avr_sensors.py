@@ -12,13 +12,13 @@ import math
 import numpy as np
 import pytest
 from support.avr_bench import on_avr
-from support.avr_boards import missing_tools
 from support.emulator_bench import RobotBench
+from support.missing_tools import AVR, needing
 
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 
-pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+pytestmark = needing(*AVR)
 
 RADIUS, TRACK = 0.035, 0.147
 

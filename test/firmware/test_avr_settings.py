@@ -16,12 +16,12 @@ from support.avr_boards import (
     booted,
     build,
     drive,
-    missing_tools,
     request,
     settings_record,
 )
 from support.firmware_core import run_make
 from support.long_tests import few_of
+from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import (
@@ -40,7 +40,7 @@ from t3mpc_ros.radio.protocol.frames import (
 from t3mpc_ros.radio.protocol.framing import crc16
 from t3mpc_ros.radio.tool.robot_records import RobotSettings, decode_settings, encode_settings
 
-pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+pytestmark = needing(*AVR)
 
 NEW = RobotSettings(bytes.fromhex('c25a33a6e1'), 100, microsteps=8)
 WRITING = 0.3

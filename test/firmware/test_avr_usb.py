@@ -18,12 +18,12 @@ from support.avr_boards import (
     build,
     console_output,
     cycle,
-    missing_tools,
     odometry_agrees,
     request,
     settings_record,
 )
 from support.long_tests import few_of
+from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import codec
@@ -43,7 +43,7 @@ from t3mpc_ros.radio.protocol.frames import (
 )
 from t3mpc_ros.radio.protocol.framing import crc16, encode_frame
 
-pytestmark = pytest.mark.skipif(bool(missing_tools()), reason=f'not installed: {missing_tools()}')
+pytestmark = needing(*AVR)
 
 KEY, OTHER = bytes(range(0x80, 0x90)), bytes(range(0x30, 0x40))
 KEY_ADDRESS, MARK_ADDRESS = 8, 26

@@ -8,16 +8,16 @@ import subprocess
 
 import pytest
 from support.firmware_core import FIRMWARE, run_make
+from support.missing_tools import needing, needs
 
-pytestmark = pytest.mark.skipif(shutil.which('gcc') is None, reason='needs gcc')
+pytestmark = needing('gcc')
 
 
 @pytest.mark.slow
 @pytest.mark.long
 def test_fuzzers_find_no_error(tmp_path):
     """Ten million bytes and a million packets with sanitizers; all states of a session."""
-    if shutil.which('make') is None:
-        pytest.skip('needs make')
+    needs('make')
     run = run_make(tmp_path, 'test')
     assert run.returncode == 0, run.stderr
     assert run.stdout.count('robot, ') == 2
@@ -91,10 +91,7 @@ def test_the_search_finds_each_broken_rule(tmp_path, name):
     assert 'not so' in run.stderr
 
 
-@pytest.mark.skipif(
-    not (shutil.which('make') and shutil.which('avr-gcc') and shutil.which('simavr')),
-    reason='needs make, avr-gcc and simavr',
-)
+@needing('make', 'avr-gcc', 'simavr')
 def test_results_are_independent_of_the_int_width(tmp_path):
     """2250 packets through robot and dongle, on this machine and on a simulated ATmega2560."""
     run = run_make(tmp_path, 'same')

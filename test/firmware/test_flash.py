@@ -9,6 +9,7 @@ import subprocess
 import threading
 
 import pytest
+from support.missing_tools import needs
 
 FIRMWARE = Path(__file__).resolve().parents[2] / 'firmware'
 
@@ -123,15 +124,26 @@ def test_programmers_at_a_port_are_distinguished(name, monkeypatch):
     assert bool(programmer.warning) == (name.startswith('boot loader'))
 
 
+def run_make(*words):
+    needs('make')
+    return subprocess.run(['make', '-s', '-C', FIRMWARE, *words], capture_output=True, text=True)
+
+
 def test_make_prints_what_it_found_and_the_command(sysfs):
+    """The file is taken as it is, without a compiler: ``-o``."""
     folder, plug = sysfs
     plug('1-1', '16c0:05dc')
-    done = subprocess.run(
-        ['make', '-s', '-C', FIRMWARE, 'flash-dongle', 'DRY_RUN=1', f'FLASH=--sysfs {folder}'],
-        capture_output=True,
-        text=True,
-        env={**os.environ, 'MAKEFLAGS': '-o build/dongle.hex'},
-    )
+    old = ['-o', 'build/dongle.hex']
+    done = run_make(*old, 'flash-dongle', 'DRY_RUN=1', f'FLASH=--sysfs {folder}')
     assert done.returncode == 0, done.stderr
     assert 'USBasp (USB 1-1): dongle' in done.stdout
     assert 'avrdude -c usbasp -p m328p' in done.stdout
+
+
+@pytest.mark.parametrize('goal', ['flash', 'flash-dongle', 'avr', 'core'])
+def test_make_without_the_compiler_of_the_boards_has_a_remedy(goal, tmp_path):
+    """It said ``avr-gcc: No such file or directory``."""
+    done = run_make('AVR_CC=no-such-gcc', f'BUILD={tmp_path}', goal)
+    assert done.returncode != 0
+    assert 'error: no-such-gcc is not installed' in done.stderr
+    assert 'remedy: sudo apt-get install gcc-avr' in done.stderr

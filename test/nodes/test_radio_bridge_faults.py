@@ -14,6 +14,7 @@ import threading
 
 from nav_msgs.msg import Odometry
 import pytest
+from support.missing_tools import needs
 from support.ros_graph import CommandSource, diagnostic, reason, twist
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters, StopTimeMonitor
@@ -110,6 +111,7 @@ def follows_commands(node):
 @pytest.mark.slow
 def test_a_killed_bridge_leaves_the_wheels_at_rest(harness, processes, tmp_path):
     """SIGKILL at full speed; the emulator measures the time to standstill."""
+    needs('C compiler')
     path = tmp_path / 'dongle'
     processes.start('emulator', 'emulator', '--link', str(path), program='t3mpc')
     processes.wait_for('emulator', 'stop with Ctrl-C', 120.0)

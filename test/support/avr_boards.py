@@ -21,7 +21,6 @@ from ctypes import (
 import fcntl
 from functools import cache
 from pathlib import Path
-import shutil
 import subprocess
 from typing import Any, NamedTuple
 
@@ -79,16 +78,6 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     't3_sim_powered': (c_bool, (c_void_p,)),
     't3_sim_wheel': (None, (c_void_p, c_int, POINTER(c_int64))),
 }
-
-
-def missing_tools() -> str:
-    """Return the missing tools; empty if the firmware can be built and simulated."""
-    tools = [name for name in ('make', 'gcc', 'avr-gcc') if shutil.which(name) is None]
-    if not Path('/usr/include/simavr/sim_avr.h').exists():
-        tools.append('libsimavr-dev')
-    if not Path('/usr/include/libelf.h').exists():
-        tools.append('libelf-dev')
-    return ', '.join(tools)
 
 
 @cache

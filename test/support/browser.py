@@ -3,10 +3,8 @@
 """Headless Chromium, driven as a person does."""
 
 import json
-import shutil
 
-import pytest
-
+from support.missing_tools import find, needs
 from support.waiting import wait_until
 
 WIDTHS = 'return document.documentElement.scrollWidth'
@@ -31,17 +29,15 @@ class Browser:
     """Chromium with a page, and waits for what it shows."""
 
     def __init__(self):
-        chromedriver, chromium = map(shutil.which, ('chromedriver', 'chromium'))
-        if not chromedriver or not chromium:
-            pytest.skip('chromium and chromedriver are not installed')
+        needs('chromium', 'chromedriver')
         from selenium import webdriver
 
         options = webdriver.ChromeOptions()
-        options.binary_location = chromium
+        options.binary_location = find('chromium')
         for word in ('headless=new', 'no-sandbox', 'disable-gpu', 'disable-dev-shm-usage'):
             options.add_argument(f'--{word}')
         options.set_capability('goog:loggingPrefs', {'browser': 'ALL', 'performance': 'ALL'})
-        service = webdriver.ChromeService(chromedriver)
+        service = webdriver.ChromeService(find('chromedriver'))
         self.driver = webdriver.Chrome(options=options, service=service)
 
     def text(self, name):

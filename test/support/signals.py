@@ -1,0 +1,15 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Signals as a terminal leaves them."""
+
+import signal
+
+
+def attend():
+    """Attend to the signals that end a process, also where the caller ignores some.
+
+    ``nohup`` ignores SIGHUP and the shell, for what runs in the background, SIGINT; children
+    inherit that, and neither a shell nor this package changes it.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)

@@ -1,0 +1,103 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Tests that need a tool beyond the README: skipped in one way, and listed with a remedy."""
+
+import ast
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import pytest
+from support import missing_tools
+
+TESTS = Path(__file__).resolve().parent
+USERS = """
+import pytest
+from support.missing_tools import needing, needs, skip
+from t3mpc_ros.emulator.firmware_library import CompilerMissingError
+
+@needing('make', 'avr-gcc')
+def test_marked(): pass
+
+@pytest.fixture(scope='module')
+def tool(): needs('make')
+
+@pytest.mark.parametrize('number', [1, 2])
+def test_fixture(tool, number): pass
+
+def test_core(): raise CompilerMissingError('none')
+
+def test_other(): pytest.skip('of another reason: make')
+"""
+LISTED = [
+    'not installed: C compiler, 1 test skipped; remedy: apt-get install gcc libc6-dev',
+    'not installed: avr-gcc, 1 test skipped; '
+    'remedy: apt-get install gcc-avr avr-libc binutils-avr',
+    'not installed: make, 3 tests skipped; remedy: apt-get install make',
+]
+
+
+@pytest.mark.slow
+def test_what_is_missing_is_listed_once_with_its_remedy(tmp_path):
+    """By the process that writes the summary, and for several runs at the end of the last."""
+    (tmp_path / 'test_users.py').write_text(USERS)
+    notes = tmp_path / 'notes'
+    notes.touch()
+
+    def run(*words, **extra):
+        done = subprocess.run(
+            [sys.executable, *map(str, words)],
+            cwd=tmp_path,
+            env={**os.environ, 'PATH': '', 'PYTHONPATH': f'{TESTS}{os.pathsep}{TESTS.parent}'}
+            | extra,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return re.findall('^not installed: .*', done.stdout + done.stderr, re.MULTILINE)
+
+    pytest_run = [
+        '-m',
+        'pytest',
+        '-c',
+        TESTS.parent / 'pyproject.toml',
+        '-p',
+        'conftest',
+        tmp_path,
+    ]
+    assert run(*pytest_run, '-n', 1, T3MPC_MISSING_TOOLS='') == LISTED
+    for _ in range(2):
+        assert run(*pytest_run, '-n', 0, T3MPC_MISSING_TOOLS=str(notes)) == []
+    both = [line.replace('3 tests', '6 tests').replace('1 test ', '2 tests ') for line in LISTED]
+    assert run(missing_tools.__file__, notes) == both
+
+
+OTHERS = {
+    ('test_scripts.py', 'skipif'): 'not through scripts/check',
+    ('test_scripts.py', 'which'): 'tools that the scripts need',
+    ('support/missing_tools.py', 'skip'): 'the way',
+    ('support/missing_tools.py', 'skipif'): 'the way',
+    ('support/missing_tools.py', 'which'): 'the way',
+}
+"""Names that a file may use otherwise, and what for."""
+
+
+def test_no_skip_for_want_of_a_tool_goes_another_way():
+    """It would not be listed: a check without the tool would look like one with it."""
+    installed = (TESTS.parent / 'requirements-dev.txt').read_text()
+    found = set()
+    for path in TESTS.rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text())):
+            name = getattr(node, 'attr', getattr(node, 'id', ''))
+            owner = getattr(getattr(node, 'value', None), 'id', '')
+            if isinstance(node, ast.Call) and getattr(node.func, 'attr', '') == 'importorskip':
+                # Of the libraries that scripts/check has installed.
+                assert re.search(rf'^{node.args[0].value.partition(".")[0]}\b', installed, re.M)
+            elif name in ('skipif', 'SkipTest') or f'{owner}.{name}' in (
+                'pytest.skip',
+                'shutil.which',
+            ):
+                found.add((str(path.relative_to(TESTS)), name))
+    assert found <= {*OTHERS}
