@@ -419,7 +419,7 @@ OUTCOME = Outcome(
 )  # fmt: skip
 
 
-def test_errors_of_faults_are_named_and_the_verdict_is_that_of_the_worst(caught):
+def test_a_verdict_on_faults_is_that_of_the_worst_error(caught):
     other = replace(OUTCOME, name='brown_out', before=0.3, during=0.9, after=None)
     page = fault_page.page([OUTCOME, other])
     (axis,) = caught[0].axes
