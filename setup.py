@@ -2,11 +2,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build description; colcon and pip both read it."""
 
+from contextlib import suppress
 from glob import glob
+import gzip
 import os
 import re
+import tarfile
 
 from setuptools import find_packages, setup
+from setuptools.command.sdist import sdist
+
+try:
+    from setuptools.command.bdist_wheel import bdist_wheel
+except ImportError:  # before 70.1, as on Ubuntu 24.04
+    bdist_wheel = None
 
 NAME = 't3mpc_ros'
 
@@ -25,11 +34,66 @@ def requirements(file):
     return [each for each in found if each and not each.startswith(('-r', 'pip', 'setuptools'))]
 
 
+# Equal sources give equal distributions, byte for byte, wherever and whenever they are built.
+os.environ.setdefault('SOURCE_DATE_EPOCH', '315532800')  # 1980, the first year of a wheel
+
+
+def mode_of(folder):
+    """Return the mode of a folder or file of a distribution, whatever the umask is."""
+    return 0o755 if folder else 0o644
+
+
+class SourceDistribution(sdist):
+    """An archive that shows nothing of the time, user and umask of its build."""
+
+    def run(self):
+        """Forget the list of files of an earlier build, which is added to the new one."""
+        with suppress(FileNotFoundError):
+            os.remove(f'{NAME}.egg-info/SOURCES.txt')
+        super().run()
+
+    def make_archive(self, base_name, format, root_dir=None, base_dir=None, **_):
+        """Write the tree ``base_dir`` to a tar file; return its path."""
+        path = f'{base_name}.tar.gz'
+        epoch = int(os.environ['SOURCE_DATE_EPOCH'])
+
+        def plain(member):
+            member.mtime, member.mode = epoch, mode_of(member.isdir())
+            member.uid = member.gid = 0
+            member.uname = member.gname = ''
+            return member
+
+        os.makedirs(self.dist_dir, exist_ok=True)
+        with (
+            open(path, 'wb') as file,
+            gzip.GzipFile('', 'wb', fileobj=file, mtime=epoch) as packed,
+            tarfile.open(fileobj=packed, mode='w', format=tarfile.PAX_FORMAT) as archive,
+        ):
+            archive.add(base_dir, filter=plain)
+        return path
+
+
+COMMANDS = {'sdist': SourceDistribution}
+if bdist_wheel:
+
+    class Wheel(bdist_wheel):
+        """A wheel without the umask of its build; the time is ``SOURCE_DATE_EPOCH``."""
+
+        def write_wheelfile(self, *arguments, **options):
+            """Write the last file before the wheel is packed, and set the modes of all."""
+            super().write_wheelfile(*arguments, **options)
+            for folder, _, files in os.walk(self.bdist_dir or ''):
+                for file in files:
+                    os.chmod(os.path.join(folder, file), mode_of(folder=False))
+
+    COMMANDS['bdist_wheel'] = Wheel
+
 NEEDED = requirements('requirements.txt')
 
 setup(
     name=NAME,
     version=VERSION,
+    cmdclass=COMMANDS,
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     # Stated, so that an editable installation is a path and not an import hook.
     package_dir={'': '.'},

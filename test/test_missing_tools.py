@@ -33,8 +33,8 @@ def test_other(): pytest.skip('of another reason: make')
 """
 LISTED = [
     'not installed: C compiler, 1 test skipped; remedy: apt-get install gcc libc6-dev',
-    'not installed: avr-gcc, 1 test skipped; '
-    'remedy: apt-get install gcc-avr avr-libc binutils-avr',
+    'not installed: avr-gcc, 1 test skipped; remedy: '
+    'apt-get install gcc-avr avr-libc binutils-avr',
     'not installed: make, 3 tests skipped; remedy: apt-get install make',
 ]
 
@@ -46,58 +46,50 @@ def test_what_is_missing_is_listed_once_with_its_remedy(tmp_path):
     notes = tmp_path / 'notes'
     notes.touch()
 
+    folders = os.pathsep.join(map(str, (TESTS, TESTS.parent)))
+
     def run(*words, **extra):
         done = subprocess.run(
             [sys.executable, *map(str, words)],
             cwd=tmp_path,
-            env={**os.environ, 'PATH': '', 'PYTHONPATH': f'{TESTS}{os.pathsep}{TESTS.parent}'}
-            | extra,
+            env={**os.environ, 'PATH': '', 'PYTHONPATH': folders, **extra},
             capture_output=True,
             text=True,
         )
         assert done.returncode == 0, done.stdout + done.stderr
         return re.findall('^not installed: .*', done.stdout + done.stderr, re.MULTILINE)
 
-    pytest_run = [
-        '-m',
-        'pytest',
-        '-c',
-        TESTS.parent / 'pyproject.toml',
-        '-p',
-        'conftest',
-        tmp_path,
-    ]
-    assert run(*pytest_run, '-n', 1, T3MPC_MISSING_TOOLS='') == LISTED
+    words = ['-m', 'pytest', '-c', TESTS.parent / 'pyproject.toml', '-p', 'conftest', tmp_path]
+    assert run(*words, '-n', 1, T3MPC_MISSING_TOOLS='') == LISTED
     for _ in range(2):
-        assert run(*pytest_run, '-n', 0, T3MPC_MISSING_TOOLS=str(notes)) == []
+        assert run(*words, '-n', 0, T3MPC_MISSING_TOOLS=str(notes)) == []
     both = [line.replace('3 tests', '6 tests').replace('1 test ', '2 tests ') for line in LISTED]
     assert run(missing_tools.__file__, notes) == both
 
 
 OTHERS = {
-    ('test_scripts.py', 'skipif'): 'not through scripts/check',
-    ('test_scripts.py', 'which'): 'tools that the scripts need',
+    ('test_scripts.py', 'skipif'): 'not started by scripts/check',
+    ('test_scripts.py', 'which'): 'what the scripts themselves need',
     ('support/missing_tools.py', 'skip'): 'the way',
     ('support/missing_tools.py', 'skipif'): 'the way',
     ('support/missing_tools.py', 'which'): 'the way',
 }
-"""Names that a file may use otherwise, and what for."""
+"""Files that use such a name, and what for."""
 
 
 def test_no_skip_for_want_of_a_tool_goes_another_way():
     """It would not be listed: a check without the tool would look like one with it."""
     installed = (TESTS.parent / 'requirements-dev.txt').read_text()
+    owners = {'skip': ('pytest', 'mark'), 'skipif': ('mark',), 'which': ('shutil',)}
     found = set()
     for path in TESTS.rglob('*.py'):
         for node in ast.walk(ast.parse(path.read_text())):
-            name = getattr(node, 'attr', getattr(node, 'id', ''))
-            owner = getattr(getattr(node, 'value', None), 'id', '')
-            if isinstance(node, ast.Call) and getattr(node.func, 'attr', '') == 'importorskip':
-                # Of the libraries that scripts/check has installed.
-                assert re.search(rf'^{node.args[0].value.partition(".")[0]}\b', installed, re.M)
-            elif name in ('skipif', 'SkipTest') or f'{owner}.{name}' in (
-                'pytest.skip',
-                'shutil.which',
-            ):
-                found.add((str(path.relative_to(TESTS)), name))
+            if not isinstance(node, ast.Attribute):
+                continue
+            owner = ast.unparse(node.value).rpartition('.')[2]
+            if owner in owners.get(node.attr, ()):
+                found.add((str(path.relative_to(TESTS)), node.attr))
+        # Libraries: only those that scripts/check installs.
+        for name in re.findall(r"importorskip\('(\w+)", path.read_text()):
+            assert re.search(rf'^{name}\b', installed, re.MULTILINE), path
     assert found <= {*OTHERS}

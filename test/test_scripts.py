@@ -73,7 +73,10 @@ exec(sys.argv[2])' "$here" "$2" ;;
   mkdir -p "$VENV/lib/t3mpc_ros"
   mv "$VENV/bin/t3mpc" "$VENV/lib/t3mpc_ros/t3mpc" ;;
 *missing_tools.py*) cat "$2" >&2 ;;
--m\ ruff* | -m\ mypy* | -m\ pytest*) echo "$*" >>"$beside/checks" ;;
+-m\ ruff* | -m\ mypy* | -m\ pytest*)
+  echo "$*" >>"$beside/checks"
+  case "$*" in *pytest*) echo "not installed, $*" >>"$T3MPC_MISSING_TOOLS" ;; esac
+  [ ! -e "$beside/failing" ] || exit 1 ;;
 *main\ compile)
   note compile
   [ ! -e "$beside/slow_kernels" ] || exec sleep 60 ;;
@@ -311,8 +314,9 @@ def test_each_part_of_the_environment_is_installed_when_needed(checkout):
     assert checkout.done() == []
 
 
-def test_check_runs_what_is_asked_for(checkout):
+def test_check_runs_what_is_asked_for(checkout, tmp_path):
     check = checkout.root / 'scripts' / 'check'
+    (notes := tmp_path / 'temporary').mkdir()
     usual = ['not (ros or long)', 'ros and not (timed or long)', 'ros and timed and not long']
     for arguments, linted, selected in (
         ((), True, usual),
@@ -320,15 +324,24 @@ def test_check_runs_what_is_asked_for(checkout):
         (('--long',), False, ['long']),
         (('--long', '3/7'), False, ['long --part 3/7']),
     ):
-        assert checkout.run(*arguments, script=check).returncode == 0
+        done = checkout.run(*arguments, script=check, TMPDIR=notes)
+        assert done.returncode == 0
         lines = checkout.report('checks')
         begin = re.compile(r'-m pytest --outcomes \S+ ')
         tests = [begin.sub('', line) for line in lines if begin.match(line)]
+        # What all of them have skipped for want of a tool stands at the end, once.
+        listed = [line for line in done.stderr.splitlines() if 'not installed' in line]
+        assert [begin.sub('', line.partition(', ')[2]) for line in listed] == tests
+        assert [*notes.iterdir()] == []
         assert len(lines) - len(tests) == (3 if linted else 0)
         found = [re.fullmatch(r'-m (.*?)(?: --ignore-glob .*| -n .*)?', test) for test in tests]
         assert [match.group(1) for match in found] == selected
     assert checkout.run('-k', 'name', script=check).returncode == 0
     assert [line for line in checkout.report('checks') if line.endswith('/outcomes -k name')]
+    checkout.beside('failing').touch()
+    done = checkout.run('--long', script=check)
+    assert done.returncode == 1
+    assert re.search('^not installed, .* -m long$', done.stderr, re.MULTILINE)
 
 
 def test_the_installer_is_uv_and_without_it_pip(checkout):
@@ -348,6 +361,13 @@ def test_the_installer_is_uv_and_without_it_pip(checkout):
         'UV_INDEX_STRATEGY=unsafe-best-match',
         f'UV_FIND_LINKS={checkout.root}',
     }
+    # A home folder that cannot be written: uv would fail at its cache.
+    checkout.beside('cache').rmdir()
+    checkout.beside('cache').touch()
+    (checkout.root / '.venv' / 'stamp').unlink()
+    checkout.run('t3mpc')
+    assert f'UV_CACHE_DIR={checkout.root}/.venv/uv/cache' in checkout.report('uv_settings')
+    checkout.done()
     uv.unlink()
     checkout.beside('no_uv').touch()
     (checkout.root / '.venv' / 'stamp').unlink()
@@ -376,6 +396,16 @@ def test_executables_are_moved_and_files_linked(tmp_path, monkeypatch):
     for name in ('launch', 'config'):
         names = {path.name for path in (ROOT / name).iterdir() if path.is_file()}
         assert {path.name for path in (share / 't3mpc_ros' / name).iterdir()} == names
+
+    # The path of an editable installation, in any locale and from any folder.
+    packages = tmp_path / 'lib' / 'python3.11' / 'site-packages'
+    packages.mkdir(parents=True)
+    path = packages / '__editable__.t3mpc_ros-0.1.0.pth'
+    finish['shorten_path'](tmp_path, source := tmp_path / 'Übung')
+    assert not path.exists()
+    path.write_text(f'{source}\n')
+    finish['shorten_path'](tmp_path, tmp_path)
+    assert path.read_bytes() == b'../../..\n'
 
     size = finish['LARGE']
     contents = {'a.so': b'1' * size, 'a.so.2': b'1' * size, 'b.so': b'2' * size, 'c.so': b'1'}
@@ -476,6 +506,21 @@ def test_a_sourced_ros_does_not_enter_the_local_environment(checkout, tmp_path):
     assert not {'PYTHONPATH', 'RMW_IMPLEMENTATION', 'PYTHONDONTWRITEBYTECODE'} & set(environment)
 
 
+def test_programs_run_in_a_locale_of_utf8(checkout):
+    """In another, Python failed on its own path file if the path of the checkout had an umlaut."""
+    checkout.run('t3mpc')
+    program = checkout.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
+    program.write_text('#!/bin/sh\necho "$LC_ALL"\n')
+    none = {'LC_ALL': '', 'LC_CTYPE': '', 'LANG': ''}
+    for given, seen in (
+        ({'LC_ALL': 'C'}, 'C.UTF-8'),
+        ({'LC_ALL': 'xx_XX.UTF-8'}, 'C.UTF-8'),  # of a terminal elsewhere; not installed here
+        (none, 'C.UTF-8'),
+        (none | {'LANG': 'C.UTF-8'}, ''),
+    ):
+        assert checkout.run('t3mpc', **given).stdout == f'{seen}\n', given
+
+
 real_environment = pytest.mark.skipif(
     Path(sys.prefix) != ROOT / '.venv', reason='not run through scripts/check: no .venv in use'
 )
@@ -489,6 +534,18 @@ def test_run_starts_the_real_program():
     done = subprocess.run(run, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr.endswith(f'NAME one of: {" ".join(sorted(EXECUTABLES))}\n')
+
+
+@real_environment
+def test_the_environment_starts_without_a_locale():
+    """A path file with the umlaut of a checkout ended every program in a UnicodeDecodeError."""
+    for path in Path(sys.prefix).glob('lib/python*/site-packages/*.pth'):
+        assert path.read_bytes().isascii(), path
+    program = [sys.executable, '-c', 'import t3mpc_ros; print(ascii(t3mpc_ros.__path__[0]))']
+    done = subprocess.run(
+        program, env={'LC_ALL': 'C'}, cwd='/', capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == ascii(str(ROOT / 't3mpc_ros'))
 
 
 @pytest.mark.long

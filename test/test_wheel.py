@@ -4,6 +4,7 @@
 
 import os
 from pathlib import Path
+import shutil
 import sys
 import tarfile
 import zipfile
@@ -82,6 +83,25 @@ def test_the_distributions_hold_every_file_of_the_package(source, archive, wheel
         names = {name.partition('/')[2] for name in files.getnames()}
     assert wanted - names == set()
     assert {'requirements.txt', 'package.xml', 'LICENSE', 'launch/sim.launch.py'} <= names
+
+
+def test_equal_sources_give_equal_distributions(source, archive, wheel, tmp_path):
+    """At another time and place, with another umask, for another time zone and owner of files."""
+    (tmp_path / 'Übung mit Blank').mkdir()
+    other = Path(shutil.copytree(source, tmp_path / 'Übung mit Blank' / 'copy', symlinks=True))
+    for number, path in enumerate(sorted(other.rglob('*'))):
+        path.chmod(0o770 if path.is_dir() else 0o660)
+        os.utime(path, (number * 86400, number * 86400))
+    before = os.umask(0o077)
+    try:
+        zone = {'TZ': 'Pacific/Auckland', 'PYTHONHASHSEED': '7'}
+        _run(sys.executable, 'setup.py', '-q', 'sdist', '-d', tmp_path, cwd=other, **zone)
+        words = ['-q', '--no-deps', '--no-build-isolation', '--no-index', '-w', tmp_path, other]
+        _run(sys.executable, '-m', 'pip', 'wheel', *words, cwd=tmp_path, **zone)
+    finally:
+        os.umask(before)
+    for made in (archive, wheel):
+        assert (tmp_path / made.name).read_bytes() == made.read_bytes()
 
 
 def test_the_extras_are_declared(wheel):

@@ -14,6 +14,7 @@ import socket
 from typing import Self
 
 from t3mpc_ros.cli.process_group import installed_file
+from t3mpc_ros.nodes.common.ros_context import provide_log_directory
 
 DOMAINS = range(1, 102)
 """Domains of private graphs: 0 is the default of all robots, those above use ephemeral ports."""
@@ -62,6 +63,7 @@ class PrivateGraph:
         a second when a subscriber joins (Fast-DDS issue 6535).
         """
         environment = {k: v for k, v in os.environ.items() if k not in _NETWORK_VARIABLES}
+        provide_log_directory(environment)
         environment.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
         environment['ROS_DOMAIN_ID'] = str(self.domain)
         environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'

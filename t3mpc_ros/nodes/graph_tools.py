@@ -19,13 +19,13 @@ from rcl_interfaces.srv import GetParameters, ListParameters
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import SetBool
 import yaml
 
 from t3mpc_ros.nodes.common import qos
 from t3mpc_ros.nodes.common.graph_introspection import message_class
 from t3mpc_ros.nodes.common.remote_parameters import RemoteParameters, plain_value
+from t3mpc_ros.nodes.common.ros_context import init_ros
 
 LISTING = 1.5
 """Time in which nodes are discovered before they are listed, s."""
@@ -285,7 +285,7 @@ class Graph:
 @contextmanager
 def graph(stop: Callable[[], bool] = lambda: False) -> Iterator[Graph]:
     """Return a graph in a context of its own, which ends with the ``with`` block."""
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    init_ros([])
     node = Node('t3mpc', start_parameter_services=False, enable_rosout=False)
     opened = Graph(node, stop)
     try:

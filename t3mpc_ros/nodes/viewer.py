@@ -27,7 +27,6 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.logging_severity import LoggingSeverity
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Range
 from std_msgs.msg import Float64, Int32MultiArray
@@ -41,6 +40,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS, State
 from t3mpc_ros.nodes.common import conversions
 from t3mpc_ros.nodes.common.endpoints import PolledCallbackGroup
 from t3mpc_ros.nodes.common.remote_parameters import RemoteParameters, plain_value
+from t3mpc_ros.nodes.common.ros_context import init_ros
 from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
@@ -439,7 +439,7 @@ def view_node(sink: Sink, namespace: str = '') -> Iterator[ViewNode]:
     ValueError
         The namespace is not valid in ROS.
     """
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    init_ros([])
     try:
         try:
             node = ViewNode(sink, namespace)

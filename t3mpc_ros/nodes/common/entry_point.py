@@ -19,6 +19,7 @@ from t3mpc_ros.nodes.arguments import (
     unknown_arguments,
     unmatched_files,
 )
+from t3mpc_ros.nodes.common.ros_context import init_ros
 from t3mpc_ros.nodes.registry import node_module
 from t3mpc_ros.stop_signal import StopSignal
 
@@ -101,7 +102,6 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
     import rclpy
     from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
     from rclpy.executors import ExternalShutdownException
-    from rclpy.signals import SignalHandlerOptions
 
     from t3mpc_ros.parameters.table import ParameterError
 
@@ -109,7 +109,7 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
     if problem := parameter_file_problem(argv):
         return _usage_error(name, problem)
     try:
-        rclpy.init(args=list(argv), signal_handler_options=SignalHandlerOptions.NO)
+        init_ros(argv)
     except (RuntimeError, ValueError) as error:
         return _usage_error(name, f'invalid command line: {error}')
     configuration_errors = (
