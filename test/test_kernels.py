@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 
+import numba
 from numba.core.errors import TypingError
 import numpy as np
 import pytest
@@ -73,7 +74,7 @@ def test_a_kernel_that_allocates_an_array_is_rejected():
         total(np.ones(2))
 
 
-def test_fingerprint_depends_on_files_with_kernels_only(tmp_path):
+def test_fingerprint_depends_on_kernels_and_compiler_only(tmp_path, monkeypatch):
     (tmp_path / 'a').mkdir()
     file, other = tmp_path / 'a' / 'x.py', tmp_path / 'a' / 'y.py'
     file.write_text('@kernel\ndef f(): return 1\n')
@@ -81,7 +82,14 @@ def test_fingerprint_depends_on_files_with_kernels_only(tmp_path):
     other.write_text('nothing = "compiled"\n')
     assert source_fingerprint(tmp_path) == before
     file.write_text('@kernel\ndef f(): return 2\n')
-    assert source_fingerprint(tmp_path) != before
+    seen = {before, source_fingerprint(tmp_path)}
+    file.rename(tmp_path / 'x.py')
+    seen.add(source_fingerprint(tmp_path))
+    monkeypatch.setattr(numba, '__version__', '0.0.1')
+    seen.add(source_fingerprint(tmp_path))
+    (tmp_path / 'kernels.py').write_text('OPT = 1\n')
+    seen.add(source_fingerprint(tmp_path))
+    assert len(seen) == 5
 
 
 @pytest.mark.slow

@@ -65,7 +65,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return int(options.run(options, stop))
         except (ProcedureError, KeyFileError, ParameterError) as error:
             if stop():
-                print('t3mpc robot: interrupted', file=sys.stderr)
+                # The reason is another one where the radio of the dongle could not be restored.
+                reason = '' if str(error) == 'interrupted' else f': {error}'
+                print(f't3mpc robot: interrupted{reason}', file=sys.stderr)
                 return EXIT_INTERRUPTED
             print(f't3mpc robot: {error}', file=sys.stderr)
             return EXIT_FAILED

@@ -206,7 +206,7 @@ def make_cells(
     """
     chosen = setting.chosen_cases(cases)
     combinations = _combinations(parameters)
-    origin, sources = provenance(), source_digest()
+    origin, sources = provenance(), source_digest(every=True)
     prepared = []
     for controller in as_controllers(controllers):
         for values in combinations:
@@ -378,8 +378,10 @@ def _digest(content: object) -> str:
 
 
 def _content(value: Any) -> object:
-    """Return what a value is, as text and numbers: functions and classes by their source."""
-    if value is None or isinstance(value, str | bool | int | float):
+    """Return what a value is, as text and numbers: functions and files by their content."""
+    if isinstance(value, str | os.PathLike):
+        return os.fspath(value), _file(Path(value).expanduser())
+    if value is None or isinstance(value, bool | int | float):
         return value
     if isinstance(value, Controller):
         source = value.source
@@ -397,12 +399,18 @@ def _content(value: Any) -> object:
         return [(str(key), _content(item)) for key, item in value.items()]
     if isinstance(value, list | tuple):
         return [_content(item) for item in value]
-    if isinstance(value, os.PathLike):
-        return Path(value).expanduser().read_text(encoding='utf-8')
     if hasattr(value, '__dataclass_fields__'):
         names = value.__dataclass_fields__
         return type(value).__name__, [_content(getattr(value, name)) for name in names]
     return _code(value)
+
+
+def _file(path: Path) -> str:
+    """Return a digest of a file, a schedule of faults or a world say; '' if there is none."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ''
+    except OSError:
+        return ''
 
 
 def _code(value: Any) -> object:

@@ -31,11 +31,14 @@ RUN = 'radio.tool.procedure.run_script'
 
 
 class Interruption:
-    """Ctrl-C while a procedure runs, which then ends."""
+    """Ctrl-C while a procedure runs, which then ends for a reason."""
+
+    def __init__(self, reason='interrupted'):
+        self._reason = reason
 
     def __call__(self, *_):
         signal.raise_signal(signal.SIGINT)
-        raise ProcedureError('interrupted')
+        raise ProcedureError(self._reason)
 
 
 def stored(state=frames.SETTINGS_GOOD, **changes):
@@ -102,6 +105,7 @@ ROBOT = {
 CASES = [
     *((f'robot {words}', {RUN: ProcedureError('no board')}, 2, 'no board') for words in ROBOT),
     *((f'robot {words}', {RUN: Interruption()}, 130, 'interrupted') for words in ROBOT),
+    ('robot scan --port p', {RUN: Interruption('not restored')}, 130, 'interrupted: not restor'),
     ('robot ping --port p', rated(GOOD), 0, 'good'),
     ('robot ping --port p', rated(GOOD, POOR), 0, 'try: remedy'),
     ('robot ping --port p', rated(GOOD, BAD), 1, 'BAD'),

@@ -3,6 +3,7 @@
 """``t3mpc view --bag``: a recorded run on the page."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.recorded_run import recorded_run
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
+from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.view.live_data import STEP
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'changes.mcap'
@@ -48,3 +50,12 @@ def test_banner_and_switches_are_those_of_the_report(shown):
         switches = load_run(recording).switches
     found = [each['time'] for each in shown.get('events', ()) if each['kind'] == 'switch']
     assert found == switches.tolist()
+
+
+@pytest.mark.parametrize(('sound', 'kind'), [(True, 'good'), (False, 'warning')])
+def test_the_banner_has_the_kind_of_the_verdict(sound, kind, monkeypatch):
+    verdict = Verdict(() if sound else ('it was stopped',))
+    metrics = SimpleNamespace(verdict=verdict)
+    monkeypatch.setattr('t3mpc_ros.cli.recorded_run.compute_metrics', lambda *_: metrics)
+    banner = recorded_run(GOLDEN).read(0)[0]['facts']['banner']
+    assert (banner['kind'], banner['detail']) == (kind, verdict.text())

@@ -5,6 +5,7 @@
 import copy
 from dataclasses import astuple
 import math
+from pathlib import Path
 import re
 import sqlite3
 
@@ -28,6 +29,7 @@ from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.main import main as t3mpc
 from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, parts
 from t3mpc_ros.evaluation.bag_report.link_history import link_metrics
+from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
 from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.response import (
@@ -580,6 +582,14 @@ def test_runs_are_compared_with_the_first(offset, verdict, words, tmp_path, caps
     assert words in printed
     page = (tmp_path / 'out' / 'comparison.html').read_text(encoding='utf-8')
     assert page.index(verdict) < page.index('Good run') < page.index('RMSE settled')
+    kind = {'Larger': 'bad', 'Smaller': 'good'}.get(verdict.split()[0], 'open')
+    assert re.search(r'<div class="verdict (\w+)"', page)[1] == kind
+    rows = dict(re.findall(r'<td[^>]*>(odometry to command, [^<]*)</td>\s*<td>([^<]*)</td>', page))
+    with open_bag(folders[0]) as recording:
+        one = compute_metrics(load_run(recording), Path(), recording.message_count)
+    assert [float(each) for each in rows.values()] == pytest.approx(
+        [1e3 * one.latency, 1e3 * one.latency_99], rel=5e-3
+    )
     shown = ['error', 'speeds', 'commands']
     titles = [name for name in shown for _ in re.findall(f'<h3>{name.capitalize()}, ', page)]
     assert titles == [name for name in shown for _ in range(2)]

@@ -4,7 +4,7 @@
 
 import argparse
 import csv
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from html import unescape
 from html.parser import HTMLParser
 import json
@@ -20,7 +20,7 @@ from support.unrendered import unrendered  # noqa: F401 - a fixture
 
 from t3mpc_ros.cli.paper import add_parser
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
-from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.methods import FULL, ComparedMethod
 from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
 from t3mpc_ros.evaluation.paper import claims as claiming
 from t3mpc_ros.evaluation.paper.claims import markdown
@@ -34,6 +34,7 @@ from t3mpc_ros.evaluation.paper.experiment_runs import (
     ExperimentGrid,
     ExperimentSetup,
     RunFile,
+    RunKey,
     RunNumbers,
     fingerprint,
     make_grid,
@@ -365,6 +366,12 @@ def test_fingerprint_differs_by_parameters_types_arrays():
     ]
     prints = {fingerprint(one, 's') for one in (method, *others)} | {fingerprint(method, 't')}
     assert len(prints) == 5
+    for name, value in {'name': 'n', 'baseline': False, 'preview': True}.items():
+        prints.add(fingerprint(replace(method, **{name: value}), 's'))
+    assert len(prints) == 8
+    assert {each.name for each in fields(ComparedMethod)} == {
+        'name', 'controller_type', 'parameters', 'pretrained', 'baseline', 'preview',
+    }  # fmt: skip
     equal = replace(method, parameters={'count': 3, 'gains': np.array([1.0, 2.0])})
     assert fingerprint(equal, 's') == fingerprint(method, 's')
 
@@ -393,6 +400,29 @@ def test_digest_covers_sources_that_change_a_run(tmp_path):
         (tmp_path / name).write_text('two')
         seen.add(source_digest(tmp_path))
     assert len(seen) == 4
+    # Runs of a sweep and of a patrol depend on more.
+    for name in ('scripting/plants.py', 'worlds/room.yaml', 'evaluation/tuning/tuned.json'):
+        before = source_digest(tmp_path, every=True)
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text('three')
+        assert source_digest(tmp_path, every=True) != before
+
+
+def test_each_part_of_a_key_makes_another_run(tmp_path):
+    experiment = Experiment('m', 'torque', 0.04, 'nominal')
+    key = RunKey(experiment, 1, 59.5, 'f')
+    others = {'method': 'n', 'drive': 'velocity', 'noise': 0.1, 'case': 'disturbance'}
+    keys = [key]
+    keys += [replace(key, experiment=replace(experiment, **{k: v})) for k, v in others.items()]
+    changes = {'seed': 2, 'duration': 26.0, 'fingerprint': 'g'}
+    keys += [replace(key, **{name: value}) for name, value in changes.items()]
+    assert {*others} == {each.name for each in fields(Experiment)}
+    assert {'experiment', *changes} == {each.name for each in fields(RunKey)}
+    written = {each: numbers_of(0.1 + k)[0] for k, each in enumerate(keys)}
+    with RunFile(tmp_path / 'runs.jsonl') as file:
+        for each, numbers in written.items():
+            file.add(each, numbers)
+        assert file.read() == written
 
 
 # Results

@@ -3,7 +3,7 @@
 """``t3mpc patrol``: runs, claims, tables, page."""
 
 import contextlib
-from dataclasses import replace
+from dataclasses import fields, replace
 import json
 import math
 
@@ -28,6 +28,7 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
 )
 from t3mpc_ros.evaluation.patrol.patrol_metrics import PatrolMetrics
 from t3mpc_ros.evaluation.patrol.predictability import Skill
+from t3mpc_ros.geometry.path_timing import MotionLimits
 from t3mpc_ros.simulation.world import clearance, load_world
 
 
@@ -161,6 +162,30 @@ def test_an_interrupted_study_goes_on_with_equal_results(tmp_path, monkeypatch, 
     monkeypatch.setattr(patrol_comparison, 'measured_patrol', measured_patrol)
     compare_patrols(replace(plan, duration=6.0), file, report=said.append)
     assert '0 are there already, 4 to do' in said[-1]
+
+
+def test_the_key_of_a_patrol_changes_with_all_that_determines_it(monkeypatch, tmp_path):
+    def keys(plan):
+        found = []
+        monkeypatch.setattr(
+            patrol_comparison,
+            'run_missing_jobs',
+            lambda file, jobs, *_: found.extend(jobs) or dict.fromkeys(jobs),
+        )
+        compare_patrols(plan, tmp_path / 'runs.jsonl')
+        return found
+
+    base = PatrolPlan(('boustrophedon',), (1,))
+    changes = {
+        'paths': ('random walk',), 'seeds': (2,), 'duration': 60.0, 'robot': 'twin',
+        'arena': (-1.0, -1.0, 1.0, 1.0), 'limits': MotionLimits(linear=0.1),
+    }  # fmt: skip
+    assert changes.keys() == {each.name for each in fields(PatrolPlan)}
+    found = [*keys(base), *(keys(replace(base, **{k: v}))[0] for k, v in changes.items())]
+    found += keys(PatrolPlan(('boustrophedon',), (3, 1)))  # only the first has a track
+    assert len({*found}) == len(found)
+    monkeypatch.setattr(patrol_comparison, 'source_digest', lambda **_: 'other')
+    assert not {*keys(base)} & {*found}
 
 
 def _numbers(result):

@@ -25,6 +25,7 @@ from t3mpc_ros.radio.tool import (
     robot_info,
     robot_settings,
 )
+from t3mpc_ros.radio.tool.channel_scan import ChannelResult
 from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, Procedure, ProcedureError
 from t3mpc_ros.radio.tool.robot_records import POWERS, RATES, SENSORS, RobotSettings
 
@@ -350,20 +351,37 @@ def test_the_scan_finds_the_robot_and_restores_the_radio(channel, rate):
     assert channel_scan.recommend([result], LinkParameters(channel=channel, rate=rate))[0]
 
 
-def test_an_interrupted_scan_restores_the_radio():
+@pytest.mark.parametrize(
+    'script',
+    [
+        lambda: channel_scan.scan_channels(LinkParameters(), ('2M',), lambda *report: None),
+        lambda: link_test.run_link_test(LinkParameters(channel=40), 50),
+    ],
+)
+@pytest.mark.parametrize('lost', [0, 1])
+def test_an_interrupted_procedure_restores_the_radio(script, lost):
+    """A second Ctrl-C does not interrupt the restoring, not even when its request is lost."""
     bench = ToolBench(channel=120)
-    before = bench.radio()
+    before, interruptions, dropped = bench.radio(), [], []
+    feed = bench.emulator.feed
 
     def interrupt(bench):
-        if bench.radio().channel == 40:
+        if bench.radio().channel == 40 or interruptions:
+            interruptions.append(bench.now_ns)
             procedure.interrupt(bench.now_ns)
 
-    bench.each = interrupt
-    script = channel_scan.scan_channels(LinkParameters(), ('2M',), lambda *report: None)
-    procedure = Procedure(script, decode_from_dongle)
+    def lose(data, now_ns):
+        if interruptions and len(dropped) < lost:
+            dropped.append(data)
+        else:
+            feed(data, now_ns)
+
+    bench.each, bench.emulator.feed = interrupt, lose
+    procedure = Procedure(script(), decode_from_dongle)
     bench.run(procedure)
-    assert procedure.error == 'interrupted'
-    assert bench.radio() == before
+    assert (procedure.error, bench.radio()) == ('interrupted', before)
+    assert len(dropped) == lost
+    assert len(interruptions) > 1
 
 
 def test_unplugging_the_dongle_ends_the_scan():
@@ -378,6 +396,21 @@ def test_unplugging_the_dongle_ends_the_scan():
         bench.at_dongle(
             channel_scan.scan_channels(LinkParameters(), ('1M',), lambda *report: None)
         )
+
+
+def test_the_recommended_channel_is_the_best():
+    answers = {5: 9, 6: 19, 7: 3}
+    found = [ChannelResult(k, '1M', count, 20, 0.0) for k, count in answers.items()]
+    good, advice = channel_scan.recommend(found, LinkParameters())
+    assert not good
+    assert advice == (
+        'the robot is on another channel or rate than configured: set link.channel to 6 and '
+        "link.rate to '1M', or build its firmware for 82 at 1M"
+    )
+    best = LinkParameters(channel=6)
+    assert channel_scan.recommend(found, best)[1].endswith('ping measures the link quality')
+    whole = [found[1]._replace(answered=20)]
+    assert channel_scan.recommend(whole, best) == (True, 'the robot answers as configured')
 
 
 def test_a_scan_without_result_has_a_recommendation():

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Sweeps: complete rows, resumption, and the same numbers wherever they are computed."""
 
+from dataclasses import fields, replace
 import math
 import os
 import signal
@@ -12,7 +13,11 @@ import pytest
 
 import t3mpc_ros as t3
 from t3mpc_ros.cli.main import main
+from t3mpc_ros.evaluation.link_faults import LinkFaults
 from t3mpc_ros.scripting import parameter_sweep
+from t3mpc_ros.scripting.parameter_sweep import make_cells
+from t3mpc_ros.scripting.setting import Setting
+from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 
 SHORT = {'plant': 'servo', 'duration': 2.0}
 GAINS = {'gain': [10.0, 20.0]}
@@ -127,6 +132,122 @@ def test_another_controller_of_the_same_name_is_run_anew(tmp_path, counted):
         script.write_text(text.replace('GAIN', gain))
         t3.sweep(f'{script}:step', {}, seeds=[1], executor=1, output=path, **SHORT)
     assert len(counted) == 2
+
+
+def right_hand_side(time, state, command):
+    return np.resize(command, state.shape) - state
+
+
+def other_side(time, state, command):
+    return np.resize(command, state.shape) - 2.0 * state
+
+
+def first_noise(generator, time, speeds):
+    return generator.normal(0.0, 0.1, 2)
+
+
+def other_noise(generator, time, speeds):
+    return generator.normal(0.0, 0.2, 2)
+
+
+def first(state):
+    return state[:2]
+
+
+def doubled(state):
+    return 2.0 * state[:2]
+
+
+SERVO, TWIN = Setting('servo', duration=2.0), Setting('twin', duration=2.0)
+LINKS = LinkFaults(0.1, (0.01, 0.02), 0.2, (0.0, 0.01), 0.5, 1.0)
+EVENT = FaultEvent(0.5, 'gyro_dead', True, 1.0)
+LAW, ODE = t3.NoiseLaw(first_noise, 0.1), t3.OdePlant(right_hand_side, output=first)
+SPACE = t3.StateSpace(-np.eye(2), np.eye(2), np.eye(2))
+OTHER_ROBOT = t3.Robot(lag=0.05)
+
+
+def on(base, name):
+    """Return how a value becomes a setting, as its argument of that name."""
+    return lambda value: replace(base, **{name: value})
+
+
+CHANGES = [
+    (SERVO, lambda setting: setting, {
+        'plant': 'torque', 'reference': np.ones((300, 2)), 'noise': 0.1, 'faults': LINKS,
+        'duration': 3.0, 'robot_parameters': {'friction_factor': 2.0},
+    }),
+    (LINKS, on(SERVO, 'faults'), {
+        'command_loss': 0.3, 'command_delay': (0.01, 0.03), 'odometry_loss': 0.4,
+        'odometry_delay': (0.0, 0.02), 'begin': 0.6, 'lasting': 2.0,
+    }),
+    (EVENT, lambda event: replace(TWIN, faults=FaultSchedule([event])), {
+        'at': 0.6, 'fault': 'ranges_dead', 'value': False, 'duration': 2.0,
+    }),
+    (LAW, on(SERVO, 'noise'), {'draw': other_noise, 'variance': 0.2}),
+    (t3.Robot(), on(SERVO, 'plant'), {
+        'wheel_radius': 0.04, 'wheel_separation': 0.2, 'lag': 0.03, 'dead_time': 0.02,
+        'linear_velocity': 0.3, 'angular_velocity': 3.0, 'wheel_velocity': 9.0,
+        'linear_acceleration': 0.9, 'angular_acceleration': 9.0, 'wheel_acceleration': 20.0,
+        'parameters': {'friction_factor': 2.0},
+    }),
+    (ODE, on(SERVO, 'plant'), {
+        'right_hand_side': other_side, 'states': 4, 'output': doubled, 'drive': 'torque',
+        'initial': (1.0, 1.0), 'robot': OTHER_ROBOT,
+    }),
+    (SPACE, on(SERVO, 'plant'), {
+        'A': -2.0 * np.eye(2), 'B': 2.0 * np.eye(2), 'C': 2.0 * np.eye(2),
+        'drive': 'torque', 'initial': (1.0, 1.0), 'robot': OTHER_ROBOT,
+    }),
+    (t3.Controller(Proportional, {'gain': 10.0}, 'a'), None, {
+        'source': 'ADRC', 'settings': {'gain': 11.0}, 'name': 'b',
+    }),
+]  # fmt: skip
+
+
+def keys(setting=SERVO, controllers='ADRC', parameters=None, seeds=(1,), cases=('nominal',)):
+    return [*make_cells(controllers, parameters or {}, seeds, cases, setting)]
+
+
+@pytest.mark.parametrize(
+    ('base', 'setting', 'changes'), CHANGES, ids=[type(row[0]).__name__ for row in CHANGES]
+)
+def test_the_key_of_a_run_changes_with_all_that_determines_it(base, setting, changes):
+    """A sweep once took stale runs from its file after another input had changed."""
+    names = {each.name for each in fields(base) if each.init}
+    assert changes.keys() == names, 'every field must have a row'
+
+    def key(value):
+        if setting is None:
+            return keys(controllers=value)[0]
+        return keys(setting(value))[0]
+
+    found = [key(base), *(key(replace(base, **{name: v})) for name, v in changes.items())]
+    assert len({*found}) == len(found)
+    assert key(replace(base)) == found[0]
+
+
+def test_the_key_of_a_run_changes_with_its_place_in_the_sweep(monkeypatch, tmp_path):
+    found = keys(parameters={'gain': [10.0, 20.0]}, seeds=(1, 2), cases=('nominal', 'disturbance'))
+    assert len({*found}) == 8
+    again = keys(parameters={'gain': [20.0]}, seeds=(2,), cases=('disturbance',))
+    assert {*again} < {*found}
+    # What the package is made of, and the Python that runs it.
+    for name, other in (('source_digest', 'x'), ('provenance', {'python': '4'})):
+        monkeypatch.setattr(parameter_sweep, name, lambda *_, value=other, **__: value)
+        changed = keys(parameters={'gain': [20.0]}, seeds=(2,), cases=('disturbance',))
+        assert not {*changed} & {*found, *again}
+        again += changed
+
+
+def test_the_key_of_a_run_changes_with_the_content_of_its_files(tmp_path):
+    """A schedule was known by its path alone: after a change of it the old runs came back."""
+    faults = tmp_path / 'faults.yaml'
+    found = set()
+    for at in (0.5, 0.7, 0.5):
+        faults.write_text(f'- {{at: {at}, fault: gyro_dead, value: true}}\n')
+        found |= {*keys(replace(TWIN, faults=str(faults)), 'full')}
+        found |= {*keys(replace(TWIN, faults=faults), 'full')}
+    assert len(found) == 2
 
 
 @pytest.mark.parametrize(

@@ -229,20 +229,21 @@ def measure(run: LoopRecord) -> RunNumbers:
     return RunNumbers(run.rmse(START), settled, run.chatter(), run.largest_error(START), True)
 
 
-def source_digest(package: Path = PACKAGE_DIRECTORY) -> str:
-    """Return a digest of every source file that can change the result of a run.
+def source_digest(package: Path = PACKAGE_DIRECTORY, *, every: bool = False) -> str:
+    """Return a digest of every source file that can change the result of a run of the paper.
 
     It covers the Python and array files of the package except those that only display, record or
     select, and includes this file, which measures. Tuned values are part of the method's
-    parameters.
+    parameters. With ``every`` it covers all of them, and worlds, schedules and tuned values: what
+    a run on the twin or of a script is made of.
     """
+    suffixes = ('.py', '.npy', '.npz', *(('.yaml', '.json', '.csv') if every else ()))
     digest = hashlib.sha256()
     for path in sorted(package.rglob('*')):
         name = path.relative_to(package).as_posix()
-        kept = name == 'evaluation/paper/experiment_runs.py' or not name.startswith(
-            _IRRELEVANT_SOURCES
-        )
-        if kept and path.suffix in ('.py', '.npy', '.npz'):
+        kept = every or name == 'evaluation/paper/experiment_runs.py'
+        kept = kept or not name.startswith(_IRRELEVANT_SOURCES)
+        if kept and path.suffix in suffixes:
             digest.update(name.encode() + b'\0' + hashlib.sha256(path.read_bytes()).digest())
     return digest.hexdigest()[:16]
 

@@ -164,7 +164,7 @@ def compare_patrols(
 def _run_key(plan: PatrolPlan, name: str, seed: int) -> str:
     """Return a digest of all that determines a result; that of the first seed has a track."""
     run = replace(plan, paths=(name,), seeds=(seed,)), seed == plan.seeds[0]
-    content = repr((t3mpc_ros.__version__, source_digest(), run))
+    content = repr((t3mpc_ros.__version__, source_digest(every=True), run))
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
