@@ -316,8 +316,8 @@ class PlaybackTimeline:
                 self._position = max(self._position, head.at_ns)
             self._advance()
         if self._head is None and not self.finished:
+            self._bind(now_ns)
             self.finished = True
-            self._position, self._anchor_ns = self._position_at(now_ns), now_ns
         wake_ns = None if self._head is None else self._due_ns(self._head, now_ns)
         if wake_ns is None or wake_ns > now_ns:
             wake_ns = self._tick(now_ns, out, wake_ns)

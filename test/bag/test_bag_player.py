@@ -646,64 +646,6 @@ def test_stepping_into_the_next_loop_does_not_play_the_map_early(bag):
         assert [m.topic for m in player.messages] == played
 
 
-def test_seek_cancels_pending_steps(bag):
-    player = Player(bag, paused=True).run()
-    player.made.play_next(player.now, 5)
-    player.made.seek(player.now, START)
-    player.wake = player.now
-    assert player.run().messages == []
-
-
-@pytest.mark.parametrize('seed', range(40))
-@pytest.mark.slow
-def test_no_sequence_of_commands_skips_or_repeats_a_message(bag, seed):
-    """Between seeks the order is that of the bag, for any commands and delays of the caller."""
-    rng = random.Random(seed)
-    loop = seed % 4 == 0
-    player = Player(bag, loop=loop, paused=seed % 3 == 0, clock_rate=rng.choice([0.0, 40.0]))
-    made, now = player.made, player.now
-    written, played, sought = expected(ticks()), [], False
-    sequences = []
-    for _ in range(150):
-        action = rng.randrange(8)
-        if action == 0:
-            made.pause(player.now)
-        elif action == 1:
-            made.resume(player.now)
-        elif action == 2:
-            made.set_rate(player.now, rng.choice([0.01, 0.5, 1.0, 3.7, 100.0, rng.random() + 0.1]))
-        elif action == 3:
-            made.play_next(player.now, rng.randrange(1, 6))
-        elif action == 4 and rng.random() < 0.2:
-            sequences.append((sought, player.messages))
-            player.out.clear()
-            sought = START + rng.randrange(2 * SECOND - SECOND // 50)
-            assert made.seek(player.now, sought) == ''
-        elif action == 5 and player.wake is not None:
-            player.now = max(player.now, player.wake)
-        else:
-            player.now += rng.randrange(SECOND // 5)
-        for _ in range(rng.randrange(4)):
-            player.ask(most=rng.randrange(1, 9))
-    assert player.now > now
-    made.resume(player.now)
-    player.wake = player.now
-    if not loop:
-        player.run()
-        assert made.finished
-    sequences.append((sought, player.messages))
-    for sought, played in sequences:
-        whole = written
-        if sought is not False:
-            rest = [m for m in written if m.received_ns >= sought]
-            whole = [*bag.latched_messages_before(sought), *rest]
-        if loop:
-            whole = whole + written * 50
-        assert played == whole[: len(played)]
-    if not loop:
-        assert len(played) == len(whole)
-
-
 def test_position_and_remaining_time_follow_the_rate(bag):
     player = Player(bag, rate=2.0)
     player.run(player.now + SECOND // 4)

@@ -53,15 +53,16 @@ def a_writer(source, folder):
         'max_file_ns': source.choice([0, 100 * SECOND]),
         'definitions': DEFINITIONS,
     }
-    used = BagWriter(folder / 'used' / 'bag', metadata_records={'a': {'b': 'c'}}, **options)
+    records, attachments = {'a': {'b': 'c'}}, {}
+    used = BagWriter(folder / 'used' / 'bag', metadata_records=records, **options)
     for _ in range(source.randrange(30)):
-        _do_something(used, source)
+        _do_something(used, source, records, attachments)
     used.split()
     (folder / 'new' / 'bag').mkdir(parents=True)
     for path in used.folder.glob('*_0.mcap'):
         (folder / 'new' / 'bag' / path.name).write_bytes(path.read_bytes())
-    fresh = BagWriter(folder / 'new' / 'bag', metadata_records=used._metadata_records, **options)
-    for attachment, read_ns in used._attachments.values():
+    fresh = BagWriter(folder / 'new' / 'bag', metadata_records=records, **options)
+    for attachment, read_ns in attachments.values():
         fresh.add_attachment(attachment, read_ns)
     for topic in used._topics.values():
         fresh.add_topic(topic.name, topic.type_name, topic.offered_qos_profiles, topic.type_hash)
@@ -72,18 +73,20 @@ def a_writer(source, folder):
         each._synced_ns = 0
         later = random.Random(seed)
         for _ in range(10):
-            _do_something(each, later)
+            _do_something(each, later, {}, {})
         each.close()
     yield used.path.read_bytes(), fresh.path.read_bytes(), ()
 
 
-def _do_something(writer, source):
+def _do_something(writer, source, records, attachments):
     action, at_ns = source.randrange(5), source.randrange(50 * SECOND)
     topic = source.choice(['/a', '/b'])
     if action == 0:
-        writer.add_metadata_record(topic, {'value': str(at_ns)})
+        records[topic] = {'value': str(at_ns)}
+        writer.add_metadata_record(topic, records[topic])
     elif action == 1:
-        writer.add_attachment(Attachment(topic, 'text/plain', source.randbytes(3)), at_ns)
+        attachments[topic] = Attachment(topic, 'text/plain', source.randbytes(3)), at_ns
+        writer.add_attachment(*attachments[topic])
     elif action == 2:
         writer.tick(at_ns)
     else:
@@ -328,7 +331,7 @@ class Player(RuleBasedStateMachine):
         assert self.made.due_messages(self.now_ns) == ([], self.now_ns)
         self.ask(0, 1)
 
-    @rule(elapsed=st.integers(0, 300), most=st.integers(1, 9))
+    @rule(elapsed=st.integers(0, 600), most=st.integers(1, 9))
     def ask(self, elapsed, most):
         self.now_ns += elapsed * MS
         if not (self.paused or self.finished):
@@ -395,7 +398,7 @@ class Player(RuleBasedStateMachine):
 
 
 TestPlayer = Player.TestCase
-TestPlayer.settings = STATEFUL
+TestPlayer.settings = settings(STATEFUL, max_examples=200)
 
 
 @given(
