@@ -7,6 +7,7 @@ Fields follow ``rosbag2_storage/include/rosbag2_storage/yaml.hpp`` (branch jazzy
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+import errno
 import os
 from pathlib import Path
 from typing import Any
@@ -148,6 +149,19 @@ def write_metadata(folder: Path, metadata: BagMetadata) -> None:
     except OSError:
         temporary.unlink(missing_ok=True)
         raise
+    sync_folder(folder)
+
+
+def sync_folder(folder: Path) -> None:
+    """Write the names in a folder to the disk: a power failure may lose a new file without it."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a network share, for example
+            raise
+    finally:
+        os.close(handle)
 
 
 def read_origin(folder: Path) -> tuple[dict[str, str], str] | None:

@@ -301,7 +301,12 @@ def open_bag(path: Path | str) -> BagReader:
         others = [path]
     else:
         raise BagError(f'{path} is no MCAP file and no sqlite3 bag')
-    files += [RosbagsFile(each) for each in others]
+    for each in others:
+        try:
+            files.append(RosbagsFile(each))
+        except BagError:
+            BagReader(path, files, incomplete).close()
+            raise
     if not files and not incomplete and (path / _RUN_BAG).is_dir():
         return open_bag(path / _RUN_BAG)
     if not files:

@@ -17,6 +17,7 @@ from t3mpc_ros.bag.metadata import (
     BagMetadata,
     FileInformation,
     TopicInformation,
+    sync_folder,
     write_metadata,
 )
 from t3mpc_ros.bag.qos import QosProfile, dump_yaml, profiles_to_yaml
@@ -144,6 +145,7 @@ class BagWriter:
         """Messages dropped after a write error."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
+            sync_folder(self.folder.parent)
             existing, self.incomplete_files = collect_metadata(self.folder)
             write_metadata(self.folder, existing)
         except OSError as error:
@@ -160,6 +162,7 @@ class BagWriter:
         self._chunk_seen: tuple[int, int] | None = None
         try:
             self.path, self._output = _create_next_file(self.folder, self._stem)
+            sync_folder(self.folder)
         except OSError as error:
             raise _folder_error(self.folder, error) from error
         try:

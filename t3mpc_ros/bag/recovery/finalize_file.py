@@ -112,6 +112,7 @@ def finalize_file(path: Path) -> int:
                 write_all(file, tail + bytes(spare))
                 os.fsync(file.fileno())
                 file.truncate(end + len(tail))
+                os.fsync(file.fileno())  # the spare bytes would hide the end of the file
             except OSError:
                 file.truncate(end)
                 if len(parts) <= 2:

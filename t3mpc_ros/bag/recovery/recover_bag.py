@@ -11,7 +11,7 @@ import shutil
 from typing import BinaryIO, cast
 
 from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, collect_metadata, read_mcap_file
-from t3mpc_ros.bag.metadata import read_origin, write_metadata
+from t3mpc_ros.bag.metadata import read_origin, sync_folder, write_metadata
 from t3mpc_ros.bag.recovery.recover_file import UnreadableError, recover_file
 from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
 from t3mpc_ros.bag.schema import BagError
@@ -75,6 +75,7 @@ def recover_bag(
     if (origin := read_origin(files[0].parent)) is not None:  # usually missing
         metadata = replace(metadata, custom_data=origin[0], ros_distro=origin[1])
     write_metadata(output, metadata)
+    sync_folder(output.parent)
     return RecoveryResult(output, tuple(results))
 
 

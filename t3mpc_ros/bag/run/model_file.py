@@ -4,6 +4,7 @@
 
 from collections.abc import Mapping
 import json
+import os
 from pathlib import Path
 from typing import Any
 import zipfile
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import t3mpc_ros
+from t3mpc_ros.bag.metadata import sync_folder
 
 FORMAT = 1
 """Version of the format; incremented if the meaning of an array changes."""
@@ -32,7 +34,7 @@ def save_model(
     parameters: Mapping[str, object],
     origin: Mapping[str, object] | None = None,
 ) -> None:
-    """Write a model file.
+    """Write a model file; on an error an existing one is unchanged.
 
     Parameters
     ----------
@@ -58,11 +60,17 @@ def save_model(
             'origin': dict(origin or {}),
         }
     )
+    temporary = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
-        with path.open('wb') as target:
+        with temporary.open('wb') as target:
             content: dict[str, Any] = {_HEADER: np.array(header), **arrays}
             np.savez_compressed(target, **content)
+            target.flush()
+            os.fsync(target.fileno())
+        temporary.replace(path)
+        sync_folder(path.parent)
     except OSError as error:
+        temporary.unlink(missing_ok=True)
         raise ModelError(f'cannot write the model file {path}: {error.strerror}') from error
 
 
@@ -103,7 +111,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
         raise ModelError(
             f'cannot read the model file {path}: {error.strerror or error}'
         ) from error
-    except (KeyError, ValueError, zipfile.BadZipFile) as error:
+    except (EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise ModelError(f'{path} is not a model file of t3mpc_ros') from error
     found = header.get('format') if isinstance(header, dict) else None
     if found != FORMAT:

@@ -46,6 +46,8 @@ def create_key_file(path: Path, entropy: Callable[[int], bytes]) -> int:
         raise KeyFileError(f'{path} cannot be created: {error.strerror}') from error
     with os.fdopen(handle, 'w') as target:
         target.write(key.hex() + '\n')
+        target.flush()
+        os.fsync(target.fileno())  # the robot may hold it before a power failure
     return key_check(key)
 
 
