@@ -249,6 +249,9 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             self._robot.shut_down()
         os.write(self._wake_write, b'.')
         self._port_thread.join(SHUTDOWN_TIMEOUT)
+        if not self._port_thread.is_alive():
+            os.close(self._wake_read)
+            os.close(self._wake_write)
 
 
 def _robot_description(parameters: RadioBridgeParameters) -> RobotDescription:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which files are open, and which would survive a power failure."""
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import gc
 import hashlib
 import os
@@ -10,26 +10,24 @@ from pathlib import Path
 import stat
 
 
-def open_files():
-    """Return the open file descriptors of this process with what they refer to."""
+def open_files(folder=''):
+    """Return the open file descriptors of this process that refer to something in a folder."""
     found = {}
     for number in os.listdir('/proc/self/fd'):
-        try:
+        with suppress(FileNotFoundError):  # that of the listing itself
             found[number] = os.readlink(f'/proc/self/fd/{number}')
-        except FileNotFoundError:  # that of the listing itself
-            continue
-    return found
+    return {number: name for number, name in found.items() if name.startswith(f'{folder}')}
 
 
 @contextmanager
-def no_file_left_open():
+def no_file_left_open(folder=''):
     """Fail if the block leaves a file open that only the garbage collector would close."""
     gc.collect()
     gc.disable()
     try:
-        before = open_files()
+        before = open_files(folder)
         yield
-        assert open_files() == before
+        assert open_files(folder) == before
     finally:
         gc.enable()
 

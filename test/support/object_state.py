@@ -8,7 +8,7 @@ import enum
 import importlib
 import inspect
 import pkgutil
-from types import ModuleType
+from types import GenericAlias, ModuleType
 
 import numpy as np
 
@@ -59,7 +59,7 @@ def _walk(thing, path, found, origin_ns, above):
         found[path] = f'now {thing - origin_ns:+d}' if is_time else f'{thing!r}'
     elif isinstance(thing, np.ndarray | np.generic):
         found[path] = f'{thing.dtype} {thing.shape} {thing.tobytes().hex()}'
-    elif id(thing) in above or isinstance(thing, type | ModuleType):
+    elif id(thing) in above or isinstance(thing, type | ModuleType | GenericAlias):
         return
     else:
         _walk_parts(thing, path, found, origin_ns, above | {id(thing)})

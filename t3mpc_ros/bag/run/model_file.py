@@ -104,7 +104,8 @@ def read_model_header(path: Path) -> dict[str, Any]:
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
     try:
-        with np.load(path, allow_pickle=False) as content:
+        # Of a file that it cannot read, numpy leaves the archive to the garbage collector.
+        with path.open('rb') as file, np.load(file, allow_pickle=False) as content:
             header = json.loads(str(content[_HEADER]))
             arrays = {name: np.array(content[name]) for name in content.files if name != _HEADER}
     except OSError as error:

@@ -23,7 +23,7 @@ from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode
 from t3mpc_ros.nodes.player.player_thread import PlayerThread
 from t3mpc_ros.nodes.player.publishers import CLOCK, PublishingRules, TopicPublishers
 from t3mpc_ros.nodes.player.terminal import KeyboardHandler, ProgressLine
-from t3mpc_ros.parameters.table import parameter
+from t3mpc_ros.parameters.table import ParameterError, parameter
 
 CONFIGURATION_ERRORS = (BagError,)
 """Errors of :func:`make` other than :class:`ParameterError`."""
@@ -121,12 +121,16 @@ class PlayerNode(BaseNode[PlayerParameters]):
         parameters = self.parameters
         path = parameters.qos_profile_overrides_path
         overrides = read_qos_overrides(path) if path else {}
-        self._reader, unfinished = parameters.open_reader()
-        reader = self._reader
+        reader, unfinished = parameters.open_reader()
+        try:
+            self._span = begin_ns, end_ns = parameters.time_range_ns(reader)
+        except ParameterError:
+            reader.close()
+            raise
+        self._reader = reader
         publishes_clock = (
             parameters.clock_publish_frequency > 0.0 or parameters.clock_publish_on_topic_publish
         )
-        self._span = begin_ns, end_ns = parameters.time_range_ns(reader)
         self._topic_publishers = TopicPublishers(
             self, reader, PublishingRules(parameters.allow_commands, publishes_clock, overrides)
         )

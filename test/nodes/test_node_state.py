@@ -1,0 +1,482 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Nodes without messages: state after a change, exact levels of the diagnostics, closed files."""
+
+from contextlib import suppress
+import json
+import os
+from types import SimpleNamespace
+
+import pytest
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool
+from support.bag_messages import STORE
+from support.file_watch import no_file_left_open
+from support.object_state import state
+from support.other_parameters import with_other_value
+from support.ros_graph import NODE_CLASSES
+
+from t3mpc_ros.bag.writer import BagWriter
+from t3mpc_ros.chaos.path_source import PortraitSource
+from t3mpc_ros.chaos.reference import ChaoticReference
+from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
+from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.geometry.types import ORIGIN
+from t3mpc_ros.nodes.common.base_node import ERROR, NO_CLOCK, OK, WARN
+from t3mpc_ros.nodes.player.node import PlayerNode
+from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
+from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.registry import NODES, parameter_class
+from t3mpc_ros.nodes.viewer import ViewNode
+from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.link.statistics import DiagnosticLevel
+from t3mpc_ros.robot.interface import BatteryReading
+
+pytestmark = pytest.mark.ros
+
+START = 1_700_000_000 * 10**9
+
+
+@pytest.fixture
+def bag(tmp_path):
+    """Return the folder of a bag of one second."""
+    with BagWriter(tmp_path / 'played', metadata_records={}) as made:
+        made.add_topic('/a', 'std_msgs/msg/Float64')
+        for number in range(2):
+            made.write('/a', START + number * 10**9, START, b'\0\1\0\0' + bytes(8))
+    return str(tmp_path / 'played')
+
+
+@pytest.fixture
+def start(harness, tmp_path, bag, monkeypatch):
+    """Return a function that starts a node, which takes part in no graph until it is spun."""
+    given = {
+        'recorder': {'storage__uri': str(tmp_path / 'bag'), 'storage__snapshot_duration': 1.0},
+        'player': {'storage__uris': [bag], 'play__start_paused': True},
+        'sim_robot': {'publish_clock': True},
+        'radio_bridge': {'port': str(tmp_path / 'no_port')},
+    }
+
+    monkeypatch.setattr(RadioBridgeNode, '_serve_port', lambda node: None)
+
+    def start(name, **parameters):
+        return harness.add(NODE_CLASSES[name], **(given.get(name, {}) | parameters))
+
+    return start
+
+
+def call(node, name, **request):
+    """Return the response of a service of a node, without a graph."""
+    (service,) = (
+        each for each in node.services if each.service_name == node.resolve_service_name(name)
+    )
+    kind = service.srv_type
+    return service.callback(kind.Request(**request), kind.Response())
+
+
+def changed(node, **values):
+    """Set parameters through the service of the node."""
+    messages = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    results = call(node, '~/set_parameters', parameters=messages).results
+    assert [each.reason for each in results] == [''] * len(values)
+
+
+def published(publisher):
+    """Return a list to which the messages of a publisher are appended from now on."""
+    messages, publish = [], publisher.publish
+
+    def note(message):
+        messages.append(message)
+        publish(message)
+
+    publisher.publish = note
+    return messages
+
+
+def whole_state(node, kept=()):
+    """Return the state of a node: its own objects, its timers and its publishers."""
+    found = {path: value for path, value in state(node).items() if not path.startswith(kept)}
+    found['timers'] = sorted(each.timer_period_ns for each in node.timers)
+    found['publishers'] = sorted(each.topic_name for each in node.publishers)
+    return found
+
+
+def difference(one, other):
+    return {path for path in one.keys() | other.keys() if one.get(path) != other.get(path)}
+
+
+# -- parameters -----------------------------------------------------------------------------------
+
+DYNAMIC = [name for name in NODES if any(each.dynamic for each in parameter_class(name).specs())]
+PREDICTIVE = '_controller._tracker.law.predictive'
+KEPT = {
+    'controller': (
+        '_journal',
+        '_matching',
+        '_references',
+        '_controller._trajectory.buffer.jump',
+        '_controller.status.skill',
+        PREDICTIVE,
+    ),
+    'sim_robot': ('_robot', '_real_time_factor', '_simulated_time'),
+    'radio_bridge': (),
+    'player': ('_opened_ns', '_thread._timeline._anchor', '_thread._timeline._primed'),
+}
+"""What depends on the time of the start, or counts changes."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('name', DYNAMIC)
+def test_a_changed_node_is_as_one_started_so(name, start, harness):
+    node, values = start(name), {}
+    for spec in parameter_class(name).specs():
+        if spec.dynamic:
+            wanted = with_other_value(node.parameters, spec)
+            values[spec.name] = wanted.to_dict()[spec.name]
+            changed(node, **{spec.name: values[spec.name]})
+            assert node.parameters == wanted
+            assert node.get_parameter(spec.name).value == values[spec.name]
+    kept = ('_Node__', '_fingerprint', '_logged', *KEPT[name])
+    found = whole_state(node, kept)
+    robot = getattr(node, '_robot', None)
+    if name == 'controller':
+        call(node, '~/reset')  # until then it keeps what it has learnt
+        weights = state(node._controller.get_weights())
+    harness.remove(node)
+    fresh = start(name, **values)
+    assert fresh.parameters == node.parameters
+    assert difference(found, whole_state(fresh, kept)) == set()
+    if name == 'controller':
+        assert difference(weights, state(fresh._controller.get_weights())) == set()
+    if name == 'sim_robot':
+        assert robot._parameters == fresh._robot._parameters
+
+
+def test_the_timer_of_a_robot_follows_the_real_time_factor(start):
+    node = start('sim_robot')
+    for factor, period_ms in ((2.0, 5), (0.5, 20), (0.0, 50), (1.0, 10)):
+        changed(node, real_time_factor=factor)
+        assert node._timer.timer_period_ns == period_ms * 10**6
+        assert node._simulated_time.real_time_factor == factor
+
+
+def test_changed_parameters_are_published_with_their_revision(start):
+    """A revision that came one change late was lost in what a busy machine skipped."""
+    node = start('controller')
+    revisions = published(node._revision_publisher)
+    rows = published(node._journal_publisher)
+    for number, gain in enumerate((3.0, 4.0), 1):
+        changed(node, **{'law.gain': gain})
+        content = json.loads(revisions[-1].data)
+        assert content == {'revision': number, 'parameters': _listed(node.parameters)}
+        assert content['parameters']['law.gain'] == gain
+        assert rows[-1].data[1] == 4  # Event.CONFIGURE
+        assert rows[-1].data[4] == number == len(revisions)
+    changed(node, **{'law.gain': 4.0})
+    assert len(revisions) == 2
+
+
+def _listed(parameters):
+    return json.loads(json.dumps(parameters.to_dict()))
+
+
+# -- services -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'name, service, kept',
+    [
+        ('controller', '~/enable', ('_journal',)),
+        ('controller', '~/reset', ('_journal',)),
+        ('reference_generator', '~/pause', ()),
+        ('sim_robot', 'e_stop', ()),
+        ('sim_robot', 'reset_odometry', ()),
+        ('sim_robot', '~/set_pose', ()),
+        ('radio_bridge', 'e_stop', ()),
+        ('radio_bridge', 'reset_odometry', ()),
+        ('player', '~/pause', ()),
+    ],
+)
+def test_a_service_called_twice_has_its_effect_once(name, service, kept, start):
+    node = start(name)
+    times = '_simulated_time', '_real_time_factor', '_robot._limiter._clock_ns', '_thread'
+    kept = ('_Node__', *times, *kept)
+    states = []
+    for _ in range(2):
+        kind = next(each for each in node.services if each.service_name.endswith(service[2:]))
+        answer = call(node, service, **({'data': True} if kind.srv_type is SetBool else {}))
+        assert answer.success, answer.message
+        states.append(whole_state(node, kept))
+    assert difference(*states) == set()
+
+
+def test_motion_enabled_again_is_as_before(start):
+    node = start('controller')
+    before = whole_state(node, ('_journal', '_Node__'))
+    call(node, '~/enable', data=False)
+    assert node._controller.status.reason is not Reason.TRACKING
+    assert difference(before, whole_state(node, ('_journal', '_Node__'))) != set()
+    call(node, '~/enable', data=True)
+    left = difference(before, whole_state(node, ('_journal', '_Node__')))
+    assert {path for path in left if 'status' not in path} == set()
+
+
+@pytest.mark.parametrize('source', ['signals', 'portrait'])
+def test_a_reseeded_generator_is_as_one_of_the_seed(source, start):
+    """A manual reseed used to add the remaining time to that of the new seed."""
+    node = start('reference_generator', source=source, reseed__shortest=5.0, reseed__longest=9.0)
+    parameters = node.parameters
+    if source == 'portrait':
+        node._source = node._make_source(ORIGIN)
+    fingerprints, seeds = {node._fingerprint}, {node._seed}
+    for number in range(3):
+        for _ in range(7 * number):
+            (node._source or node._generator).advance()
+        answer = call(node, '~/reseed')
+        assert answer.success
+        fingerprints.add(node._fingerprint)
+        seeds.add(node._seed)
+        assert matches_fingerprint(node._fingerprint, node._seed)
+        assert node.produce_diagnostics()[2]['seed_fingerprint'] == node._fingerprint
+        if source == 'portrait':
+            fresh = PortraitSource(parameters, parameters.geometry, ORIGIN, node._seed, int)
+            assert node._source._left == fresh._left
+            assert node._source._times.random() == fresh._times.random()
+        else:
+            fresh = ChaoticReference(parameters, parameters.geometry)
+            fresh.reset(node._seed)
+            assert node._generator.advance() == fresh.advance()
+    assert len(fingerprints) == len(seeds) == 4
+
+
+def test_each_reseed_of_a_path_has_its_fingerprint(start):
+    node = start(
+        'reference_generator', source='portrait', reseed__shortest=0.2, reseed__longest=0.2
+    )
+    node._source = node._make_source(ORIGIN)
+    found = {node._fingerprint}
+    for _ in range(100):
+        node._source.advance()
+        found.add(node._fingerprint)
+        assert matches_fingerprint(node._fingerprint, node._seed)
+    assert len(found) > 3
+
+
+# -- diagnostics ----------------------------------------------------------------------------------
+
+
+class Instead:
+    """An object with some of its attributes replaced."""
+
+    def __init__(self, original, **replaced):
+        self._original = original
+        self.__dict__.update(replaced)
+
+    def __getattr__(self, name):
+        return getattr(self._original, name)
+
+
+def test_levels_of_the_controller(start):
+    node = start('controller')
+    assert node.produce_diagnostics()[:2] == (WARN, 'stopped: no odometry')
+    node._steps = 1
+    controller = node._controller
+    for reason in Reason:
+        node._controller = Instead(controller, status=controller.status._replace(reason=reason))
+        level = {Reason.TRACKING: OK, Reason.NOT_FOLLOWING: WARN}.get(reason, ERROR)
+        text = reason.value if reason.moves else f'stopped: {reason.value}'
+        assert node.produce_diagnostics()[:2] == (level, text)
+    status = controller.status._replace(reason=Reason.TRACKING)
+    for stuck, level in ((False, OK), (True, WARN)):
+        keep_out = SimpleNamespace(activity=SimpleNamespace(stuck=stuck, value='what it does'))
+        node._controller = Instead(controller, status=status, keep_out=keep_out)
+        assert node.produce_diagnostics()[0] == level
+    node._controller = Instead(controller, status=status)
+    node._rejected_references = 1
+    assert node.produce_diagnostics()[0] == WARN
+    node._odometry_problem = 'is too old'
+    assert node.produce_diagnostics()[:2] == (ERROR, 'stopped: odom is too old')
+
+
+def robot_conditions(state):
+    """Return changes of a robot state with the level of each."""
+    status = state.status._replace(
+        enabled=True, estop=False, slipping=False, imu_fault=False, low_battery=False
+    )
+    good = state._replace(status=status, reason='', lost_steps=None)
+    low = BatteryReading(9.0, 1.0, 0.5)
+    return [
+        (good, OK),
+        (good._replace(reason='no command yet'), WARN),
+        (good._replace(status=status._replace(slipping=True)), WARN),
+        (good._replace(status=status._replace(imu_fault=True)), WARN),
+        (good._replace(status=status._replace(low_battery=True), battery=low), WARN),
+        (good._replace(lost_steps=(0, 3)), WARN),
+        (good._replace(status=status._replace(estop=True), reason='emergency stop: x'), ERROR),
+    ]
+
+
+def test_levels_of_the_simulated_robot(start):
+    node = start('sim_robot')
+    assert node.produce_diagnostics()[:2] == (ERROR, NO_CLOCK)
+    for found, level in robot_conditions(node._robot.advance(10**7)):
+        node._state = found
+        assert node.produce_diagnostics()[0] == level, found
+    node._state = robot_conditions(node._state)[0][0]
+    node._scheduler = Instead(node._scheduler, skipped=1)
+    text = 'processor overloaded: samples were skipped'
+    assert node.produce_diagnostics()[:2] == (WARN, text)
+
+
+def test_levels_of_the_radio_bridge(start):
+    node = start('radio_bridge')
+    assert node.produce_diagnostics()[0] == ERROR
+    robot = node._robot
+    link, quality = robot.link, robot.quality(0)._replace(level=DiagnosticLevel.OK, text='')
+
+    def level(found, quality=quality, **replaced):
+        node._robot = Instead(
+            robot,
+            link=Instead(link, **({'state': LinkState.RUN} | replaced)),
+            advance=lambda now_ns: found,
+            quality=lambda now_ns: quality,
+        )
+        return node.produce_diagnostics()[0]
+
+    (good, _), *_ = conditions = robot_conditions(robot.advance(0))
+    assert [level(found) for found, _ in conditions] == [wanted for _, wanted in conditions]
+    for each in LinkState:
+        assert level(good, state=each) == (OK if each is LinkState.RUN else ERROR)
+    for found in DiagnosticLevel:
+        text = 'why' if found else ''
+        assert level(good, quality._replace(level=found, text=text)) == bytes([found])
+    node._robot = robot
+
+
+def test_levels_of_the_recorder(start, harness, tmp_path):
+    node = start('recorder')
+    assert node.produce_diagnostics()[:2] == (OK, 'recording')
+    node._raw_subscriptions._lost['/a'] = 2
+    lacks = 'the bag lacks 0 dropped and 2 lost messages'
+    assert node.produce_diagnostics()[:2] == (WARN, lacks)
+    node._snapshots.problem = 'no snapshot'
+    assert node.produce_diagnostics()[:2] == (WARN, 'no snapshot')
+    node._dropped, node._dropped_ns = 3, node.steady_ns()
+    slow = 'the disk is too slow: 3 messages dropped so far'
+    assert node.produce_diagnostics()[:2] == (ERROR, slow)
+    node._dropped_ns -= 3 * 10**9
+    node._snapshots.problem = ''
+    assert node.produce_diagnostics()[0] == WARN
+    node._failure = 'the disk is full'
+    assert node.produce_diagnostics()[:2] == (ERROR, 'the disk is full')
+    harness.remove(node)
+    node = start('recorder', storage__snapshot_mode=True)
+    assert node.produce_diagnostics()[:2] == (OK, 'caching for snapshots')
+    node._snapshots.problem = 'no snapshot'
+    assert node.produce_diagnostics()[:2] == (ERROR, 'no snapshot')
+
+
+def test_levels_of_the_player(start):
+    assert start('player', storage__uris=[]).produce_diagnostics()[0] == WARN
+    node = start('player')
+    assert node.produce_diagnostics()[:2] == (OK, 'waiting for subscribers')
+    node._started = True
+    assert node.produce_diagnostics()[:2] == (OK, 'paused')
+    node._other_publishers = {'/a': '/b'}
+    assert node.produce_diagnostics()[:2] == (WARN, 'also published by other nodes: /a')
+    node._damaged = 3
+    assert node.produce_diagnostics()[:2] == (WARN, '3 messages of damaged chunks are not played')
+    node._thread.failure = 'the bag cannot be read'
+    assert node.produce_diagnostics()[:2] == (ERROR, 'the bag cannot be read')
+
+
+def test_levels_of_the_reference_generator(start):
+    node = start('reference_generator')
+    assert node.produce_diagnostics()[:2] == (OK, 'running')
+    call(node, '~/pause', data=True)
+    assert node.produce_diagnostics()[:2] == (OK, 'paused')
+    call(node, '~/pause', data=False)
+    node._path_clock.rate = 0.0
+    assert node.produce_diagnostics()[:2] == (OK, 'waiting for the robot')
+    node._scheduler = Instead(node._scheduler, skipped=1)
+    assert node.produce_diagnostics()[0] == WARN
+    node.clock_started = lambda: False
+    assert node.produce_diagnostics()[:2] == (WARN, NO_CLOCK)
+    path = start('reference_generator', source='topic')
+    assert path.produce_diagnostics()[0] == WARN
+
+
+def test_a_warning_raises_the_level_to_a_warning_and_no_further(start):
+    node = start('reference_generator')
+    statuses = published(node._diagnostics)
+    for level in (OK, WARN, ERROR):
+        node.produce_diagnostics = lambda level=level: (level, 'text', {})
+        node.start_warnings = []
+        node._publish_diagnostics()
+        assert statuses[-1].status[0].level == level
+        node.start_warnings = ['something']
+        node._publish_diagnostics()
+        status = statuses[-1].status[0]
+        wanted = 'something' if level == OK else 'text; something'
+        assert (status.level, status.message) == (max(level, WARN), wanted)
+
+
+# -- live page ------------------------------------------------------------------------------------
+
+
+def test_a_node_that_has_left_is_gone_from_the_page(ros):
+    """It stood on the page with its last report."""
+    calls = []
+
+    class Sink:
+        def __getattr__(self, name):
+            return lambda *values: calls.append((name, *values))
+
+    node = ViewNode(Sink())
+    present = ['controller', 'sim_robot']
+    node.get_node_names_and_namespaces = lambda: [(each, '/') for each in present]
+    for _ in range(2):
+        node.look_at_graph()
+    node._rows['controller'] = {'law.gain': {'name': 'law.gain', 'value': 1.0}}
+    assert [each for each in calls if each[0] == 'node_gone'] == []
+    present.remove('controller')
+    for _ in range(2):
+        node.look_at_graph()
+    assert [each for each in calls if each[0] == 'node_gone'] == [('node_gone', 'controller')]
+    assert ('set', 'parameters/controller', None) in calls
+    assert calls[-1] == ('set', 'nodes', ['sim_robot'])
+    # Of a node that comes back, the parameters are read again.
+    assert (*node._remote,) == ('sim_robot',)
+    assert 'controller' not in node._rows
+    node.destroy_node()
+
+
+# -- files ----------------------------------------------------------------------------------------
+
+
+def test_a_bridge_that_has_ended_has_no_pipe(start, harness):
+    node = start('radio_bridge')
+    harness.remove(node)
+    for number in (node._wake_read, node._wake_write):
+        with pytest.raises(OSError, match='Bad file descriptor'):
+            os.fstat(number)
+
+
+def test_a_player_that_cannot_start_has_no_bag_open(ros, tmp_path):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    with Writer(tmp_path / 'a', version=9, storage_plugin=StoragePlugin.SQLITE3) as made:
+        connection = made.add_connection('/a', 'std_msgs/msg/Float64', typestore=STORE)
+        made.write(connection, START, b'\0\1\0\0' + bytes(8))
+    values = {'storage.uris': [str(tmp_path / 'a')], 'play.start_offset': 9.0}
+    overrides = [Parameter(name, value=value) for name, value in values.items()]
+    with no_file_left_open(tmp_path), suppress(ParameterError):
+        PlayerNode(parameter_overrides=overrides).destroy_node()
+
+
+def test_a_recorder_knows_when_a_fingerprint_is_new(start):
+    node = start('recorder')
+    assert isinstance(node, RecorderNode)
+    new = [node._metadata.add_seed('/a', text) for text in ('1', '1', '2', '2', '1')]
+    assert new == [True, False, True, False, True]
