@@ -226,7 +226,12 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     by zero gives inf or NaN as in IEEE 754 instead of an exception; arguments are validated
     before the kernel is called. Constants that may change are passed as arguments, because the
     cache does not detect a changed global.
+
+    With ``NUMBA_DISABLE_JIT=1`` it is ``function`` itself, for debuggers and for the measurement of
+    coverage: a hundred times slower, and a plain number divided by zero is an error there.
     """
+    if config.DISABLE_JIT:
+        return function
     compiled = _Kernel(function)
     compiled.enable_caching()
     return cast('Callable[P, R]', compiled)
@@ -254,6 +259,8 @@ class TypedKernel(Generic[P, R]):
         return _typed_kernel, (self._function.__module__, self._function.__name__)
 
     def _compile(self, arguments: Sequence[object]) -> Callable[P, R]:
+        if config.DISABLE_JIT:
+            return self._function
         compiled = cast('_Kernel', self._function)
         # The first call may have an integer where later ones have a float.
         hints = compiled.py_func.__annotations__.values()
