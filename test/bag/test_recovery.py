@@ -31,6 +31,7 @@ from t3mpc_ros.bag.recovery.recover_file import UnreadableError, recover_file
 from t3mpc_ros.bag.schema import MessageDefinitions
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.cli.bag import main as bag_main
+from t3mpc_ros.cli.bag import size_text
 
 START = 1_700_000_000_000_000_000
 TEXT, NUMBER = 'std_msgs/msg/String', 'std_msgs/msg/Float64'
@@ -525,6 +526,17 @@ def test_recover_command_reports_messages_and_exit_code(tmp_path, capsys):
     assert bag_main(['recover', str(tmp_path / 'nothing')]) == 1
     with pytest.raises(SystemExit, match='2'):
         bag_main(['recover'])
+
+
+@pytest.mark.parametrize(
+    ('size', 'text'),
+    [
+        (0, '0 B'), (999, '999 B'), (1000, '1 kB'), (12_345, '12.3 kB'), (999_499, '999 kB'),
+        (999_501, '1 MB'), (2.5e9, '2.5 GB'), (3.21e12, '3210 GB'),
+    ],
+)  # fmt: skip
+def test_sizes_are_in_a_suitable_unit(size, text):
+    assert size_text(int(size)) == text
 
 
 def test_sqlite_bag_is_rejected_with_advice(tmp_path, capsys):

@@ -160,25 +160,6 @@ def test_key_file_of_zeros_is_rejected(tmp_path, capsys):
     assert 'zeros' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    'arguments',
-    [
-        ['jog', 'left', '0', '--port', 'x'],
-        ['jog', 'middle', '1', '--port', 'x'],
-        ['jog', 'left', '1', '--speed', '11', '--port', 'x'],
-        ['ping', '--count', '0', '--port', 'x'],
-        ['ping'],
-        ['key'],
-        [],
-    ],
-)
-def test_wrong_arguments_are_usage_errors(arguments, capsys):
-    with pytest.raises(SystemExit) as ended:
-        cli.main(arguments)
-    assert ended.value.code == 2
-    capsys.readouterr()
-
-
 def test_calibrating_needs_a_person_at_a_terminal(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     with open(os.devnull) as empty:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``bag animate``: frames, range rays and refusals."""
 
+from dataclasses import replace
 import math
 from pathlib import Path
 
@@ -9,8 +10,15 @@ import numpy as np
 from PIL import Image
 import pytest
 
+from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main
-from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions, RangeReadings
+from t3mpc_ros.evaluation.bag_report import animation
+from t3mpc_ros.evaluation.bag_report.animation import (
+    AnimationOptions,
+    RangeReadings,
+    animate_bag,
+)
+from t3mpc_ros.evaluation.bag_report.run_data import load_run
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'
 
@@ -33,6 +41,45 @@ def test_an_animation_has_its_frames_rate_and_size(tmp_path, capsys):
     assert changed[:, 170:].any()  # the speeds
     assert changed.mean() < 0.2
     assert tuple(first[0, 0]) == (255, 255, 255)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('measured', ['odom', 'ground_truth/odom'])
+def test_the_panels_show_the_quantities_of_their_titles(measured, tmp_path, monkeypatch):
+    with open_bag(GOLDEN) as recording:
+        run = load_run(recording)
+    motions = {**run.motions, measured: run.motions['odom']}
+    if measured != 'odom':
+        del motions['odom']
+    receipts = {**run.receipts, measured: run.receipts['odom']}
+    run = replace(run, motions=motions, receipts=receipts)
+    monkeypatch.setattr(animation, 'load_run', lambda *_: run)
+    figures = []
+
+    class Kept(animation.Figure):
+        def __init__(self, *arguments, **named):
+            super().__init__(*arguments, **named)
+            figures.append(self)
+
+    monkeypatch.setattr(animation, 'Figure', Kept)
+    options = AnimationOptions(start=4.0, duration=2.0, rate=2.0, width=300)
+    animate_bag(GOLDEN, tmp_path / 'x.gif', options)
+    floor, *panels = figures[-1].axes
+    source = 'ground truth' if 'truth' in measured else 'odometry'
+    assert floor.get_legend().get_texts()[0].get_text() == f'robot ({source})'
+    motion, reference = motions[measured], motions['reference']
+    shown = {(axis.get_title(loc='left') or axis.get_title()): axis.lines for axis in panels}
+    errors = shown.pop('errors / (rad/s)')
+    assert [*shown] == ['right wheel / (rad/s)', 'left wheel / (rad/s)']
+    for error, (title, lines) in zip(errors[:2], shown.items(), strict=True):
+        wheel = title.split()[0]
+        for line, series in zip(lines[:2], (motion, reference), strict=True):
+            time, values = line.get_data()
+            assert values == pytest.approx(np.interp(time, series.time, series[wheel]))
+            assert len(time) > 50
+        time, values = error.get_data()
+        wanted = np.interp(time, reference.time, reference[wheel])
+        assert values == pytest.approx(np.interp(time, motion.time, motion[wheel]) - wanted)
 
 
 def test_rays_start_at_the_sensors_and_end_at_the_readings():

@@ -419,7 +419,7 @@ OUTCOME = Outcome(
 )  # fmt: skip
 
 
-def test_a_verdict_on_faults_is_that_of_the_worst_error(caught):
+def test_errors_of_faults_are_named_and_judged_by_the_worst(caught):
     other = replace(OUTCOME, name='brown_out', before=0.3, during=0.9, after=None)
     page = fault_page.page([OUTCOME, other])
     (axis,) = caught[0].axes
@@ -540,3 +540,27 @@ def test_yaw_errors_at_the_end_are_root_mean_squares_in_degrees():
     assert sorted(y) == pytest.approx(np.degrees([0.03, 0.05]))
     assert np.argmax(x) == np.argmax(y)
     assert (panel.get_xlabel(), below.get_ylabel()) == ('rms error / deg', 'with gyro / deg')
+
+
+def test_the_distance_sensor_is_in_centimetres():
+    true = np.array([0.1, 0.3, 0.5, 0.02, 0.95])
+    readings = np.column_stack([true, [0.11, 0.32, 0.53, -math.inf, math.inf]])
+    evidence = SimpleNamespace(
+        sharp=np.array([[0.1, 2.3], [0.8, 0.4]]),
+        readings=readings,
+        parameters=SimpleNamespace(range_sensor=SimpleNamespace(minimum=0.1, maximum=0.8)),
+    )
+    voltage, distance = validation_page.sharp(evidence).axes
+    assert lines(voltage)['twin'] == pytest.approx(np.array([[10.0, 80.0], [2.3, 0.4]]))
+    x, y = lines(distance)['read']
+    assert x[:3] == pytest.approx([10.0, 30.0, 50.0])
+    assert y[:3] == pytest.approx([11.0, 32.0, 53.0])
+    assert np.isnan(y[3:]).all()
+    near, far = (line for line in distance.lines if line.get_marker() == '|')
+    assert (near.get_xdata(), far.get_xdata()) == (pytest.approx([2.0]), pytest.approx([95.0]))
+    assert {each.get_text(): each.get_position()[1] for each in distance.texts} == {
+        'too near': near.get_ydata()[0],
+        'nothing there': far.get_ydata()[0],
+    }
+    assert texts(voltage) == ('voltage', 'distance / cm', 'V')
+    assert texts(distance)[1:] == ('true distance / cm', 'read / cm')

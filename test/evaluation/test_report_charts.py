@@ -5,11 +5,13 @@
 from dataclasses import asdict, replace
 import math
 from pathlib import Path
+import re
 
 import numpy as np
 import pytest
 
 from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.evaluation.bag_report import report_page
 from t3mpc_ros.evaluation.bag_report.link_history import LinkHistory, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     ChannelMetrics,
@@ -34,6 +36,7 @@ from t3mpc_ros.evaluation.bag_report.verdict import Stop, Verdict, judge
 from t3mpc_ros.evaluation.charts import Plane
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 
+GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'
 WHEELS = 'right', 'left'
 TIME = 0.01 * np.arange(2000)
 MOTIONS = 'linear', 'angular', 'right', 'left', 'x', 'y', 'yaw'
@@ -342,6 +345,18 @@ def test_tables_of_response_and_link_in_full():
     assert [row[1] for row in link_table(GIVEN.links).rows] == [
         '1000', '13', '98.7 %', '6.50 ms', '12.0 ms', '0.400 s', '2', '3', '4', '5', '6',
     ]  # fmt: skip
+
+
+def test_regularity_of_a_topic_in_its_units(monkeypatch, tmp_path):
+    timing = {ODOMETRY: Timing(70, 0.02, 0.003, 0.04)}
+    run = replace(RUN, topics={ODOMETRY: '/odom'}, timing=timing)
+    monkeypatch.setattr(report_page, 'load_run', lambda *_: run)
+    page = report_page.write_report(GOLDEN, tmp_path).report.read_text(encoding='utf-8')
+    (row,) = re.findall(r'<td[^>]*>/odom</td>((?:\s*<td[^>]*>[^<]*</td>){4})\s*</tr>', page)
+    assert re.findall(r'>([^<]+)</td>', row) == ['70', '50.0', '3.00', '4.00']
+    heads = re.findall(r'<th[^>]*>([^<]+)</th>', page)
+    at = heads.index('rate / Hz')
+    assert heads[at - 1 : at + 3] == ['messages', 'rate / Hz', 'jitter / ms', 'missing / %']
 
 
 # -- verdicts -------------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from t3mpc_ros.radio.tool import (
 )
 from t3mpc_ros.radio.tool.channel_scan import ChannelResult
 from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, Procedure, ProcedureError
+from t3mpc_ros.radio.tool.robot_log import LogEntry, LogKind, format_log
 from t3mpc_ros.radio.tool.robot_records import POWERS, RATES, SENSORS, RobotSettings
 
 KEY, OTHER = bytes(range(16)), bytes(range(1, 17))
@@ -396,6 +397,27 @@ def test_unplugging_the_dongle_ends_the_scan():
         bench.at_dongle(
             channel_scan.scan_channels(LinkParameters(), ('1M',), lambda *report: None)
         )
+
+
+def test_each_entry_of_the_log_in_words():
+    entries = {
+        (LogKind.BOOT, 0b10101): 'boot: power on, brown-out, JTAG',
+        (LogKind.BOOT, 0b01010): 'boot: reset button or opened port, watchdog',
+        (LogKind.BOOT, 0): 'boot: started by a boot loader',
+        (LogKind.ESTOP, 0): 'emergency stop',
+        (LogKind.EXPIRED, 0): 'stopped by itself: no command in time',
+        (LogKind.IMU, 0): 'the inertial sensor does not answer',
+        (LogKind.RADIO, 0): 'the radio chip does not answer',
+        (LogKind.BATTERY, 8970): 'battery below its cut-off: 9.0 V',
+        (LogKind.RECORDS, 3): robot_settings.SETTINGS_TEXTS[3],
+        (LogKind.RECORDS, 99): 'records in state 99',
+        (LogKind.LOOP, 12345): 'longest pass of the main loop: 12.3 ms',
+        (99, 7): 'unknown entry 99: 7',
+    }
+    assert {kind for kind, _ in entries} >= {*LogKind}
+    shown = format_log(tuple(LogEntry(5, kind, 61, value) for kind, value in entries))
+    assert shown.splitlines() == [f'     5       61 s  {text}' for text in entries.values()]
+    assert format_log(()) == 'the log is empty'
 
 
 def test_the_recommended_channel_is_the_best():

@@ -1,0 +1,187 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Published tables: each cell is the number that its head names, in its unit."""
+
+from dataclasses import asdict, fields
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.evaluation.bag_report import report_page
+from t3mpc_ros.evaluation.bag_report.response import MotionSummary, Roughness
+from t3mpc_ros.evaluation.bag_report.run_data import BY_WHEEL
+from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY
+from t3mpc_ros.evaluation.confidence_intervals import interval
+from t3mpc_ros.evaluation.method_comparison.compared_runs import (
+    METRICS,
+    SETTLING,
+    START,
+    twin_numbers,
+)
+from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
+from t3mpc_ros.evaluation.open_loop_estimation import table as estimation_table
+from t3mpc_ros.evaluation.paper.experiment_runs import Experiment, RunNumbers
+from t3mpc_ros.evaluation.paper.results import ResultRow, Results
+from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolResult
+from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES, PatrolMetrics
+from t3mpc_ros.evaluation.patrol.patrol_page import coverage_table, surprise_table
+from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, Skill
+from t3mpc_ros.evaluation.process_replay.comparison import Comparison, FieldComparison, Tolerances
+from t3mpc_ros.evaluation.twin_closed_loop import INITIAL_STANDSTILL
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+
+
+def columns(table):
+    """Return the cells of a table by their heads, a dictionary for each row."""
+    return [dict(zip(table.head, row, strict=True)) for row in table.rows]
+
+
+def test_rows_of_the_paper():
+    runs = [RunNumbers(0.1 * k, 0.03 * k * k, 50.0 + k, 2.0 + k, True) for k in (1, 2, 4)]
+    experiment = Experiment('PI', 'torque', 0.04, 'nominal')
+    (row,) = Results({'PI': (True, False)}, {experiment: runs}, 59.5).rows
+    rmse, settled = [run.rmse for run in runs], [run.settled for run in runs]
+    wanted = {
+        'controller': 'PI', 'baseline': True, 'preview': False, 'drive': 'torque', 'noise': 0.04,
+        'case': 'nominal', 'rmse_mean': np.mean(rmse), 'rmse_ci95': interval(rmse),
+        'settled_mean': np.mean(settled), 'settled_ci95': interval(settled),
+        'chatter_mean': np.mean([51.0, 52.0, 54.0]), 'largest_error': 6.0, 'finite': True,
+        'seeds': 3, 'duration': 59.5,
+    }  # fmt: skip
+    assert wanted.keys() == {each.name for each in fields(ResultRow)}
+    assert asdict(row) == pytest.approx(wanted)
+
+
+def test_numbers_of_a_run_on_the_twin():
+    """Of a drive with a constant error of the wheels, and a body that turns too fast."""
+    time = 0.01 * np.arange(2001)
+    reference = np.tile([4.0, 2.0], (time.size, 1))
+    error = np.where(time < 10.0, 0.1, 0.3)[:, None]
+    ramp = np.cumsum(np.full((time.size, 2), 0.02), axis=0)
+    requested = np.where((np.arange(time.size) % 2)[:, None], 0.01, 0.0) + ramp
+    stopped = (time >= 12.0) & (time < 14.0)
+    record = SimpleNamespace(
+        time=time, reference=reference, rotors=reference + error, requested=requested,
+        ground=reference + (0.2, 0.1),
+        robot_reasons=['stop' if each else '' for each in stopped],
+        controller_reasons=[''] * time.size,
+    )  # fmt: skip
+    modes = (time >= 7.0).astype(int)
+    scenario = SimpleNamespace(
+        reference=lambda: SimpleNamespace(time=time, modes=modes), fault_span=(9.0, 12.0)
+    )
+    found = twin_numbers(scenario, record)
+    geometry = WheelGeometry()
+    rate = 0.1 * geometry.wheel_radius / geometry.wheel_separation
+    assert found['yaw_rate'] == found['yaw_rate_settled'] == pytest.approx(rate)
+    counted = time >= INITIAL_STANDSTILL + START
+    before, after = SETTLING
+    settled = counted & ((time < 7.0 - before) | (time >= 7.0 + after))
+    for name, rows in (('overall', counted), ('settled', settled)):
+        assert found[name] == pytest.approx(np.sqrt(np.mean(error[rows] ** 2)), rel=1e-3)
+    assert found['drift'] == pytest.approx(rate * 0.01 * np.count_nonzero(counted), rel=2e-3)
+    assert found['stopped'] == pytest.approx(2.0, abs=0.01)
+    # The acceleration alternates between 3 and 1 rad/s²: it varies by 2 in 0.01 s.
+    assert found['variation'] == pytest.approx(200.0, rel=1e-2)
+    during = math.sqrt((0.1**2 + 2 * 0.3**2) / 3)
+    assert found['before'] == pytest.approx(0.1)
+    assert found['during'] == pytest.approx(during, rel=5e-3)
+    assert found['after'] == pytest.approx(0.3)
+    assert {*found} == {metric.name for metric in METRICS}
+
+
+def patrol(k):
+    skills = tuple(
+        Skill(h, 0.1 * k + 0.01 * j, 'linear', {}, 3.0 * k + j) for j, h in enumerate(HORIZONS)
+    )
+    times = {share: 100.0 * k + j for j, share in enumerate(SHARES)}
+    metrics = PatrolMetrics(
+        900.0, 200.0 * k, 0.2 * k, times, 0.3 * k, 0.01 * k, 0.4 * k, 0.15 * k, skills,
+        path_error=0.002 * k,
+    )  # fmt: skip
+    return PatrolResult(metrics, np.zeros(5), k - 1, 0.05 * k, None)
+
+
+def test_tables_of_patrols():
+    results = {OURS: [patrol(1)], 'random walk': [patrol(2)]}
+    heads = ('coverage, %', 'evenness', 'path error, mm', 'avoiding, %', 'patrols with contacts')
+    rows = columns(coverage_table(PatrolPlan(robot='twin'), results))
+    for k, row in enumerate(rows, 1):
+        cells = [float(row[head]) for head in heads]
+        assert cells == pytest.approx([20.0 * k, 0.3 * k, 2.0 * k, 5.0 * k, k - 1])
+        times = [float(row[f'{100.0 * share:g} %, s']) for share in SHARES]
+        assert times == pytest.approx([100.0 * k + j for j in range(len(SHARES))])
+    for k, row in enumerate(columns(surprise_table(results)), 1):
+        skills = [float(row[f'skill at {horizon:g} s']) for horizon in HORIZONS]
+        assert skills == pytest.approx([0.1 * k + 0.01 * j for j in range(len(HORIZONS))])
+        judged = [*HORIZONS].index(5.0)
+        assert float(row['error at 5 s, m']) == pytest.approx(3.0 * k + judged)
+        heads = ('permutation entropy', 'spectral entropy', 'exponent, 1/s')
+        assert [float(row[head]) for head in heads] == pytest.approx([0.4 * k, 0.15 * k, 0.01 * k])
+        assert row['best predictor at 5 s'] == 'linear'
+
+
+def test_the_table_of_a_replay_in_full():
+    rows = (
+        FieldComparison('linear', 90, 0.5, 0.25, 4, 2.5, 25),
+        FieldComparison('angular', 80, 1e-12, 1e-10, 0, math.nan, -1),
+    )
+    outcome = Comparison(
+        rows, Tolerances(0.01, 0.1), np.arange(3.0), {}, {}, np.array([True, True, False]),
+        ('a remark',), ('law.gain is 2, recorded 1',),
+    )  # fmt: skip
+    assert outcome.table() == (
+        'note: a remark\n'
+        'setting: law.gain is 2, recorded 1\n'
+        '2 of 3 events compared\n'
+        'field          n    max abs    max rel   differ    first at\n'
+        'linear        90   5.00e-01   2.50e-01        4      2.500 s\n'
+        'angular       80   1.00e-12   1.00e-10        0           -\n'
+        'differs: linear first, at 2.500 s (event 25)'
+    )
+
+
+def test_tables_of_the_estimators():
+    results = [
+        EstimationResult(kind, noise, (s, s + 0.1), (10 * s, 10 * s + 2))
+        for kind, s in (('type3', 0.2), ('type1', 0.5))
+        for noise, s in ((0.01, s), (0.04, 2 * s))
+    ]
+    half, wide = interval([0.0, 0.1]), interval([0.0, 2.0])
+    text = estimation_table(results)
+    assert f'| type3 | 0.2500 ± {half:.4f} | 0.4500 ± {half:.4f} | +80 % |' in text
+    assert f'| type1 | 0.5500 ± {half:.4f} | 1.0500 ± {half:.4f} | +91 % |' in text
+    assert '| the measurement itself | 0.1000 | 0.2000 |' in text
+    assert '| type1 | +0.3000 ± 0.0000 | +0.6000 ± 0.0000 |' in text
+    assert f'| type3 | 3.0000 ± {wide:.4f} | 5.0000 ± {wide:.4f} | +67 % |' in text
+    assert '(rad/s²)' in text
+
+
+def test_tables_of_motion(monkeypatch):
+    run = SimpleNamespace(
+        channels=BY_WHEEL, motions={COMMAND: 'command', ODOMETRY: 'motion'}, measured=ODOMETRY
+    )
+    summary = MotionSummary(12.0, 34.0, 0.56, 24.0, ((1.0, 2.5), (7.0, 7.5)), 0.75)
+    monkeypatch.setattr(report_page, 'motion_summary', lambda _: summary)
+    assert dict(report_page.motion_table(run).rows) == {
+        'path length, forwards and backwards': '12.0 m',
+        'turning, both ways': '34.0 rad',
+        'speed while moving, mean and largest': '0.500 and 0.560 m/s',
+        'time moving': '24.0 s',
+        'stops': '2, 2.0 s in all, the longest 1.5 s',
+        'standstill at': '1.0 to 2.5, 7.0 to 7.5 s',
+        'of that, motion was commanded': '0.8 s',
+    }
+    rough = {('command', 'right'): 1, ('motion', 'right'): 5}
+    monkeypatch.setattr(
+        report_page,
+        'roughness',
+        lambda series, name, held: Roughness(
+            *(rough.get((series, name), 8.0) + 0.1 * k for k in range(4))
+        ),
+    )
+    rows = report_page.roughness_table(run).rows
+    assert rows[0] == ['command', 'right wheel', '1.00', '1.10', '1.20', '1.30', 'rad/s², rad/s³']
+    assert rows[2][:6] == ['robot', 'right wheel', '5.00', '5.10', '5.20', '5.30']
