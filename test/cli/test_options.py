@@ -111,7 +111,7 @@ def test_the_defaults_are_those_of_the_code(command):
         assert commands()[command].get_default(name) == value, name
 
 
-def test_the_help_without_an_environment_is_that_of_the_parser():
+def test_the_help_without_environment_is_that_of_the_parser():
     """``scripts/demo --help`` is a text of its own."""
     text = subprocess.run(
         [ROOT / 'scripts' / 'demo', '--help'], capture_output=True, text=True, check=True

@@ -2,14 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """``t3mpc paper``: the plan, the campaign that can be stopped, statistics, claims and the page."""
 
-import argparse
 import csv
 from dataclasses import dataclass, field, fields, replace
 from html import unescape
 from html.parser import HTMLParser
 import json
 import math
-from pathlib import Path
 import re
 
 import matplotlib.image
@@ -18,7 +16,6 @@ import pytest
 from scipy import stats
 from support.unrendered import unrendered  # noqa: F401 - a fixture
 
-from t3mpc_ros.cli.paper import add_parser
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.methods import FULL, ComparedMethod
 from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
@@ -876,15 +873,3 @@ def test_nothing_depends_on_the_order_of_the_runs_or_on_a_resume(folder, tmp_pat
     assert len(runner.done) < len(lines)
     for name in ('results.json', 'results.csv', 'tables.md'):
         assert (tmp_path / name).read_text() == (folder / name).read_text(), name
-
-
-def test_the_command_line_reads_its_options():
-    parser = argparse.ArgumentParser()
-    add_parser(parser.add_subparsers())
-    words = ['paper', '--quick', '--seeds', '4', '--workers', '2', '--output', 'x', '--fresh']
-    options = parser.parse_args(words)
-    assert (options.quick, options.seeds, options.workers, options.fresh) == (True, 4, 2, True)
-    assert options.output == Path('x')
-    assert callable(options.run)
-    with pytest.raises(SystemExit):
-        parser.parse_args(['paper', '--seeds', '0'])

@@ -965,12 +965,3 @@ def test_the_tables_of_the_pages_have_the_names_of_the_methods():
             if re.search(r'MPC|DMC|FLS|ADRC|sliding|torque|feed-forward', name)
         }
         assert not similar, page
-
-
-@pytest.mark.parametrize(
-    'line', [['--evaluations', '0'], ['--workers', '-1'], ['--evaluations', 'many']]
-)
-def test_wrong_command_lines_are_refused(line, capsys):
-    with pytest.raises(SystemExit):
-        parser().parse_args(['tune', *line])
-    assert line[1] in capsys.readouterr().err
