@@ -289,6 +289,7 @@ def test_messages_older_than_the_chunk_duration_are_in_the_file(tmp_path):
         due = len([i for i in range(0, 10, 2) if i * SECOND // 20 <= now - SECOND // 2])
         assert there >= due, f'at {now / SECOND:.2f} s'
     assert there == 5
+    bag.close()
 
 
 def test_disk_sync_at_most_once_per_second_and_only_for_new_data(tmp_path, monkeypatch):
@@ -301,6 +302,7 @@ def test_disk_sync_at_most_once_per_second_and_only_for_new_data(tmp_path, monke
             bag.write(*message('/n', step / 20))
         bag.tick(now)
     assert 3 <= len(synced) <= 4
+    bag.close()
 
 
 @pytest.mark.parametrize('options', [{'max_file_bytes': 20_000}, {'max_file_ns': SECOND}])
@@ -430,6 +432,7 @@ def test_finalizing_keeps_attachments_except_a_truncated_one(tmp_path):
         bag.flush()
         sizes.append(bag.size)
     whole = bag.path.read_bytes()
+    bag.close()
     torn = tmp_path / 'torn.mcap'
     for size, messages, files in ((sizes[2], 3, 3), (sizes[1], 2, 2), (sizes[1] + 300, 2, 2)):
         torn.write_bytes(whole[:size])

@@ -281,7 +281,8 @@ def test_a_killed_recorder_leaves_a_folder_that_can_be_read(folder):
     killed = BagWriter(folder, metadata_records={})
     fill(killed, 20, START + 10**10)
     killed.flush()
-    assert read_with_rosbags(folder) == one  # and the second never gets closed
+    killed._output.abandon()
+    assert read_with_rosbags(folder) == one  # and the second is never completed
 
 
 def test_a_bag_without_messages_is_readable(folder):
@@ -468,6 +469,7 @@ def test_zeros_after_a_power_failure_are_removed(folder):
     bag = BagWriter(folder, metadata_records={})
     written = fill(bag, 10)
     bag.flush()
+    bag._output.abandon()
     with bag.path.open('ab') as file:
         file.write(bytes(5000))
     assert finalize_file(bag.path) == len(written)

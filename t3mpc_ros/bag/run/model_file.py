@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import t3mpc_ros
-from t3mpc_ros.bag.metadata import sync_folder
 
 FORMAT = 1
 """Version of the format; incremented if the meaning of an array changes."""
@@ -68,7 +67,6 @@ def save_model(
             target.flush()
             os.fsync(target.fileno())
         temporary.replace(path)
-        sync_folder(path.parent)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise ModelError(f'cannot write the model file {path}: {error.strerror}') from error
