@@ -4,9 +4,12 @@
 
 import math
 
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.stats import kstest
+from support.properties import PROPERTY
 
 from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.parameters.table import ParameterError
@@ -49,15 +52,30 @@ def test_one_mode_never_switches(kind):
     assert schedule.at(1e7) == (0, 0, 1.0, 0.0, 0, 0.0, math.inf)
 
 
-@pytest.mark.parametrize('parameters', [SwitchingParameters(blend=1.0), RANDOM])
-def test_the_mode_does_not_depend_on_earlier_queries(parameters):
-    times = np.random.default_rng(1).uniform(0.0, 300.0, 200)
-    asked = SwitchingSchedule(parameters, seed=5)
+TIMES = st.floats(0.0, 300.0) | st.integers(0, 25).map(lambda n: 12.0 * n)
+
+
+@PROPERTY
+@given(
+    st.sampled_from((SwitchingParameters(blend=1.0), RANDOM)),
+    st.integers(0, 2**128),
+    st.lists(TIMES, min_size=5),
+)
+def test_the_mode_does_not_depend_on_earlier_queries(parameters, seed, times):
+    """Neither do the switch times, at which the new mode is active."""
+    asked = SwitchingSchedule(parameters, seed)
     for time in times:
-        assert asked.at(time) == SwitchingSchedule(parameters, seed=5).at(time)
-    assert asked.switches_until(300.0) == SwitchingSchedule(parameters, seed=5).switches_until(
-        300.0
-    )
+        mode = asked.at(time)
+        assert mode == SwitchingSchedule(parameters, seed).at(time)
+        assert mode.since <= time < mode.until
+        assert mode.switches == len(asked.switches_until(time))
+        if mode.switches:
+            before = asked.at(np.nextafter(mode.since, 0.0))
+            assert (before.until, before.mode, before.switches) == (
+                mode.since,
+                mode.previous,
+                mode.switches - 1,
+            )
 
 
 def test_random_dwells_are_uniform_between_their_bounds():
@@ -76,15 +94,6 @@ def test_random_modes_are_uniform_among_the_other_modes():
     shares = np.bincount(changes, minlength=4) / changes.size
     assert shares[0] == 0.0
     np.testing.assert_allclose(shares[1:], 1.0 / 3.0, atol=0.03)
-
-
-def test_switch_times_agree_with_the_modes():
-    schedule = SwitchingSchedule(RANDOM, seed=4)
-    for number, time in enumerate(schedule.switches_until(200.0), start=1):
-        before, after = schedule.at(np.nextafter(time, 0.0)), schedule.at(time)
-        assert (before.switches, after.switches) == (number - 1, number)
-        assert before.until == after.since == time
-        assert after.previous == before.mode != after.mode
 
 
 def test_a_sudden_switch_has_no_transition():

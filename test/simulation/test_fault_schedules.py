@@ -8,9 +8,12 @@ from pathlib import Path
 import re
 import runpy
 
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 import setuptools
+from support.properties import PROPERTY
 
 from t3mpc_ros.simulation.fault_injection import (
     FAULTS,
@@ -28,6 +31,7 @@ from t3mpc_ros.simulation.world import WORLDS_FOLDER
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / 'docs' / 'faults.md').read_text()
 NO_FAULT = FaultParameters()
+TABLES = NO_FAULT, FaultParameters(command_delay=0.7, gyro_dead=True)
 SPECS = {spec.name: spec for spec in FaultParameters.specs()}
 NAMES = list(FAULTS)
 
@@ -160,31 +164,26 @@ def naive(events: list[FaultEvent], elapsed: float, dynamic: FaultParameters) ->
     return replace(dynamic, **values)
 
 
-def random_events(generator: np.random.Generator) -> list[FaultEvent]:
-    """Return events on a grid of 1/4 s, so that many start and end at the same time."""
-    events = []
-    for _ in range(generator.integers(0, 25)):
-        name = str(generator.choice(NAMES[:4] if generator.random() < 0.7 else NAMES))
-        lasts = generator.integers(1, 20) / 4 if generator.random() < 0.8 else math.inf
-        events.append(
-            FaultEvent(generator.integers(0, 40) / 4, name, some_value(name, generator), lasts)
-        )
-    return events
+def event_of(name):
+    """Draw an event on a grid of 1/4 s, so that many start and end at the same time."""
+    quarter = st.integers(1, 20).map(lambda count: count / 4)
+    value = st.integers(0, 2**32).map(lambda n: some_value(name, np.random.default_rng(n)))
+    return st.builds(FaultEvent, quarter, st.just(name), value, quarter | st.just(math.inf))
 
 
-def test_random_schedules_match_a_naive_evaluation():
-    generator = np.random.default_rng(1)
-    differ = 0
-    for _ in range(40):
-        events = random_events(generator)
-        schedule = FaultSchedule(events)
-        tables = [NO_FAULT, FaultParameters(command_delay=0.7, gyro_dead=True)]
-        for elapsed in generator.permutation(np.arange(-4, 120) / 8)[:40].tolist():
-            dynamic = tables[generator.integers(2)]
-            expected = naive(events, elapsed, dynamic)
-            assert schedule.at(elapsed, dynamic) == expected
-            differ += expected != dynamic
-    assert differ > 300
+@PROPERTY
+@given(
+    st.lists(
+        st.sampled_from(NAMES[:4]).flatmap(event_of) | st.sampled_from(NAMES).flatmap(event_of)
+    ),
+    st.lists(
+        st.tuples(st.integers(-4, 90).map(lambda n: n / 8), st.sampled_from(TABLES)), min_size=9
+    ),
+)
+def test_a_schedule_is_the_naive_evaluation_in_any_order(events, questions):
+    schedule = FaultSchedule(events)
+    for elapsed, dynamic in questions:
+        assert schedule.at(elapsed, dynamic) == naive(events, elapsed, dynamic)
 
 
 def test_rounding_does_not_change_event_duration():

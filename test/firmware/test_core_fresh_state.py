@@ -1,0 +1,302 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Firmware core: what a boot, a new session, settings or a release leave of what was before.
+
+The memory of a used board is compared with that of a new one, field by field: what a test of
+frames does not ask for is compared as well.
+"""
+
+from collections.abc import Iterator
+import ctypes
+import os
+import random
+import re
+import shutil
+import struct
+import subprocess
+
+import pytest
+from support.firmware_core import CLEAR, ENABLE, ESTOP, FIRMWARE, KEY, Dongle, Robot
+
+from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD
+from t3mpc_ros.radio.tool.robot_records import RobotSettings, encode_settings
+
+HEADERS = '\n'.join(path.read_text() for path in sorted((FIRMWARE / 'core').glob('*.h')))
+STRUCTS = dict(re.findall(r'^struct (t3_\w+) \{\n(.*?)^\};', HEADERS, re.DOTALL | re.MULTILINE))
+POINTERS = ('robot.port', 'console.port', 'console.robot', 'dongle.port')
+
+
+def members(kind: str, prefix: str) -> Iterator[str]:
+    """Yield the members of a structure of the core, those of structures in it included."""
+    text = re.sub(r'//.*', '', STRUCTS[kind])
+    for declaration in re.sub(r'enum \{[^}]*\}', 'enum', text).split(';'):
+        words = re.findall(r'\w+', re.sub(r'\[[^\]]*\]', '', declaration).replace('const', ''))
+        structure = words[:1] == ['struct']
+        typed = structure or (words[:1] == ['enum'] and len(words) > 2)
+        for name in words[1 + typed :]:
+            if structure and words[1] in STRUCTS and not {*'*['} & {*declaration}:
+                yield from members(words[1], f'{prefix}.{name}')
+            else:
+                yield f'{prefix}.{name}'
+
+
+@pytest.fixture(scope='module')
+def layout(library, tmp_path_factory):
+    """Return offset and size of each member of what ctypes holds: by robot and by dongle."""
+    folder = tmp_path_factory.mktemp('layout')
+    found = {}
+    compiler = next(filter(None, map(shutil.which, (os.environ.get('CC', 'cc'), 'gcc', 'clang'))))
+    for board, parts in (('robot', ('robot', 'console')), ('dongle', ('dongle',))):
+        paths = [path for part in parts for path in members(f't3_{part}', part)]
+        host = f't3_host_{board}'
+        rows = ''.join(
+            f'{{offsetof(struct {host}, {p}), sizeof(((struct {host} *)0)->{p})}},' for p in paths
+        )
+        source = folder / f'{board}.c'
+        source.write_text(
+            f'#include <stddef.h>\n#include "{FIRMWARE}/host/t3_host_{board}.c"\n'
+            f'const size_t layout[][2] = {{{rows}}};\n'
+        )
+        command = [compiler, '-shared', '-fPIC', f'-I{FIRMWARE}/core', f'-I{FIRMWARE}/host']
+        subprocess.run([*command, '-o', source.with_suffix('.so'), source], check=True)
+        made = ctypes.CDLL(str(source.with_suffix('.so')), mode=os.RTLD_LAZY)
+        table = (ctypes.c_size_t * 2 * len(paths)).in_dll(made, 'layout')
+        found[board] = {path: tuple(row) for path, row in zip(paths, table, strict=True)}
+    assert len(found['robot']) > 90
+    assert len(found['dongle']) > 20
+    return found
+
+
+def memory(part, layout):
+    """Return the bytes of each member, without the pointers."""
+    return {
+        path: ctypes.string_at(part._object.value + offset, size)
+        for path, (offset, size) in layout[part.kind].items()
+        if path not in POINTERS
+    }
+
+
+def unlike(one, other, layout, kept=()):
+    """Return the members that differ, but for those that begin with a name that is kept."""
+    first, second = memory(one, layout), memory(other, layout)
+    return [p for p in first if first[p] != second[p] and not p.startswith(kept)]
+
+
+def like(robot, library, key=b''):
+    """Return a board with the memory cells and the hardware of another one, not booted again."""
+    made = Robot(library, key)
+    for address in range(1024):
+        made.call(
+            'poke_eeprom', ctypes.c_uint16(address), robot.call('cell', ctypes.c_uint16(address))
+        )
+    return made
+
+
+def use(robot, r):
+    """Do everything that a host, a hand and time can do, in any order; return the replies."""
+    replies = []
+    for _ in range(40):
+        act = r.randrange(16)
+        if act == 0:
+            replies.append(robot.hello(nonce=r.randbytes(8)))
+        elif act == 1:
+            replies.append(robot.act(r.randrange(4), r.randrange(4)))
+        elif act == 2:
+            replies.append(
+                robot.request(
+                    robot.sign(
+                        struct.pack('<BBBBi', 0x23, 0x5A, 9, r.randrange(12), r.randrange(40_000))
+                    )
+                )
+            )
+        elif act == 3:
+            robot.send(robot.command(0, 0, flags=r.choice((ESTOP, CLEAR, 0, ENABLE))))
+        elif act == 4:
+            robot.call('press', ctypes.c_bool(r.random() < 0.3))
+            robot.run(r.choice((2000, 7000, 60_000)))
+        elif act == 5:
+            robot.call(
+                'set_adc', ctypes.c_uint8(r.randrange(9)), ctypes.c_uint16(r.randrange(1024))
+            )
+        elif act == 6:
+            robot.send(r.randbytes(r.randrange(1, 33)))
+        elif act == 7:
+            replies.append(
+                robot.console(r.choice((b'\x03\x01ping', b'\x06\x09\0\0', b'\x05\x09')))
+            )
+        elif act == 8:
+            robot.send(robot.command(3000, 1000, host_us=robot.host_us + (1 << 31)))
+        elif act == 9:
+            robot.call('set_imu', ctypes.c_bool(r.random() < 0.5), (ctypes.c_int16 * 7)(*range(7)))
+        else:
+            robot.send(robot.command(r.randrange(-9000, 9000), 5000, ttl=r.choice((0, 5, 20))))
+        robot.run(r.choice((300, 5000, 150_000)))
+        replies.append((robot.reply(), robot.status, robot.speeds, robot.call('levels')))
+    return replies
+
+
+def come_to_rest(robot):
+    """Release what is pressed, measure nothing, and wait until nothing changes any more."""
+    robot.call('press', ctypes.c_bool(False))
+    for channel in range(9):
+        robot.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(0xFFFF))
+    robot.call('set_imu', ctypes.c_bool(True), (ctypes.c_int16 * 7)())
+    robot.run(2_000_000)
+
+
+@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+@pytest.mark.parametrize('seed', range(3))
+def test_a_booted_robot_is_as_new(library, layout, key, seed):
+    used = Robot(library, key)
+    use(used, random.Random(seed))
+    come_to_rest(used)
+    new = like(used, library, key)
+    for each in (used, new):
+        come_to_rest(new)
+        each.run(-each.now % 200)  # to the same phase of the main loop
+        each.call('usb_take', ctypes.create_string_buffer(4096), ctypes.c_uint32(4096))
+        each.call('boot', ctypes.c_uint8(4), ctypes.c_uint32(77))
+        each.seq, each.session_key, each.delay, each.echo_age = 0, b'', 1000, 1000
+    assert not unlike(used, new, layout)
+    assert use(used, random.Random(seed)) == use(new, random.Random(seed))
+
+
+KEPT_IN_A_SESSION = (
+    *('robot.counters', 'robot.refused', 'robot.parameters', 'robot.steps.wheels'),
+    *('robot.longest_us', 'robot.estop', 'robot.action_'),
+    *('robot.rest_us', 'robot.button_us', 'robot.ttl_', 'robot.command_us', 'robot.battery_us'),
+    *('robot.loaded_us', 'robot.period_us', 'robot.tick_us', 'robot.last_frame_us'),
+    *('robot.answer_from_us', 'robot.next_range', 'robot.steps.time_us'),
+    *('robot.session.greetings', 'robot.session.robot_nonce', 'robot.session.session_key'),
+    *('robot.session.last_us', 'console'),
+)
+"""What a host that comes later must see, or is a time. An action is repeated only after one."""
+
+
+@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+@pytest.mark.parametrize('seed', range(3))
+def test_a_new_session_begins_as_the_first_one(library, layout, key, seed):
+    """An action of the session before, of the same number, is no repetition."""
+    used, new = Robot(library, key), Robot(library, key)
+    used.run(1000)
+    used.hello()
+    if key:  # the clock of the host wraps within the session
+        used.send(used.command(3000, 3000, host_us=0xFFFFFFF0))
+        used.send(used.command(3000, 3000, host_us=5, epoch=1))
+    use(used, random.Random(seed))
+    come_to_rest(used)
+    used.hello()
+    used.send(used.command(0, 0, flags=CLEAR))
+    used.act(2, 1)
+    used.drive(30_000, 9000, 200_000)  # scaled down, and then it expires
+    for each in (used, new):
+        come_to_rest(each)
+        each.seq = 0
+        each.hello(session=0x33, nonce=bytes(range(8)))
+    assert memory(used, layout)['robot.action_done'] == memory(new, layout)['robot.action_done']
+    assert not unlike(used, new, layout, KEPT_IN_A_SESSION)
+    used.call('poke_steps', ctypes.c_uint8(0), ctypes.c_int32(500))
+    assert used.act(1, 1, session=0x33)[4:] == new.act(1, 1, session=0x33)[4:]
+    assert used.steps[0] == 0
+
+
+def change_settings(robot, settings):
+    robot.store(SETTINGS_RECORD, encode_settings(settings))
+    robot.run(700_000)
+
+
+@pytest.mark.parametrize(
+    'settings',
+    [
+        RobotSettings(divider=7.5),
+        RobotSettings(invert_left=True),
+        RobotSettings(microsteps=32, steps_per_turn=400),
+        RobotSettings(rate='250k', channel=7, address=b'12345'),
+        RobotSettings(sensors=('GP2Y0A41',) * 8),
+    ],
+    ids=['divider', 'direction', 'steps', 'radio', 'sensors'],
+)
+def test_stored_settings_are_in_effect_as_after_a_boot(library, layout, settings):
+    """The battery of the divider before was filtered into that of the new one."""
+    used, new = Robot(library), Robot(library)
+    for each in (used, new):
+        for channel in range(9):
+            each.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(400))
+        each.run(1_500_000)
+    change_settings(used, settings)
+    change_settings(new, settings)
+    new.call('boot', ctypes.c_uint8(4), ctypes.c_uint32(0))
+    for each in (used, new):
+        each.run(200_000)
+    times = KEPT_IN_A_SESSION[5:] + ('robot.settings.copies', 'robot.reset_cause')
+    assert not unlike(used, new, layout, (*times, 'robot.counters'))
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_booted_dongle_is_as_new(library, layout, seed):
+    used, new = Dongle(library), Dongle(library)
+    r = random.Random(seed)
+    for _ in range(30):
+        frame = bytes([1, r.randrange(256), r.randrange(20), 3]) + r.randbytes(r.choice((3, 6)))
+        used.write(
+            r.choice(
+                (frame, frame, b'\x02\x07' + bytes([9, 1, 2, 3, 4]) + b'abcde', r.randbytes(9))
+            )
+        )
+        used.run(r.choice((100, 30_000)))
+        used.reply(r.randbytes(r.randrange(33)), r.randrange(20), r.random() < 0.7)
+    used.call('bytes', b'\x05half', ctypes.c_uint32(5))
+    used.call('overrun')
+    for each in (used, new):
+        each.call('boot', ctypes.c_uint8(8))
+        each.read()
+    assert not unlike(used, new, layout)
+
+
+def test_a_transaction_of_the_dongle_leaves_nothing_to_the_next(library, layout):
+    used, new = Dongle(library), Dongle(library)
+    used.write(bytes([1, 5, 2, 3]) + b'abcdef')
+    used.reply(b'a payload')
+    used.run(1000)
+    used.reply(b'another')
+    new.run(1000)
+    assert used.frames()
+    for each in (used, new):
+        each.write(bytes([1, 6, 0, 3]) + b'xyz')
+        each.sent()
+        each.reply(b'', acknowledged=True)
+    assert used.read() == new.read()
+    assert not unlike(
+        used, new, layout, ('dongle.splitter', 'dongle.second', 'dongle.gap', 'dongle.answer')
+    )
+
+
+def test_a_released_emergency_stop_leaves_a_robot_at_rest(library, layout):
+    """Released, the robot is as after any command to stand, and the command before is gone."""
+    used, new = Robot(library), Robot(library)
+    for each in (used, new):
+        each.run(1000)
+        each.hello()
+        each.drive(4000, 4000, 300_000)
+    used.send(used.command(4000, 4000, flags=ESTOP))
+    used.run(1_000_000)
+    new.send(new.command(0, 0, flags=0))
+    new.run(1_000_000)
+    for each in (used, new):
+        each.send(each.command(0, 0, flags=CLEAR))
+        each.run(100_000)
+    assert not unlike(used, new, layout, ('robot.steps', 'robot.rest_us', 'console'))
+
+
+def test_the_button_counts_after_its_times(library, layout):
+    """As pressed after 5 ms, as released after 50 ms, and the pass of the main loop."""
+    robot = Robot(library)
+    robot.run(100_000)
+    for pressed, wait_us in ((True, 5_000), (False, 50_000)):
+        robot.call('press', ctypes.c_bool(pressed))
+        passed_us = 0
+        while bool(memory(robot, layout)['robot.pressed'][0]) != pressed:
+            robot.run(200)
+            passed_us += 200
+        assert wait_us <= passed_us <= wait_us + 400
+        robot.run(1000)
