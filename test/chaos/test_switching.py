@@ -55,6 +55,7 @@ def test_one_mode_never_switches(kind):
 TIMES = st.floats(0.0, 300.0) | st.integers(0, 25).map(lambda n: 12.0 * n)
 
 
+@pytest.mark.slow
 @PROPERTY
 @given(
     st.sampled_from((SwitchingParameters(blend=1.0), RANDOM)),

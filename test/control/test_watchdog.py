@@ -4,9 +4,13 @@
 
 import math
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, rule
 import numpy as np
 import pytest
 from support.control_loops import GEOMETRY, PERIOD, ServoLoop
+from support.properties import PROPERTY, STATEFUL
 
 from t3mpc_ros.control.watchdog import (
     EVIDENCE_WEIGHT,
@@ -26,60 +30,88 @@ def _decide(watchdog, stamp_ms, **changes):
     return watchdog.decide(stamp_ms * MS, **facts)
 
 
-def test_every_reason_to_stop_is_detected():
-    watchdog = InputWatchdog(WatchdogParameters())
-    assert _decide(watchdog, 0) is Reason.NO_REFERENCE
-    watchdog.reference_received()
-    assert _decide(watchdog, 10) is Reason.TRACKING
-    assert _decide(watchdog, 20, finite=False) is Reason.ODOMETRY_BAD
-    assert _decide(watchdog, 30, known=False) is Reason.NO_REFERENCE
-    assert _decide(watchdog, 150) is Reason.TRACKING
-    assert _decide(watchdog, 170) is Reason.REFERENCE_STALE
-    watchdog.reference_received()
-    assert _decide(watchdog, 180) is Reason.TRACKING
-    watchdog.enabled = False
-    watchdog.reference_received()
-    assert _decide(watchdog, 190) is Reason.DISABLED
-    watchdog.enabled = True
-    assert _decide(watchdog, 200) is Reason.TRACKING
+class WatchdogMachine(RuleBasedStateMachine):
+    """Any sequence of messages: the reason to stop, and each time-out at its very instant.
 
-
-@pytest.mark.parametrize('fault', [{'speed': 41.0}, {'error': 26.0}])
-def test_a_diverging_state_stops_the_robot_for_the_hold_time(fault):
-    watchdog = InputWatchdog(WatchdogParameters())
-    reasons = []
-    for k in range(100):
-        watchdog.reference_received()
-        reasons.append(_decide(watchdog, 10 * k, **(fault if k == 10 else {})))
-    assert reasons[9] is Reason.TRACKING
-    assert all(reason is Reason.DIVERGING for reason in reasons[10:61])
-    assert all(reason is Reason.TRACKING for reason in reasons[61:])
-
-
-def test_elapsed_is_none_for_first_messages_gaps_and_restarts():
-    watchdog = InputWatchdog(WatchdogParameters())
-    assert watchdog.elapsed(1000 * MS) is None
-    assert watchdog.elapsed(1010 * MS) == pytest.approx(0.01)
-    assert watchdog.elapsed(1300 * MS) is None
-    assert watchdog.elapsed(1310 * MS) == pytest.approx(0.01)
-    assert watchdog.elapsed(500 * MS) is None
-
-
-def test_a_clock_that_starts_again_ends_the_hold():
-    """A simulation was restarted while the state diverged.
-
-    The end of the hold was a stamp of the old clock: after a run of ten minutes the robot would
-    have stood still for the next ten.
+    A simulation was restarted while the state diverged: the end of the hold was a stamp of the
+    old clock, and after a run of ten minutes the robot would have stood still for the next ten.
     """
-    watchdog = InputWatchdog(WatchdogParameters())
-    for stamp_ms in (600_000, 600_010):
-        watchdog.elapsed(stamp_ms * MS)
-    watchdog.reference_received()
-    assert _decide(watchdog, 600_010, speed=41.0) is Reason.DIVERGING
-    assert watchdog.elapsed(0) is None
-    assert _decide(watchdog, 0) is Reason.NO_REFERENCE
-    watchdog.reference_received()
-    assert _decide(watchdog, 10) is Reason.TRACKING
+
+    def __init__(self):
+        super().__init__()
+        self.watchdog = InputWatchdog(WatchdogParameters())
+        self.last = self.reference = self.held_until = None
+        self.now, self.pending, self.enabled = 600_000, False, True
+
+    @rule(on=st.sampled_from((True, True, False)))
+    def enable(self, on):
+        self.watchdog.enabled = self.enabled = on
+
+    @rule()
+    def reset(self):
+        self.watchdog.reset()
+        self.last = self.reference = self.held_until = None
+        self.pending = False
+
+    @rule(
+        referenced=st.booleans(),
+        wait=st.sampled_from((10, 10, 10, 140, 200, 201, 300, -1, -599_000)),
+        speed=st.sampled_from((1.0, 1.0, 1.0, 40.0, 40.1)),
+        error=st.sampled_from((0.1, 0.1, 0.1, 25.0, 25.1)),
+        finite=st.sampled_from((*(True,) * 9, False)),
+        known=st.sampled_from((*(True,) * 9, False)),
+    )
+    def receive_odometry(self, referenced, wait, **facts):
+        if referenced:
+            self.watchdog.reference_received()
+            self.pending = True
+        self.receive(self.now + wait, **facts)
+
+    @rule(off=st.sampled_from((-1, 0, 1)), held=st.booleans())
+    def receive_odometry_at_an_edge(self, off, held):
+        """At the end of a stop with a reference of now, or with the oldest that still counts."""
+        self.receive_odometry(
+            True, 10, speed=100.0 if held else 1.0, error=0.1, finite=True, known=True
+        )
+        edge = self.now + (500 if held else 150) + off
+        while self.now < edge:
+            self.receive_odometry(
+                held, min(edge - self.now, 160), speed=1.0, error=0.1, finite=True, known=True
+            )
+
+    def receive(self, now, **facts):
+        gap = None if self.last is None else now - self.last
+        elapsed = self.watchdog.elapsed(now * MS)
+        assert elapsed == (gap / 1000 if gap is not None and 0 <= gap <= 200 else None)
+        if gap is not None and gap < 0:
+            self.reference = self.held_until = None
+        self.now = self.last = now
+        assert _decide(self.watchdog, now, **facts) is self.reason(**facts)
+
+    def reason(self, speed, error, finite, known):
+        if self.pending:
+            self.reference, self.pending = self.now, False
+        if not self.enabled:
+            return Reason.DISABLED
+        if not finite:
+            return Reason.ODOMETRY_BAD
+        if self.reference is None:
+            return Reason.NO_REFERENCE
+        if self.now - self.reference > 150:
+            return Reason.REFERENCE_STALE
+        if not known:
+            return Reason.NO_REFERENCE
+        if speed > 40.0 or error > 25.0:
+            self.held_until = self.now + 500
+        if self.held_until is not None and self.now <= self.held_until:
+            return Reason.DIVERGING
+        self.held_until = None
+        return Reason.TRACKING
+
+
+@pytest.mark.slow
+class TestWatchdog(WatchdogMachine.TestCase):
+    settings = settings(STATEFUL, max_examples=60)
 
 
 def test_the_odometry_timeout_is_measured_with_one_clock():
@@ -87,6 +119,9 @@ def test_the_odometry_timeout_is_measured_with_one_clock():
     assert watchdog.odometry_timed_out(None, 0)
     assert not watchdog.odometry_timed_out(1000 * MS, 1199 * MS)
     assert watchdog.odometry_timed_out(1000 * MS, 1201 * MS)
+
+
+NEAR = st.sampled_from((0.0, 1.0, 1.5, -3.0, 4.0))
 
 
 def response_monitor(**changes):
@@ -228,28 +263,32 @@ def test_a_robot_that_follows_again_gets_no_step_of_the_command():
     assert np.abs(np.diff(sent, axis=0)).max() <= limit * 0.01 * (1 + 1e-9)
 
 
-def test_the_shortcut_for_the_last_command_keeps_the_decision():
-    """Comparing the last command first avoids a search and gives the same decision."""
-    generator = np.random.default_rng(4)
-    monitor, whole = response_monitor(), response_monitor()
-    decisions = []
-    for k in range(3000):
-        command = 3.0 * np.sin(0.02 * k) + generator.normal(size=2)
-        off = 5.0 if k % 700 > 600 else 0.0
-        measured = command + off + generator.normal(scale=0.8, size=2)
-        decisions.append(monitor.update(*measured))
-        # Reorder the window to disable the shortcut: the most distant command is the last.
-        if len(whole._commands) == whole._commands.maxlen:
-            far = max(whole._commands, key=lambda one: abs(one[0] - measured[0]))
-            kept = list(whole._commands)
-            whole._commands.remove(far)
-            whole._commands.append(far)
-            assert whole.update(*measured) == decisions[-1]
-            whole._commands.clear()
-            whole._commands.extend(kept)
-        else:
-            assert whole.update(*measured) == decisions[-1]
-        monitor.add_command(*command)
-        whole.add_command(*command)
-    assert True in decisions
-    assert False in decisions
+@pytest.mark.slow
+@PROPERTY
+@given(
+    st.lists(st.tuples(NEAR, NEAR, st.sampled_from((0.0, 1.5, 1.6))), min_size=60, max_size=120)
+)
+def test_the_decision_is_that_of_the_whole_window(steps):
+    """Comparing the last command first only avoids a search; commands near zero count little.
+
+    A distance of just the bound is within it.
+    """
+    monitor = response_monitor(response_window=0.05, response_timeout=0.03)
+    window, evidence, responsive = [], 0, True
+    for right, left, away in steps:
+        if len(window) == 5:
+            lows, highs = map(min, zip(*window, strict=True)), map(max, zip(*window, strict=True))
+            ranges = list(zip(lows, highs, strict=True))
+            outside = any(not low - 1.5 <= right + away <= high + 1.5 for low, high in ranges[:1])
+            outside |= any(not low - 1.5 <= left <= high + 1.5 for low, high in ranges[1:])
+            stands = all(low - 1.5 <= 0.0 <= high + 1.5 for low, high in ranges)
+            if outside != responsive:
+                evidence = 0
+            else:
+                evidence += 1 if stands and not responsive else EVIDENCE_WEIGHT
+            if evidence >= 3 * EVIDENCE_WEIGHT:
+                responsive, evidence = not responsive, 0
+        assert monitor.update(right + away, left) == responsive
+        assert monitor.counts == (len(window), evidence)
+        monitor.add_command(right, left)
+        window = [*window, (right, left)][-5:]

@@ -4,8 +4,12 @@
 
 import math
 
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 import numpy as np
 import pytest
+from support.properties import STATEFUL
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import BodyTwist, WheelSpeeds
@@ -28,13 +32,6 @@ def make_fast_limiter(**parameters: float) -> CommandLimiter:
 
 def command(right: float, left: float, stamp_ms: float = 0.0) -> RobotCommand:
     return RobotCommand(WheelSpeeds(right, left), round(stamp_ms * MS))
-
-
-def test_initial_target_is_zero_with_a_reason():
-    limited_command = make_limiter().advance(0, 0.01)
-    assert limited_command.wheels == (0.0, 0.0)
-    assert limited_command.reason == 'no command yet'
-    assert not limited_command.timed_out
 
 
 def test_command_within_limits_passes_unchanged_without_delay():
@@ -106,57 +103,6 @@ def test_overflowing_command_is_rejected_as_non_finite():
     assert limiter.advance(0, 0.01).wheels == (0.0, 0.0)
 
 
-def test_command_times_out_exactly_at_cmd_vel_timeout():
-    limiter = make_fast_limiter()
-    limiter.accept(command(5.0, 5.0), 0)
-    before = limiter.advance(250 * MS - 1, 0.01)
-    assert before.target == (5.0, 5.0)
-    assert not before.timed_out
-    after = limiter.advance(250 * MS, 0.01)
-    assert after.target == (0.0, 0.0)
-    assert after.timed_out
-    assert after.reason == 'no command for 0.25 s'
-    # A new command ends the timeout.
-    limiter.accept(command(1.0, 1.0, 300.0), 300 * MS)
-    assert limiter.advance(300 * MS, 0.01).reason == ''
-    assert not limiter.timed_out
-
-
-def test_repeating_an_old_command_does_not_reset_the_timeout():
-    """A bridge that repeats its last command must not keep the robot moving."""
-    limiter = make_fast_limiter()
-    old = command(5.0, 5.0, 0.0)
-    for now in range(0, 400, 10):
-        limiter.accept(old, now * MS)
-        limited_command = limiter.advance(now * MS, 0.01)
-        assert (limited_command.target == (5.0, 5.0)) == (now < 250)
-
-
-def test_stale_and_out_of_order_commands_are_rejected():
-    limiter = make_fast_limiter()
-    limiter.accept(command(5.0, 5.0, 400.0), 400 * MS)
-    assert 'too old' in limiter.accept(command(9.0, 9.0, 100.0), 400 * MS)
-    assert 'older than the one before' in limiter.accept(command(9.0, 9.0, 399.0), 410 * MS)
-    assert limiter.advance(410 * MS, 0.01).target == (5.0, 5.0)
-
-
-def test_future_stamp_does_not_extend_the_timeout():
-    limiter = make_fast_limiter()
-    limiter.accept(command(5.0, 5.0, 10_000.0), 0)
-    assert limiter.advance(250 * MS, 0.01).timed_out
-
-
-def test_backward_time_jump_stops_until_the_next_command():
-    limiter = make_fast_limiter()
-    limiter.accept(command(5.0, 5.0, 1000.0), 1000 * MS)
-    limiter.advance(1000 * MS, 0.01)
-    limited_command = limiter.advance(10 * MS, 0.01)
-    assert limited_command.target == (0.0, 0.0)
-    assert limited_command.reason == 'the clock jumped back'
-    assert limiter.accept(command(4.0, 4.0, 20.0), 20 * MS) == ''
-    assert limiter.advance(20 * MS, 0.01).target == (4.0, 4.0)
-
-
 def test_backward_time_jump_keeps_speed_continuous():
     limiter = make_limiter()
     now = 5_000
@@ -166,56 +112,6 @@ def test_backward_time_jump_keeps_speed_continuous():
         now += 10
     assert speed == pytest.approx(6.0)
     assert limiter.advance(0, 0.01).wheels.right == pytest.approx(6.0 - 0.6)
-
-
-def test_stop_lasts_until_the_next_command():
-    limiter = make_fast_limiter()
-    limiter.accept(command(5.0, 5.0), 0)
-    limiter.stop('shutting down', 0)
-    limited_command = limiter.advance(0, 0.01)
-    assert (limited_command.target, limited_command.reason) == ((0.0, 0.0), 'shutting down')
-    limiter.accept(command(5.0, 5.0), 0)
-    assert limiter.advance(0, 0.01).target == (5.0, 5.0)
-
-
-def test_emergency_stop_latches_until_release_and_new_command():
-    limiter = make_fast_limiter()
-    limiter.accept(command(5.0, 5.0), 0)
-    limiter.latch('button', 0)
-    for now in range(0, 1000, 50):
-        assert 'button' in limiter.accept(command(5.0, 5.0, now), now * MS)
-        limiter.stop('something else', now * MS)
-        limiter.accept(command(math.nan, 0.0), now * MS)
-        limited_command = limiter.advance(now * MS, 0.01)
-        assert limited_command.target == (0.0, 0.0)
-        assert limited_command.estop
-        assert limited_command.reason == 'emergency stop: button'
-    # A restarted clock does not release it.
-    assert limiter.advance(0, 0.01).estop
-    assert limiter.release(0) == ''
-    limited_command = limiter.advance(0, 0.01)
-    assert limited_command.target == (0.0, 0.0)
-    assert not limited_command.estop
-    assert 'released' in limited_command.reason
-    assert limiter.accept(command(5.0, 5.0), 0) == ''
-    assert limiter.advance(0, 0.01).target == (5.0, 5.0)
-    assert 'no emergency stop' in limiter.release(0)
-
-
-def test_wheel_acceleration_never_exceeds_its_limit():
-    generator = np.random.default_rng(2)
-    limiter, now, before = make_limiter(), 0, (0.0, 0.0)
-    for _ in range(2000):
-        if generator.uniform() < 0.1:
-            limiter.accept(command(*generator.uniform(-15.0, 15.0, 2), now), now * MS)
-        if generator.uniform() < 0.02:
-            limiter.stop('test', now * MS)
-        limited_command = limiter.advance(now * MS, 0.01)
-        rate = 60.0 if limited_command.target == (0.0, 0.0) else 30.0
-        change = np.abs(np.array(limited_command.wheels) - before).max()
-        assert change <= rate * 0.01 + 1e-9
-        before = limited_command.wheels
-        now += 10
 
 
 def test_deceleration_to_standstill_keeps_curvature():
@@ -350,3 +246,118 @@ def test_limits_change_while_running():
         wheel_speed=0.0, acceleration=1e5, stop_deceleration=1e5
     )
     assert limiter.advance(10 * MS, 0.01).wheels == (0.0, 0.0)
+
+
+TIMEOUT = 250
+"""ms"""
+
+
+SPEEDS = st.floats(-15.0, 15.0) | st.sampled_from((0.0, 5.0, math.nan, math.inf, 1e300))
+
+
+class LimiterMachine(RuleBasedStateMachine):
+    """Any sequence of calls: what is followed, why not, until when, and how fast it changes.
+
+    A command expires exactly at its time-out, whatever its stamp and however often it is repeated;
+    nothing but a release ends an emergency stop, and nothing resumes a command that was dropped.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.limiter, self.now = make_limiter(), 1000
+        self.followed, self.estop, self.timed_out = None, False, False
+        self.last, self.last_now = (0.0, 0.0), -(10**9)
+
+    def drop(self, timed_out=False):
+        self.followed, self.timed_out = None, timed_out
+
+    @rule(ms=st.sampled_from((0, 1, 9, 10, 20, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1, 9999)))
+    def wait(self, ms):
+        self.now += ms
+
+    @precondition(lambda self: self.followed)
+    @rule(off=st.sampled_from((-1, 0)))
+    def wait_until_it_expires(self, off):
+        self.now = max(self.now, self.followed[1] + TIMEOUT + off)
+        self.advance()
+
+    @rule()
+    def jump_back(self):
+        self.limiter.advance(self.now * MS, 0.01)  # the limiter has seen this time
+        self.now -= 500
+        reason = self.limiter.advance(self.now * MS, 0.01).reason
+        assert reason == ('emergency stop: button' if self.estop else 'the clock jumped back')
+        self.drop()
+        self.last_now = -(10**9)
+
+    @rule(
+        wheels=st.tuples(SPEEDS, SPEEDS),
+        age=st.sampled_from((0, 0, 1, 10, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1, -20, -9999)),
+    )
+    def accept(self, wheels, age):
+        stamp = self.now - age
+        why = self.limiter.accept(command(*wheels, stamp), self.now * MS)
+        if not all(map(math.isfinite, wheels)):
+            assert why
+            self.drop()
+        elif self.estop:
+            assert 'emergency stop' in why
+        elif age >= TIMEOUT:
+            assert 'too old' in why
+        elif self.followed and min(stamp, self.now) < self.followed[1]:
+            assert 'older than the one before' in why
+        else:
+            assert why == ''
+            self.followed, self.timed_out = (wheels, min(stamp, self.now)), False
+
+    @rule()
+    def stop(self):
+        self.limiter.stop('because', self.now * MS)
+        self.drop()
+        assert self.estop or self.limiter.reason == 'because'
+
+    @rule()
+    def latch(self):
+        self.limiter.latch('button', self.now * MS)
+        self.estop = True
+        self.drop()
+
+    @rule()
+    def release(self):
+        assert ('no emergency stop' in self.limiter.release(self.now * MS)) != self.estop
+        if self.estop:
+            self.drop()
+        self.estop = False
+
+    @rule()
+    def advance(self):
+        found = self.limiter.advance(self.now * MS, 0.01)
+        if self.followed and self.now - self.followed[1] >= TIMEOUT:
+            self.drop(timed_out=True)
+            assert found.reason == 'no command for 0.25 s'
+        wheels = self.followed[0] if self.followed else (0.0, 0.0)
+        twist = twist_from_wheels(found.target, GEOMETRY)
+        assert abs(twist.linear) <= 0.5 * (1.0 + 1e-9)
+        assert abs(twist.angular) <= 8.0 * (1.0 + 1e-9)
+        assert max(map(abs, found.target)) <= 10.0 * (1.0 + 1e-9)
+        assert found.target[0] * wheels[1] == pytest.approx(found.target[1] * wheels[0])
+        assert (found.target == wheels) == (not found.limited)
+        assert (found.estop, found.timed_out) == (self.estop, self.timed_out)
+        if self.now - self.last_now >= 10:
+            rate = 60.0 if found.target == (0.0, 0.0) else 30.0
+            change = np.abs(np.subtract(found.wheels, self.last)).max()
+            assert change <= rate * 0.01 + 1e-9 or self.last_now < 0
+        self.last, self.last_now = found.wheels, self.now
+
+    @invariant()
+    def tells_what_it_follows(self):
+        limiter, now_ns = self.limiter, self.now * MS
+        assert (limiter.reason == '') == (self.followed is not None)
+        assert limiter.estop == self.estop == limiter.reason.startswith('emergency stop')
+        until = self.followed[1] + TIMEOUT if self.followed else self.now
+        assert limiter.remaining_ns(now_ns) == max(until - self.now, 0) * MS
+
+
+@pytest.mark.slow
+class TestLimiter(LimiterMachine.TestCase):
+    settings = settings(STATEFUL, max_examples=60)

@@ -171,6 +171,7 @@ def event_of(name):
     return st.builds(FaultEvent, quarter, st.just(name), value, quarter | st.just(math.inf))
 
 
+@pytest.mark.slow
 @PROPERTY
 @given(
     st.lists(
