@@ -227,8 +227,8 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     before the kernel is called. Constants that may change are passed as arguments, because the
     cache does not detect a changed global.
 
-    With ``NUMBA_DISABLE_JIT=1`` it is ``function`` itself, for debuggers and for the measurement of
-    coverage: a hundred times slower, and a plain number divided by zero is an error there.
+    With ``NUMBA_DISABLE_JIT=1`` it is ``function`` itself, for debuggers and for the measurement
+    of coverage: a hundred times slower, and a plain number divided by zero is an error there.
     """
     if config.DISABLE_JIT:
         return function

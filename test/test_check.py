@@ -143,6 +143,58 @@ def test_every_stage_runs_and_the_exit_code_says_what_remains(arguments, stages,
         assert again == calls[len(calls) - len(again) :]  # at the end, when nothing runs beside it
 
 
+PASSED_ON = """#!/bin/sh
+[ "$2" != pytest ] || exec {python} "$@" -p conftest -p starved -c pytest.ini
+"""
+STARVED = """
+import os, pathlib, pytest
+from support import processor_wait
+from support.waiting import wait_until
+
+processor_wait.ProcessorWait.share = lambda self: 0.9
+
+@pytest.fixture
+def waited(request):
+    \"\"\"Wait in vain the first time.\"\"\"
+    seen = pathlib.Path(os.environ['SEEN'], request.node.name)
+    repeated = seen.exists()
+    seen.touch()
+    wait_until(lambda: repeated, 'no answer', 0.0)
+"""
+TESTS = """
+import pytest
+from starved import waited
+
+@pytest.mark.parametrize('word', ['a b::c', 'ü\\n'])
+def test_slow(word, waited):
+    pass
+
+@pytest.mark.slow
+def test_wrong(waited):
+    assert 3 == 4
+"""
+
+
+@pytest.mark.slow
+def test_what_pytest_notes_is_what_is_repeated(checkout, tmp_path, monkeypatch):
+    """With the plugin and worker processes of the real tests."""
+    (checkout / 'python').write_text(PASSED_ON.format(python=sys.executable))
+    (checkout / 'pytest.ini').write_text('[pytest]\nmarkers =\n    slow')
+    (checkout / 'starved.py').write_text(STARVED)
+    (checkout / 'test').mkdir()
+    (checkout / 'test' / 'test_starved.py').write_text(TESTS)
+    (tmp_path / 'seen').mkdir()
+    monkeypatch.setenv('SEEN', str(tmp_path / 'seen'))
+    paths = map(str, (ROOT, ROOT / 'test', checkout))
+    monkeypatch.setenv('PYTHONPATH', os.pathsep.join(paths))
+    done = run([checkout / 'scripts' / 'check', '-n', '1', 'test'])
+    assert done.returncode == 1
+    assert done.stdout.count('3 inconclusive') == 1
+    assert '1 failed, 2 passed' in done.stdout
+    repeated = re.findall(r'^(\w+) when repeated, .*?::(\w+)', done.stderr, re.M)
+    assert sorted(repeated) == [('failed', 'test_wrong'), *[('passed', 'test_slow')] * 2]
+
+
 def test_the_documented_exit_codes_are_produced():
     text = (ROOT / 'scripts' / 'check').read_text()
     (words,) = re.findall(r'Exit code: (.*?)128 \+ N', text.replace('\n# ', ' '))

@@ -61,8 +61,8 @@ def test_what_is_missing_is_listed_once_with_its_remedy(tmp_path):
 
     words = ['-m', 'pytest', '-c', TESTS.parent / 'pyproject.toml', '-p', 'conftest', tmp_path]
     assert run(*words, '-n', 1, T3MPC_MISSING_TOOLS='') == LISTED
-    for _ in range(2):
-        assert run(*words, '-n', 0, T3MPC_MISSING_TOOLS=str(notes)) == []
+    for workers in (0, 1):
+        assert run(*words, '-n', workers, T3MPC_MISSING_TOOLS=str(notes)) == []
     both = [line.replace('3 tests', '6 tests').replace('1 test ', '2 tests ') for line in LISTED]
     assert run(missing_tools.__file__, notes) == both
 

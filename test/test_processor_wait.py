@@ -13,6 +13,8 @@ import pytest
 from support import processor_wait, waiting
 from support.processor_wait import ProcessorWait, descendants
 
+from t3mpc_ros.cli.process_group import ProcessError
+
 pytestmark = pytest.mark.slow
 
 TESTS = Path(__file__).resolve().parent
@@ -232,6 +234,39 @@ def test_what_the_fixture_ends_is_noted_before(end, tmp_path, monkeypatch):
     group.start('sleeper')
     getattr(group, end)('sleeper')
     assert noted == [('sleeper',)]
+
+
+def test_a_process_that_ended_is_no_timeout(tmp_path, monkeypatch):
+    """It will never answer, however quiet the machine is."""
+    program = tmp_path / 'lib' / 't3mpc_ros' / 'node'
+    program.parent.mkdir(parents=True)
+    program.write_text('#!/bin/sh\n[ -z "$1" ] || exec sleep 60\n')
+    program.chmod(0o755)
+    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+    group = waiting.Processes(tmp_path / 'log', os.environ)
+    group.start('node')
+    with pytest.raises(ProcessError, match='ended with code 0') as ended:
+        group.wait_ready('node')
+    assert not isinstance(ended.value, waiting.TIMEOUTS)
+    group.start('node', 'sleep')
+    with pytest.raises(waiting.TIMEOUTS):
+        group.wait_ready('node', 0.0)
+    with pytest.raises(waiting.TIMEOUTS):
+        group.stop('node', 0, 0.0)
+    with (
+        subprocess.Popen(['true']) as process,
+        pytest.raises(AssertionError, match='ended before it printed "ready"'),
+    ):
+        waiting.wait_for_text(process, lambda: 'text', 'ready')
+    with subprocess.Popen(['sleep', '60']) as process:
+        for wait in (
+            lambda: waiting.wait_for_text(process, str, 'ready', 0.0),
+            lambda: waiting.wait_for_end(process, 0.0),
+            lambda: waiting.communicate(process, 0.0),
+        ):
+            with pytest.raises(waiting.WaitTimeoutError):
+                wait()
+        process.kill()
 
 
 # -- no other waits -------------------------------------------------------------------------------

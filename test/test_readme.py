@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -399,19 +400,21 @@ def _work(command, output, tmp_path):
     arguments += [word.replace('OUTPUT', str(output)) for word in extra]
     _prepare_bags(command, output)
     log = tmp_path / 'output.txt'
-    with _started(arguments, output, log) as process:
-        if endless:
-            ready = 'stop with Ctrl-C' if 't3mpc' in arguments else f'{arguments[1]} ready'
-            wait_for_text(process, log.read_text, ready, 120.0)
-            process.send_signal(signal.SIGINT)
-        code = wait_for_end(process, 240.0)
-    # On a busy machine the round trip is long, and ping fails with a report; so does a demo, whose
-    # robot was stopped or whose odometry was late.
-    output_text = log.read_text()
-    slow = 'ping' in command and 'robot answers' in output_text
-    slow |= command.startswith(DEMO) and code == 3 and 'odom missing: ' in output_text
+    # The machine was too slow: for a demo, which says so, or for the round trip of a ping.
+    slow = 4 if command.startswith(DEMO) else 1 if 'robot ping' in command else None
+    for _ in range(3):
+        if command.startswith(DEMO):
+            shutil.rmtree(arguments[arguments.index('--output') + 1], ignore_errors=True)
+        with _started(arguments, output, log) as process:
+            if endless:
+                ready = 'stop with Ctrl-C' if 't3mpc' in arguments else f'{arguments[1]} ready'
+                wait_for_text(process, log.read_text, ready, 120.0)
+                process.send_signal(signal.SIGINT)
+            code = wait_for_end(process, 240.0)
+        if code != slow:
+            break
     # 3: the file has no end, as the page says.
-    assert code == (3 if 'broken' in command else 0) or slow, f'{command}: {log.read_text()}'
+    assert code == (3 if 'broken' in command else 0), f'{command}: {log.read_text()}'
     assert 'Traceback' not in log.read_text()
     if command == DEMO:
         assert (output / 'run' / 'report.html').stat().st_size > 100_000

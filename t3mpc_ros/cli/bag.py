@@ -305,7 +305,8 @@ def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
         description='Writes report.html, one file with verdict, charts and tables. The bag may be '
         'of any robot: MCAP or sqlite3, with a topic of odometry (nav_msgs/Odometry), of commands '
         '(geometry_msgs/Twist or TwistStamped), or both; they are found by name, else by type. '
-        'Several bags are compared with the first in comparison.html.',
+        'Several bags are compared with the first in comparison.html. Exit code 0: written, '
+        'whatever the verdict; 1: nothing can be read.',
     )
     parser.add_argument(
         'bags', type=Path, nargs='+', metavar='BAG', help='folder of a bag, or its one file'

@@ -56,6 +56,7 @@ def test_another_type_on_cmd_vel_is_a_warning(stamped, harness):
 # -- diagnostics ----------------------------------------------------------------------------------
 
 
+@pytest.mark.timed
 def test_every_node_publishes_diagnostics_at_1_hz(harness, tmp_path):
     stamps = {}
     harness.probe.create_subscription(

@@ -253,7 +253,8 @@ def test_a_brown_out_stops_the_robot_temporarily(harness):
     count = len(odom)
     harness.spin_until(lambda: len(odom) > count + 20)
     harness.spin_until(lambda: speed(odom[-1]) > 0.08, 'it drives again, for commands still come')
-    away = [state for state in states if state.reason]
+    # On a busy machine commands are late, too: another reason.
+    away = [state for state in states if 'brown-out' in state.reason]
     assert away[-1].stamp_ns - away[0].stamp_ns == pytest.approx(0.5 * NANOSECONDS, rel=0.2)
     # Without current the wheels coast to a stop.
     assert min(state.truth.twist.linear for state in away) < 0.05
@@ -408,6 +409,7 @@ def test_equal_seeds_steps_and_commands_give_equal_messages(harness):
     assert first['odom'] != other['odom']
 
 
+@pytest.mark.timed
 def test_real_time_factor_10_is_about_ten_times_as_fast(harness):
     clock = []
     harness.probe.create_subscription(

@@ -20,6 +20,7 @@ import types
 from unittest import mock
 
 from ament_index_python import packages
+import numpy  # noqa: F401  (not within the substitutes: it cannot be imported twice)
 import yaml
 
 from t3mpc_ros.cli.process_group import executable

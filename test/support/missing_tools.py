@@ -74,6 +74,8 @@ def needing(*names):
 
 def list_missing(terminal):
     """List what was missing, at the end of a run; or note it for a list at the end of several."""
+    if hasattr(terminal.config, 'workerinput'):
+        return  # the main process has the reports of all workers
     skipped = Counter()
     for report in terminal.stats.get('skipped', []):
         _, found, names = report.longrepr[2].partition(REASON)
