@@ -48,7 +48,7 @@ def channels(robot):
     if imu := parts.get(SimulatedImu):
         rows = []
         for _ in range(COUNT):
-            imu.measure(np.zeros((3, 2)), 0.5)  # longer than the filter remembers
+            imu.measure(np.zeros((3, 2)), 0.003)  # both stages of the filter matter
             rows.append((imu._walk, *imu.counts))
         walk, turn, ahead, aside = np.array(rows).T
         walk = np.diff(walk, prepend=0.0)

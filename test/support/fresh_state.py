@@ -23,8 +23,8 @@ import numpy as np
 
 from t3mpc_ros.kernels import TypedKernel
 
-SINGLY = 64
-"""Longest array whose elements are leaves of their own."""
+SINGLY = 300
+"""Most elements of an array that are named one by one."""
 OPAQUE = (
     types.FunctionType,
     types.BuiltinFunctionType,
@@ -86,8 +86,12 @@ class _Copy:
         """Return the rows in which two copies differ, or '' for the whole."""
         if not isinstance(other, _Copy) or self._kind != other._kind or not self._array.ndim:
             return ['']
-        rows = zip(self._array, other._array, strict=True)
-        found = [f'[{k}]' for k, (a, b) in enumerate(rows) if a.tobytes() != b.tobytes()]
+        pairs = np.ndenumerate(self._array)
+        found = [
+            ''.join(f'[{k}]' for k in index)
+            for (index, a), b in zip(pairs, other._array.flat, strict=True)
+            if a.tobytes() != b.tobytes()
+        ]
         return found if len(found) <= SINGLY else ['']
 
 
@@ -178,9 +182,10 @@ def carry(
 
 
 def _carry_rows(source: np.ndarray, target: np.ndarray, paths: tuple[str, ...], path: str) -> None:
-    for index in range(len(source) if source.ndim else 0):
-        if matches(f'{path}[{index}]', paths):
-            target[index] = source[index]
+    if any(pattern.startswith((path, '*')) for pattern in paths):
+        for index, value in np.ndenumerate(source):
+            if matches(path + ''.join(f'[{k}]' for k in index), paths):
+                target[index] = value
 
 
 def _put(target: Any, name: str, value: Any) -> None:
@@ -203,6 +208,8 @@ class Operation(NamedTuple):
     """Paths of random streams and clocks, which go on; and what follows from what is kept."""
     scratch: tuple[str, ...] = ()
     """Paths that are written before they are read again: work space and unused rows."""
+    built: Callable[[], Any] | None = None
+    """Builds an object that is already as the operation makes one."""
 
 
 class Stateful(NamedTuple):
@@ -224,16 +231,20 @@ def check_fresh(entry: Stateful, operation: Operation, seeds: int = 4) -> None:
     exceptions = (*survivors, *operation.scratch)
     needed = set()
     for seed in range(seeds):
-        used, new, other = entry.make(), entry.make(), entry.make()
+        used, other = entry.make(), entry.make()
+        new = operation.built() if operation.built else entry.make()
         for part in range(seed % 2 + 1):  # each state is entered once or twice
             entry.drive(used, random.Random(f'{seed} {part}'))
         before = state_of(used)
-        carry(used, new, survivors)
-        for each in (used, new, other):
+        carry(used, new, survivors if operation.built is None else ())
+        for each in (used, other) if operation.built else (used, new, other):
             operation.apply(each)
+        if operation.built:
+            assert not different(other, new, operation.scratch), 'a new one is not as one built so'
+            carry(used, new, survivors)
         wrong = [p for p in changes(before, state_of(used)) if matches(p, operation.kept)]
         assert not wrong, f'not kept: {wrong}'
-        unlike = different(used, other) if exceptions else []
+        unlike = different(used, other) + different(new, other) if exceptions else []
         needed |= {each for each in exceptions if any(matches(p, (each,)) for p in unlike)}
         expect_equal(used, new, 'state', operation.scratch)
         answers = [entry.drive(each, random.Random(f'next {seed}')) for each in (used, new)]
@@ -281,7 +292,8 @@ def alternatives(parameters: Any, spec: Any) -> Iterator[Any]:
 
 def check_configured(entry: Configured) -> None:
     """Assert that each dynamic parameter takes effect, and as if the object were built with it."""
-    usual = entry.drive(entry.make(entry.parameters), random.Random(1))
+    thing = entry.make(entry.parameters)
+    usual = [entry.drive(thing, random.Random(seed)) for seed in (1, 2)]
     wrong, idle = {}, []
     for spec in entry.parameters.specs():
         shown = spec.name.startswith(entry.elsewhere)
@@ -299,11 +311,19 @@ def check_configured(entry: Configured) -> None:
                 paths += different(*answers)
             if paths:
                 wrong[spec.name] = paths[:5]
-            effects = shown or bool(different(answers[0], usual))
+            effects = shown or _takes_effect(entry, changed, usual)
         if not effects:
             idle.append(spec.name)
     assert not wrong, f'as built before: {wrong}'
     assert not idle, f'without effect: {idle}'
+
+
+def _takes_effect(entry: Configured, changed: Any, usual: list[object]) -> bool:
+    """Return whether parameters that are replaced after some use change what follows."""
+    thing = entry.make(entry.parameters)
+    entry.drive(thing, random.Random(1))
+    entry.replace(thing, changed)
+    return bool(different(entry.drive(thing, random.Random(2)), usual[1]))
 
 
 def check_round_trip(entry: Configured) -> None:

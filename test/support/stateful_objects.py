@@ -826,7 +826,13 @@ FRESH = {
         {
             'reset': Operation(lambda f: f.reset(SPEEDS)),
             'set_dead_time': Operation(
-                lambda f: f.set_dead_time(0.0437), kept=('.state',), continued=('._commands',)
+                lambda f: f.set_dead_time(0.0437),
+                kept=('.state',),
+                continued=('._commands',),
+                scratch=('._parameters.dead_time',),
+                built=lambda: SpeedKalmanFilter(
+                    SpeedFilterParameters(dead_time=0.0437), 'velocity', PERIOD
+                ),
             ),
         },
     ),
@@ -856,8 +862,11 @@ FRESH = {
         {
             'reset': Operation(
                 lambda e: e.reset(SPEEDS),
-                kept=tuple(f'.state[{row}]' for row in range(11, 18)),
-                continued=('.state[0]', '.state[18]'),
+                kept=(
+                    *(f'.state[{row}]' for row in range(11, 18)),
+                    *(f'.state[0][{column}]' for column in (0, 1, 2, 3, 8)),
+                    *(f'.state[18][{column}]' for column in (4, 5, 6)),
+                ),
             )
         },
     ),
@@ -985,7 +994,13 @@ FRESH = {
         drive_reference,
         {
             'reset': Operation(lambda c: c.reset()),
-            'reset to a seed': Operation(lambda c: c.reset(1 << 100)),
+            'reset to a seed': Operation(
+                lambda c: c.reset(5),
+                scratch=('._parameters.seed',),
+                built=lambda: ChaoticReference(
+                    ReferenceParameters.from_dict(CHAOS | {'seed': 5}), GEOMETRY
+                ),
+            ),
         },
     ),
     FractionalSolver: Stateful(
@@ -993,7 +1008,12 @@ FRESH = {
         drive_solver,
         {
             'reset': Operation(lambda s: s.reset()),
-            'reset to a state': Operation(lambda s: s.reset(np.array([1.0, 2.0, 3.0, 4.0]))),
+            'reset to a state': Operation(
+                lambda s: s.reset(np.array([1.0, 2.0, 3.0, 4.0])),
+                built=lambda: FractionalSolver(
+                    hyperchaotic_system(), 1e-3, np.array([1.0, 2.0, 3.0, 4.0])
+                ),
+            ),
         },
     ),
     SwitchingSchedule: Stateful(
@@ -1006,6 +1026,7 @@ FRESH = {
         lambda: CommandLimiter(CommandLimiterParameters(), GEOMETRY),
         drive_limiter,
         {
+            'latch': Operation(lambda x: x.latch('because', 10**11), kept=('._ramp',)),
             'latch and release': Operation(latch_and_release, kept=('._ramp',)),
             'stop': Operation(lambda x: x.stop('because', 10**11), kept=('._ramp',)),
             'jump back': Operation(
@@ -1019,16 +1040,19 @@ FRESH = {
         {
             'reset': Operation(
                 lambda o: o.reset(Pose(1.0, 2.0, 3.0)),
-                kept=('._memory',),
-                continued=('._covariance[3]', '._drift[3]'),
+                kept=('._memory', '._covariance[3][3]', '._covariance[4][4]', '._drift[3][3]'),
             ),
             'forget_bias': Operation(
                 lambda o: o.forget_bias(),
                 # The response of the gyro's filter to the steps, and for how long they rest.
-                kept=('._pose', *(f'._memory[{k}]' for k in (2, 3, 4, 5, 9))),
-                continued=(
-                    *(f'._{m}[{k}]' for m in ('covariance', 'drift') for k in (0, 1, 2)),
-                    '._covariance[4]',
+                kept=(
+                    *('._pose', *(f'._memory[{k}]' for k in (2, 3, 4, 5, 9))),
+                    *(
+                        f'._{matrix}[{row}][{column}]'
+                        for matrix in ('covariance', 'drift')
+                        for row in (0, 1, 2, 4)
+                        for column in (0, 1, 2, 4)
+                    ),
                 ),
                 # Not read before the bias is known again.
                 scratch=tuple(f'._memory[{k}]' for k in (6, 7, 8)),
@@ -1135,7 +1159,10 @@ FRESH = {
             (FaultEvent(1.0, 'command_loss', 0.5, 1.0), FaultEvent(1.5, 'brown_out', True))
         ),
         drive_faults,
-        {'at the start': Operation(lambda s: s.at(0.5, FaultParameters()))},
+        {
+            f'a question at {at} s': Operation(lambda s, at=at: s.at(at, FaultParameters()))
+            for at in (0.5, 1.2, 1.7, 2.5)
+        },
     ),
     SimulatedImu: Stateful(
         lambda: SimulatedImu(SimulatedImuParameters(), np.random.default_rng(1)),
@@ -1304,7 +1331,7 @@ CONFIGURED = {
         CommandLimiterParameters(max_stopping_time=5.0),
         lambda p: CommandLimiter(p, GEOMETRY),
         assign,
-        drive_limiter,
+        drive_with(drive_limiter, 1, 2, 3),
     ),
     WheelOdometry: Configured(
         WheelOdometryParameters(), lambda p: WheelOdometry(p, GEOMETRY), assign, drive_wheels
@@ -1349,7 +1376,9 @@ CONFIGURED = {
         elsewhere=COMMANDS,
         late=LATE,
     ),
-    PaperRobot: Configured(PAPER, PaperRobot, configure, drive_robot, late=LATE),
+    PaperRobot: Configured(
+        PAPER, PaperRobot, configure, drive_robot, ('drive.speed_ceiling',), late=LATE
+    ),
     DigitalTwin: Configured(
         TWIN,
         DigitalTwin,

@@ -1,0 +1,29 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Slip monitor: when it stops the robot, and when it lets it go."""
+
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
+from t3mpc_ros.robot.slip_monitor import SlipMonitor
+
+STAND, DRIVE = RobotCommand(ZERO_WHEEL_SPEEDS, 0), RobotCommand(WheelSpeeds(1.0, 0.0), 0)
+
+
+def test_a_stop_begins_and_ends_at_its_bounds():
+    """The largest permitted slip is permitted; a pause of just half a second ends the stop."""
+    monitor = SlipMonitor()
+    assert not monitor.update(1.0, 1.0, 10.0)
+    assert not monitor.rejects(DRIVE, 10.0)
+    assert monitor.update(1.001, 1.0, 20.0)
+    assert monitor.rejects(DRIVE, 20.25)
+    assert monitor.rejects(STAND, 20.5)
+    assert monitor.update(0.0, 1.0, 20.625)
+    assert not monitor.update(0.0, 1.0, 20.75)
+    assert not monitor.rejects(DRIVE, 20.75)
+
+
+def test_a_limit_of_zero_disables_the_stop():
+    monitor = SlipMonitor()
+    assert monitor.update(2.0, 1.0, 0.0)
+    assert not monitor.update(2.0, 0.0, 0.1)
+    assert not monitor.update(99.0, 0.0, 0.2)
