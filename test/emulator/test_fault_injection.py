@@ -56,18 +56,3 @@ def test_of_two_faults_of_a_kind_the_later_one_holds():
         now_ns = round(seconds * 1e9)
         values.append(faults.value('loss'))
     assert values == [0.0, 0.1, 0.1, 0.9, 0.9, 0.1, 0.1, 0.0, 0.5]
-
-
-def test_a_fault_lasts_from_its_start_up_to_its_end():
-    """Of two that are active the one that began last counts; the end of one is none of another."""
-    now = [0]
-    faults = FaultInjection(lambda: now[0], 1)
-    faults.add(Fault('loss', 1.0, 4.0, 0.2), 0)
-    faults.add(Fault('loss', 2.0, 1.0, 0.5), 0)
-    found = []
-    for edge in (1, 2, 3, 5):
-        for now[0] in (edge * 10**9 - 1, edge * 10**9):
-            found.append(faults.value('loss'))
-    assert found == [0.0, 0.2, 0.2, 0.5, 0.5, 0.2, 0.2, 0.0]
-    now[0] = 2 * 10**9
-    assert faults.combined_probability('loss', 'loss_up') == 0.5

@@ -18,8 +18,16 @@ import subprocess
 import pytest
 from support.firmware_core import CLEAR, ENABLE, ESTOP, FIRMWARE, KEY, Dongle, Robot
 
-from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD
-from t3mpc_ros.radio.tool.robot_records import RobotSettings, encode_settings
+from t3mpc_ros.radio.protocol.codec import encode
+from t3mpc_ros.radio.protocol.frames import CALIBRATION_RECORD, SETTINGS_RECORD, Key
+from t3mpc_ros.radio.tool.robot_records import (
+    Calibration,
+    DividerCorrection,
+    RobotSettings,
+    SharpCurve,
+    encode_calibration,
+    encode_settings,
+)
 
 HEADERS = '\n'.join(path.read_text() for path in sorted((FIRMWARE / 'core').glob('*.h')))
 STRUCTS = dict(re.findall(r'^struct (t3_\w+) \{\n(.*?)^\};', HEADERS, re.DOTALL | re.MULTILINE))
@@ -161,16 +169,25 @@ def test_a_booted_robot_is_as_new(library, layout, key, seed):
     assert use(used, random.Random(seed)) == use(new, random.Random(seed))
 
 
-KEPT_IN_A_SESSION = (
-    *('robot.counters', 'robot.refused', 'robot.parameters', 'robot.steps.wheels'),
-    *('robot.longest_us', 'robot.estop', 'robot.action_'),
-    *('robot.rest_us', 'robot.button_us', 'robot.ttl_', 'robot.command_us', 'robot.battery_us'),
-    *('robot.loaded_us', 'robot.period_us', 'robot.tick_us', 'robot.last_frame_us'),
-    *('robot.answer_from_us', 'robot.next_range', 'robot.steps.time_us'),
-    *('robot.session.greetings', 'robot.session.robot_nonce', 'robot.session.session_key'),
-    *('robot.session.last_us', 'console'),
+TIMES = (
+    *(
+        'robot.rest_us',
+        'robot.button_us',
+        'robot.battery_us',
+        'robot.loaded_us',
+        'robot.period_us',
+    ),
+    *('robot.tick_us', 'robot.last_frame_us', 'robot.answer_from_us', 'robot.longest_us'),
+    *('robot.ttl_from_us', 'robot.ttl_us', 'robot.command_us', 'robot.steps.time_us'),
+    *('robot.next_range', 'console'),
 )
-"""What a host that comes later must see, or is a time. An action is repeated only after one."""
+"""Instants of what has happened, and the log."""
+KEPT_IN_A_SESSION = (
+    *('robot.counters', 'robot.refused', 'robot.parameters', 'robot.steps.wheels', 'robot.estop'),
+    *('robot.action_seq', 'robot.action_verb', 'robot.action_rc', 'robot.session.greetings'),
+    *('robot.session.robot_nonce', 'robot.session.session_key', 'robot.session.last_us'),
+)
+"""What a host that comes later must see, and nonces, no two of which are alike."""
 
 
 @pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
@@ -193,43 +210,53 @@ def test_a_new_session_begins_as_the_first_one(library, layout, key, seed):
         come_to_rest(each)
         each.seq = 0
         each.hello(session=0x33, nonce=bytes(range(8)))
-    assert memory(used, layout)['robot.action_done'] == memory(new, layout)['robot.action_done']
-    assert not unlike(used, new, layout, KEPT_IN_A_SESSION)
+    assert not unlike(used, new, layout, TIMES + KEPT_IN_A_SESSION)
     used.call('poke_steps', ctypes.c_uint8(0), ctypes.c_int32(500))
     assert used.act(1, 1, session=0x33)[4:] == new.act(1, 1, session=0x33)[4:]
     assert used.steps[0] == 0
 
 
-def change_settings(robot, settings):
-    robot.store(SETTINGS_RECORD, encode_settings(settings))
+CURVE = SharpCurve(0.3, 0.02, 0.05, 0.003)
+CALIBRATION = Calibration(divider=DividerCorrection(0.05, -0.1, 0.02), curves=8 * (CURVE,))
+CHANGES = {
+    'divider': RobotSettings(divider=7.5),
+    'direction': RobotSettings(invert_left=True),
+    'steps': RobotSettings(microsteps=32, steps_per_turn=400),
+    'radio': RobotSettings(rate='250k', channel=7, address=b'12345'),
+    'sensors': RobotSettings(sensors=('GP2Y0A41',) * 8),
+    'calibration': CALIBRATION,
+    'key': Key(2, KEY),
+    'no key': Key(2, bytes(16)),
+}
+
+
+def change(robot, what):
+    """Store a record or a key over USB."""
+    if isinstance(what, Key):
+        robot.console(encode(what))
+    elif isinstance(what, Calibration):
+        robot.store(CALIBRATION_RECORD, encode_calibration(what))
+    else:
+        robot.store(SETTINGS_RECORD, encode_settings(what))
     robot.run(700_000)
 
 
-@pytest.mark.parametrize(
-    'settings',
-    [
-        RobotSettings(divider=7.5),
-        RobotSettings(invert_left=True),
-        RobotSettings(microsteps=32, steps_per_turn=400),
-        RobotSettings(rate='250k', channel=7, address=b'12345'),
-        RobotSettings(sensors=('GP2Y0A41',) * 8),
-    ],
-    ids=['divider', 'direction', 'steps', 'radio', 'sensors'],
-)
-def test_stored_settings_are_in_effect_as_after_a_boot(library, layout, settings):
+@pytest.mark.parametrize('what', CHANGES.values(), ids=CHANGES)
+def test_stored_records_are_in_effect_as_after_a_boot(library, layout, what):
     """The battery of the divider before was filtered into that of the new one."""
     used, new = Robot(library), Robot(library)
     for each in (used, new):
         for channel in range(9):
             each.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(400))
         each.run(1_500_000)
-    change_settings(used, settings)
-    change_settings(new, settings)
+        if what is CHANGES['no key']:
+            change(each, CHANGES['key'])
+        change(each, what)
     new.call('boot', ctypes.c_uint8(4), ctypes.c_uint32(0))
     for each in (used, new):
         each.run(200_000)
-    times = KEPT_IN_A_SESSION[5:] + ('robot.settings.copies', 'robot.reset_cause')
-    assert not unlike(used, new, layout, (*times, 'robot.counters'))
+    copies = 'robot.settings.copies', 'robot.calibration.copies', 'robot.session.boots'
+    assert not unlike(used, new, layout, (*TIMES, *copies, 'robot.reset_cause', 'robot.counters'))
 
 
 @pytest.mark.parametrize('seed', range(3))
