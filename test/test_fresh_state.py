@@ -12,32 +12,43 @@ from support.fresh_state import check_configured, check_fresh, check_round_trip,
 from support.stateful_objects import CONFIGURED, FRESH, NEVER_RESET
 
 PACKAGES = 'control', 'mpc', 'fuzzy', 'chaos', 'robot', 'geometry', 'simulation', 'emulator'
-SLOW = 'PortraitSource', 'FuzzyEstimator', 'Controller', 'KeepOut', 'DigitalTwin'
+
+
+def _name(kind):
+    return getattr(kind, '__name__', kind)
+
+
+SLOW = (
+    'PortraitSource',
+    'FuzzyEstimator',
+    'Controller',
+    'Controller, paper',
+    'KeepOut',
+    'DigitalTwin',
+)
 CASES = [
     pytest.param(
         entry,
         operation,
-        id=f'{kind.__name__}, {name}',
-        marks=pytest.mark.slow if kind.__name__ in SLOW else (),
+        id=f'{_name(kind)}, {name}',
+        marks=pytest.mark.slow if _name(kind) in SLOW else (),
     )
     for kind, entry in FRESH.items()
     for name, operation in entry.operations.items()
 ]
-OF_PARAMETERS = [
-    pytest.param(entry, id=getattr(kind, '__name__', kind)) for kind, entry in CONFIGURED.items()
-]
+OF_PARAMETERS = [pytest.param(entry, id=_name(kind)) for kind, entry in CONFIGURED.items()]
 
 
 def test_every_class_with_a_state_is_in_a_table():
     classes = classes_of(PACKAGES)
-    assert classes.keys() == {kind.__name__ for kind in FRESH} ^ NEVER_RESET.keys()
+    assert classes.keys() == {_name(kind).split(',')[0] for kind in FRESH} ^ NEVER_RESET.keys()
     replaceable = {
         name
         for name, kind in classes.items()
         if hasattr(kind, 'configure') or 'eplaceable at run time' in (kind.__doc__ or '')
     }
     parts = {'Nt3fsMpcController', 'SwitchingTracker', 'FixedStepRobot'}  # of Controller, of twins
-    assert replaceable - parts <= {getattr(kind, '__name__', kind) for kind in CONFIGURED}
+    assert replaceable - parts <= {_name(kind) for kind in CONFIGURED}
 
 
 @pytest.mark.parametrize(('entry', 'operation'), CASES)

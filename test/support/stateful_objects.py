@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from support.fresh_state import Configured, Operation, Stateful
+from support.fresh_state import OPAQUE, Configured, Operation, Stateful
 from t3mpc_ros.chaos.path_source import (
     PathClock,
     PathReferenceParameters,
@@ -794,7 +794,11 @@ def below(name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
 
 def all_of(thing: object, *without: str) -> tuple[str, ...]:
     """Return the paths of all attributes but some."""
-    return tuple(f'.{name}' for name in vars(thing) if name not in without)
+    return tuple(
+        f'.{name}'
+        for name, part in vars(thing).items()
+        if name not in without and not isinstance(part, OPAQUE)
+    )
 
 
 COUNTS = '._arrived', '._lost', '._sent', '._dropped', '._generator'
@@ -807,6 +811,18 @@ TWIN = DigitalTwinParameters.from_dict(
     {'noise.variance': 0.04, 'faults.command_loss': 0.2, 'faults.slippery': 0.02}
 )
 PAPER = PaperRobotParameters.from_dict({'noise.variance': 0.04})
+
+
+def used_weights():
+    """Return the weights of a controller that has learnt."""
+    controller = make_controller(ControllerParameters, friction__gamma=5.0)()
+    drive_controller(controller, Random(7))
+    return {name: 1.0 + array for name, array in controller.get_weights().items()} | {
+        name: array for name, array in controller.get_weights().items() if 'scales' in name
+    }
+
+
+OTHER_WEIGHTS = used_weights()
 SPEEDS = np.array([2.0, 1.0])
 FRESH = {
     # control
@@ -942,6 +958,48 @@ FRESH = {
                     *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
                 ),
             )
+        },
+    ),
+    'Controller, paper': Stateful(
+        make_controller(ControllerParameters, pose__enabled=True, friction__gamma=5.0),
+        drive_controller,
+        {
+            'reset': Operation(
+                lambda c: c.reset(),
+                kept=('._watchdog.enabled',),
+                scratch=(
+                    *('._sampled', '._shaper'),
+                    *below('._tracker.transition', RAMPS),
+                    *below('._tracker.law', LAST[:3]),
+                    *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
+                ),
+            ),
+            'a time-out of the odometry': Operation(
+                lambda c: c.check_odometry(None, 0),
+                kept=(
+                    *all_of(
+                        make_controller(ControllerParameters)(),
+                        *('_tracker', '_actuation', '_moving', 'status'),
+                    ),
+                    *below('._tracker.law', (*ALPHA, *below('.predictive', MACHINE))),
+                ),
+                continued=below('._tracker.law.predictive', SKILL),
+                scratch=(
+                    *below('._tracker.law', LAST),
+                    *below('._tracker.transition', RAMPS),
+                    '.status.stamp_ns',
+                ),
+            ),
+            'set_weights': Operation(
+                lambda c: (c.reset(), c.set_weights(OTHER_WEIGHTS)),
+                kept=('._watchdog.enabled',),
+                scratch=(
+                    *('._sampled', '._shaper'),
+                    *below('._tracker.transition', RAMPS),
+                    *below('._tracker.law', LAST[:3]),
+                    *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
+                ),
+            ),
         },
     ),
     # mpc, fuzzy
