@@ -8,21 +8,17 @@ import pytest
 from support.ros_graph import odometry
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common.base_node import WARN
+from t3mpc_ros.nodes.common.base_node import ERROR, WARN
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
 pytestmark = pytest.mark.ros
 
 
-def wait_for_warning(harness, name, words):
-    """Wait until the diagnostics of a node contain some words at level WARN or above."""
-
-    def warned():
-        status = harness.next_status(name)
-        return status.level >= WARN and words in status.message
-
-    harness.spin_until(warned, f'{name}: {words}')
+def wait_for_warning(harness, name, words, levels=(WARN, ERROR)):
+    """Wait until the diagnostics of a node contain some words; they have one of the levels."""
+    harness.spin_until(lambda: words in harness.next_status(name).message, f'{name}: {words}')
+    assert harness.statuses(name)[-1].level in levels
 
 
 def test_odometry_of_another_clock_and_rate_is_named(harness):
@@ -45,7 +41,7 @@ def test_two_publishers_of_commands_are_named(harness):
         wait_for_warning(harness, name, '/cmd_vel has 2 publishers: /controller, /probe')
 
 
-@pytest.mark.parametrize('kind', [ControllerNode, SimRobotNode])
-def test_simulated_time_without_a_clock_is_named(kind, harness):
+@pytest.mark.parametrize('kind, level', [(ControllerNode, WARN), (SimRobotNode, ERROR)])
+def test_simulated_time_without_a_clock_is_named(kind, level, harness):
     node = harness.add(kind, use_sim_time=True)
-    wait_for_warning(harness, node.get_name(), 'no message on /clock yet')
+    wait_for_warning(harness, node.get_name(), 'no message on /clock yet', [level])

@@ -73,11 +73,8 @@ def test_an_overridden_request_is_kept_and_its_mismatch_named(harness):
     harness.create_publisher(Odometry, 'odom', BEST_EFFORT)
     words = 'no message passes between /probe and this node on /odom: best effort publisher'
 
-    def named():
-        status = harness.next_status('controller')
-        return status.level >= WARN and words in status.message.lower()
-
-    harness.spin_until(named)
+    harness.spin_until(lambda: words in harness.next_status('controller').message.lower())
+    assert harness.statuses('controller')[-1].level == WARN
     assert diagnostic(controller, 'steps') == 0
 
 

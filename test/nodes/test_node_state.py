@@ -21,11 +21,11 @@ from t3mpc_ros.chaos.path_source import PortraitSource
 from t3mpc_ros.chaos.reference import ChaoticReference
 from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.geometry.types import ORIGIN
+from t3mpc_ros.geometry.types import ORIGIN, BodyTwist
 from t3mpc_ros.nodes.common.base_node import ERROR, NO_CLOCK, OK, WARN
 from t3mpc_ros.nodes.player.node import PlayerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
-from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.recorder.metadata import ParameterCollector
 from t3mpc_ros.nodes.registry import NODES, parameter_class
 from t3mpc_ros.nodes.viewer import ViewNode
 from t3mpc_ros.parameters.table import ParameterError
@@ -119,7 +119,8 @@ KEPT = {
         '_controller.status.skill',
         PREDICTIVE,
     ),
-    'sim_robot': ('_robot', '_real_time_factor', '_simulated_time'),
+    # A serialized message has padding of any value.
+    'sim_robot': ('_robot.', '_real_time_factor', '_simulated_time', '_robot_publishers._truth'),
     'radio_bridge': (),
     'player': ('_opened_ns', '_thread._timeline._anchor', '_thread._timeline._primed'),
 }
@@ -209,6 +210,20 @@ def test_a_service_called_twice_has_its_effect_once(name, service, kept, start):
         assert answer.success, answer.message
         states.append(whole_state(node, kept))
     assert difference(*states) == set()
+
+
+@pytest.mark.parametrize('name', ['sim_robot', 'radio_bridge'])
+def test_an_emergency_stop_lasts_until_its_release(name, start):
+    node = start(name)
+    clock_ns = getattr(node, '_robot_now_ns', node.steady_ns)
+    assert call(node, 'e_stop', data=False).message == 'no emergency stop is latched'
+    for _ in range(2):
+        assert call(node, 'e_stop', data=True).message == 'latched'
+        assert node._apply_command(BodyTwist(0.1, 0.0), clock_ns()).startswith('emerg')
+    answer = call(node, 'e_stop', data=False)
+    assert (answer.success, answer.message) == (True, 'released')
+    assert node._apply_command(BodyTwist(0.1, 0.0), clock_ns()) == ''
+    assert not call(node, 'e_stop', data=False).success
 
 
 def test_motion_enabled_again_is_as_before(start):
@@ -475,8 +490,30 @@ def test_a_player_that_cannot_start_has_no_bag_open(ros, tmp_path):
         PlayerNode(parameter_overrides=overrides).destroy_node()
 
 
+def test_parameters_are_read_once_for_each_start_of_a_node():
+    present, requested = [('controller', '/')], []
+    client = SimpleNamespace(
+        service_is_ready=lambda: True,
+        call_async=lambda request: (
+            requested.append(request) or SimpleNamespace(add_done_callback=lambda callback: None)
+        ),
+    )
+    collector = ParameterCollector(
+        SimpleNamespace(
+            get_node_names_and_namespaces=lambda: present,
+            get_namespace=lambda: '/',
+            create_client=lambda kind, name: client,
+            destroy_client=lambda client: None,
+        ),
+        print,
+    )
+    for there, count in ((True, 1), (True, 1), (False, 1), (True, 2), (True, 2)):
+        present[:] = [('controller', '/'), ('talker', '/')] if there else []
+        collector.request_new()
+        assert len(requested) == count
+
+
 def test_a_recorder_knows_when_a_fingerprint_is_new(start):
     node = start('recorder')
-    assert isinstance(node, RecorderNode)
     new = [node._metadata.add_seed('/a', text) for text in ('1', '1', '2', '2', '1')]
     assert new == [True, False, True, False, True]
