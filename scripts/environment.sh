@@ -241,6 +241,8 @@ unset_other_ros() {
 # Without a locale of UTF-8, or with one that is not installed, Python reads its path files as ASCII.
 [ "$(locale charmap 2>/dev/null)" = UTF-8 ] || export LC_ALL=C.UTF-8
 unset_other_ros
+# Matplotlib has no files in a home folder that cannot be written, and says so at each start.
+{ [ -d "${HOME:-}" ] && [ -w "$HOME" ]; } || export MPLCONFIGDIR="${MPLCONFIGDIR:-$VENV/matplotlib}"
 # With it every start would compile the package again, and every run of pytest all tests.
 unset PYTHONDONTWRITEBYTECODE
 BASE_PYTHON="$(choose_python)"

@@ -521,6 +521,20 @@ def test_programs_run_in_a_locale_of_utf8(checkout):
         assert checkout.run('t3mpc', **given).stdout == f'{seen}\n', given
 
 
+def test_matplotlib_has_a_folder_without_a_home(checkout):
+    """Each of its commands began with a warning of two lines, and listed all fonts again."""
+    checkout.run('t3mpc')
+    program = checkout.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
+    program.write_text('#!/bin/sh\necho "$MPLCONFIGDIR"\n')
+    own = f'{checkout.root}/.venv/matplotlib'
+    for home, given, seen in (
+        (checkout.root, '', ''),
+        ('/dev/null', '', own),
+        ('/dev/null', '/chosen', '/chosen'),
+    ):
+        assert checkout.run('t3mpc', HOME=home, MPLCONFIGDIR=given).stdout == f'{seen}\n'
+
+
 real_environment = pytest.mark.skipif(
     Path(sys.prefix) != ROOT / '.venv', reason='not run through scripts/check: no .venv in use'
 )

@@ -8,28 +8,22 @@ import subprocess
 import sys
 
 import pytest
+from support.signals import hangup_attended
 
 from t3mpc_ros.stop_signal import SIGNALS, StopSignal
 
 
-@pytest.fixture
-def hangup():
-    """Have SIGHUP end the process: under nohup it is ignored."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGHUP, before)
-
-
 @pytest.mark.parametrize('number', SIGNALS)
-def test_the_first_signal_is_kept(number, hangup):
-    before = [signal.getsignal(each) for each in SIGNALS]
-    with StopSignal() as stop:
-        assert not stop()
-        os.kill(os.getpid(), number)
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert stop()
-        assert stop.number == number
-    assert [signal.getsignal(each) for each in SIGNALS] == before
+def test_the_first_signal_is_kept(number):
+    with hangup_attended():
+        before = [signal.getsignal(each) for each in SIGNALS]
+        with StopSignal() as stop:
+            assert not stop()
+            os.kill(os.getpid(), number)
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert stop()
+            assert stop.number == number
+        assert [signal.getsignal(each) for each in SIGNALS] == before
 
 
 def test_an_ignored_hangup_stays_ignored():

@@ -37,9 +37,8 @@ def test_a_folder_that_cannot_be_written_is_replaced(given, replaced, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.ros
-def test_a_node_starts_without_a_home_folder(graph, tmp_path):
-    """It said that its command line was invalid."""
+def test_ros_starts_without_a_home_folder(tmp_path):
+    """Every node said that its command line was invalid."""
     code = 'from t3mpc_ros.nodes.common.ros_context import init_ros; init_ros([])'
     environment = {k: v for k, v in os.environ.items() if k != 'ROS_LOG_DIR'}
     for home in (str(tmp_path), os.devnull):

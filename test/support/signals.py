@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Signals as a terminal leaves them."""
 
+from contextlib import contextmanager
 import signal
 
 
@@ -13,3 +14,13 @@ def attend():
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
+
+
+@contextmanager
+def hangup_attended():
+    """Have SIGHUP end this process and those that it starts meanwhile."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, before)
