@@ -11,12 +11,12 @@ import ctypes
 import os
 import random
 import re
-import shutil
 import struct
 import subprocess
 
 import pytest
 from support.firmware_core import CLEAR, ENABLE, ESTOP, FIRMWARE, KEY, Dongle, Robot
+from support.missing_tools import find, needs
 
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import CALIBRATION_RECORD, SETTINGS_RECORD, Key
@@ -53,7 +53,8 @@ def layout(library, tmp_path_factory):
     """Return offset and size of each member of what ctypes holds: by robot and by dongle."""
     folder = tmp_path_factory.mktemp('layout')
     found = {}
-    compiler = next(filter(None, map(shutil.which, (os.environ.get('CC', 'cc'), 'gcc', 'clang'))))
+    needs('C compiler')
+    compiler = find('C compiler')
     for board, parts in (('robot', ('robot', 'console')), ('dongle', ('dongle',))):
         paths = [path for part in parts for path in members(f't3_{part}', part)]
         host = f't3_host_{board}'

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Plugin that ends each test after half a second of processor time: ``-p support.short_cases``.
+"""Plugin that ends each test after a second of processor time: ``-p support.short_cases``.
 
 For the coverage of kernels, which are a hundred times slower without the compiler. A test that is
 ended counts as skipped; one that fails before fails.
@@ -10,7 +10,7 @@ import signal
 
 import pytest
 
-LIMIT = 0.5
+LIMIT = 1.0
 """Processor time of a test without its fixtures, s."""
 
 
