@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Print the branch coverage of each package of t3mpc_ros; exit with 1 if one is below its bound.
 
-Usage: coverage.py DATA [DATA ...], files of coverage.py whose results are joined: kernels are
-counted in a run without the compiler.
+Usage: coverage_report.py DATA [DATA ...], files of coverage.py whose results are joined. Compiled
+kernels are invisible: they are counted in a run with NUMBA_DISABLE_JIT=1. The data of a check is
+measured by ``T3MPC_COVERAGE=DATA scripts/check``.
 """
 
 from collections import defaultdict
