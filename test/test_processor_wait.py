@@ -49,6 +49,14 @@ def waited():
     busy()
     raise ProcessTimeoutError('the story of the fixture')
 
+@pytest.fixture
+def wrong():
+    yield
+    1 / 0
+
+def test_error_in_a_fixture(wrong):
+    busy()
+
 @pytest.fixture(scope='module')
 def shared():
     busy()
@@ -121,7 +129,7 @@ def run_pytest(folder, text, *words, shares=''):
 
 def test_certain_faults_fail_on_a_busy_machine(busy, tmp_path):
     """They were three skips, and no failure."""
-    done, outcomes = run_pytest(tmp_path, CERTAIN.format(busy=0.7), '-n', 2, shares=None)
+    done, outcomes = run_pytest(tmp_path, CERTAIN.format(busy=0.4), '-n', 1, shares=None)
     assert done.returncode == 1
     assert '3 failed' in done.stdout
     assert set(outcomes.values()) == {'failed'}
@@ -147,14 +155,15 @@ def test_only_a_timeout_of_a_wait_is_inconclusive(workers, tmp_path):
         'test_exception',
         'test_program_error',
         'test_wrong_value_after_a_wait',
+        'test_error_in_a_fixture',
     }
     assert outcomes['test_sound'] == 'passed'
-    assert '4 failed, 1 passed, 5 inconclusive' in done.stdout
+    assert '4 failed, 2 passed, 1 error, 5 inconclusive' in done.stdout
     listed = done.stdout.partition('inconclusive: the machine is too busy')[2]
     assert '::test_wait: its processes waited for a processor for 90%' in listed
     for words in ('failure', 'fixture', 'shared fixture'):
         assert f'the story of the {words}' in listed
-    assert 'processor wait of 7 tests with nodes: median 90%, above the limit of 30%: 7' in listed
+    assert 'processor wait of 8 tests with nodes: median 90%, above the limit of 30%: 8' in listed
 
 
 def test_inconclusive_tests_alone_have_an_exit_code_of_their_own(tmp_path):
@@ -163,6 +172,14 @@ def test_inconclusive_tests_alone_have_an_exit_code_of_their_own(tmp_path):
     assert (done.returncode, len(outcomes)) == (6, 5)
     done, outcomes = run_pytest(tmp_path, text, '-k', 'test_sound')
     assert (done.returncode, outcomes) == (0, {'test_sound': 'passed'})
+
+
+def test_a_shared_fixture_is_inconclusive_for_each_test(tmp_path):
+    """The second test gets the same error at once, and its processes have not waited."""
+    text = CERTAIN.format(busy=0.0) + WAITS
+    words = ['-k', 'wait_in_a_shared']
+    done, outcomes = run_pytest(tmp_path, text, *words, shares='0.9' + ', 0.0' * 9)
+    assert (done.returncode, [*outcomes.values()]) == (6, ['inconclusive'] * 2)
 
 
 def test_a_timeout_on_a_quiet_machine_is_a_failure(tmp_path):

@@ -53,6 +53,7 @@ def test_composed_runs_with_stamped_commands_in_any_order(order, compose, tmp_pa
     spin_until(lambda: nodes['recorder'].count_subscribers('cmd_vel') > 1)
     expected = 'geometry_msgs/msg/TwistStamped'
     spin_until(lambda: nodes['recorder']._recorded_types.get('/cmd_vel') == expected)
+    spin_until(lambda: nodes['sim_robot']._state.status.moving)
     count = diagnostic(nodes['recorder'], 'messages')
     spin_until(lambda: diagnostic(nodes['recorder'], 'messages') > count + 500)
     executor.shutdown()

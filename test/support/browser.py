@@ -53,7 +53,15 @@ class Browser:
         return self.driver.execute_script(script, *values)
 
     def wait(self, condition, what):
-        wait_until(condition, what)
+        from selenium.common.exceptions import StaleElementReferenceException
+
+        def met():
+            try:
+                return condition()
+            except StaleElementReferenceException:  # the page is being loaded anew
+                return False
+
+        wait_until(met, what)
 
     def show_as(self, width, height, scheme='light'):
         """Show the page in a window of that size, and wait until its parts fit into it.

@@ -21,7 +21,6 @@ import sys
 import tempfile
 import time
 
-from support.waiting import communicate
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.cli.process_group import ProcessGroup
@@ -59,6 +58,8 @@ def run(
     folder: Path, processes: ProcessGroup, seconds: float, topics: int = 20, rate: float = 100.0
 ):
     """Return the :class:`BenchmarkResult` of one recording in ``folder``."""
+    from support.waiting import communicate  # the publisher, a script, has no such package
+
     processes.start(
         'recorder', parameters={'storage.uri': str(folder), 'record.topics': ['bench/*']}
     )
