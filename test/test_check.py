@@ -30,9 +30,10 @@ plan = json.load(open('plan'))
 stage = ' '.join([module, *words[:1]]) if module == 'ruff' else module
 if module == 'pytest':
     number = sum(json.loads(line)[0] == 'pytest' for line in open('calls'))
-    stage = 'again' if words[2:4] == ['-n', '0'] else f'pytest {{number}}'
+    stage = 'again' if words[1:3] == ['-n', '0'] else f'pytest {{number}}'
 code, *lines = plan.get(stage, [0])
-with open(words[1] if module == 'pytest' else os.devnull, 'a') as outcomes:
+path = words[0].removeprefix('--outcomes=') if module == 'pytest' else os.devnull
+with open(path, 'a') as outcomes:
     outcomes.writelines(line + '\\n' for line in lines)
 if code == 'wait':
     signal.signal(signal.SIGINT, lambda *_: sys.exit(2))
@@ -136,15 +137,15 @@ def test_every_stage_runs_and_the_exit_code_says_what_remains(arguments, stages,
         assert done.returncode == code, (plan, done.stderr)
         for text in texts:
             assert re.search(rf'^.*{re.escape(text)}.*$', done.stderr, re.M), (plan, done.stderr)
-        again = [words for words in calls if words[3:5] == ['-n', '0']]
+        again = [words for words in calls if words[2:4] == ['-n', '0']]
         expected = [[A, B]] if 'again' in plan else []
-        assert [words[5:] for words in again] == expected
+        assert [words[4:] for words in again] == expected
         assert sorted(call[0] for call in calls if call not in again) == sorted(stages), plan
         assert again == calls[len(calls) - len(again) :]  # at the end, when nothing runs beside it
 
 
 PASSED_ON = """#!/bin/sh
-[ "$2" != pytest ] || exec {python} "$@" -p conftest -p starved -c pytest.ini
+[ "$2" != pytest ] || exec {python} "$@" -p starved
 """
 STARVED = """
 import os, pathlib, pytest
@@ -172,23 +173,54 @@ def test_slow(word, waited):
 @pytest.mark.slow
 def test_wrong(waited):
     assert 3 == 4
+
+@pytest.mark.ros
+def test_graph():
+    pass
+"""
+SETTINGS = """
+[pytest]
+testpaths = test
+markers =
+    slow
+    ros
+    timed
+    long
+"""
+TIMED = """
+import pytest
+
+@pytest.mark.ros
+@pytest.mark.timed
+def test_time():
+    pass
 """
 
 
 @pytest.mark.slow
 def test_what_pytest_notes_is_what_is_repeated(checkout, tmp_path, monkeypatch):
-    """With the plugin and worker processes of the real tests."""
+    """With the plugin and worker processes of the real tests, in all stages.
+
+    From the second stage on the file of outcomes exists: as a word of its own it was taken for a
+    path of tests.
+    """
     (checkout / 'python').write_text(PASSED_ON.format(python=sys.executable))
-    (checkout / 'pytest.ini').write_text('[pytest]\nmarkers =\n    slow')
+    (checkout / 'pytest.ini').write_text(SETTINGS)
     (checkout / 'starved.py').write_text(STARVED)
     (checkout / 'test').mkdir()
+    shutil.copy(ROOT / 'test' / 'conftest.py', checkout / 'test')
     (checkout / 'test' / 'test_starved.py').write_text(TESTS)
+    (checkout / 'test' / 'test_readme.py').write_text(TIMED)
     (tmp_path / 'seen').mkdir()
     monkeypatch.setenv('SEEN', str(tmp_path / 'seen'))
     paths = map(str, (ROOT, ROOT / 'test', checkout))
     monkeypatch.setenv('PYTHONPATH', os.pathsep.join(paths))
-    done = run([checkout / 'scripts' / 'check', '-n', '1', 'test'])
+    done = run([checkout / 'scripts' / 'check'])
     assert done.returncode == 1
+    assert re.findall(r'^failed stage: (.*)', done.stderr, re.M) == [
+        'pytest: inconclusive tests again, one at a time (exit code 1)'
+    ]
+    assert done.stdout.count('1 passed in') == 2
     assert done.stdout.count('3 inconclusive') == 1
     assert '1 failed, 2 passed' in done.stdout
     repeated = re.findall(r'^(\w+) when repeated, .*?::(\w+)', done.stderr, re.M)

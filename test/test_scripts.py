@@ -327,7 +327,7 @@ def test_check_runs_what_is_asked_for(checkout, tmp_path):
         done = checkout.run(*arguments, script=check, TMPDIR=notes)
         assert done.returncode == 0
         lines = checkout.report('checks')
-        begin = re.compile(r'-m pytest --outcomes \S+ ')
+        begin = re.compile(r'-m pytest --outcomes=\S+ ')
         tests = [begin.sub('', line) for line in lines if begin.match(line)]
         # What all of them have skipped for want of a tool stands at the end, once.
         listed = [line for line in done.stderr.splitlines() if 'not installed' in line]

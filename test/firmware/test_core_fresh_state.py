@@ -8,6 +8,7 @@ frames does not ask for is compared as well.
 
 from collections.abc import Iterator
 import ctypes
+import itertools
 import os
 import random
 import re
@@ -15,7 +16,18 @@ import struct
 import subprocess
 
 import pytest
-from support.firmware_core import CLEAR, ENABLE, ESTOP, FIRMWARE, KEY, Dongle, Robot
+from support.firmware_core import (
+    CLEAR,
+    COUNTERS,
+    ENABLE,
+    ENABLED,
+    ESTOP,
+    FIRMWARE,
+    IDLE_OFF,
+    KEY,
+    Dongle,
+    Robot,
+)
 from support.missing_tools import find, needs
 
 from t3mpc_ros.radio.protocol.codec import encode
@@ -170,6 +182,11 @@ def test_a_booted_robot_is_as_new(library, layout, key, seed):
     assert use(used, random.Random(seed)) == use(new, random.Random(seed))
 
 
+CLEARED = (
+    *(f'counters.{name}' for name in COUNTERS),
+    *('refusal', 'refused'),
+)
+"""What CLEAR_COUNTERS clears."""
 TIMES = (
     *(
         'robot.rest_us',
@@ -205,7 +222,10 @@ def test_a_new_session_begins_as_the_first_one(library, layout, key, seed):
     come_to_rest(used)
     used.hello()
     used.send(used.command(0, 0, flags=CLEAR))
+    used.send(b'\xff')
+    used.run(1000)
     used.act(2, 1)
+    assert not any(b''.join(memory(used, layout)[f'robot.{name}'] for name in CLEARED))
     used.drive(30_000, 9000, 200_000)  # scaled down, and then it expires
     for each in (used, new):
         come_to_rest(each)
@@ -314,6 +334,76 @@ def test_a_released_emergency_stop_leaves_a_robot_at_rest(library, layout):
         each.send(each.command(0, 0, flags=CLEAR))
         each.run(100_000)
     assert not unlike(used, new, layout, ('robot.steps', 'robot.rest_us', 'console'))
+
+
+def pass_through(robot):
+    """Enter every state of the robot once, and leave it; return what was seen meanwhile."""
+    seen = []
+
+    def wait(us):
+        for _ in range(us // 20_000):
+            robot.run(20_000)
+            seen.append((robot.status, robot.speeds, robot.call('powered'), robot.call('levels')))
+
+    def drive(us, *speeds, **other):
+        for _ in range(us // 40_000):
+            robot.send(robot.command(*speeds, **other))
+            wait(40_000)
+
+    drive(400_000, 5000, 3000)
+    wait(1_200_000)  # it expires, rests, and is idle
+    drive(400_000, 30_000, 5000)  # scaled down
+    drive(400_000, 0, 0)
+    wait(400_000)
+    robot.send(robot.command(0, 0, flags=ESTOP))
+    wait(2_400_000)
+    robot.send(robot.command(0, 0, flags=CLEAR))
+    drive(200_000, 4000, -4000)
+    robot.call('press', ctypes.c_bool(True))
+    wait(400_000)
+    robot.call('press', ctypes.c_bool(False))
+    wait(400_000)
+    robot.send(robot.command(0, 0, flags=CLEAR))
+    for channel, count in ((8, 350), (8, 0xFFFF)):  # an empty battery, and none
+        robot.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(count))
+        drive(1_200_000, 4000, 4000)
+    for answers in (False, True):
+        robot.call('set_imu', ctypes.c_bool(answers), (ctypes.c_int16 * 7)())
+        drive(1_200_000, 1000, 1000)
+    robot.send(robot.command(0, 0, flags=0))
+    wait(4_000_000)
+    return seen
+
+
+def test_each_state_is_the_same_when_it_is_entered_again(library):
+    """A robot that had once been idle lost its power as soon as it came to rest again."""
+    robot = Robot(library)
+    robot.run(1_200_000)
+    robot.hello()
+    robot.set(IDLE_OFF, 600)
+    robot.run(-robot.now % 2_000_000)
+    first = pass_through(robot)
+    robot.run(-robot.now % 2_000_000)
+    assert pass_through(robot) == first
+    rests = [
+        after
+        for before, after in itertools.pairwise(first)
+        if any(before[1]) and not any(after[1]) and after[0] & ENABLED
+    ]
+    assert len(rests) >= 2
+    assert all(powered for _, _, powered, _ in rests)
+    assert not all(powered for _, _, powered, _ in first)
+
+
+def test_a_command_expires_in_the_first_pass_after_its_ttl(library, layout):
+    robot = Robot(library)
+    robot.run(1000)
+    robot.hello()
+    robot.send(robot.command(5000, 5000, ttl=20))
+    robot.run(199_800)
+    assert not any(memory(robot, layout)['robot.expired'])
+    robot.run(400)
+    assert any(memory(robot, layout)['robot.expired'])
 
 
 def test_the_button_counts_after_its_times(library, layout):
