@@ -99,6 +99,7 @@ class SetpointArbiter:
             Whether the robot does not answer: it may still receive, and would move unobserved.
         """
         self._sent_wheels = ZERO_WHEEL_SPEEDS
+        self._button_held &= robot_latched  # a latch that is gone was another one
         ttl = self._parameters.ttl_units
         if self._estop:
             return Setpoint(CommandFlag.ESTOP, 0, 0, ttl)
