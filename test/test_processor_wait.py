@@ -12,6 +12,7 @@ import time
 import pytest
 from support import processor_wait, waiting
 from support.processor_wait import ProcessorWait, descendants
+from support.signals import attended
 
 from t3mpc_ros.cli.process_group import ProcessError
 
@@ -248,7 +249,8 @@ def test_what_the_fixture_ends_is_noted_before(end, tmp_path, monkeypatch):
     program.chmod(0o755)
     monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
     group = waiting.Processes(tmp_path / 'log', os.environ)
-    group.start('sleeper')
+    with attended():
+        group.start('sleeper')
     getattr(group, end)('sleeper')
     assert noted == [('sleeper',)]
 

@@ -8,14 +8,14 @@ import subprocess
 import sys
 
 import pytest
-from support.signals import hangup_attended
+from support.signals import attended
 
 from t3mpc_ros.stop_signal import SIGNALS, StopSignal
 
 
 @pytest.mark.parametrize('number', SIGNALS)
 def test_the_first_signal_is_kept(number):
-    with hangup_attended():
+    with attended():
         before = [signal.getsignal(each) for each in SIGNALS]
         with StopSignal() as stop:
             assert not stop()

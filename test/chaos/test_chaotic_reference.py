@@ -78,6 +78,7 @@ def test_rate_is_the_derivative_of_the_wheels_away_from_jumps(output, blend):
         assert error.max() < 0.2
 
 
+@pytest.mark.compiled
 def test_rate_has_no_impulse_at_a_sudden_jump():
     run = samples(6000)
     wheels, rates = wheels_of(run), rates_of(run)
@@ -106,6 +107,7 @@ def test_defaults_are_what_a_small_robot_can_follow():
     assert np.all(rates.std(axis=0) > 2.0)
 
 
+@pytest.mark.compiled
 def test_twist_is_equation_1_and_body_output_its_inverse():
     geometry = WheelGeometry(wheel_radius=0.05, wheel_separation=0.3)
     wheels, body = (
@@ -118,6 +120,7 @@ def test_twist_is_equation_1_and_body_output_its_inverse():
         assert right.twist.angular == pytest.approx(parameters.angular_scale * left.wheels.left)
 
 
+@pytest.mark.compiled
 def test_time_scale_only_slows_the_same_states_down():
     """reference(t) = y(kappa t): half the scale at half the rate gives identical states."""
     fast = samples(300, rate=100.0, time_scale=0.05, ramp=0.0)
@@ -150,6 +153,7 @@ def test_seed_zero_starts_at_the_initial_state_others_near_it():
     np.testing.assert_allclose(other, exact, atol=1e-4)
 
 
+@pytest.mark.compiled
 def test_switch_times_do_not_reveal_the_perturbation():
     """With a common random stream the first dwell is the scaled perturbation of y1."""
     parameters = ReferenceParameters.from_dict(

@@ -68,6 +68,7 @@ def test_repeated_terms_and_squares_are_added():
     np.testing.assert_allclose(out, [[3.0, 0.0], [12.0 + 5.0, 2.0]])
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('order', [0.98, 1.0])
 def test_plus_sign_of_e6_is_chaotic_and_minus_sign_decays(order):
     """The paper prints (85) with '- 5 y1 y3 25 y1'.

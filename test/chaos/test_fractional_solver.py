@@ -153,6 +153,7 @@ def test_order_one_is_heuns_method_to_rounding():
     np.testing.assert_allclose(full, expected, rtol=0.0, atol=1e-10)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('tolerance', [1e-6, 1e-8, 1e-10])
 def test_solver_follows_the_full_memory_for_a_lyapunov_time(tolerance):
     """Over 0.4 s of (85), states up to 40, running and full memory differ by 100 tolerances.
@@ -230,6 +231,7 @@ def test_rate_is_unknown_at_time_zero_unless_the_order_is_one():
     assert np.isfinite(solver.rate).all()
 
 
+@pytest.mark.compiled
 def test_memory_size_does_not_depend_on_the_run_length():
     solver = FractionalSolver(hyperchaotic_system(), 1e-3, START)
 
@@ -276,6 +278,7 @@ def test_returned_states_are_copies():
     assert np.isfinite(solver.advance()).all()
 
 
+@pytest.mark.compiled
 def test_a_long_run_stays_on_the_attractor():
     """150 s, some 350 Lyapunov times: the ranges are those of an earlier, shorter run.
 

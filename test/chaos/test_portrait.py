@@ -48,6 +48,7 @@ def test_equal_seeds_give_equal_paths_others_do_not():
     assert np.abs(one[:count] - other[:count]).max() > 0.5
 
 
+@pytest.mark.compiled
 def test_reseed_continues_without_a_jump():
     """A patrol changes its seed on the way: the path goes on from where it is."""
     path, before = _points(5, 5.0)
@@ -56,6 +57,7 @@ def test_reseed_continues_without_a_jump():
     assert np.hypot(*np.diff(after, axis=0).T).max() < 0.0101
 
 
+@pytest.mark.compiled
 def test_a_robot_that_is_held_up_does_not_change_the_path():
     """The next seed comes at a place of the path: the time until it waits with the path."""
     values = {'reseed.shortest': 3.0, 'reseed.longest': 3.0}

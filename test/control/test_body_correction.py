@@ -78,6 +78,7 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.compiled
 def test_wrong_radii_and_separation_are_learnt():
     body = Body(miscalibrated, noise=0.02)
     before = rms(Body(miscalibrated, noise=0.02, enabled=True, learning_rate=0.0).run(40.0)[2000:])
@@ -96,6 +97,7 @@ def test_a_robot_that_is_exact_is_left_alone():
         np.testing.assert_array_equal(body.sent[-1], body.reference(body.k + 1))
 
 
+@pytest.mark.compiled
 def test_the_map_decreases_the_lyapunov_function():
     """V = |alpha* - alpha|²/2 never increases without noise if the map can be represented."""
     body = Body(exact)
@@ -140,6 +142,7 @@ def test_a_yaw_that_is_never_measured_changes_nothing():
     assert body.correction.authority == 0.0
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(('of_map', 'of_yaw'), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1), (0.1, 0.2)])
 def test_the_corrections_are_bounded(of_map, of_yaw):
     body = Body(

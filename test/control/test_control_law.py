@@ -279,6 +279,7 @@ def test_certificate_holds_for_a_decaying_error_only():
     assert reading.margin < 0.0
 
 
+@pytest.mark.compiled
 def test_the_law_takes_columns_and_integers_after_plain_arrays():
     """Its kernels keep the types of their first arguments and would misread other arrays."""
     numbers = np.random.default_rng(1).integers(-9, 9, (6, 3, 2))

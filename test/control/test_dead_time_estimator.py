@@ -106,6 +106,7 @@ def at(seconds: float) -> int:
     return round(seconds / PERIOD)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('dead_time', few_of([0.0375, 0.12, 0.01, 0.03, 0.06], 2))
 def test_the_dead_time_is_found_within_its_deviation(dead_time):
     errors = []

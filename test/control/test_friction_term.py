@@ -58,6 +58,7 @@ def test_v_rate_is_79_if_the_friction_coefficients_follow_e23():
         assert change / dt == pytest.approx(delta @ others, rel=1e-4, abs=1e-4)
 
 
+@pytest.mark.compiled
 def test_friction_of_both_wheels_is_learnt_through_the_body():
     law = controller(**{'adaptation.gamma': 0.0, 'friction.gamma': 30.0})
     track(law, 60.0)
@@ -75,6 +76,7 @@ def test_with_much_friction_the_error_is_less_than_half():
     assert smooth[0] < 1.02 * smooth[1] + 1e-6
 
 
+@pytest.mark.compiled
 def test_without_gamma_g_is_31_as_printed():
     law = controller(**{'friction.gamma': 0.0})
     track(law, 2.0)
@@ -84,6 +86,7 @@ def test_without_gamma_g_is_31_as_printed():
     np.testing.assert_array_equal(-law.terms[0], law.fuzzy.evaluate(chi))
 
 
+@pytest.mark.compiled
 def test_coefficients_stay_in_the_ball_under_any_error():
     parameters = {'adaptation.radius': 3.0, 'friction.gamma': 1e4}
     law = controller(**parameters)
@@ -93,6 +96,7 @@ def test_coefficients_stay_in_the_ball_under_any_error():
         assert np.linalg.norm(law.friction, axis=1).max() <= np.sqrt(2.0) * 3.0 * (1.0 + 1e-12)
 
 
+@pytest.mark.compiled
 def test_a_model_from_before_the_term_has_no_friction():
     law = controller()
     track(law, 2.0)

@@ -66,6 +66,7 @@ def test_nothing_near_changes_nothing():
     assert keep_out.activity is Activity.FREE
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('direction', np.linspace(-1.4, 1.4, 5).tolist())
 @pytest.mark.parametrize('turn', [-1.0, 0.0, 1.0])
 @pytest.mark.parametrize('speed', [0.35, -0.35])
@@ -95,6 +96,7 @@ def test_approach_slows_down_within_the_deceleration():
     assert speeds[-1] < 0.01
 
 
+@pytest.mark.compiled
 def test_robot_looks_before_it_enters_unseen_floor():
     """The robot stops before floor that no ray has crossed, and turns to look."""
     keep_out = KeepOut(PARAMETERS, LIMITS)

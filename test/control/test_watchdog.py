@@ -234,6 +234,7 @@ def test_after_5_s_without_response_the_error_is_as_before():
     assert errors['unmonitored'] > 1.3 * errors['monitored']
 
 
+@pytest.mark.compiled
 def test_an_unresponsive_robot_gets_the_reference_as_command():
     robot = StoppingRobot()
     robot.run(5.0)
@@ -248,6 +249,7 @@ def test_an_unresponsive_robot_gets_the_reference_as_command():
     assert sent == pytest.approx(robot.wanted(robot.now - PERIOD), abs=0.05)
 
 
+@pytest.mark.compiled
 def test_a_robot_that_follows_again_gets_no_step_of_the_command():
     """The law starts again from the last command, not from a measured speed."""
     robot, sent = StoppingRobot(), []

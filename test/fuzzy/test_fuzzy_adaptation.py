@@ -63,6 +63,7 @@ def test_the_law_is_77_and_78():
     np.testing.assert_allclose(alpha, expected, rtol=1e-14)
 
 
+@pytest.mark.compiled
 def test_v_decreases_by_the_integral_of_k_delta_squared():
     """Without noise and disturbance, (79) is an equality: V(0) - V(T) = K int |delta|² dt.
 
@@ -124,6 +125,7 @@ def _drift(noise, dead_zone):
     return norms
 
 
+@pytest.mark.compiled
 def test_noise_makes_the_plain_law_drift_a_dead_zone_stops_it():
     """Noise of 0.2 rad/s for 20 s takes |alpha| to 14 rad/s², and on with the root of time.
 

@@ -68,6 +68,7 @@ def _rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('kind', KINDS)
 def test_adaptation_reduces_tracking_and_estimation_errors(kind):
     """K = 8 1/s at 100 Hz, friction unknown: 0.79 rad/s RMS without adaptation, 0.21 with."""
@@ -80,6 +81,7 @@ def test_adaptation_reduces_tracking_and_estimation_errors(kind):
     assert _rms(estimation[half:]) < 0.4 * _rms(unknown[half:])
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('noise', [0.1, 0.2])
 def test_adaptation_still_helps_on_noisy_speeds(noise):
     sets = Sets()

@@ -90,11 +90,13 @@ def _weights():
     return PredictiveController(DEFAULT, PERIOD, GAIN).get_weights()
 
 
+@pytest.mark.compiled
 def test_it_removes_most_of_a_piecewise_constant_disturbance():
     """Without pretraining v_p stays at 0.3 % of u, with a random step response."""
     assert _gain(_levels(3000, 1)) < 0.40
 
 
+@pytest.mark.compiled
 def test_it_removes_most_of_a_slowly_varying_disturbance():
     assert _gain(_waves(3000)) < 0.35
 
@@ -136,11 +138,13 @@ def test_it_helps_a_robot_other_than_the_nominal_one(plant):
     assert _gain(_levels(3000, 2), noise=0.05, **plant) < 0.65
 
 
+@pytest.mark.compiled
 def test_it_works_for_other_control_periods_and_feedback_gains():
     parameters = DEFAULT.with_values({'decimation': 10, 'average': 10})
     assert _gain(_levels(3000, 1), parameters, nominal_gain=4.0, gain=4.0) < 0.45
 
 
+@pytest.mark.compiled
 def test_step_response_is_right_from_the_first_second():
     controller = PredictiveController(DEFAULT, PERIOD, GAIN)
     controller.step(np.zeros(2))
@@ -154,6 +158,7 @@ def test_step_response_is_right_from_the_first_second():
     np.testing.assert_allclose(controller.step_response[:, -1], true[9], rtol=0.25)
 
 
+@pytest.mark.compiled
 def test_the_skill_is_high_on_unseen_data():
     controller = PredictiveController(DEFAULT, PERIOD, GAIN)
     assert np.all(controller.skill > 0.8)
@@ -180,6 +185,7 @@ def test_random_weights_get_no_authority():
     assert np.mean(np.array(figures) < 1e-2 * DEFAULT.v_max) > 0.9
 
 
+@pytest.mark.compiled
 def test_a_wrong_sign_of_v_p_gets_no_authority():
     """A decaying error is predictable without a model of v_p."""
     parameters = DEFAULT.with_values({'learning': False})
@@ -200,6 +206,7 @@ def test_a_wrong_sign_of_v_p_gets_no_authority():
     np.testing.assert_array_equal(moves, 0.0)
 
 
+@pytest.mark.compiled
 def test_a_steady_disturbance_leaves_no_steady_error():
     """Without learning, the offset e alone removes the error."""
     parameters = DEFAULT.with_values({'learning': False, 'offset_gain': 0.2})
@@ -209,6 +216,7 @@ def test_a_steady_disturbance_leaves_no_steady_error():
     np.testing.assert_allclose(moves[-1], -4.0, atol=0.02)
 
 
+@pytest.mark.compiled
 def test_v_p_keeps_its_bounds_for_any_errors():
     parameters = DEFAULT.with_values({'v_max': 3.0, 'dv_max': 0.8})
     controller = PredictiveController(parameters, PERIOD, GAIN)
@@ -220,6 +228,7 @@ def test_v_p_keeps_its_bounds_for_any_errors():
     assert np.max(np.abs(v)) > 0.3  # v_p is active
 
 
+@pytest.mark.compiled
 def test_v_p_changes_by_the_first_optimal_change_63():
     """Without active bounds, (61) gives pi dv_0 = -mu sum of s_j Psi_j."""
     parameters = DEFAULT.with_values({'v_max': 1e3, 'dv_max': 1e3, 'learning': False})
@@ -244,6 +253,7 @@ def test_v_p_changes_by_the_first_optimal_change_63():
     assert np.max(np.abs(changes)) > 0.1
 
 
+@pytest.mark.compiled
 def test_v_p_is_held_between_the_predictive_steps():
     controller = PredictiveController(DEFAULT, PERIOD, GAIN)
     generator = np.random.default_rng(5)
@@ -254,6 +264,7 @@ def test_v_p_is_held_between_the_predictive_steps():
     assert np.count_nonzero(np.diff(v[:, 0, 0])) > 30
 
 
+@pytest.mark.compiled
 def test_a_reduced_bound_takes_effect_at_once():
     controller = PredictiveController(DEFAULT, PERIOD, GAIN)
     _run(controller, np.full((300, 2), 8.0))
@@ -265,6 +276,7 @@ def test_a_reduced_bound_takes_effect_at_once():
         controller.configure(replace(DEFAULT, horizon=8))
 
 
+@pytest.mark.compiled
 def test_disabled_it_returns_zero_and_still_learns():
     controller = PredictiveController(DEFAULT.with_values({'enabled': False}), PERIOD, GAIN)
     before = controller.get_weights()['output_weights']
@@ -312,6 +324,7 @@ def test_a_known_jump_is_not_learned_and_preview_helps():
     assert _rms(previewed) < 0.75 * _rms(known)
 
 
+@pytest.mark.compiled
 def test_a_known_jump_decays_in_the_prediction_with_the_feedback():
     parameters = DEFAULT.with_values({'enabled': False})
     controller = PredictiveController(parameters, PERIOD, GAIN)
@@ -350,6 +363,7 @@ def test_it_learns_from_the_applied_v_p():
     assert abs(gain(notify=True) - true) < abs(gain(notify=False) - true)
 
 
+@pytest.mark.compiled
 def test_after_a_limit_changes_start_between_zero_and_v_p():
     """A limit may exceed v_p; a change that starts there would move v_p to its bound."""
     for applied, start in ((-50.0, 0.0), (0.5, 0.5), (99.0, None)):
@@ -364,6 +378,7 @@ def test_after_a_limit_changes_start_between_zero_and_v_p():
         assert np.all(controller.status == OPTIMAL)
 
 
+@pytest.mark.compiled
 def test_reset_clears_the_history_but_not_the_weights():
     controller = PredictiveController(DEFAULT, PERIOD, GAIN)
     _run(controller, _levels(1000, 10))
@@ -378,6 +393,7 @@ def test_reset_clears_the_history_but_not_the_weights():
         np.testing.assert_array_equal(array, _weights()[name])
 
 
+@pytest.mark.compiled
 def test_it_is_deterministic_and_weights_can_be_restored():
     first = PredictiveController(DEFAULT, PERIOD, GAIN)
     first.warm_up()
@@ -422,6 +438,7 @@ def test_a_recorded_run_improves_on_the_nominal_loop():
         trained.pretrain(errors)
 
 
+@pytest.mark.compiled
 def test_invalid_input_is_rejected_without_effect():
     controller = PredictiveController(DEFAULT, PERIOD, GAIN)
     good = controller.get_weights()
@@ -465,6 +482,7 @@ def test_inconsistent_parameters_are_rejected(values, match):
         DEFAULT.with_values(values)
 
 
+@pytest.mark.compiled
 def test_lags_shorter_than_the_dead_time_are_rejected():
     parameters = DEFAULT.with_values({'nominal.dead_time': 0.2})
     with pytest.raises(ParameterError, match='move_lags must cover'):
@@ -474,6 +492,7 @@ def test_lags_shorter_than_the_dead_time_are_rejected():
         PredictiveController(DEFAULT, PERIOD, 0.0)
 
 
+@pytest.mark.compiled
 def test_a_deep_copy_is_independent():
     controller, errors = PredictiveController(DEFAULT, PERIOD, GAIN), np.array([0.3, -0.2])
     for k in range(60):

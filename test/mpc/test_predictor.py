@@ -86,6 +86,7 @@ def test_authority_is_smooth_and_needs_skill_and_sign():
     assert smooth_step(0.5, 0.0, 1.0) == 0.5
 
 
+@pytest.mark.compiled
 def test_a_pretrained_machine_predicts_an_unseen_run():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
@@ -101,6 +102,7 @@ def test_an_untrained_machine_has_no_skill():
     assert skill_score(predictor.history, 1) < 0.3
 
 
+@pytest.mark.compiled
 def test_offline_evaluation_changes_no_weights():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
@@ -117,6 +119,7 @@ def test_offline_evaluation_changes_no_weights():
     assert history.persistence_mse[1] == pytest.approx(stayed, rel=1e-10)
 
 
+@pytest.mark.compiled
 def test_residuals_compare_predictions_with_measurements():
     """The prediction over half a horizon uses the moves that were made since."""
     predictor, run = _predictor()
@@ -156,6 +159,7 @@ def test_a_prediction_uses_the_offset_of_its_time():
     np.testing.assert_array_equal(history.offsets, newest[:count])
 
 
+@pytest.mark.compiled
 def test_an_error_beyond_the_range_is_not_learned():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)

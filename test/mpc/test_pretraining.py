@@ -218,6 +218,7 @@ def test_rls_returns_to_the_pretraining_without_excitation():
     assert np.max(rls.information) < 1e-6
 
 
+@pytest.mark.compiled
 def test_rls_adapts_faster_than_any_gradient_rate():
     """Lags of one slow signal are nearly parallel, which a scalar gamma cannot handle."""
     excitation = ExcitationParameters()

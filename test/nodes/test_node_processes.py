@@ -14,7 +14,7 @@ from rclpy.node import Node
 from support import node_cost_bench
 from support.long_tests import few_of
 from support.ros_graph import speed, stamp
-from support.signals import hangup_attended
+from support.signals import attended
 from support.waiting import Processes, wait_until
 
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
@@ -47,7 +47,7 @@ def test_a_signal_ends_an_executable_at_once_with_code_0(
     )
     monkeypatch.setenv('PYTHONPATH', str(tmp_path))
     processes = request.getfixturevalue('processes')  # reads the environment
-    with hangup_attended():
+    with attended():
         processes.start(name)
     processes.wait_ready(name)
     assert processes.stop(name, number) == 0

@@ -252,7 +252,8 @@ TIMEOUT = 250
 """ms"""
 
 
-SPEEDS = st.floats(-15.0, 15.0) | st.sampled_from((0.0, 5.0, math.nan, math.inf, 1e300))
+SPEEDS = st.floats(-15.0, 15.0) | st.sampled_from((0.0, 5.0))
+WRONG_SPEEDS = SPEEDS | st.sampled_from((math.nan, math.inf, 1e300))
 
 
 class LimiterMachine(RuleBasedStateMachine):
@@ -291,9 +292,13 @@ class LimiterMachine(RuleBasedStateMachine):
         self.last_now = -(10**9)
 
     @rule(
-        wheels=st.tuples(SPEEDS, SPEEDS),
-        age=st.sampled_from((0, 0, 1, 10, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1, -20, -9999)),
+        wheels=st.tuples(WRONG_SPEEDS, WRONG_SPEEDS),
+        age=st.sampled_from((0, 1, 10, TIMEOUT - 1, TIMEOUT, TIMEOUT + 1, -20, -9999)),
     )
+    def accept_or_reject(self, wheels, age):
+        self.accept(wheels, age)
+
+    @rule(wheels=st.tuples(SPEEDS, SPEEDS), age=st.sampled_from((0, 10)))
     def accept(self, wheels, age):
         stamp = self.now - age
         why = self.limiter.accept(command(*wheels, stamp), self.now * MS)
@@ -309,6 +314,16 @@ class LimiterMachine(RuleBasedStateMachine):
         else:
             assert why == ''
             self.followed, self.timed_out = (wheels, min(stamp, self.now)), False
+
+    @precondition(lambda self: not self.estop)
+    @rule(wheels=st.tuples(SPEEDS, SPEEDS), repeated=st.integers(1, 3))
+    def accept_and_let_expire(self, wheels, repeated):
+        for _ in range(repeated):
+            self.accept(wheels, 0)
+            self.tells_what_it_follows()
+            if self.followed:
+                self.wait_until_it_expires(0)
+                self.tells_what_it_follows()
 
     @rule()
     def stop(self):
@@ -353,6 +368,7 @@ class LimiterMachine(RuleBasedStateMachine):
     def tells_what_it_follows(self):
         limiter, now_ns = self.limiter, self.now * MS
         assert (limiter.reason == '') == (self.followed is not None)
+        assert limiter.timed_out == self.timed_out
         assert limiter.estop == self.estop == limiter.reason.startswith('emergency stop')
         until = self.followed[1] + TIMEOUT if self.followed else self.now
         assert limiter.remaining_ns(now_ns) == max(until - self.now, 0) * MS

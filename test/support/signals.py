@@ -5,6 +5,8 @@
 from contextlib import contextmanager
 import signal
 
+NUMBERS = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+
 
 def attend():
     """Attend to the signals that end a process, also where the caller ignores some.
@@ -12,15 +14,18 @@ def attend():
     ``nohup`` ignores SIGHUP and the shell, for what runs in the background, SIGINT; children
     inherit that, and neither a shell nor this package changes it.
     """
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in NUMBERS:
         signal.signal(number, signal.SIG_DFL)
 
 
 @contextmanager
-def hangup_attended():
-    """Have SIGHUP end this process and those that it starts meanwhile."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+def attended():
+    """Attend to ignored signals in this process and those that it starts meanwhile."""
+    ignored = [number for number in NUMBERS if signal.getsignal(number) == signal.SIG_IGN]
+    for number in ignored:
+        signal.signal(number, signal.SIG_DFL)
     try:
         yield
     finally:
-        signal.signal(signal.SIGHUP, before)
+        for number in ignored:
+            signal.signal(number, signal.SIG_IGN)

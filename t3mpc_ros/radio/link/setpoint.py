@@ -70,7 +70,6 @@ class SetpointArbiter:
     def latch(self, reason: str) -> None:
         """Latch the emergency stop."""
         self._estop = f'emergency stop: {reason}'
-        self._release_until_ns = None
         self.clear(reasons.NO_COMMAND)
 
     def release(self, robot_latched: bool, now_ns: int) -> str:
