@@ -113,6 +113,13 @@ def test_every_byte_comes_back_through_rosbags_and_through_mcap(folder):
     assert bag.path == folder / 'run_0.mcap'
     assert read_with_rosbags(folder) == written
     assert read_with_mcap(bag.path) == written
+    with bag.path.open('rb') as file:
+        messages = [each for *_, each in make_reader(file).iter_messages()]
+    assert [each.publish_time for each in messages] == [now - 1_000_000 for _, now, _ in written]
+    counts = dict.fromkeys({each.channel_id for each in messages}, 0)
+    for each in messages:  # by channel: a gap would be a lost message
+        assert each.sequence == counts[each.channel_id]
+        counts[each.channel_id] += 1
 
 
 def test_the_data_section_has_a_checksum_and_it_is_right(folder):

@@ -142,6 +142,15 @@ def test_a_withdrawn_jump_leaves_no_offset():
     assert not transition.active
 
 
+def test_jumps_from_the_instant_of_a_withdrawal_on_do_not_occur():
+    transition = JumpTransition(JumpTransitionParameters(), 0.0, T)
+    jumps = {instant: np.array([1.0, -2.0]) * instant for instant in (24, 25, 26)}
+    for instant, jump in jumps.items():
+        transition.announce(instant * NS, jump, np.zeros(2))
+    transition.withdraw(25 * NS)
+    np.testing.assert_array_equal(transition.pop_passed(100 * NS), jumps[24])
+
+
 def test_future_jumps_enter_psi_free_in_their_period():
     transition = JumpTransition(JumpTransitionParameters(), 0.0, T)
     transition.announce(7 * NS, np.array([2.0, -1.0]), np.zeros(2))

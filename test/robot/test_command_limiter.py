@@ -191,10 +191,11 @@ def test_an_emergency_stop_has_a_fixed_least_deceleration():
     assert stop_time(limiter, 3000, 3000) <= 10.0 / 60.0 + 0.01
 
 
-def test_a_lowered_speed_limit_does_not_slow_a_stop():
+@pytest.mark.parametrize('right, left', [(10.0, 10.0), (-10.0, -10.0), (0.0, -10.0)])
+def test_a_lowered_speed_limit_does_not_slow_a_stop(right, left):
     limiter = make_limiter()
     for now in range(0, 1000, 10):
-        limiter.accept(command(10.0, 10.0, now), now * MS)
+        limiter.accept(command(right, left, now), now * MS)
         limiter.advance(now * MS, 0.01)
     limiter.parameters = CommandLimiterParameters(
         wheel_speed=0.5, acceleration=2.0, stop_deceleration=2.0
