@@ -99,8 +99,9 @@ STAGES = ['ruff', 'ruff', 'mypy', 'pytest']
 
 
 @pytest.fixture
-def checkout(tmp_path):
-    """Return a function that runs ``scripts/check``: plan, arguments, exit code, stages, text."""
+def checkout(tmp_path, monkeypatch):
+    """Return a folder with ``scripts/check`` and a Python of the test."""
+    monkeypatch.delenv('T3MPC_COVERAGE', raising=False)  # of a check that runs this test
     scripts = tmp_path / 'a checkout' / 'scripts'
     scripts.mkdir(parents=True)
     (scripts / 'environment.sh').write_text(ENVIRONMENT)
