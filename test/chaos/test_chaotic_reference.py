@@ -38,6 +38,7 @@ def derivative(values, rate):
     return inner * rate / 12.0
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_samples_are_on_the_grid_and_start_from_rest():
     run = samples(400)
@@ -59,6 +60,7 @@ def test_wheels_are_the_selected_scaled_states():
         assert sample.selected == parameters.switching.pairs[sample.mode]
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('output', ['wheels', 'body'])
 @pytest.mark.parametrize('blend', [0.0, 4.0])
 @pytest.mark.slow
@@ -94,6 +96,7 @@ def test_rate_has_no_impulse_at_a_sudden_jump():
         np.testing.assert_allclose(rates[jump], slope[np.array(run[jump].selected) - 1], atol=0.1)
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_defaults_are_what_a_small_robot_can_follow():
     """Standard deviation near 3 rad/s, accelerations of 1 to 6 rad/s², peaks near 10 rad/s."""
@@ -174,6 +177,7 @@ def test_switch_times_do_not_reveal_the_perturbation():
     assert left.var() > 0.8 * centred.var()
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_reset_repeats_a_run_and_another_seed_gives_another_one():
     reference = ChaoticReference(

@@ -22,6 +22,7 @@ def _points(seed, length=60.0, **values):
     return path, np.vstack([path.advance(5.0) for _ in range(round(length / 5.0))])
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('blend', [0.0, 2.0], ids=['abrupt', 'smooth'])
 @pytest.mark.parametrize('arena', [(-1.75, -1.25, 1.75, 1.25), TRIANGLE])
 @pytest.mark.slow

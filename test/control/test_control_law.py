@@ -201,6 +201,7 @@ def test_the_compensated_bound_is_the_smallest_that_80_permits():
     assert off.compensated_bound == omega_bar < bound
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('seed', few_of(range(4)))
 @pytest.mark.slow
 def test_e17_the_integral_of_84_holds_with_the_initial_v_only(seed):

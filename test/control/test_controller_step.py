@@ -23,6 +23,9 @@ from t3mpc_ros.parameters.table import ParameterError
 MS = 1_000_000
 
 
+pytestmark = pytest.mark.compiled
+
+
 @pytest.fixture(scope='module')
 def tracking():
     loop = Loop()
