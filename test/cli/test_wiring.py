@@ -814,3 +814,29 @@ def test_an_option_of_the_demo_reaches_its_node(words, monkeypatch, tmp_path):
 def test_every_option_of_the_demo_has_a_row():
     used = f'{" ".join(DEMO)} '
     assert not [name for name in options(commands()['demo']) if f'--{name} ' not in used]
+
+
+@pytest.mark.parametrize('command', ['echo', 'hz'])
+def test_what_arrives_is_printed_at_once(command, monkeypatch, tmp_path):
+    """Into a pipe nothing was seen until kilobytes had gathered."""
+    path = tmp_path / 'pipe'
+    seen = []
+
+    def messages(topic):
+        yield 'one'
+        for time in (1.0, 2.0, 3.0):
+            clock.time = time
+            yield 'two'
+            yield None
+            seen.append(path.read_text())
+
+    clock = SimpleNamespace(time=0.0)
+    monkeypatch.setattr('t3mpc_ros.cli.graph.time.monotonic', lambda: clock.time)
+    opened = MagicMock(messages=messages)
+    monkeypatch.setattr('t3mpc_ros.nodes.graph_tools.graph', lambda stop: nullcontext(opened))
+    monkeypatch.setattr('t3mpc_ros.nodes.graph_tools.message_text', lambda message, _: message)
+    with path.open('w') as pipe:
+        monkeypatch.setattr(sys, 'stdout', pipe)
+        assert main(['topic', command, '/odom']) == 0
+    assert seen[1]
+    assert seen[1] != seen[2]

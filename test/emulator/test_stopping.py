@@ -3,11 +3,13 @@
 """Time from the last valid command to rest: host of the bridge and emulator in virtual time."""
 
 import math
+import re
 
 import pytest
 from support.emulator_bench import RobotBench
 from support.long_tests import few_of
 
+from t3mpc_ros.emulator.emulator import StopTimeMonitor
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.radio.link.port_actions import LinkState
 
@@ -38,6 +40,21 @@ def run_and_observe(bench, seconds):
         if bench.board.speeds != (0, 0):
             moved = (bench.now_ns - start_ns) / NANOSECONDS
     return moved
+
+
+def test_the_report_of_a_stop_names_its_time_and_the_speeds_before():
+    bench = RobotBench()
+    bench.connect()
+    watch = StopTimeMonitor(bench.emulator)
+    bench.drive(8.0, 5.0)
+    bench.run(1.5)
+    assert watch.poll() == ''
+    bench.inject('loss_down', math.inf, 1.0)
+    bench.run(1.0)
+    text = r'wheels at rest (0\.\d{3}) s after the last command \(right 8, left 5 rad/s\)'
+    time = float(re.fullmatch(text, watch.poll())[1])
+    assert 0.1 < time <= REST
+    assert watch.poll() == ''
 
 
 @pytest.mark.parametrize('late', few_of(range(0, 20, 4), 2))

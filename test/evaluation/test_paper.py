@@ -873,3 +873,11 @@ def test_nothing_depends_on_the_order_of_the_runs_or_on_a_resume(folder, tmp_pat
     assert len(runner.done) < len(lines)
     for name in ('results.json', 'results.csv', 'tables.md'):
         assert (tmp_path / name).read_text() == (folder / name).read_text(), name
+
+
+@pytest.mark.usefixtures('unrendered')
+def test_a_fresh_start_runs_everything_again(folder, tmp_path):
+    (tmp_path / RUNS).write_text(text := (folder / RUNS).read_text())
+    options = PaperOptions(tmp_path, quick=True, seeds=2, estimation_seeds=1, fresh=True)
+    reproduce(fake_setup(runner := FakeRunner()), options)
+    assert len(runner.done) >= len(text.splitlines())  # and those of the figures

@@ -20,9 +20,11 @@ from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool import procedure, robot_records
 from t3mpc_ros.radio.tool.calibration_wizard import CalibrationWizard, WizardOptions
+from t3mpc_ros.robot import calibration
 from t3mpc_ros.robot.calibration import (
     COVERAGE,
     Calibration,
+    CalibrationError,
     DividerCorrection,
     Estimate,
     SharpCurve,
@@ -159,6 +161,27 @@ def test_a_mark_distance_of_zero_is_refused_and_repeated(person):
     assert 'at least 0.5 m: got 0' in person.transcript
     assert "must be a number, or skip: got '0.5 m'" in person.transcript
     assert found.wheel_radius.value == pytest.approx(RADIUS, rel=0.01)
+
+
+@pytest.mark.slow
+def test_turns_that_are_refused_count_for_nothing(person, monkeypatch):
+    """Their marks were misread: by 90 degrees in ten turns, 2.5 % of the scale of the gyro."""
+    estimate, refused = calibration.estimate_track, []
+
+    def refuse_once(turns, *others):
+        if not refused:
+            refused.append(turns)
+            raise CalibrationError('misread')
+        return estimate(turns, *others)
+
+    monkeypatch.setattr(calibration, 'estimate_track', refuse_once)
+    person.answers = {'Degrees from the mark': ['90', '-90'], 'Enter to repeat': ['']}
+    start = Calibration(wheel_radius=Estimate(RADIUS, 1e-5))
+    found = wizard(person, 'track', start=start).run()
+    assert refused
+    true = 1.0 / (1.0 + 0.03 * person.plant._imu._scale)
+    error = abs(found.gyro_scale.value - true)
+    assert error < 1.5 * COVERAGE * found.gyro_scale.uncertainty < 0.005
 
 
 def test_what_is_left_out_keeps_its_value(person):

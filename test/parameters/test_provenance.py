@@ -1,0 +1,34 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What bags and reports say about the program that made them."""
+
+import platform
+import subprocess
+
+import t3mpc_ros
+from t3mpc_ros.parameters.provenance import provenance
+
+
+def test_the_commit_is_that_of_the_checkout_and_says_whether_files_differ(tmp_path):
+    package = tmp_path / 't3mpc_ros'
+    package.mkdir()
+    (package / 'module.py').write_text('1')
+    assert provenance(package) == {
+        'version': t3mpc_ros.__version__,
+        'commit': 'unknown',
+        'python': platform.python_version(),
+    }
+
+    def git(*words):
+        command = ['git', '-C', tmp_path, '-c', 'user.name=a', '-c', 'user.email=a@b', *words]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+    git('init', '-q')
+    assert provenance(package)['commit'] == 'unknown'  # nothing is committed
+    git('add', '.')
+    git('commit', '-qm', 'one')
+    commit = git('rev-parse', 'HEAD').strip()
+    git('tag', 'v1')  # a tag is no commit
+    assert provenance(package)['commit'] == commit
+    (package / 'module.py').write_text('2')
+    assert provenance(package)['commit'] == f'{commit}-dirty'
