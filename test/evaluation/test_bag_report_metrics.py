@@ -331,7 +331,7 @@ def test_parts_between_gaps_have_their_settled_error(rows, tmp_path):
     for switch in SWITCHES:
         calm &= (times < switch - 0.195) | (times >= switch + 1.0)
     # The first second of each part is left out.
-    driven = (1.005 < times) & (times < 8.4), times > 12.0
+    driven = (times > 1.005) & (times < 8.4), times > 12.0
     for row, part in ((table[:7], driven[0]), (table[7:14], driven[1])):
         for k, cell in ((0, row[3]), (1, row[5])):
             rms = np.sqrt(np.mean(error[calm & part, k] ** 2))
