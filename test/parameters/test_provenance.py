@@ -9,7 +9,7 @@ import t3mpc_ros
 from t3mpc_ros.parameters.provenance import provenance
 
 
-def test_the_commit_is_that_of_the_checkout_and_says_whether_files_differ(tmp_path):
+def test_the_commit_says_whether_files_differ(tmp_path):
     package = tmp_path / 't3mpc_ros'
     package.mkdir()
     (package / 'module.py').write_text('1')
