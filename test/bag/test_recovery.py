@@ -8,6 +8,7 @@ import itertools
 import json
 import os
 import random
+import re
 import sqlite3
 import struct
 
@@ -28,8 +29,10 @@ from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_output, recover_bag
 from t3mpc_ros.bag.recovery.recover_file import UnreadableError, recover_file
+from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult, TopicResult
 from t3mpc_ros.bag.schema import MessageDefinitions
 from t3mpc_ros.bag.writer import BagWriter
+from t3mpc_ros.cli import bag as bag_commands
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.bag import size_text
 
@@ -526,6 +529,78 @@ def test_recover_command_reports_messages_and_exit_code(tmp_path, capsys):
     assert bag_main(['recover', str(tmp_path / 'nothing')]) == 1
     with pytest.raises(SystemExit, match='2'):
         bag_main(['recover'])
+
+
+SOUND = {'ended': True, 'exact': True}
+GONE = Damage(100, 3100, 'a chunk', messages=5, span_ns=(2 * 10**9, 5 * 10**9))
+
+
+@pytest.mark.parametrize(
+    ('state', 'damages', 'lost', 'column', 'verdict'),
+    [
+        (SOUND, [], (0, 0), ['0', '0'], 'nothing is lost'),
+        (
+            SOUND, [GONE], (0, 5), ['0', '5'],
+            'lost: 5 messages, within 3.000 s, 3 kB of the input not usable',
+        ),
+        # Overlapping spans are counted once; what is repeated elsewhere is not lost.
+        (
+            SOUND,
+            [
+                GONE,
+                Damage(4000, 4500, 'more', messages=1, span_ns=(4 * 10**9, 7 * 10**9)),
+                Damage(9000, 9999, 'an index', harmless=True),
+            ],
+            (2, 4),
+            ['2', '4'],
+            'lost: 6 messages, within 5.000 s, 3.5 kB of the input not usable',
+        ),
+        (SOUND, [Damage(1, 3, 'zeros')], (0, 0), ['0', '0'], 'lost: 0 messages, 2 B of'),
+        # Without an end, or without statistics, more may be gone than is known.
+        (
+            {'ended': True}, [GONE], (0, 5), ['?', '>= 5'],
+            'lost: >= 5 messages, within 3.000 s, 3 kB of',
+        ),
+        ({}, [GONE], (0, 5), ['?', '>= 5'], 'lost: >= 5 messages, 3 kB of'),
+        (
+            {}, [Damage(100, 3100, 'the file has no end')], (0, 0), ['?', '?'],
+            'lost: an unknown number of messages, 3 kB of',
+        ),
+    ],
+)  # fmt: skip
+def test_recover_says_what_it_knows_of_the_loss(
+    state, damages, lost, column, verdict, monkeypatch, tmp_path, capsys
+):
+    names = '/a', '/b'
+    made = [
+        FileResult(
+            'run_0.mcap', 9000, topics={
+                name: TopicResult(name, 'x/Y', kept, unchecked, gone)
+                for name, kept, unchecked, gone in zip(
+                    names, (40, 300), (7, 0), lost, strict=True
+                )
+            }, damages=damages, **state,
+        ),
+        # A sound file of the same bag changes neither the counts nor what is known.
+        FileResult('run_1.mcap', 10, True, True, {'/a': TopicResult('/a', 'x/Y', 2)}),
+    ]  # fmt: skip
+    result = RecoveryResult(tmp_path / 'new', tuple(made))
+    monkeypatch.setattr(bag_commands, 'recover_bag', lambda *_: result)
+    assert bag_main(['recover', str(tmp_path / 'x')]) == (0 if verdict == 'nothing is lost' else 3)
+    printed = capsys.readouterr().out
+    lines = [re.split(r'\s{2,}', line) for line in printed.splitlines()]
+    assert lines[:3] == [
+        ['topic', 'type', 'kept', 'unchecked', 'lost'],
+        ['/a', 'x/Y', '42', '7', column[0]],
+        ['/b', 'x/Y', '300', '0', column[1]],
+    ]
+    said = printed.splitlines()[-1]
+    assert said.startswith(f'342 messages are kept in {tmp_path / "new"}; {verdict}')
+    assert 'run_1.mcap: sound, copied' in printed
+    assert 'no checksum of the file covers these' in printed
+    if GONE in damages:
+        assert '  bytes 100 to 3100: a chunk; 5 messages lost; within 3.000 s\n' in printed
+    assert printed.count('(nothing is lost with it)') == sum(each.harmless for each in damages)
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,7 @@ def test_an_animation_has_its_frames_rate_and_size(tmp_path, capsys):
     with Image.open(output) as film:
         assert film.n_frames == 21
         assert film.info['duration'] == 200
+        assert film.info['loop'] == 0  # for ever
         assert film.size[0] == 300
         first = np.asarray(film.convert('RGB')).astype(int)
         film.seek(20)

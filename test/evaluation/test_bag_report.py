@@ -28,7 +28,7 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.main import main as t3mpc
 from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, parts
-from t3mpc_ros.evaluation.bag_report.link_history import link_metrics
+from t3mpc_ros.evaluation.bag_report.link_history import COUNTERS, link_metrics
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
 from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
@@ -527,6 +527,37 @@ def test_the_link_s_figures_come_from_its_diagnostics(rows, tmp_path, capsys):
     assert '>Radio link</h2>' in page
     assert 'link' in titles_of(page)
     assert 'Least share of a report: 94.0 %.' in page
+
+
+def test_every_counter_of_a_link_goes_on_over_restarts(rows, tmp_path):
+    """A bridge has counted before its first report; those that do not fall begin anew, too.
+
+    A counter that was as high again at that report once had no growth over the restart.
+    """
+    before = dict(zip(COUNTERS, (2000, 37, 3, 5, 7, 11, 13, 17, 1900, 19), strict=True))
+    after = dict(zip(COUNTERS, (700, 23, 3, 6, 9, 11, 14, 29, 680, 31), strict=True))
+    said = [
+        status(1.5, **dict.fromkeys(COUNTERS, 1)),
+        status(2.5, **before),
+        status(3.5, **after),
+        status(4.5, **{key: 'none' if key == 'sessions' else n + 2 for key, n in after.items()}),
+        status(5.5, **{key: n + 4 for key, n in after.items()}),
+    ]
+    (link,) = run_of(write(tmp_path / 'bag', sorted([*rows, *said], key=lambda r: r[0]))).links
+    expected = {key: before[key] - 1 + after[key] + 4 for key in COUNTERS}
+    assert {key: link.grown(key) for key in COUNTERS} == expected
+    found = link_metrics(link)
+    assert found.answered == pytest.approx(1.0 - expected['cycles_lost'] / expected['cycles'])
+    assert {
+        'cycles': found.cycles,
+        'cycles_lost': found.lost,
+        'robot_resets': found.resets,
+        'dongle_resets': found.dongle_resets,
+        'sessions': found.sessions,
+        'port_failures': found.port_failures,
+    }.items() <= expected.items()
+    assert [*np.isnan(link.answered())] == [True, False, True, False, False]
+    assert found.damaged == expected['crc_errors'] + expected['frame_errors']
 
 
 # -- long runs ----------------------------------------------------------------------------------

@@ -68,17 +68,29 @@ class LinkHistory:
             return np.full(self.time.size, math.nan) if share is None else 1.0 - share
         made, failed = (np.diff(table, prepend=math.nan) for table in (cycles, lost))
         with np.errstate(invalid='ignore', divide='ignore'):
-            # A falling counter means that the bridge was restarted.
-            return np.where((made > 0.0) & (failed >= 0.0), 1.0 - failed / made, math.nan)
+            known = (made > 0.0) & (failed >= 0.0) & (np.diff(self._starts(), prepend=0) == 0)
+            return np.where(known, 1.0 - failed / made, math.nan)
 
     def grown(self, key: str) -> float:
         """Return the increase of a counter in the recording, over restarts; NaN if unknown."""
         table = self.values.get(key)
         if table is None or not np.isfinite(table).any():
             return math.nan
-        known = table[np.isfinite(table)]
-        steps = np.diff(known)
-        return float(np.where(steps >= 0.0, steps, known[1:]).sum())
+        rows = np.flatnonzero(np.isfinite(table))
+        known = table[rows]
+        restarted = np.diff(self._starts()[rows]) > 0
+        return float(np.where(restarted, known[1:], np.diff(known)).sum())
+
+    def _starts(self) -> NDArray[np.intp]:
+        """Return how often the bridge was started anew up to each report, shape (n,).
+
+        All its counters begin at zero then. The one that falls tells it of those that do not.
+        """
+        fell = np.zeros(self.time.size, dtype=bool)
+        for table in (self.values[key] for key in COUNTERS if key in self.values):
+            rows = np.flatnonzero(np.isfinite(table))
+            fell[rows[1:]] |= np.diff(table[rows]) < 0.0
+        return np.cumsum(fell)
 
 
 @dataclass(frozen=True)
