@@ -10,6 +10,7 @@ import math
 from types import SimpleNamespace
 
 from matplotlib.colors import to_hex
+from matplotlib.patches import Circle, Rectangle
 import numpy as np
 import pytest
 
@@ -25,14 +26,23 @@ from t3mpc_ros.evaluation.paper import paper_figures
 from t3mpc_ros.evaluation.paper.experiment_runs import STAGES, WITHOUT, Experiment, RunNumbers
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.results import Results
-from t3mpc_ros.evaluation.patrol import patrol_figures
-from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolResult
+from t3mpc_ros.evaluation.patrol import patrol_figures, tracking_page
+from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid
+from t3mpc_ros.evaluation.patrol.path_tracking import OURS as TRACKER
+from t3mpc_ros.evaluation.patrol.path_tracking import TRACKED_PATHS
+from t3mpc_ros.evaluation.patrol.patrol_comparison import (
+    OURS,
+    PatrolPlan,
+    PatrolResult,
+    PatrolTrack,
+)
 from t3mpc_ros.evaluation.process_replay import divergence_figure
 from t3mpc_ros.evaluation.process_replay.comparison import Comparison, FieldComparison, Tolerances
 from t3mpc_ros.evaluation.twin_validation import validation_page
 from t3mpc_ros.evaluation.twin_validation.courses import Course, Drift
 from t3mpc_ros.scripting.parameter_sweep import Sweep
 from t3mpc_ros.scripting.single_run import RunResult
+from t3mpc_ros.simulation.world import World
 
 GREEN, RED, GREY, COMMAND = '#15803d', '#be123c', '#6b7280', '#0f766e'
 
@@ -496,6 +506,162 @@ def test_skills_have_their_intervals():
         assert middles == pytest.approx([np.mean(row) for row in values])
         assert half == pytest.approx([interval(row) for row in values])
     assert texts(axis)[1:] == ('horizon / s', 'skill of the observer')
+
+
+WORLD = World(
+    'odd',
+    np.array([[0.0, 0.0, 4.0, 0.5], [4.0, 0.5, 3.0, 2.0]]),
+    np.array([[1.0, 1.5, 0.2]]),
+    np.array([[3.0, 0.5, 0.4, 0.1]]),
+    np.array([[2.0, 1.0, 0.8, 0.2, math.pi / 6]]),
+)
+
+
+def value_at(axis, x, y):
+    """Return the number that the picture of an axis shows at a place of its coordinates."""
+    (image,) = axis.images
+    across, up = axis.transData.transform((x, y))
+    return image.get_cursor_data(SimpleNamespace(x=across, y=up))
+
+
+def walls_of(axis):
+    """Return the walls that are drawn, shape (n, 4), and the places (m) of discs and boxes."""
+    (walls,) = axis.collections
+    discs = [(*each.center, each.radius) for each in axis.patches if isinstance(each, Circle)]
+    corners = [
+        each.get_patch_transform().transform(each.get_path().vertices[:4])
+        for each in axis.patches
+        if isinstance(each, Rectangle)
+    ]
+    return np.reshape(walls.get_segments(), (-1, 4)), discs, corners
+
+
+def patrol_track(place, hits):
+    """Return a patrol that stays at a place for 3 s and at another one for 1 s."""
+    time = np.arange(0.0, 5.0)
+    position = np.array([place, place, place, place, (3.5, 1.75)])
+    blocked = np.zeros((4, 8), dtype=bool)
+    blocked[3, 1] = True  # x 0.5 to 1, y 1.5 to 2
+    grid = CoverageGrid((0.0, 0.0), (4.0, 2.0), 8, 4, blocked)
+    return PatrolTrack(
+        time, position, position + 9.0, time > 0.0, grid, WORLD, np.asarray(hits, dtype=float)
+    )
+
+
+TRACKS = {
+    OURS: patrol_track((0.25, 0.25), [(4.0, 0.5), (3.2, 1.7)]),
+    'random walk': patrol_track((2.75, 0.75), [(1.0, 1.3)]),
+}
+
+
+def test_heat_maps_are_where_the_robot_was():
+    """Between the walls and axes of the room: the picture of an array begins at the top."""
+    *axes, bar = patrol_figures.heat_maps(TRACKS).axes
+    for axis, (name, track), place in zip(
+        axes, TRACKS.items(), ((0.25, 0.25), (2.75, 0.75)), strict=True
+    ):
+        assert title(axis) == name
+        even = 4.0 / 31  # s in each of the cells that count
+        assert 3.0 / even <= value_at(axis, *place) < 4.0 / even
+        entered = {(x, y) for x, y in track.grid.centres().reshape(-1, 2).tolist()
+                   if value_at(axis, x, y) > 0.0}  # fmt: skip
+        steps = np.linspace(place, (3.5 - 1e-9, 1.75 - 1e-9), 1000)
+        assert entered == {(*cell,) for cell in (0.5 * np.floor(2.0 * steps) + 0.25).tolist()}
+        assert np.ma.is_masked(value_at(axis, 0.75, 1.75))
+        assert axis.images[0].get_clim() == (0.0, 3.0)
+        assert walls_of(axis)[0] == pytest.approx(WORLD.segments)
+        assert (axis.get_xlim(), axis.get_ylim()) == (
+            pytest.approx((-0.1, 4.1)),
+            pytest.approx((-0.1, 2.1)),
+        )
+        dark, pale = (axis.images[0].cmap(each)[0] for each in (1.0, 0.0))
+        assert dark < pale
+    assert bar.get_ylabel() == 'time in the cell / even share'
+
+
+def test_patrols_are_drawn_with_their_hits_and_the_room():
+    for axis, (name, track) in zip(
+        patrol_figures.path_panels(TRACKS).axes, TRACKS.items(), strict=True
+    ):
+        assert title(axis) == name
+        hits, path = axis.lines
+        assert hits.get_xydata() == pytest.approx(track.hits)
+        assert to_hex(hits.get_color()) == '#f59e0b'  # orange, as the title says
+        assert (hits.get_marker(), hits.get_linestyle()) == ('.', 'None')
+        assert path.get_xydata() == pytest.approx(track.position)
+        assert axis.get_aspect() == 1.0
+        segments, discs, (corners,) = walls_of(axis)
+        assert segments == pytest.approx(WORLD.segments)
+        assert discs == [(3.0, 0.5, 0.4), (1.0, 1.5, 0.2)]
+        along, across = (
+            size / 2 * np.array((math.cos(yaw), math.sin(yaw)))
+            for size, yaw in ((0.8, math.pi / 6), (0.2, 2 * math.pi / 3))
+        )
+        middle = np.array((2.0, 1.0))
+        assert corners == pytest.approx(
+            np.array([middle + a * along + b * across for a, b in
+                      ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+        )  # fmt: skip
+
+
+def test_tracked_paths_have_the_drives_of_their_methods():
+    paths = [*TRACKED_PATHS][:2]
+    colours = {'path': '#9ca3af', TRACKER: '#be123c', 'pure pursuit': '#0284c7'}
+    results = {
+        path: {
+            method: [SimpleNamespace(track=np.array([[k, 2.0 * n], [k + 1.0, 3.0 * n]]))]
+            for n, method in enumerate(('pure pursuit', TRACKER, 'with the default gains'), 1)
+        }
+        for k, path in enumerate(paths)
+    }
+    first, second, *empty = tracking_page.draw_tracks(results).axes
+    for axis, path in zip((first, second), paths, strict=True):
+        shown = lines(axis)
+        assert shown.keys() == colours.keys()
+        assert shown.pop('path').T == pytest.approx(TRACKED_PATHS[path]())
+        for name, drawn in shown.items():
+            assert drawn.T == pytest.approx(results[path][name][0].track)
+        assert {each.get_label(): to_hex(each.get_color()) for each in axis.lines} == colours
+        assert texts(axis) == (path, 'x / m', 'y / m')
+    assert not any(axis.get_visible() for axis in empty)
+
+
+def test_divergences_are_marked_at_their_time_and_field(caught, tmp_path):
+    """Beside the name of the field; pale where all agree, dark beyond the tolerance."""
+    time = 5.0 + 0.1 * np.arange(100)
+    was = {name: np.zeros(100) for name in ('command', 'speed', 'estimate')}
+    was['estimate'][:50] = np.nan  # not recorded before 10 s
+    now = {name: values.copy() for name, values in was.items()}
+    now['speed'][20:25] += 1.0
+    now['estimate'][80:] += 1.0
+    rows = tuple(
+        FieldComparison(name, 100, 1.0, 1.0, beyond, when, first)
+        for name, beyond, when, first in (
+            ('command', 0, math.nan, -1), ('speed', 5, 7.0, 20), ('estimate', 20, 13.0, 80)
+        )
+    )  # fmt: skip
+    outcome = Comparison(
+        rows, Tolerances(0.01, 0.1), time, was, now, np.ones(100, dtype=bool), (), ()
+    )
+    divergence_figure.write_divergence_figure(outcome, tmp_path / 'x.png')
+    axis = caught[0].axes[-1]
+    places = dict(
+        zip([each.get_text() for each in axis.get_yticklabels()], axis.get_yticks(), strict=True)
+    )
+    assert places.keys() == was.keys()
+    for name, same, dark in (
+        ('command', (5.5, 7.1, 13.5), ()),
+        ('speed', (5.5, 9.0, 13.5), (7.1,)),
+        ('estimate', (11.0,), (13.2, 14.5)),
+    ):
+        assert [value_at(axis, when, places[name]) for when in same] == [0.0] * len(same), name
+        assert [value_at(axis, when, places[name]) for when in dark] == [1.0] * len(dark), name
+    assert np.ma.is_masked(value_at(axis, 7.1, places['estimate']))
+    assert places['command'] < places['speed'] < places['estimate']
+    assert axis.yaxis_inverted()  # the first at the top
+    colours = [to_hex(axis.images[0].cmap(level)) for level in (0.0, 1.0)]
+    assert colours == ['#d1fae5', RED]
+    assert axis.get_xlabel() == 'time / s'
 
 
 COURSE = Course('10 turns', TIME, *(np.outer(TIME, (k, 2 * k, 0.1 * k)) for k in (1.0, 2.0, 3.0)),
