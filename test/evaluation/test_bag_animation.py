@@ -6,6 +6,7 @@ from dataclasses import replace
 import math
 from pathlib import Path
 
+from matplotlib.colors import to_hex
 import numpy as np
 from PIL import Image
 import pytest
@@ -18,7 +19,9 @@ from t3mpc_ros.evaluation.bag_report.animation import (
     RangeReadings,
     animate_bag,
 )
-from t3mpc_ros.evaluation.bag_report.run_data import load_run
+from t3mpc_ros.evaluation.bag_report.run_data import Series, load_run
+from t3mpc_ros.evaluation.bag_report.topic_roles import ODOMETRY, REFERENCE
+from t3mpc_ros.simulation.world import World
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'
 
@@ -81,6 +84,90 @@ def test_the_panels_show_the_quantities_of_their_titles(measured, tmp_path, monk
         time, values = error.get_data()
         wanted = np.interp(time, reference.time, reference[wheel])
         assert values == pytest.approx(np.interp(time, motion.time, motion[wheel]) - wanted)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('follows', [True, False])
+def test_the_floor_shows_the_robot_its_way_and_what_it_sees(follows, tmp_path, monkeypatch):
+    """Where it is at the last frame, with the path to follow up to then, or that ahead of it."""
+    time = np.arange(0.0, 6.0, 0.05)
+    pose = {'x': 0.2 * time - 0.5, 'y': 0.1 * time**1.5, 'yaw': 0.3 * time - 1.0}
+    speeds = dict.fromkeys(('linear', 'angular', 'right', 'left'), np.full(time.size, 0.2))
+    wanted = {**speeds, 'x': pose['x'] + 0.3, 'y': pose['y'] - 0.4}
+    wanted['angular'] = np.full(time.size, -0.5)
+    with open_bag(GOLDEN) as recording:
+        run = load_run(recording)
+    run = replace(
+        run,
+        motions={ODOMETRY: Series(time, {**pose, **speeds}), REFERENCE: Series(time, wanted)},
+        receipts={ODOMETRY: time, REFERENCE: time},
+        follows_path=follows,
+    )
+    mounts = np.array([[0.1, 0.05, 0.0], [0.0, -0.1, -math.pi / 2]])
+    ranges = RangeReadings((time, time), (1.0 + 0.1 * time, 0.5 + 0.05 * time), mounts)
+    world = World(
+        'odd', np.array([[-1.0, -0.5, 2.0, -0.6]]), np.array([[1.5, 1.5, 0.2]]), np.empty((0, 4)),
+        np.empty((0, 5)),
+    )  # fmt: skip
+    figures = []
+
+    class Kept(animation.Figure):
+        def __init__(self, *arguments, **named):
+            super().__init__(*arguments, **named)
+            figures.append(self)
+
+    monkeypatch.setattr(animation, 'Figure', Kept)
+    monkeypatch.setattr(animation, 'load_run', lambda *_: run)
+    monkeypatch.setattr(animation, 'read_ranges', lambda *_: ranges)
+    monkeypatch.setattr(animation, 'recorded_world', lambda *_: world)
+    chosen = AnimationOptions(start=1.0, duration=2.0, rate=1.0, width=200)
+    animate_bag(GOLDEN, tmp_path / 'x.gif', chosen)
+    floor = figures[-1].axes[0]
+    line, trail, hits, nose = (each.get_xydata() for each in floor.lines)
+    at = np.array([np.interp(3.0, time, pose[each]) for each in ('x', 'y', 'yaw')])
+    driven = (time > 1.0 - 1e-9) & (time < 3.0 - 1e-9)
+    way = np.column_stack([pose['x'], pose['y']])[driven]
+    assert trail == pytest.approx(np.vstack([way, at[:2]]))
+    walls, rays = floor.collections
+    pillar, body = floor.patches
+    assert body.center == pytest.approx(at[:2])
+    assert nose == pytest.approx(
+        np.array([at[:2], at[:2] + 0.1 * np.array((math.cos(at[2]), math.sin(at[2])))])
+    )
+    assert np.array(rays.get_segments()) == pytest.approx(ranges.rays(3.0, (*at,)))
+    seen = [
+        ranges.rays(now, tuple(np.interp(now, time, pose[each]) for each in ('x', 'y', 'yaw')))
+        for now in (1.0, 2.0, 3.0)
+    ]
+    assert hits == pytest.approx(np.vstack(seen)[:, 1])
+    if follows:
+        assert line == pytest.approx(np.column_stack([wanted['x'], wanted['y']])[driven])
+    else:
+        # From the robot, as far as the wanted speeds lead, turning right.
+        assert len(line) == pytest.approx(animation.AHEAD / 0.05, abs=1)
+        assert np.hypot(*(line[0] - at[:2])) == pytest.approx(0.01)
+        steps = np.diff(line[:-1], axis=0)
+        assert np.hypot(*steps.T) == pytest.approx(0.01)
+        courses = np.arctan2(steps[:, 1], steps[:, 0])
+        assert np.diff(courses) == pytest.approx(-0.025)
+        assert courses[0] == pytest.approx(at[2], abs=0.06)
+    assert walls.get_segments()[0] == pytest.approx(world.segments.reshape(2, 2))
+    assert (*pillar.center, pillar.radius) == (1.5, 1.5, 0.2)
+    assert (floor.get_xlim(), floor.get_ylim()) == (
+        pytest.approx((-1.2, 2.2)),
+        pytest.approx((-0.8, way[:, 1].max() + 0.2), abs=0.02),
+    )
+    shown = [
+        (text.get_text(), each.get_color())
+        for text, each in zip(
+            floor.get_legend().get_texts(), floor.get_legend().get_lines(), strict=True
+        )
+    ]
+    ahead = 'reference' if follows else 'reference, next 1.5 s'
+    assert [text for text, _ in shown] == ['robot (odometry)', ahead, 'range sensors']
+    drawn = [floor.lines[1].get_color(), floor.lines[0].get_color()]
+    assert [colour for _, colour in shown[:2]] == drawn
+    assert to_hex(rays.get_color()[0]) == shown[2][1]
 
 
 def test_rays_start_at_the_sensors_and_end_at_the_readings():

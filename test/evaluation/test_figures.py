@@ -7,6 +7,7 @@ Every quantity of the runs has a value of its own, so that any two that are exch
 
 from dataclasses import fields, replace
 import math
+import re
 from types import SimpleNamespace
 
 from matplotlib.colors import to_hex
@@ -39,9 +40,18 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
 from t3mpc_ros.evaluation.process_replay import divergence_figure
 from t3mpc_ros.evaluation.process_replay.comparison import Comparison, FieldComparison, Tolerances
 from t3mpc_ros.evaluation.twin_validation import validation_page
-from t3mpc_ros.evaluation.twin_validation.courses import Course, Drift
+from t3mpc_ros.evaluation.twin_validation.component_tests import (
+    GYRO_SHEET,
+    Allan,
+    LowPass,
+    Ramp,
+    TorqueCurve,
+)
+from t3mpc_ros.evaluation.twin_validation.courses import Course, Drift, Patrol
+from t3mpc_ros.scripting.chaos_generator import ChaosSolution
 from t3mpc_ros.scripting.parameter_sweep import Sweep
 from t3mpc_ros.scripting.single_run import RunResult
+from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.world import World
 
 GREEN, RED, GREY, COMMAND = '#15803d', '#be123c', '#6b7280', '#0f766e'
@@ -618,9 +628,9 @@ def test_tracked_paths_have_the_drives_of_their_methods():
     for axis, path in zip((first, second), paths, strict=True):
         shown = lines(axis)
         assert shown.keys() == colours.keys()
-        assert shown.pop('path').T == pytest.approx(TRACKED_PATHS[path]())
+        assert pytest.approx(TRACKED_PATHS[path]()) == shown.pop('path').T
         for name, drawn in shown.items():
-            assert drawn.T == pytest.approx(results[path][name][0].track)
+            assert pytest.approx(results[path][name][0].track) == drawn.T
         assert {each.get_label(): to_hex(each.get_color()) for each in axis.lines} == colours
         assert texts(axis) == (path, 'x / m', 'y / m')
     assert not any(axis.get_visible() for axis in empty)
@@ -730,3 +740,233 @@ def test_the_distance_sensor_is_in_centimetres():
     }
     assert texts(voltage) == ('voltage', 'distance / cm', 'V')
     assert texts(distance)[1:] == ('true distance / cm', 'read / cm')
+
+
+# -- parts of the twin ----------------------------------------------------------------------------
+
+TWIN = DigitalTwinParameters.from_dict({'world': 'room', 'seed': 1})
+
+
+def moved(values, shift):
+    return np.asarray(values, dtype=float) + shift
+
+
+def ramp_of(k, lost):
+    time = np.array([0.0, 1.0, 2.0])
+    columns = (moved((0.1, 0.2, 0.4), n + 10 * k) for n in range(5))
+    return Ramp(20.0 * k, time, *columns, (lost, lost + 1))
+
+
+EVIDENCE = SimpleNamespace(
+    parameters=TWIN,
+    torque=[
+        TorqueCurve(volts, current, np.array([0.0, 10.0, 20.0, 40.0]),
+                    current * np.array([1.0, 0.8, 0.3, 0.0]) + (0.001 * volts, 0, 0, 0),
+                    volts * 1.5)
+        for current in (1.0, 1.7) for volts in (9.0, 12.0, 24.0)
+    ],
+    needed=0.0625,
+    ramps=(ramp_of(1, 0), ramp_of(2, 7)),
+    low_pass=[
+        LowPass(np.array([1.0, 10.0, 100.0]), moved((-1.0, -3.0, -9.0), -k), 200.0 - k, 1.5 + k)
+        for k in range(7)
+    ],
+    allan=Allan(np.array([0.1, 0.2, 1.0, 10.0]), np.array([0.4, 0.3, 0.2, 0.1])),
+)  # fmt: skip
+
+
+def test_motors_pull_what_their_panel_says():
+    figure = validation_page.torque(EVIDENCE)
+    for axis, current in zip(figure.axes, (1.0, 1.7), strict=True):
+        assert texts(axis)[:2] == (f'{current:g} A', 'wheel speed / rad/s')
+        curves = [each for each in EVIDENCE.torque if each.current == current]
+        shown = lines(axis)
+        marks = [each for each in axis.lines if each.get_marker() == 'v' and len(each.get_xdata())]
+        for curve, mark in zip(curves, marks, strict=True):
+            line = next(each for each in axis.lines if each.get_label() == f'{curve.volts:g} V')
+            assert shown[line.get_label()] == pytest.approx(
+                np.array([curve.speed[:3], curve.torque[:3]])  # without the 0 at its end
+            )
+            assert mark.get_color() == line.get_color()
+            at = np.interp(curve.ceiling, curve.speed, curve.torque)
+            assert mark.get_xydata()[0] == pytest.approx((curve.ceiling, at))
+        assert {*shown['needed to drive'][1]} == {0.0625}
+        assert {*shown['fastest pulses'][0]} == {TWIN.motor.top_speed}
+        (shade,) = axis.patches
+        assert shade.get_label() == 'speeds of the robot'
+        assert (shade.get_x(), shade.get_width()) == (0.0, TWIN.limiter.wheel_speed)
+    assert figure.axes[0].get_ylabel() == 'pull-out torque / N m'
+
+
+def test_ramps_show_field_rotor_and_way():
+    figure = validation_page.stall(EVIDENCE)
+    axes = np.array(figure.axes).reshape(3, 2)
+    for column, ramp, name in zip(
+        axes.T, EVIDENCE.ramps, ('20 rad/s²: none lost', '40 rad/s²: 7 steps lost'), strict=True
+    ):
+        assert title(column[0]) == name
+        assert lines(column[0])['rotor'] == pytest.approx(np.array([ramp.time, ramp.rotor]))
+        assert lines(column[0])['field'][1] == pytest.approx(ramp.field)
+        assert column[1].lines[1].get_ydata() == pytest.approx(ramp.behind)
+        assert {*lines(column[1])['pull-out'][1]} == {1.0}
+        assert lines(column[2])['by the steps'][1] == pytest.approx(ramp.counted_distance)
+        assert lines(column[2])['true'][1] == pytest.approx(ramp.driven)
+    assert [axis.get_ylabel() for axis in axes[:, 0]] == [
+        'speed / rad/s', 'rotor behind its\nfield / full steps', 'way / m'
+    ]  # fmt: skip
+
+
+def test_the_gyro_is_beside_its_data_sheet():
+    gain, delay, noise = validation_page.gyro(EVIDENCE).axes
+    own = int(TWIN.imu.low_pass)
+    shown = lines(gain)
+    assert shown[f'twin, DLPF_CFG {own}'][1] == pytest.approx(EVIDENCE.low_pass[own].gain)
+    drawn = [each.get_ydata() for each in gain.lines if len(each.get_xdata()) == 3]
+    assert np.array(drawn) == pytest.approx(np.array([each.gain for each in EVIDENCE.low_pass]))
+    sheet = np.array(GYRO_SHEET)
+    assert shown['data sheet'][0] == pytest.approx(sheet[:, 0])
+    assert shown['data sheet'][1] == pytest.approx(-3.01)
+    assert pytest.approx(sheet) == lines(delay)['data sheet'].T
+    assert lines(delay)['twin'] == pytest.approx(
+        np.array([(200.0 - k, 1.5 + k) for k in range(7)]).T
+    )
+    shown = lines(noise)
+    span, deviation = EVIDENCE.allan.span, EVIDENCE.allan.deviation
+    assert shown['twin, standing'] == pytest.approx(np.array([span, deviation]))
+    # A white noise of 0.005 deg/s/√Hz has half its variance in means over a second.
+    white = shown[f'{TWIN.imu.gyro_noise:g} deg/s/√Hz of the data sheet'][1]
+    assert white[2] == pytest.approx(TWIN.imu.gyro_noise / math.sqrt(2.0))
+    assert white[0] / white[3] == pytest.approx(10.0)
+    walk = shown['wandering bias'][1]
+    assert walk[3] / walk[0] == pytest.approx(10.0)
+    assert (gain.get_ylabel(), delay.get_ylabel(), noise.get_ylabel()) == (
+        'gain / dB', 'ms', 'deg/s'
+    )  # fmt: skip
+
+
+def test_the_glance_has_the_current_of_the_robot_and_the_ramp_beyond():
+    evidence = SimpleNamespace(
+        **vars(EVIDENCE), sharp=np.array([[0.1, 2.3], [0.8, 0.4]]), squares=[COURSE, None],
+        slip_shown='ice',
+    )  # fmt: skip
+    torque, stall, distance, square = validation_page.overview(evidence).axes
+    own = f'{TWIN.motor.phase_current:g} A'
+    assert [title(axis) for axis in (torque, stall, distance, square)] == [
+        f'pull-out torque / N m, {own}',
+        'stall, 40 rad/s²: 7 steps lost',
+        'distance sensor',
+        'square, ice',
+    ]
+    (panel,) = (axis for axis in validation_page.torque(EVIDENCE).axes if title(axis) == own)
+    for name in ('9 V', '12 V', '24 V'):
+        assert lines(torque)[name] == pytest.approx(lines(panel)[name])
+    named = [each.get_text() for each in torque.get_legend().get_texts()]
+    assert named == ['9 V', '12 V', '24 V', 'V / (2 L I) steps a second']
+    assert lines(stall)['rotor'][1] == pytest.approx(EVIDENCE.ramps[1].rotor)
+    assert lines(distance)['twin'] == pytest.approx(np.array([[10.0, 80.0], [2.3, 0.4]]))
+    assert pytest.approx(COURSE.truth[:, :2]) == lines(square)['where it was'].T
+    ends = {to_hex(each.get_color()): each.get_xydata()[0] for each in square.lines
+            if each.get_marker() == 'o'}  # fmt: skip
+    for label, poses in (
+        ('where it was', COURSE.truth),
+        ('odometry with gyro', COURSE.odometry),
+        ('odometry, steps alone', COURSE.steps),
+    ):
+        (colour,) = (to_hex(e.get_color()) for e in square.lines if e.get_label() == label)
+        assert ends[colour] == pytest.approx(poses[-1, :2])
+
+
+def test_spells_of_slip_are_shaded_until_the_end():
+    events = [SimpleNamespace(at=a, until=b) for a, b in ((2.0, 5.0), (28.0, 99.0), (40.0, 50.0))]
+    (axis,) = validation_page.turns(COURSE, events, 'oil').axes
+    end = TIME[-1]
+    shown = [(each.get_x(), each.get_x() + each.get_width()) for each in axis.patches]
+    assert shown == [(2.0, pytest.approx(5.0)), (28.0, pytest.approx(end))]
+    assert [each.get_label() for each in axis.patches][0] == 'oil'
+
+
+def test_a_drive_through_the_room_has_its_readings_and_its_collision():
+    """Long green rays are what the sensors read; then all are dead, and a wall stops it."""
+    time = 0.1 * np.arange(100)
+    yaw = 0.05 * time + 0.3
+    truth = np.column_stack([0.1 * time, 0.04 * time - 0.2, yaw])
+    course = replace(COURSE, time=time, truth=truth, odometry=truth + (0.01, 0.03, 0.0))
+    ranges = np.full((100, 8), math.inf)
+    ranges[:, 2], ranges[:, 5] = 0.5, -math.inf  # left ahead; too near at the back
+    patrol = Patrol(course, ranges, 6.0, 9.0, False, 12.4)
+    (axis,) = validation_page.room(patrol, TWIN).axes
+    shown = lines(axis)
+    assert pytest.approx(truth[:61, :2]) == shown['where it was'].T
+    assert pytest.approx(truth[60:, :2]) == shown['the same, sensors dead'].T
+    assert pytest.approx(course.odometry[:, :2]) == shown['odometry'].T
+    assert shown['start'][:, 0] == pytest.approx(truth[0, :2])
+    (note,) = axis.texts
+    assert (note.get_text(), *note.xy) == ('12 N', *truth[90, :2])
+    rays = [
+        np.array(each.get_xydata()) for each in axis.lines
+        if to_hex(each.get_color()) == validation_page.FUSED and len(each.get_xdata()) == 2
+    ]  # fmt: skip
+    discs = [each for each in axis.patches if isinstance(each, Circle)]
+    *before, last = [disc.center for disc in discs if disc.get_radius() == TWIN.bumper.radius]
+    assert last == pytest.approx(truth[-1, :2])
+    assert len(rays) == len(before) == 5
+    for (start, end), place in zip(rays, before, strict=True):
+        angle = yaw[np.argmin(np.hypot(*(truth[:, :2] - place).T))]
+        ahead, aside = (np.array((math.cos(a), math.sin(a))) for a in (angle, angle + math.pi / 2))
+        assert start == pytest.approx(place + 0.05 * ahead + 0.09 * aside)
+        assert end == pytest.approx(start + 0.5 * aside)
+    assert texts(axis)[1:] == ('x / m', 'y / m')
+    assert walls_of(axis)[0].shape[1] == 4
+
+
+def test_the_measurements_of_the_parts_are_those_of_their_rows():
+    patrol = SimpleNamespace(max_contact_force=12.4)
+    evidence = SimpleNamespace(**vars(EVIDENCE), patrol=patrol)
+    table = validation_page.bench_table(evidence).markdown()
+    speed = f'{TWIN.limiter.wheel_speed:g}'
+    for words in (
+        # Between 10 and 20 rad/s: 0.8 to 0.3 of the current.
+        f'| torque at 12 V, 1.7 A | at {speed} rad/s 1.360 N m, at 18.0 rad/s 0.680 |',
+        'needed 0.062 N m',
+        '| ramp of 20 rad/s² | 0 and 1 steps lost, 100.0 cm wrong |',
+        '| ramp of 40 rad/s² | 7 and 8 steps lost, 100.0 cm wrong |',
+        '| gyro at -3 dB | 197.0 Hz | 42 Hz |',
+        '| delay of the gyro | 4.50 ms | 4.8 ms |',
+        # At 0.2 s, the longest that is brief: 0.3 √0.4.
+        '| noise of the gyro | 0.1897 deg/s/√Hz | 0.005 deg/s/√Hz |',
+        '| hardest push of a wall | 12 N |',
+    ):
+        assert words in table, words
+
+
+def test_findings_count_the_runs_with_slip():
+    drifts = [
+        Drift(course, slip, seed, math.radians(steps), math.radians(fused), math.radians(limit),
+              0.0, 0.0, 0.0, 0, 0.0)
+        for course, slip, seed, steps, fused, limit in (
+            ('square', validation_page.NO_SLIP.name, 1, 0.1, 0.9, 9.0),
+            ('square', 'ice', 1, 50.0, 5.0, 2.0),
+            ('square', 'ice', 2, -7.0, 3.0, 3.0),
+            ('turns', 'ice', 1, -60.0, 6.0, 4.0),
+        )
+    ]  # fmt: skip
+    said = validation_page._findings(SimpleNamespace(drifts=drifts))
+    assert [re.findall(r'\d+\.\d|\d+ of \d+', each) for each in said] == [
+        ['1 of 2', '7.0', '3.0'],
+        ['1 of 1', '0.0', '4.0'],
+    ]
+    assert [each.split(':')[0] for each in said] == ['square', 'turns']
+
+
+def test_solutions_of_the_chaotic_system_are_drawn_by_state():
+    time = np.linspace(0.0, 1.0, 50)
+    states = np.column_stack([np.sin(time), 2.0 + time, time**2])
+    solution = ChaosSolution(time, states, SimpleNamespace(size=3))
+    axes = solution.plot().axes
+    for k, axis in enumerate(axes):
+        assert title(axis) == f'y{k + 1}'
+        assert axis.lines[0].get_xydata() == pytest.approx(np.column_stack([time, states[:, k]]))
+    assert axes[-1].get_xlabel() == 'time / s'
+    (axis,) = solution.plot(plane=True).axes
+    assert axis.lines[0].get_xydata() == pytest.approx(states[:, :2])
+    assert texts(axis)[1:] == ('y1', 'y2')
