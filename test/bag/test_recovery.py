@@ -639,6 +639,22 @@ def test_info_lists_files_topics_parameters_and_incomplete_files(tmp_path, capsy
         '2023-11-14 22:13:20 UTC',
     ):
         assert words in printed, words
+    cells = [re.split(r'\s{2,}', line) for line in printed.splitlines()]
+    (whole,) = {*(tmp_path / 'run').glob('*.mcap')} - {torn}
+    size, unfinished = (size_text(file.stat().st_size) for file in (whole, torn))
+    assert size != unfinished
+    with open_bag(tmp_path / 'run') as bag:
+        for topic in bag.topics.values():
+            (row,) = (row for row in cells if row[0] == topic.name)
+            rate = f'{topic.message_count / 7.99:.2f}'
+            assert row[1:4] == [topic.type_name, str(topic.message_count), rate]
+    for row in (
+        ['messages', '800'],
+        ['storage', f'mcap, {size} in 1 file(s)'],
+        [f'file {whole.name}', size],
+        [f'UNFINISHED {torn.name}', f'{unfinished}, not counted above'],
+    ):
+        assert row in cells, row
     assert bag_main(['info', str(tmp_path / 'run'), '--json']) == 0
     found = json.loads(capsys.readouterr().out)
     assert found['message_count'] == 800

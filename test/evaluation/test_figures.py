@@ -39,6 +39,7 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
 )
 from t3mpc_ros.evaluation.process_replay import divergence_figure
 from t3mpc_ros.evaluation.process_replay.comparison import Comparison, FieldComparison, Tolerances
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL
 from t3mpc_ros.evaluation.twin_validation import validation_page
 from t3mpc_ros.evaluation.twin_validation.component_tests import (
     GYRO_SHEET,
@@ -47,7 +48,7 @@ from t3mpc_ros.evaluation.twin_validation.component_tests import (
     Ramp,
     TorqueCurve,
 )
-from t3mpc_ros.evaluation.twin_validation.courses import Course, Drift, Patrol
+from t3mpc_ros.evaluation.twin_validation.courses import Course, Drift, Patrol, drift_table
 from t3mpc_ros.scripting.chaos_generator import ChaosSolution
 from t3mpc_ros.scripting.parameter_sweep import Sweep
 from t3mpc_ros.scripting.single_run import RunResult
@@ -956,6 +957,23 @@ def test_findings_count_the_runs_with_slip():
         ['1 of 1', '0.0', '4.0'],
     ]
     assert [each.split(':')[0] for each in said] == ['square', 'turns']
+
+
+def test_drifts_are_summed_up_by_course_and_slip():
+    degrees = math.radians(1.0)
+    found = [
+        Drift('square', slip, seed, steps * degrees, fused * degrees, 0.0, 0.3, 0.4, slid, lost, t)
+        for slip, seed, steps, fused, slid, lost, t in (
+            (validation_page.NO_SLIP.name, 1, 2.0, 1.0, 0.0, 0, 0.0),
+            ('ice', 1, 30.0, 3.0, 1.5, 8, 0.2),
+            ('ice', 2, -40.0, 9.0, 2.5, 12, 0.4),
+        )
+    ]
+    still, ice = drift_table(found).rows
+    # Root mean squares of 30 and 40, 3 and 9; means of the rest.
+    assert still[2:6] == ('2.0', '1.0', EMPTY_CELL, EMPTY_CELL)
+    assert ice[:8] == ('square', 'ice', '35.4', '6.7', '0.190', '1 of 2', '0.30', '0.40')
+    assert ice[8:10] == ('2.00', '10')
 
 
 def test_solutions_of_the_chaotic_system_are_drawn_by_state():
