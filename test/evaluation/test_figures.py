@@ -845,7 +845,7 @@ def test_the_gyro_is_beside_its_data_sheet():
     )  # fmt: skip
 
 
-def test_the_glance_has_the_current_of_the_robot_and_the_ramp_beyond():
+def test_the_glance_has_the_robots_current_and_the_ramp_beyond():
     evidence = SimpleNamespace(
         **vars(EVIDENCE), sharp=np.array([[0.1, 2.3], [0.8, 0.4]]), squares=[COURSE, None],
         slip_shown='ice',
@@ -886,7 +886,7 @@ def test_spells_of_slip_are_shaded_until_the_end():
     assert [each.get_label() for each in axis.patches][0] == 'oil'
 
 
-def test_a_drive_through_the_room_has_its_readings_and_its_collision():
+def test_a_drive_through_the_room_has_readings_and_a_collision():
     """Long green rays are what the sensors read; then all are dead, and a wall stops it."""
     time = 0.1 * np.arange(100)
     yaw = 0.05 * time + 0.3
