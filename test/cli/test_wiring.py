@@ -6,12 +6,13 @@ What a command calls is replaced by functions that record their arguments. A row
 of an option and the recorded values that differ from those of the command without them.
 """
 
-from argparse import Namespace
+from argparse import ArgumentTypeError, Namespace
 from contextlib import nullcontext
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
+import re
 import shlex
 import sys
 from types import SimpleNamespace
@@ -672,9 +673,11 @@ def observed(monkeypatch, tmp_path, capsys):
             each.unlink()
         graph = GRAPH.method_calls[-1] if GRAPH.method_calls else ('', ())
         fault = BOARD.schedule_fault.call_args
+        printed = capsys.readouterr()
         return calls.found | {
             'code': code,
-            'text': capsys.readouterr().out,
+            'text': printed.out,
+            'error': printed.err,
             'files': names,
             'browser': opened[0] if opened else None,
             'graph': (graph[0], *graph[1]),
@@ -711,6 +714,61 @@ def test_every_option_has_a_row(command):
         assert not names or any(f'{name} ' in used for name in names), option
 
 
+def takes_zero(option):
+    """Return whether an option is a number that may be 0 and is another one by default."""
+    if option.type is None or not option.option_strings:
+        return False
+    try:
+        value = option.type('0')
+    except (ArgumentTypeError, ValueError):
+        return False
+    return value in (0, (0,)) and value != option.default
+
+
+def with_zero(words):
+    """Yield the option and the words of each row of a command with 0 in place of its number."""
+    name = max((each for each in commands() if f'{words} '.startswith(f'{each} ')), key=len)
+    known = options(commands()[name]).values()
+    zero = {word for each in known if takes_zero(each) for word in each.option_strings}
+    for row in TABLE[words][1]:
+        for word, number in re.findall(r'(--\S+) (-?[\d.]\S*)', row):
+            if word in zero:
+                yield word, row, row.replace(f'{word} {number}', f'{word} 0')
+        for word, number in re.findall(r'(--\S+) \S+=([\d.]+)$', row):
+            yield word, row, f'{row.removesuffix(number)}0'
+
+
+WITH_ZERO = {words: [*with_zero(words)] for words in TABLE}
+
+
+@pytest.mark.parametrize('words', [words for words, rows in WITH_ZERO.items() if rows])
+def test_zero_reaches_its_function_or_is_refused(words, observed):
+    """A 0 that is taken for an option that was not given changes nothing, and says nothing."""
+    cores, rows = TABLE[words]
+    for _, row, changed in WITH_ZERO[words]:
+        found = observed(f'{words} {changed}', cores)
+        if found['code'] != 0:
+            assert re.search(r'got .*\b0\b', found['error']), changed
+            continue
+        values = [np.ravel(found[path]) for path in rows[row]]
+        assert any(value.dtype.kind in 'if' and 0 in value for value in values), changed
+
+
+def test_every_number_that_may_be_zero_is_tried():
+    for command, parser in commands().items():
+        if command == 'demo':
+            continue
+        tried = {
+            word
+            for words, rows in WITH_ZERO.items()
+            for word, *_ in rows
+            if f'{words} '.startswith(f'{command} ')
+        }
+        for option in filter(takes_zero, options(parser).values()):
+            assert tried & {*option.option_strings}, f'{command} {option.dest}'
+    assert sum(map(len, WITH_ZERO.values())) > 20
+
+
 # -- the demo -------------------------------------------------------------------------------------
 
 
@@ -740,6 +798,11 @@ DEMO = {
     '--duration 9': {'seconds': 9.0},
     '--output new': {'recorder storage.uri': 'new/bag'},
     '--seed 5': {'reference_generator seed': 5, 'sim_robot seed': 5},
+    '--seed 0': {'reference_generator seed': 0, 'sim_robot seed': 0},
+    '--robot emulator --seed 0 --output new': {
+        'emulator': 't3mpc emulator --link new/dongle --loss 0.0 --seed 0',
+        'reference_generator seed': 0,
+    },
     '--robot servo': {
         'sim_robot drive.kind': 'velocity',
         'controller composition': 'paper',
@@ -813,7 +876,10 @@ def test_an_option_of_the_demo_reaches_its_node(words, monkeypatch, tmp_path):
 
 def test_every_option_of_the_demo_has_a_row():
     used = f'{" ".join(DEMO)} '
-    assert not [name for name in options(commands()['demo']) if f'--{name} ' not in used]
+    known = options(commands()['demo'])
+    assert not [name for name in known if f'--{name} ' not in used]
+    zero = [name for name, option in known.items() if takes_zero(option)]
+    assert not [name for name in zero if f'--{name} 0 ' not in used]
 
 
 @pytest.mark.parametrize('command', ['echo', 'hz'])
