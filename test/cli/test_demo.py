@@ -4,6 +4,7 @@
 
 from contextlib import ExitStack, suppress
 import dataclasses
+from datetime import datetime
 import os
 from pathlib import Path
 import re
@@ -11,6 +12,7 @@ import signal
 import socket
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from support.bag_messages import START, diagnostics, twist_message
@@ -317,17 +319,31 @@ def test_every_demo_of_the_ci_is_such_a_one():
         )
 
 
-def test_the_link_latest_leads_to_the_last_run(tmp_path):
-    """So that every command of the documentation can be pasted."""
-    first = _new_run(tmp_path / 'runs')
-    assert (tmp_path / 'runs' / 'latest').resolve() == first.resolve()
-    (tmp_path / 'runs' / 'latest').unlink()
-    (tmp_path / 'runs' / 'latest').symlink_to('older')
-    first.rename(tmp_path / 'other')
-    assert (tmp_path / 'runs' / 'latest').readlink() == Path('older')
-    second = _new_run(tmp_path / 'runs')
-    assert (tmp_path / 'runs' / 'latest').resolve() == second.resolve()
-    assert list(second.iterdir()) == []
+def test_the_link_latest_leads_to_the_last_run(tmp_path, monkeypatch):
+    """So that every command of the documentation can be pasted, after each demo."""
+    times = (datetime(2026, 1, 2, 3, 4, second) for second in range(60))
+    monkeypatch.setattr('t3mpc_ros.cli.main.datetime', SimpleNamespace(now=lambda: next(times)))
+    runs = tmp_path / 'runs'
+    latest = runs / 'latest'
+    found = []
+    for before in (None, 'the last run', 'the last run', 'older', tmp_path, '..'):
+        if before not in (None, 'the last run'):  # a run that was removed, or a folder elsewhere
+            latest.unlink()
+            latest.symlink_to(before)
+        found.append(_new_run(runs))
+        assert latest.is_symlink()
+        assert latest.resolve() == found[-1].resolve(), before
+        assert not latest.readlink().is_absolute()
+    assert sorted(runs.iterdir()) == [*found, latest]
+    assert not any(list(each.iterdir()) for each in found)
+
+
+def test_what_is_no_link_is_left_alone_as_latest(tmp_path):
+    latest = tmp_path / 'runs' / 'latest'
+    latest.mkdir(parents=True)
+    (latest / 'kept').touch()
+    assert list(_new_run(latest.parent).iterdir()) == []
+    assert (latest / 'kept').is_file()
 
 
 # -- private graphs -------------------------------------------------------------------------------

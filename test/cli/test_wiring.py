@@ -669,6 +669,7 @@ def observed(monkeypatch, tmp_path, capsys):
         code = main(shlex.split(words))
         files = [each for each in tmp_path.glob('new*') if each.is_file()]
         names = ' '.join(each.name for each in files)
+        content = [each.read_bytes() for each in files]
         for each in files:
             each.unlink()
         graph = GRAPH.method_calls[-1] if GRAPH.method_calls else ('', ())
@@ -679,6 +680,7 @@ def observed(monkeypatch, tmp_path, capsys):
             'text': printed.out,
             'error': printed.err,
             'files': names,
+            'content': content,
             'browser': opened[0] if opened else None,
             'graph': (graph[0], *graph[1]),
             'fault': tuple(fault[0][0]) if fault else (),
@@ -712,6 +714,23 @@ def test_every_option_has_a_row(command):
     for option in options(commands()[command]).values():
         names = option.option_strings
         assert not names or any(f'{name} ' in used for name in names), option
+
+
+@pytest.mark.parametrize(
+    ('words', 'option', 'name'),
+    [
+        (words, option, expected['files'])
+        for words, (_, rows) in TABLE.items()
+        for option, expected in rows.items()
+        if 'files' in expected
+    ],
+)
+def test_a_file_that_exists_is_written_anew(words, option, name, observed):
+    """Of a second run nothing of the first may be left in it."""
+    first = observed(f'{words} {option}', TABLE[words][0])
+    Path(name).write_text(1000 * 'of an earlier run\n')
+    again = observed(f'{words} {option}', TABLE[words][0])
+    assert (again['code'], again['content']) == (first['code'], first['content'])
 
 
 def takes_zero(option):
@@ -750,7 +769,7 @@ def test_zero_reaches_its_function_or_is_refused(words, observed):
         if found['code'] != 0:
             assert re.search(r'got .*\b0\b', found['error']), changed
             continue
-        values = [np.ravel(found[path]) for path in rows[row]]
+        values = [np.ravel(found.get(path)) for path in rows[row]]
         assert any(value.dtype.kind in 'if' and 0 in value for value in values), changed
 
 
