@@ -1,0 +1,98 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What a study has finished is on the disk at once: one that is killed goes on from there."""
+
+from dataclasses import replace
+from functools import cache
+import shutil
+
+import pytest
+
+import t3mpc_ros as t3
+from t3mpc_ros.evaluation.methods import method_definitions
+from t3mpc_ros.evaluation.paper.experiment_runs import (
+    ExperimentGrid,
+    RunFile,
+    RunNumbers,
+    needed_experiments,
+    run_missing,
+)
+from t3mpc_ros.evaluation.paper.reproduce import default_setup
+from t3mpc_ros.evaluation.patrol import patrol_comparison
+from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
+from t3mpc_ros.evaluation.tuning.tune_methods import history_path, tune_methods
+from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
+from t3mpc_ros.scripting import parameter_sweep
+
+measured_patrol = cache(patrol_comparison.measured_patrol)
+
+
+def sweep(folder, begun, monkeypatch):
+    pytest.importorskip('pyarrow')
+
+    def measured(job):
+        begun()
+        scenario, method = job
+        return {'overall': scenario.seed / method.parameters.gain}
+
+    monkeypatch.setattr(parameter_sweep, 'measured_run', measured)
+    path, values = folder / 'sweep.parquet', {'gain': [10.0, 20.0]}
+    return t3.sweep('ADRC', values, seeds=[1, 2], plant='servo', output=path, executor=1).rows
+
+
+def paper(folder, begun, monkeypatch):
+    def measure_many(jobs, made_of, team):
+        for index, (scenario, method) in enumerate(jobs):
+            begun()
+            yield index, RunNumbers(scenario.seed / 3.0, len(method.name), 0.3, 0.4, True)
+
+    setup = replace(default_setup(), measure_many=measure_many)
+    grid = ExperimentGrid((101, 102), 6.0, ('nominal',), (0.04,))
+    needed = needed_experiments(setup, grid)[:3]
+    return run_missing(setup, grid, needed, RunFile(folder / 'runs.jsonl'), 'sources')
+
+
+def patrols(folder, begun, monkeypatch):
+    def measured(job):
+        begun()
+        return measured_patrol(job)
+
+    monkeypatch.setattr(patrol_comparison, 'measured_patrol', measured)
+    plan = PatrolPlan(('boustrophedon', 'random walk'), (101, 102), 5.0)
+    found = compare_patrols(plan, folder / 'runs.jsonl')
+    return {name: [result.metrics.coverage for result in found[name]] for name in plan.paths}
+
+
+def tuning(folder, begun, monkeypatch):
+    def evaluate(method, drive, candidates):
+        begun()
+        return [each.gain for each in candidates]
+
+    chosen = [each for each in method_definitions() if each.name in ('ADRC', 'PI + feed-forward')]
+    path = folder / 'tuned.json'
+    store = tune_methods(chosen, ['velocity'], 30, 1, path, evaluate=evaluate, resume=True)
+    assert all(history_path(path, each, 'velocity').is_file() for each in chosen)
+    assert [*TunedParameters.load(path)] == [*store]
+    return store.table()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('study', [sweep, paper, patrols, tuning])
+def test_a_killed_study_goes_on_with_what_is_missing(study, tmp_path, monkeypatch):
+    """Finished runs were in the memory of the process alone, and lost with it."""
+    whole, begun = tmp_path / 'whole', []
+    whole.mkdir()
+
+    def kept():  # what would be left on the disk if the process were killed in this run
+        shutil.copytree(whole, tmp_path / f'{len(begun)}')
+        begun.append(1)
+
+    with monkeypatch.context() as patch:
+        expected = study(whole, kept, patch)
+    runs = len(begun)
+    assert runs >= 4
+    for done in (1, runs - 1):
+        begun.clear()
+        with monkeypatch.context() as patch:
+            found = study(tmp_path / f'{done}', lambda: begun.append(1), patch)
+        assert (len(begun), found) == (runs - done, expected)
