@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.closed_loop import JobError, WorkerPool
+from t3mpc_ros.evaluation.closed_loop import JobError, WorkerPool, map_jobs
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.link_faults import LinkFaults
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (
@@ -176,9 +176,9 @@ def sweep(
     names = tuple(parameters)
     report = _print if progress else None
     if path is None:
-        with WorkerPool(workers) as pool:
-            found = dict(pool.map(cell_numbers, [cell.job for cell in cells.values()]))
-        numbers = {key: found[i] for i, key in enumerate(cells)}
+        jobs = [cell.job for cell in cells.values()]
+        found = map_jobs(cell_numbers, jobs, workers, progress=progress)
+        numbers = dict(zip(cells, found, strict=True))
         return _checked(Sweep(_rows(cells, numbers), names))
     result = _to_file(path, cells, workers, report, names)
     return _checked(result)
