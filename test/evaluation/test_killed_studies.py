@@ -4,6 +4,8 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
+import re
 import shutil
 
 import pytest
@@ -96,3 +98,13 @@ def test_a_killed_study_goes_on_with_what_is_missing(study, tmp_path, monkeypatc
         with monkeypatch.context() as patch:
             found = study(tmp_path / f'{done}', lambda: begun.append(1), patch)
         assert (len(begun), found) == (runs - done, expected)
+
+
+def test_every_study_with_a_file_of_its_runs_is_tried():
+    package = Path(t3.__file__).parent
+    users = {
+        path.stem
+        for path in package.rglob('*.py')
+        if re.search(r'import .*\b(ResultFile|write_atomically)\b', path.read_text())
+    }
+    assert users == {'parameter_sweep', 'experiment_runs', 'patrol_comparison', 'cma_search'}

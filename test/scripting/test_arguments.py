@@ -300,3 +300,30 @@ def test_one_run_is_the_same_in_every_function(argument):
     many = t3.sweep(controller, {}, seeds=seeds, cases=cases, executor=1, **given).rows
     for (row,) in (among, many):
         assert {name: row[name] for name in alone} == alone
+
+
+WRITERS = {
+    'run': (run, ('to_csv', 'to_parquet', 'plot')),
+    'comparison': (compared, ('to_csv', 'to_parquet', 'to_html')),
+    'sweep': (swept, ('to_csv', 'to_parquet')),
+    'chaos': (lambda: t3.chaos(tspan=(0.0, 0.2)), ('to_csv', 'plot')),
+}
+ENDS = {'to_csv': '.csv', 'to_parquet': '.parquet', 'to_html': '.html', 'plot': '.png'}
+
+
+@pytest.mark.parametrize('name', WRITERS)
+def test_a_file_that_exists_is_replaced(name, tmp_path):
+    make, writers = WRITERS[name]
+    result = make()
+    assert {each for each in dir(result) if each in ENDS} <= {*writers, 'plot'}
+    for writer in writers:
+        if writer == 'to_parquet':
+            pytest.importorskip('pyarrow')
+        path = tmp_path / 'new' / f'file{ENDS[writer]}'
+        getattr(result, writer)(path)
+        first = path.read_bytes()
+        path.write_bytes(b'of an earlier run\n' + 2 * first)
+        getattr(result, writer)(f'{path}')
+        assert path.read_bytes() == first, writer
+        assert [*path.parent.iterdir()] == [path]
+        path.unlink()
