@@ -12,6 +12,8 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import ORIGIN
 from t3mpc_ros.parameters.table import ParameterError
 
+pytestmark = pytest.mark.compiled
+
 TRIANGLE = (0.0, 0.0, 3.0, 0.0, 1.0, 2.0)
 
 
@@ -22,7 +24,6 @@ def _points(seed, length=60.0, **values):
     return path, np.vstack([path.advance(5.0) for _ in range(round(length / 5.0))])
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize('blend', [0.0, 2.0], ids=['abrupt', 'smooth'])
 @pytest.mark.parametrize('arena', [(-1.75, -1.25, 1.75, 1.25), TRIANGLE])
 @pytest.mark.slow
@@ -49,7 +50,6 @@ def test_equal_seeds_give_equal_paths_others_do_not():
     assert np.abs(one[:count] - other[:count]).max() > 0.5
 
 
-@pytest.mark.compiled
 def test_reseed_continues_without_a_jump():
     """A patrol changes its seed on the way: the path goes on from where it is."""
     path, before = _points(5, 5.0)
@@ -58,7 +58,6 @@ def test_reseed_continues_without_a_jump():
     assert np.hypot(*np.diff(after, axis=0).T).max() < 0.0101
 
 
-@pytest.mark.compiled
 def test_a_robot_that_is_held_up_does_not_change_the_path():
     """The next seed comes at a place of the path: the time until it waits with the path."""
     values = {'reseed.shortest': 3.0, 'reseed.longest': 3.0}

@@ -87,6 +87,7 @@ def test_wrong_radii_and_separation_are_learnt():
     assert after < 0.35 * before
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_a_robot_that_is_exact_is_left_alone():
     """Noise of the gyro must not turn a good robot into a worse one."""
@@ -169,6 +170,7 @@ def test_a_rollback_restores_map_and_authority():
     assert body.correction.authority == authority
 
 
+@pytest.mark.compiled
 def test_nothing_is_learnt_while_disturbed():
     body = Body(miscalibrated)
     body.run(5.0)

@@ -247,6 +247,7 @@ def test_speeds_at_the_stamp_need_the_other_model():
     np.testing.assert_allclose(errors, [0.0, -0.5 * PERIOD], atol=0.002)
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_the_stepper_twin_with_an_unknown_dead_time():
     robot = loop_robot(seed=7).with_values({'drive.dead_time': 0.06})

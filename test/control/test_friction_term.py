@@ -66,6 +66,7 @@ def test_friction_of_both_wheels_is_learnt_through_the_body():
     np.testing.assert_allclose(law.friction, -FRICTION, atol=1.5)
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_with_much_friction_the_error_is_less_than_half():
     with_term, without = (track(controller(**{'friction.gamma': g}), 30.0) for g in (10.0, 0.0))

@@ -19,6 +19,8 @@ from t3mpc_ros.control.input_monitor import InputMonitor
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, Pose, State
 
+pytestmark = pytest.mark.compiled
+
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
 LEAD = 0.4
 DURATION = 60.0

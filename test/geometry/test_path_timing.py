@@ -55,6 +55,7 @@ PATHS = {
 }
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('name', PATHS)
 @pytest.mark.parametrize(
     'limits',

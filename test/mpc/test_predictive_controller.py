@@ -106,6 +106,7 @@ def test_it_helps_with_noise_of_variance_0_04():
     assert _gain(_levels(3000, 1), noise=0.2) < 0.55
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_with_noise_alone_it_costs_a_few_per_cent():
     """With only noise to predict, the effect of v_p must be negligible."""
@@ -118,6 +119,7 @@ def test_with_noise_alone_it_costs_a_few_per_cent():
     assert np.max(np.abs(moves)) < 0.2 * DEFAULT.v_max
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(
     'plant',
     few_of(
@@ -164,6 +166,7 @@ def test_the_skill_is_high_on_unseen_data():
     assert np.all(controller.skill > 0.8)
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_random_weights_get_no_authority():
     """With the skill half a horizon ahead alone, a third would get authority."""
@@ -307,6 +310,7 @@ def _jumping(known, preview):
     return errors, controller
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_a_known_jump_is_not_learned_and_preview_helps():
     """Unknown jumps look like dynamics of the robot, so a wrong gain is learned."""
@@ -341,6 +345,7 @@ def test_a_known_jump_decays_in_the_prediction_with_the_feedback():
     np.testing.assert_allclose(controller.prediction[1], 0.0, atol=1e-9)
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_it_learns_from_the_applied_v_p():
     """When a limit suppresses v_p, the machine must not learn that v_p has no effect."""
@@ -410,6 +415,7 @@ def test_it_is_deterministic_and_weights_can_be_restored():
     assert np.all(copy.get_weights()['output_weights'] != 7.0)
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_a_recorded_run_improves_on_the_nominal_loop():
     """The recorded run is that of a robot three times as slow as the nominal one."""
@@ -467,6 +473,7 @@ def test_invalid_input_is_rejected_without_effect():
     )
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(
     'values, match',
     [
