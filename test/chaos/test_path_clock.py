@@ -3,9 +3,17 @@
 """A path waits for the robot, but not forever for one that cannot come."""
 
 import numpy as np
+import pytest
 
-from t3mpc_ros.chaos.path_source import PathClock, WaitParameters
-from t3mpc_ros.geometry.types import ORIGIN, Pose
+from t3mpc_ros.chaos.path_source import (
+    GivenPathSource,
+    PathClock,
+    PathReferenceParameters,
+    TwistSource,
+    WaitParameters,
+)
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose
 
 PERIOD_NS = 10_000_000
 WAIT = WaitParameters()
@@ -69,3 +77,47 @@ def test_the_path_waits_as_long_as_the_robot_has_not_set_off():
     assert (_rates(np.full(6000, 0.5), begin=ORIGIN) == 0.0).all()
     assert (_rates(np.full(6000, 0.5), begin=ORIGIN, on_the_way=False) == 0.0).all()
     assert (_rates(np.full(6000, 0.5), on_the_way=False) == 1.0).all()
+
+
+@pytest.mark.parametrize('used', [0.3, 0.9, 1.1, 1.9, 2.5])
+def test_each_wait_has_the_whole_patience(used):
+    """Also if the one before ended with little patience left, or while the path went on."""
+    away, steps = 0.5, round(WAIT.patience / 0.01)
+    first = np.full(round(used * steps), away)
+    rates = _rates([*first, 0.0, *np.full(4 * steps, away)])
+    expected = _rates(np.full(4 * steps, away))
+    assert (rates[: len(first)] == expected[: len(first)]).all()
+    assert rates[len(first)] == 1.0
+    np.testing.assert_array_equal(rates[len(first) + 1 :], expected)
+
+
+def _twists(source, count=400):
+    return np.array([source.advance()[1] for _ in range(count)])
+
+
+def _send_twist(source, _):
+    source.set_target(BodyTwist(0.2, 1.0))
+
+
+def _send_points(source, k):
+    source.add_points(np.array([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0]]) + [0.3 * k, 0.0])
+
+
+SOURCES = {
+    'twist': (lambda p: TwistSource(p, ORIGIN), _send_twist),
+    'topic': (lambda p: GivenPathSource(p, WheelGeometry(), ORIGIN), _send_points),
+}
+
+
+@pytest.mark.parametrize('name', SOURCES)
+def test_a_source_answers_each_time_as_the_first_time(name):
+    """It is at rest before and after, and what it was given expires or is driven to its end."""
+    make, send = SOURCES[name]
+    source, found = make(PathReferenceParameters()), []
+    for k in range(3):
+        send(source, k)
+        found.append(_twists(source))
+        assert tuple(found[k][-1]) == STANDSTILL
+    assert found[0][:, 0].max() > 0.1
+    # A path begins within a period, and its speed grows by 0.005 m/s in one.
+    np.testing.assert_allclose(found[1:], [found[0]] * 2, atol=0.01)

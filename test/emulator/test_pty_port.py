@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pseudo-terminal port of the emulator, and ``t3mpc emulator`` as a process."""
 
+from itertools import product
 import os
 from pathlib import Path
 import select
@@ -15,7 +16,7 @@ from support.missing_tools import needs
 from support.waiting import communicate
 
 from t3mpc_ros.cli import emulator, robot
-from t3mpc_ros.emulator.pty_port import PtyPort, PtyPortError
+from t3mpc_ros.emulator.pty_port import PtyPort, PtyPortError, serve
 from t3mpc_ros.radio.serial_port import PortError, SerialPort
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -156,6 +157,101 @@ def test_a_file_is_not_replaced(tmp_path):
     assert path.read_text() == 'chapter 1'
     with pytest.raises(PtyPortError, match='No such file'):
         PtyPort(tmp_path / 'nowhere' / 'dongle')
+
+
+class ScriptedPort:
+    """A port whose client is there (bytes) or not (None) at each update."""
+
+    def __init__(self, inputs):
+        self.inputs, self.written, self.calls = [*inputs], [], []
+
+    def wait(self, seconds):
+        return self.inputs.pop(0)
+
+    def write(self, data):
+        self.written.append(data)
+
+    def open(self):
+        self.calls.append('open')
+
+    def close(self):
+        self.calls.append('close')
+
+
+class ScriptedEmulator:
+    """Records what it is told, and answers each update with its number."""
+
+    now_ns, next_ns, port_number, port_open = 0, None, 0, True
+
+    def __init__(self):
+        self.updates, self.told = 0, []
+
+    def run_to(self, now_ns):
+        self.updates += 1
+        return [(now_ns, b'%d' % self.updates)]
+
+    def feed(self, data, now_ns):
+        self.told.append(('dongle', self.updates, data))
+
+    def feed_console(self, data, now_ns):
+        self.told.append(('robot', self.updates, data))
+
+    def take_console(self):
+        return [(0, b'%d' % self.updates)]
+
+    def restart_dongle(self):
+        self.told.append(('dongle', self.updates + 1, 'restart'))
+
+    def restart_robot(self):
+        self.told.append(('robot', self.updates, 'restart'))
+
+
+@pytest.mark.parametrize('restart_on_open', [True, False])
+@pytest.mark.parametrize('scripted', ['dongle', 'robot'])
+def test_each_opening_of_a_port_restarts_its_board(scripted, restart_on_open):
+    """Whenever a client comes, after any history of clients, and no board but that of the port.
+
+    What a client writes arrives once and after the restart; without a client nothing is written.
+    """
+    for inputs in product((None, b'', b'x'), repeat=5):
+        inputs, absent = [*inputs, None], [None] * 6
+        ports = {'dongle': ScriptedPort(absent), 'robot': ScriptedPort(absent)}
+        ports[scripted] = ScriptedPort(inputs)
+        emulator = ScriptedEmulator()
+        serve(
+            emulator,
+            ports['dongle'],
+            1.0,
+            lambda emulator=emulator: emulator.updates == 6,
+            restart_on_open,
+            ports['robot'],
+        )
+        expected = []
+        for update, (before, now) in enumerate(zip([None, *inputs], inputs, strict=False), 1):
+            if restart_on_open and before is None and now is not None:
+                expected.append((scripted, update, 'restart'))
+            if now:
+                expected.append((scripted, update, now))
+        assert emulator.told == expected, inputs
+        answered = [b'%d' % k for k, each in enumerate(inputs, 1) if each is not None]
+        assert [port.written for port in ports.values()] == [
+            answered if name == scripted else [] for name in ports
+        ]
+
+
+def test_the_port_follows_each_time_that_the_dongle_is_unplugged_or_moved():
+    emulator, port, expected = ScriptedEmulator(), ScriptedPort([b''] * 9), []
+    script = [(True, 0), (False, 0), (False, 0), (True, 0), (True, 1), (False, 1), (True, 1)]
+    script += [(True, 2), (True, 2)]
+    for (plugged, number), (now_plugged, now_number) in zip(script, script[1:], strict=False):
+        expected += [('close', 'open')[now_plugged]] * (plugged != now_plugged)
+        expected += ['open'] * (number != now_number)
+
+    def update():
+        emulator.port_open, emulator.port_number = script[emulator.updates - 1]
+
+    serve(emulator, port, 1.0, lambda: emulator.updates == len(script), on_update=update)
+    assert port.calls == expected
 
 
 @pytest.mark.parametrize(

@@ -1025,7 +1025,11 @@ FRESH = {
             'a restart of the reference': Operation(
                 lambda c: c.add_reference(0, ORIGIN),
                 kept=('._held', '._nearest', '._set_off', '._stamp_ns', '._start', '.rate'),
-            )
+            ),
+            'the robot is where it should be': Operation(
+                lambda c: (c.add_reference(2 * 10**9, ORIGIN), c.observe(2 * 10**9, ORIGIN)),
+                kept=('._set_off', '._start'),
+            ),
         },
     ),
     PortraitSource: Stateful(
