@@ -3,6 +3,8 @@
 """Recorded runs computed again: exactly where all is known, and saying so where it is not."""
 
 import argparse
+import contextlib
+import functools
 import json
 import math
 from pathlib import Path
@@ -12,6 +14,7 @@ from mcap.writer import Writer
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
+from support.other_parameters import with_other_value
 
 from t3mpc_ros.bag.columns import read_columns
 from t3mpc_ros.bag.reader import open_bag
@@ -52,6 +55,7 @@ from t3mpc_ros.evaluation.training.training_data import load_training_data
 from t3mpc_ros.evaluation.twin_closed_loop import loop_controller
 from t3mpc_ros.geometry.types import BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.simulation.world import load_world
 
 pytestmark = pytest.mark.slow
 
@@ -492,6 +496,105 @@ def test_a_model_is_found_by_its_checksum_or_missed_and_said(tmp_path):
     given = load_inputs(folder, model=learnt)
     assert given.exact.all()
     assert compare(given, replay_controller(given)).same
+
+
+KEEP_OUT = {'pose.enabled': True, 'keep_out.enabled': True, 'keep_out.scan_rate': 5.0}
+PAPER = {'composition': 'paper', 'predictive.excitation.duration': 20.0}
+OF_WHEELS = {
+    'rate': 50.0,
+    'wheel_radius': 0.05,
+    'wheel_separation': 0.3,
+    'mean_speeds': False,
+    'speed_filter.dead_time': 0.05,
+    'fuzzy.kind': 'type1',
+    'fuzzy.sets': 3,
+    'predictive.horizon': 4,
+    'predictive.control_horizon': 2,
+    'watchdog.reference_timeout': 0.02,
+}
+BUILT = {
+    'composition': ({}, PAPER),
+    'wheels': (PAPER, OF_WHEELS),
+    'keep-out': ({}, {**KEEP_OUT, 'command_shaper.straight_frequency': 3.0}),
+    'sensors and map': (KEEP_OUT, {'keep_out.mounts': (0.1, 0.0, 2.0), 'keep_out.map.range': 0.4}),
+    'bundled world': (KEEP_OUT, {'keep_out.world': 'corridor'}),
+    'world of a file': (KEEP_OUT, {'keep_out.world': 'walls.yaml'}),
+}
+"""Parameters of two controllers that are built in different ways, the second ones besides."""
+
+
+@pytest.fixture(scope='module')
+def plain_runs(tmp_path_factory):
+    """Return the run with the usual parameters of a row of the table."""
+    made = functools.cache(
+        lambda items: built_run(tmp_path_factory.mktemp('run') / 'plain', dict(items))
+    )
+    return lambda parameters: made(tuple(parameters.items()))
+
+
+def built_run(folder, changes):
+    """Drive past some walls, open loop, with readings of a sensor that sees none of them."""
+    parameters = loop_controller().with_values(changes)
+    world = parameters.keep_out.world
+    start = 1_700_000_000_000_000_000
+    with ControllerBag(folder, parameters) as tape:
+        taped = RecordedController(
+            parameters, tape, start, obstacles=load_world(world).obstacles if world else None
+        )
+        for k in range(240):
+            now, way = start + 10_000_000 * k, 0.002 * max(k - 150, 0)
+            turn = 0.05 * max(0, min(k, 150) - 5)  # a controller that looks around sees it turn
+            if k < 230:  # later, the reference is stale
+                twist = BodyTwist(0.2 + 0.1 * math.sin(0.15 * k), 0.3 * math.sin(0.1 * k))
+                pose = Pose(way + 0.02, 0.3, 0.0)
+                taped.add_reference(now, State(now + 200_000_000, pose, twist))
+            if k % 4 == 0:
+                taped.add_range(now + 1000, 0, 0.7)
+            speeds = BodyTwist(0.2 + 0.02 * math.sin(0.2 * k), 0.3 * math.sin(0.1 * k - 0.2))
+            taped.step(now + 500_000, State(now, Pose(way, 0.3, turn), speeds))
+    return load_inputs(folder)
+
+
+@pytest.mark.parametrize('name', BUILT)
+def test_a_replay_builds_the_controller_as_its_node_did(name, plain_runs, tmp_path, monkeypatch):
+    """Each parameter that is fixed when a controller is built has its effect in a replay, too."""
+    monkeypatch.chdir(tmp_path)
+    Path('walls.yaml').write_text('name: told\nwalls:\n  - points: [[0.4, -1.0], [0.4, 1.0]]\n')
+    usual, changes = BUILT[name]
+    plain, built = plain_runs(usual), built_run(tmp_path / 'built', usual | changes)
+    assert built.exact.all()
+    again = replay_controller(built)
+    # A yaw is rounded on its way through a message.
+    outcome = compare(built, again, Tolerances(absolute=1e-9, relative=0.0))
+    assert outcome.same, outcome.table()
+    assert Reason.TRACKING in again.reasons
+    unlike = [plain.recorded[key] - built.recorded[key] for key in SPEEDS]
+    assert np.nanmax(np.abs(unlike)) > 1e-4, 'the parameters have no effect in this run'
+    # What a replay is asked to change it builds so, too.
+    changed = replay_controller(plain, changes).fields
+    for key in SPEEDS:
+        np.testing.assert_allclose(changed[key], built.recorded[key], atol=1e-9)
+
+
+def test_every_parameter_is_read_as_it_was_recorded(bag, tmp_path):
+    """From the revisions that the node publishes, or from the record of the recorder alone."""
+    parameters = loop_controller()
+    for spec in ControllerParameters.specs():
+        with contextlib.suppress(AssertionError):  # a file, and what others forbid
+            parameters = with_other_value(parameters, spec)
+    texts = {'keep_out.world': 'room', 'keep_out.mounts': (0.1, 0.0, 2.0)}
+    parameters = parameters.with_values(KEEP_OUT | texts)
+    now = 1_700_000_000_000_000_000
+    with ControllerBag(tmp_path / 'bag', parameters) as tape:
+        tape.parameters(now, 0, parameters.to_dict())
+        tape.motion('reference', now, State(now, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, 0.0)))
+        tape.motion('odom', now, State(now, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, 0.0)))
+        tape.command(now + 1, BodyTwist(0.0, 0.0))
+        tape.row(now + 2, Journal().step(now))
+    rest = without(tape.path, tmp_path / 'rest', lambda topic, _: 'parameters' in topic)
+    for path in (tape.path, rest):
+        (life,) = load_inputs(path).lives
+        assert life.parameters[life.start].to_dict() == parameters.to_dict()
 
 
 def test_a_command_before_a_kill_is_not_that_of_the_next_process():

@@ -134,14 +134,27 @@ def test_a_recorded_controller_replays_bit_for_bit(late, harness, tmp_path):
 
 
 def test_a_patrol_replays_bit_for_bit(harness, tmp_path):
-    """Its commands depend on the range sensors, too, whose readings are in the journal."""
-    bag = tmp_path / 'bag'
+    """Its commands depend on the range sensors, too, whose readings are in the journal.
+
+    The robot also keeps out of walls that it is told of, which no sensor sees.
+    """
+    bag, world = tmp_path / 'bag', tmp_path / 'told.yaml'
+    world.write_text(
+        'name: told\nwalls:\n'
+        '  - {points: [[-0.3, -0.3], [0.3, -0.3], [0.3, 0.3], [-0.3, 0.3]], closed: true}\n'
+    )
     recorder = start_recorder(harness, bag)
-    controller = harness.add(ControllerNode, pose__enabled=True, keep_out__enabled=True)
+    controller = harness.add(
+        ControllerNode,
+        pose__enabled=True,
+        keep_out__enabled=True,
+        keep_out__world=str(world),
+        keep_out__scan_rate=5.0,  # it looks around before it drives
+    )
     harness.spin_until(lambda: recorder.count_publishers('controller/journal') > 0)
     harness.add(SimRobotNode, world='room')
     harness.add(ReferenceGeneratorNode, source='portrait', seed=7)
-    harness.spin_until(lambda: diagnostic(controller, 'steps') > 400)
+    harness.spin_until(lambda: diagnostic(controller, 'steps') > 500)
     harness.remove(controller)
     harness.remove(recorder)
     inputs = load_inputs(bag)

@@ -28,6 +28,7 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
 from t3mpc_ros.evaluation.process_replay.controller_replay import ReplayResult, output_row
 from t3mpc_ros.evaluation.scenario import RATE
 from t3mpc_ros.evaluation.twin_closed_loop import LEAD, chaotic_course, loop_controller, loop_robot
+from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, State, WheelSpeeds
 from t3mpc_ros.parameters.table import Value
@@ -110,7 +111,8 @@ class RecordedController:
     """A controller whose inputs and outputs are written to a bag, as by node and recorder.
 
     Every event has its time, which must not decrease. ``every`` is how many steps lie between two
-    publications of its scalars; ``model`` is the file to start from.
+    publications of its scalars; ``model`` is the file to start from; ``obstacles`` are those that
+    its keep-out knows.
     """
 
     def __init__(
@@ -120,10 +122,11 @@ class RecordedController:
         now_ns: int,
         every: int = 5,
         model: Path | None = None,
+        obstacles: Obstacles | None = None,
     ) -> None:
         self._tape, self._every, self._steps = tape, every, 0
         self._journal = Journal()
-        self.controller = Controller(parameters)
+        self.controller = Controller(parameters, obstacles)
         self.controller.warm_up()
         tape.parameters(now_ns, 0, parameters.to_dict())
         if model is not None:
@@ -148,6 +151,11 @@ class RecordedController:
                 if name in SCALAR_NAMES:
                     self._tape.number(now_ns + 3 * LATER, name, value)
         return command, status
+
+    def add_range(self, now_ns: int, sensor: int, reading: float) -> None:
+        """Pass a range reading (m) to the controller."""
+        self._tape.row(now_ns, self._journal.range(sensor, reading))
+        self.controller.add_range(sensor, reading)
 
     def silent(self, now_ns: int) -> None:
         """Handle missing odometry: stop."""
