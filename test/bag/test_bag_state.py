@@ -377,6 +377,18 @@ class Player(RuleBasedStateMachine):
         assert bool(problem) == (not self.paused or self.finished or count < 1)
         self.steps += 0 if problem else count
 
+    @rule(late=st.booleans(), count=st.integers(1, 4), most=st.integers(1, 2))
+    def step_and_go_on(self, late, count, most):
+        """Steps from messages that are late, and steps that are pending when it resumes."""
+        self.resume()
+        self.ask(600 if late else 0, 1)
+        self.pause()
+        self.step(count)
+        self.ask(0, most)
+        self.resume()
+        self.pause()
+        self.ask(0, 9)
+
     @rule(at=st.integers(-10, 1010))
     def seek(self, at):
         problem = self.made.seek(self.now_ns, START + at * MS)
@@ -450,6 +462,12 @@ class Queue(RuleBasedStateMachine):
         assert self.queue.put(messages) == lost
         self.waiting += fits
 
+    @rule(beyond=st.sampled_from([0, 1]))
+    def fill(self, beyond):
+        """To the last byte, and one more."""
+        size = 4 + beyond + self.LIMIT - self.memory(message('/0', 0, 4))
+        self.put([size] if size >= 4 else [])
+
     @rule()
     def put_task(self):
         self.waiting.append(lambda writer: None)
@@ -508,6 +526,10 @@ class Cache(RuleBasedStateMachine):
             gone = self.cached.popleft()
             if gone.topic in self.latched:
                 self.expired = [*self.expired, gone][-self.latched['/map'] :]
+
+    @rule(off=st.sampled_from([-1, 0, 1]))
+    def add_when_the_newest_expires(self, off):
+        self.add([self.SPAN // MS + off])
 
     @property
     def bytes(self):
