@@ -79,6 +79,24 @@ class WatchdogMachine(RuleBasedStateMachine):
                 held, min(edge - self.now, 160), speed=1.0, error=0.1, finite=True, known=True
             )
 
+    @rule(
+        enabled=st.booleans(),
+        finite=st.booleans(),
+        reset=st.booleans(),
+        wait=st.sampled_from((10, 160)),
+    )
+    def receive_reference_that_is_not_followed(self, enabled, finite, reset, wait):
+        """Before a reset, or with an odometry that stops the robot: it has its age afterwards."""
+        facts = {'speed': 1.0, 'error': 0.1, 'known': True}
+        self.watchdog.reference_received()
+        self.pending = True
+        if reset:
+            self.reset()
+        self.enable(enabled)
+        self.receive(self.now + 10, finite=finite, **facts)
+        self.enable(True)
+        self.receive(self.now + wait, finite=True, **facts)
+
     def receive(self, now, **facts):
         gap = None if self.last is None else now - self.last
         elapsed = self.watchdog.elapsed(now * MS)

@@ -75,6 +75,20 @@ class Arbiter(RuleBasedStateMachine):
             self.cycles(1, 20, True, False)
             self.press(True)
 
+    @rule(cycles=st.integers(1, 3))
+    def release_twice(self, cycles):
+        """The second release is as long as the first one, which another stop has ended."""
+        for count in (cycles, 4):
+            self.latch('one')
+            self.release()
+            self.cycles(count, 20, True, False)
+
+    @rule(off=st.sampled_from([-1, 0, 1]))
+    def command_until_it_expires(self, off):
+        self.command(5.0, -5.0, 100)
+        self.now_ns = self.until_ns + off
+        self.cycle(0, True, False)
+
     @rule()
     def restart(self):
         """The robot restarts: its latch is that of the button."""
