@@ -239,7 +239,7 @@ def test_each_opening_of_a_port_restarts_its_board(scripted, restart_on_open):
         ]
 
 
-def test_the_port_follows_each_time_that_the_dongle_is_unplugged_or_moved():
+def test_the_port_follows_each_time_the_dongle_is_plugged_again():
     emulator, port, expected = ScriptedEmulator(), ScriptedPort([b''] * 9), []
     script = [(True, 0), (False, 0), (False, 0), (True, 0), (True, 1), (False, 1), (True, 1)]
     script += [(True, 2), (True, 2)]
