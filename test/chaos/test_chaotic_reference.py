@@ -50,6 +50,7 @@ def test_samples_are_on_the_grid_and_start_from_rest():
     assert np.abs(wheels_of(run)[:30]).max() < 0.3
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_wheels_are_the_selected_scaled_states():
     parameters = ReferenceParameters(ramp=0.0)

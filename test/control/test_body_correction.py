@@ -136,6 +136,7 @@ def test_yaw_error_from_a_push_is_removed():
     assert abs(body.correction.yaw_error) < 0.03
 
 
+@pytest.mark.compiled
 def test_a_yaw_that_is_never_measured_changes_nothing():
     """A robot without yaw in its odometry: its "error" is as large as the command itself."""
     body = Body(lambda right, left: 0.0)

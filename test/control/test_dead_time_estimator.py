@@ -126,6 +126,7 @@ def test_the_dead_time_is_found_within_its_deviation(dead_time):
     assert np.sqrt(np.mean(np.square(errors))) > 0.4
 
 
+@pytest.mark.compiled
 def test_dead_time_and_lag_are_identified_as_a_sum():
     command = smooth_commands(60.0, 3)
     drive = simulate(command, 0.03, 3, lag=0.02)
@@ -155,6 +156,7 @@ def test_constant_commands_identify_nothing(speed):
     assert abs(estimator.dead_time - 0.01) < 1e-9
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('duration', few_of([4.0, 1.0, 10.0]))
 def test_late_commands_leave_no_trace(duration):
     for seed in range(4):
@@ -174,6 +176,7 @@ def test_late_commands_leave_no_trace(duration):
         assert abs(record[-1, 0] - 0.01) < 0.002
 
 
+@pytest.mark.compiled
 def test_a_persistent_change_is_adopted():
     count = at(80.0)
     dead_time = np.where(np.arange(count) < at(30.0), 0.01, 0.045)
@@ -329,6 +332,7 @@ def test_friction_is_not_taken_for_dead_time(friction, noise_variance):
         np.testing.assert_array_equal(record[:, 1], 0.01)
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_the_friction_model_halves_the_error_by_friction():
     errors = {True: [], False: []}

@@ -145,6 +145,7 @@ def test_drive_that_does_not_answer_is_paused():
     assert keep_out.activity is Activity.STUCK_DRIVE
 
 
+@pytest.mark.compiled
 def test_a_reading_counts_at_the_pose_of_the_last_odometry():
     """A robot that had been carried while its controller was disabled marked the wrong floor."""
     controller = Controller(

@@ -235,6 +235,7 @@ def settled(robot):
     return float(np.sqrt(np.mean(robot.run(5.0)[100:] ** 2)))
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_after_5_s_without_response_the_error_is_as_before():
     """Without the response monitor, the adaptation increases the error for 30 s."""

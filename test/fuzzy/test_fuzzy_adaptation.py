@@ -81,6 +81,7 @@ def test_v_decreases_by_the_integral_of_k_delta_squared():
     assert gaps[0] / gaps[1] == pytest.approx(2.0, rel=0.1)
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_with_a_dead_zone_v_decreases_for_bounded_disturbances():
     """The disturbance has amplitude K * width per wheel, the largest the argument allows.

@@ -91,6 +91,7 @@ def test_adaptation_still_helps_on_noisy_speeds(noise):
     assert _rms(tracking[half:]) < 0.5 * _rms(without[half:])
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_a_target_of_the_same_family_is_learned():
     """With a plant that some alpha* describes exactly, the estimate keeps improving."""

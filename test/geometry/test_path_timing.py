@@ -80,6 +80,7 @@ def test_timing_keeps_every_limit(name, limits):
     assert (path.angular[[0, -1]] == 0.0).all()
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('name', PATHS)
 @pytest.mark.slow
 def test_a_path_that_waits_keeps_every_limit(name):

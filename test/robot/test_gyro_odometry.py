@@ -118,6 +118,7 @@ def nees(robots, odometries):
     return float(np.mean(values))
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_normalized_estimation_error_matches_the_covariance():
     count = 80
@@ -141,6 +142,7 @@ def test_normalized_estimation_error_matches_the_covariance():
     assert not any(odometry.slipping for odometry in odometries)
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_standstill_corrects_half_of_the_yaw_drift():
     count = 40

@@ -114,6 +114,7 @@ def test_parameters_do_not_shift_other_random_numbers():
     assert [repr(s.ranges) for s in before] != [repr(s.ranges) for s in after]
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_halving_the_step_changes_a_minute_by_less_than_10_um():
     """Pulses evaluated at the stages alone were half a step late: 0.36 mm after a minute."""
