@@ -42,7 +42,7 @@ def run_and_observe(bench, seconds):
     return moved
 
 
-def test_the_report_of_a_stop_names_its_time_and_the_speeds_before():
+def test_a_report_of_a_stop_names_its_time_and_speeds():
     bench = RobotBench()
     bench.connect()
     watch = StopTimeMonitor(bench.emulator)
