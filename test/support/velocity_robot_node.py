@@ -29,7 +29,7 @@ class VelocityRobotNode(Node):
         self._robot = VelocityRobot()
         self._odometry = self.create_publisher(Odometry, 'odom', qos_profile_sensor_data)
         self.create_subscription(TwistStamped, 'cmd_vel', self._on_command, 10)
-        self._last_ns = self._command_ns = self._now_ns()
+        self._last_ns = self._command_ns = self._published_ns = self._now_ns()
         self.create_timer(1.0 / rate, self._publish)
         self.get_logger().info('velocity_robot ready')
 
@@ -48,6 +48,9 @@ class VelocityRobotNode(Node):
 
     def _publish(self):
         self._advance()
+        if self._last_ns == self._published_ns:
+            return  # the timer was late, and makes up for it: there is nothing new
+        self._published_ns = self._last_ns
         if self._now_ns() - self._command_ns > TIMEOUT_NS:
             self._robot.command(0.0, 0.0)
         (x, y, yaw), linear, angular = self._robot.odometry()
