@@ -21,7 +21,11 @@ ROOT="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 PYTHON="$ROOT/python"
 say() { printf '%s\\n' "$*" >&2; }
 """
-PYTHON = """#!{python} -IS
+# No path with a blank can stand behind "#!".
+STAND_IN = """#!/bin/sh
+exec '{python}' -IS '{program}' "$@"
+"""
+PROGRAM = """
 import json, os, signal, sys, time
 _, _, module, *words = sys.argv
 with open('calls', 'a') as calls:
@@ -30,7 +34,7 @@ plan = json.load(open('plan'))
 stage = ' '.join([module, *words[:1]]) if module == 'ruff' else module
 if module == 'pytest':
     number = sum(json.loads(line)[0] == 'pytest' for line in open('calls'))
-    stage = 'again' if words[1:3] == ['-n', '0'] else f'pytest {{number}}'
+    stage = 'again' if words[1:3] == ['-n', '0'] else f'pytest {number}'
 code, *lines = plan.get(stage, [0])
 path = words[0].removeprefix('--outcomes=') if module == 'pytest' else os.devnull
 with open(path, 'a') as outcomes:
@@ -106,7 +110,8 @@ def checkout(tmp_path, monkeypatch):
     scripts.mkdir(parents=True)
     (scripts / 'environment.sh').write_text(ENVIRONMENT)
     shutil.copy(ROOT / 'scripts' / 'check', scripts)
-    (scripts.parent / 'python').write_text(PYTHON.format(python=sys.executable))
+    (program := scripts.parent / 'program.py').write_text(PROGRAM)
+    (scripts.parent / 'python').write_text(STAND_IN.format(python=sys.executable, program=program))
     (scripts.parent / 'python').chmod(0o755)
     return scripts.parent
 
@@ -146,7 +151,7 @@ def test_every_stage_runs_and_the_exit_code_says_what_remains(arguments, stages,
 
 
 PASSED_ON = """#!/bin/sh
-[ "$2" != pytest ] || exec {python} "$@" -p starved
+[ "$2" != pytest ] || exec '{python}' "$@" -p starved
 """
 STARVED = """
 import os, pathlib, pytest

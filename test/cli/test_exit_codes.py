@@ -268,8 +268,10 @@ def test_an_interrupted_calibration_ends_with_130(monkeypatch, tmp_path, capsys)
 def test_the_code_of_a_process_is_how_it_ended(end, code, tmp_path, monkeypatch):
     """A node that a signal has killed has a negative code: it did not end cleanly."""
     program = tmp_path / 'node'
-    program.write_text(
-        f'#!{sys.executable}\nimport os, signal, sys\nprint("here", flush=True)\n'
+    # No path with a blank can stand behind "#!".
+    program.write_text(f"#!/bin/sh\nexec '{sys.executable}' '{program}.py' \"$@\"\n")
+    program.with_suffix('.py').write_text(
+        'import os, signal, sys\nprint("here", flush=True)\n'
         f'signal.signal(2, lambda *_: None)\nsignal.sigwait([2]) if not sys.argv[1:] else None\n'
         f'{end}\n'
     )
