@@ -117,6 +117,7 @@ def test_a_path_that_waits_keeps_every_limit(name):
     assert len(rows) > 1.1 * len(whole.time)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('name', PATHS)
 @pytest.mark.slow
 def test_poses_follow_path_and_twists(name):

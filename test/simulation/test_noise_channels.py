@@ -134,6 +134,7 @@ OTHER_EVENTS = 'faults.brown_out', 'faults.supply_sag', 'battery.', 'cmd_vel_tim
 """With a restart of the board the IMU draws another offset; a stop changes what is sent."""
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 @pytest.mark.parametrize('table', [DigitalTwinParameters, PaperRobotParameters])
 def test_no_parameter_shifts_the_numbers_of_a_channel(table):

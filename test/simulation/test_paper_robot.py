@@ -352,6 +352,7 @@ def test_torque_drive_converges_with_order_four():
     assert fine < 1e-8
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_velocity_drive_converges_when_substep_is_halved():
     """Order two where the ramp ends within a step, four where the drive does not limit."""

@@ -135,6 +135,7 @@ def test_wheels_turn_exactly_as_far_as_the_pulses():
     assert max(map(abs, robot.load_angles)) * GEOMETRY.wheel_radius < 0.1e-3
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_commands_within_the_torque_lose_no_steps():
     """Random speeds and ramps that need at most 0.35 of the available torque.
