@@ -59,6 +59,8 @@ def save_model(
             'origin': dict(origin or {}),
         }
     )
+    from t3mpc_ros.bag.metadata import sync_folder  # the start of a node does without it
+
     temporary = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
         with temporary.open('wb') as target:
@@ -67,6 +69,7 @@ def save_model(
             target.flush()
             os.fsync(target.fileno())
         temporary.replace(path)
+        sync_folder(path.parent)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise ModelError(f'cannot write the model file {path}: {error.strerror}') from error
