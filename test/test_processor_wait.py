@@ -238,31 +238,36 @@ def test_a_process_that_has_ended_counts_as_last_noted(times):
     assert wait.share() == 0.75
 
 
+@pytest.fixture
+def processes_of(tmp_path, monkeypatch):
+    """Return a function that gives processes whose one executable runs a command of the shell."""
+
+    def make(name, command):
+        program = tmp_path / 'lib' / 't3mpc_ros' / name
+        program.parent.mkdir(parents=True)
+        program.write_text(f'#!/bin/sh\n{command}\n')
+        program.chmod(0o755)
+        monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
+        return waiting.Processes(tmp_path / 'log', os.environ)
+
+    return make
+
+
 @pytest.mark.parametrize('end', ['kill', 'stop'])
-def test_what_the_fixture_ends_is_noted_before(end, tmp_path, monkeypatch):
+def test_what_the_fixture_ends_is_noted_before(end, processes_of, monkeypatch):
     wait = processor_wait.begin()
     noted = []
     monkeypatch.setattr(wait, 'note', lambda: noted.append(group.running()))
-    program = tmp_path / 'lib' / 't3mpc_ros' / 'sleeper'
-    program.parent.mkdir(parents=True)
-    program.write_text('#!/bin/sh\nexec sleep 60\n')
-    program.chmod(0o755)
-    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
-    group = waiting.Processes(tmp_path / 'log', os.environ)
+    group = processes_of('sleeper', 'exec sleep 60')
     with attended():
         group.start('sleeper')
     getattr(group, end)('sleeper')
     assert noted == [('sleeper',)]
 
 
-def test_a_process_that_ended_is_no_timeout(tmp_path, monkeypatch):
+def test_a_process_that_ended_is_no_timeout(processes_of):
     """It will never answer, however quiet the machine is."""
-    program = tmp_path / 'lib' / 't3mpc_ros' / 'node'
-    program.parent.mkdir(parents=True)
-    program.write_text('#!/bin/sh\n[ -z "$1" ] || exec sleep 60\n')
-    program.chmod(0o755)
-    monkeypatch.setenv('AMENT_PREFIX_PATH', str(tmp_path))
-    group = waiting.Processes(tmp_path / 'log', os.environ)
+    group = processes_of('node', '[ -z "$1" ] || exec sleep 60')
     group.start('node')
     with pytest.raises(ProcessError, match='ended with code 0') as ended:
         group.wait_ready('node')

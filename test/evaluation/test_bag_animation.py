@@ -47,9 +47,23 @@ def test_an_animation_has_its_frames_rate_and_size(tmp_path, capsys):
     assert tuple(first[0, 0]) == (255, 255, 255)
 
 
+@pytest.fixture
+def figures(monkeypatch):
+    """Return the figures that are made for animations, as a list that grows."""
+    made = []
+
+    class Kept(animation.Figure):
+        def __init__(self, *arguments, **named):
+            super().__init__(*arguments, **named)
+            made.append(self)
+
+    monkeypatch.setattr(animation, 'Figure', Kept)
+    return made
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize('measured', ['odom', 'ground_truth/odom'])
-def test_the_panels_show_the_quantities_of_their_titles(measured, tmp_path, monkeypatch):
+def test_the_panels_show_the_quantities_of_their_titles(measured, figures, tmp_path, monkeypatch):
     with open_bag(GOLDEN) as recording:
         run = load_run(recording)
     motions = {**run.motions, measured: run.motions['odom']}
@@ -58,14 +72,6 @@ def test_the_panels_show_the_quantities_of_their_titles(measured, tmp_path, monk
     receipts = {**run.receipts, measured: run.receipts['odom']}
     run = replace(run, motions=motions, receipts=receipts)
     monkeypatch.setattr(animation, 'load_run', lambda *_: run)
-    figures = []
-
-    class Kept(animation.Figure):
-        def __init__(self, *arguments, **named):
-            super().__init__(*arguments, **named)
-            figures.append(self)
-
-    monkeypatch.setattr(animation, 'Figure', Kept)
     options = AnimationOptions(start=4.0, duration=2.0, rate=2.0, width=300)
     animate_bag(GOLDEN, tmp_path / 'x.gif', options)
     floor, *panels = figures[-1].axes
@@ -88,7 +94,9 @@ def test_the_panels_show_the_quantities_of_their_titles(measured, tmp_path, monk
 
 @pytest.mark.slow
 @pytest.mark.parametrize('follows', [True, False])
-def test_the_floor_shows_the_robot_its_way_and_what_it_sees(follows, tmp_path, monkeypatch):
+def test_the_floor_shows_the_robot_its_way_and_what_it_sees(
+    follows, figures, tmp_path, monkeypatch
+):
     """Where it is at the last frame, with the path to follow up to then, or that ahead of it."""
     time = np.arange(0.0, 6.0, 0.05)
     pose = {'x': 0.2 * time - 0.5, 'y': 0.1 * time**1.5, 'yaw': 0.3 * time - 1.0}
@@ -109,14 +117,6 @@ def test_the_floor_shows_the_robot_its_way_and_what_it_sees(follows, tmp_path, m
         'odd', np.array([[-1.0, -0.5, 2.0, -0.6]]), np.array([[1.5, 1.5, 0.2]]), np.empty((0, 4)),
         np.empty((0, 5)),
     )  # fmt: skip
-    figures = []
-
-    class Kept(animation.Figure):
-        def __init__(self, *arguments, **named):
-            super().__init__(*arguments, **named)
-            figures.append(self)
-
-    monkeypatch.setattr(animation, 'Figure', Kept)
     monkeypatch.setattr(animation, 'load_run', lambda *_: run)
     monkeypatch.setattr(animation, 'read_ranges', lambda *_: ranges)
     monkeypatch.setattr(animation, 'recorded_world', lambda *_: world)
