@@ -281,8 +281,10 @@ def test_the_code_of_a_process_is_how_it_ended(end, code, tmp_path, monkeypatch)
     def started(*arguments):
         group = ProcessGroup(tmp_path / 'log', os.environ)
         previous = signal.pthread_sigmask(signal.SIG_BLOCK, [2])  # inherited: for sigwait
-        group.start('node', *arguments)
-        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
+        try:
+            group.start('node', *arguments)
+        finally:  # a later test would start what no Ctrl-C ends
+            signal.pthread_sigmask(signal.SIG_SETMASK, previous)
         group.wait_for('node', 'here')
         return group
 

@@ -128,6 +128,7 @@ def basis(body, right, left):
     return phi
 
 
+@pytest.mark.compiled
 def test_yaw_error_from_a_push_is_removed():
     body = Body(miscalibrated, noise=0.01, yaw_gain=1.0, max_yaw_correction=0.1)
     body.run(20.0)
@@ -160,6 +161,7 @@ def test_the_corrections_are_bounded(of_map, of_yaw):
     assert 0.3 * (of_map + of_yaw) <= max(corrections) <= of_map + of_yaw + 1e-12
 
 
+@pytest.mark.compiled
 def test_a_rollback_restores_map_and_authority():
     body = Body(miscalibrated)
     body.run(20.0)
@@ -180,6 +182,7 @@ def test_nothing_is_learnt_while_disturbed():
     np.testing.assert_array_equal(body.correction.fuzzy.coefficients, coefficients)
 
 
+@pytest.mark.compiled
 def test_a_slide_of_the_tyres_is_hardly_learnt():
     """It once stayed in the map: a third of a second on ice turned the robot for seconds."""
     body = Body(miscalibrated, noise=0.01)

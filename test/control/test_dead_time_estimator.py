@@ -311,6 +311,7 @@ def run_servo(
     return record
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('friction', few_of([4.0, 0.0, 1.0, 3.0], 2))
 @pytest.mark.parametrize('dead_time', few_of([0.03, 0.06], 2))
 @pytest.mark.slow
@@ -321,6 +322,7 @@ def test_dead_time_of_a_servo_is_found_with_friction(dead_time, friction):
         assert np.abs(record[at(25.0) :] - dead_time).max() < 0.004
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('friction', few_of([4.0, 0.0, 1.0, 3.0], 2))
 @pytest.mark.parametrize('noise_variance', few_of([0.04, 0.0, 0.1]))
 @pytest.mark.slow

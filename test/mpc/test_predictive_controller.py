@@ -101,6 +101,7 @@ def test_it_removes_most_of_a_slowly_varying_disturbance():
     assert _gain(_waves(3000)) < 0.35
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_it_helps_with_noise_of_variance_0_04():
     assert _gain(_levels(3000, 1), noise=0.2) < 0.55

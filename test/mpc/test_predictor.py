@@ -94,6 +94,7 @@ def test_a_pretrained_machine_predicts_an_unseen_run():
     assert skill_score(predictor.history, 1) > 0.8
 
 
+@pytest.mark.compiled
 def test_an_untrained_machine_has_no_skill():
     predictor, _ = _predictor()
     predictor.machine.output_weights[:] = np.random.default_rng(1).standard_normal(12)

@@ -152,6 +152,7 @@ def test_cd_epochs_reduce_the_reconstruction_error():
     assert figures[-1] < 0.7 * figures[0]
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_cd_weights_remain_bounded():
     """Data outside [-1, 1] cannot be reconstructed; without the limit X_v diverges."""
@@ -373,6 +374,7 @@ def test_a_recorded_run_is_split_in_time_and_reversed():
     np.testing.assert_array_equal(runs[1][1][1], [-15.0, -13.0])
 
 
+@pytest.mark.compiled
 def test_more_noise_than_in_pretraining_remains_bounded():
     machine, rls = _machine(), make_rls_state(12)
     generator = np.random.default_rng(13)

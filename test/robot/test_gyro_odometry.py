@@ -258,6 +258,7 @@ def test_yaw_variance_of_ten_turns_cancels_when_turning_back():
     assert math.sqrt(odometries[0].covariance[2, 2]) < 0.05 * sure
 
 
+@pytest.mark.compiled
 def test_bias_is_estimated_at_standstill_and_again_after_a_jump():
     count = 40
     robots, odometries = Robots(count, 7), make_odometries(count)
@@ -477,6 +478,7 @@ def test_short_turns_include_the_gyro_delay(period):
     assert abs(robots.yaw_errors(odometries)[0]) < 60 * 1e-4
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_covariance_stays_symmetric_and_positive_definite():
     generator = np.random.default_rng(15)

@@ -135,6 +135,7 @@ def test_halving_the_step_changes_a_minute_by_less_than_10_um():
 # -- odometry errors from lost steps and sliding tyres --------------------------------------------
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_counters_give_the_path_without_lost_steps_or_slip():
     robot = DigitalTwin(parameters(odometry__use_gyro=False))
@@ -331,6 +332,7 @@ def test_read_only_parameters_cannot_change_at_run_time():
 # -- documentation --------------------------------------------------------------------------------
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_documented_twin_example_runs(capsys):
     page = (Path(__file__).resolve().parents[2] / 'docs' / 'simulation.md').read_text()
