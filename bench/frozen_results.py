@@ -108,6 +108,9 @@ def vectors() -> object:
     return {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
 
 
+SEEDS = 4
+"""Of the 20 held-out seeds of the paper's results; all of them are in docs/results_tables.md, to
+the digits that are printed there."""
 RESULTS: dict[str, Callable[[], object]] = {
     'vectors': vectors,
     'golden_replays': golden_replays,
@@ -127,9 +130,6 @@ RESULTS: dict[str, Callable[[], object]] = {
     'compare_torque': lambda: command('compare', '--robot', 'torque', '--seeds', '201-202'),
     'paper': lambda: command('paper', '--seeds', str(SEEDS)),
 }
-SEEDS = 4
-"""Of the 20 held-out seeds of the paper's results; all of them are in docs/results_tables.md, to
-the digits that are printed there."""
 
 
 def differences(old: object, new: object, where: str = '') -> Iterator[tuple[str, object, object]]:
