@@ -19,8 +19,8 @@ except ImportError:  # before 70.1, as on Ubuntu 24.04
 
 NAME = 't3mpc_ros'
 
-with open(f'{NAME}/__init__.py', encoding='utf-8') as source:
-    VERSION = re.search(r"^__version__ = '([^']+)'", source.read(), re.MULTILINE).group(1)
+with open(f'{NAME}/version.py', encoding='utf-8') as source:
+    VERSION = re.search(r"^VERSION = '([^']+)'", source.read(), re.MULTILINE).group(1)
 
 ROS = 'ros-jazzy-'
 

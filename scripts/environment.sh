@@ -71,7 +71,7 @@ wanted_stamp() {
   hash="$({
     origin_of "$BASE_PYTHON"
     case "$1" in
-    run) cat "$ROOT"/{requirements.txt,setup.py,setup.cfg,package.xml,t3mpc_ros/__init__.py} \
+    run) cat "$ROOT"/{requirements.txt,setup.py,setup.cfg,package.xml,t3mpc_ros/version.py} \
       "$ROOT"/{config/*.*,launch/*.launch.py} "$ROOT"/scripts/{environment.sh,finish_install.py} ;;
     check) cat "$ROOT"/requirements-*.txt ;;
     esac

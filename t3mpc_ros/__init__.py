@@ -12,6 +12,8 @@ import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from t3mpc_ros.version import VERSION
+
 if TYPE_CHECKING:
     from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
     from t3mpc_ros.evaluation.link_faults import LinkFaults
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from t3mpc_ros.scripting.single_run import RunResult, simulate
     from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 
-__version__ = '0.1.0'
+__version__ = VERSION
 __all__ = [
     'BagColumns',
     'ChaosSolution',

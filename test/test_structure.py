@@ -28,6 +28,7 @@ PACKAGES = {
     'kernels': set(),
     'stop_signal': set(),
     'missing_library': set(),
+    'version': set(),
     'geometry': {'parameters', 'kernels'},
     'chaos': BASE,
     'fuzzy': BASE,
@@ -145,12 +146,17 @@ def test_imports_follow_the_direction_of_the_packages(path):
         if top == 't3mpc_ros':
             if rest and rest[0] in PACKAGES:
                 allowed = PACKAGES[package] | {package} if package else FRONT
-                assert rest[0] in allowed, f'{package} imports {rest[0]}'
+                assert rest[0] in allowed | {'version'}, f'{package} imports {rest[0]}'
         elif ROS.match(top):
             assert package == 'nodes', f'{path} imports {name}: only nodes/ may import ROS'
         else:
             allowed = set(sys.stdlib_module_names) | {'numpy'} | LIBRARIES.get(package, set())
             assert top in allowed, f'{path} imports {name}'
+
+
+def test_only_its_documentation_imports_the_root_package():
+    users = [path for path in SOURCES if 't3mpc_ros' in _imports(path)]
+    assert users == [PACKAGE / 'scripting' / 'api_page.py']
 
 
 def test_only_the_serial_port_of_the_radio_imports_pyserial():

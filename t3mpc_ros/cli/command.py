@@ -10,8 +10,8 @@ import select
 import sys
 from typing import Any
 
-import t3mpc_ros
 from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.version import VERSION
 
 
 class ArgumentParser(argparse.ArgumentParser):
@@ -20,7 +20,7 @@ class ArgumentParser(argparse.ArgumentParser):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         if self.add_help:  # a subcommand without help leaves its arguments to another parser
-            version = f't3mpc_ros {t3mpc_ros.__version__}'
+            version = f't3mpc_ros {VERSION}'
             self.add_argument(
                 '--version', action='version', version=version, help='show the version and exit'
             )

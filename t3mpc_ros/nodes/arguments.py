@@ -11,8 +11,8 @@ from pathlib import Path
 import re
 import textwrap
 
-import t3mpc_ros
 from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
+from t3mpc_ros.version import VERSION
 
 ROS_ARGUMENTS = (
     ('-p NAME:=VALUE', 'set a parameter'),
@@ -44,7 +44,7 @@ def information(node: str, argv: Sequence[str]) -> str:
     words = user_arguments(argv)
     if {'-h', '--help'} & set(words):
         return help_text(node)
-    return f't3mpc_ros {t3mpc_ros.__version__}' if '--version' in words else ''
+    return f't3mpc_ros {VERSION}' if '--version' in words else ''
 
 
 def unknown_arguments(node: str, argv: Sequence[str]) -> str:

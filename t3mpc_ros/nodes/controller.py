@@ -39,7 +39,7 @@ from t3mpc_ros.nodes.common.base_node import (
     publish_and_wait_for_acked,
 )
 from t3mpc_ros.nodes.common.command_subscription import age_problem, message_age_ns
-from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
+from t3mpc_ros.nodes.common.conversions import FrameParameters
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 

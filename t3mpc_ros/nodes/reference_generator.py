@@ -30,7 +30,7 @@ from t3mpc_ros.geometry.timing import SampleScheduler
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, Pose, State
 from t3mpc_ros.nodes.common import conversions, qos
 from t3mpc_ros.nodes.common.base_node import ACK_TIMEOUT, NO_CLOCK, OK, WARN, BaseNode
-from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
+from t3mpc_ros.nodes.common.conversions import FrameParameters
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
 CONFIGURATION_ERRORS: tuple[type[Exception], ...] = (PathError,)

@@ -6,9 +6,9 @@ from pathlib import Path
 import platform
 import subprocess
 
-import t3mpc_ros
+from t3mpc_ros.version import VERSION
 
-PACKAGE_DIRECTORY = Path(t3mpc_ros.__file__).resolve().parent
+PACKAGE_DIRECTORY = Path(__file__).resolve().parents[1]
 
 
 def provenance(package: Path = PACKAGE_DIRECTORY) -> dict[str, str]:
@@ -18,7 +18,7 @@ def provenance(package: Path = PACKAGE_DIRECTORY) -> dict[str, str]:
     files differ from it; ``unknown`` when the package is not in a checkout of its own.
     """
     return {
-        'version': t3mpc_ros.__version__,
+        'version': VERSION,
         'commit': _commit(package),
         'python': platform.python_version(),
     }

@@ -13,7 +13,7 @@ from sensor_msgs.msg import Imu, Range
 from std_srvs.srv import Trigger
 from support.ros_graph import LATCHED
 
-from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
+from t3mpc_ros.nodes.common.conversions import FrameParameters
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode

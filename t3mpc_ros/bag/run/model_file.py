@@ -12,12 +12,12 @@ import zipfile
 import numpy as np
 from numpy.typing import NDArray
 
-import t3mpc_ros
+from t3mpc_ros.version import VERSION
 
 FORMAT = 1
 """Version of the format; incremented if the meaning of an array changes."""
 
-PACKAGED = Path(t3mpc_ros.__file__).resolve().parent / 'evaluation' / 'training'
+PACKAGED = Path(__file__).resolve().parents[2] / 'evaluation' / 'training'
 """Folder of the model files that come with the package."""
 
 _HEADER = 'header'
@@ -54,7 +54,7 @@ def save_model(
     header = json.dumps(
         {
             'format': FORMAT,
-            'version': t3mpc_ros.__version__,
+            'version': VERSION,
             'parameters': dict(parameters),
             'origin': dict(origin or {}),
         }

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-import t3mpc_ros
 from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean, paired
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     DRIFT,
@@ -45,6 +44,7 @@ from t3mpc_ros.evaluation.reporting import (
     html_page,
 )
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, TUNING_SEEDS
+from t3mpc_ros.version import VERSION
 
 BETTER, WORSE, INCONCLUSIVE = 'better', 'worse', 'inconclusive'
 """Verdicts on a paired difference: its 95 % interval lies below zero, above it, or contains it."""
@@ -245,7 +245,7 @@ def record(plan: ComparisonPlan, results: Results) -> dict[str, Any]:
             cases[case] = {'text': text, 'methods': found}
     return {
         'format': 1,
-        'version': t3mpc_ros.__version__,
+        'version': VERSION,
         'robot': plan.robot,
         'drive_of_tuning': TUNED_FOR[plan.robot],
         'seeds': list(plan.seeds),

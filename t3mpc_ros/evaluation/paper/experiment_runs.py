@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-import t3mpc_ros
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.methods import FULL, ComparedMethod
 from t3mpc_ros.evaluation.methods import STAGES as METHOD_STAGES
@@ -22,6 +21,7 @@ from t3mpc_ros.evaluation.reporting import finite
 from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
 from t3mpc_ros.evaluation.scenario import DRIVES
 from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
+from t3mpc_ros.version import VERSION
 
 NOISES = (0.0, 0.01, 0.04, 0.1)
 """Noise variance of the measured wheel speeds, (rad/s)²: the paper's range."""
@@ -250,7 +250,7 @@ def source_digest(package: Path = PACKAGE_DIRECTORY, *, every: bool = False) -> 
 
 def fingerprint(method: ComparedMethod, sources: str) -> str:
     """Return a digest of version, sources and method: what the result of a scenario needs."""
-    parts = [t3mpc_ros.__version__, sources, plain(method)]
+    parts = [VERSION, sources, plain(method)]
     text = json.dumps(parts, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
-import t3mpc_ros
 from t3mpc_ros.evaluation import open_loop_estimation
 from t3mpc_ros.evaluation.closed_loop import WorkerPool, measure_many
 from t3mpc_ros.evaluation.methods import methods
@@ -29,6 +28,7 @@ from t3mpc_ros.evaluation.paper.results import all_tables, results_of, write_csv
 from t3mpc_ros.evaluation.plotting import write_pictures
 from t3mpc_ros.evaluation.reporting import strict_json
 from t3mpc_ros.evaluation.scenario import CASES, HELD_OUT_SEEDS, Scenario
+from t3mpc_ros.version import VERSION
 
 RUNS = 'runs.jsonl'
 """Finished runs, in the folder of the output."""
@@ -98,7 +98,7 @@ def reproduce(
     compared = [row for row in results.rows if EXACT not in row.controller]
     exact = [row for row in results.rows if EXACT in row.controller]
     content = {
-        'version': t3mpc_ros.__version__,
+        'version': VERSION,
         'parameters': parameters | {'sources': sources},
         'results': [row.record() for row in compared],
         'exact_models': [row.record() for row in exact],
@@ -146,7 +146,7 @@ def _parameters(
 
 def _origin(grid: ExperimentGrid, options: PaperOptions, sources: str) -> str:
     words = [
-        f'version {t3mpc_ros.__version__}, sources {sources}',
+        f'version {VERSION}, sources {sources}',
         f'{len(grid.seeds)} held-out seeds, runs of {grid.duration:g} s at 100 Hz',
         'RMSE of true wheel speeds, both wheels, first 3 s left out',
     ]

@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-import t3mpc_ros
 from t3mpc_ros.chaos.portrait import PortraitParameters
 from t3mpc_ros.evaluation.closed_loop import WorkerPool
 from t3mpc_ros.evaluation.paper.experiment_runs import source_digest
@@ -45,6 +44,7 @@ from t3mpc_ros.geometry.types import ORIGIN
 from t3mpc_ros.robot.description import ray_ends, sensor_mounts
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 from t3mpc_ros.simulation.world import World, parse_world
+from t3mpc_ros.version import VERSION
 
 Array = NDArray[np.float64]
 
@@ -164,7 +164,7 @@ def compare_patrols(
 def _run_key(plan: PatrolPlan, name: str, seed: int) -> str:
     """Return a digest of all that determines a result; that of the first seed has a track."""
     run = replace(plan, paths=(name,), seeds=(seed,)), seed == plan.seeds[0]
-    content = repr((t3mpc_ros.__version__, source_digest(every=True), run))
+    content = repr((VERSION, source_digest(every=True), run))
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 

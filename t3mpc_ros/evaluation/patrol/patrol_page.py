@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-import t3mpc_ros
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
 from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     BOXES,
@@ -33,6 +32,7 @@ from t3mpc_ros.evaluation.reporting import (
     format_interval,
     html_page,
 )
+from t3mpc_ros.version import VERSION
 
 COVERED, TIMES_SLOWER = 0.9, 3.0
 """Share of the cells, and how many times longer than the boustrophedon a path may take for it."""
@@ -278,7 +278,7 @@ def record(plan: PatrolPlan, results: Results) -> dict[str, Any]:
     """Return plan, claims and every number for a JSON file."""
     return {
         'format': 1,
-        'version': t3mpc_ros.__version__,
+        'version': VERSION,
         'robot': plan.robot,
         'seeds': list(plan.seeds),
         'duration': plan.duration,

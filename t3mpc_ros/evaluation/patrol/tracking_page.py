@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 import math
 from typing import Any
 
-import t3mpc_ros
 from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean, paired
 from t3mpc_ros.evaluation.patrol.path_tracking import (
     ARRIVED,
@@ -30,6 +29,7 @@ from t3mpc_ros.evaluation.reporting import (
     format_interval,
     html_page,
 )
+from t3mpc_ros.version import VERSION
 
 BETTER, WORSE, INCONCLUSIVE = 'ours is better', 'ours is worse', 'inconclusive'
 _KINDS = {BETTER: 'yes', WORSE: 'no', INCONCLUSIVE: 'open'}
@@ -152,7 +152,7 @@ def record(plan: TrackingPlan, results: TrackingResults) -> dict[str, Any]:
     """Return plan and every number for a JSON file."""
     return {
         'format': 1,
-        'version': t3mpc_ros.__version__,
+        'version': VERSION,
         'seeds': list(plan.seeds),
         'limits': plan.limits.to_dict(),
         'paths': {

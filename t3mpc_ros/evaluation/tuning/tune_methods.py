@@ -13,7 +13,6 @@ from typing import Self
 
 from tqdm import tqdm
 
-import t3mpc_ros
 from t3mpc_ros.evaluation.closed_loop import Job, JobError, LoopRecord, MethodSpec, WorkerPool
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import TUNING_SEEDS, Scenario
@@ -26,6 +25,7 @@ from t3mpc_ros.evaluation.tuning.tuned_parameters import (
     TuningBudget,
 )
 from t3mpc_ros.parameters.table import ParameterError, Parameters
+from t3mpc_ros.version import VERSION
 
 SMOOTHNESS = 1e-5
 """rho, s²: what a unit of chatter (rad/s³) costs in tracking error (rad/s).
@@ -329,7 +329,7 @@ def _about(method: MethodDefinition, drive: str, budget: TuningBudget) -> dict[s
     scenarios = asdict(budget)
     del scenarios['evaluations'], scenarios['search_seed']
     controller = method.controller_type.__qualname__
-    origin = {'drive': drive, 'version': t3mpc_ros.__version__}
+    origin = {'drive': drive, 'version': VERSION}
     return {'method': method.name, 'controller': controller, **origin, **scenarios}
 
 
@@ -343,5 +343,5 @@ def _entry(
         objective=found.value,
         start_objective=first if math.isfinite(first) else None,
         budget=budget,
-        version=t3mpc_ros.__version__,
+        version=VERSION,
     )

@@ -1,8 +1,9 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Conversions between ROS messages and the types of the package."""
+"""Conversions between ROS messages and the types of the package, and prefixes of frames."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 import math
 import struct
 
@@ -13,6 +14,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
+from t3mpc_ros.parameters.table import Parameters, parameter
 
 UNKNOWN_VARIANCE = 1e6
 """Variance of a quantity that is not measured, in any unit."""
@@ -20,6 +22,25 @@ UNKNOWN_VARIANCE = 1e6
 
 MIN_POSE_VARIANCE = 1e-6
 """Least published variance of a pose: 1 mm and 1 mrad."""
+
+
+@dataclass(frozen=True)
+class FrameParameters(Parameters):
+    """Prefix of frames, with the parameters of diff_drive_controller.
+
+    Topics are separated by the namespace, transforms are not: two robots need two names for each
+    frame.
+    """
+
+    tf_frame_prefix_enable: bool = parameter(True, 'whether frames get a prefix')
+    tf_frame_prefix: str = parameter('', 'prefix of the frames; empty: the namespace of the node')
+
+    def prefixed(self, frame: str, namespace: str) -> str:
+        """Return a frame with the prefix that a node in this namespace uses."""
+        prefix = (self.tf_frame_prefix or namespace).strip('/')
+        if not (self.tf_frame_prefix_enable and prefix) or frame.startswith(f'{prefix}/'):
+            return frame
+        return f'{prefix}/{frame}'
 
 
 def time_from_ns(stamp_ns: int) -> Time:

@@ -13,7 +13,7 @@ from sensor_msgs.msg import BatteryState, Imu, JointState, Range
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes.common import conversions, qos, sensor_messages
-from t3mpc_ros.nodes.common.frame_prefix import FrameParameters
+from t3mpc_ros.nodes.common.conversions import FrameParameters
 from t3mpc_ros.parameters.table import parameter
 from t3mpc_ros.robot.description import FixedFrame, FrameNames, fixed_frames
 from t3mpc_ros.robot.interface import RANGE_SENSORS, RobotState
