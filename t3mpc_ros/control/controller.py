@@ -417,7 +417,46 @@ class Controller:
             self._clear_reference()
             if self._keep_out is not None:
                 self._keep_out.reset()
+        plan_ns, reason = self._sample_plan(odometry)
+        if reason.moves and restarted:
+            reason = Reason.ODOMETRY_RESTARTED
+        speeds, reference, begin, end = self._sampled
+        if not reason.moves:
+            self._stop()
+            self.status = self._make_status(stamp, reason, speeds - reference)
+            return STANDSTILL, self.status
 
+        actuation, dt = self._actuation, elapsed or self._period
+        restart = elapsed is None or not self._moving
+        if restart:
+            actuation.reset(speeds)
+            self._response.reset()
+            self._snapshots.clear()
+        elif not self._response.update(*speeds.tolist()):
+            return self._command_unresponsive(odometry, dt)
+        elif self.status.reason is Reason.NOT_FOLLOWING:
+            restart = True
+            actuation.reset(speeds, actuation.command.copy())
+        self._observe(speeds, dt, restart=restart)
+        if self.parameters.pose.enabled:
+            if restart:
+                self._pose.reset()
+            self._follow_pose(odometry, begin, end, dt)
+        if restart:
+            self._begin_plan(stamp, plan_ns)
+        if self._jumps or self._announced:
+            self._announce_jumps(stamp, plan_ns)
+        acceleration = self._acceleration(plan_ns, odometry.pose.yaw, begin, end, dt)
+        applied = actuation.send_acceleration(acceleration).copy()
+        self._tracker.set_applied(applied, saturated=actuation.limited)
+        self._response.add_command(*actuation.command.tolist())
+        self._take_snapshot()
+        self.status = self._make_status(stamp, reason, actuation.speeds - reference, applied)
+        return actuation.twist, self.status
+
+    def _sample_plan(self, odometry: State) -> tuple[int, Reason]:
+        """Sample speeds and reference; return the instant planned for, ns, and whether to move."""
+        stamp, twist = odometry.stamp_ns, odometry.twist
         finite = odometry.is_finite()
         if finite:
             self._place = odometry.pose
@@ -425,8 +464,6 @@ class Controller:
         if not self._moving:
             self._ahead_ns = self._plan_ahead(effect_ns)
         plan_ns = effect_ns + self._ahead_ns
-        speeds, reference, begin, end = self._sampled
-        twist = odometry.twist
         known, speed, error = self._sample_reference(
             self._trajectory.buffer,
             stamp,
@@ -436,56 +473,29 @@ class Controller:
             self._sampling,
             self._sampled,
         )
-        reason = self._watchdog.decide(
+        return plan_ns, self._watchdog.decide(
             stamp, finite=finite, known=known, speed=speed, error=error if finite else 0.0
         )
-        if reason.moves and restarted:
-            reason = Reason.ODOMETRY_RESTARTED
-        if not reason.moves:
-            self._stop()
-            self.status = self._make_status(stamp, reason, speeds - reference)
-            return STANDSTILL, self.status
 
-        restart = elapsed is None or not self._moving
-        if restart:
-            self._actuation.reset(speeds)
-            self._response.reset()
-            self._snapshots.clear()
-        elif not self._response.update(*speeds.tolist()):
-            return self._command_unresponsive(odometry, elapsed or self._period)
-        elif self.status.reason is Reason.NOT_FOLLOWING:
-            restart = True
-            self._actuation.reset(speeds, self._actuation.command.copy())
-        actuation = self._actuation
-        actuation.observe(speeds, elapsed or self._period)
+    def _observe(self, speeds: Array, dt: float, *, restart: bool) -> None:
+        """Update the estimates of speeds, disturbance and dead time, ``dt`` s after the last."""
+        self._actuation.observe(speeds, dt)
         if restart:
             self._dead_time.reset(speeds)
             self._disturbed, self._before_disturbance = False, None
         else:
-            self._update_dead_time(speeds, elapsed or self._period)
-        if self.parameters.pose.enabled:
-            if restart:
-                self._pose.reset()
-            self._follow_pose(odometry, begin, end, elapsed or self._period)
-        if restart:
-            self._tracker.begin(plan_ns, actuation.predicted, begin)
-            self._shaper.reset(actuation.predicted)
-            self._body.restart()
-            self._moving = True
-            self._announced.clear()
-            known_ns = plan_ns if self.parameters.jump_transition.preview else stamp
-            self._jumps = [jump for jump in self._jumps if jump.stamp_ns > known_ns]
-        if self._jumps or self._announced:
-            self._announce_jumps(stamp, plan_ns)
-        acceleration = self._acceleration(
-            plan_ns, odometry.pose.yaw, begin, end, elapsed or self._period
-        )
-        applied = actuation.send_acceleration(acceleration).copy()
-        self._tracker.set_applied(applied, saturated=actuation.limited)
-        self._response.add_command(*actuation.command.tolist())
-        self._take_snapshot()
-        self.status = self._make_status(stamp, reason, actuation.speeds - reference, applied)
-        return actuation.twist, self.status
+            self._update_dead_time(speeds, dt)
+
+    def _begin_plan(self, stamp_ns: int, plan_ns: int) -> None:
+        """Begin to move at the predicted speeds, towards the reference at ``plan_ns``."""
+        predicted = self._actuation.predicted
+        self._tracker.begin(plan_ns, predicted, self._sampled.begin)
+        self._shaper.reset(predicted)
+        self._body.restart()
+        self._moving = True
+        self._announced.clear()
+        known_ns = plan_ns if self.parameters.jump_transition.preview else stamp_ns
+        self._jumps = [jump for jump in self._jumps if jump.stamp_ns > known_ns]
 
     def _acceleration(
         self, plan_ns: int, yaw: float, begin: Array, end: Array, elapsed: float
