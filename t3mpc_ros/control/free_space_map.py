@@ -157,6 +157,17 @@ class FreeSpaceMap:
 
 
 @kernel
+def has_obstacle(cells: Cells, row: int, column: int, reach: int) -> bool:
+    """Return whether a cell at most ``reach`` rows and columns away is occupied."""
+    count = cells.shape[0]
+    for near_row in range(max(row - reach, 0), min(row + reach + 1, count)):
+        for near_column in range(max(column - reach, 0), min(column + reach + 1, count)):
+            if cells[near_row, near_column] >= OCCUPIED:
+                return True
+    return False
+
+
+@kernel
 def add_ray(
     grid: MapGrid,
     x: float,
@@ -200,12 +211,10 @@ def add_ray(
         return
     column = int(math.floor((x + hit * cosine - low) / size))
     row = int(math.floor((y + hit * sine - low) / size))
-    if 0 <= column < count and 0 <= row < count and grid.cells[row, column] != KNOWN:
-        if hit < 0.1:
-            # Nearer than the sensor measures: only if nothing is known to be there already.
-            for near_row in range(max(row - 4, 0), min(row + 5, count)):
-                for near_column in range(max(column - 4, 0), min(column + 5, count)):
-                    if grid.cells[near_row, near_column] >= OCCUPIED:
-                        return
-        grid.cells[row, column] = OCCUPIED
-        grid.cleared[row, column] = 0
+    if not (0 <= column < count and 0 <= row < count) or grid.cells[row, column] == KNOWN:
+        return
+    # Nearer than the sensor measures: only if nothing is known to be there already.
+    if hit < 0.1 and has_obstacle(grid.cells, row, column, 4):
+        return
+    grid.cells[row, column] = OCCUPIED
+    grid.cleared[row, column] = 0

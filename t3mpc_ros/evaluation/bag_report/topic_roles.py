@@ -72,11 +72,11 @@ class TopicChoice:
 def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
     """Return the topic of each role."""
     names, namespaces = find_topics(recording.topics, wanted.namespace)
-    held = {name: topic for name, topic in recording.topics.items() if topic.message_count}
+    filled = {name: topic for name, topic in recording.topics.items() if topic.message_count}
     chosen = {
         name: full
         for name, full in names.items()
-        if full in held and held[full].type_name in KINDS[name]
+        if full in filled and filled[full].type_name in KINDS[name]
     }
     for name, full in (
         (ODOMETRY, wanted.odom),
@@ -88,31 +88,12 @@ def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
     if wanted.odom and not wanted.namespace:
         chosen.pop(TRUTH, None)  # errors refer to the given topic
     notes = []
-    space = wanted.namespace and '/' + wanted.namespace.strip('/') + '/'
-    for name, topic_name, option in (
-        (ODOMETRY, wanted.odom, '--odom'),
-        (COMMAND, wanted.cmd_vel, '--cmd-vel'),
-    ):
-        if topic_name or (name == ODOMETRY and TRUTH in chosen):
-            continue
-        others = [
-            topic
-            for topic in held.values()
-            if topic.type_name in KINDS[name]
-            and topic.name not in chosen.values()
-            and f'/{INITIAL_INPUTS}' not in topic.name
-            and not any(topic.name.endswith(f'/{known}') for known in NAMES if known != name)
-            and (not space or topic.name.startswith(space))
-        ]
-        others.sort(key=lambda topic: _rank(name, topic, namespaces[0]))
-        by_name = name in chosen
-        if not by_name and others:
-            chosen[name] = others.pop(0).name
-        if name in chosen and (others or not by_name):
-            what = 'Odometry' if name == ODOMETRY else 'The command'
-            also = ', '.join(topic.name for topic in others)
-            rest = f'; there is also {also} ({option} chooses)' if also else ''
-            notes.append(f'{what} is taken from {chosen[name]}{rest}.')
+    if not (wanted.odom or TRUTH in chosen):
+        others = _candidates(ODOMETRY, filled.values(), chosen, wanted.namespace, namespaces[0])
+        notes += _choose_by_type(ODOMETRY, 'Odometry', '--odom', chosen, others)
+    if not wanted.cmd_vel:
+        others = _candidates(COMMAND, filled.values(), chosen, wanted.namespace, namespaces[0])
+        notes += _choose_by_type(COMMAND, 'The command', '--cmd-vel', chosen, others)
     if not chosen:
         raise ReportError(
             f'{recording.folder}: there is nothing to report: no message of odometry '
@@ -121,6 +102,40 @@ def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
         )
     ours = bool({REFERENCE, *NUMBERS} & set(chosen)) and not wanted.reference
     return TopicChoice(chosen, namespaces, ours, tuple(notes))
+
+
+def _candidates(
+    name: str,
+    topics: Iterable[TopicInformation],
+    chosen: Mapping[str, str],
+    namespace: str | None,
+    preferred: str,
+) -> list[str]:
+    """Return the topics that a role may have by their type, beside the chosen ones, best first."""
+    space = f'/{namespace.strip("/")}/' if namespace else ''
+    found = [
+        topic
+        for topic in topics
+        if topic.type_name in KINDS[name]
+        and topic.name not in chosen.values()
+        and f'/{INITIAL_INPUTS}' not in topic.name
+        and not any(topic.name.endswith(f'/{known}') for known in NAMES if known != name)
+        and topic.name.startswith(space)
+    ]
+    return [topic.name for topic in sorted(found, key=lambda each: _rank(name, each, preferred))]
+
+
+def _choose_by_type(
+    name: str, what: str, option: str, chosen: dict[str, str], others: list[str]
+) -> list[str]:
+    """Choose the best of ``others`` for a role that no name decides; return what to note."""
+    by_name = name in chosen
+    if not by_name and others:
+        chosen[name] = others.pop(0)
+    if name not in chosen or (by_name and not others):
+        return []
+    rest = f'; there is also {", ".join(others)} ({option} chooses)' if others else ''
+    return [f'{what} is taken from {chosen[name]}{rest}.']
 
 
 def _requested_topic(recording: BagReader, name: str, full: str) -> str:
