@@ -5,6 +5,7 @@
 import ast
 from collections import defaultdict
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 import re
 import xml.etree.ElementTree as ElementTree
@@ -207,6 +208,15 @@ def test_no_test_imports_another_test():
     for path in TESTS.rglob('*.py'):
         for name in _imports(path):
             assert not name.startswith(('test.', 'test_')), f'{path} imports {name}'
+
+
+def test_the_core_of_the_firmware_has_no_circle():
+    """Requests and telemetry needed the robot, which needed both."""
+    users = defaultdict(set)
+    for path in (ROOT / 'firmware' / 'core').glob('*.[ch]'):
+        included = re.findall(r'#include "(\w+)\.h"', path.read_text())
+        users[path.stem] |= {*included} - {path.stem}
+    assert list(TopologicalSorter(users).static_order())
 
 
 def test_names_of_tests_have_at_most_60_characters():

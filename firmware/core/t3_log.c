@@ -3,7 +3,7 @@
 #include "t3_log.h"
 
 #include "t3_bytes.h"
-#include "t3_robot.h"
+#include "t3_robot_state.h"
 
 #define BODY (T3_STORE_LOG_SIZE - T3_CRC_SIZE)
 #define SECOND_US UINT32_C(1000000)

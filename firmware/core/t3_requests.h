@@ -4,7 +4,7 @@
 #ifndef T3_REQUESTS_H
 #define T3_REQUESTS_H
 
-#include "t3_robot.h"
+#include "t3_robot_state.h"
 
 // Execute a request of the session, and prepare the reply.
 void t3_request(struct t3_robot *robot, const struct t3_packet *packet);

@@ -11,13 +11,6 @@
 #include "t3_telemetry.h"
 
 #define TTL_UNIT_US UINT32_C(10000)
-#define BATTERY_WEIGHT 8u
-
-void t3_answer_with(struct t3_robot *robot, uint8_t kind, uint8_t seq, uint8_t id, uint8_t rc)
-{
-    const struct t3_answer wanted = {kind, seq, id, rc, T3_VERSION};
-    robot->answer = wanted;
-}
 
 static int32_t parameter(const struct t3_robot *robot, uint8_t id)
 {
@@ -228,12 +221,6 @@ void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
     }
 }
 
-bool t3_robot_rests(const struct t3_robot *robot)
-{
-    // Enabled, but its drivers not yet powered: the tick in between has not come.
-    return !robot->enabled && !robot->powered && !t3_ramp_busy(&robot->ramp);
-}
-
 // -- time ----------------------------------------------------------------------------------------
 
 static void watch_ttl(struct t3_robot *robot, uint32_t now_us)
@@ -259,20 +246,15 @@ static void watch_button(struct t3_robot *robot, uint32_t now_us)
         latch_estop(robot);
 }
 
-uint16_t t3_robot_battery(const struct t3_robot *robot)
-{
-    return (uint16_t)(robot->battery_sum / BATTERY_WEIGHT);
-}
-
 static void measure_battery(struct t3_robot *robot)
 {
     const uint16_t count = robot->port->adc(robot->port->context, T3_ADC_BATTERY);
     const uint32_t supply = t3_calibration_battery(
         &robot->calibration, t3_battery_mv_of(robot->settings.now.divider, count));
     if (!supply || !robot->battery_sum)
-        robot->battery_sum = BATTERY_WEIGHT * supply;
+        robot->battery_sum = T3_BATTERY_WEIGHT * supply;
     else
-        robot->battery_sum += supply - robot->battery_sum / BATTERY_WEIGHT;
+        robot->battery_sum += supply - robot->battery_sum / T3_BATTERY_WEIGHT;
     const int32_t filtered = t3_robot_battery(robot);
     const int32_t cutoff = parameter(robot, T3_BATTERY_CUTOFF);
     const int32_t low = parameter(robot, T3_BATTERY_LOW);
@@ -420,21 +402,6 @@ void t3_robot_use_settings(struct t3_robot *robot)
     robot->port->unlock(robot->port->context);
     t3_robot_invert(robot);
     robot->battery_sum = 0;  // in mV of another divider: not to be filtered with it
-}
-
-void t3_robot_invert(struct t3_robot *robot)
-{
-    robot->port->lock(robot->port->context);
-    robot->steps.inverted =
-        (uint8_t)(robot->settings.now.inverted ^ (uint8_t)parameter(robot, T3_INVERT_WHEELS));
-    robot->port->unlock(robot->port->context);
-}
-
-uint8_t t3_robot_records(const struct t3_robot *robot)
-{
-    if (t3_settings_usable(&robot->settings) && !t3_calibration_usable(&robot->calibration))
-        return T3_SETTINGS_CALIBRATION;
-    return robot->settings.copies.state;
 }
 
 void t3_robot_boot(struct t3_robot *robot, const struct t3_port *port, uint8_t reset_cause,

@@ -2,8 +2,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "t3_signal.h"
 
-#include "t3_robot.h"
-#include "t3_telemetry.h"
+#include "t3_robot_state.h"
 
 #define STEP_US UINT32_C(100000)
 #define STEPS 20u

@@ -9,30 +9,6 @@
 
 #define AGE_UNIT_US 10u
 
-uint8_t t3_robot_status(const struct t3_robot *robot)
-{
-    const uint16_t supply = t3_robot_battery(robot);
-    uint8_t status = 0;
-    if (robot->enabled)
-        status |= T3_STATUS_ENABLED;
-    if (t3_ramp_moving(&robot->ramp))
-        status |= T3_STATUS_MOVING;
-    if (robot->estop)
-        status |= T3_STATUS_ESTOP;
-    if (robot->expired)
-        status |= T3_STATUS_TTL_EXPIRED;
-    if (robot->imu_fault)
-        status |= T3_STATUS_IMU_FAULT;
-    // 0: nothing is wired to it
-    if (supply && supply < robot->parameters.values[T3_BATTERY_LOW])
-        status |= T3_STATUS_LOW_BATTERY;
-    if (!robot->session.id)
-        status |= T3_STATUS_NO_SESSION;
-    if (robot->limited)
-        status |= T3_STATUS_LIMITED;
-    return status;
-}
-
 static struct t3_imu sample_imu(struct t3_robot *robot)
 {
     struct t3_imu imu;

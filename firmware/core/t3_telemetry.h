@@ -4,7 +4,7 @@
 #ifndef T3_TELEMETRY_H
 #define T3_TELEMETRY_H
 
-#include "t3_robot.h"
+#include "t3_robot_state.h"
 
 // Write the payload of the pending reply, sampled now; return its size.
 uint8_t t3_telemetry(struct t3_robot *robot, uint32_t now_us, uint8_t *to);
