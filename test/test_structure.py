@@ -54,8 +54,7 @@ FRONT = {'scripting', 'evaluation', 'simulation'}
 # Libraries that each package may import.
 LIBRARIES = {
     'kernels': {'numba'},
-    'geometry': {'yaml'},
-    'simulation': {'yaml'},
+    'parameters': {'yaml'},
     'radio': {'serial'},
     'bag': {'mcap', 'rosbags', 'yaml', 'zstandard', 'lz4'},
     'evaluation': {'matplotlib', 'PIL', 'yaml', 'cma', 'casadi', 'jinja2', 'tqdm', 'daqp'},

@@ -19,6 +19,7 @@ import yaml
 
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml
 
 UNLIMITED = 2**63 - 1
 """RMW_DURATION_INFINITE in nanoseconds: 9223372036 s and 854775807 ns."""
@@ -192,11 +193,9 @@ def read_qos_overrides(path: Path | str) -> dict[str, QosProfile]:
     """
     path = Path(path).expanduser()
     try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except OSError as error:
-        raise QosError(f'{path} cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise QosError(f'{path} is not YAML: {" ".join(str(error).split())}') from error
+        content = read_yaml(path)
+    except YamlError as error:
+        raise QosError(f'{path} {error}') from error
     if not isinstance(content, dict):
         raise QosError(f'{path} must contain profiles by topic: got {type(content).__name__}')
     return {

@@ -9,7 +9,7 @@ import math
 import os
 from pathlib import Path
 import sys
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import yaml
 
@@ -17,6 +17,7 @@ from t3mpc_ros.cli.command import ask_line, check_writable
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
 from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.radio_robot import RadioRobotParameters
 from t3mpc_ros.radio.tool import procedure, robot_records, robot_settings
@@ -207,12 +208,12 @@ def read_parameter_file(path: Path) -> tuple[Calibration, dict[str, object]]:
         The file cannot be read, or is another one.
     """
     try:
-        content = yaml.safe_load(path.read_text())
+        content: Any = read_yaml(path)
         values = content['/**/radio_bridge']['ros__parameters']
         parameters = RadioRobotParameters.from_dict(values)
-    except OSError as error:
-        raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, KeyError, TypeError) as error:
+    except YamlError as error:
+        raise ParameterError(f'{path} {error}') from error
+    except (KeyError, TypeError) as error:
         raise ParameterError(
             f'{path} must be a parameter file of t3mpc robot calibrate, with calibration below '
             '/**/radio_bridge'

@@ -8,14 +8,13 @@ import math
 import os
 from pathlib import Path
 import sys
-from typing import TypeVar
-
-import yaml
+from typing import Any, TypeVar
 
 from t3mpc_ros.cli import calibrate
 from t3mpc_ros.cli.command import ArgumentParser, ask_line, check_writable
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
@@ -175,12 +174,8 @@ def _show_log(options: argparse.Namespace, stop: StopSignal) -> int:
 
 def _load_settings(path: Path) -> RobotSettings:
     try:
-        return robot_settings.settings_of_file(yaml.safe_load(path.read_text()))
-    except OSError as error:
-        raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
-    except yaml.YAMLError as error:
-        raise ParameterError(f'{path} must be a YAML file: {error}') from error
-    except SettingsFileError as error:
+        return robot_settings.settings_of_file(read_yaml(path))
+    except (YamlError, SettingsFileError) as error:
         raise ParameterError(f'{path} {error}') from error
 
 
@@ -314,12 +309,11 @@ def _link_parameters(options: argparse.Namespace) -> LinkParameters:
 def _read_link_parameters(path: Path) -> dict[str, object]:
     """Return the parameters below ``link`` of a ROS parameter file, names with dots."""
     try:
-        content = yaml.safe_load(path.read_text())
-        group = content['/**']['ros__parameters']['link']
-        return dict(_flat_items(group))
-    except OSError as error:
-        raise ParameterError(f'{path} cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError) as error:
+        content: Any = read_yaml(path)
+        return dict(_flat_items(content['/**']['ros__parameters']['link']))
+    except YamlError as error:
+        raise ParameterError(f'{path} {error}') from error
+    except (KeyError, TypeError, AttributeError) as error:
         raise ParameterError(
             f'{path} must be a parameter file of t3mpc robot setup, with link below /**'
         ) from error

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.path_timing import PathError
+from t3mpc_ros.parameters.yaml_files import YamlError, parse_yaml, read_text
 
 Array = NDArray[np.float64]
 
@@ -33,15 +34,9 @@ def load_path(file: str | Path) -> Array:
     """
     path = Path(file)
     try:
-        with path.open('rb') as stream:
-            content = stream.read(MAX_FILE_SIZE + 1)
-        if len(content) > MAX_FILE_SIZE:
-            raise PathError(f'{path} must have at most {MAX_FILE_SIZE} bytes: it has more')
-        text = content.decode('utf-8')
-    except OSError as error:
-        raise PathError(f'{path} cannot be read: {error.strerror}') from error
-    except UnicodeDecodeError as error:
-        raise PathError(f'{path} must be UTF-8 text: {error}') from error
+        text = read_text(path, MAX_FILE_SIZE)
+    except YamlError as error:
+        raise PathError(f'{path} {error}') from error
     readers = {'.csv': _csv_rows, '.yaml': _yaml_rows, '.yml': _yaml_rows}
     if path.suffix.lower() not in readers:
         raise PathError(f'{path} must end in .csv or .yaml: got {path.suffix or "no suffix"!r}')
@@ -51,6 +46,8 @@ def load_path(file: str | Path) -> Array:
         ).reshape(-1, 2)
         if len(points) < 2 or not np.ptp(points, axis=0).any():
             raise PathError(f'two points that differ are needed: got {len(points)}')
+    except YamlError as error:
+        raise PathError(f'{path} {error}') from error
     except PathError as error:
         raise PathError(f'{path}: {error}') from error.__cause__
     return points
@@ -73,12 +70,7 @@ def _csv_rows(text: str) -> list[tuple[str, object]]:
 
 
 def _yaml_rows(text: str) -> list[tuple[str, object]]:
-    import yaml
-
-    try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise PathError(f'not YAML: {error}') from error
+    content = parse_yaml(text)
     if not isinstance(content, dict) or not isinstance(content.get('points'), list):
         raise PathError('must have points: [[x, y], ...]')
     if unknown := set(map(str, content)) - {'points', 'closed', 'name'}:

@@ -8,9 +8,6 @@ from dataclasses import dataclass
 import math
 import os
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from t3mpc_ros.parameters.table import (
     ParameterError,
@@ -20,6 +17,7 @@ from t3mpc_ros.parameters.table import (
     nearest_hint,
     parameter,
 )
+from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml
 
 SCHEDULES_FOLDER = Path(__file__).resolve().parent / 'schedules'
 """Folder of the bundled schedules."""
@@ -238,36 +236,11 @@ def load_schedule(name_or_path: str | Path) -> FaultSchedule:
             )
         path = SCHEDULES_FOLDER / f'{name}.yaml'
     try:
-        return FaultSchedule(map(_event, *_entries(_read(path))), name=path.stem)
+        return FaultSchedule(map(_event, *_entries(read_yaml(path))), name=path.stem)
+    except YamlError as error:
+        raise ScheduleError(f'{name} {error}') from None
     except ScheduleError as error:
         raise ScheduleError(f'{name}: {error}') from None
-
-
-def _read(path: Path) -> object:
-    try:
-        return yaml.load(path.read_text(encoding='utf-8'), Loader=_OnceLoader)
-    except OSError as error:
-        raise ScheduleError(f'cannot be read: {error.strerror}') from None
-    except yaml.MarkedYAMLError as error:
-        line = f'line {error.problem_mark.line + 1}: ' if error.problem_mark else ''
-        raise ScheduleError(f'is not YAML: {line}{error.problem}') from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ScheduleError(f'is not YAML: {" ".join(str(error).split())}') from None
-
-
-class _OnceLoader(yaml.SafeLoader):
-    """Rejects a duplicate key, of which YAML would silently drop the first."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                continue
-            if key.value in seen:
-                problem = f'{key.value} is given twice in one entry; a new entry begins with "- "'
-                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
 
 
 def _entries(content: object) -> tuple[list[str], list[object]]:

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import nearest_hint
+from t3mpc_ros.parameters.yaml_files import YamlError, parse_yaml, read_text
 
 Array = npt.NDArray[np.float64]
 
@@ -36,8 +36,6 @@ MAX_SEGMENTS = 2000
 """Straight wall segments, those of boxes included: every ray and every step visits each."""
 MAX_CIRCLES = 500
 MAX_PATCHES = 100
-MAX_FILE_SIZE = 1_000_000
-"""Bytes."""
 JOIN_TOLERANCE = 1e-4
 """m: ends nearer than this to each other, or to a wall, touch."""
 _NUMBER_PATTERN = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?', re.IGNORECASE)
@@ -168,20 +166,14 @@ def load_world(path_or_name: str | Path) -> World:
     if path_or_name in names:
         path = WORLDS_FOLDER / f'{path_or_name}.yaml'
     try:
-        with path.open('rb') as file:
-            content = file.read(MAX_FILE_SIZE + 1)
-        if len(content) > MAX_FILE_SIZE:
-            raise WorldError(f'{path} must have at most {MAX_FILE_SIZE} bytes: it has more')
-        text = content.decode('utf-8')
-    except FileNotFoundError:
+        text = read_text(path)
+    except YamlError as error:
+        if not isinstance(error.__cause__, FileNotFoundError):
+            raise WorldError(f'{path} {error}') from error
         raise WorldError(
             f'there is no world {path_or_name}, neither a file nor one of '
             f'{", ".join(names)}{nearest_hint(str(path_or_name), names)}'
         ) from None
-    except OSError as error:
-        raise WorldError(f'{path} cannot be read: {error.strerror}') from error
-    except UnicodeDecodeError as error:
-        raise WorldError(f'{path} must be UTF-8 text: {error}') from error
     return parse_world(text, str(path))
 
 
@@ -201,38 +193,11 @@ def parse_world(text: str, source: str) -> World:
         Contains ``source``, the entry, the bound and the value.
     """
     try:
-        return _world(_parsed(text), Path(source).stem)
+        return _world(parse_yaml(text), Path(source).stem)
+    except YamlError as error:
+        raise WorldError(f'{source} {error}') from error
     except WorldError as error:
         raise WorldError(f'{source}: {error}') from error.__cause__
-
-
-class _Loader(yaml.SafeLoader):
-    """Rejects a duplicate key, of which YAML would silently keep the last."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        pairs = node.value if isinstance(node, yaml.MappingNode) else []
-        seen: set[str] = set()
-        for key in (key for key, _ in pairs if isinstance(key, yaml.ScalarNode)):
-            if key.value in seen:
-                line = key.start_mark.line + 1
-                raise WorldError(f'{key.value} is given twice in one entry, at line {line}')
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
-def _parsed(text: str) -> object:
-    try:
-        return yaml.load(text, Loader=_Loader)
-    except WorldError:
-        raise
-    except yaml.YAMLError as error:
-        mark = getattr(error, 'problem_mark', None)
-        line = f'line {mark.line + 1}: ' if mark else ''
-        problem = getattr(error, 'problem', None) or str(error)
-        raise WorldError(f'not YAML: {line}{problem}') from error
-    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
-        # Errors of the parser itself: an invalid date, endless brackets, !!int without digits.
-        raise WorldError(f'not YAML that can be read: {error}') from error
 
 
 def _world(content: object, stem: str) -> World:

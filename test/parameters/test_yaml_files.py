@@ -1,0 +1,47 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""YAML files of users: what is refused, with the place."""
+
+import pytest
+
+from t3mpc_ros.parameters.yaml_files import MAX_FILE_SIZE, YamlError, read_yaml
+
+BAD = {
+    b'walls: [': 'is not YAML: line 1: ',
+    b'a: 1\nb: {c: 1\n': 'is not YAML: line 3: ',
+    b'name: \x07': 'is not YAML: ',
+    b'name: 2026-13-45': 'is not YAML: month must be in 1..12',
+    b'name: !!int ""': 'is not YAML: ',
+    b'name: ' + 5000 * b'[': 'is not YAML: maximum recursion depth exceeded',
+    b'!!python/object:os.system {}': 'is not YAML: line 1: could not determine a constructor',
+    b'walls: !!map [1]': 'is not YAML: line 1: expected a mapping node',
+    b'- at: 1\n  for: 2\n  at: 3\n': 'line 3: at is given twice in one entry; a new entry of a ',
+    'name: Küche'.encode('latin-1'): 'must be UTF-8 text: ',
+    b'#' * (MAX_FILE_SIZE + 1): f'must have at most {MAX_FILE_SIZE} bytes: it has more',
+}
+
+
+@pytest.mark.parametrize(('content', 'words'), BAD.items(), ids=range(len(BAD)))
+def test_what_is_wrong_is_said_in_one_line(content, words, tmp_path):
+    path = tmp_path / 'file.yaml'
+    path.write_bytes(content)
+    with pytest.raises(YamlError) as caught:
+        read_yaml(path)
+    message = str(caught.value)
+    assert words in message
+    assert '\n' not in message
+    assert len(message) < 250
+
+
+def test_a_file_that_cannot_be_read_says_why(tmp_path):
+    for path, words in ((tmp_path / 'none', 'No such file'), (tmp_path, 'Is a directory')):
+        with pytest.raises(YamlError, match=f'cannot be read: {words}'):
+            read_yaml(path)
+
+
+def test_the_longest_file_and_an_empty_one_are_read(tmp_path, monkeypatch):
+    path = tmp_path / 'file.yaml'
+    path.write_bytes(b'a: [1, 2.5, Z\xc3\xbcrich] #'.ljust(MAX_FILE_SIZE, b'x'))
+    assert read_yaml(path) == {'a': [1, 2.5, 'Zürich']}
+    path.write_bytes(b'')
+    assert read_yaml(path) is None
