@@ -2,25 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every program of ``examples/`` runs, and shows what its docstring says."""
 
-import importlib.util
-from pathlib import Path
+import math
 
 import numpy as np
 import pytest
+from support.checkout import ROOT, load_example
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
 BAG = ROOT / 'test' / 'golden' / 'stops.mcap'
-
-
-def load(name):
-    """Return a program as a module, with its main part not run."""
-    spec = importlib.util.spec_from_file_location(f'example_{name}', ROOT / f'examples/{name}.py')
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def _own_controller(module, folder):
@@ -71,6 +62,13 @@ def _fuzzy_system(module, folder):
     assert max(errors.values()) < 0.1
 
 
+def _digital_twin(module, folder):
+    lost, (truth, odometry, steps) = module.main(folder, side=1.0)
+    assert lost >= 4
+    assert math.dist(steps[-1, :2], (0.0, 0.0)) < 5e-3  # the counters see a square
+    assert math.dist(truth[-1], steps[-1]) > 5.0 * math.dist(truth[-1], odometry[-1])
+
+
 CHECKS = {
     name.removeprefix('_'): check
     for name, check in globals().copy().items()
@@ -80,7 +78,7 @@ CHECKS = {
 
 @pytest.mark.parametrize('name', [path.stem for path in EXAMPLES])
 def test_an_example_runs_and_shows_what_it_says(name, tmp_path):
-    CHECKS[name](load(name), tmp_path)
+    CHECKS[name](load_example(name), tmp_path)
 
 
 def test_the_tutorial_shows_the_controller_of_the_example():

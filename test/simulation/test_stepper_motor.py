@@ -12,6 +12,7 @@ from support.long_tests import few_of
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.plant.contact import BumperParameters
 from t3mpc_ros.simulation.plant.disturbances import (
     Disturbance,
@@ -19,7 +20,7 @@ from t3mpc_ros.simulation.plant.disturbances import (
     FrictionParameters,
 )
 from t3mpc_ros.simulation.plant.drivetrain import Drivetrain, Load, TyreParameters
-from t3mpc_ros.simulation.plant.dynamics import BodyParameters
+from t3mpc_ros.simulation.plant.dynamics import BodyParameters, wheel_inertia
 from t3mpc_ros.simulation.plant.stepper_motor import (
     StepperMotorParameters,
     pull_out_torque,
@@ -118,6 +119,27 @@ def test_current_above_the_rating_is_rejected():
         StepperMotorParameters(phase_current=2.0)
 
 
+@pytest.mark.parametrize('volts', [9.0, 12.0])
+def test_motors_pull_more_than_the_robot_needs(volts):
+    """At its top speed and acceleration, straight ahead or on the spot, with friction."""
+    robot = DigitalTwinParameters()
+    motor, limiter, friction = robot.motor, robot.limiter, robot.friction
+    inertia = wheel_inertia(robot.true_body, robot.geometry)
+    hardest = inertia[0, 0] + abs(inertia[0, 1]) + motor.rotor_inertia
+    needed = hardest * limiter.acceleration
+    needed += friction.coulomb + friction.viscous * limiter.wheel_speed
+    assert pull_out_torque(limiter.wheel_speed, volts, motor.constants()) > needed
+
+
+def test_the_speed_ceiling_is_v_over_2_l_i_steps_a_second():
+    """12 V, 2.8 mH, 1.7 A: there a current no longer rises within a step; 6.3 turns a second."""
+    robot = DigitalTwinParameters()
+    motor = robot.motor
+    turns = VOLTS / (2.0 * motor.inductance * motor.rated_current) / motor.full_steps
+    assert turns == pytest.approx(6.30, abs=0.01)
+    assert robot.drive.speed_ceiling == pytest.approx(math.tau * turns, abs=0.05)
+
+
 # -- lost steps -----------------------------------------------------------------------------------
 
 
@@ -174,6 +196,26 @@ def test_ramp_beyond_the_torque_always_loses_steps(seed):
     assert abs(right) >= 4
     assert abs(left) >= 4
     assert math.copysign(1.0, right) == math.copysign(1.0, target)
+
+
+@pytest.mark.parametrize(('share', 'loses'), [(0.5, False), (1.5, True)])
+def test_the_counters_miss_the_steps_lost_on_a_ramp(share, loses):
+    motor, friction = StepperMotorParameters(), FrictionParameters()
+    peak = pull_out_torque(0.0, VOLTS, motor.constants()) - friction.coulomb
+    robot = drivetrain(motor, friction=friction)
+    for target, periods in ((10.0, 50), (0.0, 80)):
+        for _ in range(periods):
+            robot.run(
+                WheelSpeeds(target, target), share * peak / needed_torque(motor, 1.0), VOLTS,
+                calm(), 10,
+            )  # fmt: skip
+    lost = robot.lost_steps[0]
+    assert (lost >= 4) is loses
+    assert lost % 4 == 0
+    counted = 0.5 * motor.microstep * sum(robot.counters)
+    missed = math.tau * lost / motor.full_steps
+    way = GEOMETRY.wheel_radius * (counted - missed)
+    assert robot.pose.x == pytest.approx(way, abs=1e-3)
 
 
 def test_lost_steps_at_rest_are_whole_tooth_pitches():

@@ -1,7 +1,8 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Copies of the package, and an environment without the variables of the user's setup."""
+"""Copies and examples of the package, an environment without the variables of the user's setup."""
 
+import importlib.util
 import os
 from pathlib import Path
 import re
@@ -24,3 +25,11 @@ def copy_package(destination):
     ignored = [line.rstrip('/') for line in (ROOT / '.gitignore').read_text().split()]
     shutil.copytree(ROOT, destination, ignore=shutil.ignore_patterns('.git', *ignored))
     return destination
+
+
+def load_example(name):
+    """Return a program of ``examples/`` as a module, with its main part not run."""
+    spec = importlib.util.spec_from_file_location(f'example_{name}', ROOT / f'examples/{name}.py')
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
