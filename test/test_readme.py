@@ -52,7 +52,6 @@ SHORTENED = {
     'scripts/run sim_robot --ros-args -p world:=room': ([], True),
     'scripts/run sim_robot --ros-args -p world:=room -p faults.schedule:=rough_ride': ([], True),
     'scripts/run t3mpc --help': ([], False),
-    'scripts/run t3mpc twin --quick': (['--output', 'OUTPUT/twin'], False),
     'scripts/run t3mpc faults': (['brown_out', 'collision'], False),
     'scripts/demo --patrol': (
         ['--duration', '5', '--headless', '--output', 'OUTPUT/patrol'],

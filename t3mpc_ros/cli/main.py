@@ -21,7 +21,6 @@ from t3mpc_ros.cli.patrol import add_parser as add_patrol
 from t3mpc_ros.cli.sweep import add_parser as add_sweep
 from t3mpc_ros.cli.train import add_parser as add_train
 from t3mpc_ros.cli.tune import add_parser as add_tune
-from t3mpc_ros.cli.twin import add_parser as add_twin
 from t3mpc_ros.cli.view import add_parser as add_view
 from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
@@ -48,6 +47,9 @@ PROGRAMS = {
 }
 """Subcommands with their own parser, in the module of the same name."""
 
+REMOVED = {'twin': 'examples/digital_twin.py draws the twin, test/simulation checks it'}
+"""Successors of the commands that were removed."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Return the exit code: 0 done, 1 failed with a reason, 2 wrong command line."""
@@ -62,6 +64,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: Sequence[str]) -> int:
+    if words and words[0] in REMOVED:
+        print(f'error: t3mpc {words[0]} was removed: {REMOVED[words[0]]}', file=sys.stderr)
+        return 2
     if words and words[0] in PROGRAMS:
         # Imported only when it is used: `t3mpc --help` stays fast.
         code: int = import_module(f't3mpc_ros.cli.{words[0]}').main(words[1:])
@@ -273,7 +278,6 @@ def _parser() -> argparse.ArgumentParser:
     add_patrol(commands)
     add_tune(commands, _method_definitions)
     add_train(commands)
-    add_twin(commands)
     add_outcomes_parser(commands)
     add_view(commands)
     add_graph_parsers(commands)

@@ -199,6 +199,7 @@ CASES = [
             'emulator --link l --loss 2': 'must be from 0 to 1: got 2',
             'topic': 'required',
             'nothing': 'invalid choice',
+            'twin --quick': 'error: t3mpc twin was removed: examples/digital_twin.py',
             '': 'required: COMMAND',
         }.items()
     ),

@@ -26,7 +26,6 @@ from support.parsers import commands, options
 from t3mpc_ros.bag.recovery.result import RecoveryResult
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS
-from t3mpc_ros.evaluation.twin_validation.validation_page import QUICK
 from t3mpc_ros.nodes.registry import NODES, parameter_class
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import key_check
@@ -415,14 +414,6 @@ TABLE = {
             '--keep-predictor': {'fit_bags.keep_predictor': True},
             '--folds 3': {'fit_bags.count': 3},
             '--output new.npz': {'save_model.path': 'new.npz'},
-        },
-    ),
-    'twin': (
-        {'evaluation.twin_validation.validation_page.write_validation': ''},
-        {
-            '--output new': {'write_validation.output': 'new'},
-            '--seed 4': {'write_validation.seed': 4},
-            '--quick': flat('write_validation.amount', QUICK),
         },
     ),
     'faults': (
