@@ -19,7 +19,7 @@ from t3mpc_ros.radio.tool.robot_records import RobotSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'equations.md'
-FUNCTION = re.compile(r'`(t3mpc_ros/[\w/]+\.py)::([\w.]+)`(\\\*)?')
+FUNCTION = re.compile(r'`((?:t3mpc_ros/[\w/]+|test/support/equations)\.py)::([\w.]+)`')
 TEST = re.compile(r'`(test/[\w/]+\.py)::(test_\w+)`')
 NUMBER = re.compile(r'\((\d+)\)|(E\d+)')
 
@@ -38,8 +38,8 @@ NUMBERED = [row for row in ROWS if NUMBER.fullmatch(row[0])]
 
 
 def _named(row):
-    """Return the functions of a row as (path, name, starred)."""
-    return [(path, name, bool(star)) for path, name, star in FUNCTION.findall(row[-2])]
+    """Return the functions of a row as (path, name)."""
+    return FUNCTION.findall(row[-2])
 
 
 FUNCTIONS = sorted({one for row in ROWS for one in _named(row)})
@@ -52,7 +52,11 @@ def _tree(path):
 
 
 def _module(path):
-    return importlib.import_module(path.removesuffix('.py').replace('/', '.'))
+    return importlib.import_module(_dotted(path))
+
+
+def _dotted(path):
+    return path.removeprefix('test/').removesuffix('.py').replace('/', '.')
 
 
 def test_every_equation_and_every_correction_has_exactly_one_row():
@@ -65,16 +69,14 @@ def test_every_equation_and_every_correction_has_exactly_one_row():
 def test_no_cell_is_empty_and_references_are_well_formed(row):
     assert len(row) == (4 if row in NUMBERED else 3)
     assert all(row)
-    assert row[-2] == ', '.join(
-        f'`{path}::{name}`' + star for path, name, star in FUNCTION.findall(row[-2])
-    )
+    assert row[-2] == ', '.join(f'`{path}::{name}`' for path, name in _named(row))
     assert row[-1] == ', '.join(f'`{path}::{name}`' for path, name in TEST.findall(row[-1]))
     assert _named(row)
     assert TEST.search(row[-1])
 
 
-@pytest.mark.parametrize('path, name, starred', FUNCTIONS, ids=lambda value: str(value))
-def test_every_function_named_exists(path, name, starred):
+@pytest.mark.parametrize('path, name', FUNCTIONS)
+def test_every_function_named_exists(path, name):
     found = reduce(getattr, name.split('.'), _module(path))
     assert found.__doc__
 
@@ -82,7 +84,7 @@ def test_every_function_named_exists(path, name, starred):
 @pytest.mark.parametrize('row', NUMBERED, ids=lambda row: row[0])
 def test_the_docstring_contains_the_equation_number(row):
     """A range such as (16)-(19) does not count for the numbers between its ends."""
-    for path, name, _ in _named(row):
+    for path, name in _named(row):
         module = _module(path)
         texts = [module.__doc__]
         for part in name.split('.'):
@@ -94,7 +96,7 @@ def test_the_docstring_contains_the_equation_number(row):
 
 def test_each_number_is_in_a_docstring_below_module_level():
     for row in NUMBERED:
-        own = [reduce(getattr, name.split('.'), _module(path)) for path, name, _ in _named(row)]
+        own = [reduce(getattr, name.split('.'), _module(path)) for path, name in _named(row)]
         assert any(row[0] in one.__doc__ for one in own), row[0]
 
 
@@ -112,40 +114,36 @@ def test_a_test_of_each_row_reaches_a_function_of_that_row(row):
     for path, _ in TEST.findall(row[-1]):
         direct = _imported(path)
         reached |= direct.union(*(_imported(file) for file in direct))
-    assert reached & {path for path, _, _ in _named(row)}
+    assert reached & {path for path, _ in _named(row)}
 
 
 @cache
 def _imported(path):
     found = set()
     for node in ast.walk(_tree(path)):
-        if isinstance(node, ast.ImportFrom) and (node.module or '').startswith('t3mpc_ros'):
-            source = node.module.replace('.', '/')
+        if isinstance(node, ast.ImportFrom):
+            source = (node.module or '').replace('.', '/').replace('support/', 'test/support/')
             found |= {f'{source}.py', *(f'{source}/{name.name}.py' for name in node.names)}
     return {file for file in found if (ROOT / file).exists()}
 
 
 @pytest.mark.slow
-def test_a_star_marks_exactly_the_unused_functions():
-    marked = {(path, name) for path, name, star in FUNCTIONS if star}
-    plain = {(path, name) for path, name, star in FUNCTIONS if not star}
-    assert not marked & plain
-    for path, name in marked:
-        assert not _called(path, name, marked), f'{path}::{name} is called: remove the star'
-    for path, name in plain:
-        if '.' not in name and name[0].islower():  # methods and classes are not checked
-            assert _called(path, name, marked), f'{path}::{name} is not called: add a star'
+def test_the_package_calls_its_functions_on_the_page():
+    """What only tests call stands in test/support/equations.py."""
+    for path, name in FUNCTIONS:
+        # Methods and classes are not checked.
+        if path.startswith('t3mpc_ros') and '.' not in name and name[0].islower():
+            assert _called(path, name), f'{path}::{name} is not called'
 
 
-def _called(path, name, marked):
-    """Return whether the package uses a function outside itself and the marked functions."""
-    module = path.removesuffix('.py').replace('/', '.')
+def _called(path, name):
+    """Return whether the package uses a function outside itself."""
     return any(
         name in read
         for file, (imported, parts) in _uses().items()
-        if file == path or (module, name) in imported
+        if file == path or (_dotted(path), name) in imported
         for own, read in parts
-        if (file, own) not in marked and (file, own) != (path, name)
+        if (file, own) != (path, name)
     )
 
 

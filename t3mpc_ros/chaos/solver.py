@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-r"""Solvers of fractional-order systems: constant memory for nodes, full memory as their check.
+r"""Solver of fractional-order systems with constant cost and constant memory.
 
 Caputo's equation D^q y = f(y) is the Volterra equation
 
@@ -14,11 +14,9 @@ uses the same past. Predictor and corrector thus share one past, and at q = 1 th
 Heun's, which the original is not. On a linear equation with one state both methods coincide; the
 order is min(2, 1 + q) for both.
 
-:func:`solve_full_memory` keeps every slope, at a cost of O(N) per step and O(N^2) per run: it is
-the independent check of the other one, for tests and figures only. :class:`FractionalSolver` has
-constant cost and constant memory. Over the newest step its kernel is the true one, integrated
-exactly; over everything before it the kernel is the sum of exponentials of
-:mod:`t3mpc_ros.chaos.sum_of_exponentials`, valid from a lag of one step on. A mode
+Over the newest step the kernel is the true one, integrated exactly; over everything before it the
+kernel is the sum of exponentials of :mod:`t3mpc_ros.chaos.sum_of_exponentials`, valid from a lag
+of one step on. A mode
 
 .. math:: z(t) = \int_0^t e^{-\lambda (t - s)} g(s)\,ds
 
@@ -268,121 +266,3 @@ class FractionalSolver:
         if not np.isfinite(self._vectors[:2]).all():
             raise FloatingPointError(f'state is not finite at {self.time} s: {self._vectors[0]}')
         return self.state
-
-
-def interval_weights(order: float, count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    r"""Return the product-trapezoid weights of the older and the newer end of past intervals.
-
-    Entry m belongs to the interval of lags [m, m + 1], in units of the step:
-
-    .. math:: \text{older}_m = \frac{1}{\Gamma(q)} \int_m^{m+1} u^{q-1} (u - m)\,du, \qquad
-              \text{newer}_m = \frac{1}{\Gamma(q)} \int_m^{m+1} u^{q-1} (m + 1 - u)\,du
-
-    The closed form is a difference of powers that loses digits like m^2. Beyond the first
-    interval the integrand is smooth, so 14 Gauss points integrate it to rounding.
-
-    Returns
-    -------
-    older, newer
-        Shape (count,) each; multiply by step**order.
-    """
-    older = np.empty(count)
-    newer = np.empty(count)
-    older[:1] = order / math.gamma(order + 2.0)
-    newer[:1] = 1.0 / math.gamma(order + 2.0)
-    if count > 1:
-        nodes, shares = np.polynomial.legendre.leggauss(14)
-        nodes = 0.5 * (nodes + 1.0)
-        shares = 0.5 * shares / math.gamma(order)
-        lag = np.arange(1.0, count)[:, None] + nodes
-        older[1:] = (lag ** (order - 1.0) * nodes) @ shares
-        newer[1:] = (lag ** (order - 1.0) * (1.0 - nodes)) @ shares
-    return older, newer
-
-
-def solve_full_memory(
-    system: QuadraticSystem, step: float, initial: NDArray[np.float64], steps: int
-) -> NDArray[np.float64]:
-    """Return the states at 0, step, ... , steps * step, from every past slope.
-
-    Parameters
-    ----------
-    system
-        Each state may have its own order.
-    step
-        s, positive.
-    initial
-        Shape (d,).
-    steps
-        Number of steps, not negative.
-
-    Returns
-    -------
-    states
-        Shape (steps + 1, d).
-
-    Raises
-    ------
-    ValueError
-        The step is not positive, or the initial state has the wrong size.
-    """
-    if not 0.0 < step < math.inf:
-        raise ValueError(f'step must be positive and finite: got {step}')
-    if np.shape(initial) != (system.size,):
-        raise ValueError(f'initial must have shape ({system.size},): got {np.shape(initial)}')
-    if steps < 0:
-        raise ValueError(f'steps must not be negative: got {steps}')
-    older = np.empty((steps, system.size))
-    newer = np.empty((steps, system.size))
-    rectangle = np.empty(system.size)
-    for state, order in enumerate(system.orders):
-        ends = interval_weights(order, steps)
-        older[:, state] = step**order * ends[0]
-        newer[:, state] = step**order * ends[1]
-        rectangle[state] = step**order / math.gamma(order + 1.0)
-    states = np.empty((steps + 1, system.size))
-    states[0] = initial
-    _integrate_full_memory(
-        system.terms(),
-        older,
-        newer,
-        rectangle,
-        np.empty((steps + 1, system.size)),
-        np.empty((steps + 1, system.size)),
-        states,
-        np.empty(system.size),
-    )
-    return states
-
-
-@kernel
-def _integrate_full_memory(
-    terms: Terms,
-    older: NDArray[np.float64],
-    newer: NDArray[np.float64],
-    rectangle: NDArray[np.float64],
-    slopes: NDArray[np.float64],
-    predicted: NDArray[np.float64],
-    states: NDArray[np.float64],
-    guess: NDArray[np.float64],
-) -> None:
-    """Write ``states`` after its given first row.
-
-    older, newer      : shape (N, d), weights by lag, scaled by the step
-    rectangle         : shape (d,), the predictor's weight of the newest slope
-    slopes, predicted : shape (N + 1, d), work space; f at the corrected and the predicted state
-    states            : shape (N + 1, d), first row given
-    guess             : shape (d,), work space
-    """
-    right_hand_side(terms, states[0], slopes[0])
-    for n in range(states.shape[0] - 1):
-        for i in range(guess.size):
-            past = 0.0
-            for j in range(n):
-                past += older[n - j, i] * slopes[j, i] + newer[n - j, i] * predicted[j + 1, i]
-            guess[i] = states[0, i] + past + rectangle[i] * slopes[n, i]
-            states[n + 1, i] = states[0, i] + past + older[0, i] * slopes[n, i]
-        right_hand_side(terms, guess, predicted[n + 1])
-        for i in range(guess.size):
-            states[n + 1, i] += newer[0, i] * predicted[n + 1, i]
-        right_hand_side(terms, states[n + 1], slopes[n + 1])

@@ -154,8 +154,3 @@ def hyperchaotic_system(
         ),
         quadratic=((0, 1, 2, a), (1, 0, 2, -d), (2, 0, 1, 1.0)),
     )
-
-
-def linear_decay_system(order: float) -> QuadraticSystem:
-    """Return D^q y = -y, whose solution from 1 is the Mittag-Leffler function E_q(-t^q)."""
-    return QuadraticSystem((order,), linear=((0, 0, -1.0),))

@@ -199,26 +199,7 @@ def compensator(error: float, bound: float, smoothing: float) -> float:
     return -bound * math.tanh(error / smoothing)
 
 
-# -- stability: V of (74), its bound E14, and the certificate at run time -------------------------
-
-
-def lyapunov_value(errors: Array, coefficient_errors: Array, adaptation_gain: float) -> float:
-    """Return V of equation (74), rad²/s²: half of |delta|² plus |alpha* - alpha|²/(2 gamma).
-
-    Along the closed loop V' is (75), the sum of delta delta' - alpha~ alpha'/gamma. With the law
-    it becomes (76), and (79) if the coefficients follow (77)-(78).
-
-    Parameters
-    ----------
-    errors
-        delta, shape (n,), rad/s.
-    coefficient_errors
-        alpha~ = alpha* - alpha of all outputs, rad/s².
-    adaptation_gain
-        gamma, 1/s².
-    """
-    squares = float(np.sum(coefficient_errors**2))
-    return 0.5 * float(errors @ errors) + squares / (2.0 * adaptation_gain)
+# -- stability: the bound E14 of V (74), and the certificate at run time --------------------------
 
 
 @kernel

@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.fuzzy.sets import LOWER, UPPER, FuzzySets
+from t3mpc_ros.fuzzy.sets import FuzzySets
 from t3mpc_ros.kernels import kernel
 
 Array = NDArray[np.float64]
@@ -105,23 +105,6 @@ def square_distances(maxima: Array, centres: Array, sharpness: Array, squares: A
                         apart = maxima[i, h, j, level, bound] - centre
                         apart *= sharpness[i, h, j, level, bound]
                         squares[i, h, j, level, bound] = apart * apart
-
-
-@kernel
-def memberships(
-    inputs: Array, centres: Array, nonsingleton_gain: Array, sharpness: Array, grades: Array
-) -> None:
-    r"""Write the grades :math:`\zeta = \exp(-((x^* - o)/\beta)^2)`, (16)-(23) with E7.
-
-    They are (20) and (21) for the upper width at upper and lower level, (22) and (23) for the
-    lower width. A control step uses :func:`relative_memberships` instead, which cannot underflow.
-    Arguments as in :func:`fuzzify` and :func:`square_distances`; ``grades`` is overwritten.
-    """
-    fuzzify(inputs, centres, nonsingleton_gain, grades)
-    square_distances(grades, centres, sharpness, grades)
-    flat = grades.reshape(-1)
-    for k in range(flat.size):
-        flat[k] = math.exp(-flat[k])
 
 
 @kernel
@@ -271,51 +254,3 @@ def compute_basis(inputs: Array, sets: FuzzySets) -> Array:
     tables = FuzzyTables.of(sets, 1)
     evaluate_basis(values, tables)
     return tables.phi
-
-
-def output_by_double_sum(inputs: Array, sets: FuzzySets, lower: Array, upper: Array) -> float:
-    r"""Return the output as the double sum over slices and rules, equation (29) with E7 and E8.
-
-    .. math:: y = \frac{1}{\sum_j(\underline\varsigma_j + \bar\varsigma_j)}
-        \sum_j\left(\bar\varsigma_j
-        \frac{\sum_l(\bar\Omega^l_{\bar\varsigma_j} + \underline\Omega^l_{\bar\varsigma_j})
-        \bar\alpha_{l,j}}{\sum_l(\bar\Omega^l_{\bar\varsigma_j} +
-        \underline\Omega^l_{\bar\varsigma_j})} + \underline\varsigma_j\frac{\cdots}{\cdots}\right)
-
-    E8: each slice is a mean of the coefficients weighted by the firing strengths, hence without
-    the printed 1/2, and the slices are averaged with their levels as weights. An independent,
-    literal implementation that checks (31)-(33): too slow for a control step, and 0/0 far outside
-    the centres, where every firing strength underflows.
-
-    Parameters
-    ----------
-    inputs
-        U, shape (n,), rad/s.
-    sets
-        Tables, of which centres, widths, levels and input fuzziness are used.
-    lower, upper
-        Rule coefficients at the lower and upper levels, shape (r, lambda) each, rad/s².
-    """
-    n, per_input = sets.centres.shape
-
-    def firing(rule: int, j: int, level: int, bound: int) -> float:
-        product = 1.0
-        for i in range(n):
-            h = rule // per_input ** (n - 1 - i) % per_input
-            o = float(sets.centres[i, h])
-            beta = float(sets.widths[i, h, j, level, bound])
-            beta_u = sets.input_fuzziness
-            x = (float(inputs[i]) * beta**2 + o * beta_u**2) / (beta**2 + beta_u**2)  # (16)-(19)
-            product *= math.exp(-(((x - o) / beta) ** 2))  # (20)-(23) with E7, (24)-(27)
-        return product
-
-    numerator = 0.0
-    for j in range(sets.slices):
-        for level, alpha in ((UPPER, upper), (LOWER, lower)):
-            weighted = total = 0.0
-            for rule in range(sets.rules):
-                both = firing(rule, j, level, UPPER) + firing(rule, j, level, LOWER)
-                weighted += both * float(alpha[rule, j])
-                total += both
-            numerator += float(sets.levels[j, level]) * weighted / total
-    return numerator / float(sets.levels.sum())

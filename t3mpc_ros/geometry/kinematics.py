@@ -56,12 +56,6 @@ def wheels_from_twist(twist: BodyTwist, geometry: WheelGeometry) -> WheelSpeeds:
     return WheelSpeeds(*wheel_speeds(twist.linear, twist.angular, geometry.wheel_radius, half))
 
 
-def pose_rate(yaw: float, wheels: WheelSpeeds, geometry: WheelGeometry) -> Pose:
-    """Return (x', y', P') in m/s, m/s and rad/s, equations (2)-(3) with E1."""
-    twist = twist_from_wheels(wheels, geometry)
-    return Pose(twist.linear * math.cos(yaw), twist.linear * math.sin(yaw), twist.angular)
-
-
 def advance_pose(pose: Pose, twist: BodyTwist, dt: float) -> Pose:
     """Return the pose after ``dt`` seconds of constant twist: the exact arc of (2).
 

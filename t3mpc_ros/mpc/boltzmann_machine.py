@@ -266,50 +266,6 @@ def predict_error(machine: BoltzmannMachine) -> float:
 
 
 @kernel
-def energy(visible_weights: Array, eta: Array, mu: Array) -> float:
-    """Return E(eta, mu) = -etaᵀ X_v mu, equation (42); dimensionless."""
-    total = 0.0
-    for i in range(eta.size):
-        for j in range(mu.size):
-            total -= eta[i] * visible_weights[i, j] * mu[j]
-    return total
-
-
-@kernel
-def free_energy(visible_weights: Array, eta: Array) -> float:
-    """Return F(eta) = -ln of the sum of exp(-E/2) over every mu in {-1, 1}^hidden.
-
-    (42) does not couple the hidden units, so the sum is a product of 2 cosh(X_vᵀ eta / 2).
-    """
-    total = 0.0
-    for j in range(visible_weights.shape[1]):
-        y = 0.0
-        for i in range(eta.size):
-            y += visible_weights[i, j] * eta[i]
-        # ln(2 cosh(y/2)) without overflow.
-        total -= 0.5 * abs(y) + math.log1p(math.exp(-abs(y)))
-    return total
-
-
-def boltzmann_distribution(energies: Array) -> Array:
-    """Return the Boltzmann probability of each state, exp(-E/2) / sum exp(-E/2), (41) with E9.
-
-    E9: the printed J' = delta^E / E is no distribution. The temperature is 2 because Xi (40),
-    the tanh of *half* its argument, is the mean of a unit in {-1, 1} at exactly that
-    temperature; at temperature 1 the passes (36)-(39) do not sample from (41). The temperature
-    only scales X_v, and gamma in (43).
-
-    Parameters
-    ----------
-    energies
-        E of every possible state, equation (42).
-    """
-    weights: Array = np.exp(-0.5 * (energies - energies.min()))
-    weights /= weights.sum()
-    return weights
-
-
-@kernel
 def contrastive_divergence_step(machine: BoltzmannMachine, rate: float) -> None:
     """Update X_v along eta_0 mu_0ᵀ - eta_1 mu_1ᵀ, equation (43), after :func:`predict_error`.
 

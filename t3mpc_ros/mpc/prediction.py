@@ -100,25 +100,6 @@ def toeplitz(step: Array, out: Array) -> None:
 
 
 @kernel
-def forced_response(step: Array, changes: Array, ahead: int) -> float:
-    r"""Return delta_hat_forced(t + ahead), equation (47) with E11, in rad/s.
-
-    .. math:: \sum_{\iota=0}^{j-1} s_\iota\, \Delta v_p(t + j - \iota - 1)
-
-    E11: with the printed index t + j - iota + 1 moves would act before they are made.
-
-    step    : shape (n_p,), s_0 ...
-    changes : shape (n_c,), changes of v_p at t, t+1, ... (rad/s²), zero after the last
-    ahead   : j, from 1 to n_p
-    """
-    total = 0.0
-    for i in range(ahead):
-        if ahead - i - 1 < changes.size:
-            total += step[i] * changes[ahead - i - 1]
-    return total
-
-
-@kernel
 def predicted_errors(matrix: Array, changes: Array, free: Array, out: Array) -> None:
     """Write Psi = S dv + Psi_free (rad/s), shape (n_p,), (45), (52)-(53) with dv of (55)."""
     for j in range(out.size):

@@ -196,22 +196,6 @@ def solve_quadratic_program(
 
 
 @kernel
-def cost(
-    matrix: Array, free: Array, changes: Array, error_weight: float, move_weight: float
-) -> float:
-    """Return J = mu PsiᵀPsi + pi dvᵀdv, equations (34) and (60), in units of the weights."""
-    total = 0.0
-    for j in range(free.size):
-        psi = free[j]
-        for i in range(changes.size):
-            psi += matrix[j, i] * changes[i]
-        total += error_weight * psi * psi
-    for i in range(changes.size):
-        total += move_weight * changes[i] * changes[i]
-    return total
-
-
-@kernel
 def normal_equations(
     matrix: Array,
     free: Array,
@@ -275,22 +259,6 @@ def solve_upper(lower: Array, x: Array) -> None:
         for j in range(i + 1, x.size):
             x[i] -= lower[j, i] * x[j]
         x[i] /= lower[i, i]
-
-
-@kernel
-def unconstrained_optimum(lower: Array, gradient: Array, changes: Array) -> None:
-    """Write dv = -mu (mu SᵀS + pi I)⁻¹ SᵀPsi_free, equation (62) with E10.
-
-    E10: the printed right-hand side lacks the minus sign that follows from (61).
-
-    lower   : Cholesky factor of the Hessian
-    gradient : mu SᵀPsi_free
-    changes : shape (n_c,), overwritten (rad/s²)
-    """
-    for i in range(changes.size):
-        changes[i] = -gradient[i]
-    solve_lower(lower, changes)
-    solve_upper(lower, changes)
 
 
 @kernel

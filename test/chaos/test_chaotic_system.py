@@ -4,15 +4,10 @@
 
 import numpy as np
 import pytest
+from support.equations import linear_decay_system
 
 from t3mpc_ros.chaos.solver import FractionalSolver
-from t3mpc_ros.chaos.system import (
-    QuadraticSystem,
-    hyperchaotic_system,
-    jacobian,
-    linear_decay_system,
-    right_hand_side,
-)
+from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system, jacobian, right_hand_side
 
 STATES = np.random.default_rng(3).normal(0.0, (10.0, 2.0, 4.0, 20.0), (20, 4))
 

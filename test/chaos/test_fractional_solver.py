@@ -9,14 +9,10 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.special import gammaln
+from support.equations import interval_weights, linear_decay_system, solve_full_memory
 
-from t3mpc_ros.chaos.solver import (
-    FractionalSolver,
-    interval_weights,
-    mode_weights,
-    solve_full_memory,
-)
-from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system, linear_decay_system
+from t3mpc_ros.chaos.solver import FractionalSolver, mode_weights
+from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
 
 ONE = np.ones(1)
 START = np.array([1.0, 1.0, 1.0, 1.0])

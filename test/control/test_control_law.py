@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from support.equations import lyapunov_value, wheel_coriolis
 from support.long_tests import few_of
 
 from t3mpc_ros.control.control_law import (
@@ -18,7 +19,6 @@ from t3mpc_ros.control.control_law import (
     compensator,
     law_terms,
     lyapunov_rate_bound,
-    lyapunov_value,
 )
 from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
@@ -29,7 +29,6 @@ from t3mpc_ros.simulation.plant.dynamics import (
     BodyParameters,
     dynamics_vector,
     wheel_acceleration,
-    wheel_coriolis,
     wheel_inertia,
 )
 

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from support.equations import wheel_coriolis
 
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
@@ -29,7 +30,7 @@ from t3mpc_ros.fuzzy.inference import compute_basis
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
-from t3mpc_ros.simulation.plant.dynamics import wheel_coriolis, wheel_inertia
+from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 
 pytestmark = pytest.mark.slow
 

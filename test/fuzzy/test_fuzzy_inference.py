@@ -10,14 +10,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 from scipy.special import logsumexp
+from support.equations import memberships, output_by_double_sum
 
-from t3mpc_ros.fuzzy.inference import (
-    compute_basis,
-    firing_strengths,
-    fuzzify,
-    memberships,
-    output_by_double_sum,
-)
+from t3mpc_ros.fuzzy.inference import compute_basis, firing_strengths, fuzzify
 from t3mpc_ros.fuzzy.sets import FuzzyParameters, FuzzySets, build_sets, slice_levels, type3_widths
 
 Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from support.equations import pose_rate
 
 from t3mpc_ros.geometry.kinematics import (
     WheelGeometry,
     advance_pose,
-    pose_rate,
     twist_from_wheels,
     wheels_from_twist,
 )

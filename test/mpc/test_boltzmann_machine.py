@@ -6,13 +6,11 @@ import itertools
 
 import numpy as np
 import pytest
+from support.equations import boltzmann_distribution, energy, free_energy
 
 from t3mpc_ros.mpc.boltzmann_machine import (
     LayerSizes,
     bipolar_sigmoid,
-    boltzmann_distribution,
-    energy,
-    free_energy,
     make_machine,
     predict_error,
     set_visible,

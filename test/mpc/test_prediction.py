@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from support.equations import forced_response
 
 from t3mpc_ros.mpc.boltzmann_machine import (
     LayerSizes,
@@ -15,7 +16,6 @@ from t3mpc_ros.mpc.boltzmann_machine import (
     set_visible,
 )
 from t3mpc_ros.mpc.prediction import (
-    forced_response,
     free_response,
     predict_responses,
     predicted_errors,

@@ -8,13 +8,11 @@ import itertools
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from support.equations import boltzmann_distribution, energy, free_energy
 
 from t3mpc_ros.mpc.boltzmann_machine import (
     LayerSizes,
-    boltzmann_distribution,
     contrastive_divergence_step,
-    energy,
-    free_energy,
     gradient_step,
     make_machine,
     make_rls_state,

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
+from support.equations import cost, unconstrained_optimum
 from support.properties import PROPERTY
 
 from t3mpc_ros.mpc.prediction import toeplitz
@@ -16,12 +17,10 @@ from t3mpc_ros.mpc.quadratic_program import (
     OPTIMAL,
     UNFINISHED,
     cholesky,
-    cost,
     is_dependent,
     make_workspace,
     normal_equations,
     solve_quadratic_program,
-    unconstrained_optimum,
 )
 
 

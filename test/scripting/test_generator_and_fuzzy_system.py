@@ -6,12 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.equations import linear_decay_system, output_by_double_sum, solve_full_memory
 
 import t3mpc_ros as t3
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.chaos.solver import solve_full_memory
-from t3mpc_ros.chaos.system import linear_decay_system
-from t3mpc_ros.fuzzy.inference import output_by_double_sum
 
 BAG = Path(__file__).resolve().parents[1] / 'golden' / 'stops.mcap'
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import matplotlib.figure
 import numpy as np
 import pytest
+from support.equations import linear_decay_system
 
 import t3mpc_ros as t3
-from t3mpc_ros.chaos.system import linear_decay_system
 
 pytestmark = pytest.mark.slow
 

@@ -7,26 +7,29 @@ import math
 
 import numpy as np
 import pytest
-
-from t3mpc_ros.geometry.kinematics import WheelGeometry, pose_rate, twist_from_wheels
-from t3mpc_ros.geometry.types import WheelSpeeds
-from t3mpc_ros.simulation.plant.dynamics import (
-    BodyParameters,
+from support.equations import (
     body_dynamics,
     constrained_acceleration,
     constraint_matrix,
     constraint_rate,
-    coriolis_factor,
     coriolis_matrix,
-    dynamics_vector,
     inertia_matrix,
     input_matrix,
     kinetic_energy,
     null_space,
     null_space_rate,
+    pose_rate,
     reduce_to_wheels,
-    wheel_acceleration,
     wheel_coriolis,
+)
+
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.simulation.plant.dynamics import (
+    BodyParameters,
+    coriolis_factor,
+    dynamics_vector,
+    wheel_acceleration,
     wheel_inertia,
 )
 

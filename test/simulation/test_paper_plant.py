@@ -7,12 +7,13 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from support.equations import wheel_coriolis
 
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.command_limiter import ramp_towards
 from t3mpc_ros.simulation.plant.disturbances import Disturbance
-from t3mpc_ros.simulation.plant.dynamics import wheel_coriolis, wheel_inertia
+from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant.paper_plant import (
     PaperPlant,
     PaperRobot,
