@@ -6,14 +6,13 @@
 ``cmd_vel`` (Twist or TwistStamped) and publishes ``odom``. See docs/your_robot.md.
 """
 
-from launch.actions import DeclareLaunchArgument
-
 from t3mpc_ros.nodes.launch_files import (
-    FLAG,
     RECORD,
     SEED,
     USE_SIM_TIME,
+    argument,
     describe,
+    flag,
     params_file,
 )
 
@@ -34,22 +33,13 @@ def generate_launch_description():
     return describe(
         nodes,
         params_file('generic.yaml'),
-        DeclareLaunchArgument(
-            'odom_topic', default_value='odom', description='odometry of the robot'
-        ),
-        DeclareLaunchArgument(
-            'cmd_vel_topic', default_value='cmd_vel', description='velocity commands of the robot'
-        ),
-        DeclareLaunchArgument(
-            'rate',
-            default_value='',
-            description='rate of the odometry, Hz; empty: that of params_file',
-        ),
-        DeclareLaunchArgument(
+        argument('odom_topic', 'odometry of the robot', 'odom'),
+        argument('cmd_vel_topic', 'velocity commands of the robot', 'cmd_vel'),
+        argument('rate', 'rate of the odometry, Hz; empty: that of params_file'),
+        flag(
             'generate_reference',
-            default_value='true',
-            choices=FLAG,
-            description='start the reference generator; false: another node publishes reference',
+            'start the reference generator; false: another node publishes reference',
+            'true',
         ),
         SEED,
         USE_SIM_TIME,

@@ -6,13 +6,12 @@ With ``robot:=false`` only generator, controller and recorder start, for a robot
 and publishes ``odom`` and ``range/*``. See docs/patrol.md.
 """
 
-from launch.actions import DeclareLaunchArgument
-
 from t3mpc_ros.nodes.launch_files import (
-    FLAG,
     RECORD,
     USE_SIM_TIME,
+    argument,
     describe,
+    flag,
     params_file,
 )
 
@@ -45,32 +44,21 @@ def generate_launch_description():
     return describe(
         nodes,
         params_file(),
-        DeclareLaunchArgument(
+        argument(
             'world',
-            default_value='',
-            description='world of the simulated robot: room, corridor, or a YAML file; empty: '
+            'world of the simulated robot: room, corridor, or a YAML file; empty: '
             'that of params_file, else room',
         ),
-        DeclareLaunchArgument(
-            'known_world',
-            default_value='',
-            description='walls that the keep-out knows, as world; empty: none, it sees them',
+        argument(
+            'known_world', 'walls that the keep-out knows, as world; empty: none, it sees them'
         ),
-        DeclareLaunchArgument(
+        argument(
             'seed',
-            default_value='',
-            description='seed of an experiment that can be repeated; empty: that of params_file, '
+            'seed of an experiment that can be repeated; empty: that of params_file, '
             'else a secret one from the operating system',
         ),
-        DeclareLaunchArgument(
-            'localised',
-            default_value='false',
-            choices=FLAG,
-            description='use the true pose of the simulator in place of the odometry',
-        ),
-        DeclareLaunchArgument(
-            'robot', default_value='true', choices=FLAG, description='start the simulated robot'
-        ),
+        flag('localised', 'use the true pose of the simulator in place of the odometry'),
+        flag('robot', 'start the simulated robot', 'true'),
         USE_SIM_TIME,
         RECORD,
     )

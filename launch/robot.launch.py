@@ -5,9 +5,14 @@
 ``ros2 launch t3mpc_ros robot.launch.py port:=/dev/serial/by-id/... key_file:=~/.t3mpc_key``
 """
 
-from launch.actions import DeclareLaunchArgument
-
-from t3mpc_ros.nodes.launch_files import RECORD, ROBOT_DESCRIPTION, SEED, describe, params_file
+from t3mpc_ros.nodes.launch_files import (
+    RECORD,
+    ROBOT_DESCRIPTION,
+    SEED,
+    argument,
+    describe,
+    params_file,
+)
 
 
 def nodes(launched):
@@ -22,15 +27,12 @@ def nodes(launched):
 
 
 def generate_launch_description():
-    port = DeclareLaunchArgument(
+    port = argument(
         'port',
-        default_value='',
-        description='serial port of the dongle, or a pattern of several; empty: that of the '
+        'serial port of the dongle, or a pattern of several; empty: that of the '
         'parameter files, /dev/t3mpc_dongle*',
     )
-    key_file = DeclareLaunchArgument(
-        'key_file',
-        default_value='',
-        description='key of the robot; empty: that of the parameter files, or no key',
+    key_file = argument(
+        'key_file', 'key of the robot; empty: that of the parameter files, or no key'
     )
     return describe(nodes, params_file(), ROBOT_DESCRIPTION, port, key_file, SEED, RECORD)

@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Launch the closed loop with the simulated robot: ``ros2 launch t3mpc_ros sim.launch.py``."""
 
-from launch.actions import DeclareLaunchArgument
-
 from t3mpc_ros.nodes.launch_files import (
     RECORD,
     ROBOT_DESCRIPTION,
     SEED,
     USE_SIM_TIME,
+    argument,
     describe,
     params_file,
 )
@@ -27,9 +26,5 @@ def nodes(launched):
 
 
 def generate_launch_description():
-    world = DeclareLaunchArgument(
-        'world',
-        default_value='',
-        description='room, corridor, or a YAML file; empty: that of the parameter files',
-    )
+    world = argument('world', 'room, corridor, or a YAML file; empty: that of the parameter files')
     return describe(nodes, params_file(), ROBOT_DESCRIPTION, world, SEED, USE_SIM_TIME, RECORD)

@@ -7,12 +7,11 @@ robot publishes the clock for all nodes. The robots do not collide with each oth
 walls of the world.
 """
 
-from launch.actions import DeclareLaunchArgument
-
 from t3mpc_ros.nodes.launch_files import (
     ROBOT_DESCRIPTION,
     SEED,
     USE_SIM_TIME,
+    argument,
     describe,
     params_file,
 )
@@ -44,10 +43,9 @@ def nodes(launched):
 
 
 def generate_launch_description():
-    world = DeclareLaunchArgument(
+    world = argument(
         'world',
-        default_value='',
-        description='world of both robots: room, corridor, or a YAML file; empty: that of '
+        'world of both robots: room, corridor, or a YAML file; empty: that of '
         'params_file, or room',
     )
     return describe(nodes, params_file(), ROBOT_DESCRIPTION, world, SEED, USE_SIM_TIME)

@@ -84,13 +84,11 @@ def help_text(node: str) -> str:
     lines += [f'  {argument:<20}{text}' for argument, text in ROS_ARGUMENTS]
     lines += ['', 'parameters, with default and range (* can be set while the node runs):']
     for spec in parameter_class(node).specs():
-        default = ', '.join(map(str, spec.default)) if spec.many else spec.default  # type: ignore[arg-type]
-        unit = f' {spec.unit}' if spec.unit else ''
-        facts = f'{default}{unit}' if default != '' else '(empty)'
+        default = spec.default_text() or '(empty)'
         bounds = f', {spec.bounds_text()}' if spec.bounds_text() else ''
         mark = '*' if spec.dynamic else ' '
         lines += [
-            *_wrapped(f'{mark} {spec.name} = ', facts + bounds),
+            *_wrapped(f'{mark} {spec.name} = ', default + bounds),
             *_wrapped('      ', spec.text),
         ]
     return '\n'.join(lines)
@@ -126,21 +124,11 @@ def unmatched_files(argv: Sequence[str], nodes: Sequence[str]) -> list[str]:
     """Return a warning for each parameter file that matches none of the nodes of the process.
 
     A file for other nodes of the package is no mistake: launch files pass one to every node.
-
-    Parameters
-    ----------
-    argv
-        Command line, with usable parameter files.
-    nodes
-        Full names of the nodes.
     """
-    import yaml
-
     names = [name.rpartition('/')[2] for name in nodes]
     problems = []
     for file in _parameter_files(argv):
-        content = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
-        keys = [key for key, _ in _node_entries(content, '')]
+        keys = list(dict.fromkeys(key for key, _, _ in _entries(file)))
         matched = any(_key_pattern(key).fullmatch(node) for key in keys for node in nodes)
         others = set(NODES) - set(names)
         if matched or (keys and all(key.rpartition('/')[2] in others for key in keys)):
@@ -159,43 +147,28 @@ def _parameter_files(argv: Sequence[str]) -> list[str]:
 
 
 def file_values(file: str, node: str) -> dict[str, object]:
-    """Return the parameters by name that a parameter file sets at a node.
+    """Return the parameters by name that a valid parameter file sets at ``/namespace/name``."""
+    return {
+        name: value
+        for key, name, value in _entries(file)
+        if name and _key_pattern(key).fullmatch(node)
+    }
 
-    Parameters
-    ----------
-    file
-        A valid parameter file.
-    node
-        Full name of the node, ``/namespace/name``.
-    """
+
+def _entries(file: str) -> Iterator[tuple[str, str, object]]:
+    """Yield node, parameter and value; namespaces may be nested keys, as groups are."""
     import yaml
 
-    content = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
-    values: dict[str, object] = {}
-    for key, tree in _node_entries(content, ''):
-        if _key_pattern(key).fullmatch(node):
-            values.update(_leaves(tree, ''))
-    return values
+    def leaves(tree: object, path: tuple[str, ...]) -> Iterator[tuple[str, str, object]]:
+        if isinstance(tree, dict) and tree:
+            for key, value in tree.items():
+                yield from leaves(value, (*path, str(key)))
+        elif 'ros__parameters' in path:
+            at = path.index('ros__parameters')
+            node = ''.join(f'/{part.strip("/")}' for part in path[:at])
+            yield node, '.'.join(path[at + 1 :]), tree
 
-
-def _leaves(tree: object, prefix: str) -> Iterator[tuple[str, object]]:
-    """Yield the values below nested keys, by names with dots."""
-    if not isinstance(tree, dict):
-        yield prefix, tree
-        return
-    for key, value in tree.items():
-        yield from _leaves(value, f'{prefix}.{key}' if prefix else str(key))
-
-
-def _node_entries(tree: object, prefix: str) -> Iterator[tuple[str, object]]:
-    """Yield node names and parameters of a file, whose namespaces may be nested keys."""
-    if not isinstance(tree, dict):
-        return
-    for key, value in tree.items():
-        if key == 'ros__parameters':
-            yield prefix, value
-        else:
-            yield from _node_entries(value, f'{prefix}/{str(key).strip("/")}')
+    yield from leaves(yaml.safe_load(Path(file).read_text(encoding='utf-8')), ())
 
 
 def _key_pattern(key: str) -> 're.Pattern[str]':

@@ -22,10 +22,31 @@ from t3mpc_ros.nodes.registry import parameter_class
 from t3mpc_ros.robot.description import urdf
 
 PACKAGE = 't3mpc_ros'
-FLAG = ('true', 'false', 'True', 'False')
+
+
+def argument(name: str, description: str, default: str = '') -> DeclareLaunchArgument:
+    """Return an argument with any text as its value."""
+    return DeclareLaunchArgument(name, default_value=default, description=description)
+
+
+def flag(name: str, description: str, default: str = 'false') -> DeclareLaunchArgument:
+    """Return an argument that is true or false."""
+    return DeclareLaunchArgument(
+        name,
+        default_value=default,
+        choices=('true', 'false', 'True', 'False'),
+        description=description,
+    )
+
+
+def params_file(default: str = '') -> DeclareLaunchArgument:
+    """Return the argument for a file with parameters of the nodes."""
+    text = 'YAML file with parameters of the nodes, or the name of one in config/'
+    return argument('params_file', text, default)
+
 
 COMMON = (
-    DeclareLaunchArgument('namespace', default_value='', description='namespace of all nodes'),
+    argument('namespace', 'namespace of all nodes'),
     DeclareLaunchArgument(
         'log_level',
         default_value='info',
@@ -35,40 +56,17 @@ COMMON = (
 )
 """Arguments of every launch file."""
 
-SEED = DeclareLaunchArgument(
-    'seed', default_value='', description='seed; empty: that of the parameter files'
-)
-USE_SIM_TIME = DeclareLaunchArgument(
-    'use_sim_time', default_value='false', choices=FLAG, description='use the time of /clock'
-)
-RECORD = DeclareLaunchArgument(
-    'record', default_value='true', choices=FLAG, description='record a bag'
-)
-ROBOT_DESCRIPTION = DeclareLaunchArgument(
+SEED = argument('seed', 'seed; empty: that of the parameter files')
+USE_SIM_TIME = flag('use_sim_time', 'use the time of /clock')
+RECORD = flag('record', 'record a bag', 'true')
+ROBOT_DESCRIPTION = flag(
     'robot_description',
-    default_value='false',
-    choices=FLAG,
-    description='start robot_state_publisher, if it is installed, with the URDF of the robot',
+    'start robot_state_publisher, if it is installed, with the URDF of the robot',
 )
-
-
-def params_file(default: str = '') -> DeclareLaunchArgument:
-    """Return the argument for a file with parameters of the nodes."""
-    return DeclareLaunchArgument(
-        'params_file',
-        default_value=default,
-        description='YAML file with parameters of the nodes, or the name of one in config/',
-    )
 
 
 class PackageNodes:
-    """Makes the nodes of one launch file from the values of its arguments.
-
-    Parameters
-    ----------
-    arguments
-        Values of the launch arguments, as texts.
-    """
+    """Makes the nodes of one launch file from the values of its arguments, which are texts."""
 
     def __init__(self, arguments: Mapping[str, str]) -> None:
         self._arguments = arguments
@@ -83,13 +81,7 @@ class PackageNodes:
         return self._arguments[name].lower() == 'true'
 
     def given(self, name: str, kind: Callable[[str], Any] = str) -> dict[str, Any]:
-        """Return the parameter of the same name, empty if the argument is.
-
-        Raises
-        ------
-        ValueError
-            The value is of another type.
-        """
+        """Return the parameter of the same name, empty if the argument is."""
         value = self._arguments[name]
         try:
             return {name: kind(value)} if value else {}
@@ -105,20 +97,9 @@ class PackageNodes:
         namespace: str = '',
         remappings: Sequence[tuple[str, str]] = (),
     ) -> Node:
-        """Return a node.
+        """Return a node, named as its executable, in a namespace below that of all nodes.
 
-        Parameters
-        ----------
-        name
-            Its name, which is that of its executable.
-        given
-            Parameters that override every file.
-        defaults
-            Parameters that ``params_file`` may override.
-        namespace
-            Namespace below that of all nodes.
-        remappings
-            Pairs of a topic and its new name.
+        ``given`` parameters override every file, ``defaults`` are overridden by ``params_file``.
         """
         levels = self._levels(name, given, defaults)
         return Node(
@@ -234,15 +215,7 @@ def _typed(parameters: Mapping[str, Any]) -> dict[str, Any]:
 def describe(
     make_nodes: Callable[[PackageNodes], list[Node]], *arguments: DeclareLaunchArgument
 ) -> LaunchDescription:
-    """Return the description of a launch file.
-
-    Parameters
-    ----------
-    make_nodes
-        Returns the nodes for the values of the arguments.
-    arguments
-        Arguments beside those of every launch file.
-    """
+    """Return the description of a launch file, with ``arguments`` beside the common ones."""
 
     def run(context: LaunchContext) -> list[Node]:
         return make_nodes(PackageNodes(context.launch_configurations))

@@ -8,6 +8,7 @@ one node does not load the code of the others.
 
 from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,23 +16,12 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from t3mpc_ros.parameters.table import Parameters
 
-_NODES = {
-    'reference_generator': ('reference_generator', 'ReferenceGeneratorParameters'),
-    'controller': ('controller', 'ControllerNodeParameters'),
-    'sim_robot': ('sim_robot', 'SimRobotParameters'),
-    'radio_bridge': ('radio_bridge', 'RadioBridgeParameters'),
-    'recorder': ('recorder.node', 'RecordingParameters'),
-    'player': ('player.node', 'PlayerParameters'),
-    'composed': ('composed', 'ComposedParameters'),
-}
-
-NODES = tuple(_NODES)
-"""Names of the nodes, which are those of their executables."""
-
 
 class NodeInterface(NamedTuple):
-    """What a node is for, its topics and its services; ``*`` stands for several names."""
+    """Where a node stands, what it is for, its topics and services; ``*``: several names."""
 
+    parameters: str
+    """Its module below ``t3mpc_ros.nodes``, and the parameter class in it."""
     summary: str
     subscribes: tuple[str, ...] = ()
     publishes: tuple[str, ...] = ()
@@ -43,12 +33,14 @@ _ROBOT_SERVICES = ('reset_odometry', 'e_stop')
 
 INTERFACES = {
     'reference_generator': NodeInterface(
+        'reference_generator:ReferenceGeneratorParameters',
         'Publishes the reference: chaotic signals, a chaotic path, or a given path or twist.',
         subscribes=('odom', 'path', 'target_twist'),
         publishes=('reference', 'reference/path', 'reference/signals', '/diagnostics'),
         services=('~/reseed', '~/pause'),
     ),
     'controller': NodeInterface(
+        'controller:ControllerNodeParameters',
         'Tracks the reference with the odometry of a robot and publishes its velocity commands.',
         subscribes=('reference', 'odom', 'range/*'),
         publishes=(
@@ -66,24 +58,28 @@ INTERFACES = {
         services=('~/enable', '~/reset', '~/save_model'),
     ),
     'sim_robot': NodeInterface(
+        'sim_robot:SimRobotParameters',
         'Simulates the robot: executes velocity commands, publishes odometry and sensors.',
         subscribes=('cmd_vel',),
         publishes=(*_ROBOT_TOPICS, 'ground_truth/odom', '/clock', '/diagnostics'),
         services=(*_ROBOT_SERVICES, '~/set_pose', '~/step'),
     ),
     'radio_bridge': NodeInterface(
+        'radio_bridge:RadioBridgeParameters',
         'Connects the real robot: sends velocity commands, publishes odometry and sensors.',
         subscribes=('cmd_vel',),
         publishes=(*_ROBOT_TOPICS, '/diagnostics'),
         services=_ROBOT_SERVICES,
     ),
     'recorder': NodeInterface(
+        'recorder.node:RecordingParameters',
         'Records topics into an MCAP bag that rosbag2 reads.',
         subscribes=('*', '/diagnostics'),
         publishes=('/diagnostics',),
         services=('~/split_bagfile', '~/snapshot'),
     ),
     'player': NodeInterface(
+        'player.node:PlayerParameters',
         'Publishes the messages of bags at the recorded times; storage.uris names the bags.',
         publishes=('*', '/clock', '/diagnostics'),
         services=(
@@ -96,11 +92,15 @@ INTERFACES = {
         ),
     ),
     'composed': NodeInterface(
+        'composed:ComposedParameters',
         'Runs the nodes that its parameter nodes lists in one process.',
         publishes=('/diagnostics',),
     ),
 }
 """Interface of each node, for ``--help``."""
+
+NODES = tuple(INTERFACES)
+"""Names of the nodes, which are those of their executables."""
 
 MARK = '<!-- generated from here on: python -m t3mpc_ros.nodes.registry docs/nodes.md -->'
 """First line of the generated part of ``docs/nodes.md``."""
@@ -108,12 +108,12 @@ MARK = '<!-- generated from here on: python -m t3mpc_ros.nodes.registry docs/nod
 
 def node_module(node: str) -> ModuleType:
     """Return the module of a node."""
-    return import_module(f't3mpc_ros.nodes.{_NODES[node][0]}')
+    return import_module(f't3mpc_ros.nodes.{INTERFACES[node].parameters.partition(":")[0]}')
 
 
 def parameter_class(node: str) -> 'type[Parameters]':
     """Return the parameter class of a node."""
-    found: type[Parameters] = getattr(node_module(node), _NODES[node][1])
+    found: type[Parameters] = resolve_name(f't3mpc_ros.nodes.{INTERFACES[node].parameters}')
     return found
 
 
@@ -133,11 +133,9 @@ def parameters_section() -> str:
         lines += ['| parameter | default | range | dynamic | description | source |']
         lines += ['|---|---|---|---|---|---|']
         for spec in parameter_class(node).specs():
-            default = ', '.join(map(str, spec.default)) if spec.many else str(spec.default)  # type: ignore[arg-type]
-            unit = f' {spec.unit}' if spec.unit else ''
             cells = (
                 f'`{spec.name}`',
-                f'{default}{unit}' if default else '*(empty)*',
+                spec.default_text() or '*(empty)*',
                 spec.bounds_text(),
                 'dynamic' if spec.dynamic else '',
                 spec.text,

@@ -67,6 +67,12 @@ class ParameterSpec:
             return tuple(self._check_one(item) for item in value)  # type: ignore[return-value]
         return self._check_one(value)
 
+    def default_text(self) -> str:
+        """Return the default with its unit, empty for an empty text or list."""
+        many = isinstance(self.default, tuple)
+        text = ', '.join(map(str, self.default)) if many else str(self.default)  # type: ignore[arg-type]
+        return f'{text} {self.unit}'.rstrip() if text else ''
+
     def bounds_text(self) -> str:
         """Return the range as text, empty when every value of the type is valid."""
         if self.choices:
