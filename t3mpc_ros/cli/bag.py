@@ -400,7 +400,7 @@ def run_animate(options: argparse.Namespace) -> int:
         An option is outside its bounds.
     """
     from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions, animate_bag
-    from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions
+    from t3mpc_ros.evaluation.topic_roles import ReportOptions
 
     chosen = AnimationOptions(
         options.start, options.duration, options.speed, options.rate, options.width

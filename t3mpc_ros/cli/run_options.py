@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
 
 if TYPE_CHECKING:
-    from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions
+    from t3mpc_ros.evaluation.topic_roles import ReportOptions
 
 ROBOTS = ('twin', 'servo', 'torque')
 FULL, NOMINAL = 'full', 'nominal'
@@ -100,7 +100,7 @@ def report_options(options: argparse.Namespace) -> 'ReportOptions':
     ValueError
         Wheel radius without separation or the reverse.
     """
-    from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions
+    from t3mpc_ros.evaluation.topic_roles import ReportOptions
 
     if (options.wheel_radius is None) != (options.track is None):
         raise ValueError('--wheel-radius and --track must be given together')

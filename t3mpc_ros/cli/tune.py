@@ -134,7 +134,7 @@ def _tuned(
 
 def _identify(options: argparse.Namespace) -> int:
     """Print the parameter file for the robot in the bag ``options.robot`` and return 0."""
-    from t3mpc_ros.evaluation.bag_report.topic_roles import bag_display_name
+    from t3mpc_ros.evaluation.topic_roles import bag_display_name
     from t3mpc_ros.evaluation.tuning.drive_identification import identify_bag, parameter_file
 
     bag = Path(options.robot)

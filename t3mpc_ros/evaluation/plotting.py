@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
+from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     ODOMETRY,
     REFERENCE,

@@ -11,7 +11,6 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.plotting import (
@@ -23,6 +22,7 @@ from t3mpc_ros.evaluation.plotting import (
     new_panels,
     png_of,
 )
+from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.scripting.script_error import ScriptError
 
 Array = NDArray[np.float64]

@@ -20,7 +20,7 @@ from t3mpc_ros.evaluation.bag_report.animation import (
     animate_bag,
 )
 from t3mpc_ros.evaluation.bag_report.run_data import Series, load_run
-from t3mpc_ros.evaluation.bag_report.topic_roles import ODOMETRY, REFERENCE
+from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE
 from t3mpc_ros.simulation.world import World
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'

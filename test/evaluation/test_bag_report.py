@@ -45,7 +45,7 @@ from t3mpc_ros.evaluation.bag_report.run_data import (
     Series,
     load_run,
 )
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
+from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     ODOMETRY,
     REFERENCE,

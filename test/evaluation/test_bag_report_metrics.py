@@ -47,7 +47,8 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.run_data import Series, load_run
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
+from t3mpc_ros.evaluation.charts import MAX_POINTS, PageData, thinned
+from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     NAMES,
     ODOMETRY,
@@ -56,7 +57,6 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     ReportOptions,
     find_topics,
 )
-from t3mpc_ros.evaluation.charts import MAX_POINTS, PageData, thinned
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, WheelSpeeds
 

@@ -16,7 +16,7 @@ import yaml
 from t3mpc_ros.cli import tune
 from t3mpc_ros.control.controller import StepperControllerParameters
 from t3mpc_ros.control.dead_time_estimator import IDENTIFIED_DEVIATION
-from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions
+from t3mpc_ros.evaluation.topic_roles import ReportOptions
 from t3mpc_ros.evaluation.tuning.drive_identification import (
     MAX_RELATIVE_DEVIATION,
     IdentificationError,

@@ -10,10 +10,10 @@ import pytest
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions, choose_topics, find_topics
 from t3mpc_ros.evaluation.process_replay.comparison import ELSEWHERE, Tolerances, compare
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
+from t3mpc_ros.evaluation.topic_roles import ReportOptions, choose_topics, find_topics
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'
 INPUTS = ('reference', 'odom')

@@ -11,7 +11,7 @@ import pytest
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference, patrol_blocks
 from t3mpc_ros.evaluation.bag_report.run_data import Series, load_run
-from t3mpc_ros.evaluation.bag_report.topic_roles import REFERENCE, TRUTH
+from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'
 

@@ -26,7 +26,6 @@ from t3mpc_ros.cli.bag import add_compare_parser, add_replay_parser
 from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
-from t3mpc_ros.evaluation.bag_report.topic_roles import SCALARS
 from t3mpc_ros.evaluation.process_replay.comparison import (
     ELSEWHERE,
     Tolerances,
@@ -51,6 +50,7 @@ from t3mpc_ros.evaluation.process_replay.golden_bags import (
 )
 from t3mpc_ros.evaluation.process_replay.journal_alignment import commands_of, match
 from t3mpc_ros.evaluation.process_replay.method_replay import replay_method
+from t3mpc_ros.evaluation.topic_roles import SCALARS
 from t3mpc_ros.evaluation.training.training_data import load_training_data
 from t3mpc_ros.evaluation.twin_closed_loop import loop_controller
 from t3mpc_ros.geometry.types import BodyTwist, Pose, State

@@ -25,15 +25,15 @@ from t3mpc_ros.evaluation.bag_report.report_page import link_table, response_tab
 from t3mpc_ros.evaluation.bag_report.response import ResponseFit
 from t3mpc_ros.evaluation.bag_report.run_comparison import ErrorDifference
 from t3mpc_ros.evaluation.bag_report.run_data import BY_BODY, BY_WHEEL, Run, Series, Timing
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
+from t3mpc_ros.evaluation.bag_report.verdict import Stop, Verdict, judge
+from t3mpc_ros.evaluation.charts import Plane
+from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     ODOMETRY,
     REFERENCE,
     SIGNALS,
     TRUTH,
 )
-from t3mpc_ros.evaluation.bag_report.verdict import Stop, Verdict, judge
-from t3mpc_ros.evaluation.charts import Plane
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'

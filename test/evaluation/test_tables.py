@@ -12,7 +12,6 @@ import pytest
 from t3mpc_ros.evaluation.bag_report import report_page
 from t3mpc_ros.evaluation.bag_report.response import MotionSummary, Roughness
 from t3mpc_ros.evaluation.bag_report.run_data import BY_WHEEL
-from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     METRICS,
@@ -29,6 +28,7 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES, PatrolMetrics
 from t3mpc_ros.evaluation.patrol.patrol_page import coverage_table, surprise_table
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, Skill
 from t3mpc_ros.evaluation.process_replay.comparison import Comparison, FieldComparison, Tolerances
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY
 from t3mpc_ros.evaluation.twin_closed_loop import INITIAL_STANDSTILL
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 

@@ -21,14 +21,14 @@ from PIL import Image
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
 from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
+from t3mpc_ros.evaluation.plotting import COLOURS, STYLE, draw_world
+from t3mpc_ros.evaluation.reporting import progress_bar
+from t3mpc_ros.evaluation.topic_roles import (
     REFERENCE,
     TRUTH,
     ReportError,
     ReportOptions,
 )
-from t3mpc_ros.evaluation.plotting import COLOURS, STYLE, draw_world
-from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.description import ray_ends, sensor_mounts
 from t3mpc_ros.robot.interface import RANGE_SENSORS

@@ -14,9 +14,9 @@ from t3mpc_ros.evaluation.bag_report.continuity import within_gaps
 from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics, link_metrics
 from t3mpc_ros.evaluation.bag_report.response import ResponseFit, responses
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
-from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 
 Array = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
-from t3mpc_ros.evaluation.bag_report.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.evaluation.charts import Chart, Line
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES, SHORTEST, patrol_metrics
 from t3mpc_ros.evaluation.reporting import Block, Heading, Paragraph, Table
+from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.simulation.world import recorded_world
 
 Array = NDArray[np.float64]

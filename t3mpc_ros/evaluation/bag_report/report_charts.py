@@ -25,14 +25,14 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 )
 from t3mpc_ros.evaluation.bag_report.response import ResponseFit, busiest, predicted, smooth
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
+from t3mpc_ros.evaluation.charts import Chart, Curve, Line, Plane, thinned
+from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     ODOMETRY,
     REFERENCE,
     SIGNALS,
     TRUTH,
 )
-from t3mpc_ros.evaluation.charts import Chart, Curve, Line, Plane, thinned
 from t3mpc_ros.simulation.world import world_outline
 
 Array = NDArray[np.float64]

@@ -33,15 +33,6 @@ from t3mpc_ros.evaluation.bag_report.response import (
     roughness,
 )
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, load_run
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
-    COMMAND,
-    ODOMETRY,
-    REFERENCE,
-    SCALARS,
-    TRUTH,
-    ReportOptions,
-    bag_display_name,
-)
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
 from t3mpc_ros.evaluation.reporting import (
@@ -57,6 +48,15 @@ from t3mpc_ros.evaluation.reporting import (
     Tiles,
     VerdictBox,
     html_page,
+)
+from t3mpc_ros.evaluation.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    SCALARS,
+    TRUTH,
+    ReportOptions,
+    bag_display_name,
 )
 from t3mpc_ros.geometry.types import NANOSECONDS
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report.continuity import parts
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
-from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.topic_roles import COMMAND
 from t3mpc_ros.kernels import kernel
 
 Array = NDArray[np.float64]

@@ -25,14 +25,6 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 from t3mpc_ros.evaluation.bag_report.report_charts import TERM_DASHES, is_long, line
 from t3mpc_ros.evaluation.bag_report.report_page import verdict_box
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, load_run
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
-    COMMAND,
-    ODOMETRY,
-    REFERENCE,
-    ReportError,
-    ReportOptions,
-    bag_display_name,
-)
 from t3mpc_ros.evaluation.charts import Chart, Curve, Plane
 from t3mpc_ros.evaluation.confidence_intervals import interval, rms
 from t3mpc_ros.evaluation.reporting import (
@@ -46,6 +38,14 @@ from t3mpc_ros.evaluation.reporting import (
     Table,
     VerdictBox,
     html_page,
+)
+from t3mpc_ros.evaluation.topic_roles import (
+    COMMAND,
+    ODOMETRY,
+    REFERENCE,
+    ReportError,
+    ReportOptions,
+    bag_display_name,
 )
 
 Array = NDArray[np.float64]

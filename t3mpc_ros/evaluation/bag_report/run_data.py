@@ -24,7 +24,8 @@ from t3mpc_ros.evaluation.bag_report.link_history import (
     LinkHistory,
     read_diagnostics,
 )
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
+from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
+from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     JOURNAL,
     KINDS,
@@ -39,7 +40,6 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     TopicChoice,
     choose_topics,
 )
-from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
 from t3mpc_ros.parameters.table import ParameterError

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
-from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 
 MAX_STOPPED = 0.01
 """Largest share of the drive without a command to move."""

@@ -200,7 +200,7 @@ _IRRELEVANT_SOURCES = (
     'evaluation/process_replay/', 'evaluation/paper/', 'evaluation/tuning/',
     'evaluation/method_comparison/', 'evaluation/baselines/feed_forward.py',
     'evaluation/plotting.py', 'evaluation/reporting.py', 'evaluation/lyapunov_exponents.py',
-    'evaluation/open_loop_estimation.py', 'evaluation/methods.py',
+    'evaluation/open_loop_estimation.py', 'evaluation/methods.py', 'evaluation/topic_roles.py',
 )  # fmt: skip
 
 

@@ -12,11 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.controller import WHEELS
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
-    ODOMETRY,
-    REFERENCE,
-    TRUTH,
-)
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.confidence_intervals import rms
@@ -46,6 +41,11 @@ from t3mpc_ros.evaluation.plotting import (
     mark_switches,
     new_figure,
     new_panels,
+)
+from t3mpc_ros.evaluation.topic_roles import (
+    ODOMETRY,
+    REFERENCE,
+    TRUTH,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, WheelSpeeds

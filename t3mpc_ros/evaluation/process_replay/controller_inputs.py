@@ -20,15 +20,6 @@ from t3mpc_ros.bag.recording.message_losses import message_loss_notes
 from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, JOURNAL_COLUMNS, Event, parameters_from_json
 from t3mpc_ros.bag.run.model_file import load_model
 from t3mpc_ros.control.controller import SCALAR_NAMES, ControllerParameters
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
-    COMMAND,
-    INITIAL_INPUTS,
-    KINDS,
-    ODOMETRY,
-    REFERENCE,
-    TRUTH,
-    find_topics,
-)
 from t3mpc_ros.evaluation.process_replay.journal_alignment import (
     ConsumedMessages,
     by_receipt,
@@ -36,6 +27,15 @@ from t3mpc_ros.evaluation.process_replay.journal_alignment import (
     match,
     rows_of,
     with_initial_inputs,
+)
+from t3mpc_ros.evaluation.topic_roles import (
+    COMMAND,
+    INITIAL_INPUTS,
+    KINDS,
+    ODOMETRY,
+    REFERENCE,
+    TRUTH,
+    find_topics,
 )
 from t3mpc_ros.geometry.types import NANOSECONDS, StateArray
 from t3mpc_ros.parameters.table import ParameterError, ParameterSpec

@@ -17,7 +17,6 @@ from t3mpc_ros.bag.run.journal import Journal, parameters_to_json
 from t3mpc_ros.bag.run.model_file import load_model
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, ControllerParameters, Status
-from t3mpc_ros.evaluation.bag_report.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     CONTROLLER,
     FIELDS,
@@ -27,6 +26,7 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
 )
 from t3mpc_ros.evaluation.process_replay.controller_replay import ReplayResult, output_row
 from t3mpc_ros.evaluation.scenario import RATE
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.evaluation.twin_closed_loop import LEAD, chaotic_course, loop_controller, loop_robot
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
 from t3mpc_ros.control.controller import ControllerParameters
-from t3mpc_ros.evaluation.bag_report.topic_roles import bag_display_name
 from t3mpc_ros.evaluation.proposed_method import random_output_weights
+from t3mpc_ros.evaluation.topic_roles import bag_display_name
 from t3mpc_ros.evaluation.training.fit import (
     explained,
     fit_coefficients,

@@ -16,7 +16,10 @@ from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.control.actuation import wheel_limits
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS, Controller, ControllerParameters
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
+from t3mpc_ros.evaluation.process_replay.controller_inputs import ReplayError, recorded_parameters
+from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
+from t3mpc_ros.evaluation.process_replay.journal_alignment import match_commands
+from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     JOURNAL,
     ODOMETRY,
@@ -24,9 +27,6 @@ from t3mpc_ros.evaluation.bag_report.topic_roles import (
     SCALARS,
     find_topics,
 )
-from t3mpc_ros.evaluation.process_replay.controller_inputs import ReplayError, recorded_parameters
-from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
-from t3mpc_ros.evaluation.process_replay.journal_alignment import match_commands
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, State
 

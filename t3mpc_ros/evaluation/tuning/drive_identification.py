@@ -31,7 +31,7 @@ from t3mpc_ros.control.dead_time_estimator import (
 )
 from t3mpc_ros.evaluation.bag_report.response import busiest, fit_response
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, load_run
-from t3mpc_ros.evaluation.bag_report.topic_roles import (
+from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     ODOMETRY,
     ReportOptions,
