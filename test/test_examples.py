@@ -8,6 +8,9 @@ import numpy as np
 import pytest
 from support.checkout import ROOT, load_example
 
+import t3mpc_ros as t3
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+
 pytestmark = pytest.mark.slow
 
 EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
@@ -42,6 +45,15 @@ def _own_noise(module, folder):
 
 def _read_bag(module, folder):
     assert module.main(BAG, folder)['/odom']['stamp'].size > 100
+
+
+def _recorded_reference(module, folder):
+    """From the first message on, the simulated reference is the recorded one."""
+    table = module.main(BAG, folder, 2.0, executor=1)
+    assert table.plan.methods == ('full', 'DMC')
+    recorded = t3.read_bag(BAG)['/reference']['twist.twist.linear.x'][:200]
+    right, left = table.plan.setting.own_reference.speeds[:200].T
+    np.testing.assert_allclose(0.5 * WheelGeometry().wheel_radius * (right + left), recorded)
 
 
 def _sweep_gain(module, folder):

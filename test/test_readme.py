@@ -119,7 +119,6 @@ SHORTENED = {
     ),
     "scripts/run player --ros-args -p storage.uris:='[run1, run2]' -p play.rate:=2.0 "
     '-p play.start_offset:=10.0': ([], False),
-    'scripts/run t3mpc bag replay runs/latest/bag --method DMC': ([], False),
     'scripts/run t3mpc bag report turtlebot_bag --odom /odom --cmd-vel /cmd_vel': (
         ['--output', 'OUTPUT/turtlebot'],
         False,

@@ -18,7 +18,7 @@ from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.bag.recording.message_losses import message_loss_notes
 from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_output, recover_bag
 from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
-from t3mpc_ros.cli.command import ArgumentParser, run_command
+from t3mpc_ros.cli.command import ArgumentParser, RemovedOption, run_command
 from t3mpc_ros.cli.run_options import add_topic_options, report_options
 from t3mpc_ros.cli.train import add_bag_options, run_bags
 from t3mpc_ros.geometry.types import NANOSECONDS
@@ -416,17 +416,22 @@ def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
     parser = commands.add_parser(
         'replay',
         help='compute a recorded run again',
-        description='Gives the recorded odometry and reference to the controller of today, '
-        'offline and as fast as it goes, in the order in which the recorded controller took them. '
-        'With other parameters, or with another method, it computes what would have been '
-        'commanded; the robot does not answer to that.',
+        description='Feeds the recorded odometry and reference to the current controller, '
+        'offline and without waiting, in the order in which the recorded controller processed '
+        'them. With other parameters it computes what would have been commanded; the recorded '
+        'robot does not respond to that.',
     )
     parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
     parser.add_argument(
         '--output', type=Path, metavar='DIR', help='write a bag of what was computed'
     )
     parser.add_argument(
-        '--method', metavar='NAME', help="another method in the controller's place"
+        '--method',
+        action=RemovedOption,
+        nargs='?',
+        const='examples/recorded_reference.py compares methods in closed loop on the reference of '
+        'a bag, with t3.compare',
+        help=argparse.SUPPRESS,
     )
     add_input_options(parser)
     parser.set_defaults(run=run_replay)
@@ -475,26 +480,20 @@ def run_replay(options: argparse.Namespace) -> int:
     begin = time.perf_counter()
     inputs = load_inputs(options.bag, options.namespace, model)
     read = time.perf_counter()
-    if options.method:
-        from t3mpc_ros.evaluation.process_replay.method_replay import replay_method
-
-        ready = read
-        again = replay_method(inputs, options.method, changes)
-    else:
-        controllers = make_controllers(inputs, changes)
-        ready = time.perf_counter()
-        again = replay_controller(inputs, changes, controllers)
+    controllers = make_controllers(inputs, changes)
+    ready = time.perf_counter()
+    again = replay_controller(inputs, changes, controllers)
     end = time.perf_counter()
     reading, starting, running = read - begin, ready - read, end - ready
     span = again.steps / again.parameters.rate
     whole, alone = span / (reading + running), span / running
     print(
         f'{again.steps} steps, {span:.1f} s of control, in {reading + running:.2f} s: '
-        f'{whole:.0f} x real time, {alone:.0f} x without reading'
-        + (f'; {starting:.2f} s to compile and to warm up are not counted' if starting else '')
+        f'{whole:.0f} x real time, {alone:.0f} x without reading; '
+        f'{starting:.2f} s to compile and to warm up are not counted'
     )
     print(compare(inputs, again).table())
-    if options.method or changes or options.model:
+    if changes or options.model:
         print(OPEN_LOOP)
     if options.output:
         from t3mpc_ros.evaluation.process_replay.golden_bags import write_replay

@@ -26,6 +26,20 @@ class ArgumentParser(argparse.ArgumentParser):
             )
 
 
+class RemovedOption(argparse.Action):
+    """An option that is no longer there: an error, whose end is its ``const``."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        """End with the error."""
+        parser.error(f'{option_string} was removed: {self.const}')
+
+
 def run_command(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
     """Return the exit code of the chosen subcommand: its own, or 1 after an error.
 

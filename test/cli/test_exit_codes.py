@@ -192,6 +192,7 @@ CASES = [
             'robot jog middle 1 --port p': 'invalid choice',
             'robot jog left 1 --speed 11 --port p': 'must be from 0.2 to 10: got 11',
             'robot ping --count 0 --port p': 'must be from 1 to 100000: got 0',
+            'bag replay b --method DMC': '--method was removed: examples/recorded_reference.py',
             'robot ping': 'required: --port',
             'robot key': 'required: ACTION',
             'robot': 'required: COMMAND',

@@ -49,7 +49,6 @@ from t3mpc_ros.evaluation.process_replay.golden_bags import (
     run_golden_scenario,
 )
 from t3mpc_ros.evaluation.process_replay.journal_alignment import commands_of, match
-from t3mpc_ros.evaluation.process_replay.method_replay import replay_method
 from t3mpc_ros.evaluation.topic_roles import SCALARS
 from t3mpc_ros.evaluation.training.training_data import load_training_data
 from t3mpc_ros.evaluation.twin_closed_loop import loop_controller
@@ -817,23 +816,6 @@ def test_wrong_tolerances_and_a_missing_bag_are_refused(bag):
         bag_program('compare', bag, '--field', 'cmd_vel.linear.x=little')
     with pytest.raises(ValueError, match='BAG must be given'):
         bag_program('compare')
-
-
-def test_a_rival_answers_where_the_controller_let_the_robot_move(inputs, again):
-    there = replay_method(inputs, 'PI + feed-forward').fields
-    assert set(there) == set(SPEEDS)
-    tracking = np.array([reason is Reason.TRACKING for reason in again.reasons])
-    for name in SPEEDS:
-        was = inputs.recorded[name]
-        assert np.isfinite(there[name][tracking]).mean() > 0.98
-        assert np.nanstd((there[name] - was)[tracking]) < 0.5 * np.nanstd(was[tracking])
-        assert np.nanmax(np.abs((there[name] - was)[tracking])) > 1e-4, 'it is another method'
-        stopped = inputs.commanding & ~tracking
-        np.testing.assert_array_equal(there[name][stopped], 0.0)
-    for name, values in replay_method(inputs, 'pi feed-forward').fields.items():
-        np.testing.assert_array_equal(values, there[name])
-    with pytest.raises(ReplayError, match='method must be one of PI'):
-        replay_method(inputs, 'nobody')
 
 
 def test_the_settings_topic_is_json(bag):

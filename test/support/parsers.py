@@ -49,4 +49,5 @@ def _leaves(parser, words):
 
 def options(parser):
     """Return what a command takes, but help and version, by the name in its namespace."""
-    return {each.dest: each for each in parser._actions if each.dest not in ('help', 'version')}
+    shown = (each for each in parser._actions if each.help != argparse.SUPPRESS)
+    return {each.dest: each for each in shown if each.dest not in ('help', 'version')}
