@@ -136,6 +136,15 @@ def _closure(module: str) -> set[str]:
     return found
 
 
+def test_a_replay_imports_neither_report_nor_methods():
+    """The report and the training recompute with it what a bag lacks: they import the replay."""
+    above = {'bag_report', 'training', 'tuning', 'methods', 'patrol', 'paper'}
+    for path in PACKAGE.joinpath('evaluation', 'process_replay').glob('*.py'):
+        for module in set().union(*map(_closure, _imports(path))):
+            package, *rest = module.split('.')[1:] or ['']
+            assert package != 'evaluation' or not above & {*rest[:1]}, f'{path} needs {module}'
+
+
 @pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_follow_the_direction_of_the_packages(path):
     import sys
