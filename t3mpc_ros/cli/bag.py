@@ -496,7 +496,7 @@ def run_replay(options: argparse.Namespace) -> int:
     if changes or options.model:
         print(OPEN_LOOP)
     if options.output:
-        from t3mpc_ros.evaluation.process_replay.golden_bags import write_replay
+        from t3mpc_ros.evaluation.process_replay.replay_bag import write_replay
 
         print(f'written to {write_replay(inputs, again, options.output)}')
     return 0
@@ -515,9 +515,7 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
         'With two: what they hold of one run. Exit code 0: all within the tolerances; 3: '
         'something differs; 1: it cannot be compared.',
     )
-    parser.add_argument(
-        'bag', type=Path, nargs='?', metavar='BAG', help='folder of the bag, or its file'
-    )
+    parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
     parser.add_argument('other', type=Path, nargs='?', metavar='OTHER', help='another bag')
     parser.add_argument(
         '--abs',
@@ -542,9 +540,11 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
     )
     parser.add_argument(
         '--update-golden',
-        type=Path,
-        metavar='FOLDER',
-        help='compare nothing: make the golden bags anew, test/golden say, on purpose',
+        action=RemovedOption,
+        nargs='?',
+        const='PYTHONPATH=. .venv/bin/python test/support/golden_bags.py records the golden bags '
+        'anew, in a checkout',
+        help=argparse.SUPPRESS,
     )
     add_input_options(parser)
     parser.set_defaults(run=run_compare)
@@ -560,7 +560,7 @@ def run_compare(options: argparse.Namespace) -> int:
     BagError
         A bag cannot be read.
     ValueError
-        A tolerance or parameter is invalid, or no bag is given.
+        A tolerance or parameter is invalid.
     """
     from t3mpc_ros.bag.run.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
@@ -568,13 +568,7 @@ def run_compare(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
     from t3mpc_ros.evaluation.process_replay.controller_replay import OPEN_LOOP, replay_controller
     from t3mpc_ros.evaluation.process_replay.divergence_figure import write_divergence_figure
-    from t3mpc_ros.evaluation.process_replay.golden_bags import write_golden
 
-    if options.update_golden:
-        write_golden(options.update_golden)
-        return SAME
-    if options.bag is None:
-        raise ValueError('BAG must be given, or --update-golden')
     tolerances = tolerances_from(options.abs, options.rel, options.fields)
     changes = parse_assignments(ControllerParameters, options.parameters)
     model = load_model(options.model) if options.model else None

@@ -180,8 +180,7 @@ REPLAY = {
     'evaluation.process_replay.controller_replay.replay_controller': REPLAYED,
     'evaluation.process_replay.comparison.compare': OUTCOME,
     'evaluation.process_replay.comparison.compare_bags': OUTCOME,
-    'evaluation.process_replay.golden_bags.write_replay': 'there',
-    'evaluation.process_replay.golden_bags.write_golden': [],
+    'evaluation.process_replay.replay_bag.write_replay': 'there',
     'evaluation.process_replay.divergence_figure.write_divergence_figure': None,
 }
 REPORT = SimpleNamespace(verdict=SimpleNamespace(text=text), summary=text)
@@ -504,7 +503,6 @@ TABLE = {
             '--rel 0.1': {'compare.tolerances.relative': 0.1},
             '--field terms/*=2': {'compare.tolerances.fields.terms/*': 2.0},
             '--picture new.png': {'write_divergence_figure.path': 'new.png'},
-            '--update-golden new': {'write_golden.folder': 'new'},
             '--set law.gain=3': {'replay_controller.changes.law.gain': 3},
             '--model key': {'load_inputs.model.w': (1.0,)},
             '--namespace r1': {'load_inputs.namespace': 'r1'},
