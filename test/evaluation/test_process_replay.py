@@ -316,24 +316,10 @@ def test_a_tolerance_that_cannot_be_used_is_refused(arguments, words):
 # -- bags from which something is missing --------------------------------------------------------
 
 
-def test_without_a_journal_receive_order_is_used_and_noted(bag, tmp_path):
+def test_a_bag_without_a_journal_is_refused(bag, tmp_path):
     copy = without(bag, tmp_path / 'copy', lambda topic, _: topic == JOURNAL)
-    inputs = load_inputs(copy)
-    assert not inputs.journalled
-    assert any('no journal' in note for note in inputs.notes)
-    outcome = compare(inputs, replay_controller(inputs))
-    assert any('approximate' in remark for remark in outcome.remarks)
-    # Until the robot is disabled nothing happened that only the journal tells.
-    row = next(row for row in outcome.rows if row.field == 'cmd_vel.linear.x')
-    assert row.count > 800
-    assert row.first >= 1.49
-
-
-def test_a_run_without_events_is_the_same_without_its_journal(tmp_path):
-    path = golden('switches')
-    inputs = load_inputs(without(path, tmp_path / 'copy', lambda topic, _: topic == JOURNAL))
-    outcome = compare(inputs, replay_controller(inputs), Tolerances(ELSEWHERE, ELSEWHERE))
-    assert outcome.same, outcome.table()
+    with pytest.raises(ReplayError, match='no journal of the controller .* record it, as the'):
+        load_inputs(copy)
 
 
 def test_a_late_recorder_is_noted_and_compared_from_the_reset_on(bag, tmp_path):

