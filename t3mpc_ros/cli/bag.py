@@ -107,19 +107,19 @@ def _info(bag: BagReader) -> dict[str, Any]:
 
 
 def _info_text(bag: BagReader) -> str:
-    held = _info(bag)
-    size = size_text(sum(held['files'].values()))
+    info = _info(bag)
+    size = size_text(sum(info['files'].values()))
     rows = [
-        ('bag', held['path']),
+        ('bag', info['path']),
         ('storage', f'{bag.storage}, {size} in {len(bag.files)} file(s)'),
         ('start', _date(bag.start_ns) if bag.message_count else 'no message'),
         ('duration', f'{bag.duration:.3f} s'),
         ('messages', str(bag.message_count)),
     ]
-    rows += [(f'file {name}', size_text(size)) for name, size in held['files'].items()]
+    rows += [(f'file {name}', size_text(size)) for name, size in info['files'].items()]
     rows += [
         (f'UNFINISHED {name}', f'{size_text(size)}, not counted above')
-        for name, size in held['incomplete_files'].items()
+        for name, size in info['incomplete_files'].items()
     ]
     parts = [columns(rows)]
     if bag.incomplete_files:
@@ -131,15 +131,15 @@ def _info_text(bag: BagReader) -> str:
         parts.append('\n'.join(notes))
     if bag.topics:
         topics = [('topic', 'type', 'messages', 'Hz', 'quality of service')]
-        for topic in held['topics']:
+        for topic in info['topics']:
             name, count = topic['name'], str(topic['message_count'])
             quality = '; '.join(topic['qos_profiles']) or '-'
-            topics.append((name, topic['type_name'], count, f'{held["rates"][name]:.2f}', quality))
+            topics.append((name, topic['type_name'], count, f'{info["rates"][name]:.2f}', quality))
         parts.append(columns(topics, right=(2, 3)))
     parts += [_info_table(title, table) for title, table in bag.metadata_records.items()]
     parts += _calibrations(bag.metadata_records)
-    if held['attachments']:
-        items = [(e['name'], e['media_type'], size_text(e['size'])) for e in held['attachments']]
+    if info['attachments']:
+        items = [(e['name'], e['media_type'], size_text(e['size'])) for e in info['attachments']]
         parts.append('attachments\n' + columns(items, right=(2,)))
     return '\n\n'.join(parts)
 
@@ -203,7 +203,7 @@ def add_recover_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
         description='Writes what an MCAP file, or every MCAP file of a folder, still holds into '
         'a new folder, with index and metadata.yaml, and reports what was kept and lost. The '
         'input is only read. Exit code 0: nothing was lost; 3: something was, or a file has no '
-        'end, so that its writer may have held more; 1: nothing can be read, or the output '
+        'end, so that its writer may have written more; 1: nothing can be read, or the output '
         'cannot be written; 2: the output is no new or empty folder, or in the input.',
     )
     parser.add_argument('bag', type=Path, metavar='FILE', help='an MCAP file, or a folder of such')

@@ -22,13 +22,13 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     )
     parser.add_argument('bags', nargs='*', type=Path, metavar='BAG', help='folder of a bag')
     parser.add_argument(
-        '--robot', choices=DRIVES, default='servo', help='of the practice (default servo)'
+        '--robot', choices=DRIVES, default='servo', help='of the training runs (default servo)'
     )
     parser.add_argument(
         '--seeds',
         type=int,
         default=SEEDS,
-        help=f'runs with and without the model after the practice (default {SEEDS})',
+        help=f'runs with and without the model after the training (default {SEEDS})',
     )
     add_bag_options(parser)
     parser.set_defaults(run=run)

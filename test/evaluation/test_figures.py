@@ -461,7 +461,7 @@ def test_the_first_divergence_shows_both_runs_and_the_tolerance(caught, tmp_path
     shown = {name: y for name, (_, y) in (lines(close) | lines(apart)).items()}
     rows = (time >= 2.0) & (time <= 4.0)
     assert shown['recorded'] == pytest.approx(was[rows])
-    assert shown['rerun'] == pytest.approx(now[rows])
+    assert shown['recomputed'] == pytest.approx(now[rows])
     assert shown['tolerance'] == pytest.approx(0.01 + 0.1 * 2.0)
     assert shown['difference'][-1] == pytest.approx(0.5)
     assert title(close) == 'speed'

@@ -228,7 +228,7 @@ def test_a_file_that_breaks_off_in_its_summary_is_refused(bag, tmp_path):
 
 
 def test_a_gain_one_percent_off_is_found_and_named(inputs):
-    parameters = inputs.lives[0].parameters[0]
+    parameters = inputs.sessions[0].parameters[0]
     gain, fitting = parameters.law.gain, parameters.resolved().law.gain
     outcome = compare(
         inputs, replay_controller(inputs, {'law.gain': 1.01 * fitting}), Tolerances(1e-6, 1e-6)
@@ -245,7 +245,7 @@ def test_a_gain_one_percent_off_is_found_and_named(inputs):
 
 
 def test_the_same_settings_named_again_change_nothing(inputs):
-    gain = inputs.lives[0].parameters[0].law.gain
+    gain = inputs.sessions[0].parameters[0].law.gain
     outcome = compare(inputs, replay_controller(inputs, {'law.gain': gain}))
     assert outcome.same
     assert outcome.parameters == ()
@@ -259,7 +259,7 @@ def test_a_setting_that_does_not_exist_is_refused(inputs):
 def test_live_settings_are_those_of_their_time():
     path = golden('changes')
     inputs = load_inputs(path)
-    found = {name: table.law.gain for name, table in inputs.lives[0].parameters.items()}
+    found = {name: table.law.gain for name, table in inputs.sessions[0].parameters.items()}
     assert found[0] != 20.0
     assert found[1] == found[5] == 20.0
 
@@ -341,8 +341,8 @@ def test_a_late_recorder_is_noted_and_compared_from_the_reset_on(bag, tmp_path):
 @pytest.mark.parametrize(
     'topic, words',
     [
-        ('/odom', '1 odometry messages that the controller had are not in the bag'),
-        ('/reference', '1 references that the controller had are not in the bag'),
+        ('/odom', '1 odometry messages that the controller processed are not in the bag'),
+        ('/reference', '1 references that the controller received are not in the bag'),
         (JOURNAL, '1 events are missing in the journal'),
     ],
 )
@@ -379,7 +379,7 @@ def test_odometry_lost_before_the_first_reference_is_harmless(tmp_path):
 
 
 def test_a_recorder_that_notes_no_time_of_publication_will_do(bag, tmp_path):
-    """Heard after its row of the journal, a command is still the one of that row."""
+    """A command received after its row of the journal is still the one of that row."""
     moved = tmp_path / 'moved'
     with bag.open('rb') as file, BagWriter(moved, metadata_records={}) as writer:
         for schema, channel, message in make_reader(file).iter_messages():
@@ -544,7 +544,7 @@ def built_run(folder, changes):
 def test_a_replay_builds_the_controller_as_its_node_did(name, plain_runs, tmp_path, monkeypatch):
     """Each parameter that is fixed when a controller is built has its effect in a replay, too."""
     monkeypatch.chdir(tmp_path)
-    Path('walls.yaml').write_text('name: told\nwalls:\n  - points: [[0.4, -1.0], [0.4, 1.0]]\n')
+    Path('walls.yaml').write_text('name: walls\nwalls:\n  - points: [[0.4, -1.0], [0.4, 1.0]]\n')
     usual, changes = BUILT[name]
     plain, built = plain_runs(usual), built_run(tmp_path / 'built', usual | changes)
     assert built.exact.all()
@@ -578,8 +578,8 @@ def test_every_parameter_is_read_as_it_was_recorded(bag, tmp_path):
         writer.row(now + 2, Journal().step(now))
     rest = without(writer.path, tmp_path / 'rest', lambda topic, _: 'parameters' in topic)
     for path in (writer.path, rest):
-        (life,) = load_inputs(path).lives
-        assert life.parameters[life.start].to_dict() == parameters.to_dict()
+        (session,) = load_inputs(path).sessions
+        assert session.parameters[session.start].to_dict() == parameters.to_dict()
 
 
 def test_a_command_before_a_kill_is_not_that_of_the_next_process():
@@ -597,7 +597,7 @@ def test_a_command_before_a_kill_is_not_that_of_the_next_process():
     assert commands_of(rows, published, sent).tolist() == [0, 1, 2, -1, 3, 4]
 
 
-def test_a_node_that_was_started_again_is_another_life(tmp_path):
+def test_a_node_that_was_started_again_is_another_session(tmp_path):
     """Both are in one bag, and the second knows nothing of the first."""
     parameters = loop_controller()
     start = 1_700_000_000_000_000_000
@@ -610,7 +610,7 @@ def test_a_node_that_was_started_again_is_another_life(tmp_path):
                 recorded.add_reference(now, State(now + 400_000_000, Pose(0.0, 0.0, 0.0), still))
                 recorded.step(now + 1000, State(now, Pose(0.0, 0.0, 0.0), still))
     inputs = load_inputs(tmp_path / 'bag')
-    assert [len(life.events) for life in inputs.lives] == [100, 100]
+    assert [len(session.events) for session in inputs.sessions] == [100, 100]
     assert inputs.notes == ()
     assert inputs.exact.all()
     assert compare(inputs, replay_controller(inputs)).same
@@ -770,11 +770,11 @@ def test_a_damaged_bag_is_refused_or_read_never_more(bag, tmp_path):
 # -- the commands ---------------------------------------------------------------------------------
 
 
-def test_a_rerun_written_as_a_bag_compares_with_its_source(bag, tmp_path, capsys):
+def test_a_replay_written_as_a_bag_compares_with_its_source(bag, tmp_path, capsys):
     assert bag_program('replay', bag, '--output', tmp_path / 'again') == 0
-    said = capsys.readouterr().out
-    assert 'x real time' in said
-    assert 's to compile and to warm up are not counted' in said
+    printed = capsys.readouterr().out
+    assert 'x real time' in printed
+    assert 's to compile and to warm up are not counted' in printed
     assert bag_program('compare', bag, tmp_path / 'again', '--abs', '1e-6', '--rel', '1e-6') == 0
     assert bag_program('compare', tmp_path / 'again', '--abs', '1e-6', '--rel', '1e-6') == 0
 

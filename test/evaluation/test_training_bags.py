@@ -70,7 +70,7 @@ def lab_run(seed):
 
 
 def test_three_recorded_bags_train_as_well_as_three_simulations(model):
-    """The same lesson, its runs once rebuilt from lossy bags and once known exactly.
+    """The same training data, the runs once rebuilt from lossy bags and once known exactly.
 
     Judged on runs of the lab that neither has seen: skill within 5 %, and as much explained.
     """
@@ -106,11 +106,11 @@ def test_every_bag_is_judged_by_the_others(model):
     assert [fold.name for fold in model.folds] == [f'run{seed}/bag' for seed in RECORDED]
     for fold in model.folds:
         assert fold.judged > 0.7 * SECONDS
-        assert fold.skills['taught'].min() > 0.4
+        assert fold.skills['fitted'].min() > 0.4
         assert fold.explained.min() > 0.2
     for word in ('cross-validated in 3 folds', 'nominal loop', 'random', 'mean ± spread'):
         assert word in model.text
-    means, spread = mean_and_spread([fold.skills['taught'] for fold in model.folds])
+    means, spread = mean_and_spread([fold.skills['fitted'] for fold in model.folds])
     assert spread.max() < 0.15
     np.testing.assert_allclose(means, model.origin['cross_validation']['skill']['mean'], atol=1e-4)
 

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Models from bags and from practice: the run rebuilt exactly, and what is learnt from it."""
+"""Models fitted to bags and to simulated runs: the run is rebuilt exactly."""
 
 from dataclasses import replace
 import math
@@ -226,17 +226,17 @@ def predictor_of(learnt):
 
 
 def test_a_predictor_from_a_bag_is_as_good_as_from_simulation(run, sampled):
-    """On the quarter that it has not seen; the practice is 120 s of three other runs."""
+    """On the quarter that it has not seen; the training data are 120 s of three other runs."""
     parameters = run.controller.parameters
     errors, moves = sampled
     cut = 3 * len(errors) // 4
     unseen = stretches(errors[cut:], moves[cut:])
-    lesson = fit_predictor(parameters, errors[:cut], moves[:cut])
-    assert 28.0 < lesson.taught <= 30.0
+    fit = fit_predictor(parameters, errors[:cut], moves[:cut])
+    assert 28.0 < fit.duration <= 30.0
     own, pretrained, nominal = (
         skills(parameters.predictive, 0.05, weights, unseen)
         for weights in (
-            lesson.weights,
+            fit.weights,
             predictor_of(fit_simulated_runs('velocity')[0]),
             Controller(parameters).law.predictive.get_weights(),
         )
@@ -246,23 +246,23 @@ def test_a_predictor_from_a_bag_is_as_good_as_from_simulation(run, sampled):
     assert np.all(own > nominal)
 
 
-def test_the_model_is_learnt_from_all_and_judged_by_folds(run, sampled, trained):
-    """Each block by what the other four teach, so never by its own lesson."""
+def test_the_model_is_fitted_to_all_and_evaluated_by_folds(run, sampled, trained):
+    """Each block with the model of the other four, so never with its own data."""
     parameters = run.controller.parameters
-    lesson = fit_predictor(parameters, *sampled)
-    for name, values in lesson.weights.items():
+    fit = fit_predictor(parameters, *sampled)
+    for name, values in fit.weights.items():
         np.testing.assert_array_equal(trained.learnt[f'predictive.{name}'], values)
-    assert lesson.taught > 38.0
+    assert fit.duration > 38.0
     assert [fold.name for fold in trained.folds] == [f'block {i}' for i in range(1, 6)]
     assert sum(fold.judged for fold in trained.folds) > 30.0
     for fold in trained.folds:
-        assert fold.skills['taught'].min() > 0.3
-        assert np.all(fold.skills['taught'] > fold.skills['nominal loop'])
-        assert np.all(fold.skills['taught'] > fold.skills['random'])
-        for value in (*fold.skills['taught'].ravel(), *fold.skills['random'].ravel()):
+        assert fold.skills['fitted'].min() > 0.3
+        assert np.all(fold.skills['fitted'] > fold.skills['nominal loop'])
+        assert np.all(fold.skills['fitted'] > fold.skills['random'])
+        for value in (*fold.skills['fitted'].ravel(), *fold.skills['random'].ravel()):
             assert f'{value:.2f}' in trained.text
     assert np.mean([fold.explained for fold in trained.folds]) > 0.2
-    assert f'predictor: learnt from {lesson.taught:.1f} s' in trained.text
+    assert f'predictor: fitted to {fit.duration:.1f} s' in trained.text
 
 
 def test_the_skill_of_segments_pools_their_squared_errors(run, sampled):
@@ -367,16 +367,16 @@ def test_several_bags_teach_together_and_each_is_a_fold(run, tmp_path):
     sampled = [periods(replay, parameters.predictive, parameters.rate) for replay in replays]
     first = fit_predictor(parameters, *sampled[0])
     found = skills(parameters.predictive, 0.05, first.weights, stretches(*sampled[1]))
-    np.testing.assert_array_equal(both.folds[1].skills['taught'], found)
+    np.testing.assert_array_equal(both.folds[1].skills['fitted'], found)
     share = explained(parameters, fit_coefficients(parameters, replays[0]), replays[1])
     np.testing.assert_array_equal(both.folds[1].explained, share)
     assert found.min() > 0.4
     replay = TrainingData.joined(replays)
     assert np.flatnonzero(replay.begins).tolist() == [0, 2000]
-    lesson = fit_predictor(parameters, *periods(replay, parameters.predictive, parameters.rate))
-    assert np.max(lesson.uncertainty) < 0.3
+    fit = fit_predictor(parameters, *periods(replay, parameters.predictive, parameters.rate))
+    assert np.max(fit.uncertainty) < 0.3
     np.testing.assert_array_equal(
-        both.learnt['predictive.output_weights'], lesson.weights['output_weights']
+        both.learnt['predictive.output_weights'], fit.weights['output_weights']
     )
     with pytest.raises(TrainingError, match='two have the same content'):
         fit_bags([halves[0], halves[0]])  # before anything is fitted
@@ -646,10 +646,10 @@ def test_dither_moves_v_p_by_itself_and_keeps_its_bound():
         PredictiveParameters(dither=-1.0)
 
 
-# -- practice, and the command line -------------------------------------------------------------
+# -- simulated runs, and the command line -------------------------------------------------------
 
 
-def test_practice_on_the_command_line(tmp_path, capsys):
+def test_training_on_the_command_line(tmp_path, capsys):
     path = tmp_path / 'model.npz'
     assert main(['train', '--robot', 'servo', '--seeds', '2', '--output', str(path)]) == 0
     said = capsys.readouterr().out

@@ -99,25 +99,25 @@ def test_a_recorded_controller_replays_bit_for_bit(late, harness, tmp_path):
     bag = tmp_path / 'bag'
     eventful_run(harness, bag, tmp_path / 'model.npz', late)
     inputs = load_inputs(bag)
-    [life] = inputs.lives
-    assert life.rows[0, 0] == 0, 'the journal begins with the first event'
+    [session] = inputs.sessions
+    assert session.rows[0, 0] == 0, 'the journal begins with the first event'
     # Ranges are in the journal with the keep-out only.
-    assert {Event(value) for value in life.events.tolist()} == set(Event) - {Event.RANGE}
-    assert life.exact.all(), inputs.notes
+    assert {Event(value) for value in session.events.tolist()} == set(Event) - {Event.RANGE}
+    assert session.exact.all(), inputs.notes
     again = replay_controller(inputs)
     reasons = set(again.reasons)
     assert {Reason.TRACKING, Reason.NOT_FOLLOWING, Reason.DISABLED, Reason.NO_ODOMETRY} <= reasons
     outcome = compare(inputs, again, Tolerances(absolute=1e-9, relative=0.0))
     assert outcome.same, outcome.table()
-    held = np.isfinite(inputs.recorded['cmd_vel.linear.x'])
-    missing = np.count_nonzero(inputs.commanding & ~held)
+    recorded_commands = np.isfinite(inputs.recorded['cmd_vel.linear.x'])
+    missing = np.count_nonzero(inputs.commanding & ~recorded_commands)
     assert missing == listed_as_missing(bag, '/cmd_vel'), inputs.notes
     assert not late or any(
         note.startswith(f'{missing} commands of the controller') for note in inputs.notes
     )
     assert (missing > 0) == late
     for name in ('cmd_vel.linear.x', 'cmd_vel.angular.z'):
-        compared = inputs.commanding & inputs.exact & held
+        compared = inputs.commanding & inputs.exact & recorded_commands
         assert np.count_nonzero(compared) > 500
         recorded, computed = inputs.recorded[name][compared], again.fields[name][compared]
         np.testing.assert_array_equal(computed, recorded)
@@ -135,11 +135,11 @@ def test_a_recorded_controller_replays_bit_for_bit(late, harness, tmp_path):
 def test_a_patrol_replays_bit_for_bit(harness, tmp_path):
     """Its commands depend on the range sensors, too, whose readings are in the journal.
 
-    The robot also keeps out of walls that it is told of, which no sensor sees.
+    The robot also keeps out of walls of its world, which no sensor sees.
     """
-    bag, world = tmp_path / 'bag', tmp_path / 'told.yaml'
+    bag, world = tmp_path / 'bag', tmp_path / 'walls.yaml'
     world.write_text(
-        'name: told\nwalls:\n'
+        'name: walls\nwalls:\n'
         '  - {points: [[-0.3, -0.3], [0.3, -0.3], [0.3, 0.3], [-0.3, 0.3]], closed: true}\n'
     )
     recorder = start_recorder(harness, bag)
@@ -157,12 +157,12 @@ def test_a_patrol_replays_bit_for_bit(harness, tmp_path):
     harness.remove(controller)
     harness.remove(recorder)
     inputs = load_inputs(bag)
-    (life,) = inputs.lives
-    assert np.count_nonzero(life.events == Event.RANGE) > 100
+    (session,) = inputs.sessions
+    assert np.count_nonzero(session.events == Event.RANGE) > 100
     again = replay_controller(inputs)
     outcome = compare(inputs, again, Tolerances(absolute=0.0, relative=0.0))
     assert outcome.same, outcome.table()
-    held = np.isfinite(inputs.recorded['cmd_vel.linear.x'])
-    compared = inputs.commanding & inputs.exact & held
+    recorded_commands = np.isfinite(inputs.recorded['cmd_vel.linear.x'])
+    compared = inputs.commanding & inputs.exact & recorded_commands
     assert np.count_nonzero(compared) > 200
     assert np.ptp(inputs.recorded['cmd_vel.angular.z'][compared]) > 0.0, 'the robot moved'

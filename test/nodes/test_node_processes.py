@@ -200,8 +200,8 @@ def test_the_loop_runs_at_100_hz_in_four_processes(run):
 def test_each_controller_of_the_run_replays_bit_for_bit(run):
     """Before the kill and after it; its first inputs reached the late recorder."""
     inputs = load_inputs(run.bag)
-    assert len(inputs.lives) == 2
-    first = inputs.lives[0]
+    assert len(inputs.sessions) == 2
+    first = inputs.sessions[0]
     assert first.rows[0, 0] == 0, 'the journal begins with the first event'
     # A reference that starts again is discovered by controller and recorder at different times.
     before = first.rows[:, 2] < run.killed_ns['reference_generator']

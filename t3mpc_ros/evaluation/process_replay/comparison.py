@@ -258,8 +258,8 @@ def _keys(inputs: ControllerInputs) -> list[tuple[int, int]]:
     """Return the session and the number of each event."""
     return [
         (start, number)
-        for start, life in enumerate(inputs.lives)
-        for number in life.rows[:, 0].tolist()
+        for start, session in enumerate(inputs.sessions)
+        for number in session.rows[:, 0].tolist()
     ]
 
 
@@ -267,7 +267,9 @@ def _recorded_values(
     inputs: ControllerInputs, names: Mapping[str, object]
 ) -> dict[str, list[object]]:
     """Return the values of parameters over the run, in order."""
-    tables = [parameters for life in inputs.lives for parameters in life.parameters.values()]
+    tables = [
+        parameters for session in inputs.sessions for parameters in session.parameters.values()
+    ]
     found: dict[str, list[object]] = {}
     for name in names:
         found[name] = list(dict.fromkeys(_plain(table.to_dict()[name]) for table in tables))

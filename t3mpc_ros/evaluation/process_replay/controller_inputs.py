@@ -60,7 +60,7 @@ class ControllerSession:
     """Events from one start of the controller node to the next, one row each."""
 
     first: int
-    """Index of its first row over all lives."""
+    """Index of its first row over all sessions."""
     rows: Integers
     """The journal, as in :data:`~t3mpc_ros.bag.run.journal.JOURNAL_COLUMNS`, shape (n, 5)."""
     taken: ConsumedMessages
@@ -85,7 +85,7 @@ class ControllerInputs:
     bag: Path
     odometry: TopicColumns
     references: TopicColumns
-    lives: tuple[ControllerSession, ...]
+    sessions: tuple[ControllerSession, ...]
     time: Array
     """Time of each row, s since the first message of the bag, shape (n,)."""
     recorded: Mapping[str, Array]
@@ -99,17 +99,17 @@ class ControllerInputs:
     @property
     def stamps_ns(self) -> Integers:
         """Odometry stamp of each row, shape (n,)."""
-        return np.concatenate([life.rows[:, 2] for life in self.lives])
+        return np.concatenate([session.rows[:, 2] for session in self.sessions])
 
     @property
     def events(self) -> Integers:
         """Event kind of each row, shape (n,)."""
-        return np.concatenate([life.events for life in self.lives])
+        return np.concatenate([session.events for session in self.sessions])
 
     @property
     def exact(self) -> Flags:
         """Whether the inputs of each row are complete, shape (n,)."""
-        return np.concatenate([life.exact for life in self.lives])
+        return np.concatenate([session.exact for session in self.sessions])
 
     @property
     def commanding(self) -> Flags:
@@ -134,18 +134,18 @@ def load_inputs(
     ReplayError
         Topics or parameters are missing, or cannot be used.
     """
-    with open_bag(bag) as held:
-        return inputs_of(held, namespace, model)
+    with open_bag(bag) as recording:
+        return inputs_of(recording, namespace, model)
 
 
 def inputs_of(
-    held: BagReader, namespace: str | None = None, model: Mapping[str, Array] | None = None
+    recording: BagReader, namespace: str | None = None, model: Mapping[str, Array] | None = None
 ) -> ControllerInputs:
     """Return inputs and recorded outputs of an open bag, see :func:`load_inputs`."""
-    bag = held.folder
-    notes = message_loss_notes(held.metadata_records)
-    recorded_topics = {name for name, topic in held.topics.items() if topic.message_count}
-    known, namespaces = find_topics(held.topics, namespace)
+    bag = recording.folder
+    notes = message_loss_notes(recording.metadata_records)
+    recorded_topics = {name for name, topic in recording.topics.items() if topic.message_count}
+    known, namespaces = find_topics(recording.topics, namespace)
     prefix = namespaces[0]
     names = (REFERENCE, ODOMETRY, COMMAND, JOURNAL, *sorted(SCALARS))
     wanted = {name: f'{prefix}/{name}' for name in names}
@@ -155,7 +155,7 @@ def inputs_of(
         if name in wanted and full in recorded_topics
     }
     for name in (ODOMETRY, COMMAND):
-        if name not in topics and (full := _renamed_topic(held, name, [*topics.values()])):
+        if name not in topics and (full := _renamed_topic(recording, name, [*topics.values()])):
             topics[name] = full
             notes.append(f'{name} is taken from {full}')
     if missing := [name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics]:
@@ -166,29 +166,29 @@ def inputs_of(
             'the order of its inputs: record it, as the recorder does by default; t3mpc bag '
             'report needs none'
         )
-    revisions = _revisions(held, f'{prefix}/{CONTROLLER}/parameters')
-    default = None if revisions else recorded_parameters(held, prefix, notes)
+    revisions = _revisions(recording, f'{prefix}/{CONTROLLER}/parameters')
+    default = None if revisions else recorded_parameters(recording, prefix, notes)
     initial = {
         name: full
         for name in (REFERENCE, ODOMETRY)
         if (full := f'{prefix}/{INITIAL_INPUTS}{name}') in recorded_topics
     }
-    columns = read_columns(held, [*topics.values(), *initial.values()])
+    columns = read_columns(recording, [*topics.values(), *initial.values()])
     by_name = {name: columns[full] for name, full in topics.items()}
     for name, full in initial.items():
         by_name[name] = with_initial_inputs(by_name[name], columns[full])
-    reader = _Reader(held, by_name, revisions, default, model, notes)
-    lives, time_ns, commands = reader.lives()
-    recorded = reader.answers(lives, commands)
+    reader = _Reader(recording, by_name, revisions, default, model, notes)
+    sessions, time_ns, commands = reader.sessions()
+    recorded = reader.recorded_outputs(sessions, commands)
     return ControllerInputs(
         bag=bag,
         odometry=by_name[ODOMETRY],
         references=by_name[REFERENCE],
-        lives=tuple(lives),
-        time=(time_ns - held.start_ns) / NANOSECONDS,
+        sessions=tuple(sessions),
+        time=(time_ns - recording.start_ns) / NANOSECONDS,
         recorded=recorded,
         commands_ns=np.where(commands >= 0, by_name[COMMAND].received_ns[commands], 0),
-        start_ns=held.start_ns,
+        start_ns=recording.start_ns,
         notes=tuple(notes),
     )
 
@@ -231,20 +231,20 @@ def _value(row: ParameterSpec, text: str) -> object:
         return text
 
 
-def _renamed_topic(held: BagReader, name: str, used: Sequence[str]) -> str:
+def _renamed_topic(recording: BagReader, name: str, used: Sequence[str]) -> str:
     """Return the only topic that can be the odometry or command of a robot with other names.
 
     Empty if there is none, or several. Topics of another controller's namespace do not count.
     """
     others = [
         full
-        for full, topic in held.topics.items()
+        for full, topic in recording.topics.items()
         if topic.type_name in KINDS[name]
         and topic.message_count
         and full not in used
         and f'/{INITIAL_INPUTS}' not in full
         and not full.endswith((f'/{REFERENCE}', f'/{TRUTH}'))
-        and f'{full.removesuffix(f"/{name}")}/{JOURNAL}' not in held.topics
+        and f'{full.removesuffix(f"/{name}")}/{JOURNAL}' not in recording.topics
     ]
     return others[0] if len(others) == 1 else ''
 
@@ -265,12 +265,13 @@ def motions(column: TopicColumns) -> StateArray:
 Revision = tuple[int, int, Mapping[str, object]]
 
 
-def _revisions(held: BagReader, topic: str) -> list[Revision]:
+def _revisions(recording: BagReader, topic: str) -> list[Revision]:
     """Return (receive time, revision, parameters) in order of receipt."""
-    if topic not in held.topics:
+    if topic not in recording.topics:
         return []
     messages = [
-        (each.received_ns, held.decode(each)) for each in held.serialized_messages([topic])
+        (each.received_ns, recording.decode(each))
+        for each in recording.serialized_messages([topic])
     ]
     try:
         return [(when, *parameters_from_json(message.data)) for when, message in messages]
@@ -291,9 +292,9 @@ def _names() -> frozenset[str]:
 
 @dataclass
 class _Reader:
-    """Assembles the lives of the controller of one bag and reports losses."""
+    """Assembles the sessions of the controller of one bag and reports losses."""
 
-    held: BagReader
+    recording: BagReader
     columns: Mapping[str, TopicColumns]
     revisions: Sequence[Revision]
     default: ControllerParameters | None
@@ -302,10 +303,10 @@ class _Reader:
     published: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """Publication time of each row."""
 
-    def lives(self) -> tuple[list[ControllerSession], Integers, Integers]:
-        """Return the lives, the publication time of their rows, and the command of each row."""
+    def sessions(self) -> tuple[list[ControllerSession], Integers, Integers]:
+        """Return the sessions, the publication time of their rows, and the command of each row."""
         journal = self.columns[JOURNAL]
-        # A previous life, kept by the latched publisher: in order of publication.
+        # A previous session, latched by its publisher: in order of publication.
         order = np.argsort(journal.published_ns, kind='stable')
         rows, published = journal.integers[order], journal.published_ns[order]
         fresh = np.concatenate([[True], np.diff(rows[:, 0]) != 0])  # duplicates after a restart
@@ -316,15 +317,17 @@ class _Reader:
         )
         self.published = published
         bounds = [0, *(np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1).tolist(), len(rows)]
-        lives = []
+        sessions = []
         for first, last in zip(bounds, bounds[1:], strict=False):
-            lives.append(self._life(rows[first:last], received[first:last], first))
+            sessions.append(self._session(rows[first:last], received[first:last], first))
         commands = self.columns[COMMAND]
-        return lives, published, commands_of(rows, published, commands.published_ns)
+        return sessions, published, commands_of(rows, published, commands.published_ns)
 
-    def answers(self, lives: Sequence[ControllerSession], commands: Integers) -> dict[str, Array]:
+    def recorded_outputs(
+        self, sessions: Sequence[ControllerSession], commands: Integers
+    ) -> dict[str, Array]:
         """Return the recorded value of each field by row."""
-        events = np.concatenate([life.events for life in lives])
+        events = np.concatenate([session.events for session in sessions])
         recorded = {name: np.full(len(events), np.nan) for name in FIELDS}
         there = commands >= 0
         for i, name in enumerate(SPEEDS):
@@ -338,20 +341,23 @@ class _Reader:
             recorded[name][rows[rows >= 0]] = column.numbers[rows >= 0, 0]
         without = np.flatnonzero(np.isin(events, COMMAND_EVENTS) & ~there)
         if without.size:
-            span = (self.published[without[[0, -1]]] - self.held.start_ns) / NANOSECONDS
+            span = (self.published[without[[0, -1]]] - self.recording.start_ns) / NANOSECONDS
             self.notes.append(
                 f'{without.size} commands of the controller, from {span[0]:.3f} s to '
                 f'{span[1]:.3f} s, are not in the bag and not compared'
             )
         return recorded
 
-    def _life(self, rows: Integers, received: Integers, first: int) -> ControllerSession:
+    def _session(self, rows: Integers, received: Integers, first: int) -> ControllerSession:
         taken = match(rows, self.columns[ODOMETRY].stamps_ns, self.columns[REFERENCE].stamps_ns)
         for count, what in (
             (int(rows[0, 0]), 'events of the controller were before the recording'),
             (taken.lost_events, 'events are missing in the journal of the controller'),
-            (taken.lost_odometry, 'odometry messages that the controller had are not in the bag'),
-            (taken.lost_references, 'references that the controller had are not in the bag'),
+            (
+                taken.lost_odometry,
+                'odometry messages that the controller processed are not in the bag',
+            ),
+            (taken.lost_references, 'references that the controller received are not in the bag'),
         ):
             if count:
                 self.notes.append(f'{count} {what}')
@@ -385,7 +391,7 @@ class _Reader:
     def _parameters_of(
         self, rows: Integers, received: Integers
     ) -> tuple[dict[int, ControllerParameters], int]:
-        """Return the parameters of one life by revision, and its initial revision."""
+        """Return the parameters of one session by revision, and its initial revision."""
         if self.default is not None:
             return {0: self.default}, 0
         # The initial parameters are published before the first event.
@@ -406,7 +412,9 @@ class _Reader:
         if self.revisions:
             return str(self.revisions[0][2].get('model', ''))
         tables = (
-            table for title, table in self.held.metadata_records.items() if CONTROLLER in title
+            table
+            for title, table in self.recording.metadata_records.items()
+            if CONTROLLER in title
         )
         return next((table['model'] for table in tables if 'model' in table), '')
 
@@ -418,17 +426,17 @@ class _Reader:
         name = self._model_name()
         if not wanted.size:
             return None
-        kept = [item.data for item in self.held.attachments().values()]
+        files = [item.data for item in self.recording.attachments().values()]
         if name and Path(name).is_file():
-            kept.append(Path(name).read_bytes())
-        for content in kept:
+            files.append(Path(name).read_bytes())
+        for content in files:
             if zlib.crc32(content) == wanted[0]:
                 with tempfile.NamedTemporaryFile(suffix='.npz') as file:
                     file.write(content)
                     file.flush()
                     return load_model(Path(file.name))
         self.notes.append(
-            f'the model {name or "file"} that the controller began with is not in the bag: '
+            f'the initial model {name or "file"} of the controller is not in the bag: '
             'give it by --model'
         )
         return None

@@ -47,7 +47,7 @@ def output_row(twist: BodyTwist, status: Status) -> list[float]:
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """Outputs of a replay, one row per event as in :class:`Inputs`; NaN where none."""
+    """Outputs of a replay, one row per event as in :class:`ControllerInputs`; NaN where none."""
 
     fields: Mapping[str, Array]
     """Outputs by field name (``controller_inputs.FIELDS``), or some of them, shape (n,) each."""
@@ -65,7 +65,7 @@ def replay_controller(
     changes: Mapping[str, object] | None = None,
     controllers: Sequence[Controller] | None = None,
 ) -> ReplayResult:
-    """Return the outputs of today's controller for recorded inputs.
+    """Return the outputs of the current controller for recorded inputs.
 
     ``changes`` are parameters by name that replace the recorded ones throughout the run;
     ``controllers``, made by :func:`make_controllers`, are consumed by the call.
@@ -79,16 +79,18 @@ def replay_controller(
     """
     changes = changes or {}
     controllers = make_controllers(inputs, changes) if controllers is None else controllers
-    answers = np.full((inputs.events.size, len(FIELDS)), math.nan)
-    reasons: list[Reason | None] = [None] * len(answers)
+    outputs = np.full((inputs.events.size, len(FIELDS)), math.nan)
+    reasons: list[Reason | None] = [None] * len(outputs)
     odometry, references = [*motions(inputs.odometry)], [*motions(inputs.references)]
     parameters = ControllerParameters()
-    for life, controller in zip(inputs.lives, controllers, strict=True):
-        for row, twist, status in _session_steps(controller, life, changes, odometry, references):
-            answers[row] = output_row(twist, status)
+    for session, controller in zip(inputs.sessions, controllers, strict=True):
+        for row, twist, status in _session_steps(
+            controller, session, changes, odometry, references
+        ):
+            outputs[row] = output_row(twist, status)
             reasons[row] = status.reason
         parameters = controller.parameters
-    fields = dict(zip(FIELDS, np.ascontiguousarray(answers.T), strict=True))
+    fields = dict(zip(FIELDS, np.ascontiguousarray(outputs.T), strict=True))
     steps = len(reasons) - reasons.count(None)
     return ReplayResult(fields, tuple(reasons), steps, parameters, dict(changes))
 
@@ -96,14 +98,14 @@ def replay_controller(
 def make_controllers(
     inputs: ControllerInputs, changes: Mapping[str, object] | None = None
 ) -> list[Controller]:
-    """Return one compiled controller for each recorded life, initialised as its node did."""
+    """Return one compiled controller for each recorded session, initialised as its node did."""
     controllers = []
-    for life in inputs.lives:
-        parameters = life.parameters[life.start].with_values(changes or {})
+    for session in inputs.sessions:
+        parameters = session.parameters[session.start].with_values(changes or {})
         controller = Controller(parameters, _obstacles(parameters))
         controller.warm_up()
-        if life.model is not None:
-            controller.set_weights(life.model)
+        if session.model is not None:
+            controller.set_weights(session.model)
         controllers.append(controller)
     return controllers
 
@@ -155,30 +157,32 @@ def recompute_scalars(
 
 def _session_steps(
     controller: Controller,
-    life: ControllerSession,
+    session: ControllerSession,
     changes: Mapping[str, object],
     odometry: Sequence[State],
     references: Sequence[State],
 ) -> Iterator[tuple[int, BodyTwist, Status]]:
-    """Process the events of one life in their order; yield row, command and status of each."""
-    taken = life.taken
+    """Process the events of one session in their order; yield row, command and status of each."""
+    taken = session.taken
     inputs = np.stack([taken.odometry, taken.begin, taken.end], axis=1).tolist()
-    rows = zip(life.events.tolist(), life.rows[:, 4].tolist(), inputs, strict=True)
-    for row, (event, value, (received, begin, end)) in enumerate(rows, life.first):
+    rows = zip(session.events.tolist(), session.rows[:, 4].tolist(), inputs, strict=True)
+    for row, (event, value, (received, begin, end)) in enumerate(rows, session.first):
         for reference in references[begin:end]:
             controller.add_reference(reference)
         if event == _STEP:
             if received >= 0:
                 yield row, *controller.step(odometry[received])
         elif event == Event.RANGE:
-            controller.add_range(int(life.rows[row - life.first, 2]), reading_from_value(value))
+            controller.add_range(
+                int(session.rows[row - session.first, 2]), reading_from_value(value)
+            )
         elif event in (Event.ODOMETRY_TIMEOUT, Event.FINISH):
             if event == Event.ODOMETRY_TIMEOUT:
                 controller.check_odometry(None, 0)
             yield row, STANDSTILL, controller.status
         elif event == Event.CONFIGURE:
-            if value in life.parameters:
-                controller.configure(life.parameters[value].with_values(changes))
+            if value in session.parameters:
+                controller.configure(session.parameters[value].with_values(changes))
         elif event in (Event.RESET, Event.ENABLE):
             controller.enable(bool(value))
             if event == Event.RESET:

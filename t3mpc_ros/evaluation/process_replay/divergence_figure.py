@@ -51,7 +51,7 @@ def _close_up(close: Any, apart: Any, outcome: Comparison, name: str, when: floa
     was, now = outcome.recorded[name][shown], outcome.computed[name][shown]
     # The recorded line is wide, so that it stays visible below the other.
     close.plot(time[shown], was, color=COLOURS['odom'], label='recorded', linewidth=4.0)
-    close.plot(time[shown], now, color=COLOURS['error'], label='rerun', linewidth=1.0)
+    close.plot(time[shown], now, color=COLOURS['error'], label='recomputed', linewidth=1.0)
     close.set_title(name)
     absolute, relative = outcome.tolerances.of(name)
     with np.errstate(invalid='ignore'):

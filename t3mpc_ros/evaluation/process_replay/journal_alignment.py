@@ -63,7 +63,7 @@ def with_initial_inputs(received: TopicColumns, initial: TopicColumns) -> TopicC
 def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> ConsumedMessages:
     """Return the messages that the controller processed, by its journal.
 
-    ``rows`` is the journal of one life of the controller, shape (n, 5), see
+    ``rows`` is the journal of one session of the controller, shape (n, 5), see
     :mod:`t3mpc_ros.bag.run.journal`; stamps of the messages are in order of receipt.
     """
     number, event, stamp, handed, value = rows.T
@@ -87,21 +87,21 @@ def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> Cons
     )
 
 
-def match_commands(asked: Array, answered: Array) -> NDArray[np.int64]:
+def match_commands(odometry: Array, commands: Array) -> NDArray[np.int64]:
     """Return the odometry message of each command, -1 without one, shape (m,).
 
     The controller responds to each message it processes, in order: command j belongs to message
     j + s, where s is the number of earlier messages without a command, from before the first
     command or lost. Receive times (ascending, s) alone mislead: on a busy processor the next
     message arrives before the command, and of two publishers the second may even be received
-    first. Both pass, so s is the median over two seconds.
+    first. Both are brief, so s is the median over two seconds.
     """
-    numbers = np.arange(answered.size)
-    behind = np.searchsorted(asked, answered, side='right') - 1 - numbers
+    numbers = np.arange(commands.size)
+    behind = np.searchsorted(odometry, commands, side='right') - 1 - numbers
     padded = np.pad(behind, ALIKE, mode='symmetric')
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * ALIKE + 1)
     found: NDArray[np.int64] = numbers + np.median(windows, axis=1).astype(np.int64)
-    found[(found < 0) | (found >= asked.size)] = -1
+    found[(found < 0) | (found >= odometry.size)] = -1
     return found
 
 
@@ -165,12 +165,12 @@ def _reference_ranges(
     is whether some references before a row are passed after it for that reason.
     """
     end = np.zeros(len(handed), dtype=np.int64)
-    tells = (newest != 0) & (handed > 0)
-    for last in np.flatnonzero(recorded == newest[tells][-1]).tolist() if tells.any() else ():
-        shift = last + 1 - int(handed[tells][-1])
-        if handed[tells][0] + shift <= 0:
+    stamped = (newest != 0) & (handed > 0)
+    for last in np.flatnonzero(recorded == newest[stamped][-1]).tolist() if stamped.any() else ():
+        shift = last + 1 - int(handed[stamped][-1])
+        if handed[stamped][0] + shift <= 0:
             continue
-        if np.array_equal(recorded[handed[tells] + shift - 1], newest[tells]):
+        if np.array_equal(recorded[handed[stamped] + shift - 1], newest[stamped]):
             # References before a row without a stamp are passed all the same.
             end = np.where(handed > 0, np.maximum(handed + shift, 0), max(shift, 0))
             end = np.minimum(end, recorded.size)

@@ -67,7 +67,7 @@ def write_replay(inputs: ControllerInputs, again: ReplayResult, folder: Path) ->
         for when, value in zip(times.tolist(), again.fields[name].tolist(), strict=True):
             if math.isfinite(value):
                 messages.append((when + LATER, f'{CONTROLLER}/{name}', float_bytes(value)))
-    for session in inputs.lives:
+    for session in inputs.sessions:
         for when, row in zip(times[session.first :].tolist(), session.rows.tolist(), strict=False):
             messages.append((when, f'{CONTROLLER}/journal', row_bytes(row)))
         first = int(times[session.first]) - 2 * LATER

@@ -25,7 +25,7 @@ class MoveEffect:
     """Identified effect of v_p on the error."""
 
     response: float
-    """Change of the error per held change of v_p, (rad/s)/(rad/s²)."""
+    """Change of the error per lasting change of v_p, (rad/s)/(rad/s²)."""
     error: float
     """Standard error of the gain; infinite when it is not identifiable."""
     own: float
@@ -112,8 +112,8 @@ class PredictorFit:
     """Weights as :meth:`PredictiveController.get_weights` returns them."""
     uncertainty: Array
     """Standard error of the effect of v_p over the nominal effect, shape (2,)."""
-    taught: float
-    """s"""
+    duration: float
+    """Duration of the data, s."""
 
 
 def periods(
@@ -156,11 +156,11 @@ def periods(
         delays = [np.median(jumps[published - late]) for late in range(decimation)]
         starts = published - np.argmax(delays)
         seen = starts[:, None] - np.arange(average)
-        held = np.minimum(starts[:, None] + np.arange(decimation), last - 1)
+        applied = np.minimum(starts[:, None] + np.arange(decimation), last - 1)
         error, move = replay.errors[seen].mean(axis=1), replay.moves[published]
         whole = (average - 0.5) / rate > replay.time[starts] - replay.time[seen[:, -1]]
         error[~whole] = math.nan
-        move[replay.limited[held].mean(axis=1) > 0.5] = math.nan
+        move[replay.limited[applied].mean(axis=1) > 0.5] = math.nan
         torn = 1 + np.flatnonzero(np.abs(np.diff(replay.time[starts]) / span - 1.0) > 0.5)
         errors += [np.insert(error, torn, math.nan, axis=0), gap]
         moves += [np.insert(move, torn, math.nan, axis=0), gap]
@@ -190,13 +190,13 @@ def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -
     """
     predictive, period = parameters.predictive, 1.0 / parameters.rate
     timing = SampleTiming(period, predictive.decimation, predictive.average)
-    taught = np.count_nonzero(np.isfinite(errors + moves).all(axis=1)) * timing.span
+    duration = np.count_nonzero(np.isfinite(errors + moves).all(axis=1)) * timing.span
     parts = stretches(errors, moves)
-    if taught < MIN_EXCITATION or not parts:
+    if duration < MIN_EXCITATION or not parts:
         raise TrainingError(
             f'the run must hold at least {MIN_EXCITATION:g} s with known errors and v_p, and of '
             'these '
-            f'{JUDGED * timing.span:g} s without a gap: got {taught:.1f} s, the longest stretch '
+            f'{JUDGED * timing.span:g} s without a gap: got {duration:.1f} s, the longest stretch '
             f'{_longest(errors + moves) * timing.span:.1f} s'
         )
     loop = replace(predictive.nominal, feedback_gain=min(feedback_slope(parameters), 100.0))
@@ -216,11 +216,11 @@ def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -
         worst = int(np.argmax(uncertainty))
         raise TrainingError(
             'v_p must move more to show what it does: by itself, apart from what errors and older '
-            f'v_p foretell, it moved by {effects[worst].own:.2g} rad/s² (standard deviation), so '
-            f'in {taught:.0f} s its effect is known to {100.0 * uncertainty[worst]:.0f} % of the '
-            f'nominal one, and {100.0 * UNCERTAIN:.0f} % are needed. Set predictive.dither of the '
-            'controller while recording (a few rad/s²), record for longer, or keep the predictor '
-            'as it is (--keep-predictor)'
+            f'v_p predict, it moved by {effects[worst].own:.2g} rad/s² (standard deviation), so '
+            f'in {duration:.0f} s its effect is known to {100.0 * uncertainty[worst]:.0f} % of '
+            f'the nominal one, and {100.0 * UNCERTAIN:.0f} % are needed. Set predictive.dither of '
+            'the controller while recording (a few rad/s²), record for longer, or keep the '
+            'predictor as it is (--keep-predictor)'
         )
     learning = learning_constants(predictive, timing.span)
     generator = np.random.default_rng(predictive.seed)
@@ -232,7 +232,7 @@ def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -
         predictor.fit(*run, predictive.excitation, trust, learning)
         each.append(predictor.get_weights())
     weights = {name: np.stack([one[name] for one in each]) for name in each[0]}
-    return PredictorFit(weights, uncertainty, float(taught))
+    return PredictorFit(weights, uncertainty, float(duration))
 
 
 def _machine(parameters: PredictiveParameters, generator: np.random.Generator) -> BoltzmannMachine:

@@ -35,7 +35,7 @@ from t3mpc_ros.parameters.provenance import provenance
 
 Array = NDArray[np.float64]
 
-FITTED, NOMINAL, RANDOM = 'taught', 'nominal loop', 'random'
+FITTED, NOMINAL, RANDOM = 'fitted', 'nominal loop', 'random'
 """Compared predictors: fitted to the other folds, nominal only, and with random output
 weights of the same size. Skill 0 is no prediction."""
 NEXT_STEP, MIDDLE = 'next step', 'middle of the horizon'
@@ -91,7 +91,7 @@ def cross_validate(
         try:
             coefficients = fit_coefficients(parameters, others)
             if not keep_predictor:
-                lesson = fit_predictor(parameters, *periods(others, predictive, parameters.rate))
+                fit = fit_predictor(parameters, *periods(others, predictive, parameters.rate))
                 parts = stretches(*periods(held_out, predictive, parameters.rate))
                 judged = sum(part[0][0].size for part in parts) * span
                 nominal = PredictiveController(
@@ -100,16 +100,16 @@ def cross_validate(
                 ratings = {
                     title: skills(predictive, span, weights, parts)
                     for title, weights in (
-                        (FITTED, lesson.weights),
+                        (FITTED, fit.weights),
                         (NOMINAL, nominal),
-                        (RANDOM, random_output_weights(lesson.weights, predictive.seed)),
+                        (RANDOM, random_output_weights(fit.weights, predictive.seed)),
                     )
                 }
         except TrainingError as error:
             raise TrainingError(f'without {name} to learn from: {error}') from error
         found.append(Fold(name, judged, ratings, explained(parameters, coefficients, held_out)))
     if not keep_predictor and not any(fold.judged for fold in found):
-        raise TrainingError('there must be a stretch without a gap to judge by: there is none')
+        raise TrainingError('there must be a stretch without a gap to evaluate: there is none')
     return found
 
 
@@ -228,13 +228,11 @@ def fit_bags(
     learnt['fuzzy.coefficients'] = fit_coefficients(parameters, replay)
     status = 'predictor: pre-trained on the nominal loop, unchanged'
     if not keep_predictor:
-        lesson = fit_predictor(
-            parameters, *periods(replay, parameters.predictive, parameters.rate)
-        )
-        learnt |= {f'predictive.{name}': value for name, value in lesson.weights.items()}
+        fit = fit_predictor(parameters, *periods(replay, parameters.predictive, parameters.rate))
+        learnt |= {f'predictive.{name}': value for name, value in fit.weights.items()}
         status = (
-            f'predictor: learnt from {lesson.taught:.1f} s; the effect of v_p is known to '
-            f'{pair(100.0 * lesson.uncertainty, ".0f")} % of the nominal one (standard error)'
+            f'predictor: fitted to {fit.duration:.1f} s; the effect of v_p is known to '
+            f'{pair(100.0 * fit.uncertainty, ".0f")} % of the nominal one (standard error)'
         )
     parts = runs
     if len(runs) == 1:
@@ -242,9 +240,9 @@ def fit_bags(
     folds = cross_validate(parameters, parts, keep_predictor=keep_predictor)
     lines += [
         f'cross-validated in {len(folds)} folds: each {"bag" if len(runs) > 1 else "block"} is '
-        'judged by what the others teach (right/left); 0 is no prediction',
+        'evaluated with the model of the others (right/left); 0 is no prediction',
         fold_table(folds),
-        status + '; the model is learnt from all',
+        status + '; the model is fitted to all',
         *_warnings(folds),
     ]
     return FittedModel(learnt, parameters, _origin(origins, folds), folds, '\n'.join(lines))
@@ -254,15 +252,15 @@ def _warnings(folds: Sequence[Fold]) -> list[str]:
     """Return warnings about the use of the model."""
     found = []
     if folds[0].skills:
-        taught, nominal = (
+        fitted, nominal = (
             mean_and_spread([fold.skills[name] for fold in folds])[0] for name in (FITTED, NOMINAL)
         )
-        if (taught <= 0.0).any():
+        if (fitted <= 0.0).any():
             found.append(
-                'warning: in part the taught predictor is no better than none; record for longer, '
+                'warning: in part the fitted predictor is no better than none; record for longer, '
                 'or with more predictive.dither'
             )
-        elif (taught <= nominal).any():
+        elif (fitted <= nominal).any():
             found.append(
                 'warning: in part the nominal loop predicts as well; --keep-predictor keeps it'
             )

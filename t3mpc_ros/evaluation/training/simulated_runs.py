@@ -80,22 +80,21 @@ def assess(
         controller.set_weights(learnt)
         return controller
 
-    fresh, taught = [], []
+    fresh, trained = [], []
     with progress_bar(2 * len(seeds), show=progress) as bar:
         for seed in seeds:
             scenario = Scenario(drive, PRETRAINING_NOISE, 'nominal', seed, PRETRAINING_DURATION)
             fresh.append(run(scenario, without))
-            taught.append(run(scenario, with_model))
+            trained.append(run(scenario, with_model))
             bar.update(2)
     early, late = (
-        [[measure(record) for record in records] for records in (fresh, taught)]
+        [[measure(record) for record in records] for records in (fresh, trained)]
         for measure in (early_rmse, LoopRecord.rmse)
     )
     lines = [
-        f'practice: {len(PRETRAINING_SEEDS)} runs of {PRETRAINING_DURATION:g} s, drive {drive}, '
-        'noise '
-        f'{PRETRAINING_NOISE:g} (rad/s)², seeds {", ".join(map(str, PRETRAINING_SEEDS))}',
-        f'predictor: judged by errors and v_p in the last quarter of seed {seeds[0]} (right/left)',
+        f'training: {len(PRETRAINING_SEEDS)} runs of {PRETRAINING_DURATION:g} s, drive {drive}, '
+        f'noise {PRETRAINING_NOISE:g} (rad/s)², seeds {", ".join(map(str, PRETRAINING_SEEDS))}',
+        f'predictor: skill on errors and v_p in the last quarter of seed {seeds[0]} (right/left)',
         skill_table(held_out_skills(parameters, learnt, fresh[0])),
         f'RMSE (rad/s) on seeds {seeds[0]} to {seeds[-1]}, mean ± 95 %',
         f'                 first {EARLY:g} s         from 3 s on',

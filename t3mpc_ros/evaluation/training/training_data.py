@@ -184,9 +184,9 @@ def _rebuild(
     controller = Controller(parameters)
     odometry, reference, sent = messages[ODOMETRY], messages[REFERENCE], messages[COMMAND]
     motions, times = _motions(odometry), odometry['received']
-    answer = match_commands(times, sent['received'])
+    steps = match_commands(times, sent['received'])
     commands = np.full((times.size, 2), math.nan)
-    commands[answer[answer >= 0]] = _wheels(sent, parameters.geometry)[answer >= 0]
+    commands[steps[steps >= 0]] = _wheels(sent, parameters.geometry)[steps >= 0]
     if lost := np.count_nonzero(np.isnan(commands[:, 0])):
         notes.append(f'{lost} of {times.size} messages of {ODOMETRY} have no {COMMAND} after them')
     coming = deque(zip(reference['received'].tolist(), _motions(reference), strict=True))
@@ -216,7 +216,7 @@ def _rebuild(
         rest[i] = drive.applied - terms[_FOLLOWED].sum(axis=0)
         speeds[i], unexplained[i] = drive.speeds, drive.disturbance
     moves, recorded = (
-        _published(messages, name, sent['received'], answer, times.size)
+        _published(messages, name, sent['received'], steps, times.size)
         for name in (MOVES, FEEDBACK)
     )
     # At standstill the controller publishes zeros, and restarts afterwards.
@@ -245,7 +245,7 @@ def _published(
     messages: Mapping[str, Mapping[str, Array]],
     name: str,
     sent: Array,
-    answer: NDArray[np.int64],
+    steps: NDArray[np.int64],
     count: int,
 ) -> Array:
     """Return both wheels' scalars in the rows of their steps, (count, 2).
@@ -256,7 +256,7 @@ def _published(
     for z, wheel in enumerate(WHEELS):
         numbers = messages[f'{name}/{wheel}']
         last = np.searchsorted(sent, numbers['received'], side='right') - 1
-        rows = np.where(last >= 0, answer[last], -1)
+        rows = np.where(last >= 0, steps[last], -1)
         table[rows[rows >= 0], z] = numbers['value'][rows >= 0]
     return table
 
