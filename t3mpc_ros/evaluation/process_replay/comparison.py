@@ -212,7 +212,7 @@ def compare_columns(
     """Return the comparison of columns where they were recorded; arrays have shape (n,)."""
     tolerances = tolerances or Tolerances()
     rows = []
-    for name in (name for name in FIELDS if name in computed):
+    for name in FIELDS:
         chosen = compared & ~np.isnan(recorded[name])
         if not chosen.any():
             continue

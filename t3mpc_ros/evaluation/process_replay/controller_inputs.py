@@ -97,11 +97,6 @@ class ControllerInputs:
     """Remarks for the user."""
 
     @property
-    def stamps_ns(self) -> Integers:
-        """Odometry stamp of each row, shape (n,)."""
-        return np.concatenate([session.rows[:, 2] for session in self.sessions])
-
-    @property
     def events(self) -> Integers:
         """Event kind of each row, shape (n,)."""
         return np.concatenate([session.events for session in self.sessions])

@@ -50,7 +50,7 @@ class ReplayResult:
     """Outputs of a replay, one row per event as in :class:`ControllerInputs`; NaN where none."""
 
     fields: Mapping[str, Array]
-    """Outputs by field name (``controller_inputs.FIELDS``), or some of them, shape (n,) each."""
+    """Outputs by field name (``controller_inputs.FIELDS``), shape (n,) each."""
     reasons: tuple[Reason | None, ...]
     """Stop reasons; None at rows that are neither a step nor a timeout."""
     steps: int
