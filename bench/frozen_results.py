@@ -30,7 +30,6 @@ from t3mpc_ros.bag.reader import open_bag  # noqa: E402
 from t3mpc_ros.cli.main import main as t3mpc  # noqa: E402
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics  # noqa: E402
 from t3mpc_ros.evaluation.bag_report.run_data import load_run  # noqa: E402
-from t3mpc_ros.evaluation.bag_report.topic_roles import ReportOptions  # noqa: E402
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs  # noqa: E402
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller  # noqa: E402
 
@@ -85,7 +84,7 @@ def reports() -> object:
 def metrics_of(bag: Path) -> object:
     """Return the metrics of a report as plain data."""
     with open_bag(bag) as recording:
-        run = load_run(recording, ReportOptions())
+        run = load_run(recording)
         return plain(compute_metrics(run, Path('report.html'), 0))
 
 
