@@ -3,21 +3,17 @@
 """Decorator for compiled functions, and the folder that holds the compiled code."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import update_wrapper
 import hashlib
 from importlib import import_module
 import os
 from pathlib import Path
 import tempfile
-from typing import Any, Generic, ParamSpec, Self, TypeVar, cast
+from typing import Any, Generic, ParamSpec, TypeVar, cast
 
 import numba
-from numba.core import caching, config
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, CompileResult, Flags, compile_extra
-from numba.core.dispatcher import _FunctionCompiler  # type: ignore[attr-defined]
-from numba.core.registry import CPUDispatcher
-from numba.core.types.misc import unliteral
-from numba.core.typing import make_concrete_template
+from numba import config
+from numba.extending import overload
 import numpy as np
 from numpy.typing import NDArray
 
@@ -98,125 +94,82 @@ def _base_directories(environment: Mapping[str, str]) -> Iterator[Path]:
     yield Path(tempfile.gettempdir()) / f't3mpc_ros-{os.getuid()}'
 
 
-_Locators: Any = caching.CacheImpl._locator_classes
-"""What the compiler asks in turn; the first is for ``CACHE_DIR``, with a name that varies."""
+# Set in numba.config, not in the environment: programs that this process starts do not inherit
+# it, and it counts after an import of numba, too. Kernels are as fast with few optimisations, and
+# are compiled in three quarters of the time.
+config.OPT = type(config.OPT)(1)
+config.LOOP_VECTORIZE = config.SLP_VECTORIZE = 0
 
 
-class KernelLocator(_Locators[0]):  # type: ignore[misc]
+class KernelLocator:
     """Where the compiler caches a kernel: by the name of its module, not by the path of the file.
 
     Equal sources share the compiled code wherever they are: clones, workspaces, installations.
+    The compiler asks the classes of its setting ``NUMBA_CACHE_LOCATOR_CLASSES`` in turn.
     """
 
-    def __init__(self, function: Callable[..., object], file: str) -> None:
-        super().__init__(function, file)
-        self._cache_path = str(Path(config.CACHE_DIR, *function.__module__.split('.')))
+    def __init__(self, function: Callable[..., object]) -> None:
+        self._folder = Path(config.CACHE_DIR, *function.__module__.split('.'))
+        self._line = function.__code__.co_firstlineno
 
     @classmethod
     def from_function(cls, function: Callable[..., object], file: str) -> 'KernelLocator | None':
         """Return the locator of a kernel of this package; None for any other function."""
-        if not Path(file).is_relative_to(PACKAGE_DIRECTORY):
-            return None
-        return cast('KernelLocator | None', super().from_function(function, file))
+        return cls(function) if Path(file).is_relative_to(PACKAGE_DIRECTORY) else None
+
+    def ensure_cache_path(self) -> None:
+        """Make the folder."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        """Return the folder."""
+        return str(self._folder)
 
     def get_source_stamp(self) -> str:
         """Return what changes with the sources: the fingerprint in the name of the folder."""
         return Path(config.CACHE_DIR).name
 
+    def get_disambiguator(self) -> str:
+        """Return what tells functions of one name apart: the line."""
+        return str(self._line)
 
-# Kernels are as fast with few optimisations, and are compiled in three quarters of the time.
-config.OPT = type(config.OPT)(1)
-config.LOOP_VECTORIZE = config.SLP_VECTORIZE = 0
 
-# Set before the first kernel is made: numba reads the settings when it decorates.
+_LOCATORS = (
+    'UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,IPythonCacheLocator,'
+    'ZipCacheLocator'
+)
+"""What the compiler asks by default."""
+# Before the first kernel is made: numba reads the folder when it decorates.
 if not config.CACHE_DIR:
     config.CACHE_DIR = str(cache_directory(os.environ))
-    _Locators.insert(0, KernelLocator)
+    others = config.CACHE_LOCATOR_CLASSES or _LOCATORS
+    config.CACHE_LOCATOR_CLASSES = f'{__name__}.{KernelLocator.__name__},{others}'
 
-
-class _Flags(Flags):  # type: ignore[misc]
-    """Flags that do not change: the compiler compares them for every operation of a kernel."""
-
-    __slots__ = ()
-    __eq__ = object.__eq__
-    __hash__ = object.__hash__
-
-    def copy(self) -> Self:
-        """Return the same object."""
-        return self
-
-
-OPTIONS = {
-    'nopython': True,
-    'nogil': True,
-    'error_model': 'numpy',
-    'no_cfunc_wrapper': True,
-    '_nrt': False,
-}
+OPTIONS = {'nogil': True, 'error_model': 'numpy', 'no_cfunc_wrapper': True, '_nrt': False}
 """Without ``_nrt``, the compiler's run-time library, arrays are not allocated or counted."""
-KERNEL_FLAGS: Flags = CPUDispatcher.targetdescr.options.parse_as_flags(_Flags(), OPTIONS)
-PART_FLAGS = _Flags(KERNEL_FLAGS)
-PART_FLAGS.no_cpython_wrapper = PART_FLAGS.no_compile = True
+PART_OPTIONS = OPTIONS | {'no_cpython_wrapper': True}
 
 
-class _PartLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """Code of a kernel for those that call it: optimised and made executable as part of them."""
-
-    def _optimize_functions(self, ll_module: Any) -> None:
-        ll_module.data_layout = self._codegen._data_layout
-
-    def _optimize_final_module(self) -> None:
-        pass
-
-    def _finalize_final_module(self) -> None:
-        self._finalized = True
-
-
-class _KernelCompiler(_FunctionCompiler):  # type: ignore[misc]
-    """Compiles a kernel that Python calls."""
-
-    def _customize_flags(self, flags: Flags) -> Flags:
-        return KERNEL_FLAGS
-
-
-class _Kernel(CPUDispatcher):  # type: ignore[misc]
+class Kernel(Generic[P, R]):
     """Compiled function.
 
-    A kernel that others call is compiled as part of each of them, by itself only when Python
-    calls it, and without a second version for constant arguments.
+    A kernel that others call is compiled as part of each of them, and by itself only when Python
+    calls it: what converts arguments from Python takes longer to compile than most kernels.
     """
 
-    def __init__(self, function: Callable[..., object]) -> None:
-        super().__init__(function, targetoptions=OPTIONS)
-        self._compiler = _KernelCompiler(function, self.targetdescr, OPTIONS, {}, Compiler)
-        self._parts: dict[tuple[object, ...], CompileResult] = {}
+    def __init__(self, function: Callable[P, R]) -> None:
+        update_wrapper(self, function)
+        self.compiled: Any = numba.njit(cache=True, **OPTIONS)(function)
+        part = overload(cast('Any', self), jit_options=PART_OPTIONS, strict=False)
+        part(lambda *arguments, **named: function)
 
-    def get_call_template(
-        self, args: Sequence[object], kws: Mapping[str, object]
-    ) -> tuple[Any, ...]:
-        """Return how a kernel calls this one, with the type of a constant, not its value."""
-        signature, folded = self._compiler.fold_argument_types(
-            tuple(map(unliteral, args)), {name: unliteral(kind) for name, kind in kws.items()}
-        )
-        types = tuple(folded)
-        if types not in self._parts:
-            self._parts[types] = self._compile_part(types)
-        signatures = [part.signature for part in self._parts.values()]
-        return make_concrete_template(self.__name__, self, signatures), signature, types, {}
+    def __call__(self, *arguments: P.args, **named: P.kwargs) -> R:
+        """Return what the function returns."""
+        return cast('R', self.compiled(*arguments, **named))
 
-    def _compile_part(self, types: tuple[object, ...]) -> CompileResult:
-        target = self.targetctx
-        library = _PartLibrary(target.codegen(), self.__qualname__)
-        part = compile_extra(
-            self.typingctx, target, self.py_func, types, None, PART_FLAGS, {}, library
-        )
-        part = part._replace(entry_point=object())  # what get_overload identifies it by
-        target.insert_user_function(part.entry_point, part.fndesc, [library])
-        return part
-
-    def get_overload(self, sig: Sequence[object]) -> object:
-        """Return what identifies the code for these arguments in the kernel that is compiled."""
-        return self._parts[tuple(sig)].entry_point
+    def __reduce__(self) -> str:
+        """Return how it is copied and pickled: by its name, without the code."""
+        return self.__name__  # type: ignore[attr-defined, no-any-return]
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
@@ -230,11 +183,7 @@ def kernel(function: Callable[P, R]) -> Callable[P, R]:
     With ``NUMBA_DISABLE_JIT=1`` it is ``function`` itself, for debuggers and for the measurement
     of coverage: a hundred times slower, and a plain number divided by zero is an error there.
     """
-    if config.DISABLE_JIT:
-        return function
-    compiled = _Kernel(function)
-    compiled.enable_caching()
-    return cast('Callable[P, R]', compiled)
+    return function if config.DISABLE_JIT else Kernel(function)
 
 
 class TypedKernel(Generic[P, R]):
@@ -261,14 +210,13 @@ class TypedKernel(Generic[P, R]):
     def _compile(self, arguments: Sequence[object]) -> Callable[P, R]:
         if config.DISABLE_JIT:
             return self._function
-        compiled = cast('_Kernel', self._function)
         # The first call may have an integer where later ones have a float.
-        hints = compiled.py_func.__annotations__.values()
+        hints = self._function.__annotations__.values()
         types = tuple(
             numba.float64 if hint is float else numba.typeof(argument)
             for hint, argument in zip(hints, arguments, strict=False)
         )
-        code: Callable[P, R] = compiled.compile(types)
+        code: Callable[P, R] = cast('Kernel[P, R]', self._function).compiled.compile(types)
         self._code = code
         return code
 

@@ -212,6 +212,65 @@ def test_tests_mirror_the_packages():
     assert len(names) == len(set(names))
 
 
+@pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_no_private_name_of_a_library_is_used(path):
+    """Six classes of the kernels were built on the inside of numba, which any release may change.
+
+    Sees what is imported and what is read from it, not attributes of a library's objects.
+    """
+    assert not _private_names(_tree(path))
+
+
+@pytest.mark.parametrize(
+    'line',
+    [
+        'from numba.core import caching',
+        'import numba.core.dispatcher',
+        'from numba import core',
+        'from yaml import _yaml',
+        'import numba; numba.core.types',
+        'import numpy as np; np.lib._format',
+        'from matplotlib import figure as f; f.Figure._layout',
+    ],
+)
+def test_private_names_of_libraries_are_found(line):
+    assert _private_names(ast.parse(line))
+
+
+def _private_names(tree: ast.AST) -> set[str]:
+    """Return the private names of libraries that are imported or read from what is imported."""
+    names, imported = set(), {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            module = f'{node.module}.' if isinstance(node, ast.ImportFrom) else ''
+            for name in node.names:
+                names.add(module + name.name)
+                # Without a new name, import a.b binds a.
+                top = name.name if module or name.asname else name.name.split('.')[0]
+                imported[name.asname or top] = module + top
+    for node in ast.walk(tree):
+        first, _, rest = ast.unparse(node).partition('.') if _is_dotted(node) else ('', '', '')
+        if first in imported:
+            names.add(f'{imported[first]}.{rest}')
+    return {name for name in names if _is_private(name)}
+
+
+def _is_dotted(node: ast.AST) -> bool:
+    while isinstance(node, ast.Attribute):
+        node = node.value
+    return isinstance(node, ast.Name)
+
+
+def _is_private(name: str) -> bool:
+    import sys
+
+    first, *parts = name.split('.')
+    if first in sys.stdlib_module_names | {'t3mpc_ros'}:
+        return False
+    internal = first == 'numba' and parts[:1] == ['core']
+    return internal or any(re.match('_(?!_)', part) for part in parts)
+
+
 def test_no_test_imports_another_test():
     for path in TESTS.rglob('*.py'):
         for name in _imports(path):

@@ -462,8 +462,8 @@ from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State
 def signatures():
     modules = [module for name, module in sys.modules.items() if name.startswith('t3mpc_ros')]
     kernels = {one for module in modules for one in vars(module).values()
-               if hasattr(one, 'signatures') and not isinstance(one, type)}
-    return {(one.__module__, one.__name__): len(one.signatures) for one in kernels}
+               if hasattr(one, 'compiled') and not isinstance(one, type)}
+    return {(one.__module__, one.__name__): len(one.compiled.signatures) for one in kernels}
 
 controller = control.Controller(getattr(control, sys.argv[1])())
 controller.warm_up()

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.kernels import TypedKernel
+from t3mpc_ros.kernels import Kernel, TypedKernel
 
 SINGLY = 300
 """Most elements of an array that are named one by one."""
@@ -30,6 +30,7 @@ OPAQUE = (
     types.BuiltinFunctionType,
     types.MethodType,
     types.ModuleType,
+    Kernel,
     TypedKernel,
     type,
 )
