@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Complete MCAP files: topics, messages, metadata records and attachments.
 
-The ``mcap`` library parses the records. It does not verify the checksum of the summary, it ends at
-the first damaged chunk, it rejects the intact beginning of a truncated chunk, and it constructs an
-object for each record of a chunk, which takes several times as long as unpacking its head.
+The ``mcap`` library parses the records. It does not verify the checksum of the summary or of an
+attachment, accepts fields that end early, skips unknown records silently, rejects the intact
+beginning of a truncated chunk, and constructs an object for each record of a chunk, which takes
+several times as long as unpacking its head.
 """
 
 from bisect import bisect_left
@@ -12,7 +13,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from io import SEEK_END
+from io import SEEK_END, BytesIO
 from operator import attrgetter
 from pathlib import Path
 import re
@@ -21,8 +22,18 @@ from typing import Any, BinaryIO, NamedTuple
 import zlib
 
 import lz4.frame
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.reader import NonSeekingReader, SeekingReader
+from mcap.reader import NonSeekingReader
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    MetadataIndex,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 import zstandard
 
@@ -92,8 +103,59 @@ class FileWindow:
         return self._file.read(count)
 
 
-class ChunkError(ValueError):
-    """No part of a chunk is usable."""
+class RecordError(ValueError):
+    """A record is incomplete or damaged."""
+
+
+def read_record(window: FileWindow, start: int) -> tuple[Any, int]:
+    """Return the record of the library at ``start`` and its end.
+
+    Raises
+    ------
+    RecordError
+        No complete and valid record begins there. The data of chunks and messages are not checked.
+    """
+    head = window.read(start, HEAD.size)
+    opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
+    end = start + HEAD.size + length
+    name = record_name(opcode)
+    if end > window.size:
+        raise RecordError(f'the file ends inside a {name}')
+    return parse_record(opcode, window.read(start + HEAD.size, length)), end
+
+
+def parse_record(opcode: int, content: bytes) -> Any:
+    """Return a record of the library, whose fields must have the lengths that they state.
+
+    Raises
+    ------
+    RecordError
+        The record is damaged, or its type is unknown.
+    """
+    name, head = record_name(opcode), HEAD.pack(opcode, len(content))
+    stream = BytesIO(head + content)
+    try:
+        record = next(StreamReader(stream, True, emit_chunks=True, record_size_limit=None).records)
+    except Exception as error:  # the library raises anything on damaged bytes
+        raise RecordError(f'a {name} cannot be read: {error or type(error).__name__}') from error
+    builder = RecordBuilder()
+    record.write(builder)
+    fields = bytes(builder.end()[HEAD.size :])
+    if opcode == Opcode.ATTACHMENT:
+        fields = fields[:-4]
+        if int.from_bytes(content[-4:], 'little') not in (0, zlib.crc32(content[:-4])):
+            raise RecordError('the checksum of an attachment is wrong')
+    if not content.startswith(fields):  # later versions of the format may append fields
+        raise RecordError(f'the lengths in a {name} are inconsistent')
+    return record
+
+
+def record_name(opcode: int) -> str:
+    """Return the name of a record type."""
+    try:
+        return str(Opcode(opcode).name).lower().replace('_', ' ')
+    except ValueError:
+        return f'record of unknown type 0x{opcode:02x}'
 
 
 @dataclass(frozen=True)
@@ -120,38 +182,41 @@ class DecodedChunk:
             yield 0, view[position:]
 
 
+def chunk_end(window: FileWindow, start: int) -> int:
+    """Return the end of the chunk at ``start`` by the lengths of its fields; 0 if unknown."""
+    name_length = window.read(start + HEAD.size + _CHUNK_HEAD.size - 4, 4)
+    position = start + HEAD.size + _CHUNK_HEAD.size + int.from_bytes(name_length, 'little')
+    prefix = window.read(position, 8)
+    return position + 8 + int.from_bytes(prefix, 'little') if len(prefix) == 8 else 0
+
+
 def decode_chunk(window: FileWindow, start: int) -> DecodedChunk:
     """Return the content of the chunk at ``start``; of a truncated chunk, the beginning.
 
     Raises
     ------
-    ChunkError
+    RecordError
         The compression is unknown, decompression fails, or the checksum, or without a checksum
         the size, is wrong.
     """
+    end = chunk_end(window, start)
+    if not end:
+        raise RecordError('the file ends inside the head of a chunk')
     position = start + HEAD.size
-    head = window.read(position, _CHUNK_HEAD.size)
-    if len(head) < _CHUNK_HEAD.size:
-        raise ChunkError('the file ends inside the head of a chunk')
-    _, _, size, checksum, name_length = _CHUNK_HEAD.unpack(head)
+    _, _, size, checksum, name_length = _CHUNK_HEAD.unpack(window.read(position, _CHUNK_HEAD.size))
     position += _CHUNK_HEAD.size
     name = window.read(position, min(name_length, _NAME_LIMIT))
-    position += name_length
-    prefix = window.read(position, 8)
-    if len(prefix) < 8:
-        raise ChunkError('the file ends inside the head of a chunk')
-    length = int.from_bytes(prefix, 'little')
-    stored = window.read(position + 8, length)
-    data, finished = _decompress(name, stored)
-    if len(stored) < length:
+    position += name_length + 8
+    data, finished = _decompress(name, window.read(position, end - position))
+    if end > window.size:
         return DecodedChunk(data, complete=False, checked=False)
     if not finished:
-        raise ChunkError('the compressed data of a chunk are incomplete')
+        raise RecordError('the compressed data of a chunk are incomplete')
     if checksum:
         if zlib.crc32(data) != checksum:
-            raise ChunkError('the checksum of a chunk is wrong')
+            raise RecordError('the checksum of a chunk is wrong')
     elif len(data) != size:
-        raise ChunkError(f'a chunk has {len(data)} bytes instead of {size}')
+        raise RecordError(f'a chunk has {len(data)} bytes instead of {size}')
     return DecodedChunk(data, complete=True, checked=checksum != 0)
 
 
@@ -168,21 +233,46 @@ def _decompress(name: bytes, stored: bytes) -> tuple[bytes, bool]:
     elif name == b'lz4':
         decoder = lz4.frame.LZ4FrameDecompressor()
     else:
-        raise ChunkError(f'the compression of a chunk is unknown: {name!r}')
+        raise RecordError(f'the compression of a chunk is unknown: {name!r}')
     if not stored:
         return b'', False
     try:
         data = bytes(decoder.decompress(stored))
     except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
-        raise ChunkError(f'a chunk does not decompress: {error}') from error
+        raise RecordError(f'a chunk does not decompress: {error}') from error
     return data, bool(decoder.eof)
 
 
-def summary_is_valid(window: FileWindow, footer_end: int) -> bool:
-    """Return whether the checksum of the summary is correct or absent."""
-    start, _, checksum = FOOTER.unpack(window.read(footer_end - FOOTER.size, FOOTER.size))
-    start = start or footer_end - FOOTER.size - HEAD.size
-    return not checksum or zlib.crc32(window.read(start, footer_end - 4 - start)) == checksum
+def read_summary(window: FileWindow) -> tuple[Summary, int] | None:
+    """Return the summary of a file and its start; None if it is missing or damaged."""
+    footer_start = window.size - len(MAGIC) - FOOTER.size - HEAD.size
+    tail = window.read(max(footer_start, 0), window.size)
+    footer = tail[: HEAD.size] == HEAD.pack(Opcode.FOOTER, FOOTER.size)
+    if not footer or tail[-len(MAGIC) :] != MAGIC:
+        return None
+    start, _, checksum = FOOTER.unpack(tail[HEAD.size : -len(MAGIC)])
+    content = window.read(start or footer_start, window.size)
+    if checksum and zlib.crc32(content[: -len(MAGIC) - 4]) != checksum:
+        return None
+    summary = Summary()
+    lists = {
+        ChunkIndex: summary.chunk_indexes,
+        AttachmentIndex: summary.attachment_indexes,
+        MetadataIndex: summary.metadata_indexes,
+    }
+    try:
+        for record in StreamReader(BytesIO(content), skip_magic=True).records:
+            if isinstance(record, Schema):
+                summary.schemas[record.id] = record
+            elif isinstance(record, Channel):
+                summary.channels[record.id] = record
+            elif isinstance(record, Statistics):
+                summary.statistics = record
+            elif type(record) in lists:
+                lists[type(record)].append(record)
+    except Exception:  # the library raises anything on damaged bytes
+        return None
+    return summary, start or footer_start
 
 
 class McapFile:
@@ -259,7 +349,7 @@ class McapFile:
             for chunk, next_start_ns in zip(chunks, starts, strict=False):
                 try:
                     pending += _chunk_messages(window, chunk, names, start_ns, stop_ns)
-                except ChunkError:
+                except RecordError:
                     if not skip_damaged:
                         raise
                     self.damaged[chunk.chunk_start_offset] = _message_count(window, chunk)
@@ -285,19 +375,16 @@ class McapFile:
         """
         with self.path.open('rb') as file, read_errors(f'the attachments of {self.path}'):
             window = FileWindow(file, file.seek(0, SEEK_END))
+            found = []
             for index in self._summary.attachment_indexes:
-                start, length = index.offset + HEAD.size, index.length - HEAD.size
-                if not attachment_is_valid(window.read(start, length)):
-                    raise BagError(f'the attachment {index.name} of {self.path} is damaged')
-            file.seek(0)
-            found = list(SeekingReader(file, record_size_limit=window.size).iter_attachments())
-        return [
-            (
-                item.log_time,
-                Attachment(item.name, item.media_type, bytes(item.data), item.create_time),
-            )
-            for item in found
-        ]
+                try:
+                    item, _ = read_record(window, index.offset)
+                except RecordError as error:
+                    text = f'the attachment {index.name} of {self.path} is damaged'
+                    raise BagError(text) from error
+                copy = Attachment(item.name, item.media_type, item.data, item.create_time)
+                found.append((item.log_time, copy))
+            return found
 
     def attachment_sizes(self) -> list[tuple[str, str, int]]:
         """Return name, media type and size in bytes of each attachment."""
@@ -316,7 +403,7 @@ def _chunk_messages(
     """Return the selected messages of one chunk."""
     chunk = decode_chunk(window, index.chunk_start_offset)
     if not chunk.complete:
-        raise ChunkError('the file ends inside a chunk')
+        raise RecordError('the file ends inside a chunk')
     found = []
     data = chunk.data + bytes(_MESSAGE.size)
     position, end = 0, len(chunk.data)
@@ -326,7 +413,7 @@ def _chunk_messages(
         )
         begin, position = position + _MESSAGE.size, position + HEAD.size + length
         if position > end:
-            raise ChunkError('a record of a chunk is truncated')
+            raise RecordError('a record of a chunk is truncated')
         if opcode == Opcode.MESSAGE and channel in names and start_ns <= received_ns < stop_ns:
             message = data[begin:position]
             found.append(SerializedMessage(names[channel], received_ns, published_ns, message))
@@ -341,12 +428,6 @@ def _message_count(window: FileWindow, index: Any) -> int:
     )
 
 
-def attachment_is_valid(content: bytes) -> bool:
-    """Return whether the checksum of an attachment is correct or absent."""
-    checksum = int.from_bytes(content[-4:], 'little')
-    return checksum in (0, zlib.crc32(content[:-4]))
-
-
 def read_mcap_file(path: Path) -> McapFile | None:
     """Return a complete file; None if it is incomplete or its summary is damaged.
 
@@ -355,20 +436,15 @@ def read_mcap_file(path: Path) -> McapFile | None:
     try:
         with path.open('rb') as file:
             window = FileWindow(file, file.seek(0, SEEK_END))
-            end = window.size - len(MAGIC)
-            tail = window.read(end - FOOTER.size - HEAD.size, window.size)
-            footer = tail[: HEAD.size] == HEAD.pack(Opcode.FOOTER, FOOTER.size)
-            if not footer or tail[-len(MAGIC) :] != MAGIC or not summary_is_valid(window, end):
+            found = read_summary(window) if window.read(0, len(MAGIC)) == MAGIC else None
+            if found is None or found[0].statistics is None:
                 return None
-            file.seek(0)
-            reader = SeekingReader(file, record_size_limit=window.size)
-            summary = reader.get_summary()
-            if summary is None or summary.statistics is None:
-                return None
-            records = {item.name: dict(item.metadata) for item in reader.iter_metadata()}
+            summary = found[0]
+            items = [read_record(window, each.offset)[0] for each in summary.metadata_indexes]
+            records = {item.name: dict(item.metadata) for item in items}
             records.pop('rosbag2', None)
             return McapFile(path, summary, records)
-    except Exception:  # the parser of the library raises anything on damaged bytes
+    except (OSError, RecordError, AttributeError):  # an offset may lead to another record
         return None
 
 

@@ -12,6 +12,7 @@ from typing import Self
 
 from mcap.writer import CompressionType, Writer
 
+from t3mpc_ros.bag.finalize_file import finalize_file, open_unbuffered, write_all
 from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, Attachment, collect_metadata
 from t3mpc_ros.bag.metadata import (
     BagMetadata,
@@ -21,7 +22,6 @@ from t3mpc_ros.bag.metadata import (
     write_metadata,
 )
 from t3mpc_ros.bag.qos import QosProfile, dump_yaml, profiles_to_yaml
-from t3mpc_ros.bag.recovery.finalize_file import finalize_file, open_unbuffered, write_all
 from t3mpc_ros.bag.schema import BagError, DataError, MessageDefinitions, UnknownTopicError
 from t3mpc_ros.geometry.types import NANOSECONDS
 

@@ -260,7 +260,7 @@ EXCEPTIONS = {
     **dict.fromkeys(('_Batches', 'FileWindow'), 'one reading'),
     **dict.fromkeys(
         ('_CompletePart', '_NullOutput', '_FileRecovery', 'RecoveredFileWriter', 'TopicResult',
-         'FileResult', 'Scanner'),
+         'FileResult'),
         'one recovery',
     ),
 }  # fmt: skip

@@ -19,9 +19,9 @@ from rosbags.typesys import Stores, get_typestore
 from support import waiting
 from support.missing_tools import find, needs, skip
 
+from t3mpc_ros.bag.finalize_file import finalize_file
 from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.qos import QosProfile, profiles_to_yaml
-from t3mpc_ros.bag.recovery.finalize_file import finalize_file
 from t3mpc_ros.bag.writer import BagWriter
 
 SOURCES = Path(__file__).parents[1] / 'support' / 'mcap_check'

@@ -19,6 +19,7 @@ from support.bag_messages import STORE
 from support.file_watch import Disk, no_file_left_open
 
 from t3mpc_ros.bag import writer as writer_module
+from t3mpc_ros.bag.finalize_file import finalize_file
 from t3mpc_ros.bag.mcap_file import Attachment, has_mcap_magic, read_mcap_file
 from t3mpc_ros.bag.merged_reader import MergedReader
 from t3mpc_ros.bag.metadata import BagMetadata, read_origin, write_metadata
@@ -26,7 +27,6 @@ from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline, ReadAhead
 from t3mpc_ros.bag.qos import QosError, read_qos_overrides
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recording.snapshot import write_snapshot
-from t3mpc_ros.bag.recovery.finalize_file import finalize_file
 from t3mpc_ros.bag.recovery.recover_bag import recover_bag
 from t3mpc_ros.bag.run.model_file import ModelError, load_model, save_model
 from t3mpc_ros.bag.schema import BagError, MessageDefinitions

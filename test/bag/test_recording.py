@@ -10,6 +10,7 @@ from rosbags.rosbag2 import Reader
 from support.bag_files import metadata_of
 
 from t3mpc_ros.bag import writer
+from t3mpc_ros.bag.finalize_file import finalize_file
 from t3mpc_ros.bag.mcap_file import (
     MESSAGE_OVERHEAD,
     Attachment,
@@ -34,7 +35,6 @@ from t3mpc_ros.bag.recording.snapshot import (
     unused_folder,
     write_snapshot,
 )
-from t3mpc_ros.bag.recovery.finalize_file import finalize_file
 from t3mpc_ros.bag.schema import BagError, MessageDefinitions
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilter, TopicFilterError
 from t3mpc_ros.bag.writer import (

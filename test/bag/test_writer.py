@@ -17,12 +17,12 @@ from rosbags.typesys import Stores, get_typestore
 from support.bag_files import metadata_of, topics_of
 import yaml
 
+from t3mpc_ros.bag import finalize_file as finalization
 from t3mpc_ros.bag import writer
+from t3mpc_ros.bag.finalize_file import finalize_file
 from t3mpc_ros.bag.mcap_file import read_mcap_file
 from t3mpc_ros.bag.qos import QosProfile, profiles_from_yaml
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
-from t3mpc_ros.bag.recovery import finalize_file as finalization
-from t3mpc_ros.bag.recovery.finalize_file import finalize_file
 from t3mpc_ros.bag.schema import BagError, DataError, UnknownTopicError, UnknownTypeError
 from t3mpc_ros.bag.writer import BagWriter, DiskError, FolderError
 

@@ -15,8 +15,8 @@ from support.long_tests import few_of
 from support.recorder_bench import run
 from support.waiting import wait_for_acknowledgement, wait_until
 
+from t3mpc_ros.bag.finalize_file import finalize_file
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.recovery.finalize_file import finalize_file
 from t3mpc_ros.cli.process_group import ProcessError
 
 pytestmark = [pytest.mark.ros, pytest.mark.timed]

@@ -3,15 +3,13 @@
 """Recovery of one damaged MCAP file into a complete one."""
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import replace
 import io
+import re
 import struct
 from typing import Any, BinaryIO
 import zlib
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -21,31 +19,23 @@ from mcap.records import (
     MessageIndex,
     Metadata,
     Schema,
-    Statistics,
 )
 from mcap.writer import CompressionType, Writer
 
 from t3mpc_ros.bag.mcap_file import (
-    FOOTER,
     HEAD,
     MAGIC,
     MESSAGE_HEAD,
-    ChunkError,
     DecodedChunk,
     FileWindow,
-    attachment_is_valid,
+    RecordError,
+    chunk_end,
     decode_chunk,
-    summary_is_valid,
+    parse_record,
+    read_record,
+    read_summary,
 )
 from t3mpc_ros.bag.recovery.result import Damage, FileResult, TopicResult
-from t3mpc_ros.bag.recovery.scanner import (
-    INDEX_RECORDS,
-    RecordFit,
-    Scanner,
-    Span,
-    chunk_time_range,
-    classify_record,
-)
 from t3mpc_ros.bag.schema import BagError
 
 CHUNK_BYTES = 256 * 1024
@@ -59,8 +49,12 @@ Progress = Callable[[int, int], None]
 """Callback with the number of processed bytes and the size of the file."""
 
 _BLOCK = 2**20
-_SUMMARY_RECORDS = INDEX_RECORDS - {Opcode.MESSAGE_INDEX}
-_PARSE_ERRORS = (McapError, ValueError, struct.error)  # errors of a record that cannot be parsed
+_OPCODES = frozenset(Opcode)
+_DATA_END = HEAD.pack(Opcode.DATA_END, 4)
+_CANDIDATE = re.compile(rb'[\x05\x06].{5}\x00\x00\x00|' + re.escape(MAGIC), re.DOTALL)
+"""A message or chunk of less than 2^40 bytes, or the beginning or end of a file."""
+_TRUNCATED_LIMIT = 2**28
+"""Maximum plausible size of a truncated record, bytes."""
 
 
 class UnreadableError(BagError):
@@ -104,23 +98,19 @@ class _FileRecovery:
         self._rewriter = RecoveredFileWriter(output, compress)
         self._result = FileResult(name, window.size)
         self._topics: dict[int, str] = {}  # by channel
-        self._summary_definitions: dict[tuple[int, int], Any] | None = None
-        self._statistics: Statistics | None = None
         self._lost: dict[int, int] = {}  # messages by channel, from message indexes
         self._unattributed: dict[int, int] = {}  # messages by undefined channel
-        self._lost_chunk: Damage | None = None  # its message indexes may follow
-        self._lost_chunk_is_uncertain = False  # further chunks may be lost with it
-        self._position = 0
+        self._after_lost_chunk = False  # its message indexes may follow
         self._record_count = 0
+        self._chunked = False  # then a message behind damaged bytes is a part of a damaged chunk
+        found = read_summary(window)
+        self._summary = found and found[0]
+        self._data_end = found[1] if found else window.size
+        self._statistics = self._summary.statistics if self._summary else None
+        self._result.ended = found is not None
 
     def run(self, progress: Progress) -> FileResult:
-        has_magic = self._window.read(0, len(MAGIC)) == MAGIC
-        start = len(MAGIC) if has_magic else self._find_start()
-        if start > len(MAGIC):
-            reason = 'bytes before the MCAP magic'
-            self._result.damages.append(Damage(0, start - len(MAGIC), reason))
-        size = self._window.size
-        reached = 0
+        size, reached = self._window.size, 0
 
         def report(position: int) -> None:
             nonlocal reached
@@ -128,128 +118,238 @@ class _FileRecovery:
                 reached = position
                 progress(position, size)
 
+        self._report = report
         progress(0, size)
-        for span in Scanner(self._window, start, self._is_known_channel, report).spans():
-            report(span.start)
-            self._position = span.end
-            if span.opcode != Opcode.MESSAGE_INDEX:
-                self._close_lost_chunk()
-            self._record_count += span.opcode != 0
-            if span.reason:
-                self._take_damaged(span)
-            else:
-                self._take(span)
-        self._close_lost_chunk()
-        if not has_magic and not self._record_count:
-            name = self._result.name or 'the input'
-            raise UnreadableError(f'{name} contains no MCAP data')
-        if not has_magic:
+        position = self._start()
+        while position < size:
+            report(position)
+            position = self._take(position)
+        if self._window.read(0, len(MAGIC)) != MAGIC:
+            if not self._record_count:
+                name = self._result.name or 'the input'
+                raise UnreadableError(f'{name} contains no MCAP data')
             self._add_note('the MCAP magic at the beginning of the file is damaged')
         if not self._result.ended:
             self._add_note('the file has no end: the last chunk of its writer was not written')
         self._count_losses()
         self._rewriter.finish()
-        progress(self._window.size, self._window.size)
+        progress(size, size)
         return self._result
 
-    def _find_start(self) -> int:
-        """Return the start of the records in a file that does not begin with the magic."""
-        for start in (0, len(MAGIC)):
-            if classify_record(self._window, start).fit is RecordFit.VALID:
-                return start
+    def _start(self) -> int:
+        """Return the start of the records, also without the magic before them."""
         magic = self._window.read(0, _BLOCK).find(MAGIC)
-        return magic + len(MAGIC) if magic > 0 else 0
+        for start in (0, len(MAGIC)):
+            if magic != 0 and self._begins_record(start):
+                return start
+        if magic > 0:
+            self._result.damages.append(Damage(0, magic, 'bytes before the MCAP magic'))
+        return magic + len(MAGIC) if magic >= 0 else 0
 
     # -- records --------------------------------------------------------------------------------
 
-    def _take(self, span: Span) -> None:
-        if span.opcode in _SUMMARY_RECORDS:
-            self._result.ended = True
+    def _take(self, start: int) -> int:
+        """Copy the record at ``start``; return where the next one begins."""
+        opcode, end = self._head(start)
+        was_after_lost_chunk, self._after_lost_chunk = self._after_lost_chunk, False
         try:
-            if span.opcode == Opcode.CHUNK:
-                self._take_chunk(span)
-            elif span.opcode == Opcode.MESSAGE_INDEX:
-                if self._lost_chunk:
-                    index = MessageIndex.read(self._stream(span))
-                    self._lost_chunk = self._add_losses(self._lost_chunk, index)
-            else:
-                self._take_record(span.opcode, memoryview(self._content(span)), checked=False)
-                if span.opcode == Opcode.DATA_END:
-                    self._verify_data_checksum(span)
-                elif span.opcode == Opcode.FOOTER and not summary_is_valid(self._window, span.end):
-                    self._statistics = None
-                    self._add_note('the summary of the file is damaged')
-        except _PARSE_ERRORS as error:
-            self._damage(span, f'a record cannot be read: {error or type(error).__name__}')
+            if opcode == Opcode.CHUNK:
+                self._chunked = True
+                return self._take_chunk(start, end)
+            if opcode == Opcode.MESSAGE and end <= self._window.size:
+                if not self._begins_record(end):
+                    raise RecordError('no record found')
+                content = self._window.read(start + HEAD.size, end - start - HEAD.size)
+                self._take_message(memoryview(content), checked=False)
+                self._record_count += 1
+                return end
+            record, end = read_record(self._window, start)
+        except RecordError as error:
+            return self._skip(start, str(error))
+        self._record_count += 1
+        if isinstance(record, MessageIndex):
+            if was_after_lost_chunk:
+                self._add_losses(record)
+                self._after_lost_chunk = True
+        elif isinstance(record, DataEnd):
+            self._result.ended = True
+            self._data_end = min(self._data_end, start)
+            self._verify_data_checksum(start, record.data_section_crc)
+        elif opcode == Opcode.FOOTER:
+            return self._end_file(end)
+        elif start < self._data_end:
+            self._take_record(record)
+        return end
 
-    def _take_record(self, opcode: int, content: memoryview, checked: bool) -> None:
-        """Copy a record other than a chunk, from inside or outside of a chunk."""
-        if opcode == Opcode.MESSAGE:
-            self._take_message(content, checked)
-            return
-        stream = ReadDataStream(io.BytesIO(content))
-        if opcode == Opcode.SCHEMA:
-            self._rewriter.schema(Schema.read(stream))
-        elif opcode == Opcode.CHANNEL:
-            self._add_channel(Channel.read(stream))
-        elif opcode == Opcode.HEADER:
-            header = Header.read(stream)
-            self._rewriter.start(header.profile, header.library)
-        elif opcode == Opcode.METADATA:
-            self._rewriter.metadata(Metadata.read(stream))
-        elif opcode == Opcode.ATTACHMENT:
-            if not attachment_is_valid(bytes(content)):
-                raise ValueError('the checksum of an attachment is wrong')
-            self._rewriter.attachment(Attachment.read(stream))
-        elif opcode == Opcode.STATISTICS:
-            self._statistics = Statistics.read(stream)
+    def _take_record(self, record: Any) -> None:
+        if isinstance(record, Schema):
+            self._rewriter.schema(record)
+        elif isinstance(record, Channel):
+            self._add_channel(record)
+        elif isinstance(record, Header):
+            self._rewriter.start(record.profile, record.library)
+        elif isinstance(record, Metadata):
+            self._rewriter.metadata(record)
+        elif isinstance(record, Attachment):
+            self._rewriter.attachment(record)
 
-    def _take_message(self, content: memoryview, checked: bool) -> None:
+    def _take_message(self, content: memoryview, checked: bool) -> bool:
+        """Copy a message; return False if its channel is unknown."""
         if len(content) < MESSAGE_HEAD.size:
-            raise ValueError('a message is shorter than its head')
+            raise RecordError('a message is shorter than its head')
         channel = int.from_bytes(content[:2], 'little')
         if not self._is_known_channel(channel):
             self._unattributed[channel] = self._unattributed.get(channel, 0) + 1
-            return
+            return False
         self._rewriter.message(content)
         topic = self._result.topics[self._topics[channel]]
         topic.kept += 1
         topic.unchecked += not checked
+        return True
 
-    def _take_chunk(self, span: Span) -> None:
-        try:
-            chunk = decode_chunk(self._window, span.start)
-            if not chunk.complete:
-                raise ChunkError('the file ends inside the data of a chunk')
-        except ChunkError as error:
-            time_range = chunk_time_range(self._window, span.start)
-            self._lost_chunk = Damage(span.start, span.end, str(error), span_ns=time_range)
-            self._lost_chunk_is_uncertain = False
-            return
-        if invalid := self._take_records(chunk):
-            self._damage(span, f'{invalid} records of a chunk cannot be read')
+    def _take_chunk(self, start: int, end: int) -> int:
+        inner_end = chunk_end(self._window, start)
+        agree = inner_end == end
+        if inner_end > self._window.size and not agree:  # not to read the rest of a long file
+            raise RecordError('the lengths in a chunk are inconsistent')
+        chunk = decode_chunk(self._window, start)
+        if not chunk.complete:
+            kept = self._take_records(chunk)
+            reason = f'the file ends inside a chunk; {kept} messages of it are kept, unchecked'
+            self._add_damage(start, self._window.size, reason, self._time_range(start))
+            return self._window.size
+        if not (chunk.checked or agree):
+            raise RecordError('the lengths in a chunk are inconsistent')
+        self._record_count += 1
+        self._take_records(chunk)
+        if agree:
+            return end
+        ends = [each for each in (inner_end, end) if self._begins_record(each)]
+        return ends[0] if ends else self._skip(inner_end, 'no record found')
 
     def _take_records(self, chunk: DecodedChunk) -> int:
-        """Copy the records of a chunk; return the number of invalid ones."""
-        invalid = 0
+        """Copy the records of a chunk; return the number of kept messages."""
+        invalid = count = 0
         self._rewriter.close_chunk()
         for opcode, content in chunk.records():
-            if opcode not in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
-                invalid += 1
-                continue
             try:
-                self._take_record(opcode, content, chunk.checked)
-            except _PARSE_ERRORS:
+                if opcode == Opcode.MESSAGE:
+                    count += self._take_message(content, chunk.checked)
+                elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    self._take_record(parse_record(opcode, bytes(content)))
+                else:
+                    invalid += chunk.complete
+            except RecordError:
                 invalid += 1
         self._rewriter.close_chunk()
-        return invalid
+        if invalid:
+            self._add_damage(0, 0, f'{invalid} records of a chunk cannot be read')
+        return count
+
+    def _end_file(self, position: int) -> int:
+        """Return the end of the file after its footer."""
+        self._result.ended = True
+        if self._summary is None:
+            self._add_note('the summary of the file is damaged')
+        if self._window.read(position, len(MAGIC)) == MAGIC:
+            position += len(MAGIC)
+        if position < self._window.size:
+            self._add_damage(position, self._window.size, 'bytes after the end of the file')
+        return self._window.size
+
+    # -- damaged records ------------------------------------------------------------------------
+
+    def _skip(self, start: int, reason: str) -> int:
+        """Record a damaged record; return where the next one begins.
+
+        This is its end, if a record begins there, or the next record that is reliable.
+        """
+        opcode, end = self._head(start)
+        rest = self._window.read(start, len(_DATA_END) + 4)
+        if start + len(rest) == self._window.size and _DATA_END.startswith(rest[: HEAD.size]):
+            self._result.ended = True
+            self._data_end = start
+        span_ns, messages, harmless = None, None, False
+        if start < end and self._begins_record(end):
+            if opcode == Opcode.CHUNK:
+                self._after_lost_chunk = True
+                span_ns = self._time_range(start)
+            elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+                messages = 0
+            harmless = opcode == Opcode.MESSAGE_INDEX and self._statistics is not None
+        else:
+            end = self._next_record(start + 1)
+        self._add_damage(start, end, reason, span_ns, harmless, messages)
+        return end
+
+    def _begins_record(self, position: int) -> bool:
+        """Return whether a record, possibly truncated, or the end of the file is at a position."""
+        size = self._window.size
+        if position + HEAD.size > size:
+            return position <= size
+        opcode, end = self._head(position)
+        if opcode == Opcode.MESSAGE:
+            channel = self._window.read(position + HEAD.size, 2)
+            if len(channel) == 2 and not self._is_known_channel(int.from_bytes(channel, 'little')):
+                return False
+        if end > size:
+            return opcode in _OPCODES and end - position < _TRUNCATED_LIMIT
+        if opcode in (Opcode.CHUNK, Opcode.MESSAGE):
+            return opcode == Opcode.MESSAGE or chunk_end(self._window, position) == end
+        try:
+            read_record(self._window, position)
+        except RecordError:
+            return False
+        return True
+
+    def _next_record(self, start: int) -> int:
+        """Return the start of the next reliable chunk or message, or the end of the file.
+
+        A message or attachment may contain a valid MCAP file: bytes between two MCAP magics are
+        skipped.
+        """
+        within = False
+        size = self._window.size
+        for block_start in range(start, size, _BLOCK):
+            self._report(block_start)
+            block = self._window.read(block_start, _BLOCK + HEAD.size - 1)
+            offset = 0
+            while (match := _CANDIDATE.search(block, offset)) and match.start() < _BLOCK:
+                offset = match.start() + 1
+                if match[0] == MAGIC:
+                    within = not within
+                elif not within and self._is_reliable(block_start + match.start()):
+                    return block_start + match.start()
+        return size
+
+    def _is_reliable(self, start: int) -> bool:
+        """Return whether a valid chunk begins at ``start``, or a message and two more records."""
+        opcode, end = self._head(start)
+        if opcode == Opcode.MESSAGE:
+            places = start, end, self._head(end)[1]
+            return not self._chunked and all(map(self._begins_record, places))
+        if end > self._window.size or chunk_end(self._window, start) != end:
+            return False
+        try:
+            chunk = decode_chunk(self._window, start)
+        except RecordError:
+            return False
+        return chunk.checked or all(opcode for opcode, _ in chunk.records())
+
+    def _head(self, start: int) -> tuple[int, int]:
+        """Return opcode and end of a record according to its head; zeros after the last byte."""
+        head = self._window.read(start, HEAD.size)
+        if len(head) < HEAD.size:
+            return 0, 0
+        opcode, length = HEAD.unpack(head)
+        return opcode, start + HEAD.size + length
 
     # -- channels -------------------------------------------------------------------------------
 
     def _add_channel(self, record: Channel) -> None:
         if not self._rewriter.has_schema(record.schema_id):
-            schema = self._find_definition(Opcode.SCHEMA, record.schema_id)
-            if schema is None:
+            schema = self._summary and self._summary.schemas.get(record.schema_id)
+            if not schema:
                 self._add_note(
                     f'the type of {record.topic} is lost: its messages cannot be decoded'
                 )
@@ -264,78 +364,44 @@ class _FileRecovery:
         """Return whether a channel is defined, before this position or in the summary."""
         if channel in self._topics:
             return True
-        record = self._find_definition(Opcode.CHANNEL, channel)
-        if record is None:
-            return False
-        self._add_channel(record)
-        return True
-
-    def _find_definition(self, opcode: int, number: int) -> Any:
-        if self._summary_definitions is None:
-            self._summary_definitions = _find_definitions(self._window, self._position)
-        return self._summary_definitions.get((opcode, number))
+        if self._summary and channel in self._summary.channels:
+            self._add_channel(self._summary.channels[channel])
+        return channel in self._topics
 
     # -- losses ---------------------------------------------------------------------------------
 
-    def _take_damaged(self, span: Span) -> None:
-        if span.truncated and span.opcode == Opcode.CHUNK:
-            self._take_truncated_chunk(span)
-        elif span.opcode == Opcode.CHUNK or span.opcode == 0:
-            time_range = chunk_time_range(self._window, span.start) if span.opcode else None
-            harmless = self._result.ended  # the data section has ended
-            self._lost_chunk_is_uncertain = span.opcode == 0
-            self._lost_chunk = Damage(
-                span.start, span.end, span.reason, harmless=harmless, span_ns=time_range
-            )
-        else:
-            self._damage(span, span.reason)
+    def _add_damage(
+        self,
+        start: int,
+        end: int,
+        reason: str,
+        span_ns: tuple[int, int] | None = None,
+        harmless: bool = False,
+        messages: int | None = None,
+    ) -> None:
+        after_data = self._result.ended and start >= self._data_end
+        damage = Damage(start, end, reason, harmless or after_data, messages, span_ns)
+        self._result.damages.append(damage)
 
-    def _take_truncated_chunk(self, span: Span) -> None:
-        time_range = chunk_time_range(self._window, span.start)
-        before = {name: topic.kept for name, topic in self._result.topics.items()}
-        with suppress(ChunkError):  # the span already has a reason
-            self._take_records(decode_chunk(self._window, span.start))
-        kept = sum(t.kept - before.get(name, 0) for name, t in self._result.topics.items())
-        reason = f'{span.reason}; {kept} messages of it are kept, unchecked'
-        self._result.damages.append(Damage(span.start, span.end, reason, span_ns=time_range))
+    def _add_losses(self, index: MessageIndex) -> None:
+        """Add the messages of one message index to those of the last, damaged chunk."""
+        count = len(index.records)
+        self._lost[index.channel_id] = self._lost.get(index.channel_id, 0) + count
+        chunk = self._result.damages[-1]
+        self._result.damages[-1] = replace(chunk, messages=(chunk.messages or 0) + count)
 
-    def _damage(self, span: Span, reason: str) -> None:
-        harmless = span.opcode in INDEX_RECORDS or self._result.ended
-        if span.opcode in _SUMMARY_RECORDS:
-            self._result.ended = True
-        messages = 0 if span.opcode in (Opcode.METADATA, Opcode.ATTACHMENT) else None
-        self._result.damages.append(
-            Damage(span.start, span.end, reason, harmless, messages=messages)
-        )
-
-    def _add_losses(self, damage: Damage, index: MessageIndex) -> Damage:
-        """Return a lost chunk with the messages listed in one of its message indexes."""
-        times = [time for time, _ in index.records]
-        if not times:
-            return damage
-        self._lost[index.channel_id] = self._lost.get(index.channel_id, 0) + len(times)
-        if self._lost_chunk_is_uncertain:  # the index may belong to one of several chunks
-            return damage
-        first, last = damage.span_ns or (times[0], times[0])
-        return replace(
-            damage,
-            messages=(damage.messages or 0) + len(times),
-            span_ns=(min(first, *times), max(last, *times)),
-        )
-
-    def _close_lost_chunk(self) -> None:
-        """Add the lost chunk to the result after its last message index."""
-        if self._lost_chunk:
-            self._result.damages.append(self._lost_chunk)
-            self._lost_chunk = None
+    def _time_range(self, start: int) -> tuple[int, int] | None:
+        """Return first and last message time in the head of a chunk, ns; None if invalid."""
+        head = self._window.read(start + HEAD.size, 16)
+        if len(head) < 16:
+            return None
+        first, last = struct.unpack('<QQ', head)
+        return (first, last) if first <= last < 2**63 else None
 
     def _count_losses(self) -> None:
         """Count the lost messages; exactly if the file has its statistics."""
         result = self._result
         statistics = self._statistics
-        if result.clean and not self._unattributed:
-            result.exact = True
-            return
         if statistics is not None and all(
             self._is_known_channel(channel) for channel in statistics.channel_message_counts
         ):
@@ -345,6 +411,9 @@ class _FileRecovery:
                 totals[name] = totals.get(name, 0) + count
             for topic in result.topics.values():
                 topic.lost = max(0, totals.get(topic.name, 0) - topic.kept)
+            lost = sum(topic.lost for topic in result.topics.values())
+            if lost and result.clean:
+                result.damages.append(Damage(0, 0, f'{lost} messages are missing'))
             result.exact = True
             return
         for channel, count in [*self._lost.items(), *self._unattributed.items()]:
@@ -358,15 +427,13 @@ class _FileRecovery:
         open_ends = [d for d in result.damages if not d.harmless and d.messages is None]
         result.exact = result.ended and not open_ends
 
-    def _verify_data_checksum(self, span: Span) -> None:
+    def _verify_data_checksum(self, end: int, expected: int) -> None:
         """Verify the checksum of the data section, which covers records without a checksum."""
-        expected = DataEnd.read(self._stream(span)).data_section_crc
         if not expected or self._result.damages:
             return
         checksum = 0
-        for start in range(0, span.start, _BLOCK):
-            count = min(_BLOCK, span.start - start)
-            checksum = zlib.crc32(self._window.read(start, count), checksum)
+        for start in range(0, end, _BLOCK):
+            checksum = zlib.crc32(self._window.read(start, min(_BLOCK, end - start)), checksum)
         if checksum != expected:
             reason = (
                 'the checksum of the data section is wrong: a record outside the chunks differs'
@@ -376,12 +443,6 @@ class _FileRecovery:
     def _add_note(self, text: str) -> None:
         if text not in self._result.notes:
             self._result.notes.append(text)
-
-    def _content(self, span: Span) -> bytes:
-        return self._window.read(span.start + HEAD.size, span.end - span.start - HEAD.size)
-
-    def _stream(self, span: Span) -> ReadDataStream:
-        return ReadDataStream(io.BytesIO(self._content(span)))
 
 
 class RecoveredFileWriter:
@@ -482,30 +543,3 @@ class RecoveredFileWriter:
 
     def _ensure_started(self) -> None:
         self.start('ros2', '')
-
-
-def _find_definitions(window: FileWindow, position: int) -> dict[tuple[int, int], Any]:
-    """Return schemas and channels after ``position`` by opcode and number.
-
-    They are usually in the summary; a summary with a wrong checksum is ignored.
-    """
-    end = window.size - len(MAGIC)
-    footer = Span(end - HEAD.size - FOOTER.size, end, Opcode.FOOTER)
-    head = window.read(max(0, footer.start), HEAD.size)
-    if footer.start >= position and head == HEAD.pack(Opcode.FOOTER, FOOTER.size):
-        if not summary_is_valid(window, end):
-            return {}
-        (start,) = struct.unpack('<Q', window.read(footer.start + HEAD.size, 8))
-        position = max(position, start)
-    found: dict[tuple[int, int], Any] = {}
-    for span in Scanner(window, position, lambda channel: True).spans():
-        if span.reason or span.opcode not in (Opcode.SCHEMA, Opcode.CHANNEL):
-            continue
-        content = window.read(span.start + HEAD.size, span.end - span.start - HEAD.size)
-        stream = ReadDataStream(io.BytesIO(content))
-        try:
-            record = (Schema if span.opcode == Opcode.SCHEMA else Channel).read(stream)
-        except _PARSE_ERRORS:
-            continue
-        found.setdefault((span.opcode, record.id), record)
-    return found

@@ -7,14 +7,13 @@ For every other file, :func:`~t3mpc_ros.bag.recovery.recover_bag.recover_bag` wr
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-import io
 import os
 from pathlib import Path
 import struct
 from typing import Any
 import zlib
 
-from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
@@ -25,7 +24,6 @@ from mcap.records import (
     DataEnd,
     Footer,
     Header,
-    Message,
     MessageIndex,
     Metadata,
     MetadataIndex,
@@ -33,16 +31,18 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.stream_reader import breakup_chunk
 
 from t3mpc_ros.bag.mcap_file import (
     FOOTER,
     HEAD,
     MAGIC,
     FileWindow,
-    attachment_is_valid,
+    RecordError,
+    decode_chunk,
     has_mcap_magic,
+    parse_record,
     read_mcap_file,
+    read_record,
 )
 from t3mpc_ros.bag.schema import BagError
 
@@ -58,14 +58,6 @@ _SUMMARY_OPCODES = {
     MetadataIndex: Opcode.METADATA_INDEX,
 }
 """Records of a summary, in its order."""
-_DATA_RECORDS: dict[int, Any] = {
-    Opcode.HEADER: Header,
-    Opcode.METADATA: Metadata,
-    Opcode.ATTACHMENT: Attachment,
-    Opcode.CHUNK: Chunk,
-    Opcode.MESSAGE_INDEX: MessageIndex,
-}
-"""Records before the end of the data."""
 
 
 @dataclass
@@ -140,19 +132,12 @@ def _complete_parts(path: Path) -> Iterator[_CompletePart]:
     with path.open('rb') as file:
         window = FileWindow(file, path.stat().st_size)
         start = len(MAGIC)
-        while len(head := window.read(start, HEAD.size)) == HEAD.size:
-            opcode, length = HEAD.unpack(head)
-            end = start + HEAD.size + length
-            if end > window.size or opcode not in _DATA_RECORDS:
-                return
-            content = window.read(start + HEAD.size, length)
-            if opcode == Opcode.ATTACHMENT and not attachment_is_valid(content):
-                return
+        while True:
             try:
-                record = _DATA_RECORDS[opcode].read(ReadDataStream(io.BytesIO(content)))
+                record, end = read_record(window, start)
                 if isinstance(record, Chunk):
-                    chunk = _chunk_part(start, end, record)
-            except Exception:  # the library raises anything on damaged bytes
+                    chunk = _chunk_part(window, start, end, record)
+            except RecordError:
                 return
             if isinstance(record, MessageIndex) and chunk:
                 index = chunk.summary[-1]
@@ -164,6 +149,8 @@ def _complete_parts(path: Path) -> Iterator[_CompletePart]:
                     chunk = None
             elif isinstance(record, Header | Metadata | Attachment):
                 yield _CompletePart(end, _indexes(record, start, end - start))
+            elif not isinstance(record, Chunk):
+                return
             start = end
 
 
@@ -186,14 +173,15 @@ def _indexes(record: Any, offset: int, length: int) -> list[Any]:
     return []
 
 
-def _chunk_part(start: int, end: int, chunk: Chunk) -> _CompletePart:
+def _chunk_part(window: FileWindow, start: int, end: int, chunk: Chunk) -> _CompletePart:
     """Return a chunk without its message indexes; its own index is the last of the summary."""
     part = _CompletePart(end)
-    for record in breakup_chunk(chunk, validate_crc=True):
-        if isinstance(record, Message):
-            part.counts[record.channel_id] = part.counts.get(record.channel_id, 0) + 1
+    for opcode, content in decode_chunk(window, start).records():
+        if opcode == Opcode.MESSAGE:
+            channel = int.from_bytes(content[:2], 'little')
+            part.counts[channel] = part.counts.get(channel, 0) + 1
         else:
-            part.summary.append(record)
+            part.summary.append(parse_record(opcode, bytes(content)))
     index = ChunkIndex(
         chunk_length=end - start,
         chunk_start_offset=start,
