@@ -145,7 +145,9 @@ def parse_record(opcode: int, content: bytes) -> Any:
         fields = fields[:-4]
         if int.from_bytes(content[-4:], 'little') not in (0, zlib.crc32(content[:-4])):
             raise RecordError('the checksum of an attachment is wrong')
-    if not content.startswith(fields):  # later versions of the format may append fields
+    # Later versions of the format may append fields, but not to the end of a file.
+    ends = opcode in (Opcode.DATA_END, Opcode.FOOTER)
+    if not content.startswith(fields) or (ends and len(content) > len(fields)):
         raise RecordError(f'the lengths in a {name} are inconsistent')
     return record
 

@@ -315,6 +315,20 @@ def test_a_lost_chunk_is_counted_per_topic_with_its_time(own):
         assert damage.size == outcome.lost_bytes == entry.chunk_length
 
 
+@pytest.mark.parametrize('bit', range(8))
+def test_a_chunk_that_looks_like_another_record_is_lost(own, bit):
+    """As an index record, it was not counted as lost; as a footer, the rest was lost as well."""
+    ends, place = chunk_ends(own), make_reader(io.BytesIO(own)).get_summary().chunk_indexes[9]
+    damaged = bytearray(own)
+    damaged[place.chunk_start_offset] ^= 1 << bit
+    outcome, result = salvaged(bytes(damaged))
+    kept, whole = inside(result).messages, inside(own).messages
+    assert is_subsequence(kept, whole)
+    assert len(kept) + sum(topic.lost for topic in outcome.topics.values()) == len(whole)
+    assert len(whole) - len(kept) == ends[10][1] - ends[9][1]
+    assert not outcome.clean
+
+
 def test_channels_of_a_lost_first_chunk_are_found_in_the_summary(own):
     entry = make_reader(io.BytesIO(own)).get_summary().chunk_indexes[0]
     damaged = bytearray(own)
