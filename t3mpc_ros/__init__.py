@@ -16,7 +16,7 @@ from t3mpc_ros.version import VERSION
 
 if TYPE_CHECKING:
     from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
-    from t3mpc_ros.evaluation.link_faults import LinkFaults
+    from t3mpc_ros.evaluation.simulated_links import LinkFaults
     from t3mpc_ros.scripting.bag_columns import BagColumns, read_bag
     from t3mpc_ros.scripting.chaos_generator import ChaosSolution, chaos
     from t3mpc_ros.scripting.comparison_runs import Comparison, compare
@@ -69,7 +69,7 @@ _HOMES = {
     'scripting.references': ('Waypoints',),
     'scripting.script_error': ('ScriptError',),
     'scripting.single_run': ('RunResult', 'simulate'),
-    'evaluation.link_faults': ('LinkFaults',),
+    'evaluation.simulated_links': ('LinkFaults',),
     'simulation.fault_injection': ('FaultEvent', 'FaultSchedule'),
     _BASELINE: ('NominalModel', 'Observation'),
 }

@@ -10,7 +10,7 @@ from pathlib import Path
 import sys
 from typing import Any, TypeVar
 
-from t3mpc_ros.cli import calibrate
+from t3mpc_ros.cli import robot_calibrate
 from t3mpc_ros.cli.command import ArgumentParser, ask_line, check_writable
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 from t3mpc_ros.parameters.table import ParameterError
@@ -238,7 +238,9 @@ def _jog(options: argparse.Namespace, stop: StopSignal) -> int:
 
 
 def _calibrate(options: argparse.Namespace, stop: StopSignal) -> int:
-    return calibrate.calibrate(options, _link_parameters(options), _key_option(options), stop)
+    return robot_calibrate.calibrate(
+        options, _link_parameters(options), _key_option(options), stop
+    )
 
 
 def _doctor(options: argparse.Namespace, stop: StopSignal) -> int:
@@ -397,7 +399,7 @@ def _parser() -> argparse.ArgumentParser:
     calibrating = commands.add_parser(
         'calibrate', help='measure wheels, track, gyro, distance sensors and battery, step by step'
     )
-    calibrate.add_arguments(calibrating)
+    robot_calibrate.add_arguments(calibrating)
     examining = commands.add_parser(
         'doctor', help='go through the bench checklist: measure, ask, write a report'
     )

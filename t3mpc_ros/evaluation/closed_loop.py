@@ -27,7 +27,6 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     Observation,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.link_faults import PeriodicLinks
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import (
     DRIVES,
@@ -40,6 +39,7 @@ from t3mpc_ros.evaluation.scenario import (
     counted_rows,
     switch_times,
 )
+from t3mpc_ros.evaluation.simulated_links import PeriodicLinks
 from t3mpc_ros.parameters.table import Parameters
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant.paper_plant import DisturbedPlant

@@ -15,7 +15,7 @@ from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
-from t3mpc_ros.evaluation.link_faults import (
+from t3mpc_ros.evaluation.simulated_links import (
     DROPOUTS,
     JITTER,
     LINK_TEXTS,

@@ -21,8 +21,8 @@ from t3mpc_ros.control.controller import (
     StepperControllerParameters,
 )
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.evaluation.link_faults import NO_FAULTS, LinkFaults, OrderedLink, delay_between
 from t3mpc_ros.evaluation.scenario import RATE, Scenario
+from t3mpc_ros.evaluation.simulated_links import NO_FAULTS, LinkFaults, OrderedLink, delay_between
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, State, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError

@@ -13,7 +13,7 @@ import numpy as np
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from t3mpc_ros.chaos.path_source import (
+from t3mpc_ros.chaos.pose_reference import (
     GivenPathSource,
     PathClock,
     PathReferenceParameters,

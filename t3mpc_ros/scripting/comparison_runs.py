@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from t3mpc_ros.evaluation.confidence_intervals import Difference
-from t3mpc_ros.evaluation.link_faults import LinkFaults
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     METRICS,
     QUICK_SEEDS,
@@ -22,6 +21,7 @@ from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     Results,
 )
 from t3mpc_ros.evaluation.method_comparison.compared_runs import compare as run_plan
+from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.tuning.search_space import find_names
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.scripting.controllers import OwnMethod, as_controllers

@@ -20,7 +20,6 @@ import numpy as np
 
 from t3mpc_ros.evaluation.closed_loop import JobError, WorkerPool, map_jobs
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
-from t3mpc_ros.evaluation.link_faults import LinkFaults
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     METRICS,
     Job,
@@ -29,6 +28,7 @@ from t3mpc_ros.evaluation.method_comparison.compared_runs import (
 from t3mpc_ros.evaluation.paper.experiment_runs import source_digest
 from t3mpc_ros.evaluation.reporting import Table, finite, format_interval
 from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
+from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.tuning.search_space import find_names
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.scripting.comparison_runs import checked_seeds

@@ -9,7 +9,6 @@ import os
 from typing import Any
 
 from t3mpc_ros.control.actuation import LimitParameters
-from t3mpc_ros.evaluation.link_faults import LinkFaults
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     DRIVES,
     ROBOT_TEXTS,
@@ -18,6 +17,7 @@ from t3mpc_ros.evaluation.method_comparison.compared_runs import (
 )
 from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario, check_name
 from t3mpc_ros.evaluation.scenario import LoopPlant, SampledReference, Scenario
+from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.tuning.search_space import find_names
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.scripting.plants import (

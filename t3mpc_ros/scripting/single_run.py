@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.closed_loop import LoopRecord, run
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.link_faults import LinkFaults
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     METRICS,
     START,
@@ -28,6 +27,7 @@ from t3mpc_ros.evaluation.method_comparison.compared_runs import (
 from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario, counted_rows
+from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.twin_closed_loop import INITIAL_STANDSTILL, TwinRecord
 from t3mpc_ros.scripting.controllers import as_controller
 from t3mpc_ros.scripting.plants import NoiseLaw

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from t3mpc_ros.chaos.path_source import (
+from t3mpc_ros.chaos.pose_reference import (
     GivenPathSource,
     PathClock,
     PathReferenceParameters,

@@ -5,8 +5,8 @@
 import numpy as np
 import pytest
 
-from t3mpc_ros.chaos.path_source import PathReferenceParameters, PortraitSource
 from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
+from t3mpc_ros.chaos.pose_reference import PathReferenceParameters, PortraitSource
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import ORIGIN

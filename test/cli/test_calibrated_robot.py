@@ -17,8 +17,8 @@ from support.emulator_bench import RobotBench
 from support.missing_tools import AVR, needing
 import yaml
 
-from t3mpc_ros.cli import calibrate
 from t3mpc_ros.cli import robot as cli
+from t3mpc_ros.cli import robot_calibrate
 from t3mpc_ros.radio.protocol.authentication import read_key
 from t3mpc_ros.radio.tool import procedure
 
@@ -61,8 +61,8 @@ def test_a_new_robot_is_set_up_calibrated_and_knows_where_it_is(bench, monkeypat
         'run_at_port',
         lambda task, path, stop, device='': bench.run(task, robot=path == 'usb'),
     )
-    monkeypatch.setattr(calibrate, '_asker', lambda stop: person.ask)
-    monkeypatch.setattr(calibrate, '_show', person.show)
+    monkeypatch.setattr(robot_calibrate, '_asker', lambda stop: person.ask)
+    monkeypatch.setattr(robot_calibrate, '_show', person.show)
     monkeypatch.setattr(sys.stdin, 'isatty', lambda: True)
     for command in SETUP:
         assert cli.main(command.split()) == 0

@@ -14,8 +14,8 @@ import pytest
 from support.missing_tools import needs
 from support.waiting import communicate
 
-from t3mpc_ros.cli import calibrate
 from t3mpc_ros.cli import robot as cli
+from t3mpc_ros.cli import robot_calibrate
 from t3mpc_ros.radio.protocol.authentication import key_check, read_key
 from t3mpc_ros.radio.serial_port import SerialPort
 from t3mpc_ros.radio.tool import procedure
@@ -195,7 +195,7 @@ def test_an_interrupted_calibration_keeps_what_it_found(capsys, monkeypatch, tmp
     rates = 0.01 + 5e-4 * np.random.default_rng(1).standard_normal(500)
     still = np.zeros(500)
     recording = Recording(0.02 * np.arange(500), still, still, rates, 500, 500)
-    monkeypatch.setattr(calibrate.LinkedRobot, 'rest', lambda robot, seconds: recording)
+    monkeypatch.setattr(robot_calibrate.LinkedRobot, 'rest', lambda robot, seconds: recording)
     read, write = os.pipe()
     path = tmp_path / 'found.yaml'
     with os.fdopen(read) as terminal:
@@ -209,7 +209,7 @@ def test_an_interrupted_calibration_keeps_what_it_found(capsys, monkeypatch, tmp
     output = capsys.readouterr()
     assert 'bias of the gyro 0.57' in output.out
     assert 'interrupted' in output.err
-    bias = calibrate.read_parameter_file(path)[0].gyro_bias
+    bias = robot_calibrate.read_parameter_file(path)[0].gyro_bias
     assert bias.value == pytest.approx(0.01, abs=1e-4)
 
 

@@ -15,7 +15,7 @@ import pytest
 from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError
 from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
 from t3mpc_ros.bag.schema import BagError
-from t3mpc_ros.cli import calibrate, process_group
+from t3mpc_ros.cli import process_group, robot_calibrate
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup
 from t3mpc_ros.emulator.fault_injection import FaultError
@@ -245,13 +245,13 @@ def replace(monkeypatch, target, result):
 
 def test_an_interrupted_calibration_ends_with_130(monkeypatch, tmp_path, capsys):
     def run(wizard):
-        raise calibrate.Interrupted
+        raise robot_calibrate.Interrupted
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, 'stdin', SimpleNamespace(isatty=lambda: True))
-    monkeypatch.setattr(calibrate.CalibrationWizard, 'run', run)
+    monkeypatch.setattr(robot_calibrate.CalibrationWizard, 'run', run)
     assert main(['robot', 'calibrate', '--port', 'p']) == 130
-    monkeypatch.setattr(calibrate.CalibrationWizard, 'run', lambda wizard: Calibration())
+    monkeypatch.setattr(robot_calibrate.CalibrationWizard, 'run', lambda wizard: Calibration())
     assert main(['robot', 'calibrate', '--port', 'p']) == 0
     assert not list(tmp_path.iterdir())
 

@@ -240,11 +240,11 @@ ROBOT = {
     'radio.tool.robot_log.format_log': '',
     'radio.tool.robot_settings.read_settings': None,
     'radio.tool.robot_settings.write_settings': STORED,
-    'cli.calibrate.CalibrationWizard': lambda start, **_: SimpleNamespace(
+    'cli.robot_calibrate.CalibrationWizard': lambda start, **_: SimpleNamespace(
         run=lambda: None, calibration=start
     ),
-    'cli.calibrate.read_parameter_file': (Calibration(), {}),
-    'cli.calibrate.LinkedRobot': SimpleNamespace(has_usb=False),
+    'cli.robot_calibrate.read_parameter_file': (Calibration(), {}),
+    'cli.robot_calibrate.LinkedRobot': SimpleNamespace(has_usb=False),
     'cli.robot_doctor.run_doctor': [],
 }
 

@@ -24,7 +24,6 @@ from t3mpc_ros.evaluation.closed_loop import (
     run,
 )
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired, student_quantile
-from t3mpc_ros.evaluation.link_faults import NO_FAULTS
 from t3mpc_ros.evaluation.scenario import (
     CASES,
     DRIVES,
@@ -34,6 +33,7 @@ from t3mpc_ros.evaluation.scenario import (
     TUNING_SEEDS,
     Scenario,
 )
+from t3mpc_ros.evaluation.simulated_links import NO_FAULTS
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia

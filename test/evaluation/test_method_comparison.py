@@ -19,7 +19,6 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
     ProportionalIntegralParameters,
 )
 from t3mpc_ros.evaluation.closed_loop import MethodSpec
-from t3mpc_ros.evaluation.link_faults import LinkFaults
 from t3mpc_ros.evaluation.method_comparison.compared_runs import (
     DRIFT,
     DRIVES,
@@ -50,6 +49,7 @@ from t3mpc_ros.evaluation.method_comparison.comparison_page import (
 from t3mpc_ros.evaluation.method_comparison.twin_scenario import CASES, TwinBaseline, TwinScenario
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, TUNING_SEEDS
+from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.twin_closed_loop import (
     INITIAL_STANDSTILL,
     drive_twin,

@@ -7,7 +7,7 @@ import yaml
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli import bag as bag_cli
-from t3mpc_ros.cli.calibrate import parameter_file
+from t3mpc_ros.cli.robot_calibrate import parameter_file
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode

@@ -17,7 +17,7 @@ from support.other_parameters import with_other_value
 from support.ros_graph import NODE_CLASSES
 
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.chaos.path_source import PortraitSource
+from t3mpc_ros.chaos.pose_reference import PortraitSource
 from t3mpc_ros.chaos.reference import ChaoticReference
 from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
 from t3mpc_ros.control.watchdog import Reason

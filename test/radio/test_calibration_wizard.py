@@ -12,8 +12,8 @@ import pytest
 from support.calibration_bench import CalibrationBench, Person
 import yaml
 
-from t3mpc_ros.cli import calibrate as cli
 from t3mpc_ros.cli import robot as robot_cli
+from t3mpc_ros.cli import robot_calibrate as cli
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes.registry import parameter_class
 from t3mpc_ros.parameters.table import ParameterError

@@ -13,7 +13,7 @@ import pytest
 
 import t3mpc_ros as t3
 from t3mpc_ros.cli.main import main
-from t3mpc_ros.evaluation.link_faults import LinkFaults
+from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.scripting import parameter_sweep
 from t3mpc_ros.scripting.parameter_sweep import make_cells
 from t3mpc_ros.scripting.setting import Setting

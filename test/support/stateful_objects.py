@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from support.fresh_state import OPAQUE, Configured, Operation, Stateful
-from t3mpc_ros.chaos.path_source import (
+from t3mpc_ros.chaos.pose_reference import (
     PathClock,
     PathReferenceParameters,
     PortraitSource,

@@ -17,20 +17,20 @@ from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController, NominalModel
 from t3mpc_ros.evaluation.closed_loop import MethodLoop, observed_reference
-from t3mpc_ros.evaluation.link_faults import (
-    DROPOUTS,
-    JITTER,
-    LINK_TEXTS,
-    NO_FAULTS,
-    OVERLOAD,
-    LinkFaults,
-)
 from t3mpc_ros.evaluation.scenario import (
     RATE,
     SampledReference,
     check_run,
     nominal_model,
     sample_reference,
+)
+from t3mpc_ros.evaluation.simulated_links import (
+    DROPOUTS,
+    JITTER,
+    LINK_TEXTS,
+    NO_FAULTS,
+    OVERLOAD,
+    LinkFaults,
 )
 from t3mpc_ros.evaluation.twin_closed_loop import LEAD, loop_controller, loop_robot
 from t3mpc_ros.geometry.kinematics import wheels_from_twist

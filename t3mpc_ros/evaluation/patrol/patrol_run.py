@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.chaos.path_source import PathClock, WaitParameters
 from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
+from t3mpc_ros.chaos.pose_reference import PathClock, WaitParameters
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.keep_out import Activity
