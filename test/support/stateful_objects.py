@@ -1293,7 +1293,7 @@ NEVER_RESET = {
     **dict.fromkeys(('EventQueue', 'RadioChannel', '_Exchange'), 'one emulator, never reset'),
     **dict.fromkeys(('PtyPort', '_ConsolePort', 'StopTimeMonitor'), 'one process, never reset'),
     # No state that changes.
-    **dict.fromkeys(('Arena', 'StateArray', '_OnceLoader', '_Loader'), 'constant'),
+    **dict.fromkeys(('Arena', 'StateArray'), 'constant'),
 }
 """Classes without an entry in FRESH, and why."""
 
