@@ -109,8 +109,6 @@ def pytest_collection_modifyitems(config, items):
         marks = {mark.name for mark in item.iter_markers()} & {*MARKS}
         if not certain <= marks <= possible:
             raise pytest.UsageError(f'{item.nodeid}: its file must name its marks, mark.NAME')
-        if 'T3MPC_COVERAGE' in os.environ and marks & {'ros', 'slow'} == {'slow'}:
-            item.add_marker('no_cover')
     if config.option.part:
         number, count = config.option.part
         _keep(config, items, items[number - 1 :: count])

@@ -16,7 +16,7 @@ from support.checkout import ROOT, load_example
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.compiled]
 
 example = load_example('digital_twin')
 COURSES = ('square ccw', 'square cw', '10 turns')
