@@ -19,7 +19,7 @@ import yaml
 
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml
+from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml, shortened
 
 UNLIMITED = 2**63 - 1
 """RMW_DURATION_INFINITE in nanoseconds: 9223372036 s and 854775807 ns."""
@@ -206,13 +206,15 @@ def read_qos_overrides(path: Path | str) -> dict[str, QosProfile]:
 def _override_profile(topic: str, policies: Any) -> QosProfile:
     default = QosProfile().to_mapping()
     if not isinstance(policies, Mapping):
-        raise QosError(f'{topic} must have policies such as reliability: got {policies!r}')
+        raise QosError(
+            f'{topic} must have policies such as reliability: got {shortened(policies)}'
+        )
     for name, value in policies.items():
         if name not in default:
             raise QosError(f'{topic}: {name!r} is none of {", ".join(default)}')
         complete = isinstance(value, Mapping) and {'sec', 'nsec'} <= set(value)
         if name in _DURATIONS and not complete:
-            raise QosError(f'{topic}: {name} must have sec and nsec: got {value!r}')
+            raise QosError(f'{topic}: {name} must have sec and nsec: got {shortened(value)}')
     try:
         return QosProfile.from_mapping({**default, **policies})
     except QosError as error:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.path_timing import PathError
-from t3mpc_ros.parameters.yaml_files import YamlError, parse_yaml, read_text
+from t3mpc_ros.parameters.yaml_files import YamlError, parse_yaml, read_text, shortened
 
 Array = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def _yaml_rows(text: str) -> list[tuple[str, object]]:
         raise PathError(f'there is no entry {min(unknown)}; known are points, closed, name')
     closed = content.get('closed', False)
     if not isinstance(closed, bool):
-        raise PathError(f'closed must be true or false: got {closed!r}')
+        raise PathError(f'closed must be true or false: got {shortened(closed)}')
     points = content['points']
     return [(f'points[{n}]', point) for n, point in enumerate(points + points[:1] * closed)]
 
@@ -92,7 +92,7 @@ def _is_number(text: str) -> bool:
 
 def _point(where: str, row: object) -> tuple[float, float]:
     if not isinstance(row, list) or len(row) != 2:
-        raise PathError(f'{where} must be [x, y] in m: got {row!r}')
+        raise PathError(f'{where} must be [x, y] in m: got {shortened(row)}')
     found = []
     for name, value in zip('xy', row, strict=True):
         try:
@@ -102,7 +102,7 @@ def _point(where: str, row: object) -> tuple[float, float]:
         if not abs(number) <= MAX_COORDINATE:
             raise PathError(
                 f'{name} of {where} must be a number of at most {MAX_COORDINATE:g} m: '
-                f'got {value!r}'
+                f'got {shortened(value)}'
             )
         found.append(number)
     return found[0], found[1]

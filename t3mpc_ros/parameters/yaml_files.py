@@ -4,12 +4,19 @@
 
 import os
 from pathlib import Path
+import reprlib
 from typing import Any
 
 import yaml
 
 MAX_FILE_SIZE = 1_000_000
 """Bytes."""
+
+
+_ERRORS = yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError
+"""Of the parser itself, too: an invalid date, endless brackets, ``!!int`` without digits."""
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 80
 
 
 class YamlError(ValueError):
@@ -54,11 +61,17 @@ def parse_yaml(text: str) -> object:
     except yaml.MarkedYAMLError as error:
         line = f'line {error.problem_mark.line + 1}: ' if error.problem_mark else ''
         raise YamlError(f'is not YAML: {line}{error.problem}') from error
-    except (
-        yaml.YAMLError, ValueError, TypeError, LookupError, AttributeError, RecursionError,
-    ) as error:  # fmt: skip
-        # Of the parser itself, too: an invalid date, endless brackets, !!int without digits.
+    except _ERRORS as error:
         raise YamlError(f'is not YAML: {" ".join(str(error).split())}') from error
+
+
+def shortened(value: object) -> str:
+    """Return a value of a file for an error, in 80 characters at most.
+
+    A file of a few lines can hold a list of lists whose whole text has gigabytes.
+    """
+    text = _SHORT.repr(value)
+    return text if len(text) <= 80 else f'{text[:77]}...'
 
 
 class _Loader(yaml.SafeLoader):

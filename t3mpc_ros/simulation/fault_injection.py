@@ -17,7 +17,7 @@ from t3mpc_ros.parameters.table import (
     nearest_hint,
     parameter,
 )
-from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml
+from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml, shortened
 
 SCHEDULES_FOLDER = Path(__file__).resolve().parent / 'schedules'
 """Folder of the bundled schedules."""
@@ -130,7 +130,7 @@ class FaultEvent:
         if not isinstance(self.fault, str) or self.fault not in FAULTS:
             raise ScheduleError(
                 f'fault must be one of {", ".join(FAULTS)}: '
-                f'got {_shortened(self.fault)}{nearest_hint(str(self.fault), FAULTS)}'
+                f'got {shortened(self.fault)}{nearest_hint(str(self.fault), FAULTS)}'
             )
         spec = FAULTS[self.fault]
         try:
@@ -251,7 +251,7 @@ def _entries(content: object) -> tuple[list[str], list[object]]:
                 raise ScheduleError(f'the only key must be events: got {key}')
         content = content.get('events')
     if not isinstance(content, list):
-        raise ScheduleError(f'events must be a list of entries: got {_shortened(content)}')
+        raise ScheduleError(f'events must be a list of entries: got {shortened(content)}')
     return [f'events[{index}]' for index in range(len(content))], content
 
 
@@ -261,7 +261,7 @@ _KEYS = ('at', 'fault', 'value', 'for')
 def _event(name: str, entry: object) -> FaultEvent:
     if not isinstance(entry, dict):
         raise ScheduleError(
-            f'{name} must be a mapping of {", ".join(_KEYS)}: got {_shortened(entry)}'
+            f'{name} must be a mapping of {", ".join(_KEYS)}: got {shortened(entry)}'
         )
     for key in entry:
         if key not in _KEYS:
@@ -271,7 +271,7 @@ def _event(name: str, entry: object) -> FaultEvent:
             )
     for key in _KEYS[:3]:
         if key not in entry:
-            raise ScheduleError(f'{name}.{key} is missing: got {_shortened(entry)}')
+            raise ScheduleError(f'{name}.{key} is missing: got {shortened(entry)}')
     try:
         return FaultEvent(entry['at'], entry['fault'], entry['value'], entry.get('for', math.inf))
     except ScheduleError as error:
@@ -282,15 +282,10 @@ def _seconds(name: str, value: object, low: float) -> float:
     """Return ``value`` as seconds, or raise :class:`ScheduleError`."""
     bound = f'{name} must be at least {low:g} s'
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ScheduleError(f'{bound}: got {_shortened(value)}{_number_hint(value)}')
+        raise ScheduleError(f'{bound}: got {shortened(value)}{_number_hint(value)}')
     if not low <= value <= _MAX_TIME:  # not so for NaN either
-        raise ScheduleError(f'{bound} and at most {_MAX_TIME:g}: got {_shortened(value)}')
+        raise ScheduleError(f'{bound} and at most {_MAX_TIME:g}: got {shortened(value)}')
     return float(value)
-
-
-def _shortened(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 80 else f'{text[:77]}...'
 
 
 def _number_hint(value: object) -> str:

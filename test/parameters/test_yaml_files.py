@@ -4,7 +4,13 @@
 
 import pytest
 
-from t3mpc_ros.parameters.yaml_files import MAX_FILE_SIZE, YamlError, read_yaml
+from t3mpc_ros.parameters.yaml_files import (
+    MAX_FILE_SIZE,
+    YamlError,
+    parse_yaml,
+    read_yaml,
+    shortened,
+)
 
 BAD = {
     b'walls: [': 'is not YAML: line 1: ',
@@ -45,3 +51,15 @@ def test_the_longest_file_and_an_empty_one_are_read(tmp_path, monkeypatch):
     assert read_yaml(path) == {'a': [1, 2.5, 'Zürich']}
     path.write_bytes(b'')
     assert read_yaml(path) is None
+
+
+def test_an_error_does_not_write_out_a_list_of_lists():
+    """An entry of ten lines, each nine times the one before, took all memory in an error."""
+    text = 'a0: &a0 [x]\n' + ''.join(
+        f'a{n + 1}: &a{n + 1} [{", ".join([f"*a{n}"] * 9)}]\n' for n in range(12)
+    )
+    content = parse_yaml(text)
+    assert isinstance(content, dict)
+    assert shortened(content['a12']).startswith('[[[')
+    assert len(shortened(content['a12'])) == 80
+    assert shortened({'at': 1, 'fault': 'gyro_dead'}) == "{'at': 1, 'fault': 'gyro_dead'}"
