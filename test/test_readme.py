@@ -68,7 +68,7 @@ SHORTENED = {
     'scripts/run controller --ros-args -p law.gain:=20.0': ([], True),
     'scripts/run reference_generator --ros-args -p seed:=7': ([], True),
     'scripts/run composed': (['--ros-args', '-p', 'storage.uri:=OUTPUT/bag'], True),
-    'scripts/demo --view': (['--duration', '2', '--headless', '--output', 'OUTPUT/view'], False),
+    'scripts/demo --view': (['--duration', '8', '--headless', '--output', 'OUTPUT/view'], False),
     'scripts/run t3mpc view': (['--headless', '--port', '0'], True),
     'scripts/run t3mpc view --bag runs/latest/bag': (['--headless', '--port', '0'], True),
     'scripts/run t3mpc patrol': (
