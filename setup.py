@@ -107,8 +107,7 @@ setup(
         NAME: ['py.typed'],
         # A link in the repository; the emulator compiles them.
         f'{NAME}.emulator': ['firmware/core/*.[ch]', 'firmware/host/*.[ch]'],
-        f'{NAME}.evaluation': ['*.html', '*.css', '*.js'],
-        f'{NAME}.evaluation.method_comparison': ['*.yaml'],
+        f'{NAME}.evaluation': ['*.html', '*.css', '*.js', '*.yaml'],
         f'{NAME}.evaluation.patrol': ['*.csv'],
         f'{NAME}.evaluation.training': ['*.npz'],
         f'{NAME}.evaluation.tuning': ['*.json'],

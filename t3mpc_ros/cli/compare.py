@@ -17,7 +17,7 @@ from t3mpc_ros.cli.run_options import (
 )
 
 if TYPE_CHECKING:
-    from t3mpc_ros.evaluation.method_comparison.compared_runs import ComparisonPlan
+    from t3mpc_ros.evaluation.experiment import ComparisonPlan
 
 DEFAULT_SEEDS = '201-206'
 
@@ -82,13 +82,9 @@ def run(options: argparse.Namespace) -> int:
     ModuleNotFoundError
         A method needs a library that is not installed.
     """
-    from t3mpc_ros.evaluation.method_comparison.compared_runs import (
-        ComparisonPlan,
-        cases_for,
-        default_methods,
-        methods_for,
-    )
-    from t3mpc_ros.evaluation.methods import require_libraries
+    from t3mpc_ros.evaluation.cases import cases_for
+    from t3mpc_ros.evaluation.experiment import ComparisonPlan, default_methods
+    from t3mpc_ros.evaluation.methods import methods_for, require_libraries
     from t3mpc_ros.evaluation.tuning.search_space import find_names
 
     if options.own or options.reference or options.robot not in ROBOTS:
@@ -131,8 +127,8 @@ def _compare_own(options: argparse.Namespace) -> int:
 
 
 def _compare_and_write(options: argparse.Namespace, plan: 'ComparisonPlan') -> int:
-    from t3mpc_ros.evaluation.method_comparison import comparison_page
-    from t3mpc_ros.evaluation.method_comparison.compared_runs import compare
+    from t3mpc_ros.evaluation import comparison_page
+    from t3mpc_ros.evaluation.experiment import compare
     from t3mpc_ros.evaluation.reporting import strict_json
     from t3mpc_ros.scripting.executors import workers_for
 

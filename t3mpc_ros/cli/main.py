@@ -187,14 +187,16 @@ def _compile_robots() -> None:
 
 def _compile_controllers() -> None:
     from t3mpc_ros.control.controller import Controller, StepperControllerParameters
-    from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
+    from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
+    from t3mpc_ros.evaluation.loop import run
+    from t3mpc_ros.evaluation.method import MethodSpec
     from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
-    from t3mpc_ros.evaluation.scenario import DRIVES, Scenario
+    from t3mpc_ros.evaluation.scenario import Scenario
 
     Controller(StepperControllerParameters()).warm_up()
-    for drive in DRIVES:
+    for robot in PLANTS:
         spec = MethodSpec('full', ProposedController, ProposedParameters())
-        run(Scenario(drive, 0.04, 'nominal', 1, 1.0), spec)
+        run(Scenario(robot, NOMINAL, 1, 1.0), spec)
 
 
 def _method_definitions() -> 'Sequence[MethodDefinition]':

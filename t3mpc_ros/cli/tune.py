@@ -108,7 +108,7 @@ def _tuned(
     """Return the parameters after tuning on the chosen robots."""
     output = options.output or OUTPUT
     if options.robot == TWIN:
-        from t3mpc_ros.evaluation.method_comparison.twin_tuning import tune_twin, twin_definitions
+        from t3mpc_ros.evaluation.tuning.twin_tuning import tune_twin, twin_definitions
 
         return tune_twin(
             twin_definitions(methods),

@@ -17,19 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.method import NodeMethod
+from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.record import RATE, STATUS_FLAGS, Record, rolling_speeds
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, progress_bar
-from t3mpc_ros.evaluation.twin_closed_loop import (
-    INITIAL_STANDSTILL,
-    STATUS_FLAGS,
-    TwinRecord,
-    chaotic_course,
-    loop_controller,
-    loop_robot,
-    run_twin,
-    straight_course,
+from t3mpc_ros.evaluation.scenario import (
+    LEAD,
+    OwnParts,
+    SampledReference,
+    Scenario,
+    sampled_speeds,
 )
-from t3mpc_ros.geometry.kinematics import twist_from_wheels
-from t3mpc_ros.geometry.types import WheelSpeeds, wrap_angle
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
+from t3mpc_ros.geometry.types import BodyTwist, WheelSpeeds, wrap_angle
 from t3mpc_ros.parameters.table import Value
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import (
@@ -92,8 +93,8 @@ class Outcome:
 def evaluate_outcome(
     name: str,
     course: str,
-    record: TwinRecord,
-    undisturbed_run: TwinRecord,
+    record: Record,
+    undisturbed_run: Record,
     begin: float,
     end: float,
     parameters: DigitalTwinParameters,
@@ -105,7 +106,7 @@ def evaluate_outcome(
     last = float(record.time[-1])
     stays = end >= last
     reasons = stop_reasons(record, begin)
-    stopped = bool(record.robot_reasons[-1] or record.controller_reasons[-1])
+    stopped = bool(record.robot_reasons[-1] or record.driver_reasons[-1])
     recovery_time = None if stays or stopped else time_to_return(record, undisturbed_run, end)
     violation = _bound_violation(record, begin, parameters)
     if violation:
@@ -137,13 +138,13 @@ def evaluate_outcome(
     )
 
 
-def time_to_return(record: TwinRecord, undisturbed_run: TwinRecord, end: float) -> float | None:
+def time_to_return(record: Record, undisturbed_run: Record, end: float) -> float | None:
     """Return the time (s) from ``end`` until the wheel error stays recovered; None if it does not.
 
     It has recovered if from then on to the end it is at most :data:`ALLOWED` times the error of
     the run without the fault, in the same time or before the fault, whichever is larger.
     """
-    errors = record.rotors - record.reference, undisturbed_run.rotors - undisturbed_run.reference
+    errors = record.speeds - record.reference, undisturbed_run.speeds - undisturbed_run.reference
     usual = rms(errors[1][undisturbed_run.rows(SETTLED, BEGIN)])
     last = float(record.time[-1])
     for wait in np.arange(0.0, last - REST - end, 0.5).tolist():
@@ -153,39 +154,39 @@ def time_to_return(record: TwinRecord, undisturbed_run: TwinRecord, end: float) 
     return None
 
 
-def wheel_error(record: TwinRecord, begin: float, end: float) -> float:
+def wheel_error(record: Record, begin: float, end: float) -> float:
     """Return the error (rad/s) of the rotors from ``begin`` to ``end`` (s)."""
-    return rms((record.rotors - record.reference)[record.rows(begin, end)])
+    return rms((record.speeds - record.reference)[record.rows(begin, end)])
 
 
-def _odometry_error(record: TwinRecord, time: float) -> tuple[float, float]:
+def _odometry_error(record: Record, time: float) -> tuple[float, float]:
     """Return the odometry error (m, rad) just before ``time`` (s)."""
     row = record.rows(time, time + 1.0).start - 1
-    x, y, yaw = (record.odometry[row] - record.truth[row]).tolist()
+    x, y, yaw = (record['odometry'][row] - record['truth'][row]).tolist()
     return float(np.hypot(x, y)), abs(wrap_angle(yaw))
 
 
-def stop_reasons(record: TwinRecord, begin: float) -> dict[str, float]:
+def stop_reasons(record: Record, begin: float) -> dict[str, float]:
     """Return the duration (s) of each stop reason of robot and controller."""
     period = float(record.time[1] - record.time[0])
     reasons: dict[str, float] = {}
     for row in range(record.rows(begin, begin + 1.0).start, len(record.time)):
-        text = record.robot_reasons[row] or record.controller_reasons[row]
+        text = record.robot_reasons[row] or record.driver_reasons[row]
         if text:
             reasons[text] = reasons.get(text, 0.0) + period
     return reasons
 
 
-def _bound_violation(record: TwinRecord, begin: float, parameters: DigitalTwinParameters) -> str:
+def _bound_violation(record: Record, begin: float, parameters: DigitalTwinParameters) -> str:
     """Return the violated bound as text; '' if there is none."""
     limiter = parameters.limiter
-    rows = slice(record.rows(INITIAL_STANDSTILL, begin).start, None)
+    rows = slice(record.rows(record.start, begin).start, None)
     limit = limiter.wheel_speed
-    for what, speeds in (('command', record.commanded[rows]), ('wheel', record.rotors[rows])):
+    for what, speeds in (('command', record['commanded'][rows]), ('wheel', record.speeds[rows])):
         fastest = float(np.max(np.abs(speeds)))
         if not fastest <= limit + 1e-6:
             return f'a {what} of {fastest:.1f} rad/s, the limit being {limit:g}'
-    for right, left in record.commanded[rows].tolist():
+    for right, left in record['commanded'][rows].tolist():
         twist = twist_from_wheels(WheelSpeeds(right, left), parameters.geometry)
         if abs(twist.linear) > limiter.linear_speed + 1e-6:
             return f'a command of {twist.linear:.2f} m/s'
@@ -196,13 +197,13 @@ def _bound_violation(record: TwinRecord, begin: float, parameters: DigitalTwinPa
         since = None if not text else row if since is None else since
         if since is None or record.time[row] - record.time[since] < BRAKING_TIME:
             continue
-        if np.any(record.commanded[row]):
+        if np.any(record['commanded'][row]):
             return f'the robot moves although it reports a stop ({text})'
     return ''
 
 
 def _detected(
-    record: TwinRecord, undisturbed_run: TwinRecord, begin: float, end: float
+    record: Record, undisturbed_run: Record, begin: float, end: float
 ) -> tuple[str, ...]:
     """Return the signs of robot and controller from the begin of the fault."""
     found = []
@@ -222,19 +223,20 @@ def _detected(
         reported = np.array([one == text for one in record.robot_reasons[rows]])
         note(f'"{text.split(":")[0]}"', reported)
     during = record.rows(begin, end)
-    if np.isnan(record.nearest[during]).all():
+    if np.isnan(record['ranges'][during]).all():
         found.append('no distances')
-    error = rms((record.measured - record.reference)[during])
-    usual = rms((undisturbed_run.measured - undisturbed_run.reference)[during])
+    error = rms((record['measured'] - record.reference)[during])
+    usual = rms((undisturbed_run['measured'] - undisturbed_run.reference)[during])
     if error > ALLOWED * usual and not any(record.robot_reasons[during]):
         found.append(f'tracking error {error:.2f} rad/s')
     return tuple(found)
 
 
-def _ranges(record: TwinRecord, begin: float, end: float) -> str:
+def _ranges(record: Record, begin: float, end: float) -> str:
     """Return the nearest range in the last 2 s before ``begin``, and from then on."""
     before, during = (
-        record.nearest[record.rows(*span)] for span in ((begin - 2.0, begin), (begin, end))
+        np.fmin.reduce(record['ranges'][record.rows(*span)], axis=1)
+        for span in ((begin - 2.0, begin), (begin, end))
     )
     if not np.isfinite(before).any():
         return ''
@@ -246,7 +248,7 @@ def _ranges(record: TwinRecord, begin: float, end: float) -> str:
 
 
 def _undetected(
-    record: TwinRecord,
+    record: Record,
     begin: float,
     end: float,
     off: tuple[float, float],
@@ -255,10 +257,10 @@ def _undetected(
     """Return the effects that only ground truth shows."""
     found = []
     rows = record.rows(begin, end)
-    lost = np.abs(record.lost_steps[record.rows(begin, float(record.time[-1]))]).max(axis=0)
+    lost = np.abs(record['lost_steps'][record.rows(begin, float(record.time[-1]))]).max(axis=0)
     if lost.any():
         found.append(f'lost steps {lost[0]}, {lost[1]}')
-    slide = rms((record.ground - record.rotors)[rows])
+    slide = rms((rolling_speeds(record, WheelGeometry()) - record.speeds)[rows])
     if slide > 0.2:
         found.append(f'tyres slide ({slide:.1f} rad/s)')
     if off[0] > usual[0] + 0.02 or off[1] > usual[1] + 0.05:
@@ -271,8 +273,15 @@ DURATION = 40.0
 PAUSE = (5.0, 1.0)
 """Time from the fault to the pause of the controller of a stopped robot, and its length, s."""
 
-REFERENCE_COURSES: Mapping[str, Callable[[float], Array]] = {
-    'chaotic': chaotic_course,
+
+def straight_course(duration: float, turn: float = 0.0) -> SampledReference:
+    """Return 0.2 m/s straight ahead, or turning (rad/s)."""
+    wheels = wheels_from_twist(BodyTwist(0.2, turn), WheelGeometry())
+    return sampled_speeds(np.tile(wheels, (round((duration + LEAD) * RATE) + 1, 1)))
+
+
+REFERENCE_COURSES: Mapping[str, Callable[[float], SampledReference]] = {
+    'chaotic': lambda duration: Scenario('servo', 'nominal', 1, duration).reference(),
     'straight': straight_course,
     'arc': lambda duration: straight_course(duration, turn=-0.06),
 }
@@ -296,10 +305,15 @@ class FaultRun:
         """The name of the fault, ``collision`` for a wall."""
         return 'collision' if self.event is None else self.event.fault
 
-    @property
-    def schedule(self) -> FaultSchedule:
-        """Fault schedule of the robot."""
-        return FaultSchedule([] if self.event is None else [self.event], self.name)
+    def scenario(self, pauses: tuple[tuple[float, float], ...] = ()) -> Scenario:
+        """Return the run on the twin, with pauses of the controller (s)."""
+        own = OwnParts(
+            reference=_course(self.course, self.duration),
+            events=FaultSchedule([] if self.event is None else [self.event], self.name),
+            robot_parameters={'world': self.world},
+            pauses=pauses,
+        )
+        return Scenario('twin', 'nominal', 1, self.duration, own=own)
 
 
 def _fault_runs() -> tuple[FaultRun, ...]:
@@ -348,8 +362,9 @@ def run_fault(fault_run: FaultRun) -> Outcome:
 
     If the robot stands at the end, the run is repeated with a pause of the controller.
     """
-    parameters = loop_robot(fault_run.world)
-    record = _run(fault_run, parameters)
+    parameters = fault_run.scenario().true_robot()
+    assert isinstance(parameters, DigitalTwinParameters)
+    record = _run(fault_run)
     undisturbed_run = undisturbed(fault_run.course, fault_run.duration)
     begin, end = _span(fault_run, record, parameters)
     result = evaluate_outcome(
@@ -357,7 +372,7 @@ def run_fault(fault_run: FaultRun) -> Outcome:
     )
     if result.verdict == 'stops' and result.resumption == 'not' and fault_run.event is not None:
         again, wait = end + PAUSE[0], PAUSE[1]
-        paused = _run(fault_run, parameters, ((again, again + wait),))
+        paused = _run(fault_run, ((again, again + wait),))
         remaining = stop_reasons(paused, again + wait + AFTER)
         if not remaining:
             end = again + wait
@@ -371,37 +386,26 @@ def run_fault(fault_run: FaultRun) -> Outcome:
 
 
 @lru_cache(maxsize=8)
-def undisturbed(course: str, duration: float) -> TwinRecord:
+def undisturbed(course: str, duration: float) -> Record:
     """Return the run on a course without fault and walls."""
-    return _run(FaultRun('none', course, None, '', duration), loop_robot())
+    return _run(FaultRun('none', course, None, '', duration))
 
 
-def _run(
-    fault_run: FaultRun,
-    parameters: DigitalTwinParameters,
-    pauses: tuple[tuple[float, float], ...] = (),
-) -> TwinRecord:
-    return run_twin(
-        parameters,
-        loop_controller(),
-        _course(fault_run.course, fault_run.duration),
-        fault_run.duration,
-        fault_run.schedule,
-        pauses,
-    )
+def _run(fault_run: FaultRun, pauses: tuple[tuple[float, float], ...] = ()) -> Record:
+    return run(fault_run.scenario(pauses), NodeMethod(FULL, {}))
 
 
 @cache
-def _course(name: str, duration: float) -> Array:
+def _course(name: str, duration: float) -> SampledReference:
     return REFERENCE_COURSES[name](duration)
 
 
 def _span(
-    fault_run: FaultRun, record: TwinRecord, parameters: DigitalTwinParameters
+    fault_run: FaultRun, record: Record, parameters: DigitalTwinParameters
 ) -> tuple[float, float]:
     """Return begin and end of the fault or the collision, s."""
     if fault_run.event is None:
-        touches = record.contact_force > 0.0
+        touches = record['contact_force'] > 0.0
         return float(record.time[np.argmax(touches)] if touches.any() else 0.0), fault_run.duration
     away = parameters.boot_time if fault_run.event.fault == 'brown_out' else 0.0
     return fault_run.event.at, fault_run.event.until + away

@@ -4,6 +4,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 
 from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import AdaptiveIntervalType2, AdaptiveType1
@@ -12,6 +13,7 @@ from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
     DynamicMatrix,
     DynamicMatrixPreview,
 )
+from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
 from t3mpc_ros.evaluation.baselines.feedback_control import (
     ComputedTorque,
     DisturbanceRejection,
@@ -20,9 +22,10 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
 )
 from t3mpc_ros.evaluation.baselines.linear_mpc import LinearMpc, LinearMpcPreview
 from t3mpc_ros.evaluation.baselines.nonlinear_mpc import CasadiNmpc
-from t3mpc_ros.evaluation.closed_loop import MethodSpec
+from t3mpc_ros.evaluation.cases import NOMINAL
+from t3mpc_ros.evaluation.method import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
-from t3mpc_ros.evaluation.scenario import DRIVES
+from t3mpc_ros.evaluation.scenario import KINDS, PLANT_OF, Scenario
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
 from t3mpc_ros.evaluation.tuning.tuned_parameters import PACKAGED_FILE, TunedParameters
 from t3mpc_ros.parameters.table import Parameters
@@ -33,6 +36,12 @@ EXACT_MODEL = ', exact model'
 """Suffix of the name of a method whose model has no error."""
 MODEL_ERROR = 1.3
 """Ratio of model inertia to true inertia of the predictive baselines with preview."""
+
+FEED_FORWARD = 'feed-forward'
+"""The method with which every other is compared."""
+TWIN_ADVANCE = 0.0095
+"""Lead of feed-forward over the dead time on the twin, s: its pulse generator ramps to a command
+during the whole period that follows, and its rotors have hardly any lag."""
 
 STAGES: Mapping[str, Mapping[str, object]] = {
     'feedback': {
@@ -65,6 +74,21 @@ WITHOUT: Mapping[str, Mapping[str, object]] = {
 }
 """The full controller with one part left out. Without v_p the bound (80) of the compensator is
 lower too; with equal bound it stays, which isolates the effect of v_p."""
+
+
+TWIN_PARTS: Mapping[str, Mapping[str, object]] = {
+    'full without NT3FS': {'body.learning_rate': 0.0},
+    'full without compensator': {'body.yaw_gain': 0.0},
+    'full without shaper': {
+        'command_shaper.straight_frequency': 0.0,
+        'command_shaper.turning_frequency': 0.0,
+    },
+    'full without dead-time estimate': {'estimate_dead_time': False},
+    'full without preview': {'jump_transition.preview': False},
+    "full, the paper's composition": {'composition': 'paper'},
+}
+"""The node's controller on the twin with one part left out, and with NT3FS, compensator and v_p on
+the wheel speeds. The compensator acts with the authority of NT3FS: without it, neither does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +173,7 @@ def method_definitions() -> list[MethodDefinition]:
     found = []
     for name, kind, changes, ranges in _BASELINES:
         start = kind.parameters_type().with_values(changes)
-        found.append(MethodDefinition(name, kind, dict.fromkeys(DRIVES, start), ranges))
+        found.append(MethodDefinition(name, kind, dict.fromkeys(PLANT_OF, start), ranges))
     return [*found, MethodDefinition(FULL, ProposedController, proposed_parameters(), full)]
 
 
@@ -201,3 +225,64 @@ def _proposed_methods(full: Parameters) -> dict[str, ComparedMethod]:
         previews = parameters.to_dict()['jump_transition.preview'] is True
         found[name] = ComparedMethod(name, ProposedController, parameters, True, False, previews)
     return found
+
+
+@cache
+def methods_for(robot: str) -> Mapping[str, MethodSpec | NodeMethod]:
+    """Return the methods of a robot by name; the first one is the full controller."""
+    table = methods(KINDS[robot].drive)
+    forward = MethodSpec(FEED_FORWARD, FeedForward, feed_forward_parameters(robot))
+    ordered: dict[str, MethodSpec | NodeMethod]
+    ordered = {FULL: table[FULL], FEED_FORWARD: forward, **table}
+    return _twin_methods(table, forward) if robot == 'twin' else ordered
+
+
+def feed_forward_parameters(robot: str) -> FeedForwardParameters:
+    """Return the parameters of feed-forward on a robot."""
+    if robot == 'twin':
+        return FeedForwardParameters(advance=TWIN_ADVANCE)
+    if robot == 'torque':  # the ramp that the other methods with preview have there
+        return FeedForwardParameters().with_values({'jump_transition.acceleration': 200.0})
+    return FeedForwardParameters()
+
+
+def _twin_methods(
+    table: Mapping[str, ComparedMethod], forward: MethodSpec
+) -> Mapping[str, MethodSpec | NodeMethod]:
+    """Return the methods on the twin.
+
+    The full controller has the defaults of the node, whatever is stored as tuned for it.
+    Baselines have the parameters tuned for the twin; those of a baseline that was not are its
+    :func:`twin_start`.
+    """
+    tuned = TunedParameters.load()
+    found: dict[str, MethodSpec | NodeMethod] = {
+        FULL: NodeMethod(FULL, {}),
+        FEED_FORWARD: forward,
+    }
+    for name, method in table.items():
+        if method.baseline:
+            parameters = twin_start(method.parameters)
+            tuned_name = name.removesuffix(EXACT_MODEL)
+            if (tuned_name, KINDS['twin'].tuned_for) in tuned:
+                parameters = tuned.applied(tuned_name, KINDS['twin'].tuned_for, parameters)
+            found[name] = MethodSpec(name, method.controller_type, parameters)
+    return found | {name: NodeMethod(name, changes) for name, changes in TWIN_PARTS.items()}
+
+
+def twin_start(parameters: Parameters) -> Parameters:
+    """Return the parameters of a baseline before tuning on the twin.
+
+    They are those tuned for the velocity drive, with the feedback gain ``gain`` at which the
+    measured speed cancels in the command, (1 - exp(-T/lag))/T.
+    """
+    if 'gain' not in parameters.to_dict():
+        return parameters
+    model = Scenario('twin', NOMINAL, 0).nominal_model()
+    return parameters.with_values({'gain': model.share / model.period})
+
+
+def default_methods(robot: str) -> tuple[str, ...]:
+    """Return the full controller and every baseline, without stages and ablations."""
+    parts = {*STAGES, *WITHOUT, *TWIN_PARTS} - {FULL}
+    return tuple(name for name in methods_for(robot) if name not in parts)

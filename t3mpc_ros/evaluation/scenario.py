@@ -1,37 +1,39 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario of one simulated run: drive, noise, case, seed and reference."""
+"""Scenario of one simulated run: all that it depends on but its driver, as plain data."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.control.actuation import LimitParameters
+from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
-from t3mpc_ros.evaluation.simulated_links import (
-    DROPOUTS,
-    JITTER,
-    LINK_TEXTS,
-    NO_FAULTS,
-    OVERLOAD,
-    LinkFaults,
-)
+from t3mpc_ros.evaluation.cases import CASES, ROBOTS, Case, cases_for
+from t3mpc_ros.evaluation.record import RATE, stamp_of
+from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters
+from t3mpc_ros.parameters.table import ParameterError, nearest_hint
+from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
+from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule, load_schedule
+from t3mpc_ros.simulation.plant.disturbances import MeasurementNoise
 from t3mpc_ros.simulation.plant.paper_plant import DisturbedPlant, PaperRobotParameters
+from t3mpc_ros.simulation.plant_robot import (
+    LinkDelay,
+    NoisyPlant,
+    Plant,
+    PlantRobot,
+    SimulatedRobot,
+)
 
 Array = NDArray[np.float64]
-
-DRIVES = ('torque', 'velocity')
-"""torque: u is applied as the torque theta_bar u, as in the paper; velocity: the wheels follow
-commanded speeds with delay and lag, as on the robot."""
 
 TUNING_SEEDS = tuple(range(1, 10))
 """Seeds for tuning."""
@@ -42,87 +44,19 @@ PRETRAINING_NOISE, PRETRAINING_DURATION = 0.04, 40.0
 HELD_OUT_SEEDS = tuple(range(101, 121))
 """Seeds of the reported results; never used for tuning."""
 
-RATE = 100.0
-"""Control periods a second in every run."""
-REFERENCE_DEVIATION = 3.0
-"""Standard deviation of every signal of the reference, rad/s."""
-STATE_DEVIATIONS = (10.6, 2.22, 0.937, 22.2)
-"""Standard deviations of the raw states of (85), measured at q = 0.98 over 10 000 s."""
-CROSSING = (0.5, 0.5)
-"""Time before and after a switch within which methods cross from one reference to the other, s."""
+PLANT_OF = {'velocity': 'servo', 'torque': 'torque'}
+"""Robots with the paper's plant by their drive."""
+LEAD = 0.4
+"""Lead of the reference over the odometry, s."""
 LONGEST_DEAD_TIME = 0.06
 """Dead time up to which a reference is computed beyond the end of a run, s."""
-_ROBOT_SEEDS = 10_000  # robot seeds start here: no reference has one of them by accident
-
-
-@dataclass(frozen=True, slots=True)
-class Case:
-    """Difference of the true robot of a run from the nominal one."""
-
-    text: str
-    changes: Mapping[str, float] = field(default_factory=dict)
-    """Parameters of the robot from the start, by their flat names."""
-    later: Mapping[str, float] = field(default_factory=dict)
-    """Parameters that change during the run."""
-    when: float = 0.5
-    """Time of that change, as a share of the run."""
-    known: bool = False
-    """Whether the estimator and the methods know of ``changes``."""
-    drives: tuple[str, ...] = DRIVES
-    """Drives to which the case applies."""
-    links: LinkFaults = NO_FAULTS
-    """Faults of the links, in whole periods; unknown to all methods."""
-    reproduced: bool = True
-    """Whether it belongs to the reproduction of the paper."""
-
-
-CASES: Mapping[str, Case] = {
-    'nominal': Case('the nominal robot with its friction and disturbance'),
-    'mass +30 %': Case(
-        'body mass and inertia 30 % above nominal', {'mass_factor': 1.3, 'inertia_factor': 1.3}
-    ),
-    'mass -30 %': Case(
-        'body mass and inertia 30 % below nominal', {'mass_factor': 0.7, 'inertia_factor': 0.7}
-    ),
-    'friction x3': Case('three times the friction', {'friction_factor': 3.0}),
-    'load change': Case(
-        'at half of the run body mass and inertia rise by 30 % and friction doubles',
-        later={'mass_factor': 1.3, 'inertia_factor': 1.3, 'friction_factor': 2.0},
-    ),
-    'disturbance': Case(
-        'three times the bound of the disturbance torque',
-        {'disturbance.bound': 3.0 * DisturbanceParameters().bound},
-    ),
-    'dead time': Case(
-        'a command takes 30 ms instead of 10 ms to reach the wheels, and everyone knows it',
-        {'drive.dead_time': 0.03},
-        known=True,
-        drives=('velocity',),
-    ),
-    'dead time 60 ms': Case(
-        'a command takes 60 ms instead of 10 ms to reach the wheels, and everyone knows it',
-        {'drive.dead_time': 0.06},
-        known=True,
-        drives=('velocity',),
-        reproduced=False,
-    ),
-    'unknown dead time': Case(
-        'a command takes 30 ms to reach the wheels; everyone assumes 10 ms',
-        {'drive.dead_time': 0.03},
-        drives=('velocity',),
-        reproduced=False,
-    ),
-    'unknown dead time 60 ms': Case(
-        'a command takes 60 ms to reach the wheels; everyone assumes 10 ms',
-        {'drive.dead_time': 0.06},
-        drives=('velocity',),
-        reproduced=False,
-    ),
-    'dropouts': Case(LINK_TEXTS[DROPOUTS], links=DROPOUTS, reproduced=False),
-    'jitter': Case(LINK_TEXTS[JITTER], links=JITTER, reproduced=False),
-    'overload': Case(LINK_TEXTS[OVERLOAD], links=OVERLOAD, reproduced=False),
-}
-"""Every case by name, in the order of the tables."""
+LONGEST = 3600.0
+"""Upper bound of the duration of a run, s."""
+REFERENCE_DEVIATION = 3.0
+"""Standard deviation of every signal of the reference of the paper's plant, rad/s."""
+STATE_DEVIATIONS = (10.6, 2.22, 0.937, 22.2)
+"""Standard deviations of the raw states of (85), measured at q = 0.98 over 10 000 s."""
+_PLANT_SEEDS = 10_000  # seeds of the plant start here: no reference has one of them by accident
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,71 +78,83 @@ class SampledReference:
     """Whether this is the first sample of a new mode, shape (n + m,)"""
 
 
-class LoopPlant(Protocol):
-    """What a closed loop controls: wheels that obey torques (N m) or wheel speeds (rad/s)."""
+@dataclass(frozen=True, eq=False)
+class OwnParts:
+    """What a script puts in place of the parts of a scenario."""
 
-    @property
-    def wheels(self) -> tuple[float, float]:
-        """True wheel speeds chi, rad/s, right first; not finite when the plant has diverged."""
-        ...
-
-    def configure(self, parameters: PaperRobotParameters) -> None:
-        """Continue with other parameters of the robot."""
-        ...
-
-    def run(self, command: tuple[float, float], count: int) -> None:
-        """Integrate ``count`` steps under one command."""
-        ...
-
-    def measure(self, dt: float) -> tuple[float, float]:
-        """Return the measured wheel speeds, ``dt`` seconds after the last time."""
-        ...
+    reference: SampledReference | None = None
+    links: LinkFaults | None = None
+    events: FaultSchedule = field(default_factory=FaultSchedule)
+    """Further faults of the twin."""
+    noise: Callable[[int], MeasurementNoise] | None = None
+    """Makes the noise of the wheel speeds from a seed."""
+    nominal: PaperRobotParameters | None = None
+    """The robot that the methods assume, in place of the paper's."""
+    limits: LimitParameters | None = None
+    plant: Callable[[], Plant] | None = None
+    """Makes a plant without noise; ``noise`` is given with it."""
+    robot_parameters: Mapping[str, Any] = field(default_factory=dict)
+    """Changes of the true robot, unknown to all methods."""
+    pauses: Sequence[tuple[float, float]] = ()
+    """Times at which a person disables and re-enables the driver, s."""
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """One run without its method.
+    """One run without its driver.
 
-    Two scenarios with the same seed have the same reference, and the same numbers drawn for
-    disturbance and noise, whatever else differs: methods and cases are compared pair by pair.
+    Two scenarios with the same robot and seed have the same reference, and the same numbers drawn
+    for disturbance and noise, whatever else differs: methods and cases are compared pair by pair.
 
     Parameters
     ----------
-    drive, case, seed
-        One of :data:`DRIVES`, one of :data:`CASES`, and the seed of the reference, from which the
-        robot's own is derived.
+    robot, case, seed
+        One of :data:`ROBOTS`, one of its cases, and the seed of reference and robot.
+    duration
+        s; the twin stands for the first 1.5 s.
     noise
-        Variance of the measured wheel speeds, (rad/s)².
-    duration, lead
-        s; ``lead`` is how far ahead methods with preview see the reference.
+        Variance of the measured wheel speeds, (rad/s)², which every method knows.
+    gyro
+        Whether the baselines take the yaw rate from the odometry with its gyro in every case.
+    own
+        Parts of a script.
     """
 
-    drive: str
-    noise: float
+    robot: str
     case: str
     seed: int
     duration: float = 60.0
-    lead: float = 0.4
+    noise: float = 0.04
+    gyro: bool = False
+    own: OwnParts = field(default_factory=OwnParts, compare=False)
 
     def __post_init__(self) -> None:
-        if self.drive not in DRIVES:
-            raise ValueError(f'drive must be one of {", ".join(DRIVES)}: got {self.drive!r}')
-        if self.case not in CASES:
-            raise ValueError(f'case must be one of {", ".join(CASES)}: got {self.case!r}')
-        drives = CASES[self.case].drives
-        if self.drive not in drives:
-            raise ValueError(
-                f'drive must be {" or ".join(drives)} in case {self.case!r}: got {self.drive!r}'
-            )
-        check_run(
-            self,
+        check_name('robot', self.robot, ROBOTS)
+        check_name('case', self.case, cases_for(self.robot))
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise ValueError(f'seed must be a whole number of at least 0: got {self.seed!r}')
+        for name, low, high, unit in (
             ('noise', 0.0, 100.0, '(rad/s)²'),
-            ('duration', 1.0 / RATE, 3600.0, 's'),
-            ('lead', 0.0, 10.0, 's'),
-        )
+            ('duration', self.kind.shortest, LONGEST, 's'),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f'{name} must be from {low:g} to {high:g} {unit}: got {value}')
+        if self.gyro and not self.kind.has_gyro:
+            raise ValueError(f'gyro must be false on a robot without one: got robot {self.robot}')
 
     def __str__(self) -> str:
-        return f'{self.drive}, noise {self.noise:g}, {self.case}, seed {self.seed}'
+        return f'{self.robot}, noise {self.noise:g}, {self.case}, seed {self.seed}'
+
+    @property
+    def kind(self) -> 'RobotKind':
+        """What is particular to the robot."""
+        return KINDS[self.robot]
+
+    @property
+    def parts(self) -> Case:
+        """The case itself."""
+        return CASES[self.case]
 
     @property
     def steps(self) -> int:
@@ -217,87 +163,262 @@ class Scenario:
 
     @property
     def change_step(self) -> int:
-        """The period at whose start :meth:`changed_robot` takes over."""
-        return round(CASES[self.case].when * self.steps)
+        """The period at whose start a robot that changes during the run does so."""
+        return round(0.5 * self.steps)
 
     @property
     def links(self) -> LinkFaults:
-        """Faults of the links between robot and controller."""
-        return CASES[self.case].links
+        """Faults of the links between robot and driver."""
+        return self.parts.links if self.own.links is None else self.own.links
+
+    @property
+    def fault_span(self) -> tuple[float, float] | None:
+        """Begin and end (s) of what does not last for the whole run; None without."""
+        if self.parts.later:
+            return 0.5 * self.duration, math.inf
+        return self.links.span(self.duration) if self.links.begin else None
+
+    @property
+    def uses_gyro(self) -> bool:
+        """Whether the baselines take the yaw rate from the odometry with its gyro."""
+        return self.gyro or self.parts.gyro
 
     @property
     def limits(self) -> LimitParameters:
-        """Limits of a velocity command, equal in every run."""
-        return LimitParameters()
+        """Limits of the command, equal for all methods."""
+        return self.own.limits or self.kind.limits(self)
 
     def reference(self) -> SampledReference:
         """Return the reference wheel speeds over the run and the preview beyond it."""
-        beyond = math.ceil((self.lead + LONGEST_DEAD_TIME) * RATE) + 3
-        return _reference(self.seed, self.steps + beyond)
-
-    def robot(self) -> PaperRobotParameters:
-        """Return the true robot, as it is when the run begins."""
-        return self._nominal().with_values(
-            {
-                'noise.variance': float(self.noise),
-                'seed': _ROBOT_SEEDS + self.seed,
-                **CASES[self.case].changes,
-            }
-        )
-
-    def plant(self) -> LoopPlant:
-        """Return the plant of a new run."""
-        return DisturbedPlant(self.robot())
-
-    def changed_robot(self) -> PaperRobotParameters | None:
-        """Return the true robot from :attr:`change_step` on; None if it does not change."""
-        later = CASES[self.case].later
-        return self.robot().with_values(later) if later else None
-
-    def nominal_model(self) -> NominalModel:
-        """Return the nominal model for a method."""
-        return nominal_model(self.drive, self._known_robot(), self.limits)
+        if self.own.reference is not None:
+            return self.own.reference
+        beyond = math.ceil((LEAD + LONGEST_DEAD_TIME) * RATE) + 3
+        return sample_reference(self.kind.reference_parameters(self.seed), self.steps + beyond)
 
     def estimate(self) -> SpeedFilterParameters:
         """Return the parameters of the state estimator, equal for all methods.
 
         The true variance of the noise, and the lag and dead time that everyone knows.
         """
-        drive = self._known_robot().drive
-        return SpeedFilterParameters.from_dict(
+        return self.kind.estimate(self)
+
+    def nominal_model(self) -> NominalModel:
+        """Return the model that every method gets; with a torque drive nothing is limited."""
+        robot = self.kind.assumed_robot(self)
+        acceleration = math.inf
+        if self.kind.drive == 'velocity':
+            acceleration = isotropic_acceleration(self.limits, robot.geometry)
+        return NominalModel(self.kind.drive, 1.0 / RATE, robot.drive.lag, acceleration, robot)
+
+    def preview_rows(self, dead_time: float) -> int:
+        """Return how many periods of the reference preview gives, from the dead time (s) on."""
+        return self.kind.preview_rows(dead_time)
+
+    def true_robot(self) -> PaperRobotParameters:
+        """Return the true robot, as it is when the run begins."""
+        return self.kind.true_robot(self).with_values(self.own.robot_parameters)
+
+    def simulation(self) -> SimulatedRobot:
+        """Return the robot of a new run."""
+        return self.kind.simulation(self)
+
+
+class RobotKind:
+    """What is particular to the paper's plant as a robot, see :data:`ROBOTS`."""
+
+    start = 0.0
+    """Standstill before the run, s."""
+    settling = (0.4, 0.6)
+    """Time before and after each switch that the settled errors leave out, s."""
+    shortest = 1.0 / RATE
+    """Lower bound of the duration of a run, s."""
+    has_gyro = False
+
+    def __init__(self, text: str, drive: str) -> None:
+        self.text, self.drive = text, drive
+        self.tuned_for = drive
+        """Name under which the parameters tuned for it are stored."""
+
+    def reference_parameters(self, seed: int) -> ReferenceParameters:
+        """Return the defaults with every signal scaled to :data:`REFERENCE_DEVIATION`."""
+        amplitude = tuple(REFERENCE_DEVIATION / deviation for deviation in STATE_DEVIATIONS)
+        return ReferenceParameters.from_dict({'rate': RATE, 'amplitude': amplitude, 'seed': seed})
+
+    def controller_parameters(self, scenario: Scenario) -> ControllerParameters:
+        """Return the parameters of the controller of the node.
+
+        Raises
+        ------
+        ValueError
+            The robot has no pose, which that controller needs.
+        """
+        raise ValueError(f'the controller of the node drives the twin alone: got {scenario}')
+
+    def limits(self, scenario: Scenario) -> LimitParameters:
+        """Return the limits of a velocity command, equal in every run."""
+        return LimitParameters()
+
+    def assumed_robot(self, scenario: Scenario) -> PaperRobotParameters:
+        """Return the robot that methods assume, without factors, disturbance and noise."""
+        nominal = self._nominal(scenario)
+        case = scenario.parts
+        return nominal.with_values(case.changes) if case.known else nominal
+
+    def estimate(self, scenario: Scenario) -> SpeedFilterParameters:
+        """Return the parameters of the state estimator."""
+        drive = self.assumed_robot(scenario).drive
+        values = {'lag': drive.lag, 'dead_time': drive.dead_time}
+        return SpeedFilterParameters.from_dict({'noise_variance': float(scenario.noise), **values})
+
+    def preview_rows(self, dead_time: float) -> int:
+        """Return how many periods of the reference preview gives."""
+        return round(LEAD * RATE)
+
+    def true_robot(self, scenario: Scenario) -> PaperRobotParameters:
+        """Return the true robot, but for the changes of a script."""
+        return self._nominal(scenario).with_values(
             {
-                'noise_variance': float(self.noise),
-                'lag': drive.lag,
-                'dead_time': drive.dead_time,
+                'noise.variance': float(scenario.noise),
+                'seed': _PLANT_SEEDS + scenario.seed,
+                **scenario.parts.changes,
             }
         )
 
-    def _nominal(self) -> PaperRobotParameters:
+    def simulation(self, scenario: Scenario) -> SimulatedRobot:
+        """Return the robot of a new run."""
+        parameters, own = scenario.true_robot(), scenario.own
+        plant: Plant
+        if own.noise is None:
+            plant = DisturbedPlant(parameters)
+        else:
+            quiet = parameters.with_values({'noise.variance': 0.0})
+            inner = DisturbedPlant(quiet) if own.plant is None else own.plant()
+            plant = NoisyPlant(inner, own.noise(parameters.seed))
+        later = scenario.parts.later.get(scenario.robot)
+        links = scenario.links
+        least, most = links.command_delay
+        return PlantRobot(
+            plant,
+            parameters,
+            parameters.with_values(later) if later else None,
+            stamp_of(scenario.change_step),
+            LinkDelay(least, most - least, links.command_loss, *links.span(scenario.duration)),
+            scenario.seed,
+        )
+
+    def _nominal(self, scenario: Scenario) -> PaperRobotParameters:
+        if scenario.own.nominal is not None:
+            return scenario.own.nominal
         return PaperRobotParameters.from_dict({'drive.kind': self.drive, 'rate': RATE})
 
-    def _known_robot(self) -> PaperRobotParameters:
-        case, nominal = CASES[self.case], self._nominal()
-        return nominal.with_values(case.changes) if case.known else nominal
+
+class TwinKind(RobotKind):
+    """What is particular to the digital twin; its reference is that of ``scripts/demo``."""
+
+    start = 1.5  # odometry uses the gyro only after a standstill of this length
+    settling = (0.5, 1.0)  # its rotors ring longer than the wheels of the plant
+    shortest = 2.0
+    has_gyro = True
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text, 'velocity')
+        self.tuned_for = 'twin'
+
+    def reference_parameters(self, seed: int) -> ReferenceParameters:
+        """Return the defaults of the node with a seed."""
+        return ReferenceParameters.from_dict({'rate': RATE, 'seed': seed})
+
+    def controller_parameters(self, scenario: Scenario) -> ControllerParameters:
+        """Return the parameters of the controller node for the twin, with the known values."""
+        dead_time = scenario.parts.changes.get('drive.dead_time') if scenario.parts.known else None
+        values = {} if dead_time is None else {'speed_filter.dead_time': dead_time}
+        return StepperControllerParameters().with_values(
+            {'speed_filter.noise_variance': float(scenario.noise), **values}
+        )
+
+    def limits(self, scenario: Scenario) -> LimitParameters:
+        """Return those of the controller."""
+        return self.controller_parameters(scenario).limits
+
+    def estimate(self, scenario: Scenario) -> SpeedFilterParameters:
+        """Return those of the controller."""
+        return self.controller_parameters(scenario).speed_filter
+
+    def assumed_robot(self, scenario: Scenario) -> PaperRobotParameters:
+        """Return a servo with the lag that the node assumes.
+
+        It has no friction: a stepper motor that loses no step keeps its speed under load.
+        """
+        estimate = self.estimate(scenario)
+        return PaperRobotParameters.from_dict(
+            {
+                'drive.kind': 'velocity',
+                'drive.lag': estimate.lag,
+                'drive.dead_time': estimate.dead_time,
+                'friction.viscous': 0.0,
+                'friction.coulomb': 0.0,
+                'rate': RATE,
+            }
+        )
+
+    def preview_rows(self, dead_time: float) -> int:
+        """Return what a reference with this lead has made known at the stamp of a report."""
+        return round((LEAD - dead_time) * RATE) + 1
+
+    def true_robot(self, scenario: Scenario) -> DigitalTwinParameters:
+        """Return the true robot, but for the changes of a script."""
+        return noisy_twin(seed=scenario.seed).with_values(
+            {'noise.variance': float(scenario.noise), **scenario.parts.changes}
+        )
+
+    def simulation(self, scenario: Scenario) -> SimulatedRobot:
+        """Return the robot of a new run."""
+        parameters = scenario.true_robot()
+        assert isinstance(parameters, DigitalTwinParameters)
+        if parameters.drive.kind != 'stepper':
+            raise ParameterError(f'drive.kind must be stepper: got {parameters.drive.kind}')
+        noise = scenario.own.noise
+        further = load_schedule(parameters.faults.schedule).events
+        schedule = FaultSchedule([*further, *fault_events(scenario)], scenario.case)
+        return DigitalTwin(parameters, schedule, noise(parameters.seed) if noise else None)
 
 
-def check_run(run: Any, *ranges: tuple[str, float, float, str]) -> None:
-    """Raise ValueError for a bad seed, or an attribute outside its (name, low, high, unit)."""
-    if isinstance(run.seed, bool) or not isinstance(run.seed, int) or run.seed < 0:
-        raise ValueError(f'seed must be a whole number of at least 0: got {run.seed!r}')
-    for name, low, high, unit in ranges:
-        value = getattr(run, name)
-        if not low <= value <= high:
-            raise ValueError(f'{name} must be from {low:g} to {high:g} {unit}: got {value}')
+def noisy_twin(world: str = '', seed: int = 1) -> DigitalTwinParameters:
+    """Return the twin with the wheel speed noise that the controller assumes."""
+    return DigitalTwinParameters.from_dict({'noise.variance': 0.04, 'world': world, 'seed': seed})
 
 
-def reference_parameters(seed: int) -> ReferenceParameters:
-    """Return the defaults with every signal scaled to :data:`DEVIATION`."""
-    amplitude = tuple(REFERENCE_DEVIATION / deviation for deviation in STATE_DEVIATIONS)
-    return ReferenceParameters.from_dict({'rate': RATE, 'amplitude': amplitude, 'seed': seed})
+def fault_events(scenario: Scenario) -> list[FaultEvent]:
+    """Return the faults of the twin and its command link in a scenario."""
+    links = scenario.links
+    begin, _ = links.span(scenario.duration)
+    least, most = links.command_delay
+    values = {
+        'command_loss': links.command_loss,
+        'command_delay': least,
+        'command_jitter': most - least,
+    }
+    events = [
+        FaultEvent(begin, name, value, links.lasting) for name, value in values.items() if value
+    ]
+    for name, value in scenario.parts.later.get(scenario.robot, {}).items():
+        events.append(FaultEvent(0.5 * scenario.duration, name, value))
+    return [*scenario.own.events.events, *events]
 
 
-def _reference(seed: int, rows: int) -> SampledReference:
-    return sample_reference(reference_parameters(seed), rows)
+KINDS: Mapping[str, RobotKind] = {
+    'twin': TwinKind('Digital twin'),
+    'servo': RobotKind("The paper's plant with velocity drive", 'velocity'),
+    'torque': RobotKind("The paper's plant with torque drive", 'torque'),
+}
+"""The robots by name."""
+
+
+def check_name(kind: str, name: str, known: Collection[str]) -> None:
+    """Raise ValueError, with the nearest name, when ``name`` is not known."""
+    if name not in known:
+        hint = nearest_hint(name, known)
+        raise ValueError(f'{kind} must be one of {", ".join(known)}: got {name!r}{hint}')
 
 
 @lru_cache(maxsize=128)  # about 0.3 MB for a run of a minute
@@ -322,50 +443,12 @@ def sample_reference(parameters: ReferenceParameters, rows: int) -> SampledRefer
     return run
 
 
-def counted_rows(
-    time: Array, switches: Array, after: float, margins: tuple[float, float] = (0.0, 0.0)
-) -> NDArray[np.bool_]:
-    """Return which rows of a run count: from ``after`` on, without ``margins`` about a switch.
-
-    All in s. Margins are before a switch, where methods with preview have already left the old
-    reference, and after it. Rows from a switch on whose crossing the run does not contain whole
-    never count, nor those before it in which preview leaves the old reference: what that costs
-    would count, and not what it gains.
-    """
-    counted: NDArray[np.bool_] = time >= after
-    before, behind = margins
-    leaving, crossed = CROSSING
-    for switch in switches.tolist():
-        if time.size and switch + crossed > time[-1]:
-            counted &= time < switch - leaving
-        counted &= (time < switch - before) | (time >= switch + behind)
-    if not counted.any():
-        end = time[-1] if time.size else 0.0
-        raise ValueError(
-            f'after and margins must leave rows of a run that ends at {end:g} s: '
-            f'got {after:g} s, {before:g} s and {behind:g} s'
-        )
-    return counted
-
-
-def switch_times(time: Array, modes: NDArray[np.int64]) -> Array:
-    """Return the instants (s) of the first row of each new mode."""
-    instants: Array = time[1:][np.diff(modes) != 0]
-    return instants
-
-
-def nominal_model(
-    drive: str, robot: PaperRobotParameters, limits: LimitParameters
-) -> NominalModel:
-    """Return the nominal model of a robot; with a torque drive, its acceleration is unlimited."""
-    velocity = drive == 'velocity'
-    return NominalModel(
-        drive=drive,
-        period=1.0 / RATE,
-        lag=robot.drive.lag,
-        acceleration=isotropic_acceleration(limits, robot.geometry) if velocity else math.inf,
-        robot=robot,
-    )
+def sampled_speeds(speeds: Array) -> SampledReference:
+    """Return a reference of one mode from wheel speeds (rad/s) of each period, shape (n, 2)."""
+    count = len(speeds)
+    slope = np.gradient(speeds, axis=0) * RATE
+    none = np.zeros(count, dtype=np.int64)
+    return SampledReference(np.arange(count) / RATE, speeds, slope, none, none.astype(np.bool_))
 
 
 def isotropic_acceleration(limits: LimitParameters, geometry: WheelGeometry) -> float:

@@ -6,13 +6,11 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 import math
-from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-T = TypeVar('T')
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.robot.interface import RobotState
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,76 +52,37 @@ LINK_TEXTS: Mapping[LinkFaults, str] = {
 """What these faults are, in words."""
 
 
-def delay_between(bounds: tuple[float, float], share: float) -> float:
-    """Return the delay (s) at a share of the way from the least to the largest one."""
-    least, most = bounds
-    return least + (most - least) * share
-
-
-class OrderedLink(Generic[T]):
-    """Messages under way that arrive in order; the unit of time is the caller's."""
-
-    def __init__(self) -> None:
-        self._queue: deque[tuple[int, T]] = deque()
-        self._latest = 0
-
-    def send(self, message: T, arrival: int) -> None:
-        """Send a message that arrives at ``arrival``, or with the one before it if later."""
-        self._latest = max(self._latest, arrival)
-        self._queue.append((self._latest, message))
-
-    def arrived(self, now: int) -> Iterator[tuple[int, T]]:
-        """Yield (arrival, message) of what has arrived by ``now``."""
-        while self._queue and self._queue[0][0] <= now:
-            yield self._queue.popleft()
-
-
-class PeriodicLinks:
-    """Links with faults between plant and controller, in whole control periods.
+class ReportLink:
+    """Reports of a robot on their way to the driver; they arrive in order.
 
     Parameters
     ----------
     faults, seed
         What is lost or late; equal seeds draw equal numbers, whatever is sent.
-    steps, rate
-        Control periods of the run, and how many there are in a second.
+    duration
+        Of the run, s.
     """
 
-    def __init__(self, faults: LinkFaults, seed: int, steps: int, rate: float) -> None:
-        self._faults, self._rate = faults, rate
-        begin = round(faults.begin * steps)
-        self._active = range(begin, int(min(begin + faults.lasting * rate, steps)))
-        self._drawn: Array = np.random.default_rng((seed, 4)).random((steps, 4))
-        self._measurements: OrderedLink[tuple[int, Array]] = OrderedLink()
-        self._commands: list[tuple[int, int, Array]] = []
-        self._newest = -1
-        self._command: Array = np.zeros(2)
+    def __init__(self, faults: LinkFaults, seed: int, duration: float) -> None:
+        self._faults = faults
+        self._begin, self._end = faults.span(duration)
+        self._generator = np.random.default_rng((seed, 3))
+        self._queue: deque[tuple[int, RobotState]] = deque()
 
-    def measured(self, k: int, measured: Array) -> Iterator[tuple[int, Array]]:
-        """Send the measurement of period k; yield those that arrive in it, with their periods."""
-        lost, late = self._drawn[k, :2].tolist()
-        active = k in self._active
-        if not active or lost >= self._faults.odometry_loss:
-            delay = self._periods(self._faults.odometry_delay, late) if active else 0
-            self._measurements.send((k, measured.copy()), k + delay)
-        for _, message in self._measurements.arrived(k):
-            yield message
+    def send(self, state: RobotState) -> None:
+        """Send a report; one that is not late arrives after those before it all the same."""
+        # Two numbers for each report, so that a change of loss does not shift delays.
+        lost, late = self._generator.random(2).tolist()
+        arrival, delay = state.stamp_ns, 0.0
+        if self._begin <= state.stamp_ns / NANOSECONDS < self._end:
+            if lost < self._faults.odometry_loss:
+                return
+            least, most = self._faults.odometry_delay
+            delay = least + (most - least) * late
+        arrival += round(delay * NANOSECONDS)
+        self._queue.append((max(arrival, self._queue[-1][0] if self._queue else 0), state))
 
-    def send(self, k: int, j: int, command: Array) -> None:
-        """Send in period k the command that follows from the measurement of period j."""
-        lost, late = self._drawn[j, 2:].tolist()
-        active = k in self._active
-        if not active or lost >= self._faults.command_loss:
-            delay = self._periods(self._faults.command_delay, late) if active else 0
-            self._commands.append((k + delay, j, command.copy()))
-
-    def command(self, k: int) -> Array:
-        """Return the command that has arrived by period k, of the newest measurement."""
-        for arrival, j, command in self._commands:
-            if arrival <= k and j > self._newest:
-                self._newest, self._command = j, command
-        self._commands = [each for each in self._commands if each[0] > k]
-        return self._command
-
-    def _periods(self, bounds: tuple[float, float], share: float) -> int:
-        return round(delay_between(bounds, share) * self._rate)
+    def arrived(self, now_ns: int) -> Iterator[tuple[int, RobotState]]:
+        """Yield (arrival, report) of what has arrived by ``now_ns``."""
+        while self._queue and self._queue[0][0] <= now_ns:
+            yield self._queue.popleft()

@@ -9,26 +9,22 @@ import os
 from pathlib import Path
 from typing import Any
 
+from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import Difference
-from t3mpc_ros.evaluation.method_comparison.compared_runs import (
-    METRICS,
-    QUICK_SEEDS,
-    AnyMethod,
-    AnyScenario,
-    ComparisonPlan,
-    Job,
-    Metric,
-    Results,
-)
-from t3mpc_ros.evaluation.method_comparison.compared_runs import compare as run_plan
+from t3mpc_ros.evaluation.experiment import QUICK_SEEDS, ComparisonPlan, Results
+from t3mpc_ros.evaluation.experiment import compare as run_plan
+from t3mpc_ros.evaluation.loop import Method
+from t3mpc_ros.evaluation.metrics import METRICS, Metric
+from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.tuning.search_space import find_names
+from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.scripting.controllers import OwnMethod, as_controllers
 from t3mpc_ros.scripting.executors import workers_for
 from t3mpc_ros.scripting.plants import NoiseLaw
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
-from t3mpc_ros.scripting.setting import NOMINAL, Setting
+from t3mpc_ros.scripting.setting import Setting
 from t3mpc_ros.scripting.table_files import columns_of, write_csv, write_parquet
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
@@ -43,7 +39,7 @@ class ScriptedPlan(ComparisonPlan):
     """What a script compares."""
 
     setting: Setting = field(default_factory=Setting)
-    controllers: Mapping[str, AnyMethod] = field(default_factory=dict)
+    controllers: Mapping[str, Method] = field(default_factory=dict)
     reference_name: str = ''
     """The method with which every other is compared; by default the first one."""
 
@@ -60,19 +56,14 @@ class ScriptedPlan(ComparisonPlan):
     @property
     def additional_knowledge(self) -> Mapping[str, str]:
         """What controllers of one's own know."""
-        own = [
-            name
-            for name, method in self.controllers.items()
-            if isinstance(method, OwnMethod)
-            or isinstance(getattr(method, 'baseline', None), OwnMethod)
-        ]
+        own = [name for name, method in self.controllers.items() if isinstance(method, OwnMethod)]
         return {', '.join(own): OWN_KNOWLEDGE} if own else {}
 
-    def known_methods(self) -> Mapping[str, AnyMethod]:
+    def known_methods(self) -> Mapping[str, Method]:
         """Return the compared methods by name."""
         return self.controllers
 
-    def scenario(self, case: str, seed: int) -> AnyScenario:
+    def scenario(self, case: str, seed: int) -> Scenario:
         """Return one run without its method."""
         return self.setting.scenario(case, seed)
 
@@ -95,7 +86,7 @@ class Comparison:
         Differences are paired by seed, with the verdict ``better``, ``worse`` or
         ``inconclusive``. Without a case: of all of them, one below the other.
         """
-        from t3mpc_ros.evaluation.method_comparison.comparison_page import case_table
+        from t3mpc_ros.evaluation.comparison_page import case_table
 
         cases = self.plan.cases if case is None else find_names('case', [case], self.plan.cases)
         tables = [case_table(self.plan, self.results, each).markdown() for each in cases]
@@ -107,7 +98,7 @@ class Comparison:
     @one_sentence
     def values(self, controller: str, metric: str = 'overall', case: str = '') -> list[float]:
         """Return a metric of a controller, one number for each seed."""
-        from t3mpc_ros.evaluation.method_comparison.comparison_page import values
+        from t3mpc_ros.evaluation.comparison_page import values
 
         return values(self.results, *self._chosen(controller, case), _metric(metric))
 
@@ -119,7 +110,7 @@ class Comparison:
 
         None for the first controller itself.
         """
-        from t3mpc_ros.evaluation.method_comparison.comparison_page import difference
+        from t3mpc_ros.evaluation.comparison_page import difference
 
         run = self._chosen(controller, case)
         return difference(self.results, *run, _metric(metric), self.plan.against)
@@ -161,7 +152,7 @@ class Comparison:
     @one_sentence
     def to_html(self, path: str | os.PathLike[str]) -> Path:
         """Write tables and figures as one page and return the path."""
-        from t3mpc_ros.evaluation.method_comparison.comparison_page import page
+        from t3mpc_ros.evaluation.comparison_page import page
 
         target = Path(path).expanduser()
         target.parent.mkdir(parents=True, exist_ok=True)

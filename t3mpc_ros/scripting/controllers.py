@@ -22,13 +22,11 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
     Observation,
 )
-from t3mpc_ros.evaluation.closed_loop import MethodSpec
-from t3mpc_ros.evaluation.method_comparison.compared_runs import (
-    AnyMethod,
-    TwinMethod,
-    methods_for,
-)
-from t3mpc_ros.evaluation.methods import require_libraries
+from t3mpc_ros.evaluation.drivers import MethodDriver
+from t3mpc_ros.evaluation.loop import Method
+from t3mpc_ros.evaluation.method import MethodSpec, NodeMethod
+from t3mpc_ros.evaluation.methods import methods_for, require_libraries
+from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.tuning.search_space import find_names
 from t3mpc_ros.parameters.table import Parameters
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
@@ -74,31 +72,22 @@ class Controller:
             plain = _plain_name(self.source)
             object.__setattr__(self, 'name', f'{plain}, {values}' if values else plain)
 
-    def method(self, robot: str) -> AnyMethod:
+    def method(self, robot: str) -> Method:
         """Return it as a method of a robot: ``twin``, ``servo`` or ``torque``."""
         if isinstance(self.source, str) and FILE_SEPARATOR not in self.source:
             return self._packaged(robot, self.source)
-        own = OwnMethod(self.name, checked_source(self.source), tuple(self.settings.items()))
-        return TwinMethod(self.name, baseline=own) if robot == 'twin' else own
+        return OwnMethod(self.name, checked_source(self.source), tuple(self.settings.items()))
 
-    def _packaged(self, robot: str, wanted: str) -> AnyMethod:
+    def _packaged(self, robot: str, wanted: str) -> Method:
         known = methods_for(robot)
         (found,) = find_names('controller', [wanted], known)
         require_libraries([found])
         method = known[found]
         name = found if self.name == wanted else self.name
-        if isinstance(method, TwinMethod):
-            if method.baseline is None:
-                return replace(
-                    method, name=name, changes={**(method.changes or {}), **self.settings}
-                )
-            assert isinstance(method.baseline, MethodSpec)
-            return replace(method, name=name, baseline=self._changed(method.baseline))
+        if isinstance(method, NodeMethod):
+            return replace(method, name=name, changes={**method.changes, **self.settings})
         assert isinstance(method, MethodSpec)
-        return replace(self._changed(method), name=name)
-
-    def _changed(self, spec: MethodSpec) -> MethodSpec:
-        return replace(spec, parameters=spec.parameters.with_values(self.settings))
+        return replace(method, name=name, parameters=method.parameters.with_values(self.settings))
 
 
 def loaded(spec: str) -> Any:
@@ -239,6 +228,10 @@ class OwnMethod:
         else:
             made, step = source, _with_settings(source, settings)
         return OwnController(self.name, step, made, nominal_model)
+
+    def driver(self, scenario: Scenario) -> MethodDriver:
+        """Return a new driver for a run."""
+        return MethodDriver(self, scenario)
 
     def _instance(
         self, kind: type, settings: dict[str, Any], nominal_model: NominalModel

@@ -18,25 +18,23 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.closed_loop import JobError, WorkerPool, map_jobs
+from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
-from t3mpc_ros.evaluation.method_comparison.compared_runs import (
-    METRICS,
-    Job,
-    measured_run,
-)
+from t3mpc_ros.evaluation.experiment import measured_run
+from t3mpc_ros.evaluation.metrics import METRICS
 from t3mpc_ros.evaluation.paper.experiment_runs import source_digest
 from t3mpc_ros.evaluation.reporting import Table, finite, format_interval
 from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.tuning.search_space import find_names
+from t3mpc_ros.evaluation.workers import Job, JobError, WorkerPool, map_jobs
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.scripting.comparison_runs import checked_seeds
 from t3mpc_ros.scripting.controllers import Controller, FileController, as_controllers
 from t3mpc_ros.scripting.executors import workers_for
 from t3mpc_ros.scripting.plants import NoiseLaw
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence, sentence
-from t3mpc_ros.scripting.setting import NOMINAL, Setting
+from t3mpc_ros.scripting.setting import Setting
 from t3mpc_ros.scripting.table_files import columns_of, write_csv, write_parquet
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 

@@ -385,44 +385,6 @@ class LawNoise:
         return WheelSpeeds(*(true + noise).tolist())
 
 
-class NoisyPlant:
-    """A plant whose wheel speeds are measured with noise of a law.
-
-    Parameters
-    ----------
-    plant
-        The plant, without noise of its own.
-    noise
-        The noise.
-    """
-
-    def __init__(self, plant: Any, noise: LawNoise) -> None:
-        self._plant, self._noise = plant, noise
-        self._time = 0.0
-
-    @property
-    def wheels(self) -> tuple[float, float]:
-        """True wheel speeds, rad/s."""
-        right, left = self._plant.wheels
-        return right, left
-
-    def configure(self, parameters: PaperRobotParameters) -> None:
-        """Continue with other parameters of the robot."""
-        self._plant.configure(parameters)
-
-    def run(self, command: tuple[float, float], count: int) -> None:
-        """Integrate ``count`` steps under one command."""
-        self._plant.run(command, count)
-
-    def measure(self, dt: float) -> tuple[float, float]:
-        """Return the wheel speeds with noise, ``dt`` seconds after the last time."""
-        self._time += dt
-        right, left = self._plant.measure(dt)
-        if not (math.isfinite(right) and math.isfinite(left)):
-            return math.nan, math.nan
-        return self._noise.measure(WheelSpeeds(right, left), self._time)
-
-
 def gaussian_noise(variance: float) -> NoiseLaw:
     """Return the law of white noise with a variance in (rad/s)²."""
     return NoiseLaw(_Gaussian(math.sqrt(variance)), variance)

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import JUMP
-from t3mpc_ros.evaluation.scenario import RATE, SampledReference
+from t3mpc_ros.evaluation.record import RATE
+from t3mpc_ros.evaluation.scenario import SampledReference
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheel_speeds
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
 

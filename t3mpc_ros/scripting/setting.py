@@ -4,26 +4,24 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 import os
 from typing import Any
 
-from t3mpc_ros.control.actuation import LimitParameters
-from t3mpc_ros.evaluation.method_comparison.compared_runs import (
-    DRIVES,
-    ROBOT_TEXTS,
-    AnyScenario,
-    cases_for,
+from t3mpc_ros.evaluation.cases import NOMINAL, ROBOTS, cases_for
+from t3mpc_ros.evaluation.scenario import (
+    KINDS,
+    OwnParts,
+    SampledReference,
+    Scenario,
+    check_name,
 )
-from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario, check_name
-from t3mpc_ros.evaluation.scenario import LoopPlant, SampledReference, Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.tuning.search_space import find_names
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.scripting.plants import (
     LawNoise,
     NoiseLaw,
-    NoisyPlant,
     OdePlant,
     Robot,
     StateSpace,
@@ -31,11 +29,8 @@ from t3mpc_ros.scripting.plants import (
 )
 from t3mpc_ros.scripting.references import sampled
 from t3mpc_ros.scripting.script_error import ScriptError
-from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultSchedule, load_schedule
-from t3mpc_ros.simulation.plant.paper_plant import DisturbedPlant, PaperRobotParameters
 
-NOMINAL = 'nominal'
 OwnPlant = OdePlant | StateSpace
 
 
@@ -70,10 +65,10 @@ class Setting:
 
     def __post_init__(self) -> None:
         if isinstance(self.plant, str):
-            check_name('plant', self.plant, DRIVES)
+            check_name('plant', self.plant, ROBOTS)
         elif not isinstance(self.plant, Robot | OdePlant | StateSpace):
             raise ScriptError(
-                f'plant must be {", ".join(DRIVES)}, a Robot, an OdePlant or a StateSpace: got '
+                f'plant must be {", ".join(ROBOTS)}, a Robot, an OdePlant or a StateSpace: got '
                 f'{type(self.plant).__name__} {self.plant!r}'
             )
         if isinstance(self.noise, bool) or not isinstance(self.noise, int | float | NoiseLaw):
@@ -95,7 +90,7 @@ class Setting:
                 'parameters of the robot must not be given for a plant of your own: got '
                 f'{", ".join(self.robot_parameters)}'
             )
-        self.scenario(NOMINAL, 1).robot()
+        self.scenario(NOMINAL, 1).true_robot()
 
     @property
     def robot(self) -> str:
@@ -119,7 +114,7 @@ class Setting:
     def robot_text(self) -> str:
         """What the plant is, in words, with a reference of one's own."""
         if isinstance(self.plant, str):
-            text = ROBOT_TEXTS[self.plant]
+            text = KINDS[self.plant].text
         elif isinstance(self.plant, Robot):
             text = 'Your robot'
         else:
@@ -174,7 +169,7 @@ class Setting:
             return FaultSchedule()
         return load_schedule(os.fspath(self.faults))
 
-    def scenario(self, case: str = NOMINAL, seed: int = 1) -> AnyScenario:
+    def scenario(self, case: str = NOMINAL, seed: int = 1) -> Scenario:
         """Return one run without its method.
 
         Raises
@@ -184,112 +179,17 @@ class Setting:
         """
         if self.own_plant is not None and case != NOMINAL:
             raise ScriptError(f'case must be {NOMINAL} for a plant of your own: got {case!r}')
-        links = self.faults if isinstance(self.faults, LinkFaults) else None
-        if self.robot == 'twin':
-            return ScriptedTwinScenario(
-                case,
-                seed,
-                self.duration,
-                self.variance,
-                own_reference=self.own_reference,
-                own_links=links,
-                events=self._events,
-                law=self.noise if isinstance(self.noise, NoiseLaw) else None,
-                robot_parameters=self.robot_parameters,
-            )
-        return ScriptedScenario(
-            DRIVES[self.robot],
-            self.variance,
-            case,
-            seed,
-            self.duration,
-            own_reference=self.own_reference,
-            own_links=links,
-            own_robot=self.own_robot,
-            own_plant=self.own_plant,
-            law=self.noise if isinstance(self.noise, NoiseLaw) else None,
+        own, law = self.own_robot, self.noise if isinstance(self.noise, NoiseLaw) else None
+        if self.own_plant is not None:
+            law = law or gaussian_noise(self.variance)
+        parts = OwnParts(
+            reference=self.own_reference,
+            links=self.faults if isinstance(self.faults, LinkFaults) else None,
+            events=self._events,
+            noise=None if law is None else partial(LawNoise, law),
+            nominal=None if own is None else own.plant_parameters(KINDS[self.robot].drive),
+            limits=None if own is None else own.limits(),
+            plant=None if self.own_plant is None else self.own_plant.simulation,
             robot_parameters=self.robot_parameters,
         )
-
-
-@dataclass(frozen=True, eq=False)
-class ScriptedTwinScenario(TwinScenario):
-    """A run on the twin with a reference, faults or robot parameters of one's own."""
-
-    own_reference: SampledReference | None = None
-    own_links: LinkFaults | None = None
-    events: FaultSchedule = field(default_factory=FaultSchedule)
-    law: NoiseLaw | None = None
-    robot_parameters: dict[str, Any] = field(default_factory=dict)
-
-    __str__ = TwinScenario.__str__
-
-    @property
-    def links(self) -> LinkFaults:
-        """Faults of the links between robot and controller."""
-        return super().links if self.own_links is None else self.own_links
-
-    def reference(self) -> SampledReference:
-        """Return the reference over the run and the preview beyond it."""
-        return super().reference() if self.own_reference is None else self.own_reference
-
-    def robot(self) -> DigitalTwinParameters:
-        """Return the true robot."""
-        return super().robot().with_values(self.robot_parameters)
-
-    def speed_noise(self) -> LawNoise | None:
-        """Return the noise of the wheel speeds; None for white noise."""
-        return None if self.law is None else LawNoise(self.law, self.robot().seed)
-
-    def schedule(self) -> FaultSchedule:
-        """Return the faults of robot and command link."""
-        found = super().schedule()
-        return FaultSchedule([*self.events.events, *found.events], found.name)
-
-
-@dataclass(frozen=True, eq=False)
-class ScriptedScenario(Scenario):
-    """A run on the paper's plant, a robot or a plant of one's own."""
-
-    own_reference: SampledReference | None = None
-    own_links: LinkFaults | None = None
-    own_robot: Robot | None = None
-    own_plant: OwnPlant | None = None
-    law: NoiseLaw | None = None
-    robot_parameters: dict[str, Any] = field(default_factory=dict)
-
-    __str__ = Scenario.__str__
-
-    @property
-    def links(self) -> LinkFaults:
-        """Faults of the links between robot and controller."""
-        return super().links if self.own_links is None else self.own_links
-
-    @property
-    def limits(self) -> LimitParameters:
-        """Limits of a velocity command."""
-        return super().limits if self.own_robot is None else self.own_robot.limits()
-
-    def reference(self) -> SampledReference:
-        """Return the reference over the run and the preview beyond it."""
-        return super().reference() if self.own_reference is None else self.own_reference
-
-    def plant(self) -> LoopPlant:
-        """Return the plant of a new run."""
-        law, seed = self.law, self.robot().seed
-        if self.own_plant is not None:
-            noise = law or gaussian_noise(self.noise)
-            return NoisyPlant(self.own_plant.simulation(), LawNoise(noise, seed))
-        if law is None:
-            return DisturbedPlant(self.robot())
-        quiet = self.robot().with_values({'noise.variance': 0.0})
-        return NoisyPlant(DisturbedPlant(quiet), LawNoise(law, seed))
-
-    def robot(self) -> PaperRobotParameters:
-        """Return the true robot, as it is when the run begins."""
-        return super().robot().with_values(self.robot_parameters)
-
-    def _nominal(self) -> PaperRobotParameters:
-        if self.own_robot is None:
-            return super()._nominal()
-        return self.own_robot.plant_parameters(self.drive)
+        return Scenario(self.robot, case, seed, self.duration, self.variance, own=parts)

@@ -11,28 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.closed_loop import LoopRecord, run
+from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.method_comparison.compared_runs import (
-    METRICS,
-    START,
-    AnyMethod,
-    AnyScenario,
-    Numbers,
-    TwinMethod,
-    paper_numbers,
-    twin_numbers,
-    twin_run,
-)
-from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
+from t3mpc_ros.evaluation.loop import Method, run
+from t3mpc_ros.evaluation.metrics import METRICS, START, Numbers, measure
+from t3mpc_ros.evaluation.record import Record, counted_rows
 from t3mpc_ros.evaluation.reporting import Table
-from t3mpc_ros.evaluation.scenario import Scenario, counted_rows
+from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
-from t3mpc_ros.evaluation.twin_closed_loop import INITIAL_STANDSTILL, TwinRecord
 from t3mpc_ros.scripting.controllers import as_controller
 from t3mpc_ros.scripting.plants import NoiseLaw
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
-from t3mpc_ros.scripting.setting import NOMINAL, Setting
+from t3mpc_ros.scripting.setting import Setting
 from t3mpc_ros.scripting.table_files import write_csv, write_parquet
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
@@ -53,8 +43,8 @@ class RunResult:
 
     controller: str
     """Name of the controller."""
-    scenario: AnyScenario
-    record: LoopRecord | TwinRecord
+    scenario: Scenario
+    record: Record
     """Everything that was recorded."""
     columns: Mapping[str, Array]
     metrics: Numbers
@@ -77,8 +67,8 @@ class RunResult:
 
         On the twin the time counts from the end of its standstill of 1.5 s.
         """
-        begin = after + (INITIAL_STANDSTILL if 'yaw' in self.columns else 0.0)
         none: Array = np.zeros(0)
+        begin = after + self.record.start
         return rms(self.error[counted_rows(self.columns['time'], none, begin)])
 
     def table(self) -> str:
@@ -164,7 +154,7 @@ def simulate(
     return run_once(scenario, as_controller(controller).method(setting.robot))
 
 
-def run_once(scenario: AnyScenario, method: AnyMethod) -> RunResult:
+def run_once(scenario: Scenario, method: Method) -> RunResult:
     """Return the result of one run.
 
     Raises
@@ -172,12 +162,6 @@ def run_once(scenario: AnyScenario, method: AnyMethod) -> RunResult:
     ScriptError
         The run diverged.
     """
-    if isinstance(scenario, TwinScenario) and isinstance(method, TwinMethod):
-        twin = twin_run(scenario, method)
-        numbers = twin_numbers(scenario, twin)
-        return RunResult(method.name, scenario, twin, _twin_columns(twin), numbers)
-    assert isinstance(scenario, Scenario)
-    assert not isinstance(method, TwinMethod)
     record = run(scenario, method)
     if not record.finite:
         k = int(np.argmax(~np.isfinite(record.speeds).all(axis=1)))
@@ -186,30 +170,20 @@ def run_once(scenario: AnyScenario, method: AnyMethod) -> RunResult:
             f'the run of {method.name} diverged at {record.time[k]:.2f} s: the last finite wheel '
             f'speeds were {last[0]:.4g} and {last[1]:.4g} rad/s'
         )
-    return RunResult(method.name, scenario, record, _columns(record), paper_numbers(record))
+    return RunResult(method.name, scenario, record, _columns(record), measure(scenario, record))
 
 
-def _columns(record: LoopRecord) -> dict[str, Array]:
-    found = {'time': record.time}
+def _columns(record: Record) -> dict[str, Array]:
     arrays = {
         'reference': record.reference,
-        'measured': record.measured,
+        'measured': record['measured'],
         'speed': record.speeds,
-        'command': record.sent,
+        'command': record['sent'],
     }
-    return found | _sides(arrays)
-
-
-def _twin_columns(record: TwinRecord) -> dict[str, Array]:
-    found = {'time': record.time}
-    arrays = {
-        'reference': record.reference,
-        'measured': record.measured,
-        'speed': record.rotors,
-        'command': record.requested,
-    }
-    found |= _sides(arrays)
-    return found | {name: record.truth[:, i] for i, name in enumerate(('x', 'y', 'yaw'))}
+    found = {'time': record.time} | _sides(arrays)
+    if 'truth' in record.columns:
+        found |= {name: record['truth'][:, i] for i, name in enumerate(('x', 'y', 'yaw'))}
+    return found
 
 
 def _sides(arrays: Mapping[str, Array]) -> dict[str, Array]:

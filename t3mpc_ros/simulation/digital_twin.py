@@ -41,6 +41,7 @@ from t3mpc_ros.simulation.plant.paper_plant import (
     PaperRobotParameters,
 )
 from t3mpc_ros.simulation.plant.stepper_motor import StepperMotorParameters
+from t3mpc_ros.simulation.plant_robot import Signals
 from t3mpc_ros.simulation.sensors.battery import SimulatedBattery, SimulatedBatteryParameters
 from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters
 from t3mpc_ros.simulation.sensors.range_sensor import (
@@ -265,6 +266,11 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         return ''
 
     # -- simulation only --------------------------------------------------------------------------
+
+    @property
+    def signals(self) -> Signals:
+        """Columns of a record beside those of the state."""
+        return {'contact_force': self._drivetrain.max_contact_force}
 
     @property
     def diagnostics(self) -> TwinDiagnostics:

@@ -130,12 +130,11 @@ def topics(path):
 
 
 PAPER = 'evaluation.paper.reproduce.reproduce'
-COMPARED = 'evaluation.method_comparison.'
 COMPARE = {
-    f'{COMPARED}compared_runs.compare': {},
-    f'{COMPARED}comparison_page.markdown': '',
-    f'{COMPARED}comparison_page.record': {},
-    f'{COMPARED}comparison_page.page': '',
+    'evaluation.experiment.compare': {},
+    'evaluation.comparison_page.markdown': '',
+    'evaluation.comparison_page.record': {},
+    'evaluation.comparison_page.page': '',
     'evaluation.methods.require_libraries': None,
 }
 PATROL = {
@@ -152,7 +151,7 @@ PATROL = {
 TUNE = {
     'evaluation.methods.require_libraries': None,
     'evaluation.tuning.tune_methods.tune_methods': SimpleNamespace(table=text),
-    f'{COMPARED}twin_tuning.tune_twin': SimpleNamespace(table=text),
+    'evaluation.tuning.twin_tuning.tune_twin': SimpleNamespace(table=text),
     'evaluation.tuning.drive_identification.identify_bag': ('drive', 'paper'),
     'evaluation.tuning.drive_identification.parameter_file': 'a: 1',
 }

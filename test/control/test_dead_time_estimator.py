@@ -20,13 +20,9 @@ from t3mpc_ros.control.dead_time_estimator import (
     DeadTimeEstimator,
 )
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
-from t3mpc_ros.evaluation.twin_closed_loop import (
-    INITIAL_STANDSTILL,
-    chaotic_course,
-    loop_controller,
-    loop_robot,
-    run_twin,
-)
+from t3mpc_ros.evaluation.loop import run as run_loop
+from t3mpc_ros.evaluation.method import NodeMethod
+from t3mpc_ros.evaluation.scenario import Scenario
 
 PERIOD = 0.01
 SUBSTEPS = 20
@@ -253,11 +249,11 @@ def test_speeds_at_the_stamp_need_the_other_model():
 @pytest.mark.compiled
 @pytest.mark.slow
 def test_the_stepper_twin_with_an_unknown_dead_time():
-    robot = loop_robot(seed=7).with_values({'drive.dead_time': 0.06})
     duration = 20.0
-    record = run_twin(robot, loop_controller(), chaotic_course(duration, 7), duration)
-    drive = Drive(record.requested, record.measured)
-    estimator, trace = run(drive, rows=np.arange(at(INITIAL_STANDSTILL), at(duration)))
+    scenario = Scenario('twin', 'unknown dead time 60 ms', 7, duration)
+    record = run_loop(scenario, NodeMethod('full', {}))
+    drive = Drive(record['sent'], record['measured'])
+    estimator, trace = run(drive, rows=np.arange(at(record.start), at(duration)))
     assert estimator.identified
     # The motors respond some milliseconds later than the lag of the model.
     assert 0.058 < estimator.dead_time < 0.066

@@ -30,13 +30,14 @@ from t3mpc_ros.evaluation.fault_study import (
     undisturbed,
     update_page,
 )
-from t3mpc_ros.evaluation.twin_closed_loop import (
-    INITIAL_STANDSTILL,
-    chaotic_course,
-    loop_controller,
-    loop_robot,
-    run_twin,
-    straight_course,
+from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.method import NodeMethod
+from t3mpc_ros.evaluation.scenario import (
+    KINDS,
+    OwnParts,
+    Scenario,
+    noisy_twin,
+    sampled_speeds,
 )
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
@@ -50,8 +51,8 @@ NUMBER = re.compile(r'(?<![\w.])\d+(?:\.\d+)?')
 
 
 def short_run(schedule=None, pauses=(), **changes):
-    robot = loop_robot().with_values(changes)
-    return run_twin(robot, loop_controller(), chaotic_course(6.0), 6.0, schedule, pauses)
+    own = OwnParts(events=schedule or FaultSchedule(), robot_parameters=changes, pauses=pauses)
+    return run(Scenario('twin', 'nominal', 1, 6.0, own=own), NodeMethod('full', {}))
 
 
 def fault_run(course, name):
@@ -92,37 +93,36 @@ def test_equal_runs_are_bit_equal_with_scheduled_faults(tmp_path):
     path = tmp_path / 'ride.yaml'
     path.write_text('- {at: 3.0, fault: command_delay, value: 0.1, for: 1.0}\n')
     second = short_run(**{'faults.schedule': str(path)})
-    for name in ('requested', 'measured', 'rotors', 'odometry', 'truth', 'flags'):
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    for name, column in first.columns.items():
+        np.testing.assert_array_equal(column, second[name])
     assert first.robot_reasons == second.robot_reasons
-    assert not np.array_equal(first.rotors, short_run().rotors)
+    assert not np.array_equal(first.speeds, short_run().speeds)
 
 
 def test_robot_waits_for_gyro_calibration_then_tracks():
     record = short_run()
-    standing = record.time < INITIAL_STANDSTILL
-    assert not record.requested[standing].any()
-    assert set(np.array(record.controller_reasons)[standing]) == {'disabled by request'}
-    assert not any(np.array(record.controller_reasons)[~standing])
-    error = (record.rotors - record.reference)[record.rows(3.0, 6.0)]
+    standing = record.time < KINDS['twin'].start
+    assert not record['sent'][standing].any()
+    assert set(np.array(record.driver_reasons)[standing]) == {'disabled by request'}
+    assert not any(np.array(record.driver_reasons)[~standing])
+    error = record.error[record.rows(3.0, 6.0)]
     assert np.sqrt(np.mean(error**2)) < 0.06
 
 
 def test_a_person_can_pause_the_controller():
     record = short_run(pauses=[(3.0, 4.0)])
-    assert not record.requested[record.rows(3.0, 4.0)].any()
-    assert record.requested[record.rows(4.0, 6.0)].any()
+    assert not record['sent'][record.rows(3.0, 4.0)].any()
+    assert record['sent'][record.rows(4.0, 6.0)].any()
 
 
 def test_what_cannot_be_run_is_refused():
-    robot, controller = loop_robot(), loop_controller()
-    with pytest.raises(ValueError, match='course must have the shape'):
-        run_twin(robot, controller, straight_course(5.0), 6.0)
-    servo = robot.with_values({'drive.kind': 'velocity'})
+    short = OwnParts(reference=sampled_speeds(np.zeros((600, 2))))
+    with pytest.raises(ValueError, match=r'reference must have at least 640 rows: got 600'):
+        run(Scenario('twin', 'nominal', 1, 6.0, own=short), NodeMethod('full', {}))
     with pytest.raises(ParameterError, match='drive.kind must be stepper'):
-        run_twin(servo, controller, straight_course(5.0), 5.0)
-    with pytest.raises(ParameterError, match='rate of the controller'):
-        run_twin(robot, controller.with_values({'rate': 50.0}), straight_course(5.0), 5.0)
+        short_run(**{'drive.kind': 'velocity'})
+    with pytest.raises(ValueError, match='rate of the controller must be 100 Hz: got 50'):
+        run(Scenario('twin', 'nominal', 1, 6.0), NodeMethod('half', {'rate': 50.0}))
 
 
 # --- what becomes of it -------------------------------------------------------------------------
@@ -188,15 +188,14 @@ def test_the_page_has_a_row_for_every_trial_and_no_other():
 
 def test_a_known_delay_costs_little():
     """What hurts is not the delay but not to know of it: the controller finds it out."""
-    robot = loop_robot().with_values({'faults.command_delay': 0.1})
+    own = OwnParts(robot_parameters={'faults.command_delay': 0.1})
     errors = []
     for dead_time, estimated in ((0.01, False), (0.01, True), (0.11, True)):
-        controller = loop_controller().with_values(
-            {'speed_filter.dead_time': dead_time, 'estimate_dead_time': estimated}
-        )
-        record = run_twin(robot, controller, chaotic_course(15.0), 15.0)
+        changes = {'speed_filter.dead_time': dead_time, 'estimate_dead_time': estimated}
+        scenario = Scenario('twin', 'nominal', 1, 15.0, own=own)
+        record = run(scenario, NodeMethod('changed', changes))
         rows = record.rows(5.0, 15.0)
-        errors.append(np.sqrt(np.mean((record.rotors - record.reference)[rows] ** 2)))
+        errors.append(np.sqrt(np.mean(record.error[rows] ** 2)))
     assert errors[0] > 0.1
     assert errors[1] < 0.2 * errors[0]
     assert errors[2] < 0.2 * errors[0]
@@ -209,7 +208,11 @@ AT = fault_run('chaotic', 'gyro_dead')
 
 def judged(record):
     undisturbed_run = undisturbed('chaotic', AT.duration)
-    return evaluate_outcome(AT.name, AT.course, record, undisturbed_run, 10.0, 15.0, loop_robot())
+    return evaluate_outcome(AT.name, AT.course, record, undisturbed_run, 10.0, 15.0, noisy_twin())
+
+
+def changed(record, column, values):
+    return replace(record, columns={**record.columns, column: values})
 
 
 def test_a_run_without_fault_is_bounded_and_notices_nothing():
@@ -232,18 +235,18 @@ def test_a_robot_moving_with_a_stop_reason_is_out_of_bounds():
 
 
 @pytest.mark.parametrize(
-    'field, value', [('commanded', (10.1, 10.1)), ('commanded', (-9.9, 9.9)), ('rotors', (0, 11))]
+    'field, value', [('commanded', (10.1, 10.1)), ('commanded', (-9.9, 9.9)), ('speeds', (0, 11))]
 )
 def test_speeds_beyond_the_limits_are_unbounded(field, value):
     record = undisturbed('chaotic', AT.duration)
-    values = getattr(record, field).copy()
+    values = record[field].copy()
     values[1200] = value
-    parameters = loop_robot().with_values({'angular.z.max_velocity': 4.0})
+    parameters = noisy_twin().with_values({'angular.z.max_velocity': 4.0})
     undisturbed_run = undisturbed('chaotic', AT.duration)
     result = evaluate_outcome(
         AT.name,
         AT.course,
-        replace(record, **{field: values}),
+        changed(record, field, values),
         undisturbed_run,
         10.0,
         15.0,
@@ -254,11 +257,11 @@ def test_speeds_beyond_the_limits_are_unbounded(field, value):
 
 def test_a_lasting_error_is_impaired_a_passing_one_recovers():
     record = undisturbed('chaotic', AT.duration)
-    rotors = record.rotors.copy()
-    rotors[1500:] += 0.2
-    assert judged(replace(record, rotors=rotors)).verdict == 'impaired'
-    rotors[2000:] -= 0.2
-    result = judged(replace(record, rotors=rotors))
+    speeds = record.speeds.copy()
+    speeds[1500:] += 0.2
+    assert judged(changed(record, 'speeds', speeds)).verdict == 'impaired'
+    speeds[2000:] -= 0.2
+    result = judged(changed(record, 'speeds', speeds))
     assert result.verdict == 'bounded'
     assert 3.0 <= result.recovery_time <= 5.0
 

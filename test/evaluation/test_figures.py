@@ -5,7 +5,7 @@
 Every quantity of the runs has a value of its own, so that any two that are exchanged are seen.
 """
 
-from dataclasses import fields, replace
+from dataclasses import replace
 import math
 from types import SimpleNamespace
 
@@ -13,15 +13,15 @@ from matplotlib.colors import to_hex
 from matplotlib.patches import Circle, Rectangle
 import numpy as np
 import pytest
+from support.records import PAIRS, record_of
 
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.evaluation import fault_page
-from t3mpc_ros.evaluation.closed_loop import LoopRecord
+from t3mpc_ros.evaluation import comparison_page, fault_page
 from t3mpc_ros.evaluation.confidence_intervals import interval
+from t3mpc_ros.evaluation.experiment import ComparisonPlan
 from t3mpc_ros.evaluation.fault_study import Outcome
-from t3mpc_ros.evaluation.method_comparison import comparison_page
-from t3mpc_ros.evaluation.method_comparison.compared_runs import METRICS, ComparisonPlan
 from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.metrics import METRICS
 from t3mpc_ros.evaluation.paper import paper_figures
 from t3mpc_ros.evaluation.paper.experiment_runs import STAGES, WITHOUT, Experiment, RunNumbers
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
@@ -84,18 +84,14 @@ TIME = 0.1 * np.arange(300)
 
 def loop_record(shift=0.0):
     """Return a run whose columns all differ, with a switch at 15 s."""
-    record = LoopRecord.empty(TIME.size)
     columns = {
-        each.name: np.outer(np.sin(0.3 * TIME + k), (1.0, 1.0)) + (10.0 * k + shift, 10.0 * k + 5)
-        for k, each in enumerate(fields(LoopRecord), 1)
-        if getattr(record, each.name).shape == (TIME.size, 2)
+        name: np.outer(np.sin(0.3 * TIME + k), (1.0, 1.0)) + (10.0 * k + shift, 10.0 * k + 5)
+        for k, name in enumerate(PAIRS, 1)
     }
     modes = (TIME >= 15.0).astype(np.int64)
     columns['reference'] += 3.0 * modes[:, None]
     terms = np.stack([columns['speeds'] * (k + 2) for k in range(len(TERM_NAMES))], axis=1)
-    return replace(
-        record, time=TIME, modes=modes, terms=terms, switches=np.array([15.0]), **columns
-    )
+    return record_of(TIME, mode=modes, terms=terms, switches=[15.0], **columns)
 
 
 RUN, SERVO, BLIND, OTHER = map(loop_record, (0.0, 100.0, 200.0, 300.0))
@@ -110,7 +106,7 @@ SIDES = ('right', 'left')
     ('draw', 'unit', 'shown'),
     [
         (paper_figures.outputs, 'speed / rad/s', {'reference': 'reference', 'robot': 'speeds'}),
-        (paper_figures.control, 'u / rad/s²', {'_child': 'command'}),
+        (paper_figures.control, 'u / rad/s²', {'_child': 'acceleration'}),
         (paper_figures.estimates, 'rad/s²', {'estimate g': 'terms'}),
     ],
 )
@@ -123,7 +119,7 @@ def test_a_run_and_its_switch(draw, unit, shown):
             found = {each.get_label(): each for each in axis.lines if len(each.get_xdata()) > 2}
             for label, name in shown.items():
                 (line,) = (each for key, each in found.items() if key.startswith(label))
-                values = getattr(RUN, name)
+                values = RUN[name]
                 values = -values[:, 0] if name == 'terms' else values
                 rows = np.searchsorted(TIME, line.get_xdata() - 1e-6)
                 assert line.get_ydata() == pytest.approx(values[rows, i])
@@ -138,20 +134,21 @@ def test_measured_samples_and_the_true_unknown():
     axes = np.array(paper_figures.outputs(SHOWCASE).axes).reshape(2, 2)
     for i, axis in enumerate(axes[:, 1]):
         time, values = lines(axis)['measured']
-        assert values == pytest.approx(RUN.measured[np.searchsorted(TIME, time - 1e-6), i])
+        assert values == pytest.approx(RUN['measured'][np.searchsorted(TIME, time - 1e-6), i])
     axes = np.array(paper_figures.estimates(SHOWCASE).axes).reshape(2, 2)
     for i, axis in enumerate(axes[:, 0]):
         time, values = lines(axis)['unknown, $\\dot\\chi - u$']
         slope = np.diff(RUN.speeds[:, i]) / 0.1
-        assert values == pytest.approx(slope - RUN.command[:-1, i])
+        assert values == pytest.approx(slope - RUN['acceleration'][:-1, i])
         counted = time >= 3.0
-        miss = values + RUN.terms[:-1, 0, i]
+        miss = values + RUN['terms'][:-1, 0, i]
         share = 1.0 - np.mean(miss[counted] ** 2) / np.var(values[counted])
         assert f'{100 * share:.0f} % of the variance' in title(axis)
 
 
 def test_the_variation_of_u_is_that_of_its_wheel():
-    run = replace(RUN, command=np.cumsum(np.ones((TIME.size, 2)) * (1.0, 3.0), axis=0))
+    steep = np.cumsum(np.ones((TIME.size, 2)) * (1.0, 3.0), axis=0)
+    run = replace(RUN, columns={**RUN.columns, 'acceleration': steep})
     axes = np.array(paper_figures.control(replace(SHOWCASE, torque=run)).axes).reshape(2, 2)
     for axis, rate in zip(axes[:, 0], (10, 30), strict=True):
         assert f'varies by {rate} rad/s² a second' in title(axis)

@@ -11,34 +11,15 @@ import pytest
 
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.cli.run_options import ROBOTS, seed_range
-from t3mpc_ros.control.controller import Controller
+from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
 from t3mpc_ros.evaluation.baselines.feedback_control import (
     ProportionalIntegral,
     ProportionalIntegralParameters,
 )
-from t3mpc_ros.evaluation.closed_loop import MethodSpec
-from t3mpc_ros.evaluation.method_comparison.compared_runs import (
-    DRIFT,
-    DRIVES,
-    FEED_FORWARD,
-    QUICK_SEEDS,
-    SETTLED,
-    STOPPED,
-    YAW_RATE,
-    ComparisonPlan,
-    TwinMethod,
-    cases_for,
-    compare,
-    default_methods,
-    measured_run,
-    methods_for,
-    twin_numbers,
-    twin_run,
-    twin_start,
-)
-from t3mpc_ros.evaluation.method_comparison.comparison_page import (
+from t3mpc_ros.evaluation.cases import NOMINAL, cases_for
+from t3mpc_ros.evaluation.comparison_page import (
     BETTER,
     INCONCLUSIVE,
     WORSE,
@@ -46,18 +27,29 @@ from t3mpc_ros.evaluation.method_comparison.comparison_page import (
     judged_metrics,
     verdict,
 )
-from t3mpc_ros.evaluation.method_comparison.twin_scenario import CASES, TwinBaseline, TwinScenario
-from t3mpc_ros.evaluation.methods import FULL
-from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, TUNING_SEEDS
-from t3mpc_ros.evaluation.simulated_links import LinkFaults
-from t3mpc_ros.evaluation.twin_closed_loop import (
-    INITIAL_STANDSTILL,
-    drive_twin,
-    loop_controller,
-    loop_robot,
-    run_twin,
+from t3mpc_ros.evaluation.drivers import MethodDriver, NodeDriver
+from t3mpc_ros.evaluation.experiment import (
+    QUICK_SEEDS,
+    ComparisonPlan,
+    compare,
+    default_methods,
+    measured_run,
 )
-from t3mpc_ros.geometry.kinematics import twist_from_wheels
+from t3mpc_ros.evaluation.loop import run, run_loop
+from t3mpc_ros.evaluation.method import MethodSpec
+from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, methods_for, twin_start
+from t3mpc_ros.evaluation.metrics import DRIFT, SETTLED, STOPPED, YAW_RATE, measure
+from t3mpc_ros.evaluation.record import stamp_of
+from t3mpc_ros.evaluation.scenario import (
+    HELD_OUT_SEEDS,
+    KINDS,
+    PRETRAINING_SEEDS,
+    TUNING_SEEDS,
+    Scenario,
+    noisy_twin,
+)
+from t3mpc_ros.evaluation.simulated_links import LinkFaults
+from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, WheelSpeeds
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
@@ -67,8 +59,8 @@ PI = 'PI + feed-forward'
 
 def twin(case='nominal', method=FEED_FORWARD, seed=201, duration=4.0, **changes):
     """Return scenario and record of a short run on the twin."""
-    scenario = TwinScenario(case, seed, duration, **changes)
-    return scenario, twin_run(scenario, methods_for('twin')[method])
+    scenario = Scenario('twin', case, seed, duration, **changes)
+    return scenario, run(scenario, methods_for('twin')[method])
 
 
 def ideal_drive(commands, lag, late, steps, substeps=20):
@@ -185,23 +177,13 @@ def test_feed_forward_needs_a_future():
 # --- the loop on the twin -----------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_the_loop_of_a_controller_is_that_of_run_twin():
-    scenario = TwinScenario('nominal', 201, 3.0)
-    mine = twin_run(scenario, methods_for('twin')[FULL])
-    robot = loop_robot(seed=201)
-    other = run_twin(robot, loop_controller(), scenario.reference().speeds, 3.0)
-    assert np.array_equal(mine.requested, other.requested)
-    assert np.array_equal(mine.truth, other.truth)
-
-
 @pytest.mark.parametrize('method', [FULL, PI])
 @pytest.mark.parametrize('case', ['miscalibrated', 'overload', 'dropouts'])
 @pytest.mark.slow
 def test_equal_seeds_give_equal_runs(case, method):
     (_, first), (_, second) = (twin(case, method, duration=3.0) for _ in range(2))
-    assert np.array_equal(first.requested, second.requested)
-    assert np.array_equal(first.rotors, second.rotors)
+    for name, column in first.columns.items():
+        np.testing.assert_array_equal(column, second[name])
 
 
 @pytest.mark.slow
@@ -209,36 +191,36 @@ def test_methods_are_paired():
     """Reference, noise and lost messages are the same for every method of a seed."""
     (scenario, mine), (_, other) = (twin('dropouts', method) for method in (FEED_FORWARD, PI))
     assert np.array_equal(mine.reference, other.reference)
-    still = mine.rows(0.0, INITIAL_STANDSTILL)
-    assert np.array_equal(mine.measured[still], other.measured[still])
-    assert scenario.robot().noise.variance == 0.04
+    still = mine.rows(0.0, mine.start)
+    assert np.array_equal(mine['measured'][still], other['measured'][still])
+    assert scenario.true_robot().noise.variance == 0.04
     _, another = twin('dropouts', seed=202)
     assert not np.array_equal(mine.reference, another.reference)
 
 
-@pytest.mark.parametrize('case', list(CASES))
+@pytest.mark.parametrize('case', cases_for('twin'))
 def test_every_case_of_the_twin_drives(case):
     """The robot follows in every case: worse than usual, but it does not stop or diverge."""
     scenario, record = twin(case, FEED_FORWARD)
-    numbers = twin_numbers(scenario, record)
+    numbers = measure(scenario, record)
     assert numbers[SETTLED.name] < 2.0
     assert numbers[STOPPED.name] == 0.0
-    assert np.abs(record.requested).max() > 0.5
+    assert np.abs(record['sent']).max() > 0.5
 
 
 def test_feed_forward_does_not_depend_on_noise():
     scenario, quiet = twin(noise=0.0)
     _, noisy = twin(noise=0.1)
-    moving = quiet.time > INITIAL_STANDSTILL + 1.0  # before: from the measured speed to the plan
-    assert np.abs(quiet.requested - noisy.requested)[moving].max() < 1e-9
+    moving = quiet.time > quiet.start + 1.0  # before: from the measured speed to the plan
+    assert np.abs(quiet['sent'] - noisy['sent'])[moving].max() < 1e-9
     assert scenario.noise == 0.0
 
 
 def test_the_miscalibrated_twin_turns_otherwise():
     (_, good), (_, bad) = twin(), twin('miscalibrated')
-    moving = good.time > INITIAL_STANDSTILL + 1.0
-    assert np.abs(good.requested - bad.requested)[moving].max() < 1e-9
-    numbers = [twin_numbers(TwinScenario(case, 201, 4.0), run) for case, run in
+    moving = good.time > good.start + 1.0
+    assert np.abs(good['sent'] - bad['sent'])[moving].max() < 1e-9
+    numbers = [measure(Scenario('twin', case, 201, 4.0), run) for case, run in
                (('nominal', good), ('miscalibrated', bad))]  # fmt: skip
     assert numbers[1][YAW_RATE.name] > 2.0 * numbers[0][YAW_RATE.name]
     assert numbers[1][SETTLED.name] < 0.1
@@ -246,25 +228,29 @@ def test_the_miscalibrated_twin_turns_otherwise():
 
 def test_a_known_dead_time_is_known_to_all():
     for case, assumed in (('dead time 60 ms', 0.06), ('unknown dead time 60 ms', 0.01)):
-        scenario = TwinScenario(case, 201)
-        assert scenario.robot().drive.dead_time == 0.06
+        scenario = Scenario('twin', case, 201)
+        assert scenario.true_robot().drive.dead_time == 0.06
         assert scenario.estimate().dead_time == assumed
-        assert scenario.controller_parameters().speed_filter.dead_time == assumed
+        assert scenario.kind.controller_parameters(scenario).speed_filter.dead_time == assumed
         assert scenario.nominal_model().robot.drive.dead_time == assumed
     (_, known), (_, unknown) = twin('dead time 60 ms'), twin('unknown dead time 60 ms')
-    shift = known.requested[250:350] - unknown.requested[255:355]
+    shift = known['sent'][250:350] - unknown['sent'][255:355]
     assert np.abs(shift).max() < 1e-9
 
 
 def test_the_yaw_of_the_odometry_is_the_gyro_measurement():
     """The measured wheel speeds have the mean of the counters and the turn of the yaw."""
     spec = MethodSpec('PI', ProportionalIntegral, ProportionalIntegralParameters())
-    geometry = loop_robot().geometry
+    geometry = noisy_twin().geometry
     for gyro in (False, True):
-        baseline = TwinBaseline(spec, TwinScenario('nominal', 201, 4.0, gyro=gyro))
-        baseline.step(State(2_000_000_000, ORIGIN, BodyTwist(0.1, 0.5)))
-        odometry = State(2_010_000_000, Pose(0.001, 0.0, 0.003), BodyTwist(0.1, 0.5))
-        measured = baseline._measured(odometry, T)
+        scenario = Scenario('twin', NOMINAL, 201, 4.0, gyro=gyro)
+        driver, robot = MethodDriver(spec, scenario), scenario.simulation()
+        wheels = wheels_from_twist(BodyTwist(0.1, 0.5), geometry)
+        for stamp, pose in ((2_000_000_000, ORIGIN), (2_010_000_000, Pose(0.001, 0.0, 0.003))):
+            odometry = State(stamp, pose, BodyTwist(0.1, 0.5))
+            state = robot.advance(0)._replace(stamp_ns=stamp, wheels=wheels, odometry=odometry)
+            measured = driver._measured(state, 1)
+            driver.step(state)
         twist = twist_from_wheels(WheelSpeeds(*measured), geometry)
         assert twist.linear == pytest.approx(0.1)
         assert twist.angular == pytest.approx(0.3 if gyro else 0.5)
@@ -274,27 +260,22 @@ def test_reports_arrive_late_in_order_and_not_at_all():
     """A controller receives what the faults leave, in order and no earlier than its delay."""
     received = []
 
-    class Spy:
-        def __init__(self):
-            self.inner = Controller(loop_controller())
+    class Spy(NodeDriver):
+        def begin(self, k, *, enabled):
+            self.now_ns = stamp_of(k)
+            super().begin(k, enabled=enabled)
 
-        def enable(self, on):
-            self.inner.enable(on)
-
-        def add_reference(self, reference):
-            self.newest = reference.stamp_ns
-            return self.inner.add_reference(reference)
-
-        def step(self, odometry):
-            now_ns = self.newest - 400_000_000
-            received.append((odometry.stamp_ns, now_ns))
-            return self.inner.step(odometry)
+        def step(self, state):
+            received.append((state.stamp_ns, self.now_ns))
+            return super().step(state)
 
     faults = LinkFaults(
         odometry_loss=0.2, odometry_delay=(0.02, 0.12), begin=1.0 / 3.0, lasting=1.0
     )
-    course = TwinScenario('nominal', 201, 3.0).reference().speeds
-    drive_twin(loop_robot(seed=3), Spy(), course, 3.0, links=faults)
+    scenario = Scenario('twin', NOMINAL, 3, 3.0)
+    controller = Controller(StepperControllerParameters())
+    driver = Spy(controller, noisy_twin().geometry, scenario.reference().speeds)
+    run_loop(scenario.simulation(), driver, 300, start=1.5, links=faults, seed=3)
     stamps = [stamp for stamp, _ in received]
     assert stamps == sorted(stamps)
     during = [now - stamp for stamp, now in received if 1_000_000_000 <= stamp < 2_000_000_000]
@@ -317,16 +298,15 @@ def test_every_robot_has_feed_forward_and_the_full_controller(robot):
     assert default_methods(robot)[:2] == (FULL, FEED_FORWARD)
     assert set(default_methods(robot)) < set(methods_for(robot))
     assert cases_for(robot)[0] == 'nominal'
-    assert set(DRIVES) == set(ROBOTS)
+    assert set(KINDS) == set(ROBOTS)
 
 
 def test_the_gain_that_tuning_starts_with_cancels_the_noise():
     """On the twin the command of PI without integral does not contain the measured speed."""
     method = methods_for('twin')[PI]
-    scenario = TwinScenario('nominal', 201)
+    scenario = Scenario('twin', 'nominal', 201)
     model = scenario.nominal_model()
-    assert isinstance(method, TwinMethod)
-    parameters = twin_start(method.baseline.parameters).with_values({'integral': 0.1})
+    parameters = twin_start(method.parameters).with_values({'integral': 0.1})
     commands = []
     for speed in (1.0, 1.2):
         pi = ProportionalIntegral(parameters, model)
@@ -356,9 +336,8 @@ def test_differences_are_paired_with_their_verdict():
 
 
 def test_the_body_decides_where_it_is_not_known():
-    assert judged_metrics('twin', 'nominal')[0] is SETTLED
-    assert DRIFT in judged_metrics('twin', 'miscalibrated')
-    assert judged_metrics('servo', 'nominal')[0] is SETTLED
+    assert judged_metrics(NOMINAL)[0] is SETTLED
+    assert DRIFT in judged_metrics('miscalibrated')
 
 
 @pytest.mark.parametrize('robot', ['servo', 'torque'])

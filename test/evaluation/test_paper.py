@@ -14,9 +14,9 @@ import matplotlib.image
 import numpy as np
 import pytest
 from scipy import stats
+from support.records import record_of
 from support.unrendered import unrendered  # noqa: F401 - a fixture
 
-from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.methods import FULL, ComparedMethod
 from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
 from t3mpc_ros.evaluation.paper import claims as claiming
@@ -103,20 +103,19 @@ def fake_run(scenario, method):
     """Return a record whose error is white, of the size the settings say, plus the noise."""
     generator = np.random.default_rng((scenario.seed, len(scenario.case)))
     n = round(100 * scenario.duration)
-    run = replace(LoopRecord.empty(n), switches=np.arange(12.0, scenario.duration, 12.0))
-    time = run.time
-    time[:] = np.arange(n) / 100.0
+    time = np.arange(n) / 100.0
+    run = record_of(time, switches=np.arange(12.0, scenario.duration, 12.0))
     modes = np.minimum(time // 12.0, 4.0)
     phases = generator.uniform(0.0, 6.0, 2)
     reference = 4.0 * np.sin(0.8 * time[:, np.newaxis] + phases + 2.0 * modes[:, np.newaxis])
     size = method.parameters['error'] * (1.0 + scenario.noise)
-    run.modes[:] = modes
+    run['mode'][:] = modes
     run.reference[:] = reference
     run.speeds[:] = reference + size * generator.standard_normal((n, 2))
-    run.command[:] = run.effort[:] = np.gradient(reference, 0.01, axis=0)
-    run.terms[:, 0] = generator.standard_normal((n, 2))
+    run['acceleration'][:] = np.gradient(reference, 0.01, axis=0)
+    run['terms'][:, 0] = generator.standard_normal((n, 2))
     noise = math.sqrt(scenario.noise) * generator.standard_normal((n, 2))
-    run.measured[:] = run.speeds + noise
+    run['measured'][:] = run.speeds + noise
     return run
 
 
@@ -327,13 +326,13 @@ def test_what_is_measured_of_a_run():
     assert found.rmse == pytest.approx(math.sqrt((2 * 0.25 + 0.0625) / counted))
     assert found.settled == pytest.approx(math.sqrt(0.0625 / (counted - 200)))
     assert found.largest_error == pytest.approx(0.5)
-    assert found.chatter == run.chatter()
+    assert found.chatter == run.variation()
     assert found.finite
 
 
 def test_a_diverged_run_is_marked_as_not_finite():
     run = fake_run(FakeScenario('torque', 0.0, 'nominal', 101, 6.0), fake_methods('')[FULL])
-    run.command[-1, 0] = math.inf
+    run['acceleration'][-1, 0] = math.inf
     found = measure(run)
     assert not found.finite
     assert math.isnan(found.rmse)
@@ -727,9 +726,9 @@ def test_the_mark_of_an_exhibit_is_that_of_its_worst_claim():
 
 def test_explained_share_is_one_if_perfect_zero_if_none():
     run = fake_run(FakeScenario('torque', 0.04, 'nominal', 101, 20.0), fake_methods('')[FULL])
-    run.terms[:-1, 0] = -(np.diff(run.speeds, axis=0) / 0.01 - run.command[:-1])
+    run['terms'][:-1, 0] = -(np.diff(run.speeds, axis=0) / 0.01 - run['acceleration'][:-1])
     assert explained(run) == pytest.approx((1.0, 1.0), abs=1e-9)
-    run.terms[:, 0] = 0.0
+    run['terms'][:, 0] = 0.0
     assert max(explained(run)) <= 0.0
 
 
@@ -738,7 +737,7 @@ def test_switches_are_counted_and_only_a_whole_run_decides():
     run = fake_run(FakeScenario('torque', 0.04, 'nominal', 101, 60.0), method)
     assert switches_of(run) == pytest.approx([12.0, 24.0, 36.0, 48.0])
     assert switches_claim(run).held is True
-    run.modes[:] = 0
+    run['mode'][:] = 0
     assert switches_claim(run).held is False
     assert largest_switch(run) is None
     assert switches_claim(fake_run(FakeScenario('', 0.0, '', 1, 30.0), method)).held is None

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.records import record_of
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.main import main
@@ -33,7 +34,6 @@ from t3mpc_ros.evaluation.patrol.path_tracking import (
     straight_line,
     tuning_grids,
 )
-from t3mpc_ros.evaluation.patrol.patrol_run import PatrolRecord
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, wheels_from_twist
 from t3mpc_ros.geometry.path_timing import MotionLimits, distance_to_path, resample
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose
@@ -117,11 +117,11 @@ def test_pursuit_drives_both_loops_where_a_path_crosses(parameters):
 
 def _record(track):
     count = len(track)
-    zeros = np.zeros((count, 2))
     poses = np.column_stack([track, np.zeros(count)])
-    columns = dict.fromkeys(PatrolRecord.__slots__, zeros)
-    columns |= {'time': PERIOD * np.arange(count), 'truth': poses, 'reference': 0.0 * poses}
-    return PatrolRecord(**columns)
+    command = np.zeros((count, 2))
+    return record_of(
+        PERIOD * np.arange(count), truth=poses, reference_pose=0.0 * poses, command=command
+    )
 
 
 def test_errors_are_distances_both_ways():

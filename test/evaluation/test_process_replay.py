@@ -30,7 +30,7 @@ from t3mpc_ros.bag.run.model_file import save_model
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.writer import BagWriter, DataError
 from t3mpc_ros.cli.bag import add_compare_parser, add_replay_parser
-from t3mpc_ros.control.controller import ControllerParameters
+from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
 from t3mpc_ros.evaluation.process_replay.comparison import (
@@ -51,7 +51,6 @@ from t3mpc_ros.evaluation.process_replay.divergence_figure import write_divergen
 from t3mpc_ros.evaluation.process_replay.journal_alignment import commands_of, match
 from t3mpc_ros.evaluation.topic_roles import SCALARS
 from t3mpc_ros.evaluation.training.training_data import load_training_data
-from t3mpc_ros.evaluation.twin_closed_loop import loop_controller
 from t3mpc_ros.geometry.types import BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.simulation.world import load_world
@@ -361,7 +360,7 @@ def test_after_a_lost_message_comparison_resumes_at_a_reset(topic, words, bag, t
 
 def test_odometry_lost_before_the_first_reference_is_harmless(tmp_path):
     """The robot has not moved yet, as when the nodes have not all found each other."""
-    parameters = loop_controller()
+    parameters = StepperControllerParameters()
     start = 1_700_000_000_000_000_000
     with ControllerBag(tmp_path / 'bag', parameters) as writer:
         recorded = RecordedController(parameters, writer, start)
@@ -453,7 +452,7 @@ def test_settings_survive_their_topic_to_the_last_bit():
 
 def short_run(folder, model=None, steps=120):
     """Drive along a gentle course, open loop: enough to see whether a model was loaded."""
-    parameters = loop_controller()
+    parameters = StepperControllerParameters()
     start = 1_700_000_000_000_000_000
     with ControllerBag(folder, parameters) as writer:
         recorded = RecordedController(parameters, writer, start, model=model)
@@ -519,7 +518,7 @@ def plain_runs(tmp_path_factory):
 
 def built_run(folder, changes):
     """Drive past some walls, open loop, with readings of a sensor that sees none of them."""
-    parameters = loop_controller().with_values(changes)
+    parameters = StepperControllerParameters().with_values(changes)
     world = parameters.keep_out.world
     start = 1_700_000_000_000_000_000
     with ControllerBag(folder, parameters) as writer:
@@ -563,7 +562,7 @@ def test_a_replay_builds_the_controller_as_its_node_did(name, plain_runs, tmp_pa
 
 def test_every_parameter_is_read_as_it_was_recorded(bag, tmp_path):
     """From the revisions that the node publishes, or from the record of the recorder alone."""
-    parameters = loop_controller()
+    parameters = StepperControllerParameters()
     for spec in ControllerParameters.specs():
         with contextlib.suppress(AssertionError):  # a file, and what others forbid
             parameters = with_other_value(parameters, spec)
@@ -599,7 +598,7 @@ def test_a_command_before_a_kill_is_not_that_of_the_next_process():
 
 def test_a_node_that_was_started_again_is_another_session(tmp_path):
     """Both are in one bag, and the second knows nothing of the first."""
-    parameters = loop_controller()
+    parameters = StepperControllerParameters()
     start = 1_700_000_000_000_000_000
     with ControllerBag(tmp_path / 'bag', parameters) as writer:
         for begin in (start, start + 2_000_000_000):
@@ -807,4 +806,4 @@ def test_the_settings_topic_is_json(bag):
         [(_, message)] = recording.messages('/controller/parameters')
     content = json.loads(message.data)
     assert content['revision'] == 0
-    assert content['parameters']['law.gain'] == loop_controller().law.gain
+    assert content['parameters']['law.gain'] == StepperControllerParameters().law.gain

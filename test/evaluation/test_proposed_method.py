@@ -12,11 +12,14 @@ from support.long_tests import few_of
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.friction_term import FrictionTermParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
-from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
+from t3mpc_ros.evaluation.cases import PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import paired
+from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.method import MadeMethod, MethodSpec
 from t3mpc_ros.evaluation.methods import methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
-from t3mpc_ros.evaluation.scenario import RATE, Scenario
+from t3mpc_ros.evaluation.record import RATE
+from t3mpc_ros.evaluation.scenario import LEAD, Scenario
 from t3mpc_ros.evaluation.tuning.tuned_parameters import StoreError, TunedParameters
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, State, WheelSpeeds
@@ -33,8 +36,8 @@ def _spec(**changes):
 
 def _as_the_nodes_close_it(scenario, **changes):
     """Return the wheel speeds of the loop of stamped motions in and limited twists out."""
-    robot = PaperRobot(scenario.robot())
-    geometry = scenario.robot().geometry
+    robot = PaperRobot(scenario.true_robot())
+    geometry = scenario.true_robot().geometry
     controller = Controller(
         ControllerParameters.from_dict(
             {
@@ -47,7 +50,7 @@ def _as_the_nodes_close_it(scenario, **changes):
     )
     controller.warm_up()
     reference = scenario.reference().speeds
-    lead = round(scenario.lead * RATE)
+    lead = round(LEAD * RATE)
 
     def tell(k):
         twist = twist_from_wheels(WheelSpeeds(*reference[k].tolist()), geometry)
@@ -69,7 +72,7 @@ def _as_the_nodes_close_it(scenario, **changes):
 @pytest.mark.parametrize('noise', [0.0, 0.04])
 def test_the_offline_loop_is_the_loop_of_the_nodes(noise):
     """The evaluation of the full controller equals the behaviour of the node, jump for jump."""
-    scenario = Scenario('velocity', noise, 'nominal', 2, 30.0)
+    scenario = Scenario('servo', 'nominal', 2, 30.0, noise=noise)
     record = run(scenario, _spec(**{'speed_filter.noise_variance': noise}))
     assert np.abs(np.diff(record.reference, axis=0)).max() > 2.0  # there is a real jump in it
     np.testing.assert_allclose(record.speeds, _as_the_nodes_close_it(scenario), atol=1e-6)
@@ -89,14 +92,9 @@ class NotedDeadTimes(ProposedController):
 
 def _dead_times(scenario):
     """Return record and dead time in use of each period of the full controller."""
-    made = []
-
-    def method(nominal_model):
-        parameters = ProposedParameters.from_dict({'speed_filter.noise_variance': scenario.noise})
-        made.append(NotedDeadTimes(parameters, nominal_model))
-        return made[0]
-
-    return run(scenario, method), np.array(made[0].late)
+    parameters = ProposedParameters.from_dict({'speed_filter.noise_variance': scenario.noise})
+    method = MadeMethod(NotedDeadTimes(parameters, scenario.nominal_model()))
+    return run(scenario, method), np.array(method.controller.late)
 
 
 @pytest.mark.parametrize('case', few_of(['friction x3', 'nominal', 'disturbance', 'load change']))
@@ -104,28 +102,28 @@ def _dead_times(scenario):
 def test_known_dead_time_is_kept_with_friction_and_disturbances(case, noise):
     """Offsets alone took the friction for 20 to 110 ms in the first seconds of a run."""
     for seed in (1, 2, 3):
-        _, late = _dead_times(Scenario('velocity', noise, case, seed, 20.0))
+        _, late = _dead_times(Scenario('servo', case, seed, 20.0, noise=noise))
         np.testing.assert_array_equal(late, 1)
 
 
 @pytest.mark.parametrize(('noise', 'seed'), [(0.04, 1), (0.0, 2)])
 @pytest.mark.parametrize(('case', 'periods'), [('', 3), (' 60 ms', 6)])
 def test_unknown_dead_time_is_found_and_used(case, periods, noise, seed):
-    record, late = _dead_times(Scenario('velocity', noise, f'unknown dead time{case}', seed))
+    record, late = _dead_times(Scenario('servo', f'unknown dead time{case}', seed, noise=noise))
     found = 100 * 13
     np.testing.assert_array_equal(late[found:], periods)
-    known = run(Scenario('velocity', noise, f'dead time{case}', seed), _spec())
+    known = run(Scenario('servo', f'dead time{case}', seed, noise=noise), _spec())
     assert record.rmse(14.0) < 1.02 * known.rmse(14.0)
     assert record.rmse() < 1.1 * known.rmse()
 
 
 def test_a_torque_drive_has_no_dead_time_to_find():
-    _, late = _dead_times(Scenario('torque', 0.04, 'nominal', 1, 5.0))
+    _, late = _dead_times(Scenario('torque', 'nominal', 1, 5.0))
     np.testing.assert_array_equal(late, 0)
 
 
 def test_the_node_finds_an_unknown_dead_time_alike():
-    scenario = Scenario('velocity', 0.04, 'unknown dead time 60 ms', 2, 30.0)
+    scenario = Scenario('servo', 'unknown dead time 60 ms', 2, 30.0)
     settled = slice(1500, None)
     error = scenario.reference().speeds[: scenario.steps]
     by_node, ignored = (
@@ -143,7 +141,7 @@ def test_the_node_finds_an_unknown_dead_time_alike():
 
 def test_jumps_seen_behind_lost_measurements_are_announced():
     """The preview moves on by several periods: a jump in any of them was missed, or late."""
-    scenario = Scenario('velocity', 0.0, 'nominal', 1)
+    scenario = Scenario('servo', 'nominal', 1, noise=0.0)
     rows, jump, lost = 40, 60, 5
     reference = np.zeros((200, 2))
     reference[jump:] = 2.0
@@ -168,12 +166,12 @@ SEEDS = (1, 2, 3, 4, 5)
 
 
 @cache
-def _errors(drive, noise, case='nominal', **changes):
+def _errors(robot, noise, case='nominal', **changes):
     given = {'speed_filter.noise_variance': noise}
-    if drive == 'torque':
+    if robot == 'torque':
         given |= {'law.gain': 8.0, 'jump_transition.acceleration': 100.0}
     return [
-        run(Scenario(drive, noise, case, seed, 20.0), _spec(**(given | changes))).rmse()
+        run(Scenario(robot, case, seed, 20.0, noise=noise), _spec(**(given | changes))).rmse()
         for seed in SEEDS
     ]
 
@@ -186,10 +184,10 @@ PARTS = {
 }
 
 
-@pytest.mark.parametrize('drive', ['torque', 'velocity'])
+@pytest.mark.parametrize('robot', PLANTS)
 @pytest.mark.parametrize('part', few_of(PARTS))
-def test_leaving_out_a_part_costs_accuracy_on_the_same_seeds(part, drive):
-    more = paired(_errors(drive, 0.0, **PARTS[part]), _errors(drive, 0.0))
+def test_leaving_out_a_part_costs_accuracy_on_the_same_seeds(part, robot):
+    more = paired(_errors(robot, 0.0, **PARTS[part]), _errors(robot, 0.0))
     assert more.mean > 0.0
     assert more.certain
 
@@ -197,15 +195,15 @@ def test_leaving_out_a_part_costs_accuracy_on_the_same_seeds(part, drive):
 def test_jumps_left_to_the_program_alone_cost_more_than_a_ramp():
     """Psi_free knows the jump beforehand, but v_p is bounded and K works against it."""
     more = paired(
-        _errors('velocity', 0.0, **{'jump_transition.method': 'predictive'}),
-        _errors('velocity', 0.0),
+        _errors('servo', 0.0, **{'jump_transition.method': 'predictive'}),
+        _errors('servo', 0.0),
     )
     assert more.mean > 0.02
     assert more.certain
 
 
 def test_a_random_predictor_has_no_skill_and_the_taught_one_has():
-    scenario = Scenario('velocity', 0.04, 'nominal', 101, 20.0)
+    scenario = Scenario('servo', 'nominal', 101, 20.0)
     skills = {}
     for random in (False, True):
         method = ProposedController(
@@ -214,17 +212,17 @@ def test_a_random_predictor_has_no_skill_and_the_taught_one_has():
             ),
             scenario.nominal_model(),
         )
-        run(scenario, lambda _, method=method: method)
+        run(scenario, MadeMethod(method))
         skills[random] = method.skill
     assert skills[False].min() > 0.5
     assert skills[True].max() < 0.0
 
 
 def test_the_same_seed_gives_the_same_run_bit_for_bit():
-    scenario = Scenario('torque', 0.04, 'nominal', 3, 5.0)
+    scenario = Scenario('torque', 'nominal', 3, 5.0)
     first, second = (run(scenario, _spec()) for _ in range(2))
     np.testing.assert_array_equal(first.speeds, second.speeds)
-    np.testing.assert_array_equal(first.command, second.command)
+    np.testing.assert_array_equal(first['sent'], second['sent'])
 
 
 def test_methods_tuned_with_unequal_effort_are_not_compared():

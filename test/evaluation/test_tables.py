@@ -2,23 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Published tables: each cell is the number that its head names, in its unit."""
 
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.records import record_of
 
 from t3mpc_ros.evaluation.bag_report import report_page
 from t3mpc_ros.evaluation.bag_report.response import MotionSummary, Roughness
 from t3mpc_ros.evaluation.bag_report.run_data import BY_WHEEL
 from t3mpc_ros.evaluation.confidence_intervals import interval
-from t3mpc_ros.evaluation.method_comparison.compared_runs import (
-    METRICS,
-    SETTLING,
-    START,
-    twin_numbers,
-)
+from t3mpc_ros.evaluation.metrics import METRICS, START, measure
 from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
 from t3mpc_ros.evaluation.open_loop_estimation import table as estimation_table
 from t3mpc_ros.evaluation.paper.experiment_runs import Experiment, RunNumbers
@@ -28,9 +24,10 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES, PatrolMetrics
 from t3mpc_ros.evaluation.patrol.patrol_page import coverage_table, surprise_table
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, Skill
 from t3mpc_ros.evaluation.process_replay.comparison import Comparison, FieldComparison, Tolerances
+from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
+from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY
-from t3mpc_ros.evaluation.twin_closed_loop import INITIAL_STANDSTILL
-from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.kinematics import WheelGeometry, body_speeds
 
 
 def columns(table):
@@ -62,22 +59,21 @@ def test_numbers_of_a_run_on_the_twin():
     ramp = np.cumsum(np.full((time.size, 2), 0.02), axis=0)
     requested = np.where((np.arange(time.size) % 2)[:, None], 0.01, 0.0) + ramp
     stopped = (time >= 12.0) & (time < 14.0)
-    record = SimpleNamespace(
-        time=time, reference=reference, rotors=reference + error, requested=requested,
-        ground=reference + (0.2, 0.1),
-        robot_reasons=['stop' if each else '' for each in stopped],
-        controller_reasons=[''] * time.size,
+    geometry, kind = WheelGeometry(), KINDS['twin']
+    lengths = geometry.wheel_radius, geometry.half_separation
+    twist = np.column_stack(body_speeds(*(reference + (0.2, 0.1)).T, *lengths))
+    record = record_of(
+        time, drive='velocity', start=kind.start, switches=[7.0], reference=reference,
+        speeds=reference + error, sent=requested, twist=twist,
     )  # fmt: skip
-    modes = (time >= 7.0).astype(int)
-    scenario = SimpleNamespace(
-        reference=lambda: SimpleNamespace(time=time, modes=modes), fault_span=(9.0, 12.0)
-    )
-    found = twin_numbers(scenario, record)
-    geometry = WheelGeometry()
+    record = replace(record, robot_reasons=['stop' if each else '' for each in stopped])
+    links = LinkFaults(begin=0.45, lasting=3.0)
+    scenario = Scenario('twin', 'nominal', 1, 20.0, own=OwnParts(links=links))
+    found = measure(scenario, record)
     rate = 0.1 * geometry.wheel_radius / geometry.wheel_separation
     assert found['yaw_rate'] == found['yaw_rate_settled'] == pytest.approx(rate)
-    counted = time >= INITIAL_STANDSTILL + START
-    before, after = SETTLING
+    counted = time >= kind.start + START
+    before, after = kind.settling
     settled = counted & ((time < 7.0 - before) | (time >= 7.0 + after))
     for name, rows in (('overall', counted), ('settled', settled)):
         assert found[name] == pytest.approx(np.sqrt(np.mean(error[rows] ** 2)), rel=1e-3)

@@ -12,7 +12,8 @@ from support.training_runs import START, STEP, ClosedLoopObjective
 from t3mpc_ros.bag.run.model_file import load_model, read_model_header
 from t3mpc_ros.cli.bag import add_train_parser
 from t3mpc_ros.control.controller import Controller
-from t3mpc_ros.evaluation.closed_loop import MethodSpec, run
+from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.method import MethodSpec
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
 from t3mpc_ros.evaluation.training import recorded_runs
@@ -63,7 +64,7 @@ def model(bags):
 def lab_run(seed):
     changes = {**full_parameters('velocity').to_dict(), 'predictive.dither': DITHER}
     parameters = ProposedParameters.from_dict(changes)
-    scenario = Scenario('velocity', 0.04, 'nominal', seed, SECONDS)
+    scenario = Scenario('servo', 'nominal', seed, SECONDS)
     return training_data_of(
         run(scenario, MethodSpec('full', ProposedController, parameters)), parameters
     )

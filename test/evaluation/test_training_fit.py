@@ -24,7 +24,8 @@ from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.process_replay.journal_alignment import match_commands
-from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, RATE
+from t3mpc_ros.evaluation.record import RATE
+from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS
 from t3mpc_ros.evaluation.training.fit import (
     UNCERTAIN,
     estimate_move_effect,

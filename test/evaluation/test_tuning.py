@@ -14,8 +14,8 @@ import pytest
 
 from t3mpc_ros.cli import tune
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
-from t3mpc_ros.evaluation.closed_loop import JobError, MethodSpec
-from t3mpc_ros.evaluation.closed_loop import run as closed_loop_run
+from t3mpc_ros.evaluation.loop import run as closed_loop_run
+from t3mpc_ros.evaluation.method import MethodSpec
 from t3mpc_ros.evaluation.methods import method_definitions, methods
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.cma_search import SearchProgress, search_best
@@ -43,6 +43,7 @@ from t3mpc_ros.evaluation.tuning.tuned_parameters import (
     TuningBudget,
     write_atomically,
 )
+from t3mpc_ros.evaluation.workers import JobError
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
 
@@ -546,10 +547,10 @@ def test_closed_loop_objective_is_computed_per_run():
     for candidate, value in zip(candidates, found, strict=True):
         spec = MethodSpec('P feedback', Feedback, candidate)
         records = [
-            closed_loop_run(Scenario('torque', noise, 'nominal', seed, 5.0), spec)
+            closed_loop_run(Scenario('torque', 'nominal', seed, 5.0, noise=noise), spec)
             for seed, noise in ((1, 0.0), (2, 0.1))
         ]
-        objectives = [record.rmse() + SMOOTHNESS * record.chatter() for record in records]
+        objectives = [record.rmse() + SMOOTHNESS * record.variation() for record in records]
         assert value == pytest.approx(np.mean(objectives), rel=1e-12)
     assert found[1] < found[0]
 

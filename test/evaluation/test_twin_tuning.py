@@ -10,16 +10,16 @@ import pytest
 from t3mpc_ros.control.controller import StepperControllerParameters
 from t3mpc_ros.evaluation.baselines.feedback_control import ProportionalIntegralParameters
 from t3mpc_ros.evaluation.confidence_intervals import Difference
-from t3mpc_ros.evaluation.method_comparison import twin_tuning
-from t3mpc_ros.evaluation.method_comparison.compared_runs import (
-    OVERALL,
-    VARIATION,
-    methods_for,
-    twin_numbers,
-    twin_run,
-)
-from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
-from t3mpc_ros.evaluation.method_comparison.twin_tuning import (
+from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.method import NodeMethod
+from t3mpc_ros.evaluation.methods import EXACT_MODEL, FULL, method_definitions, methods_for
+from t3mpc_ros.evaluation.metrics import OVERALL, VARIATION, measure
+from t3mpc_ros.evaluation.record import rolling_speeds
+from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
+from t3mpc_ros.evaluation.tuning import twin_tuning
+from t3mpc_ros.evaluation.tuning.tune_methods import SMOOTHNESS, TuningScenarios
+from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
+from t3mpc_ros.evaluation.tuning.twin_tuning import (
     CASES,
     FULL_RANGES,
     TRAINING,
@@ -32,10 +32,6 @@ from t3mpc_ros.evaluation.method_comparison.twin_tuning import (
     twin_method,
     twin_objective,
 )
-from t3mpc_ros.evaluation.methods import EXACT_MODEL, FULL, method_definitions
-from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS
-from t3mpc_ros.evaluation.tuning.tune_methods import SMOOTHNESS, TuningScenarios
-from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
 
 PI = 'PI + feed-forward'
 
@@ -64,13 +60,14 @@ def test_no_seed_of_the_tuning_is_reported():
 def test_the_body_counts_where_baselines_have_the_gyro(definitions, monkeypatch):
     method = twin_method(definitions[PI], definitions[PI].start[TWIN])
     for case, body in (('nominal', False), ('miscalibrated', True)):
-        scenario = TwinScenario(case, 1, 8.0)
-        record = twin_run(scenario, method)
-        monkeypatch.setattr(twin_tuning, 'twin_run', lambda *_, record=record: record)
-        numbers = twin_numbers(scenario, record)
+        scenario = Scenario('twin', case, 1, 8.0)
+        record = run(scenario, method)
+        monkeypatch.setattr(twin_tuning, 'run', lambda *_, record=record: record)
+        numbers = measure(scenario, record)
         cost = twin_objective((scenario, method)) - SMOOTHNESS * numbers[VARIATION.name]
         counted = record.time >= 4.5
-        ground = np.sqrt(np.mean((record.ground - record.reference)[counted] ** 2))
+        ground = rolling_speeds(record, scenario.true_robot().geometry)
+        ground = np.sqrt(np.mean((ground - record.reference)[counted] ** 2))
         assert cost == pytest.approx(ground if body else numbers[OVERALL.name], rel=0.02)
         assert (cost == pytest.approx(numbers[OVERALL.name], rel=0.001)) != body
 
@@ -78,7 +75,7 @@ def test_the_body_counts_where_baselines_have_the_gyro(definitions, monkeypatch)
 def test_an_evaluation_is_the_mean_of_its_runs(definitions, monkeypatch):
     def cost(job):
         scenario, method = job
-        return scenario.seed * method.baseline.parameters.gain + 1e3 * CASES.index(scenario.case)
+        return scenario.seed * method.parameters.gain + 1e3 * CASES.index(scenario.case)
 
     monkeypatch.setattr(twin_tuning, 'twin_objective', cost)
     training = TuningScenarios((1, 2), (0.04,), 6.0, CASES)
@@ -92,11 +89,11 @@ def test_an_evaluation_is_the_mean_of_its_runs(definitions, monkeypatch):
 
 def test_the_full_controller_is_that_of_the_node(definitions):
     changed = definitions[FULL].start[TWIN].with_values({'body.yaw_gain': 3.0})
-    controller = twin_method(definitions[FULL], changed).controller(TwinScenario('nominal', 1))
-    assert controller.parameters.body.yaw_gain == 3.0
-    assert controller.parameters == TwinScenario('nominal', 1).controller_parameters().with_values(
-        {'body.yaw_gain': 3.0}
-    )
+    scenario = Scenario('twin', 'nominal', 1)
+    parameters = twin_method(definitions[FULL], changed).parameters_for(scenario)
+    own = scenario.kind.controller_parameters(scenario)
+    assert parameters == own.with_values({'body.yaw_gain': 3.0})
+    assert parameters != own
 
 
 @pytest.mark.parametrize(
@@ -147,13 +144,13 @@ def test_every_method_was_tuned_on_the_twin_alike(definitions):
 def test_the_comparison_uses_the_parameters_for_the_twin():
     store, found = TunedParameters.load(), methods_for('twin')
     for name, method in found.items():
-        if method.baseline is None or name == 'feed-forward':
+        if isinstance(method, NodeMethod) or name == 'feed-forward':
             continue
         entry = store.entry(name.removesuffix(EXACT_MODEL), TWIN)
-        values = method.baseline.parameters.to_dict()
+        values = method.parameters.to_dict()
         assert {one: values[one] for one in entry.tuned} == {
             one: entry.values[one] for one in entry.tuned
         }
         if name.endswith(EXACT_MODEL):
             assert values['model_error'] == 1.0
-    assert isinstance(found[PI].baseline.parameters, ProportionalIntegralParameters)
+    assert isinstance(found[PI].parameters, ProportionalIntegralParameters)

@@ -17,7 +17,7 @@ import numpy as np
 
 from t3mpc_ros.bag.run.journal import Journal
 from t3mpc_ros.bag.run.model_file import load_model
-from t3mpc_ros.control.controller import SCALAR_NAMES, Controller
+from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, StepperControllerParameters
 from t3mpc_ros.evaluation.process_replay.controller_inputs import CONTROLLER, FIELDS
 from t3mpc_ros.evaluation.process_replay.controller_replay import output_row
 from t3mpc_ros.evaluation.process_replay.replay_bag import (
@@ -29,9 +29,9 @@ from t3mpc_ros.evaluation.process_replay.replay_bag import (
     row_bytes,
     twist_bytes,
 )
-from t3mpc_ros.evaluation.scenario import RATE
+from t3mpc_ros.evaluation.record import RATE
+from t3mpc_ros.evaluation.scenario import LEAD, Scenario, noisy_twin
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
-from t3mpc_ros.evaluation.twin_closed_loop import LEAD, chaotic_course, loop_controller, loop_robot
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, State, WheelSpeeds
 from t3mpc_ros.robot.interface import RobotCommand
@@ -178,7 +178,7 @@ class GoldenScenario:
     bad_odometry: tuple = ()
     """Times of odometry messages that are not finite, s."""
     parameters: dict = field(default_factory=dict)
-    """Parameters of the controller other than those of :func:`loop_controller`."""
+    """Parameters of the controller other than those of the stepper robot's."""
 
 
 GOLDEN_SCENARIOS = {
@@ -218,9 +218,11 @@ GOLDEN_SCENARIOS = {
 
 def run_golden_scenario(scenario, folder):
     """Return the bag file of a run in ``folder``; equal scenarios give equal messages."""
-    parameters = loop_controller().with_values(scenario.parameters)
-    robot = DigitalTwin(loop_robot(seed=scenario.seed), FaultSchedule(scenario.faults))
-    whole = chaotic_course(scenario.stretches[-1][1], scenario.seed)
+    parameters = StepperControllerParameters().with_values(scenario.parameters)
+    robot = DigitalTwin(noisy_twin(seed=scenario.seed), FaultSchedule(scenario.faults))
+    whole = (
+        Scenario('servo', 'nominal', scenario.seed, scenario.stretches[-1][1]).reference().speeds
+    )
     course = np.concatenate(
         [whole[round(begin * RATE) : round(end * RATE)] for begin, end in scenario.stretches]
     )

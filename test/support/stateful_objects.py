@@ -1286,7 +1286,7 @@ NEVER_RESET = {
     **dict.fromkeys(
         ('Disturbance', 'SpeedNoise', 'SimulatedBattery', 'SimulatedRangeSensors'), 'no reset'
     ),
-    'DisturbedPlant': 'no reset',
+    **dict.fromkeys(('DisturbedPlant', 'NoisyPlant', 'PlantRobot'), 'one run, no reset'),
     # The state is in the memory of the C core: see test_core_fresh_state.py.
     **dict.fromkeys(('Board', 'Motion', 'RobotBoard', 'Dongle', 'Emulator'), 'C core'),
     **dict.fromkeys(('c_short_Array_7', 'c_ushort_Array_9'), 'C core'),

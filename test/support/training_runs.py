@@ -59,8 +59,8 @@ class ClosedLoopObjective:
     """Runs the controller on the simulated robot, as the nodes close the loop."""
 
     def __init__(self, seed, duration, learnt=None, tape=False, off=(), **changes):
-        scenario = Scenario('velocity', 0.04, 'nominal', seed, duration)
-        robot = PaperRobot(scenario.robot())
+        scenario = Scenario('servo', 'nominal', seed, duration)
+        robot = PaperRobot(scenario.true_robot())
         self.controller = Controller(ControllerParameters.from_dict(changes))
         if learnt is not None:
             self.controller.law.set_weights(learnt)

@@ -21,6 +21,7 @@ from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.open_loop_estimation import KINDS, EstimationResult
 from t3mpc_ros.evaluation.paper.experiment_runs import (
+    DRIVES,
     EXACT,
     NOMINAL,
     PAPER_NOISE,
@@ -29,7 +30,6 @@ from t3mpc_ros.evaluation.paper.experiment_runs import (
 )
 from t3mpc_ros.evaluation.paper.results import PairedDifference, ResultRow, Results, step_to
 from t3mpc_ros.evaluation.reporting import Table
-from t3mpc_ros.evaluation.scenario import DRIVES
 
 Array = NDArray[np.float64]
 

@@ -14,15 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.methods import FULL, ComparedMethod
 from t3mpc_ros.evaluation.methods import STAGES as METHOD_STAGES
+from t3mpc_ros.evaluation.metrics import START
+from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.reporting import finite
 from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
-from t3mpc_ros.evaluation.scenario import DRIVES
+from t3mpc_ros.evaluation.scenario import KINDS
 from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.version import VERSION
 
+DRIVES = ('torque', 'velocity')
+"""torque: u is applied as the torque theta_bar u, as in the paper; velocity: the wheels follow
+commanded speeds with delay and lag, as on the robot."""
 NOISES = (0.0, 0.01, 0.04, 0.1)
 """Noise variance of the measured wheel speeds, (rad/s)²: the paper's range."""
 PAPER_NOISE = 0.04
@@ -187,10 +191,8 @@ def _is_baseline(methods: Mapping[str, ComparedMethod], name: str) -> bool:
     return name in methods and methods[name].baseline
 
 
-SETTLING = 1.0
-"""Seconds about each switch that the settled RMSE leaves out."""
-START = 3.0
-"""Seconds at the start that no number counts: the reference grows from zero."""
+SETTLING = KINDS['servo'].settling
+"""Time before and after each switch that the settled RMSE leaves out, s."""
 
 # Sources that cannot change the result of a run with given method parameters. All others
 # invalidate stored runs: a needless repetition is better than an outdated result.
@@ -198,7 +200,8 @@ _IRRELEVANT_SOURCES = (
     'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'scripting/', 'evaluation/bag_report/',
     'evaluation/result_file.py',
     'evaluation/process_replay/', 'evaluation/paper/', 'evaluation/tuning/',
-    'evaluation/method_comparison/', 'evaluation/baselines/feed_forward.py',
+    'evaluation/comparison_page.py', 'evaluation/experiment.py', 'evaluation/fault_study.py',
+    'evaluation/fault_page.py', 'evaluation/patrol/', 'evaluation/baselines/feed_forward.py',
     'evaluation/plotting.py', 'evaluation/reporting.py', 'evaluation/lyapunov_exponents.py',
     'evaluation/open_loop_estimation.py', 'evaluation/methods.py', 'evaluation/topic_roles.py',
 )  # fmt: skip
@@ -220,13 +223,13 @@ class RunNumbers:
     """Whether every number of the run is finite."""
 
 
-def measure(run: LoopRecord) -> RunNumbers:
+def measure(run: Record) -> RunNumbers:
     """Return the metrics of a run; the first :data:`START` seconds do not count."""
-    arrays = run.reference, run.speeds, run.command, run.terms
+    arrays = run.reference, run.speeds, run['acceleration'], run['terms']
     if not all(bool(np.isfinite(values).all()) for values in arrays):
         return RunNumbers(math.nan, math.nan, math.nan, math.nan, False)
-    settled = run.rmse(START, cut=SETTLING)
-    return RunNumbers(run.rmse(START), settled, run.chatter(), run.largest_error(START), True)
+    settled = run.rmse(START, margins=SETTLING)
+    return RunNumbers(run.rmse(START), settled, run.variation(), run.largest_error(START), True)
 
 
 def source_digest(package: Path = PACKAGE_DIRECTORY, *, every: bool = False) -> str:

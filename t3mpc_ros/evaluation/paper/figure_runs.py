@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.evaluation.closed_loop import LoopRecord, full_record
 from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.metrics import START
 from t3mpc_ros.evaluation.open_loop_estimation import (
     KINDS,
     NORMALISED_GAIN,
@@ -29,13 +29,13 @@ from t3mpc_ros.evaluation.paper.experiment_runs import (
     NOMINAL,
     PAPER_NOISE,
     SETTLING,
-    START,
     WITHOUT,
     ExperimentGrid,
     ExperimentSetup,
 )
 from t3mpc_ros.evaluation.paper.results import Results
-from t3mpc_ros.evaluation.scenario import switch_times
+from t3mpc_ros.evaluation.record import Record, switch_times
+from t3mpc_ros.evaluation.workers import full_record
 
 Array = NDArray[np.float64]
 
@@ -55,13 +55,13 @@ class FigureRuns:
     """One run of each kind, all with the same seed and the paper's noise."""
 
     seed: int
-    torque: LoopRecord
+    torque: Record
     """The full controller in the paper's parameter."""
-    velocity: LoopRecord
+    velocity: Record
     """The full controller as the nodes close the loop."""
-    blind: LoopRecord | None
+    blind: Record | None
     """The same without preview."""
-    portraits: Mapping[str, LoopRecord]
+    portraits: Mapping[str, Record]
     """Of several methods in the paper's parameter, the full controller first."""
     pairs: tuple[tuple[int, int], ...]
     """Signals, from 1, that drive right and left wheel in each mode."""
@@ -95,7 +95,7 @@ def simulate_figure_runs(
         )
         for kind, name in requested
     ]
-    found: dict[tuple[str, str], LoopRecord] = {}
+    found: dict[tuple[str, str], Record] = {}
     for index, run in setup.measure_many(jobs, full_record, team):
         found[requested[index]] = run
     if len(found) != len(requested):
@@ -128,18 +128,18 @@ def portrait_methods(results: Results) -> list[str]:
     return list(dict.fromkeys([FULL, *measured, *names]))[:PORTRAITS]
 
 
-def switches_of(run: LoopRecord) -> Array:
+def switches_of(run: Record) -> Array:
     """Return the times (s) at which the reference switches."""
-    return switch_times(run.time, run.modes)
+    return switch_times(run.time, run['mode'])
 
 
-def largest_switch(run: LoopRecord) -> int | None:
+def largest_switch(run: Record) -> int | None:
     """Return the row of the switch with the largest jump, None when there is none.
 
     Switches so near the end that nothing of what follows could be shown do not count, unless
     there are no others.
     """
-    rows = np.flatnonzero(np.diff(run.modes) != 0) + 1
+    rows = np.flatnonzero(np.diff(run['mode']) != 0) + 1
     early = rows[run.time[rows] < run.time[-1] - 3.0]
     rows = early if early.size else rows
     if not rows.size:
@@ -148,20 +148,20 @@ def largest_switch(run: LoopRecord) -> int | None:
     return int(rows[int(np.argmax(jumps))])
 
 
-def estimated_unknown(run: LoopRecord) -> Array:
+def estimated_unknown(run: Record) -> Array:
     """Return g of (31) as the law used it, rad/s², shape (n, 2): its term in (66) is -g."""
-    found: Array = -run.terms[:, TERM_NAMES.index('fuzzy')]
+    found: Array = -run['terms'][:, TERM_NAMES.index('fuzzy')]
     return found
 
 
-def true_unknown(run: LoopRecord) -> Array:
+def true_unknown(run: Record) -> Array:
     """Return chi' - u of (30), from the true speeds over each period, rad/s², shape (n - 1, 2)."""
     period = (run.time[-1] - run.time[0]) / (run.time.size - 1)
-    found: Array = np.diff(run.speeds, axis=0) / period - run.command[:-1]
+    found: Array = np.diff(run.speeds, axis=0) / period - run['acceleration'][:-1]
     return found
 
 
-def explained(run: LoopRecord) -> tuple[float, float]:
+def explained(run: Record) -> tuple[float, float]:
     """Return the share of the unknown acceleration that g explains, of right and left wheel.
 
     1 - mean((unknown - g)²)/var(unknown) after the start: 1 is perfect, 0 no better than the
@@ -174,7 +174,7 @@ def explained(run: LoopRecord) -> tuple[float, float]:
     return float(shares[0]), float(shares[1])
 
 
-def switches_claim(run: LoopRecord) -> Claim:
+def switches_claim(run: Record) -> Claim:
     """Decide whether the reference changes its signals as often as in the paper's run."""
     count = switches_of(run).size
     text = 'The reference changes its signals four times in a run, suddenly (60 s here)'
@@ -189,13 +189,13 @@ def switches_claim(run: LoopRecord) -> Claim:
     )
 
 
-def follows_claim(run: LoopRecord) -> Claim:
+def follows_claim(run: Record) -> Claim:
     """Decide whether the outputs follow between switches, in the run that is drawn."""
     text = (
         'The outputs track the switching references very well (here: settled RMSE at most '
         f'{100 * FOLLOWS:.0f} % of the reference, torque drive, noise {PAPER_NOISE:g}, run shown)'
     )
-    settled = run.rmse(START, cut=SETTLING)
+    settled = run.rmse(START, margins=SETTLING)
     found = f'settled RMSE {settled:.3f} rad/s, {100 * settled / REFERENCE_SPREAD:.1f} %'
     held = bool(settled <= FOLLOWS * REFERENCE_SPREAD)
     return _of_run(run, Claim('outputs follow', 'paper', text, found, held, {'settled': settled}))
@@ -215,14 +215,14 @@ def estimate_claim(showcase: FigureRuns) -> Claim:
     return _of_run(showcase.torque, claim)
 
 
-def _of_run(run: LoopRecord, claim: Claim) -> Claim:
+def _of_run(run: Record, claim: Claim) -> Claim:
     if claim.held or run.time[-1] > LONG_ENOUGH:
         return claim
     return replace(claim, held=None, inconclusive=True)
 
 
-def broken_at_switches(run: LoopRecord, values: Sequence[Array] | Array) -> Array:
+def broken_at_switches(run: Record, values: Sequence[Array] | Array) -> Array:
     """Return ``values`` (n, 2) with a gap before each switch: a jump is no line in a portrait."""
-    rows = np.flatnonzero(np.diff(run.modes) != 0) + 1
+    rows = np.flatnonzero(np.diff(run['mode']) != 0) + 1
     broken: Array = np.insert(np.asarray(values, dtype=np.float64), rows, np.nan, axis=0)
     return broken

@@ -13,16 +13,15 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.charts import thinned
-from t3mpc_ros.evaluation.closed_loop import LoopRecord
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.metrics import START
 from t3mpc_ros.evaluation.paper.experiment_runs import (
     NOMINAL,
     PAPER_NOISE,
     PARTS,
     SETTLING,
     STAGES,
-    START,
     WITHOUT,
 )
 from t3mpc_ros.evaluation.paper.figure_runs import (
@@ -42,6 +41,7 @@ from t3mpc_ros.evaluation.plotting import (
     new_figure,
     new_panels,
 )
+from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.topic_roles import (
     ODOMETRY,
     REFERENCE,
@@ -65,7 +65,7 @@ def path(showcase: FigureRuns) -> Any:
     axis.plot(*reference.T, color=REFERENCE_COLOUR, linewidth=1.0, label='reference')
     axis.plot(*driven.T, color=DRIVEN, linewidth=1.6, label='driven')
     axis.plot(*driven[0], 'o', color=REFERENCE_COLOUR, markersize=6, label='start')
-    at = driven[1:][np.diff(run.modes) != 0]
+    at = driven[1:][np.diff(run['mode']) != 0]
     axis.plot(*at.T, 'D', color=COLOURS['switch'], markersize=5, label='switch')
     axis.set_aspect('equal', adjustable='datalim')
     axis.set(xlabel='x / m', ylabel='y / m')
@@ -105,10 +105,8 @@ def path_in_words(showcase: FigureRuns) -> str:
 def portrait_in_words(showcase: FigureRuns) -> str:
     """Return how closely the simulated robot's wheels followed."""
     run = showcase.velocity
-    return (
-        f'A simulated robot: RMSE {run.rmse():.3f} rad/s, settled {run.rmse(cut=SETTLING):.3f} '
-        'rad/s.'
-    )
+    settled = run.rmse(margins=SETTLING)
+    return f'A simulated robot: RMSE {run.rmse():.3f} rad/s, settled {settled:.3f} rad/s.'
 
 
 def robot_portrait(showcase: FigureRuns) -> Any:
@@ -121,7 +119,7 @@ def portrait(showcase: FigureRuns) -> Any:
     return _portrait(showcase.torque)
 
 
-def _portrait(run: LoopRecord) -> Any:
+def _portrait(run: Record) -> Any:
     figure = new_figure(3.4)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     for axis, values, colour, title in zip(
@@ -143,7 +141,7 @@ def modes(showcase: FigureRuns) -> Any:
     """Return which chaotic signal drives which output, the paper's Fig. 10."""
     run = showcase.torque
     figure, axes = new_panels(2, 1.25)
-    index = run.modes.astype(int) % len(showcase.pairs)
+    index = run['mode'].astype(int) % len(showcase.pairs)
     signals = np.array(showcase.pairs)[index]
     end = run.time[-1] + run.time[1] - run.time[0]
     for axis, wheel, column in zip(axes, WHEELS, signals.T, strict=True):
@@ -168,7 +166,7 @@ def outputs(showcase: FigureRuns) -> Any:
             time = run.time[rows]
             if rows.size < run.time.size:
                 axis.plot(
-                    time, run.measured[rows, i], '.', color=MEASURED, ms=2.5, label='measured'
+                    time, run['measured'][rows, i], '.', color=MEASURED, ms=2.5, label='measured'
                 )
             axis.plot(
                 *thinned(time, run.reference[rows, i]),
@@ -187,10 +185,12 @@ def control(showcase: FigureRuns) -> Any:
     figure, axes = run_and_zoom(run, 'u / rad/s²', before=0.4, after=1.6)
     span = run.time[-1] - run.time[0]
     for row, i in zip(axes, range(2), strict=True):
-        varied = float(np.abs(np.diff(run.command[:, i])).sum() / span)
+        varied = float(np.abs(np.diff(run['acceleration'][:, i])).sum() / span)
         row[0].set_title(f'{WHEELS[i]} wheel, varies by {varied:.0f} rad/s² a second')
         for axis, rows in zip(row, windows(run, 0.4, 1.6), strict=True):
-            axis.plot(*thinned(run.time[rows], run.command[rows, i]), color=COMMAND, lw=1.0)
+            axis.plot(
+                *thinned(run.time[rows], run['acceleration'][rows, i]), color=COMMAND, lw=1.0
+            )
     return figure
 
 
@@ -245,7 +245,7 @@ def preview(showcase: FigureRuns) -> Any:
     return figure
 
 
-def run_and_zoom(run: LoopRecord, unit: str, before: float, after: float) -> tuple[Any, Any]:
+def run_and_zoom(run: Record, unit: str, before: float, after: float) -> tuple[Any, Any]:
     """Return a figure with a row per wheel: the whole run, and about its largest switch."""
     figure = new_figure(4.6)
     zoomed = largest_switch(run) is not None
@@ -265,7 +265,7 @@ def run_and_zoom(run: LoopRecord, unit: str, before: float, after: float) -> tup
     return figure, axes
 
 
-def windows(run: LoopRecord, before: float, after: float) -> list[NDArray[np.intp]]:
+def windows(run: Record, before: float, after: float) -> list[NDArray[np.intp]]:
     """Return the rows of the whole run, and those about its largest switch if it has one."""
     found = [np.arange(run.time.size)]
     middle = largest_switch(run)
@@ -274,7 +274,7 @@ def windows(run: LoopRecord, before: float, after: float) -> list[NDArray[np.int
     return found
 
 
-def rows_between(run: LoopRecord, begin: float, end: float) -> NDArray[np.intp]:
+def rows_between(run: Record, begin: float, end: float) -> NDArray[np.intp]:
     """Return the rows with a time (s) in a stretch."""
     return np.flatnonzero((run.time >= begin - 1e-9) & (run.time <= end + 1e-9))
 
@@ -485,7 +485,7 @@ def portraits(showcase: FigureRuns, results: Results) -> Any:
         speeds = run.speeds[counted]
         axis.plot(speeds[:, 1], speeds[:, 0], color=colours[name], linewidth=0.8, alpha=0.9)
         title = '\n'.join(wrap(name, 24)[:2])
-        axis.set_title(f'{title}\nRMSE {run.rmse():.3f}, settled {run.rmse(cut=SETTLING):.3f}')
+        axis.set_title(f'{title}\nRMSE {run.rmse():.3f}, settled {run.rmse(margins=SETTLING):.3f}')
     _name_wheels(axes)
     return figure
 

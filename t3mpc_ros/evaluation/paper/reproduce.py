@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from t3mpc_ros.evaluation import open_loop_estimation
-from t3mpc_ros.evaluation.closed_loop import WorkerPool, measure_many
+from t3mpc_ros.evaluation.cases import CASES
 from t3mpc_ros.evaluation.methods import methods
 from t3mpc_ros.evaluation.paper.claims import all_claims, markdown
 from t3mpc_ros.evaluation.paper.experiment_runs import (
@@ -27,7 +27,8 @@ from t3mpc_ros.evaluation.paper.paper_page import EXHIBITS, ExhibitData, counted
 from t3mpc_ros.evaluation.paper.results import all_tables, results_of, write_csv
 from t3mpc_ros.evaluation.plotting import write_pictures
 from t3mpc_ros.evaluation.reporting import strict_json
-from t3mpc_ros.evaluation.scenario import CASES, HELD_OUT_SEEDS, Scenario
+from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PLANT_OF, Scenario
+from t3mpc_ros.evaluation.workers import WorkerPool, measure_many
 from t3mpc_ros.version import VERSION
 
 RUNS = 'runs.jsonl'
@@ -52,11 +53,16 @@ class PaperOptions:
     """Whether runs that are there already are thrown away."""
 
 
+def paper_scenario(drive: str, noise: float, case: str, seed: int, duration: float) -> Scenario:
+    """Return a run on the paper's plant."""
+    return Scenario(PLANT_OF[drive], case, seed, duration, noise)
+
+
 def default_setup() -> ExperimentSetup:
     """Return the methods and the closed loop of this package."""
     return ExperimentSetup(
         methods,
-        Scenario,
+        paper_scenario,
         measure_many,
         tuple(name for name, case in CASES.items() if case.reproduced),
         HELD_OUT_SEEDS,

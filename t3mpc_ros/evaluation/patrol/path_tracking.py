@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.actuation import LimitParameters
-from t3mpc_ros.evaluation.closed_loop import map_jobs
 from t3mpc_ros.evaluation.confidence_intervals import mean, rms
 from t3mpc_ros.evaluation.patrol.path_trackers import (
     PurePursuitParameters,
@@ -28,12 +27,13 @@ from t3mpc_ros.evaluation.patrol.path_trackers import (
     RegulatedParameters,
 )
 from t3mpc_ros.evaluation.patrol.patrol_run import (
-    RATE,
-    PatrolRecord,
     PatrolScenario,
+    path_error,
     run_patrol,
     world_file,
 )
+from t3mpc_ros.evaluation.record import RATE, Record
+from t3mpc_ros.evaluation.workers import map_jobs
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_file import load_path
 from t3mpc_ros.geometry.path_timing import (
@@ -249,7 +249,7 @@ def measured_drive(job: tuple[TrackingJob, TrackingMethod]) -> TrackingRun:
     return errors_of(drive(job), points, timed=method.pursuit is None)
 
 
-def drive(job: tuple[TrackingJob, TrackingMethod]) -> PatrolRecord:
+def drive(job: tuple[TrackingJob, TrackingMethod]) -> Record:
     """Return the record of a method on a path; equal arguments give equal records."""
     (_, points, seed, limits), method = job
     generator = np.random.default_rng((seed, 31))
@@ -286,23 +286,23 @@ def slippery_floor(points: Array, generator: np.random.Generator) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def errors_of(record: PatrolRecord, points: Array, *, timed: bool) -> TrackingRun:
+def errors_of(record: Record, points: Array, *, timed: bool) -> TrackingRun:
     """Return the errors of a drive along a path (m), shape (n, 2)."""
-    away = np.hypot(*(record.truth[:, :2] - points[-1]).T) > ARRIVED
+    away = np.hypot(*(record['truth'][:, :2] - points[-1]).T) > ARRIVED
     arrival = int(np.flatnonzero(away)[-1]) + 1 if away.any() else 0
     arrived = arrival < record.time.size
-    track = record.truth[: arrival + round(LAST_PIECE * RATE), :2]
+    track = record['truth'][: arrival + round(LAST_PIECE * RATE), :2]
     driven = resample(track, SPACING) if polyline_length(track) > SPACING else track[[0, -1]]
     path = resample(points, SPACING)
     distance = distance_to_path(driven, path)
-    changes = np.abs(np.diff(record.command, axis=0, prepend=0.0)) * RATE
-    error = record.error[: len(track)]
+    changes = np.abs(np.diff(record['command'], axis=0, prepend=0.0)) * RATE
+    error = path_error(record)[: len(track)]
     return TrackingRun(
         rms(distance),
         float(max(distance.max(), distance_to_path(path, driven).max())),
         rms(error) if timed else math.nan,
         float(record.time[arrival]) if arrived else math.nan,
-        _pair(np.abs(record.command).max(axis=0)),
+        _pair(np.abs(record['command']).max(axis=0)),
         _pair(changes.max(axis=0)),
         track,
     )

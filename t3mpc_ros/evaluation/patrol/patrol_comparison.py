@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.portrait import PortraitParameters
-from t3mpc_ros.evaluation.closed_loop import WorkerPool
 from t3mpc_ros.evaluation.paper.experiment_runs import source_digest
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, Visits, coverage_at
 from t3mpc_ros.evaluation.patrol.patrol_metrics import PatrolMetrics, patrol_metrics
 from t3mpc_ros.evaluation.patrol.patrol_run import (
-    PatrolRecord,
     PatrolScenario,
+    contact_count,
+    outside_avoidance,
     portrait_points,
     room_with_boxes,
     run_patrol,
@@ -36,7 +36,9 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
 )
 from t3mpc_ros.evaluation.patrol.predictability import Skill
 from t3mpc_ros.evaluation.patrol.rival_paths import RIVALS, Rectangle
+from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
+from t3mpc_ros.evaluation.workers import WorkerPool
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
@@ -284,18 +286,18 @@ def _exact_track(plan: PatrolPlan, points: Iterator[Array]) -> PatrolTrack:
     return PatrolTrack(time, position, position, always, free_cells(plan, None))
 
 
-def _twin_track(plan: PatrolPlan, record: PatrolRecord, world: World) -> PatrolTrack:
+def _twin_track(plan: PatrolPlan, record: Record, world: World) -> PatrolTrack:
     every = max(1, round(SAMPLE / float(record.time[1] - record.time[0])))
     rows = slice(None, None, every)
     return PatrolTrack(
         record.time[rows],
-        record.truth[rows, :2],
-        record.reference[rows, :2],
-        record.outside_avoidance[rows],
+        record['truth'][rows, :2],
+        record['reference_pose'][rows, :2],
+        outside_avoidance(record)[rows],
         free_cells(plan, world),
         world,
-        range_hits(record.truth[rows], record.ranges[rows]),
-        record.contacts,
+        range_hits(record['truth'][rows], record['ranges'][rows]),
+        contact_count(record),
     )
 
 

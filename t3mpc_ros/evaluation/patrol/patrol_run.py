@@ -6,13 +6,12 @@ The loop has the timing of the nodes: the reference is stamped ahead by its lead
 the robot leads to one command, which arrives after the dead time of the link or is lost.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
 import tempfile
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +21,13 @@ from t3mpc_ros.chaos.pose_reference import PathClock, WaitParameters
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.keep_out import Activity
+from t3mpc_ros.evaluation.loop import run_loop
 from t3mpc_ros.evaluation.patrol.path_trackers import PathTracker
+from t3mpc_ros.evaluation.record import RATE, Record, stamp_of
+from t3mpc_ros.evaluation.scenario import KINDS, LEAD
+from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
 from t3mpc_ros.geometry.types import (
-    NANOSECONDS,
     ORIGIN,
     STANDSTILL,
     BodyTwist,
@@ -33,22 +35,19 @@ from t3mpc_ros.geometry.types import (
     State,
     wrap_angle,
 )
-from t3mpc_ros.robot.interface import RobotCommand
+from t3mpc_ros.robot.interface import RobotCommand, RobotState
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
+from t3mpc_ros.simulation.plant_robot import Signals
 from t3mpc_ros.simulation.world import load_world
 
 Array = NDArray[np.float64]
 
-LEAD = 0.4
-"""Lead of the reference over the odometry, s."""
-INITIAL_STANDSTILL = 1.5
-"""Standstill before the run, s; odometry uses the gyro only after it."""
+START = KINDS['twin'].start
+"""Standstill before the drive, s."""
 SETTLING = 2.0
 """Time after the robot has reached its path again that still counts as avoidance, s."""
 ACTIVITIES = tuple(Activity)
-"""Meaning of :attr:`PatrolRecord.activity`."""
-RATE = 100.0
-"""Periods per second, Hz."""
+"""Meaning of the column ``activity``."""
 
 
 @dataclass(frozen=True)
@@ -83,54 +82,6 @@ class PatrolScenario:
     """Further parameters of the controller by name."""
 
 
-@dataclass(frozen=True, slots=True)
-class PatrolRecord:
-    """One patrol, a row for each period; poses are x, y (m), yaw (rad), twists m/s and rad/s."""
-
-    time: Array
-    """s since the end of the initial standstill, shape (n,)"""
-    reference: Array
-    """Pose of the reference, shape (n, 3)"""
-    reference_twist: Array
-    """Shape (n, 2)"""
-    truth: Array
-    """True pose, shape (n, 3)"""
-    pose: Array
-    """Pose that the controller got, shape (n, 3)"""
-    command: Array
-    """Twist that the controller commanded, shape (n, 2)"""
-    twist: Array
-    """True twist, shape (n, 2)"""
-    ranges: Array
-    """Readings of the range sensors, m, as in :attr:`RobotState.ranges`, shape (n, 8)"""
-    contact_force: Array
-    """Largest contact force so far, N, shape (n,)"""
-    activity: NDArray[np.int64]
-    """Index into :data:`ACTIVITIES`, shape (n,)"""
-    avoiding: NDArray[np.bool_]
-    """Whether the keep-out changed the command or the robot was on its way back, shape (n,)"""
-    cells: NDArray[np.int8]
-    """Map of the keep-out at the end, see :mod:`t3mpc_ros.control.free_space_map`."""
-
-    @property
-    def error(self) -> Array:
-        """Distance of the true position from that of the reference, m, shape (n,)."""
-        error: Array = np.hypot(*(self.truth - self.reference)[:, :2].T)
-        return error
-
-    @property
-    def outside_avoidance(self) -> NDArray[np.bool_]:
-        """Rows that are no avoidance and follow its end by :data:`SETTLING` s, shape (n,)."""
-        last = np.maximum.accumulate(np.where(self.avoiding, np.arange(self.time.size), -(10**9)))
-        outside: NDArray[np.bool_] = np.arange(self.time.size) - last > SETTLING * RATE
-        return outside
-
-    @property
-    def contacts(self) -> int:
-        """Number of periods in which the largest contact force grew: 0 without any contact."""
-        return int((np.diff(self.contact_force, prepend=0.0) > 0.0).sum())
-
-
 def portrait_points(
     seed: int, limits: MotionLimits, parameters: PortraitParameters | None = None
 ) -> Iterator[Array]:
@@ -142,13 +93,31 @@ def portrait_points(
         yield path.advance(1.0)
 
 
+def path_error(record: Record) -> Array:
+    """Return the distance of the true position from that of the reference, m, shape (n,)."""
+    error: Array = np.hypot(*(record['truth'] - record['reference_pose'])[:, :2].T)
+    return error
+
+
+def outside_avoidance(record: Record) -> NDArray[np.bool_]:
+    """Return which rows are no avoidance, and follow its end by :data:`SETTLING` s."""
+    rows = np.arange(len(record))
+    last = np.maximum.accumulate(np.where(record['avoiding'], rows, -(10**9)))
+    outside: NDArray[np.bool_] = rows - last > SETTLING * RATE
+    return outside
+
+
+def contact_count(record: Record) -> int:
+    """Return in how many periods the largest contact force grew: 0 without any contact."""
+    return int((np.diff(record['contact_force'], prepend=0.0) > 0.0).sum())
+
+
 def run_patrol(
-    points: Iterator[Array],
-    scenario: PatrolScenario,
-    on_progress: Callable[[float], None] | None = None,
-    tracker: PathTracker | None = None,
-) -> PatrolRecord:
+    points: Iterator[Array], scenario: PatrolScenario, tracker: PathTracker | None = None
+) -> Record:
     """Return the record of a robot that follows a path; equal arguments give equal runs.
+
+    Its rows begin at the end of the standstill, its time is that since then.
 
     Parameters
     ----------
@@ -157,12 +126,10 @@ def run_patrol(
         path that ends leaves the robot at its last point.
     scenario
         World, robot and localisation.
-    on_progress
-        Called each simulated second with the share that is done.
     tracker
         Law in place of the controller; the path is then only recorded as the reference.
     """
-    robot_parameters = DigitalTwinParameters.from_dict(
+    parameters = DigitalTwinParameters.from_dict(
         {
             'noise.variance': 0.04,
             'world': scenario.world or scenario.known_world,
@@ -171,94 +138,117 @@ def run_patrol(
             **scenario.robot,
         }
     )
-    controller = Controller(
-        StepperControllerParameters.from_dict(
-            {
-                'pose.enabled': True,
-                'keep_out.enabled': scenario.keep_out,
-                **scenario.controller,
-            }
-        ),
-        load_world(scenario.known_world).obstacles,
+    driver = PathDriver(points, scenario, parameters.geometry, tracker)
+    rest = round(START * RATE)
+    count = round(scenario.duration * RATE)
+    record = run_loop(
+        DigitalTwin(parameters),
+        driver,
+        rest + count,
+        start=START,
+        latency_ns=stamp_of(1) - 1,
     )
-    controller.warm_up()
-    robot = DigitalTwin(robot_parameters)
-    timing = PathTiming(scenario.limits, robot_parameters.geometry, 1.0 / RATE, ORIGIN)
-    clock = PathClock(scenario.wait)
-    generator = np.random.default_rng((scenario.seed, 7))
-    lead, rest = round(LEAD * RATE), round(INITIAL_STANDSTILL * RATE)
-    references: list[tuple[Pose, BodyTwist]] = []
-    rows = []
-    ranges_before: tuple[float, ...] = ()
-    for k in range(rest + round(scenario.duration * RATE)):
-        while len(references) <= k + lead:
-            references.append(
-                (ORIGIN, BodyTwist(0.0, 0.0))
-                if len(references) < rest
-                else timing.advance_along(points, clock.rate)
-            )
-            stamp = _stamp(len(references) - 1)
-            controller.add_reference(State(stamp, *references[-1]))
-            clock.add_reference(stamp, references[-1][0])
-        state = robot.advance(_stamp(k))
-        assert state.truth is not None
-        pose = state.odometry.pose
-        noise = generator.standard_normal(3)
-        if scenario.localised:
-            x, y, yaw = state.truth.pose
-            pose = Pose(
-                x + scenario.position_noise * float(noise[0]),
-                y + scenario.position_noise * float(noise[1]),
-                wrap_angle(yaw + scenario.yaw_noise * float(noise[2])),
-            )
-        if k < rest:
-            pose = ORIGIN  # where it is placed, known without noise
-        clock.observe(state.stamp_ns, pose)
-        controller.enable(k >= rest)
+    columns = {name: values[rest:] for name, values in record.columns.items()}
+    columns['time'] = np.arange(count) / RATE
+    return replace(
+        record,
+        columns=columns,
+        start=0.0,
+        robot_reasons=record.robot_reasons[rest:],
+        driver_reasons=record.driver_reasons[rest:],
+    )
+
+
+class PathDriver:
+    """The controller of the node on a path, with a localisation; or a law in its place.
+
+    The path waits for the robot where the scenario says so. Before the drive the robot is where it
+    was placed, which is known without noise.
+    """
+
+    def __init__(
+        self,
+        points: Iterator[Array],
+        scenario: PatrolScenario,
+        geometry: WheelGeometry,
+        tracker: PathTracker | None,
+    ) -> None:
+        self._points, self._scenario, self._geometry = points, scenario, geometry
+        self._tracker = tracker
+        values = {'pose.enabled': True, 'keep_out.enabled': scenario.keep_out}
+        self._controller = Controller(
+            StepperControllerParameters.from_dict({**values, **scenario.controller}),
+            load_world(scenario.known_world).obstacles,
+        )
+        self._controller.warm_up()
+        self._timing = PathTiming(scenario.limits, geometry, 1.0 / RATE, ORIGIN)
+        self._clock = PathClock(scenario.wait)
+        self._generator = np.random.default_rng((scenario.seed, 7))
+        self._references: list[tuple[Pose, BodyTwist]] = []
+        self._ranges: tuple[float, ...] = ()
+        self._k = 0
+        self._driving = False
+        self._pose, self._twist = ORIGIN, STANDSTILL
+        self.reason = ''
+
+    def begin(self, k: int, *, enabled: bool) -> None:
+        """Extend the reference up to its lead."""
+        self._k, self._driving = k, enabled
+        while len(self._references) <= k + round(LEAD * RATE):
+            stamp = stamp_of(len(self._references))
+            reference = (ORIGIN, BodyTwist(0.0, 0.0))
+            if len(self._references) >= round(START * RATE):
+                reference = self._timing.advance_along(self._points, self._clock.rate)
+            self._references.append(reference)
+            self._controller.add_reference(State(stamp, *reference))
+            self._clock.add_reference(stamp, reference[0])
+        self._controller.enable(enabled)
+
+    def step(self, state: RobotState) -> RobotCommand:
+        """Return the command that follows from a report of the robot."""
+        self._pose = self._localised(state)
+        self._clock.observe(state.stamp_ns, self._pose)
         for sensor, reading in enumerate(state.ranges):
-            if not ranges_before or reading != ranges_before[sensor] or k % 4 == 0:
-                controller.add_range(sensor, reading)
-        ranges_before = state.ranges
-        if tracker is None:
-            twist, _ = controller.step(State(state.stamp_ns, pose, state.odometry.twist))
-        else:
-            twist = tracker.step(pose) if k >= rest else STANDSTILL
-        robot.apply(
-            RobotCommand.from_twist(twist, robot_parameters.geometry, state.stamp_ns),
-            _stamp(k + 1) - 1,
+            if not self._ranges or reading != self._ranges[sensor] or self._k % 4 == 0:
+                self._controller.add_range(sensor, reading)
+        self._ranges = state.ranges
+        if self._tracker is None:
+            measured = State(state.stamp_ns, self._pose, state.odometry.twist)
+            self._twist, status = self._controller.step(measured)
+            self.reason = '' if status.reason.moves else status.reason.value
+        elif self._driving:
+            self._twist = self._tracker.step(self._pose)
+        return RobotCommand.from_twist(self._twist, self._geometry, state.stamp_ns)
+
+    def _localised(self, state: RobotState) -> Pose:
+        """Return the pose that the controller receives."""
+        scenario, noise = self._scenario, self._generator.standard_normal(3)
+        if not self._driving:
+            return ORIGIN
+        if not scenario.localised or state.truth is None:
+            return state.odometry.pose
+        x, y, yaw = state.truth.pose
+        return Pose(
+            x + scenario.position_noise * float(noise[0]),
+            y + scenario.position_noise * float(noise[1]),
+            wrap_angle(yaw + scenario.yaw_noise * float(noise[2])),
         )
-        if k < rest:
-            continue
-        keep_out = controller.keep_out
-        changed = keep_out is not None and keep_out.changed
+
+    @property
+    def signals(self) -> Signals:
+        """Reference, pose, command and what the keep-out does."""
+        keep_out = self._controller.keep_out
         activity = Activity.FREE if keep_out is None else keep_out.activity
-        rows.append(
-            (
-                (k - rest) / RATE,
-                references[k][0],
-                references[k][1],
-                state.truth.pose,
-                pose,
-                twist,
-                state.truth.twist,
-                state.ranges,
-                robot.diagnostics.max_contact_force,
-                ACTIVITIES.index(activity),
-                changed or controller.pose_controller.rejoining,
-            )
-        )
-        if on_progress is not None and k % 100 == 0:
-            on_progress((k - rest) / (scenario.duration * RATE))
-    columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
-    keep_out = controller.keep_out
-    columns.append(
-        np.zeros((0, 0), dtype=np.int8) if keep_out is None else keep_out.map.grid.cells
-    )
-    return PatrolRecord(*columns)
-
-
-def _stamp(k: int) -> int:
-    return round(k * NANOSECONDS / RATE)
+        changed = keep_out is not None and keep_out.changed
+        reference = self._references[self._k]
+        return {
+            'reference_pose': reference[0],
+            'reference_twist': reference[1],
+            'pose': self._pose,
+            'command': self._twist,
+            'activity': ACTIVITIES.index(activity),
+            'avoiding': changed or self._controller.pose_controller.rejoining,
+        }
 
 
 def room_with_boxes(

@@ -8,17 +8,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.evaluation.closed_loop import LoopRecord, MethodSpec, pretrain, run
+from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired, rms
+from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.method import MadeMethod, MethodSpec, pretrain
 from t3mpc_ros.evaluation.methods import FULL, methods, proposed_parameters
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
+from t3mpc_ros.evaluation.record import RATE, Record
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import (
     HELD_OUT_SEEDS,
+    PLANT_OF,
     PRETRAINING_DURATION,
     PRETRAINING_NOISE,
     PRETRAINING_SEEDS,
-    RATE,
     Scenario,
 )
 from t3mpc_ros.evaluation.training.fit import periods, skills
@@ -75,21 +78,23 @@ def assess(
     """Return a report on a model: runs on held-out seeds with it and without."""
     without = MethodSpec(FULL, ProposedController, parameters)
 
-    def with_model(*given: object) -> ProposedController:
-        controller = ProposedController(parameters, *given)  # type: ignore[arg-type]
+    def with_model(scenario: Scenario) -> MadeMethod:
+        controller = ProposedController(parameters, scenario.nominal_model())
         controller.set_weights(learnt)
-        return controller
+        return MadeMethod(controller)
 
     fresh, trained = [], []
     with progress_bar(2 * len(seeds), show=progress) as bar:
         for seed in seeds:
-            scenario = Scenario(drive, PRETRAINING_NOISE, 'nominal', seed, PRETRAINING_DURATION)
+            scenario = Scenario(
+                PLANT_OF[drive], NOMINAL, seed, PRETRAINING_DURATION, PRETRAINING_NOISE
+            )
             fresh.append(run(scenario, without))
-            trained.append(run(scenario, with_model))
+            trained.append(run(scenario, with_model(scenario)))
             bar.update(2)
     early, late = (
         [[measure(record) for record in records] for records in (fresh, trained)]
-        for measure in (early_rmse, LoopRecord.rmse)
+        for measure in (early_rmse, Record.rmse)
     )
     lines = [
         f'training: {len(PRETRAINING_SEEDS)} runs of {PRETRAINING_DURATION:g} s, drive {drive}, '
@@ -108,13 +113,13 @@ def assess(
     return '\n'.join(lines)
 
 
-def early_rmse(record: LoopRecord) -> float:
+def early_rmse(record: Record) -> float:
     """Return the tracking RMSE over both wheels in the initial phase, rad/s."""
     return rms(record.error[record.time < EARLY])
 
 
 def held_out_skills(
-    parameters: ProposedParameters, learnt: Mapping[str, Array], record: LoopRecord
+    parameters: ProposedParameters, learnt: Mapping[str, Array], record: Record
 ) -> dict[str, Array]:
     """Return the skills before and after the fit on the last quarter of a run."""
     predictive = parameters.predictive
@@ -138,19 +143,19 @@ def skill_table(skills: Mapping[str, Array]) -> str:
     return '\n'.join(lines)
 
 
-def training_data_of(record: LoopRecord, parameters: ProposedParameters) -> TrainingData:
+def training_data_of(record: Record, parameters: ProposedParameters) -> TrainingData:
     """Return a simulated run in the form of training data from a bag."""
-    terms = record.terms
+    terms = record['terms']
     begins = np.zeros(record.time.size, dtype=np.bool_)
     begins[0] = True
     return TrainingData(
         time=record.time,
         errors=-terms[:, TERM_NAMES.index('feedback')] / parameters.law.gain,
         moves=terms[:, TERM_NAMES.index('predictive')],
-        rest=record.command - terms[:, _FOLLOWED].sum(axis=1),
-        speeds=record.estimated,
-        unexplained=record.unexplained,
-        limited=record.limited,
+        rest=record['acceleration'] - terms[:, _FOLLOWED].sum(axis=1),
+        speeds=record['estimated'],
+        unexplained=record['unexplained'],
+        limited=record['limited'].astype(np.bool_),
         begins=begins,
     )
 

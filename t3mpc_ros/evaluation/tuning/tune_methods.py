@@ -13,9 +13,10 @@ from typing import Self
 
 from tqdm import tqdm
 
-from t3mpc_ros.evaluation.closed_loop import Job, JobError, LoopRecord, MethodSpec, WorkerPool
+from t3mpc_ros.evaluation.method import MethodSpec
+from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.reporting import progress_bar
-from t3mpc_ros.evaluation.scenario import TUNING_SEEDS, Scenario
+from t3mpc_ros.evaluation.scenario import PLANT_OF, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.cma_search import SearchProgress, SearchResult, search_best
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, Values, check_names
 from t3mpc_ros.evaluation.tuning.tuned_parameters import (
@@ -24,6 +25,7 @@ from t3mpc_ros.evaluation.tuning.tuned_parameters import (
     TunedParameters,
     TuningBudget,
 )
+from t3mpc_ros.evaluation.workers import Job, JobError, WorkerPool, measure_many
 from t3mpc_ros.parameters.table import ParameterError, Parameters
 from t3mpc_ros.version import VERSION
 
@@ -40,9 +42,9 @@ DURATION = 26.0
 """Length of a training run, s: the reference switches twice in it."""
 
 
-def objective(record: LoopRecord) -> float:
+def objective(record: Record) -> float:
     """Return RMSE + rho chatter of a run, rad/s; infinite for a run that broke off."""
-    value = record.rmse() + SMOOTHNESS * record.chatter()
+    value = record.rmse() + SMOOTHNESS * record.variation()
     return value if math.isfinite(value) else math.inf
 
 
@@ -86,7 +88,8 @@ class TuningScenarios:
     def scenarios(self, drive: str) -> tuple[Scenario, ...]:
         """Return the runs on the paper's plant with a drive."""
         return tuple(
-            Scenario(drive, noise, case, seed, self.duration) for seed, noise, case in self.runs()
+            Scenario(PLANT_OF[drive], case, seed, self.duration, noise)
+            for seed, noise, case in self.runs()
         )
 
 
@@ -158,7 +161,9 @@ class ClosedLoopObjective:
             for candidate in candidates
             for scenario in scenarios
         ]
-        return mean_objectives(len(candidates), len(scenarios), self.workers.run(jobs, objective))
+        return mean_objectives(
+            len(candidates), len(scenarios), measure_many(jobs, objective, self.workers)
+        )
 
 
 def mean_objectives(

@@ -16,21 +16,14 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
-from t3mpc_ros.evaluation.closed_loop import MethodSpec
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired, rms
-from t3mpc_ros.evaluation.method_comparison.compared_runs import (
-    START,
-    TUNED_FOR,
-    VARIATION,
-    TwinMethod,
-    twin_numbers,
-    twin_run,
-    twin_start,
-)
-from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
-from t3mpc_ros.evaluation.methods import FULL, methods
+from t3mpc_ros.evaluation.loop import Method, run
+from t3mpc_ros.evaluation.method import MethodSpec, NodeMethod
+from t3mpc_ros.evaluation.methods import FULL, methods, twin_start
+from t3mpc_ros.evaluation.metrics import START, VARIATION, measure
 from t3mpc_ros.evaluation.proposed_method import ProposedController
-from t3mpc_ros.evaluation.scenario import TUNING_SEEDS
+from t3mpc_ros.evaluation.record import rolling_speeds
+from t3mpc_ros.evaluation.scenario import KINDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
 from t3mpc_ros.evaluation.tuning.tune_methods import (
     SMOOTHNESS,
@@ -40,10 +33,9 @@ from t3mpc_ros.evaluation.tuning.tune_methods import (
     tune_methods,
 )
 from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedEntry, TunedParameters
-from t3mpc_ros.evaluation.twin_closed_loop import INITIAL_STANDSTILL
 from t3mpc_ros.parameters.table import Parameters
 
-TWIN = TUNED_FOR['twin']
+TWIN = KINDS['twin'].tuned_for
 CASES = ('nominal', 'miscalibrated')
 TRAINING = TuningScenarios(TUNING_SEEDS[:2], (0.04,), 26.0, CASES)
 """Runs of one evaluation."""
@@ -92,7 +84,7 @@ class TwinObjective(ClosedLoopObjective):
         """Return the mean objective of each candidate, infinite where a run broke off."""
         training = self.training
         scenarios = [
-            TwinScenario(case, seed, training.duration, noise)
+            Scenario('twin', case, seed, training.duration, noise)
             for seed, noise, case in training.runs()
         ]
         jobs = [
@@ -104,16 +96,15 @@ class TwinObjective(ClosedLoopObjective):
         return mean_objectives(len(candidates), len(scenarios), found)
 
 
-def twin_method(method: MethodDefinition, parameters: Parameters) -> TwinMethod:
+def twin_method(method: MethodDefinition, parameters: Parameters) -> Method:
     """Return a method with parameters, for the closed loop with the twin."""
     if method.name == FULL:
         values = parameters.to_dict()
-        return TwinMethod(FULL, {name: values[name] for name in method.space.names})
-    spec = MethodSpec(method.name, method.controller_type, parameters)
-    return TwinMethod(method.name, baseline=spec)
+        return NodeMethod(FULL, {name: values[name] for name in method.space.names})
+    return MethodSpec(method.name, method.controller_type, parameters)
 
 
-def twin_objective(job: tuple[TwinScenario, Any]) -> float:
+def twin_objective(job: tuple[Scenario, Any]) -> float:
     """Return RMSE + rho times the variation of a run, rad/s; infinite if it is not finite.
 
     On the default twin the error is that of the rotors. Where the baselines have the gyro it is
@@ -121,11 +112,13 @@ def twin_objective(job: tuple[TwinScenario, Any]) -> float:
     the body must not lose by it.
     """
     scenario, method = job
-    record = twin_run(scenario, method)
-    counted = record.time >= INITIAL_STANDSTILL + START
-    speeds = record.ground if scenario.uses_gyro else record.rotors
+    record = run(scenario, method)
+    counted = record.time >= record.start + START
+    speeds = record.speeds
+    if scenario.uses_gyro:
+        speeds = rolling_speeds(record, scenario.true_robot().geometry)
     rmse = rms((speeds - record.reference)[counted])
-    value = rmse + SMOOTHNESS * twin_numbers(scenario, record)[VARIATION.name]
+    value = rmse + SMOOTHNESS * measure(scenario, record)[VARIATION.name]
     return value if math.isfinite(value) else math.inf
 
 
@@ -139,7 +132,7 @@ def validate(
     start = method.start[TWIN]
     found = start.with_values({name: tuned.values[name] for name in tuned.tuned})
     jobs = [
-        (TwinScenario(case, seed, TRAINING.duration), twin_method(method, parameters))
+        (Scenario('twin', case, seed, TRAINING.duration), twin_method(method, parameters))
         for seed in VALIDATION_SEEDS
         for case in CASES
         for parameters in (found, start)

@@ -8,29 +8,22 @@ from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.evaluation.cases import CASES, NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean, paired
-from t3mpc_ros.evaluation.method_comparison.compared_runs import (
+from t3mpc_ros.evaluation.experiment import ComparisonPlan, Results
+from t3mpc_ros.evaluation.method import NodeMethod
+from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, TWIN_ADVANCE
+from t3mpc_ros.evaluation.metrics import (
     DRIFT,
-    FEED_FORWARD,
     METRICS,
     OVERALL,
     SETTLED,
-    SETTLING,
     START,
     STOPPED,
-    TUNED_FOR,
-    TWIN_ADVANCE,
     YAW_RATE,
     YAW_RATE_SETTLED,
-    ComparisonPlan,
     Metric,
-    Results,
-    case_texts,
 )
-from t3mpc_ros.evaluation.method_comparison.twin_scenario import CASES as TWIN_CASES
-from t3mpc_ros.evaluation.method_comparison.twin_scenario import TwinScenario
-from t3mpc_ros.evaluation.methods import FULL
-from t3mpc_ros.evaluation.paper.experiment_runs import SETTLING as PAPER_SETTLING
 from t3mpc_ros.evaluation.plotting import new_figure, png_of
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
@@ -43,7 +36,13 @@ from t3mpc_ros.evaluation.reporting import (
     format_interval,
     html_page,
 )
-from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, TUNING_SEEDS
+from t3mpc_ros.evaluation.scenario import (
+    HELD_OUT_SEEDS,
+    KINDS,
+    PRETRAINING_SEEDS,
+    TUNING_SEEDS,
+    Scenario,
+)
 from t3mpc_ros.version import VERSION
 
 BETTER, WORSE, INCONCLUSIVE = 'better', 'worse', 'inconclusive'
@@ -76,9 +75,9 @@ def verdict(found: Difference) -> str:
     return BETTER if found.mean < 0.0 else WORSE
 
 
-def judged_metrics(robot: str, case: str) -> tuple[Metric, ...]:
+def judged_metrics(case: str) -> tuple[Metric, ...]:
     """Return the metrics that decide a case: of the wheels, or of the body if it is unknown."""
-    if robot == 'twin' and TWIN_CASES[case].gyro:
+    if CASES[case].gyro:
         return YAW_RATE_SETTLED, YAW_RATE, DRIFT
     return SETTLED, OVERALL
 
@@ -89,13 +88,13 @@ def summary_table(plan: ComparisonPlan, results: Results) -> Table:
     for method in plan.methods:
         cells = [method]
         for case in plan.cases:
-            metric = judged_metrics(plan.robot, case)[0]
+            metric = judged_metrics(case)[0]
             found = difference(results, case, method, metric, plan.against)
             average = mean(values(results, case, method, metric))
             text = 'diverged' if math.isnan(average) else f'{average:.{metric.digits}f}'
             cells.append(text if found is None else f'{text} {verdict(found)}')
         rows.append(tuple(cells))
-    body = [case for case in plan.cases if judged_metrics(plan.robot, case)[0] is not SETTLED]
+    body = [case for case in plan.cases if judged_metrics(case)[0] is not SETTLED]
     title = 'Settled RMSE of the wheel speeds, rad/s'
     if body:
         title += f' ({", ".join(body)}: of the yaw rate of the body)'
@@ -112,7 +111,7 @@ def case_table(plan: ComparisonPlan, results: Results, case: str) -> Table:
         if metric.name in first
         and (metric is not STOPPED or any(_stopped(results, case, m) for m in plan.methods))
     ]
-    judged = judged_metrics(plan.robot, case)
+    judged = judged_metrics(case)
     head = ['method', *(f'{metric.heading}, {metric.unit}' for metric in metrics)]
     compared = plan.against in plan.methods and len(plan.methods) > 1
     if compared:
@@ -132,7 +131,7 @@ def case_table(plan: ComparisonPlan, results: Results, case: str) -> Table:
                 text = format_interval(found.mean, found.half, '+', metric.digits)
                 cells += [text, verdict(found)]
         rows.append(tuple(cells))
-    title = f'{case}: {case_texts(plan.robot)[case]}'
+    title = f'{case}: {CASES[case].text}'
     return Table(title, head, rows, (FULL,), wrap=True)
 
 
@@ -148,9 +147,9 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
         'model": that of the nominal robot',
     }
     if plan.robot == 'twin':
-        scenario = TwinScenario('nominal', 0)
+        scenario = Scenario('twin', 'nominal', 0)
         model = scenario.nominal_model()
-        gyro = [name for name in plan.cases if plan.gyro or TWIN_CASES[name].gyro] or ['no case']
+        gyro = [name for name in plan.cases if plan.gyro or CASES[name].gyro] or ['no case']
         rows |= {
             FULL: 'the controller of the node with the parameters of the node for this robot, and '
             'no learnt weights at the start; likewise with a part left out. It receives the '
@@ -189,16 +188,16 @@ def description(plan: ComparisonPlan) -> str:
         f'seeds {seeds}{outside}. '
         'True wheel speeds against the reference; mean ± half the 95 % interval over the seeds. '
     )
-    if plan.robot == 'twin':
+    kind = KINDS[plan.robot]
+    before, after = kind.settling
+    text += (
+        f'The first {START:g} s of control do not count. Settled: without {before:g} s before and '
+        f'{after:g} s after each switch. '
+    )
+    if kind.has_gyro:
         text += (
-            f'The first {START:g} s of control do not count. Settled: without {SETTLING[0]:g} s '
-            f'before and {SETTLING[1]:g} s after each switch. Yaw rate and yaw drift are those of '
-            'the body, from ground truth, against the reference; the drift is that at the end. '
-        )
-    else:
-        text += (
-            f'The first {START:g} s do not count. Settled: without {0.4 * PAPER_SETTLING:g} s '
-            f'before and {0.6 * PAPER_SETTLING:g} s after each switch. '
+            'Yaw rate and yaw drift are those of the body, from ground truth, against the '
+            'reference; the drift is that at the end. '
         )
     return text + (
         'Variation: total variation of the commanded acceleration per second and wheel. '
@@ -239,15 +238,15 @@ def page(plan: ComparisonPlan, results: Results) -> str:
 def record(plan: ComparisonPlan, results: Results) -> dict[str, Any]:
     """Return plan, runs and differences for a JSON file; NaN where a run broke off."""
     cases: dict[str, Any] = {}
-    for case, text in case_texts(plan.robot).items():
+    for case in CASES:
         if case in plan.cases:
             found = {name: _method_record(plan, results, case, name) for name in plan.methods}
-            cases[case] = {'text': text, 'methods': found}
+            cases[case] = {'text': CASES[case].text, 'methods': found}
     return {
         'format': 1,
         'version': VERSION,
         'robot': plan.robot,
-        'drive_of_tuning': TUNED_FOR[plan.robot],
+        'drive_of_tuning': KINDS[plan.robot].tuned_for,
         'seeds': list(plan.seeds),
         'duration': plan.duration,
         'noise': plan.noise,
@@ -259,16 +258,10 @@ def record(plan: ComparisonPlan, results: Results) -> dict[str, Any]:
 
 
 def _parameters(plan: ComparisonPlan, name: str) -> Mapping[str, object]:
-    method = plan.known_methods()[name]
-    parameters = getattr(method, 'parameters', None)
-    if parameters is None:
-        baseline = getattr(method, 'baseline', None)
-        if baseline is None:
-            own = TwinScenario('nominal', 0).controller_parameters()
-            parameters = own.with_values(getattr(method, 'changes', None) or {})
-        else:
-            parameters = baseline.parameters
-    return dict(parameters.to_dict())
+    method: Any = plan.known_methods()[name]
+    if isinstance(method, NodeMethod):
+        return dict(method.parameters_for(Scenario(plan.robot, NOMINAL, 0)).to_dict())
+    return dict(method.parameters.to_dict())
 
 
 def _method_record(
@@ -297,7 +290,7 @@ def _stopped(results: Results, case: str, method: str) -> bool:
 
 def _draw_differences(plan: ComparisonPlan, results: Results, case: str) -> Any:
     """Return a figure of the paired differences of the first judged metric, or None."""
-    metric = judged_metrics(plan.robot, case)[0]
+    metric = judged_metrics(case)[0]
     rows: Sequence[tuple[str, Difference]] = [
         (method, found)
         for method in plan.methods

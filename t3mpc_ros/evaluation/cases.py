@@ -1,0 +1,122 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Cases: what differs from the nominal robot and links, once for all robots."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from t3mpc_ros.evaluation.simulated_links import DROPOUTS, JITTER, NO_FAULTS, OVERLOAD, LinkFaults
+from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters
+
+ROBOTS = ('twin', 'servo', 'torque')
+"""The digital twin with stepper motors; the paper's plant with velocity or with torque drive."""
+PLANTS = ('servo', 'torque')
+PATCHES = Path(__file__).with_name('patches.yaml')
+"""World with slippery patches."""
+NOMINAL = 'nominal'
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Difference of the true robot of a run and its links from what every method assumes."""
+
+    text: str
+    changes: Mapping[str, object] = field(default_factory=dict)
+    """Parameters of the robot from the start, by their flat names."""
+    later: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """What changes at half of the run, by robot: parameters, or faults of the twin."""
+    known: bool = False
+    """Whether the estimator and the methods know of ``changes``."""
+    robots: tuple[str, ...] = ROBOTS
+    """Robots to which the case applies."""
+    links: LinkFaults = NO_FAULTS
+    """Faults of the links; unknown to all methods."""
+    gyro: bool = False
+    """Whether the baselines take the yaw rate from the odometry with its gyro, and the motion of
+    the body decides."""
+    reproduced: bool = False
+    """Whether it belongs to the reproduction of the paper."""
+
+
+_HEAVIER = {'mass_factor': 1.3, 'inertia_factor': 1.3, 'friction_factor': 2.0}
+
+CASES: Mapping[str, Case] = {
+    NOMINAL: Case('the robot as it is assumed, with friction and disturbance', reproduced=True),
+    'miscalibrated': Case(
+        'wheel radii +2 % and -1 %, track +3 %, slippery patches, 30 % more mass and inertia with '
+        'the centre of mass 6 cm ahead of the axle instead of 2 cm',
+        {
+            'right_wheel_radius_multiplier': 1.02,
+            'left_wheel_radius_multiplier': 0.99,
+            'wheel_separation_multiplier': 1.03,
+            'world': str(PATCHES),
+            'mass_factor': 1.3,
+            'inertia_factor': 1.3,
+            'body.com_offset': 0.06,
+        },
+        robots=('twin',),
+        gyro=True,
+    ),
+    'mass +30 %': Case(
+        'body mass and inertia 30 % above nominal',
+        {'mass_factor': 1.3, 'inertia_factor': 1.3},
+        robots=PLANTS,
+        reproduced=True,
+    ),
+    'mass -30 %': Case(
+        'body mass and inertia 30 % below nominal',
+        {'mass_factor': 0.7, 'inertia_factor': 0.7},
+        robots=PLANTS,
+        reproduced=True,
+    ),
+    'friction x3': Case('three times the friction', {'friction_factor': 3.0}, reproduced=True),
+    'load change': Case(
+        'at half of the run body mass and inertia rise by 30 % and friction doubles; on the twin '
+        '1 kg is added to the body',
+        later={'servo': _HEAVIER, 'torque': _HEAVIER, 'twin': {'load_change': 1.0}},
+        reproduced=True,
+    ),
+    'disturbance': Case(
+        'three times the bound of the disturbance torque',
+        {'disturbance.bound': 3.0 * DisturbanceParameters().bound},
+        reproduced=True,
+    ),
+    'dead time': Case(
+        'a command takes 30 ms instead of 10 ms, and every method knows it',
+        {'drive.dead_time': 0.03},
+        known=True,
+        robots=('twin', 'servo'),
+        reproduced=True,
+    ),
+    'dead time 60 ms': Case(
+        'a command takes 60 ms instead of 10 ms, and every method knows it',
+        {'drive.dead_time': 0.06},
+        known=True,
+        robots=('twin', 'servo'),
+    ),
+    'unknown dead time': Case(
+        'a command takes 30 ms; every method assumes 10 ms',
+        {'drive.dead_time': 0.03},
+        robots=('twin', 'servo'),
+    ),
+    'unknown dead time 60 ms': Case(
+        'a command takes 60 ms; every method assumes 10 ms',
+        {'drive.dead_time': 0.06},
+        robots=('twin', 'servo'),
+    ),
+    'dropouts': Case('10 % of the commands and 10 % of the measurements are lost', links=DROPOUTS),
+    'jitter': Case(
+        'each command is up to 20 ms late, and each measurement up to 10 ms', links=JITTER
+    ),
+    'overload': Case(
+        'for 4 s from half of the run on, each command and each measurement is 20 to 120 ms late',
+        links=OVERLOAD,
+    ),
+}
+"""Every case by name, in the order of the tables."""
+
+
+def cases_for(robot: str) -> tuple[str, ...]:
+    """Return the names of the cases of a robot."""
+    return tuple(name for name, case in CASES.items() if robot in case.robots)

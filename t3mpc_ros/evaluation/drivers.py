@@ -1,0 +1,302 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Drivers of the closed loop: the controller of the node, and methods that answer accelerations.
+
+A method sits between the state estimate and the limits of :mod:`t3mpc_ros.control.actuation`,
+which are the same for all methods; the controller of the node has its own.
+"""
+
+from collections.abc import Callable
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.control.actuation import VelocityActuation
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.control.controller import Controller
+from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
+from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.evaluation.baselines.baseline_controller import (
+    BaselineController,
+    NominalModel,
+    Observation,
+)
+from t3mpc_ros.evaluation.record import RATE, stamp_of
+from t3mpc_ros.evaluation.scenario import LEAD, SampledReference, Scenario
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
+from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, State, WheelSpeeds, wrap_angle
+from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand, RobotState
+from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
+from t3mpc_ros.simulation.plant_robot import Signals
+
+Array = NDArray[np.float64]
+
+
+class NodeDriver:
+    """The controller of the node, with the reference :data:`LEAD` ahead.
+
+    Parameters
+    ----------
+    controller, geometry
+        A new controller, and the robot that it assumes.
+    course
+        Reference wheel speeds (rad/s) of each period, shape (n, 2), up to the lead beyond the run.
+
+    Raises
+    ------
+    ValueError
+        The controller has another rate than the loop.
+    """
+
+    def __init__(self, controller: Controller, geometry: WheelGeometry, course: Array) -> None:
+        if controller.parameters.rate != RATE:
+            raise ValueError(
+                f'rate of the controller must be {RATE:g} Hz: got {controller.parameters.rate:g}'
+            )
+        self._controller, self._geometry, self._course = controller, geometry, course
+        self._known = 0
+        """Periods whose reference the controller has."""
+        self.reason = ''
+        self.signals: Signals = {}
+
+    def begin(self, k: int, *, enabled: bool) -> None:
+        """Give the controller the reference up to its lead; enable or disable it."""
+        for j in range(self._known, min(k + round(LEAD * RATE) + 1, len(self._course))):
+            twist = twist_from_wheels(WheelSpeeds(*self._course[j].tolist()), self._geometry)
+            self._controller.add_reference(State(stamp_of(j), ORIGIN, twist))
+            self._known = j + 1
+        self._controller.enable(enabled)
+
+    def step(self, state: RobotState) -> RobotCommand:
+        """Return the command that follows from a report of the robot."""
+        twist, status = self._controller.step(state.odometry)
+        self.reason = '' if status.reason.moves else status.reason.value
+        return RobotCommand.from_twist(twist, self._geometry, status.stamp_ns)
+
+
+class ObservedReference(NamedTuple):
+    """Reference as a method observes it in each period.
+
+    With preview of ``rows`` periods these are rows of the reference after the dead time, and go on
+    beyond the run. Without, r is extrapolated over the dead time by the slope it has now: a switch
+    is seen when it happens, and not before.
+    """
+
+    speeds: Array
+    """r, rad/s, shape (n, 2)."""
+    slope: Array
+    """Its change in a period, rad/s, shape (n, 2)."""
+    rows: int
+    """Rows that preview gives; 0 without preview."""
+    late: int
+    """Configured dead time, in periods."""
+    latest: int
+    """Largest dead time for which it is known, in periods."""
+
+    def at(self, k: int, late: int) -> tuple[Array, Array, Array | None]:
+        """Return r ``late`` periods after period ``k``, one period later, and the preview."""
+        if self.rows:
+            row = k + late
+            return self.speeds[row], self.speeds[row + 1], self.speeds[row : row + self.rows]
+        now = self.speeds[k] + late * self.slope[k]
+        return now, self.speeds[k] + (late + 1) * self.slope[k], None
+
+
+def observed_reference(
+    sampled: SampledReference, steps: int, rows: int, dead_time: float, *, preview: bool
+) -> ObservedReference:
+    """Return what a method observes of a reference over a run of ``steps`` periods.
+
+    The arrays can be written to, because compiled functions take one that cannot for another type.
+    """
+    late = round(dead_time * RATE)
+    if not math.isclose(dead_time * RATE, late, abs_tol=1e-6):
+        raise ValueError(f'dead time must be whole periods of {1.0 / RATE:g} s: got {dead_time} s')
+    if steps + late + rows > sampled.time.size:
+        raise ValueError(
+            f'dead time must be at most {(sampled.time.size - steps - rows) / RATE:g} s, '
+            f'as far as the reference reaches: got {dead_time} s'
+        )
+    latest = sampled.time.size - steps - rows
+    rate = sampled.rate / RATE
+    return ObservedReference(sampled.speeds.copy(), rate, rows if preview else 0, late, latest)
+
+
+DEAD_TIME_HYSTERESIS = 0.75
+"""Difference of estimate and dead time in use, in periods, at which the latter changes."""
+
+
+class MethodDriver:
+    """Drives a robot with a method, behind the state estimate and the limits of all methods.
+
+    It has no watchdog: a lost report is bridged by the estimator, as in the controller. With a
+    torque drive, u is cut where its torque would be beyond what the motors have, so that estimator
+    and method get the limited u. A method that estimates the dead time gets state estimate and
+    reference for the estimated one, in whole periods.
+    """
+
+    def __init__(
+        self, method: Callable[[NominalModel], BaselineController], scenario: Scenario
+    ) -> None:
+        self._method, self._scenario = method, scenario
+        self._model = scenario.nominal_model()
+        robot = self._model.robot
+        self._actuation = VelocityActuation(
+            scenario.estimate(),
+            scenario.limits,
+            robot.geometry,
+            self._model.drive,
+            self._model.period,
+        )
+        self._inertia = wheel_inertia(robot.body, robot.geometry)
+        self._torque_limit = robot.drive.torque_limit
+        self._enabled = True
+        self.reason = ''
+        self._start()
+
+    def _start(self) -> None:
+        """Begin anew with the next report."""
+        self._controller: BaselineController | None = None
+        self._dead_time: DeadTimeEstimator | None = None
+        self._observed = -1
+        """Period of the last report."""
+        self._yaw = 0.0
+        """Its yaw, rad."""
+        self._acceleration = np.zeros(2)
+        self._limited = False
+
+    @property
+    def signals(self) -> Signals:
+        """Estimates, limited u and terms of the last step."""
+        seam, terms = self._actuation, getattr(self._controller, 'terms', None)
+        if not (isinstance(terms, np.ndarray) and terms.shape == (len(TERM_NAMES), 2)):
+            terms = np.zeros((len(TERM_NAMES), 2))
+        return {
+            'estimated': seam.speeds.copy(),
+            'unexplained': seam.disturbance.copy(),
+            'acceleration': self._acceleration.copy(),
+            'limited': self._limited,
+            'terms': terms.copy(),
+        }
+
+    def begin(self, k: int, *, enabled: bool) -> None:
+        """Drive, or stop and forget; the scenario has the reference."""
+        if not enabled:
+            self._start()
+        self._enabled = enabled
+        self.reason = '' if enabled else Reason.DISABLED.value
+
+    def step(self, state: RobotState) -> RobotCommand:
+        """Return the command that follows from a report of the robot.
+
+        NaN if the method's answer is not finite.
+
+        Raises
+        ------
+        ValueError
+            The method answers with something else than two accelerations.
+        """
+        if not self._enabled:
+            return RobotCommand(ZERO_WHEEL_SPEEDS, state.stamp_ns)
+        k = round(state.stamp_ns * RATE / NANOSECONDS)
+        elapsed = k - self._observed if self._observed >= 0 else 1
+        measured = self._measured(state, elapsed)
+        if self._controller is None:
+            self._actuation.reset(measured)
+            self._controller = self._new_controller(measured)
+        elif self._dead_time is not None:
+            self._update_dead_time(self._dead_time, measured, elapsed)
+        self._observed, self._yaw = k, state.odometry.pose.yaw
+        asked, cut = self._limited_torque(self._answer(self._controller, k, measured, elapsed))
+        if not np.isfinite(asked).all():
+            return RobotCommand(WheelSpeeds(math.nan, math.nan), state.stamp_ns)
+        self._acceleration = self._actuation.send_acceleration(asked)
+        self._limited = self._actuation.limited or cut
+        self._controller.applied(self._acceleration, limited=self._limited)
+        sent = self._actuation.command
+        if self._model.drive == 'torque':
+            sent = np.dot(self._inertia, self._acceleration)
+        return RobotCommand(WheelSpeeds(*sent.tolist()), state.stamp_ns)
+
+    def _new_controller(self, measured: Array) -> BaselineController:
+        controller, seam = self._method(self._model), self._actuation
+        self._reference = observed_reference(
+            self._scenario.reference(),
+            self._scenario.steps,
+            self._scenario.preview_rows(seam.dead_time),
+            seam.dead_time,
+            preview=controller.preview,
+        )
+        self._late = self._reference.late
+        if controller.estimate_dead_time and seam.takes_speeds:
+            self._dead_time = DeadTimeEstimator(
+                seam.speed_filter.parameters, self._model.period, mean_speeds=False, friction=True
+            )
+            self._dead_time.reset(measured)
+        return controller
+
+    def _measured(self, state: RobotState, elapsed: int) -> Array:
+        """Return the measured wheel speeds, rad/s, shape (2,).
+
+        With the gyro, their difference is that of the yaw rate of the odometry's pose.
+        """
+        if not self._scenario.uses_gyro or self._observed < 0:
+            return np.array(state.wheels)
+        turned = wrap_angle(state.odometry.pose.yaw - self._yaw)
+        geometry, period = self._model.robot.geometry, self._model.period
+        mean = 0.5 * (state.wheels.right + state.wheels.left)
+        half = turned / (elapsed * period) * geometry.half_separation / geometry.wheel_radius
+        return np.array([mean + half, mean - half])
+
+    def _update_dead_time(
+        self, estimator: DeadTimeEstimator, measured: Array, elapsed: int
+    ) -> None:
+        """Update the dead time in use with measured speeds, ``elapsed`` periods after the last."""
+        period = self._model.period
+        estimator.step(measured, self._actuation.command, elapsed * period)
+        periods = min(estimator.dead_time_in_use / period, float(self._reference.latest))
+        if abs(periods - self._late) > DEAD_TIME_HYSTERESIS:
+            self._late = round(periods)
+            self._actuation.set_dead_time(self._late * period)
+
+    def _answer(
+        self, controller: BaselineController, k: int, measured: Array, elapsed: int
+    ) -> Array:
+        """Return what the method answers to the speeds (rad/s) measured in period ``k``."""
+        seam = self._actuation
+        seam.observe(measured, elapsed * self._model.period)
+        now, following, future = self._reference.at(k, self._late)
+        asked = controller.step(
+            Observation(
+                seam.predicted,
+                seam.disturbance,
+                now,
+                following,
+                seam.command,
+                future,
+                elapsed,
+                self._late,
+            )
+        )
+        if not (isinstance(asked, np.ndarray) and asked.shape == (2,)):
+            what = f'shape {asked.shape}' if isinstance(asked, np.ndarray) else repr(asked)
+            raise ValueError(
+                f'step() of {type(controller).__name__} must return a numpy array of shape (2,), '
+                f'the accelerations of the right and the left wheel: got {what}'
+            )
+        return asked
+
+    def _limited_torque(self, asked: Array) -> tuple[Array, bool]:
+        """Return accelerations that a torque drive can give, and whether they were cut."""
+        if self._model.drive != 'torque':
+            return asked, False
+        (diagonal, beside), (right, left) = self._inertia[0].tolist(), asked.tolist()
+        limit = self._torque_limit
+        if not limit < max(
+            abs(diagonal * right + beside * left), abs(beside * right + diagonal * left)
+        ):
+            return asked, False
+        torque = np.clip(self._inertia @ asked, -limit, limit)
+        return np.asarray(np.linalg.solve(self._inertia, torque), dtype=np.float64), True

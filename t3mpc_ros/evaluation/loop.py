@@ -1,0 +1,167 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The closed loop of a driver and a robot, without ROS, with the timing of the nodes.
+
+Each report of the robot carries its stamp to the driver; the command computed from it leaves at
+once, carries that stamp back, and the robot follows it when it has arrived. Reports may be late
+or lost on their way; what happens to a command on its way is a matter of the robot.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+import math
+from typing import Any, Protocol
+
+import numpy as np
+
+from t3mpc_ros.evaluation.record import RATE, Record, broken_off, stamp_of, switch_times
+from t3mpc_ros.evaluation.scenario import LEAD, Scenario
+from t3mpc_ros.evaluation.simulated_links import NO_FAULTS, LinkFaults, ReportLink
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.robot.interface import RANGE_SENSORS, RobotCommand, RobotState
+from t3mpc_ros.simulation.plant_robot import Signals, SimulatedRobot
+
+_NO_RANGES = (math.nan,) * len(RANGE_SENSORS)
+
+
+class Driver(Protocol):
+    """What closes the loop: the controller of the node, a method, a law for a path."""
+
+    @property
+    def reason(self) -> str:
+        """Why it stops the robot; empty where it drives."""
+        ...
+
+    @property
+    def signals(self) -> Signals:
+        """What it decided last, beside the command."""
+        ...
+
+    def begin(self, k: int, *, enabled: bool) -> None:
+        """Begin period k: take the reference that becomes known in it; drive, or stop."""
+        ...
+
+    def step(self, state: RobotState) -> RobotCommand:
+        """Return the command that follows from a report of the robot."""
+        ...
+
+
+class Method(Protocol):
+    """What makes a driver for each run."""
+
+    @property
+    def name(self) -> str:
+        """Name in tables and errors."""
+        ...
+
+    def driver(self, scenario: Scenario) -> Driver:
+        """Return a new driver."""
+        ...
+
+
+def run(scenario: Scenario, method: Method) -> Record:
+    """Return the record of a new driver of a method and the robot of a scenario.
+
+    Equal arguments give equal records, bit for bit.
+    """
+    reference, steps = scenario.reference(), scenario.steps
+    known = steps + round(LEAD * RATE)
+    if len(reference.speeds) < known:
+        raise ValueError(f'reference must have at least {known} rows: got {len(reference.speeds)}')
+    record = run_loop(
+        scenario.simulation(),
+        method.driver(scenario),
+        steps,
+        start=scenario.kind.start,
+        pauses=scenario.own.pauses,
+        links=scenario.links,
+        seed=scenario.seed,
+    )
+    columns = {
+        **record.columns,
+        'reference': reference.speeds[:steps],
+        'mode': reference.modes[:steps],
+    }
+    switches = switch_times(reference.time, reference.modes)
+    return replace(record, columns=columns, drive=scenario.kind.drive, switches=switches)
+
+
+def run_loop(
+    robot: SimulatedRobot,
+    driver: Driver,
+    periods: int,
+    *,
+    start: float = 0.0,
+    pauses: Sequence[tuple[float, float]] = (),
+    links: LinkFaults = NO_FAULTS,
+    seed: int = 0,
+    latency_ns: int = 0,
+) -> Record:
+    """Return the record of a driver and a robot; equal arguments give equal records, bit for bit.
+
+    The columns of the reference are the caller's.
+
+    Parameters
+    ----------
+    robot, driver
+        New ones.
+    periods
+        How many, :data:`RATE` a second.
+    start, pauses
+        Time until which the driver is disabled, and times at which a person disables it, s.
+    links, seed
+        Faults of the reports on their way to the driver, and the seed of their numbers.
+    latency_ns
+        Time from the arrival of a report to the departure of the command.
+    """
+    reports = ReportLink(links, seed, periods / RATE)
+    paused = [(0.0, start), *pauses]
+    columns: dict[str, list[Any]] = {'time': []}
+    robot_reasons, driver_reasons = [], []
+    sent: tuple[float, float] = (0.0, 0.0)
+    ended = -1
+    for k in range(periods):
+        now = stamp_of(k) / NANOSECONDS
+        driver.begin(k, enabled=not any(begin <= now < end for begin, end in paused))
+        state = robot.advance(stamp_of(k))
+        whole = all(map(math.isfinite, state.true_wheels or state.wheels))
+        if whole:
+            reports.send(state)
+            for arrival_ns, report in reports.arrived(stamp_of(k + 1) - 1):
+                command = driver.step(report)
+                sent = command.wheels
+                whole = whole and all(map(math.isfinite, sent))
+                if whole:
+                    robot.apply(command, arrival_ns + latency_ns)
+        row = {'time': now, 'sent': sent, **_of_state(state), **robot.signals, **driver.signals}
+        for name, value in row.items():
+            columns.setdefault(name, []).append(value)
+        robot_reasons.append(state.reason)
+        driver_reasons.append(driver.reason)
+        if not whole:
+            ended = k
+            break
+    record = Record(
+        {name: np.array(values) for name, values in columns.items()},
+        start=start,
+        robot_reasons=tuple(robot_reasons),
+        driver_reasons=tuple(driver_reasons),
+    )
+    return record if ended < 0 else broken_off(record, ended, periods)
+
+
+def _of_state(state: RobotState) -> Signals:
+    """Return the columns that a report fills."""
+    found: dict[str, Any] = {
+        'measured': state.wheels,
+        'speeds': state.true_wheels or state.wheels,
+        'commanded': state.commanded,
+        'odometry': state.odometry.pose,
+        'flags': state.status,
+    }
+    if state.truth is not None:
+        found['truth'], found['twist'] = state.truth.pose, state.truth.twist
+        found['ranges'] = state.ranges or _NO_RANGES
+    if state.lost_steps is not None:
+        found['lost_steps'] = state.lost_steps
+    return found

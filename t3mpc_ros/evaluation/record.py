@@ -1,0 +1,223 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Record of a run: columns over one time axis, and which rows of it count."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.control.control_law import TERM_NAMES
+from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.geometry.kinematics import WheelGeometry, wheel_speeds
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.robot.interface import RobotStatus
+
+Array = NDArray[np.float64]
+
+RATE = 100.0
+"""Control periods a second in every run."""
+STATUS_FLAGS = RobotStatus._fields
+"""Meaning of the column ``flags``."""
+CROSSING = (0.5, 0.5)
+"""Time before and after a switch within which methods cross from one reference to the other, s."""
+
+COLUMNS: Mapping[str, tuple[str, str]] = {
+    'time': ('s', 'since the robot was switched on'),
+    'reference': ('rad/s', 'reference of the wheels, right first'),
+    'mode': ('', 'active switching mode of the reference'),
+    'measured': ('rad/s', 'measured wheel speeds, with noise'),
+    'speeds': ('rad/s', 'true wheel speeds chi; on the twin those of its rotors'),
+    'commanded': ('rad/s', 'command after the limits of the robot, at the end of the last period'),
+    'sent': ('rad/s or N m', 'command to the robot; torques with a torque drive'),
+    'odometry': ('m, m, rad', 'pose of the odometry'),
+    'truth': ('m, m, rad', 'true pose'),
+    'twist': ('m/s, rad/s', 'true twist of the body'),
+    'lost_steps': ('', 'full steps that each rotor is behind its field'),
+    'contact_force': ('N', 'largest force of a contact so far'),
+    'flags': ('', f'status flags of the robot: {", ".join(STATUS_FLAGS)}'),
+    'ranges': ('m', 'range readings, as in RobotState.ranges'),
+    'estimated': ('rad/s', 'estimated chi'),
+    'unexplained': ('rad/s²', "estimated acceleration that chi' = u does not explain"),
+    'acceleration': ('rad/s²', 'u as the limits of the drive let it through'),
+    'limited': ('', 'whether a limit changed u'),
+    'terms': ('rad/s²', f'terms of u: {", ".join(TERM_NAMES)}; zeros for a method without them'),
+    'reference_pose': ('m, m, rad', 'pose of a reference that is a path'),
+    'reference_twist': ('m/s, rad/s', 'its twist'),
+    'pose': ('m, m, rad', 'pose that the controller received'),
+    'command': ('m/s, rad/s', 'twist that the controller commanded'),
+    'activity': ('', 'what the keep-out does, an index into its activities'),
+    'avoiding': ('', 'whether the keep-out changed the command, or the robot is on its way back'),
+}
+"""Every column: unit, and meaning. A run has those that its robot and its driver can know."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """Record of one run, one row per control period; wheels are right first.
+
+    Row k holds what was known and decided at ``time[k]``, and the state of the robot then. From a
+    row on at which the driver answered with a number that is not finite, or the robot has such a
+    speed, all numbers are NaN but time, reference and mode: the run ended there.
+    """
+
+    columns: Mapping[str, NDArray[np.generic]]
+    """One array each, the first dimension is time; see :data:`COLUMNS`."""
+    drive: str = 'velocity'
+    """Meaning of the command: ``velocity`` or ``torque``."""
+    start: float = 0.0
+    """When the robot may first move, s."""
+    switches: Array = field(default_factory=lambda: np.zeros(0))
+    """Instants of the switches, also of those after the end that preview reaches, s."""
+    robot_reasons: Sequence[str] = ()
+    """Of each row why the robot does not follow commands; empty where it does."""
+    driver_reasons: Sequence[str] = ()
+    """Of each row why the driver stops the robot; empty where it drives."""
+
+    def __getitem__(self, name: str) -> Array:
+        """Return a column."""
+        if name not in self.columns:
+            raise KeyError(f'this run has no column {name}: it has {", ".join(self.columns)}')
+        found: Array = self.columns[name]  # type: ignore[assignment]
+        return found
+
+    def __len__(self) -> int:
+        return len(self.columns['time'])
+
+    @property
+    def time(self) -> Array:
+        """Time since the robot was switched on, s, shape (n,)."""
+        return self['time']
+
+    @property
+    def reference(self) -> Array:
+        """Reference wheel speeds, rad/s, shape (n, 2)."""
+        return self['reference']
+
+    @property
+    def speeds(self) -> Array:
+        """True wheel speeds, rad/s, shape (n, 2)."""
+        return self['speeds']
+
+    @property
+    def error(self) -> Array:
+        """True tracking error chi - r, rad/s, shape (n, 2)."""
+        return self.speeds - self.reference
+
+    @property
+    def effort(self) -> Array:
+        """Acceleration asked of the robot, rad/s², shape (n, 2).
+
+        u with a torque drive; with a velocity drive the rate of change of the commanded speeds.
+        """
+        if self.drive == 'torque':
+            return self['acceleration']
+        changes: Array = np.diff(self['sent'], axis=0, prepend=0.0) / (1.0 / RATE)
+        return changes
+
+    @property
+    def finite(self) -> bool:
+        """Whether the run went to its end: every number is finite."""
+        return bool(np.isfinite(self.speeds).all() and np.isfinite(self['sent']).all())
+
+    @property
+    def stopped(self) -> NDArray[np.bool_]:
+        """Rows in which robot or driver have a reason not to move, shape (n,)."""
+        both = zip(self.robot_reasons, self.driver_reasons, strict=True)
+        return np.array([bool(robot or driver) for robot, driver in both])
+
+    def flag(self, name: str) -> NDArray[np.bool_]:
+        """Return one status flag of the robot, a name of :data:`STATUS_FLAGS`, shape (n,)."""
+        flags: NDArray[np.bool_] = self['flags'][:, STATUS_FLAGS.index(name)].astype(np.bool_)
+        return flags
+
+    def rows(self, begin: float, end: float) -> slice:
+        """Return the rows from ``begin`` up to, and without, ``end`` (s)."""
+        first, last = np.searchsorted(self.time, (begin - 1e-6, end - 1e-6)).tolist()
+        return slice(first, last)
+
+    def counted(
+        self, after: float = 3.0, margins: tuple[float, float] = (0.0, 0.0)
+    ) -> NDArray[np.bool_]:
+        """Return which rows count, from ``after`` s of control on, see :func:`counted_rows`."""
+        return counted_rows(self.time, self.switches, self.start + after, margins)
+
+    def rmse(self, after: float = 3.0, *, margins: tuple[float, float] = (0.0, 0.0)) -> float:
+        """Return the tracking RMSE over both wheels, rad/s; NaN when the run broke off."""
+        return rms(self.error[self.counted(after, margins)])
+
+    def largest_error(self, after: float = 3.0) -> float:
+        """Return the largest tracking error of a wheel from ``after`` (s) on, rad/s."""
+        return float(np.max(np.abs(self.error[self.counted(after)])))
+
+    def variation(self, rows: NDArray[np.bool_] | None = None) -> float:
+        """Return the total variation of the effort per second and wheel over rows, rad/s³."""
+        if len(self) < 2:
+            raise ValueError(f'a record must have at least 2 rows: got {len(self)}')
+        counted = slice(None) if rows is None else rows
+        time, effort = self.time[counted], self.effort[counted]
+        return float(np.abs(np.diff(effort, axis=0)).sum() / (2.0 * (time[-1] - time[0])))
+
+
+def stamp_of(k: int) -> int:
+    """Return the instant at which period k begins, ns."""
+    return round(k * NANOSECONDS / RATE)
+
+
+def counted_rows(
+    time: Array, switches: Array, after: float, margins: tuple[float, float] = (0.0, 0.0)
+) -> NDArray[np.bool_]:
+    """Return which rows of a run count: from ``after`` on, without ``margins`` about a switch.
+
+    All in s. Margins are before a switch, where methods with preview have already left the old
+    reference, and after it. Rows from a switch on whose crossing the run does not contain whole
+    never count, nor those before it in which preview leaves the old reference: what that costs
+    would count, and not what it gains.
+    """
+    counted: NDArray[np.bool_] = time >= after
+    before, behind = margins
+    leaving, crossed = CROSSING
+    for switch in switches.tolist():
+        if time.size and switch + crossed > time[-1]:
+            counted &= time < switch - leaving
+        counted &= (time < switch - before) | (time >= switch + behind)
+    if not counted.any():
+        end = time[-1] if time.size else 0.0
+        raise ValueError(
+            f'after and margins must leave rows of a run that ends at {end:g} s: '
+            f'got {after:g} s, {before:g} s and {behind:g} s'
+        )
+    return counted
+
+
+def switch_times(time: Array, modes: NDArray[np.generic]) -> Array:
+    """Return the instants (s) of the first row of each new mode."""
+    instants: Array = time[1:][modes[1:] != modes[:-1]]
+    return instants
+
+
+def rolling_speeds(record: Record, geometry: WheelGeometry) -> Array:
+    """Return the speeds of wheels that roll without slip under the true motion, shape (n, 2)."""
+    linear, angular = record['twist'].T
+    lengths = geometry.wheel_radius, geometry.half_separation
+    return np.column_stack(wheel_speeds(linear, angular, *lengths))
+
+
+def broken_off(record: Record, row: int, rows: int) -> Record:
+    """Return a record of ``rows`` rows that ended at ``row``: from there all numbers are NaN."""
+    columns: dict[str, NDArray[np.generic]] = {}
+    for name, values in record.columns.items():
+        filler = np.zeros if values.dtype == np.bool_ else partial(np.full, fill_value=math.nan)
+        missing = filler((rows - row, *values.shape[1:]))
+        columns[name] = np.concatenate([values[:row], missing]).astype(missing.dtype)
+    columns['time'] = np.arange(rows) / RATE
+    silent = ('',) * (rows - row)
+    return replace(
+        record,
+        columns=columns,
+        robot_reasons=(*record.robot_reasons[:row], *silent),
+        driver_reasons=(*record.driver_reasons[:row], *silent),
+    )
