@@ -3,9 +3,8 @@
 """Complete MCAP files: topics, messages, metadata records and attachments.
 
 The ``mcap`` library parses the records. It does not verify the checksum of the summary or of an
-attachment, accepts fields that end early, skips unknown records silently, rejects the intact
-beginning of a truncated chunk, and constructs an object for each record of a chunk, which takes
-several times as long as unpacking its head.
+attachment, accepts fields that end early, skips unknown records silently, and constructs an object
+for each message of a chunk, which takes four times as long as unpacking its head.
 """
 
 from bisect import bisect_left
@@ -21,21 +20,20 @@ import struct
 from typing import Any, BinaryIO, NamedTuple
 import zlib
 
-import lz4.frame
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader
 from mcap.records import (
     AttachmentIndex,
     Channel,
+    Chunk,
     ChunkIndex,
     MetadataIndex,
     Schema,
     Statistics,
 )
-from mcap.stream_reader import StreamReader
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
-import zstandard
 
 from t3mpc_ros.bag.metadata import NO_START_NS, BagMetadata, FileInformation, TopicInformation
 from t3mpc_ros.bag.qos import QosError, QosProfile, profiles_from_yaml
@@ -45,8 +43,6 @@ MCAP_SUFFIX = '.mcap'
 MAGIC = b'\x89MCAP0\r\n'
 HEAD = struct.Struct('<BQ')
 """Opcode and content length of every record."""
-MESSAGE_HEAD = struct.Struct('<HIQQ')
-"""Channel, sequence, log time and publish time before the data of a message."""
 FOOTER = struct.Struct('<QQI')
 """Start of the summary, start of its offsets, checksum of the summary."""
 END_NS = 2**64
@@ -55,8 +51,6 @@ MESSAGE_OVERHEAD = 256
 """Memory of a message in addition to its data, bytes."""
 
 _MESSAGE = struct.Struct('<BQHIQQ')  # head of a record and of its message
-_CHUNK_HEAD = struct.Struct('<QQQII')  # start, end, size, checksum, length of the compression name
-_NAME_LIMIT = 32
 
 
 class SerializedMessage(NamedTuple):
@@ -90,9 +84,9 @@ class Attachment:
 class FileWindow:
     """Random access to a file of fixed size; reads after its end are empty."""
 
-    def __init__(self, file: BinaryIO, size: int) -> None:
+    def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self.size = size
+        self.size = file.seek(0, SEEK_END)
 
     def read(self, start: int, count: int) -> bytes:
         """Return up to ``count`` bytes from ``start``."""
@@ -107,33 +101,24 @@ class RecordError(ValueError):
     """A record is incomplete or damaged."""
 
 
-def read_record(window: FileWindow, start: int) -> tuple[Any, int]:
+def read_record(window: FileWindow, start: int, kind: int = 0) -> tuple[Any, int]:
     """Return the record of the library at ``start`` and its end.
 
+    Its fields have the lengths that they state; the data of chunks and messages are not checked.
+
     Raises
     ------
     RecordError
-        No complete and valid record begins there. The data of chunks and messages are not checked.
+        No complete and valid record begins there, or not one of the type ``kind`` (0 = any).
     """
-    head = window.read(start, HEAD.size)
-    opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
-    end = start + HEAD.size + length
-    name = record_name(opcode)
+    opcode, end = record_head(window, start)
+    name = _record_name(opcode)
+    if kind not in (0, opcode):
+        raise RecordError(f'a {name} is where the index has a {_record_name(kind)}')
     if end > window.size:
         raise RecordError(f'the file ends inside a {name}')
-    return parse_record(opcode, window.read(start + HEAD.size, length)), end
-
-
-def parse_record(opcode: int, content: bytes) -> Any:
-    """Return a record of the library, whose fields must have the lengths that they state.
-
-    Raises
-    ------
-    RecordError
-        The record is damaged, or its type is unknown.
-    """
-    name, head = record_name(opcode), HEAD.pack(opcode, len(content))
-    stream = BytesIO(head + content)
+    content = window.read(start + HEAD.size, end - start - HEAD.size)
+    stream = BytesIO(HEAD.pack(opcode, len(content)) + content)
     try:
         record = next(StreamReader(stream, True, emit_chunks=True, record_size_limit=None).records)
     except Exception as error:  # the library raises anything on damaged bytes
@@ -149,100 +134,41 @@ def parse_record(opcode: int, content: bytes) -> Any:
     ends = opcode in (Opcode.DATA_END, Opcode.FOOTER)
     if not content.startswith(fields) or (ends and len(content) > len(fields)):
         raise RecordError(f'the lengths in a {name} are inconsistent')
-    return record
+    return record, end
 
 
-def record_name(opcode: int) -> str:
-    """Return the name of a record type."""
+def record_head(window: FileWindow, start: int) -> tuple[int, int]:
+    """Return opcode and stated end of a record; an opcode of 0 after the last byte."""
+    head = window.read(start, HEAD.size)
+    opcode, length = HEAD.unpack(head) if len(head) == HEAD.size else (0, 0)
+    return opcode, start + HEAD.size + length
+
+
+def _record_name(opcode: int) -> str:
     try:
         return str(Opcode(opcode).name).lower().replace('_', ' ')
     except ValueError:
         return f'record of unknown type 0x{opcode:02x}'
 
 
-@dataclass(frozen=True)
-class DecodedChunk:
-    """Decompressed records of one chunk."""
-
-    data: bytes
-    complete: bool
-    checked: bool
-    """Whether a checksum covers the data."""
-
-    def records(self) -> Iterator[tuple[int, memoryview]]:
-        """Yield (opcode, content) of each complete record, then the rest as opcode 0."""
-        view = memoryview(self.data)
-        position = 0
-        while position + HEAD.size <= len(view):
-            opcode, length = HEAD.unpack_from(view, position)
-            end = position + HEAD.size + length
-            if end > len(view):
-                break
-            yield opcode, view[position + HEAD.size : end]
-            position = end
-        if position < len(view):
-            yield 0, view[position:]
-
-
-def chunk_end(window: FileWindow, start: int) -> int:
-    """Return the end of the chunk at ``start`` by the lengths of its fields; 0 if unknown."""
-    name_length = window.read(start + HEAD.size + _CHUNK_HEAD.size - 4, 4)
-    position = start + HEAD.size + _CHUNK_HEAD.size + int.from_bytes(name_length, 'little')
-    prefix = window.read(position, 8)
-    return position + 8 + int.from_bytes(prefix, 'little') if len(prefix) == 8 else 0
-
-
-def decode_chunk(window: FileWindow, start: int) -> DecodedChunk:
-    """Return the content of the chunk at ``start``; of a truncated chunk, the beginning.
+def chunk_data(chunk: Chunk) -> bytes:
+    """Return the decompressed records of a chunk.
 
     Raises
     ------
     RecordError
-        The compression is unknown, decompression fails, or the checksum, or without a checksum
-        the size, is wrong.
+        The compression is unknown, decompression fails, or the checksum, or without a
+        checksum the size, is wrong.
     """
-    end = chunk_end(window, start)
-    if not end:
-        raise RecordError('the file ends inside the head of a chunk')
-    position = start + HEAD.size
-    _, _, size, checksum, name_length = _CHUNK_HEAD.unpack(window.read(position, _CHUNK_HEAD.size))
-    position += _CHUNK_HEAD.size
-    name = window.read(position, min(name_length, _NAME_LIMIT))
-    position += name_length + 8
-    data, finished = _decompress(name, window.read(position, end - position))
-    if end > window.size:
-        return DecodedChunk(data, complete=False, checked=False)
-    if not finished:
-        raise RecordError('the compressed data of a chunk are incomplete')
-    if checksum:
-        if zlib.crc32(data) != checksum:
-            raise RecordError('the checksum of a chunk is wrong')
-    elif len(data) != size:
-        raise RecordError(f'a chunk has {len(data)} bytes instead of {size}')
-    return DecodedChunk(data, complete=True, checked=checksum != 0)
-
-
-def _decompress(name: bytes, stored: bytes) -> tuple[bytes, bool]:
-    """Return the decompressed bytes of ``stored``, and whether they are complete.
-
-    Memory is allocated by the actual output, not by the sizes in the chunk, which may be damaged.
-    """
-    if name == b'':
-        return stored, True
-    decoder: Any
-    if name == b'zstd':
-        decoder = zstandard.ZstdDecompressor().decompressobj()
-    elif name == b'lz4':
-        decoder = lz4.frame.LZ4FrameDecompressor()
-    else:
-        raise RecordError(f'the compression of a chunk is unknown: {name!r}')
-    if not stored:
-        return b'', False
+    if chunk.compression not in ('', 'lz4', 'zstd'):
+        raise RecordError(f'the compression of a chunk is unknown: {chunk.compression!r}')
     try:
-        data = bytes(decoder.decompress(stored))
-    except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
-        raise RecordError(f'a chunk does not decompress: {error}') from error
-    return data, bool(decoder.eof)
+        stream, size = get_chunk_data_stream(chunk, validate_crc=True)
+    except Exception as error:  # the decompressors raise anything on damaged bytes
+        raise RecordError(f'a chunk cannot be decompressed: {error}') from error
+    if not chunk.uncompressed_crc and size != chunk.uncompressed_size:
+        raise RecordError(f'a chunk has {size} bytes instead of {chunk.uncompressed_size}')
+    return bytes(stream.read(size))
 
 
 def read_summary(window: FileWindow) -> tuple[Summary, int] | None:
@@ -337,7 +263,7 @@ class McapFile:
                     stamps = message.log_time, message.publish_time
                     yield SerializedMessage(channel.topic, *stamps, bytes(message.data))
                 return
-            window = FileWindow(file, file.seek(0, SEEK_END))
+            window = FileWindow(file)
             chunks = [
                 each
                 for each in self._summary.chunk_indexes
@@ -354,7 +280,7 @@ class McapFile:
                 except RecordError:
                     if not skip_damaged:
                         raise
-                    self.damaged[chunk.chunk_start_offset] = _message_count(window, chunk)
+                    self.damaged[chunk.chunk_start_offset] = chunk_message_count(window, chunk)
                 pending.sort(key=RECEIVE_TIME)
                 count = bisect_left(pending, next_start_ns, key=RECEIVE_TIME)
                 yield from pending[:count]
@@ -376,7 +302,7 @@ class McapFile:
             An attachment is damaged.
         """
         with self.path.open('rb') as file, read_errors(f'the attachments of {self.path}'):
-            window = FileWindow(file, file.seek(0, SEEK_END))
+            window = FileWindow(file)
             found = []
             for index in self._summary.attachment_indexes:
                 try:
@@ -403,12 +329,10 @@ def _chunk_messages(
     window: FileWindow, index: Any, names: Mapping[int, str], start_ns: int, stop_ns: int
 ) -> list[SerializedMessage]:
     """Return the selected messages of one chunk."""
-    chunk = decode_chunk(window, index.chunk_start_offset)
-    if not chunk.complete:
-        raise RecordError('the file ends inside a chunk')
+    records = chunk_data(read_record(window, index.chunk_start_offset, Opcode.CHUNK)[0])
     found = []
-    data = chunk.data + bytes(_MESSAGE.size)
-    position, end = 0, len(chunk.data)
+    data = records + bytes(_MESSAGE.size)
+    position, end = 0, len(records)
     while position < end:
         opcode, length, channel, _, received_ns, published_ns = _MESSAGE.unpack_from(
             data, position
@@ -422,7 +346,7 @@ def _chunk_messages(
     return found
 
 
-def _message_count(window: FileWindow, index: Any) -> int:
+def chunk_message_count(window: FileWindow, index: Any) -> int:
     """Return the number of messages of a chunk by its message indexes."""
     return sum(
         (int.from_bytes(window.read(offset + 1, 8), 'little') - 6) // 16
@@ -437,7 +361,7 @@ def read_mcap_file(path: Path) -> McapFile | None:
     """
     try:
         with path.open('rb') as file:
-            window = FileWindow(file, file.seek(0, SEEK_END))
+            window = FileWindow(file)
             found = read_summary(window) if window.read(0, len(MAGIC)) == MAGIC else None
             if found is None or found[0].statistics is None:
                 return None

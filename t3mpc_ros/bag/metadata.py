@@ -7,13 +7,12 @@ Fields follow ``rosbag2_storage/include/rosbag2_storage/yaml.hpp`` (branch jazzy
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-import errno
-import os
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag.qos import QosProfile, dump_yaml
 
 METADATA_FILE_NAME = 'metadata.yaml'
@@ -138,30 +137,8 @@ def write_metadata(folder: Path, metadata: BagMetadata) -> None:
     OSError
         The folder is not writable; an existing file is unchanged.
     """
-    target = folder / METADATA_FILE_NAME
-    temporary = folder / f'.{METADATA_FILE_NAME}.{os.getpid()}'
-    try:
-        with temporary.open('w', encoding='utf-8') as file:
-            file.write(dump_yaml({_ROOT: metadata.to_mapping()}))
-            file.flush()
-            os.fsync(file.fileno())  # without it, a power failure may leave an empty file
-        temporary.replace(target)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-    sync_folder(folder)
-
-
-def sync_folder(folder: Path) -> None:
-    """Write the names in a folder to the disk: a power failure may lose a new file without it."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a network share, for example
-            raise
-    finally:
-        os.close(handle)
+    text = dump_yaml({_ROOT: metadata.to_mapping()})
+    write_atomically(folder / METADATA_FILE_NAME, text)
 
 
 def read_origin(folder: Path) -> tuple[dict[str, str], str] | None:

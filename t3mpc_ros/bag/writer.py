@@ -4,6 +4,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+import errno
 import mimetypes
 import os
 from pathlib import Path
@@ -12,13 +13,12 @@ from typing import Self
 
 from mcap.writer import CompressionType, Writer
 
-from t3mpc_ros.bag.finalize_file import finalize_file, open_unbuffered, write_all
+from t3mpc_ros.atomic_file import sync_folder
 from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, Attachment, collect_metadata
 from t3mpc_ros.bag.metadata import (
     BagMetadata,
     FileInformation,
     TopicInformation,
-    sync_folder,
     write_metadata,
 )
 from t3mpc_ros.bag.qos import QosProfile, dump_yaml, profiles_to_yaml
@@ -30,6 +30,9 @@ _MEDIA_TYPES = {'.npz': 'application/zip', '.yaml': 'application/yaml', '.csv': 
 
 SYNC_PERIOD_NS = NANOSECONDS
 """Minimum time between two synchronizations with the disk."""
+
+END_RESERVE = 65_536
+"""Bytes for the end of a file and ``metadata.yaml``, in addition to what grows with the file."""
 
 # Publishers of releases before type hashes report "INVALID".
 _TYPE_HASH = re.compile(r'RIHS\d\d_[0-9a-f]{64}')
@@ -45,6 +48,9 @@ class FolderError(BagError):
 
 class DiskError(BagError):
     """Writing failed, usually because the disk is full; messages written before are kept."""
+
+    def __init__(self, path: Path, reason: str, rest: str) -> None:
+        super().__init__(f'recording into {path} failed: {reason}; {rest}')
 
 
 def read_attachment(path: Path, max_bytes: int, name: str = '') -> Attachment:
@@ -78,7 +84,8 @@ class BagWriter:
     An existing bag is continued with a new file, and its complete files are included in
     ``metadata.yaml``. Incomplete files are listed in :attr:`incomplete_files` and left unchanged
     (``t3mpc bag recover`` reads them). ``metadata.yaml`` lists complete files only, so the folder
-    is readable at any time, even after the recorder was killed.
+    is readable at any time, even after the recorder was killed. Before the disk is full, the file
+    is completed.
 
     Each file is complete in itself: schemas and channels of its messages, all metadata records,
     all attachments. Transient-local messages of earlier files are not repeated: a reader of the
@@ -160,12 +167,16 @@ class BagWriter:
         self._first_ns: int | None = None
         self._chunk_start_ns: int | None = None
         self._chunk_seen: tuple[int, int] | None = None
+        self._end_size = END_RESERVE
+        """Upper bound of the size of the summary and ``metadata.yaml``, bytes."""
         try:
             self.path, self._output = _create_next_file(self.folder, self._stem)
             sync_folder(self.folder)
         except OSError as error:
             raise _folder_error(self.folder, error) from error
         try:
+            if not self._has_room(0):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             self._writer = Writer(
                 self._output,
                 chunk_size=self._chunk_bytes,
@@ -192,7 +203,7 @@ class BagWriter:
         check_metadata_records({title: table})
         self._metadata_records[title] = dict(table)
         if self._is_open():
-            with self._writing():
+            with self._writing(sum(map(len, [title, *table, *table.values()]))):
                 self._writer.add_metadata(title, dict(table))
 
     def add_attachment(self, attachment: Attachment, read_ns: int) -> None:
@@ -200,7 +211,7 @@ class BagWriter:
         self._attachments[attachment.name] = attachment, read_ns
         if self._is_open():
             item = attachment
-            with self._writing():
+            with self._writing(len(item.data)):
                 self._writer.add_attachment(
                     item.modified_ns, read_ns, item.name, item.media_type, item.data
                 )
@@ -244,7 +255,8 @@ class BagWriter:
         schema = self._definitions.schema(type_name)
         if not self._is_open():
             return
-        with self._writing():
+        with self._writing(len(schema)):
+            self._end_size += len(schema)
             if type_name not in self._schemas:
                 self._schemas[type_name] = self._writer.register_schema(
                     type_name, 'ros2msg', schema.encode()
@@ -268,8 +280,7 @@ class BagWriter:
         DataError
             ``data`` is not bytes, or a stamp is negative.
         DiskError
-            Writing failed. Raised once: the file is finalized if possible, and later messages
-            are only counted in :attr:`lost`.
+            Writing failed. Raised once: later messages are only counted in :attr:`lost`.
         FolderError
             The next file cannot be created.
         BagError
@@ -289,7 +300,7 @@ class BagWriter:
             self.split()
         if self._first_ns is None:
             self._first_ns = received_ns
-        with self._writing():
+        with self._writing(len(data)):
             if self._chunk_start_ns is None:
                 self._chunk_start_ns = received_ns
             elif received_ns - self._chunk_start_ns >= self._chunk_ns:
@@ -350,19 +361,19 @@ class BagWriter:
         return self.path
 
     def close(self) -> None:
-        """Complete the file and add it to ``metadata.yaml``; idempotent.
+        """Complete the file and add it to ``metadata.yaml``; idempotent."""
+        if not self._closed:
+            self._closed = True
+            if not self._failed:
+                self._complete()
 
-        The file is finalized if possible when writing fails.
-        """
-        if self._closed:
-            return
-        self._closed = True
-        if self._failed:
-            return
-        with self._writing():
+    def _complete(self) -> None:
+        try:
             self._writer.finish()
             self._output.close()
             write_metadata(self.folder, collect_metadata(self.folder)[0])
+        except OSError as error:
+            raise self._fail(error) from error
 
     def __enter__(self) -> Self:
         return self
@@ -377,24 +388,38 @@ class BagWriter:
         return not self._failed
 
     @contextmanager
-    def _writing(self) -> Iterator[None]:
-        """Convert the first write error to a :class:`DiskError`."""
+    def _writing(self, size: int = 0) -> Iterator[None]:
+        """Complete the file if there is no room for ``size`` bytes and its end; convert errors.
+
+        Raises :class:`DiskError`.
+        """
+        if not self._has_room(size):
+            self._failed = True
+            self._complete()
+            raise DiskError(
+                self.path, os.strerror(errno.ENOSPC), 'the file is complete until here'
+            )
+        written = self._output.size
         try:
             yield
         except OSError as error:
             raise self._fail(error) from error
+        if self._output.size != written:  # each chunk, attachment or record has an index
+            self._end_size += 256 + 16 * len(self._channels)
+
+    def _has_room(self, size: int) -> bool:
+        """Return whether ``size`` bytes, the current chunk and the end of the file fit the disk.
+
+        The index of a chunk is smaller than its messages.
+        """
+        return self._output.free() > 2 * (size + self._chunk_bytes) + self._end_size
 
     def _fail(self, error: OSError) -> DiskError:
-        """Close and finalize the file if possible; return the error to raise."""
+        """Close the file as it is; return the error to raise."""
         self._failed = True
         self._output.abandon()
-        kept = 'the file is not readable'
-        try:
-            kept = f'{finalize_file(self.path)} messages are kept'
-            write_metadata(self.folder, collect_metadata(self.folder)[0])
-        except (OSError, BagError):
-            pass  # the first error is reported
-        return DiskError(f'recording into {self.path} failed: {error.strerror or error}; {kept}')
+        rest = 't3mpc bag recover keeps the messages until here'
+        return DiskError(self.path, error.strerror or str(error), rest)
 
 
 def _folder_error(folder: Path, error: OSError) -> FolderError:
@@ -415,14 +440,22 @@ class _Output:
     """Unbuffered file that tracks its size."""
 
     def __init__(self, path: Path) -> None:
-        self._file = open_unbuffered(path, 'xb')  # FileExistsError if another process created it
+        # Each write succeeds or fails at once; FileExistsError if another process created it.
+        self._file = path.open('xb', buffering=0)
         self.size = 0
         self._synced = 0
 
     def write(self, data: bytes) -> int:
-        write_all(self._file, data)
+        view = memoryview(data)
+        while view:  # unbuffered writes may be partial
+            view = view[self._file.write(view) :]
         self.size += len(data)
         return len(data)
+
+    def free(self) -> int:
+        """Return the free space of the disk, bytes."""
+        disk = os.fstatvfs(self._file.fileno())
+        return disk.f_bavail * disk.f_frsize
 
     def tell(self) -> int:
         return self.size

@@ -16,8 +16,14 @@ from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.bag.recording.message_losses import message_loss_notes
-from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError, default_output, recover_bag
-from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
+from t3mpc_ros.bag.recovery import (
+    Damage,
+    FileResult,
+    RecoveryOutputError,
+    RecoveryResult,
+    default_output,
+    recover_bag,
+)
 from t3mpc_ros.cli.command import ArgumentParser, RemovedOption, run_command
 from t3mpc_ros.cli.run_options import add_topic_options, report_options
 from t3mpc_ros.cli.train import add_bag_options, run_bags

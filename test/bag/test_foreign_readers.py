@@ -19,7 +19,6 @@ from rosbags.typesys import Stores, get_typestore
 from support import waiting
 from support.missing_tools import find, needs, skip
 
-from t3mpc_ros.bag.finalize_file import finalize_file
 from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.qos import QosProfile, profiles_to_yaml
 from t3mpc_ros.bag.writer import BagWriter
@@ -193,16 +192,6 @@ def test_every_file_of_a_bag_is_read(tmp_path, check):
         assert [each['digests']['/number'] for each in every] == digests
     else:
         assert [each['last']['/number']['data'] for each in every] == [59, 119, 179]
-
-
-@pytest.mark.slow
-def test_a_finalized_file_is_read(tmp_path, check):
-    path = write(tmp_path / 'run', 600, chunk_bytes=32 * 1024)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    kept = finalize_file(path)
-    (found,) = found_by(check, path)
-    assert 0 < kept == sum(found['counts'].values()) < 800
-    assert found['metadata']['settings'] == DETAILS['settings']
 
 
 @pytest.mark.slow

@@ -18,8 +18,8 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from support.bag_messages import STORE
 from support.file_watch import Disk, no_file_left_open
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag import writer as writer_module
-from t3mpc_ros.bag.finalize_file import finalize_file
 from t3mpc_ros.bag.mcap_file import Attachment, has_mcap_magic, read_mcap_file
 from t3mpc_ros.bag.merged_reader import MergedReader
 from t3mpc_ros.bag.metadata import BagMetadata, read_origin, write_metadata
@@ -27,12 +27,11 @@ from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline, ReadAhead
 from t3mpc_ros.bag.qos import QosError, read_qos_overrides
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recording.snapshot import write_snapshot
-from t3mpc_ros.bag.recovery.recover_bag import recover_bag
+from t3mpc_ros.bag.recovery import recover_bag
 from t3mpc_ros.bag.run.model_file import ModelError, load_model, save_model
 from t3mpc_ros.bag.schema import BagError, MessageDefinitions
 from t3mpc_ros.bag.writer import SYNC_PERIOD_NS, BagWriter, read_attachment
 from t3mpc_ros.evaluation.result_file import ResultFile
-from t3mpc_ros.evaluation.tuning.tuned_parameters import write_atomically
 from t3mpc_ros.radio.protocol.authentication import read_key
 from t3mpc_ros.radio.serial_port import PortError, SerialPort
 from t3mpc_ros.radio.tool.key_provisioning import create_key_file
@@ -152,12 +151,12 @@ def a_player_that_is_closed(folder):
 
 def fails(number):
     """Return a function that raises from its nth call on that the disk is full."""
-    calls = itertools.count(1)
+    calls, write = itertools.count(1), writer_module._Output.write
 
-    def call(file, data):
+    def call(output, data):
         if next(calls) >= number:
             raise OSError(errno.ENOSPC, 'No space left on device')
-        file.write(data)
+        return write(output, data)
 
     return call
 
@@ -165,7 +164,7 @@ def fails(number):
 def a_writer_on_a_full_disk(folder):
     for number in range(1, 12):
         with pytest.MonkeyPatch.context() as patch, suppress(*REFUSED):
-            patch.setattr(writer_module, 'write_all', fails(number))
+            patch.setattr(writer_module._Output, 'write', fails(number))
             made = mcap_bag(folder / f'{number}')
             made.split()
             made.write('/a', START, START, DATA)
@@ -179,7 +178,7 @@ def a_writer_without_folder(folder):
 
 def a_snapshot_on_a_full_disk(folder):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writer_module, 'write_all', fails(2))
+        patch.setattr(writer_module._Output, 'write', fails(2))
         write_snapshot(folder / 'a', [], topics={}, metadata_records={'a': {'b': 'c'}})
 
 
@@ -187,8 +186,6 @@ def a_recovery(folder):
     for name, position in {'cut': -300, 'chunk': -900}.items():
         damage(mcap_bag(folder / name).path, position)
         recover_bag(folder / name, folder / f'{name}_recovered')
-        with suppress(*REFUSED):
-            finalize_file(next((folder / name).glob('*.mcap')))
     recover_bag(mcap_bag(folder / 'whole').folder, folder / 'copied')
 
 
@@ -201,8 +198,6 @@ def a_recovery_on_a_full_disk(folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, 'fsync', full)
         with suppress(OSError):
-            finalize_file(next((folder / 'a').glob('*.mcap')))
-        with suppress(OSError):
             write_metadata(folder, BagMetadata())
         recover_bag(folder / 'a', folder / 'b')
 
@@ -211,8 +206,6 @@ def a_recovery_of_nothing(folder):
     (folder / 'a.mcap').write_bytes(b'x' * 1000)
     assert read_mcap_file(folder / 'a.mcap') is None
     assert not has_mcap_magic(folder / 'a.mcap')
-    with suppress(*REFUSED):
-        finalize_file(folder / 'a.mcap')
     recover_bag(folder / 'a.mcap', folder / 'b')
 
 
@@ -319,7 +312,7 @@ def test_every_file_is_closed(scenario, tmp_path):
 
 
 OPENING = {
-    'open', 'fdopen', 'pipe', 'open_unbuffered', 'load', 'read_text', 'read_bytes', 'Serial',
+    'open', 'fdopen', 'pipe', 'atomic_file', 'load', 'read_text', 'read_bytes', 'Serial',
     'AnyReader', '_Server', '_Output',
 }  # fmt: skip
 
@@ -350,7 +343,7 @@ def test_every_function_that_opens_a_file_is_in_a_scenario(tmp_path, monkeypatch
         for function in ast.walk(ast.parse(path.read_text()))
         if isinstance(function, ast.FunctionDef) and _opens(function)
     }
-    assert len(opening) > 25
+    assert len(opening) > 20
     assert opening - called == set()
 
 
@@ -389,8 +382,9 @@ def a_bag_after_the_period(folder):
 
 def a_bag_of_a_full_disk(folder):
     with pytest.MonkeyPatch.context() as patch, suppress(*REFUSED):
-        patch.setattr(writer_module, 'write_all', fails(9))
-        mcap_bag(folder / 'bag')
+        patch.setattr(writer_module._Output, 'free', lambda output: 70_000 - output.size)
+        mcap_bag(folder / 'bag', count=100)
+    assert (folder / 'bag' / 'metadata.yaml').read_text().count('path: ') == 1
     return folder / 'bag' / 'bag_0.mcap', folder / 'bag' / 'metadata.yaml'
 
 

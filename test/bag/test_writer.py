@@ -4,7 +4,8 @@
 
 import errno
 import io
-from pathlib import Path
+import os
+from types import SimpleNamespace
 
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import DataEnd
@@ -14,12 +15,10 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
-from support.bag_files import metadata_of, topics_of
+from support.bag_files import kept_messages, metadata_of, topics_of
 import yaml
 
-from t3mpc_ros.bag import finalize_file as finalization
 from t3mpc_ros.bag import writer
-from t3mpc_ros.bag.finalize_file import finalize_file
 from t3mpc_ros.bag.mcap_file import read_mcap_file
 from t3mpc_ros.bag.qos import QosProfile, profiles_from_yaml
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
@@ -308,8 +307,9 @@ def test_a_chunk_is_closed_by_time_as_well_as_by_size(folder):
     written = fill(bag, 200)  # two seconds
     torn = folder.parent / 'torn.mcap'
     torn.write_bytes(bag.path.read_bytes())  # content of the disk if the process is killed now
-    assert finalize_file(torn) == 300
-    assert read_with_mcap(torn) == written[:300]
+    assert [(item.topic, item.received_ns, item.data) for item in kept_messages(torn)] == (
+        written[:300]
+    )
     bag.close()
 
 
@@ -323,60 +323,44 @@ def test_a_folder_below_a_file_is_refused(tmp_path):
 
 
 def test_a_read_only_disk_is_refused_and_nothing_is_left(folder, monkeypatch):
-    def refuse(path, mode):
+    def refuse(path):
         raise OSError(errno.EROFS, 'Read-only file system')
 
-    monkeypatch.setattr(writer, 'open_unbuffered', refuse)
+    monkeypatch.setattr(writer, '_Output', refuse)
     with pytest.raises(FolderError, match='Read-only file system'):
         BagWriter(folder, metadata_records={})
     assert list(folder.glob('*.mcap')) == []
 
 
-class FullDisk:
-    """File on a disk of limited size: partial writes up to the limit, then an error."""
-
-    room = 0
-
-    def __init__(self, path: Path, mode: str) -> None:
-        self._file = path.open(mode, buffering=0)
-
-    def write(self, data):
-        free = FullDisk.room - self._file.tell()
-        if free <= 0:
-            raise OSError(errno.ENOSPC, 'No space left on device')
-        return self._file.write(data[:free])
-
-    def __getattr__(self, name):
-        return getattr(self._file, name)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self._file.close()
-
-
 @pytest.fixture
 def disk(monkeypatch):
-    for module in (writer, finalization):
-        monkeypatch.setattr(module, 'open_unbuffered', FullDisk)
-    monkeypatch.setattr(finalization, 'SPARE', 2_000)
-    return FullDisk
+    """A disk of limited size."""
+
+    class Disk:
+        room = 2**40
+
+    def status(number):
+        free = Disk.room - os.fstat(number).st_size
+        return SimpleNamespace(f_bavail=max(0, free), f_frsize=1)
+
+    monkeypatch.setattr(os, 'fstatvfs', status)
+    return Disk
 
 
-@pytest.mark.parametrize('room', [20_000, 20_500, 21_000, 23_000, 26_000, 32_000])
-def test_a_full_disk_is_reported_once_and_whole_chunks_are_kept(folder, disk, room):
+@pytest.mark.parametrize('room', [120_000, 121_000, 130_000, 200_000])
+@pytest.mark.parametrize('chunk_ns', [10**8, 10**10])
+def test_before_the_disk_is_full_the_file_is_completed(folder, disk, room, chunk_ns):
     disk.room = room
-    bag = BagWriter(folder, metadata_records=DETAILS, chunk_bytes=8 * 1024)
-    with pytest.raises(DiskError, match=r'No space left.*messages are kept'):
-        fill(bag, 2000)
+    bag = BagWriter(folder, metadata_records=DETAILS, chunk_bytes=8 * 1024, chunk_ns=chunk_ns)
+    with pytest.raises(DiskError, match=r'No space left.*the file is complete until here'):
+        fill(bag, 20_000)
     bag.write('/robot/odom', START, START, b'\0\1\0\0')
     bag.write('/robot/odom', START, START, b'\0\1\0\0')
     bag.flush()
     bag.add_metadata_record('late', {'a': 'b'})
     bag.close()
     assert bag.lost == 2
-    assert bag.path.stat().st_size <= room
+    assert bag.path.stat().st_size + len((folder / 'metadata.yaml').read_bytes()) <= room
     kept = read_with_mcap(bag.path)
     assert len(kept) > 20
     assert sorted(kept) == sorted(read_with_rosbags(folder))  # equal stamps in any order
@@ -393,15 +377,22 @@ def test_a_disk_that_is_full_at_once_is_refused(folder, disk):
     assert list(folder.glob('*.mcap')) == []
 
 
-def test_a_disk_that_fills_at_the_very_end_is_reported_by_close(folder, disk):
-    disk.room = 2**40
+def test_a_write_error_is_reported_once_and_chunks_are_kept(folder, monkeypatch):
     bag = BagWriter(folder, metadata_records={})
-    fill(bag, 20)
-    disk.room = bag.path.stat().st_size + 500
-    with pytest.raises(DiskError, match='0 messages are kept'):
+    written = fill(bag, 20)
+    bag.flush()
+
+    def fail(data):
+        raise OSError(errno.EIO, 'Input/output error')
+
+    monkeypatch.setattr(bag._output, 'write', fail)
+    fill(bag, 1)
+    with pytest.raises(DiskError, match='Input/output error; t3mpc bag recover keeps'):
         bag.close()
     bag.close()
-    assert read_with_rosbags(folder) == []
+    assert read_with_rosbags(folder) == []  # metadata.yaml lists complete files only
+    kept = [(item.topic, item.received_ns, item.data) for item in kept_messages(bag.path)]
+    assert kept == written
 
 
 def test_invalid_calls_raise_distinct_errors(folder):
@@ -435,22 +426,6 @@ def test_invalid_calls_raise_distinct_errors(folder):
 # -- incomplete files ---------------------------------------------------------------------------
 
 
-def test_file_truncated_anywhere_keeps_its_complete_chunks(folder, tmp_path):
-    with BagWriter(folder, metadata_records=DETAILS, chunk_bytes=8 * 1024) as bag:
-        written = fill(bag, 60)
-    content = bag.path.read_bytes()
-    torn = tmp_path / 'torn.mcap'
-    before = 0
-    for size in range(400, len(content), 997):
-        torn.write_bytes(content[:size])
-        kept = finalize_file(torn)
-        assert read_with_mcap(torn) == written[:kept]
-        assert kept >= before
-        assert read_mcap_file(torn).message_count == kept
-        before = kept
-    assert before == len(written)
-
-
 def test_one_flipped_bit_at_the_end_of_a_file_is_noticed(folder):
     with BagWriter(folder, metadata_records={}) as bag:
         fill(bag, 10)
@@ -462,32 +437,6 @@ def test_one_flipped_bit_at_the_end_of_a_file_is_noticed(folder):
         damaged[place] ^= 1 << place % 8
         bag.path.write_bytes(bytes(damaged))
         assert read_mcap_file(bag.path) is None, place
-
-
-def test_finalizing_a_complete_file_changes_nothing(folder):
-    with BagWriter(folder, metadata_records=DETAILS) as bag:
-        written = fill(bag, 10)
-    content = bag.path.read_bytes()
-    assert finalize_file(bag.path) == len(written)
-    assert bag.path.read_bytes() == content
-
-
-def test_zeros_after_a_power_failure_are_removed(folder):
-    bag = BagWriter(folder, metadata_records={})
-    written = fill(bag, 10)
-    bag.flush()
-    bag._output.abandon()
-    with bag.path.open('ab') as file:
-        file.write(bytes(5000))
-    assert finalize_file(bag.path) == len(written)
-    assert read_with_mcap(bag.path) == written
-
-
-def test_a_file_of_another_format_is_not_finalized(tmp_path):
-    path = tmp_path / 'text.mcap'
-    path.write_bytes(b'not mcap at all')
-    with pytest.raises(BagError, match='does not begin'):
-        finalize_file(path)
 
 
 # -- reading ------------------------------------------------------------------------------------

@@ -12,8 +12,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from t3mpc_ros.bag.recovery.recover_bag import RecoveryOutputError
-from t3mpc_ros.bag.recovery.result import Damage, FileResult, RecoveryResult
+from t3mpc_ros.bag.recovery import Damage, FileResult, RecoveryOutputError, RecoveryResult
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.cli import process_group, robot_calibrate
 from t3mpc_ros.cli.main import main

@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 from support.parsers import commands, options
 
-from t3mpc_ros.bag.recovery.result import RecoveryResult
+from t3mpc_ros.bag.recovery import RecoveryResult
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS
 from t3mpc_ros.nodes.registry import NODES, parameter_class

@@ -12,6 +12,7 @@ import re
 import numpy as np
 import pytest
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.cli import tune
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.loop import run as closed_loop_run
@@ -41,7 +42,6 @@ from t3mpc_ros.evaluation.tuning.tuned_parameters import (
     TunedEntry,
     TunedParameters,
     TuningBudget,
-    write_atomically,
 )
 from t3mpc_ros.evaluation.workers import JobError
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter

@@ -18,7 +18,7 @@ from support.long_tests import few_of
 from support.waiting import Processes, wait_until
 
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.recovery.recover_bag import recover_bag
+from t3mpc_ros.bag.recovery import recover_bag
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import qos
 

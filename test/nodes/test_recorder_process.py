@@ -11,12 +11,13 @@ import pytest
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray
+from support.bag_files import kept_messages
 from support.long_tests import few_of
 from support.recorder_bench import run
 from support.waiting import wait_for_acknowledgement, wait_until
 
-from t3mpc_ros.bag.finalize_file import finalize_file
 from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.bag.recovery import recover_bag
 from t3mpc_ros.cli.process_group import ProcessError
 
 pytestmark = [pytest.mark.ros, pytest.mark.timed]
@@ -92,7 +93,7 @@ def test_a_recorder_killed_after_a_pause_has_lost_nothing(processes, publisher, 
     time.sleep(1.0)
     processes.kill('recorder')
     (path,) = (tmp_path / 'bag').glob('*.mcap')
-    assert finalize_file(path) == 20
+    assert len(kept_messages(path)) == 20
 
 
 @pytest.mark.parametrize('number', few_of([signal.SIGINT, signal.SIGTERM]))
@@ -105,11 +106,10 @@ def test_messages_before_a_signal_are_in_the_bag(number, processes, publisher, t
     assert numbers(tmp_path / 'bag') == list(range(900))
 
 
-def test_a_file_size_limit_stops_recording_readably(processes, publisher, tmp_path):
+def test_a_write_error_stops_recording_and_keeps_chunks(processes, publisher, tmp_path):
     start(processes, tmp_path / 'bag', **{'storage.chunk_duration': 0.05})
     publisher.wait_for_recorder()
     publisher.ballast = 500
-    # More than the reserve for the end of a file on a full disk.
     resource.prlimit(processes.pid('recorder'), resource.RLIMIT_FSIZE, (400_000, 400_000))
 
     def publish_until_the_end():
@@ -121,9 +121,10 @@ def test_a_file_size_limit_stops_recording_readably(processes, publisher, tmp_pa
         publish_until_the_end()
     status = processes.log('recorder').read_text()
     assert status.count('recording has stopped') == 1
-    for words in ('File too large', 'messages are kept', 'restart the recorder'):
+    for words in ('File too large', 't3mpc bag recover', 'restart the recorder'):
         assert words in status
     assert 'Traceback' not in status
-    kept = numbers(tmp_path / 'bag')
+    recover_bag(tmp_path / 'bag', tmp_path / 'whole')
+    kept = numbers(tmp_path / 'whole')
     assert len(kept) > 50
     assert kept == list(range(len(kept)))

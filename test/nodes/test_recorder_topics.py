@@ -177,7 +177,7 @@ def test_a_full_disk_ends_the_recording_only(harness, tmp_path, monkeypatch):
     _count(harness, recorder, 5)
 
     def full(*_):
-        raise DiskError('recording into x failed: No space left on device; 5 messages are kept')
+        raise DiskError(tmp_path, 'No space left on device', 'the file is complete')
 
     monkeypatch.setattr(BagWriter, 'write', full)
     harness.spin_until(lambda: recorder.exit_code == 1)

@@ -2,7 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What other readers see of a bag."""
 
+import io
+
+from mcap.reader import make_reader
 import yaml
+
+from t3mpc_ros.bag.mcap_file import SerializedMessage
+from t3mpc_ros.bag.recovery import recover_file
 
 
 def metadata_of(folder):
@@ -21,4 +27,17 @@ def topics_of(folder):
             topic['message_count'],
         )
         for topic in metadata_of(folder)['topics_with_message_count']
+    ]
+
+
+def kept_messages(path):
+    """Return the messages that a recovery of a file finds."""
+    output = io.BytesIO()
+    with path.open('rb') as source:
+        recover_file(source, output, path.name)
+    output.seek(0)
+    reader = make_reader(output, validate_crcs=True)
+    return [
+        SerializedMessage(channel.topic, item.log_time, item.publish_time, item.data)
+        for _, channel, item in reader.iter_messages()
     ]

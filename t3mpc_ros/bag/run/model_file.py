@@ -4,7 +4,6 @@
 
 from collections.abc import Mapping
 import json
-import os
 from pathlib import Path
 from typing import Any
 import zipfile
@@ -59,19 +58,13 @@ def save_model(
             'origin': dict(origin or {}),
         }
     )
-    from t3mpc_ros.bag.metadata import sync_folder  # the start of a node does without it
+    from t3mpc_ros.atomic_file import atomic_file  # the start of a node does without it
 
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
-        with temporary.open('wb') as target:
+        with atomic_file(path) as target:
             content: dict[str, Any] = {_HEADER: np.array(header), **arrays}
             np.savez_compressed(target, **content)
-            target.flush()
-            os.fsync(target.fileno())
-        temporary.replace(path)
-        sync_folder(path.parent)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise ModelError(f'cannot write the model file {path}: {error.strerror}') from error
 
 

@@ -22,8 +22,8 @@ import cma
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.tuning.search_space import SearchSpace, Values
-from t3mpc_ros.evaluation.tuning.tuned_parameters import write_atomically
 from t3mpc_ros.parameters.table import Parameters
 
 Array = NDArray[np.float64]

@@ -10,12 +10,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 import json
 import math
-import os
 from pathlib import Path
-import tempfile
 from types import MappingProxyType, NoneType
 from typing import Any, Self, TypeVar, get_args, get_origin, get_type_hints
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.parameters.table import ParameterError, Parameters, nearest_hint
 
@@ -196,23 +195,6 @@ class TunedParameters:
             numbers = f'{entry.objective:.4f}', str(len(entry.tuned))
             rows.append((method, drive, first, *numbers, str(entry.budget.evaluations)))
         return Table('', (*head, 'evaluations'), rows).markdown()
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a file so that a reader, or a power cut, finds the old content or the new."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f'.{path.name}.')
-    try:
-        with os.fdopen(handle, 'w', encoding='utf-8') as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        # A temporary file is its owner's alone; this one is to be read like any other.
-        os.chmod(name, path.stat().st_mode & 0o777 if path.exists() else 0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
 
 
 def _entries(content: object) -> dict[tuple[str, str], TunedEntry]:
