@@ -16,9 +16,8 @@ from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
 from t3mpc_ros.bag.merged_reader import ScheduledMessage
 from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline
 from t3mpc_ros.bag.qos import QosProfile
-from t3mpc_ros.bag.recording.message_queue import MessageQueue
-from t3mpc_ros.bag.recording.snapshot import CircularMessageCache, SnapshotWriter
-from t3mpc_ros.bag.schema import BagError, MessageDefinitions
+from t3mpc_ros.bag.recording.snapshot import CircularMessageCache
+from t3mpc_ros.bag.schema import MessageDefinitions
 from t3mpc_ros.bag.writer import BagWriter
 
 SECOND, MS = 10**9, 10**6
@@ -276,61 +275,6 @@ def test_the_range_to_play_is_counted_from_the_first_message(start, duration, un
 # -- recorder -------------------------------------------------------------------------------------
 
 
-class Queue(RuleBasedStateMachine):
-    """First in, first out; what does not fit, and the rest of its batch, is dropped."""
-
-    LIMIT = 3000
-
-    def __init__(self):
-        super().__init__()
-        self.queue, self.waiting, self.taken = MessageQueue(self.LIMIT), [], []
-        self.dropped = {}
-
-    @rule(sizes=st.lists(st.integers(4, 1200), max_size=5))
-    def put(self, sizes):
-        messages = [message(f'/{size % 2}', 0, size) for size in sizes]
-        fits = []
-        for each in messages:
-            if self.memory(*fits, each) > self.LIMIT:
-                break
-            fits.append(each)
-        lost = {}
-        for each in messages[len(fits) :]:
-            lost[each.topic] = lost.get(each.topic, 0) + 1
-            self.dropped[each.topic] = self.dropped.get(each.topic, 0) + 1
-        assert self.queue.put(messages) == lost
-        self.waiting += fits
-
-    @rule(beyond=st.sampled_from([0, 1]))
-    def fill(self, beyond):
-        """To the last byte, and one more."""
-        size = 4 + beyond + self.LIMIT - self.memory(message('/0', 0, 4))
-        self.put([size] if size >= 4 else [])
-
-    @rule()
-    def put_task(self):
-        self.waiting.append(lambda writer: None)
-        self.queue.put_task(self.waiting[-1])
-
-    @rule()
-    def take(self):
-        self.taken, self.waiting = self.waiting, []
-        assert self.queue.take() == self.taken
-
-    def memory(self, *more):
-        items = [*self.waiting, *self.taken, *more]
-        return sum(each.memory_size for each in items if isinstance(each, SerializedMessage))
-
-    @invariant()
-    def counts(self):
-        assert self.queue.bytes == self.memory() <= self.LIMIT
-        assert self.queue.dropped == self.dropped
-
-
-TestQueue = Queue.TestCase
-TestQueue.settings = STATEFUL
-
-
 class Cache(RuleBasedStateMachine):
     """The last seconds within the memory, and the last latched messages before them."""
 
@@ -360,7 +304,10 @@ class Cache(RuleBasedStateMachine):
             self.newest_ns = max(self.newest_ns, messages[-1].received_ns)
         self.cache.add(messages)
         self.cached += messages
-        oldest_ns = self.newest_ns - self.SPAN
+        self.expire(self.newest_ns)
+
+    def expire(self, now_ns):
+        oldest_ns = now_ns - self.SPAN
         while self.cached and (self.bytes > self.LIMIT or self.cached[0].received_ns < oldest_ns):
             gone = self.cached.popleft()
             if gone.topic in self.latched:
@@ -377,15 +324,11 @@ class Cache(RuleBasedStateMachine):
     @precondition(lambda self: self.newest_ns)
     @rule(late=st.integers(0, 3000))
     def read(self, late):
-        begin_ns = self.newest_ns + late * MS - self.SPAN
-        recent = [each for each in self.cached if each.received_ns >= begin_ns]
-        begin_ns = min((each.received_ns for each in recent), default=begin_ns)
-        older = [each for each in self.cached if each.received_ns < begin_ns]
-        maps = [*self.expired, *(each for each in older if each.topic in self.latched)]
-        first = [
-            each._replace(received_ns=begin_ns) for each in maps[-self.latched.get('/map', 1) :]
-        ]
-        assert self.cache.messages(self.newest_ns + late * MS) == [*first, *recent]
+        now_ns = self.newest_ns + late * MS
+        self.expire(now_ns)
+        begin_ns = min((each.received_ns for each in self.cached), default=now_ns - self.SPAN)
+        first = [each._replace(received_ns=begin_ns) for each in self.expired]
+        assert self.cache.messages(now_ns) == [*first, *self.cached]
 
     @invariant()
     def memory(self):
@@ -394,9 +337,3 @@ class Cache(RuleBasedStateMachine):
 
 TestCache = Cache.TestCase
 TestCache.settings = STATEFUL
-
-
-def test_an_empty_cache_is_no_snapshot(tmp_path):
-    writer = SnapshotWriter(tmp_path, CircularMessageCache(SECOND, 10**6), DEFINITIONS)
-    with pytest.raises(BagError, match='no message was received within snapshot_time'):
-        writer.start('why', START, {}, [], print)

@@ -26,7 +26,6 @@ from t3mpc_ros.bag.metadata import BagMetadata, read_origin, write_metadata
 from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline, ReadAheadQueue
 from t3mpc_ros.bag.qos import QosError, read_qos_overrides
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.recording.snapshot import write_snapshot
 from t3mpc_ros.bag.recovery import recover_bag
 from t3mpc_ros.bag.run.model_file import ModelError, load_model, save_model
 from t3mpc_ros.bag.schema import BagError, MessageDefinitions
@@ -176,12 +175,6 @@ def a_writer_without_folder(folder):
     BagWriter(folder / 'file', metadata_records={})
 
 
-def a_snapshot_on_a_full_disk(folder):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writer_module._Output, 'write', fails(2))
-        write_snapshot(folder / 'a', [], topics={}, metadata_records={'a': {'b': 'c'}})
-
-
 def a_recovery(folder):
     for name, position in {'cut': -300, 'chunk': -900}.items():
         damage(mcap_bag(folder / name).path, position)
@@ -298,7 +291,7 @@ def results(folder):
 SCENARIOS = (
     read_everything, bags_of_two_files, a_bag_of_no_known_format, a_damaged_bag,
     played_bags_with_two_types, played_bags_without_the_second, a_player_that_is_closed,
-    a_writer_on_a_full_disk, a_writer_without_folder, a_snapshot_on_a_full_disk, a_recovery,
+    a_writer_on_a_full_disk, a_writer_without_folder, a_recovery,
     a_recovery_on_a_full_disk, a_recovery_of_nothing, an_attachment_that_is_too_large, texts,
     models, keys, a_serial_port, a_page, results,
 )  # fmt: skip

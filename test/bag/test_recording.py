@@ -1,7 +1,8 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Topic filter, message queue, split files, attachments, snapshots, monitor: in virtual time."""
+"""Topic filter, writer thread, split files, attachments, snapshots, monitor: in virtual time."""
 
+from pathlib import Path
 import threading
 
 from mcap.reader import make_reader
@@ -25,15 +26,14 @@ from t3mpc_ros.bag.recording.diagnostics_monitor import (
     SnapshotRateLimiter,
 )
 from t3mpc_ros.bag.recording.message_losses import message_loss_notes, message_loss_record
-from t3mpc_ros.bag.recording.message_queue import MessageQueue
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.recording.snapshot import (
     CircularMessageCache,
     SnapshotWriter,
     snapshot_folder_name,
     unused_folder,
-    write_snapshot,
 )
+from t3mpc_ros.bag.recording.writer_thread import WriterThread
 from t3mpc_ros.bag.schema import BagError, MessageDefinitions
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilter, TopicFilterError
 from t3mpc_ros.bag.writer import (
@@ -207,62 +207,100 @@ def test_empty_recording_or_invalid_type_is_rejected():
         RecordingParameters.from_dict({'record.topic_types': ['Odometry']})
 
 
-# -- message queue --------------------------------------------------------------------------------
+# -- writer thread --------------------------------------------------------------------------------
 
 
-def test_messages_and_tasks_are_returned_in_order():
-    queue = MessageQueue(10_000)
+class SlowBag:
+    """Bag whose messages wait for the test, and then fail if it says so."""
+
+    path = Path('bag_0.mcap')
+
+    def __init__(self):
+        self.go, self.error, self.written = threading.Event(), None, []
+
+    def write(self, *given):
+        assert self.go.wait(30.0)
+        if self.error:
+            raise self.error
+        self.written.append(SerializedMessage(*given))
+
+    def tick(self, now_ns):
+        self.now_ns = now_ns
+
+    def close(self):
+        self.written.append('closed')
+
+
+@pytest.fixture
+def slow():
+    bag = SlowBag()
+    bag.thread = WriterThread(bag, 3 * (12 + MESSAGE_OVERHEAD), lambda: 7)
+    yield bag
+    bag.go.set()
+    bag.thread.close()
+
+
+def test_messages_and_tasks_are_processed_in_order(slow):
     one, two, three = (message('/n', i) for i in range(3))
-    task = object()
-    assert queue.put([one, two]) == {}
-    queue.put_task(task)
-    assert queue.put([three]) == {}
-    assert queue.take() == [one, two, task, three]
-    assert queue.take() == []
+    slow.thread.put([one, two])
+    result = slow.thread.submit(lambda bag: bag.written.append('task') or 'result')
+    slow.thread.put([three])
+    slow.go.set()
+    assert result.result(30.0) == 'result'
+    assert slow.thread.close() == ''
+    assert slow.written == [one, two, 'task', three, 'closed']
+    assert (slow.now_ns, slow.thread.file_name) == (7, 'bag_0.mcap')
 
 
-def test_dropped_messages_are_counted_and_the_rest_dropped_too():
-    queue = MessageQueue(3 * (12 + MESSAGE_OVERHEAD))
-    assert queue.put([message('/a', 0), message('/a', 1)]) == {}
+def test_dropped_messages_are_counted_and_the_rest_dropped_too(slow):
+    assert slow.thread.put([message('/a', 0), message('/a', 1)]) == []
     big, small = message('/b', 2, size=12 + MESSAGE_OVERHEAD + 1), message('/a', 3)
-    assert queue.put([big, small, small]) == {'/b': 1, '/a': 2}
-    assert queue.put([small]) == {}
-    assert queue.put([small]) == {'/a': 1}
-    assert queue.dropped == {'/b': 1, '/a': 3}
-    queue.put_task(print)
-    assert [type(item) for item in queue.take()[:3]] == [SerializedMessage] * 3
+    assert slow.thread.put([big, small, small]) == ['/b', '/a']
+    assert slow.thread.put([small]) == []
+    assert slow.thread.put([small]) == ['/a']
+    assert slow.thread.dropped == {'/b': 1, '/a': 3}
+    assert slow.thread.bytes == 3 * small.memory_size, 'also of the messages being written'
+    slow.go.set()
+    slow.thread.close()
+    assert slow.thread.bytes == 0
+    assert len(slow.written) == 4
 
 
-def test_memory_is_released_by_the_next_take():
-    """The limit includes the batch taken last: its messages are still in memory."""
-    item = message('/a', 0)
-    queue = MessageQueue(2 * item.memory_size)
-    assert queue.put([item, item]) == {}
-    assert len(queue.take()) == 2
-    assert queue.bytes == 2 * item.memory_size
-    assert queue.put([item]) == {'/a': 1}
-    assert queue.take() == []
-    assert queue.bytes == 0
-    assert queue.put([item]) == {}
+@pytest.mark.parametrize(
+    ('error', 'text'),
+    [
+        (BagError('disk full'), 'disk full'),
+        (TypeError('a mistake'), 'writing failed: TypeError: a mistake'),
+    ],
+)
+def test_after_an_error_nothing_is_written_and_nobody_waits(slow, error, text):
+    slow.error = error
+    slow.thread.put([message('/a', 0)])
+    futures = [slow.thread.submit(lambda bag: bag.written.append('task')) for _ in range(2)]
+    slow.go.set()
+    for future in futures:
+        with pytest.raises(BagError, match=text):
+            future.result(30.0)
+    with pytest.raises(BagError, match=text):
+        slow.thread.submit(print).result(30.0)
+    assert slow.thread.close() == slow.thread.failure == text
+    assert set(slow.written) == {'closed'}
+    assert slow.thread.bytes == 0
 
 
-def test_every_message_is_taken_or_counted_with_two_threads():
-    queue = MessageQueue(40 * message('/a', 0).memory_size)
-    taken, count = [], 4000
+def test_the_recording_goes_on_between_the_slices_of_a_snapshot(slow):
+    slow.go.set()
+    seen = []
 
-    def produce():
-        for number in range(count):
-            queue.put([message('/a', number)])
-        queue.put_task('end')
+    def slices():
+        for number in range(3):
+            slow.thread.submit(lambda bag, number=number: seen.append(number))
+            yield
+            seen.append('slice')
 
-    producer = threading.Thread(target=produce)
-    producer.start()
-    while 'end' not in taken:
-        taken += queue.take(0.001)
-    producer.join()
-    kept = [item.received_ns for item in taken[:-1]]
-    assert kept == sorted(kept)
-    assert len(kept) + queue.dropped.get('/a', 0) == count
+    slow.thread.run_in_slices(slices())
+    slow.thread.close()
+    assert seen == [0, 'slice', 1, 'slice', 2, 'slice']
 
 
 # -- split files ----------------------------------------------------------------------------------
@@ -482,51 +520,69 @@ def test_recent_latched_message_is_kept_once_with_its_own_time():
     ]
 
 
-def test_snapshot_is_a_bag_with_its_reason(tmp_path):
-    messages = [message('/n', i / 10) for i in range(450)] + [message('/unknown', 50)]
-    pauses = []
-    count = write_snapshot(
-        tmp_path / 'snap',
-        messages,
-        topics={
-            '/n': TopicInformation('/n', NUMBER),
-            '/quiet': TopicInformation('/quiet', NUMBER),
-        },
-        metadata_records={'snapshot': {'reason': 'link lost'}},
-        attachments=[(Attachment('a', 'text/plain', b'x'), START)],
-        pause=lambda: pauses.append(1),
-    )
-    assert count == 450
-    assert len(pauses) == 2
-    with open_bag(tmp_path / 'snap') as reader:
+@pytest.fixture
+def snapshots(tmp_path):
+    """A snapshot writer with a function that takes a snapshot and returns its folder."""
+    thread = WriterThread(None, 0, lambda: 0)
+    cache = CircularMessageCache(100 * SECOND, 10**6)
+    made = SnapshotWriter(tmp_path, cache, MessageDefinitions(), thread)
+    made.add_topic(TopicInformation('/n', NUMBER), 0)
+
+    def take(attachments=()):
+        done, results = threading.Event(), []
+        at_ns = START + 60 * SECOND
+        folder = made.start(
+            'fault', at_ns, {}, attachments, lambda *result: (results.append(result), done.set())
+        )
+        assert done.wait(30.0)
+        return folder, *results[0]
+
+    made.take = take
+    yield made
+    thread.close()
+
+
+def test_snapshot_is_a_bag_with_its_reason(snapshots):
+    snapshots.add_topic(TopicInformation('/quiet', NUMBER), 0)
+    snapshots.add([message('/n', i / 10) for i in range(450)] + [message('/unknown', 50)])
+    folder, success, text = snapshots.take([(Attachment('a', 'text/plain', b'x'), START)])
+    assert success
+    assert text == f'snapshot of "fault": 450 messages in {folder}'
+    with open_bag(folder) as reader:
         assert reader.message_count == 450
-        assert reader.metadata_records['snapshot'] == {'reason': 'link lost'}
+        assert reader.metadata_records['snapshot']['reason'] == 'fault'
+        assert list(reader.attachments()) == ['a']
         assert list(reader.topics) == ['/n']
 
 
-def test_a_topic_that_appears_meanwhile_is_not_in_the_snapshot(tmp_path):
+def test_a_topic_that_appears_meanwhile_is_not_in_the_snapshot(snapshots):
     """The thread that writes a snapshot reads the topics while the recorder discovers others.
 
     Without its own table a new topic could end the snapshot of a fault: a dictionary must not
     grow while it is read.
     """
-    cache = CircularMessageCache(10 * SECOND, 10**6)
-    writer = SnapshotWriter(tmp_path, cache, MessageDefinitions())
-    writer.add_topic(TopicInformation('/n', NUMBER), 0)
-    writer.add([message('/n', i) for i in range(5)] + [message('/late', 5)])
-    done = []
+    snapshots.add([message('/n', i) for i in range(5)] + [message('/late', 5)])
 
     def attachments():
-        writer.add_topic(TopicInformation('/late', NUMBER), 0)
+        snapshots.add_topic(TopicInformation('/late', NUMBER), 0)
         yield Attachment('a', 'text/plain', b'x'), START
 
-    folder = writer.start(
-        'fault', START + 6 * SECOND, {}, attachments(), lambda *result: done.append(result)
-    )
-    writer.close(30.0)
-    assert done == [(True, f'snapshot of "fault": 5 messages in {folder}')]
+    folder, success, _ = snapshots.take(attachments())
+    assert success
     with open_bag(folder) as reader:
         assert list(reader.topics) == ['/n']
+
+
+def test_a_failed_snapshot_is_reported_until_the_next_one(snapshots, tmp_path):
+    with pytest.raises(BagError, match='no message was received within'):
+        snapshots.take()
+    snapshots.add([message('/n', 0)])
+    (tmp_path / 'snapshots').write_text('in the way')
+    assert snapshots.take()[1:] == (False, snapshots.problem)
+    assert snapshots.problem.startswith('no snapshot of "fault": ')
+    (tmp_path / 'snapshots').unlink()
+    assert snapshots.take()[1]
+    assert (snapshots.problem, snapshots.completed) == ('', 1)
 
 
 def test_snapshots_of_one_second_do_not_share_a_folder(tmp_path):

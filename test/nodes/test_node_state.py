@@ -377,7 +377,7 @@ def test_levels_of_the_recorder(start, harness, tmp_path):
     assert node.produce_diagnostics()[:2] == (WARN, lacks)
     node._snapshots.problem = 'no snapshot'
     assert node.produce_diagnostics()[:2] == (WARN, 'no snapshot')
-    node._dropped, node._dropped_ns = 3, node.steady_ns()
+    node._writer.dropped, node._dropped_ns = {'/a': 3}, node.steady_ns()
     slow = 'the disk is too slow: 3 messages dropped so far'
     assert node.produce_diagnostics()[:2] == (ERROR, slow)
     node._dropped_ns -= 3 * 10**9

@@ -1,26 +1,24 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Snapshots: a circular cache of the last seconds of all topics, and bags written from it."""
+"""Snapshots: the last seconds of all topics, cached in memory and written to a bag on request."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 import re
-import threading
 
 from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
 from t3mpc_ros.bag.metadata import TopicInformation
+from t3mpc_ros.bag.recording.writer_thread import WriterThread
 from t3mpc_ros.bag.schema import BagError, DataError, MessageDefinitions, UnknownTypeError
 from t3mpc_ros.bag.writer import BagWriter
 
 SNAPSHOT_RECORD = 'snapshot'
 """Title of the metadata record that contains the reason of a snapshot."""
 FOLDER = 'snapshots'
-SLICE_PAUSE = 0.01
-"""Pause between the slices of a snapshot, s, so that its compression does not delay recording."""
 MESSAGES_PER_SLICE = 200
-"""Messages between two calls of ``pause``, which yields to the running recording."""
+"""Messages of a snapshot between which the recording is written."""
 
 
 class CircularMessageCache:
@@ -39,13 +37,9 @@ class CircularMessageCache:
         self._max_bytes = max_bytes
         self._messages: deque[SerializedMessage] = deque()
         self._latched: dict[str, deque[SerializedMessage]] = {}
-        self._bytes = 0
+        self.bytes = 0
+        """Memory of the messages, without the transient-local ones before the span."""
         self._newest_ns = 0
-
-    @property
-    def bytes(self) -> int:
-        """Memory of the cached messages, without the transient-local messages before the span."""
-        return self._bytes
 
     def keep_last(self, topic: str, count: int) -> None:
         """Keep the last ``count`` messages of a transient-local topic regardless of their age."""
@@ -56,12 +50,9 @@ class CircularMessageCache:
         """Add ``messages`` in order of receipt, and remove the expired ones."""
         for message in messages:
             self._messages.append(message)
-            self._bytes += message.memory_size
+            self.bytes += message.memory_size
             self._newest_ns = max(self._newest_ns, message.received_ns)
-        oldest_ns = self._newest_ns - self._span_ns
-        cached = self._messages
-        while cached and (self._bytes > self._max_bytes or cached[0].received_ns < oldest_ns):
-            self._expire(cached.popleft())
+        self._expire(self._newest_ns - self._span_ns)
 
     def messages(self, now_ns: int) -> list[SerializedMessage]:
         """Return the messages received in the span before ``now_ns``, transient-local ones first.
@@ -69,80 +60,19 @@ class CircularMessageCache:
         A transient-local message from before the span gets the beginning of the span as its time
         of receipt, so that the bag is not longer than the span; its publish stamp is unchanged.
         """
-        start_ns = max(0, now_ns - self._span_ns)
-        recent = [message for message in self._messages if message.received_ns >= start_ns]
-        if recent:
-            start_ns = min(message.received_ns for message in recent)
-        latched = [message for kept in self._latched.values() for message in kept]
-        latched += [
-            message
-            for message in self._messages
-            if message.received_ns < start_ns and message.topic in self._latched
-        ]
-        newest = {}
-        for topic, kept in self._latched.items():
-            of_topic = [message for message in latched if message.topic == topic]
-            newest[topic] = of_topic[-(kept.maxlen or 1) :]
-        first = [item._replace(received_ns=start_ns) for kept in newest.values() for item in kept]
-        return [*first, *recent]
+        self._expire(now_ns - self._span_ns)
+        earliest_ns = max(0, now_ns - self._span_ns)
+        start_ns = min((each.received_ns for each in self._messages), default=earliest_ns)
+        latched = [each for kept in self._latched.values() for each in kept]
+        return [*(each._replace(received_ns=start_ns) for each in latched), *self._messages]
 
-    def _expire(self, message: SerializedMessage) -> None:
-        self._bytes -= message.memory_size
-        if message.topic in self._latched:
-            self._latched[message.topic].append(message)
-
-
-def unused_folder(parent: Path, name: str) -> Path:
-    """Return a path in ``parent`` that does not exist: ``name``, or ``name`` with a number."""
-    path, number = parent / name, 2
-    while path.exists():
-        path, number = parent / f'{name}_{number}', number + 1
-    return path
-
-
-def snapshot_folder_name(time: str, reason: str) -> str:
-    """Return the folder name of a snapshot: ``time`` and ``reason`` in ASCII letters."""
-    words = re.sub(r'[^a-z0-9]+', '-', reason.lower()).strip('-')[:48].rstrip('-')
-    return f'{time}_{words}' if words else time
-
-
-def write_snapshot(
-    folder: Path,
-    messages: Sequence[SerializedMessage],
-    *,
-    topics: Mapping[str, TopicInformation],
-    metadata_records: Mapping[str, Mapping[str, str]],
-    attachments: Iterable[tuple[Attachment, int]] = (),
-    definitions: MessageDefinitions | None = None,
-    pause: Callable[[], object] = lambda: None,
-) -> int:
-    """Write the messages of ``topics`` to a bag in ``folder``; return their number.
-
-    Raises
-    ------
-    FolderError
-        The folder cannot be created.
-    DiskError
-        Writing failed; messages written before are kept.
-    """
-    count = 0
-    with BagWriter(folder, metadata_records=metadata_records, definitions=definitions) as bag:
-        for attachment, read_ns in attachments:
-            bag.add_attachment(attachment, read_ns)
-        present = {message.topic for message in messages}
-        for name in [name for name in topics if name in present]:
-            topic = topics[name]
-            try:
-                bag.add_topic(name, topic.type_name, topic.offered_qos_profiles, topic.type_hash)
-            except (UnknownTypeError, DataError):
-                present.discard(name)  # the recorder reported it when the topic appeared
-        for message in messages:
-            if message.topic in present and message.topic in topics:
-                bag.write(*message)
-                count += 1
-                if count % MESSAGES_PER_SLICE == 0:
-                    pause()
-    return count
+    def _expire(self, oldest_ns: int) -> None:
+        cached = self._messages
+        while cached and (self.bytes > self._max_bytes or cached[0].received_ns < oldest_ns):
+            message = cached.popleft()
+            self.bytes -= message.memory_size
+            if message.topic in self._latched:
+                self._latched[message.topic].append(message)
 
 
 class SnapshotWriter:
@@ -156,26 +86,28 @@ class SnapshotWriter:
         Cache of the messages.
     definitions
         Source of the message schemas.
+    thread
+        Thread that writes the snapshots.
     """
 
     def __init__(
-        self, folder: Path, cache: CircularMessageCache, definitions: MessageDefinitions
+        self,
+        folder: Path,
+        cache: CircularMessageCache,
+        definitions: MessageDefinitions,
+        thread: WriterThread,
     ) -> None:
         self._folder = folder / FOLDER
         self._cache = cache
         self._definitions = definitions
+        self._thread = thread
         self._topics: dict[str, TopicInformation] = {}
-        self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
-        self.completed: list[Path] = []
-        """Folders of the complete snapshots."""
+        self.busy = False
+        """Whether a snapshot is being written."""
+        self.completed = 0
+        """Number of complete snapshots."""
         self.problem = ''
         """Why the last snapshot failed; empty if it did not."""
-
-    @property
-    def busy(self) -> bool:
-        """Whether a snapshot is being written."""
-        return self._thread is not None and self._thread.is_alive()
 
     def add_topic(self, topic: TopicInformation, latched: int) -> None:
         """Add the metadata of a topic with ``latched`` transient-local publishers."""
@@ -192,10 +124,10 @@ class SnapshotWriter:
         reason: str,
         now_ns: int,
         metadata_records: Mapping[str, Mapping[str, str]],
-        attachments: list[tuple[Attachment, int]],
+        attachments: Iterable[tuple[Attachment, int]],
         finished: Callable[[bool, str], None],
     ) -> Path:
-        """Start writing a snapshot in a thread and return its folder.
+        """Start writing a snapshot and return its folder; raise :class:`BagError` if it cannot be.
 
         Parameters
         ----------
@@ -207,49 +139,74 @@ class SnapshotWriter:
             Further content of the bag.
         finished
             Called by the writing thread with success and a text.
-
-        Raises
-        ------
-        BagError
-            Another snapshot is being written, or the cache is empty.
         """
         if self.busy:
             raise BagError('another snapshot is being written: try again after it')
         messages = self._cache.messages(now_ns)
         if not messages:
-            raise BagError('no message was received within snapshot_time')
+            raise BagError('no message was received within storage.snapshot_duration')
         time = datetime.fromtimestamp(now_ns / 1e9)
-        folder = unused_folder(
-            self._folder, snapshot_folder_name(f'{time:%Y_%m_%d-%H_%M_%S}', reason)
-        )
-        record = {SNAPSHOT_RECORD: {'reason': reason, 'time_ns': str(now_ns)}}
-        topics = dict(self._topics)
+        name = snapshot_folder_name(f'{time:%Y_%m_%d-%H_%M_%S}', reason)
+        folder = unused_folder(self._folder, name)
+        records = {
+            **metadata_records,
+            SNAPSHOT_RECORD: {'reason': reason, 'time_ns': str(now_ns)},
+        }
+        topics = dict(self._topics)  # the recorder adds others meanwhile
+        self.busy = True
 
-        def write() -> None:
+        def write() -> Iterator[None]:
+            count = 0
             try:
-                count = write_snapshot(
-                    folder,
-                    messages,
-                    topics=topics,
-                    metadata_records={**metadata_records, **record},
-                    attachments=attachments,
-                    definitions=self._definitions,
-                    pause=lambda: self._closing.wait(SLICE_PAUSE),
-                )
+                with BagWriter(
+                    folder, metadata_records=records, definitions=self._definitions
+                ) as bag:
+                    for attachment, read_ns in attachments:
+                        bag.add_attachment(attachment, read_ns)
+                    recorded = _add_topics(bag, topics, {each.topic for each in messages})
+                    for message in messages:
+                        if message.topic in recorded:
+                            bag.write(*message)
+                            count += 1
+                            if count % MESSAGES_PER_SLICE == 0:
+                                yield
             except Exception as error:  # a silent thread would look like a complete snapshot
                 self.problem = f'no snapshot of "{reason}": {error}'
-                finished(False, self.problem)
             else:
                 self.problem = ''
-                self.completed.append(folder)
-                finished(True, f'snapshot of "{reason}": {count} messages in {folder}')
+                self.completed += 1
+            self.busy = False
+            done = f'snapshot of "{reason}": {count} messages in {folder}'
+            finished(not self.problem, self.problem or done)
 
-        self._thread = threading.Thread(target=write, name='snapshot', daemon=True)
-        self._thread.start()
+        self._thread.run_in_slices(write())
         return folder
 
-    def close(self, timeout: float) -> None:
-        """Complete the current snapshot without pauses, within ``timeout`` seconds."""
-        self._closing.set()
-        if self._thread is not None:
-            self._thread.join(timeout)
+
+def _add_topics(
+    bag: BagWriter, topics: Mapping[str, TopicInformation], present: set[str]
+) -> set[str]:
+    """Add the topics that have messages and known types; return their names."""
+    added = set()
+    for name, topic in topics.items():
+        if name in present:
+            try:
+                bag.add_topic(name, topic.type_name, topic.offered_qos_profiles, topic.type_hash)
+                added.add(name)
+            except (UnknownTypeError, DataError):
+                continue  # the recorder reported it when the topic appeared
+    return added
+
+
+def unused_folder(parent: Path, name: str) -> Path:
+    """Return a path in ``parent`` that does not exist: ``name``, or ``name`` with a number."""
+    path, number = parent / name, 2
+    while path.exists():
+        path, number = parent / f'{name}_{number}', number + 1
+    return path
+
+
+def snapshot_folder_name(time: str, reason: str) -> str:
+    """Return the folder name of a snapshot: ``time`` and ``reason`` in ASCII letters."""
+    words = re.sub(r'[^a-z0-9]+', '-', reason.lower()).strip('-')[:48].rstrip('-')
+    return f'{time}_{words}' if words else time

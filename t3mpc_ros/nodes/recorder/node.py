@@ -3,8 +3,7 @@
 """``ros2 run t3mpc_ros recorder``: records topics as serialized messages into an MCAP bag.
 
 A timer takes the messages of the subscriptions (:mod:`~t3mpc_ros.nodes.recorder.subscriptions`),
-a thread compresses and writes them (:mod:`~t3mpc_ros.nodes.recorder.writer_thread`); a bounded
-queue connects both.
+a thread compresses and writes them (:mod:`~t3mpc_ros.bag.recording.writer_thread`).
 """
 
 from collections.abc import Callable, Mapping
@@ -24,9 +23,9 @@ from t3mpc_ros.bag.recording.diagnostics_monitor import (
     SnapshotRateLimiter,
 )
 from t3mpc_ros.bag.recording.message_losses import LOSSES, message_loss_record
-from t3mpc_ros.bag.recording.message_queue import MessageQueue
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.recording.snapshot import CircularMessageCache, SnapshotWriter
+from t3mpc_ros.bag.recording.writer_thread import WriterThread
 from t3mpc_ros.bag.schema import BagError, MessageDefinitions, UnknownTypeError
 from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.bag.writer import BagWriter, FolderError
@@ -36,7 +35,6 @@ from t3mpc_ros.nodes.common import qos
 from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode
 from t3mpc_ros.nodes.recorder.metadata import SEED_RECORD, ParameterCollector, RecordingMetadata
 from t3mpc_ros.nodes.recorder.subscriptions import RawSubscriptions, TopicDiscovery, offered_qos
-from t3mpc_ros.nodes.recorder.writer_thread import WriterThread
 
 CONFIGURATION_ERRORS = (BagError,)
 """Errors of :func:`make` other than :class:`ParameterError`."""
@@ -49,8 +47,6 @@ DROP_ERROR_TIME_NS = 2 * NANOSECONDS
 """Time for which dropped messages are reported as an error; afterwards as a warning."""
 SPLIT_TIMEOUT = 5.0
 """Timeout of ``~/split_bagfile`` for the disk, s."""
-SNAPSHOT_TIMEOUT = 30.0
-"""Shutdown timeout for the current snapshot, s."""
 
 
 class RecorderNode(BaseNode[RecordingParameters]):
@@ -67,8 +63,12 @@ class RecorderNode(BaseNode[RecordingParameters]):
             time.time_ns(),
         )
         self._definitions = MessageDefinitions()
-        self._queue: MessageQueue[BagWriter] = MessageQueue(parameters.max_cache_size)
-        self._writer = None if parameters.snapshot_mode else self._make_writer()
+        self._recording = not parameters.snapshot_mode
+        self._writer = WriterThread(
+            self._make_bag() if self._recording else None,
+            parameters.max_cache_size,
+            self.steady_ns,
+        )
         self._snapshots = self._make_snapshot_writer() if parameters.snapshot_duration else None
         self._recorded_types: dict[str, str] = {}
         self._raw_subscriptions = RawSubscriptions(self)
@@ -79,7 +79,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
             self._take_messages,
             self._recorded_types.__contains__,
         )
-        self._received = self._dropped = 0
+        self._received = 0
         self._dropped_ns: int | None = None
         self._failure = ''
         self._monitor = DiagnosticsMonitor(map(self._diagnostic_name, parameters.monitored_nodes))
@@ -99,14 +99,14 @@ class RecorderNode(BaseNode[RecordingParameters]):
         self.create_steady_timer(1.0, self._monitor_graph)
         self.get_logger().info(
             f'recording to {self._folder}'
-            if self._writer
+            if self._recording
             else f'caching the last {parameters.snapshot_duration:g} s for snapshots in '
             f'{self._folder}'
         )
 
     # -- parts ------------------------------------------------------------------------------------
 
-    def _make_writer(self) -> WriterThread:
+    def _make_bag(self) -> BagWriter:
         parameters = self.parameters
         writer = BagWriter(
             self._folder,
@@ -119,7 +119,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
         )
         for attachment, read_ns in self._metadata.attachments.values():
             writer.add_attachment(attachment, read_ns)
-        return WriterThread(writer, self._queue, self.steady_ns)
+        return writer
 
     def _make_snapshot_writer(self) -> SnapshotWriter:
         try:
@@ -128,7 +128,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
             raise FolderError(f'cannot record into {self._folder}: {error.strerror}') from error
         span_ns = round(self.parameters.snapshot_duration * NANOSECONDS)
         cache = CircularMessageCache(span_ns, self.parameters.snapshot_cache_size)
-        return SnapshotWriter(self._folder, cache, self._definitions)
+        return SnapshotWriter(self._folder, cache, self._definitions, self._writer)
 
     def _make_topic_filter(self) -> TopicFilter:
         topics = self.parameters.topics
@@ -152,7 +152,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
     # -- messages: subscriptions to queue ---------------------------------------------------------
 
     def _take_messages(self) -> None:
-        if self._writer and self._writer.failure and not self._failure:
+        if self._writer.failure and not self._failure:
             self._fail(self._writer.failure)
         messages = self._raw_subscriptions.take_messages()
         if not messages or self._failure:
@@ -166,11 +166,11 @@ class RecorderNode(BaseNode[RecordingParameters]):
         if self._snapshots:
             self._snapshots.add(messages)
         self._received += len(messages)
-        if self._writer and (dropped := self._queue.put(messages)):
-            self._dropped += sum(dropped.values())
+        if self._recording and (dropped := self._writer.put(messages)):
             self._dropped_ns = self.steady_ns()
+            total = sum(self._writer.dropped.values())
             self.get_logger().error(
-                f'the disk is too slow: {self._dropped} messages dropped so far, the last of '
+                f'the disk is too slow: {total} messages dropped so far, the last of '
                 f'{", ".join(dropped)} '
                 f'(storage.max_cache_size is {self.parameters.max_cache_size})',
                 throttle_duration_sec=1.0,
@@ -196,7 +196,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
             self._snapshots.add_topic(metadata, latched)
 
     def _submit(self, task: Callable[[BagWriter], object]) -> None:
-        if self._writer:
+        if self._recording:
             self._writer.submit(task)
 
     def _fail(self, reason: str) -> None:
@@ -241,11 +241,10 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     def _on_split(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._take_messages()
-        if self._writer is None:
+        if not self._recording:
             response.message = 'no recording to split: storage.snapshot_mode is set'
             return response
         self._write_losses()
-
         try:
             path = self._writer.submit(BagWriter.split).result(SPLIT_TIMEOUT)
         except BagError as error:
@@ -306,7 +305,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
         """Write the loss record if it has changed: a killed recorder leaves it, too."""
         subscriptions = self._raw_subscriptions
         table = message_loss_record(
-            self._queue.dropped, subscriptions.lost, subscriptions.undiscovered
+            self._writer.dropped, subscriptions.lost, subscriptions.undiscovered
         )
         if table != self._metadata.records.get(LOSSES):
             self._metadata.records[LOSSES] = table
@@ -315,16 +314,17 @@ class RecorderNode(BaseNode[RecordingParameters]):
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the recording runs and is complete, with its place and size."""
         lost = sum(self._raw_subscriptions.lost.values())
+        dropped = sum(self._writer.dropped.values())
         values: dict[str, object] = {
             'folder': str(self._folder),
-            'file': self._writer.file_name if self._writer else 'none',
+            'file': self._writer.file_name,
             'messages': self._received,
             'topics': len(self._recorded_types),
-            'dropped': self._dropped,
+            'dropped': dropped,
             'lost': lost,
             'undiscovered': sum(self._raw_subscriptions.undiscovered.values()),
-            'queue_bytes': self._queue.bytes,
-            'snapshots': len(self._snapshots.completed) if self._snapshots else 0,
+            'queue_bytes': self._writer.bytes,
+            'snapshots': self._snapshots.completed if self._snapshots else 0,
         }
         if self._failure:
             return ERROR, self._failure, values
@@ -332,13 +332,13 @@ class RecorderNode(BaseNode[RecordingParameters]):
             self._dropped_ns is not None
             and self.steady_ns() - self._dropped_ns < DROP_ERROR_TIME_NS
         ):
-            return ERROR, f'the disk is too slow: {self._dropped} messages dropped so far', values
+            return ERROR, f'the disk is too slow: {dropped} messages dropped so far', values
         if self._snapshots and self._snapshots.problem:
-            return WARN if self._writer else ERROR, self._snapshots.problem, values
-        if self._dropped or lost:
-            text = f'the bag lacks {self._dropped} dropped and {lost} lost messages'
+            return WARN if self._recording else ERROR, self._snapshots.problem, values
+        if dropped or lost:
+            text = f'the bag lacks {dropped} dropped and {lost} lost messages'
             return WARN, text, values
-        return OK, 'recording' if self._writer else 'caching for snapshots', values
+        return OK, 'recording' if self._recording else 'caching for snapshots', values
 
     def on_shutdown(self) -> None:
         """Write the received messages and close the bag."""
@@ -352,9 +352,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
     def _close(self) -> None:
         self._attach(self._metadata.saved_models(time.time_ns()))
         self._write_losses()
-        problem = self._writer.close() if self._writer else ''
-        if self._snapshots:
-            self._snapshots.close(SNAPSHOT_TIMEOUT)
+        problem = self._writer.close()
         if problem and not self._failure:
             self._fail(problem)
 
