@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Playback of bags: parameters, timeline, read-ahead queue and latency statistics.
+"""Playback of bags: parameters, timeline and read-ahead queue.
 
 :class:`PlaybackTimeline` reads no clock: ``now_ns`` is a time of any monotonic clock. Positions
 are nanoseconds on a timeline of consecutive loops. One anchor and the rate as an exact fraction
@@ -9,10 +9,10 @@ relate position and time, so no error accumulates.
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 import math
-import queue
-import threading
 from typing import Generic, NamedTuple, Self, TypeVar
 
 from t3mpc_ros.bag.mcap_file import SerializedMessage
@@ -31,11 +31,6 @@ COMMAND_TOPIC = 'cmd_vel'
 VELOCITY_TYPES = ('geometry_msgs/msg/Twist', 'geometry_msgs/msg/TwistStamped')
 
 T = TypeVar('T')
-
-_BATCH_SIZE = 50
-"""Items transferred together: waking the other thread costs more than reading one item."""
-_BIN_RATIO = math.log(1.02)
-_MIN_LATENCY_NS = 1_000
 
 
 @dataclass(frozen=True)
@@ -449,7 +444,7 @@ class PlaybackTimeline:
 
 
 class ReadAheadQueue(Generic[T]):
-    """Iterator over ``source`` that reads ahead in a thread.
+    """Iterator over ``source`` that reads ahead in a thread, half of ``items`` at a time.
 
     An exception of the source is raised in place of its next item. :meth:`close` ends the thread
     and closes the source.
@@ -457,89 +452,43 @@ class ReadAheadQueue(Generic[T]):
 
     def __init__(self, source: Iterator[T], items: int) -> None:
         self._source = source
-        self._batches: queue.Queue[list[T] | BaseException | None] = queue.Queue(
-            max(1, items // _BATCH_SIZE)
-        )
+        self._batch_size = max(1, items // 2)
         self._ready: deque[T] = deque()
-        self._over = False
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._read, name='read ahead', daemon=True)
-        self._thread.start()
+        self._error: Exception | None = None
+        self._thread = ThreadPoolExecutor(1, 'read ahead')
+        self._next = self._thread.submit(self._read, 1)  # the player waits for the first item
 
     def __iter__(self) -> Self:
         return self
 
     def __next__(self) -> T:
-        while not self._ready:
-            if self._over:
+        if not self._ready:
+            self._ready.extend(self._next.result())
+            if not self._ready:
                 raise StopIteration
-            got = self._batches.get()
-            if isinstance(got, list):
-                self._ready.extend(got)
-                continue
-            self._over = True
-            if got is not None:
-                raise got
+            self._next = self._thread.submit(self._read, self._batch_size)
         return self._ready.popleft()
 
     def close(self) -> None:
-        """Stop reading; the iterator is exhausted."""
-        self._closing.set()
-        self._over = True
-        self._ready.clear()
-        while self._thread.is_alive():
-            try:
-                self._batches.get(timeout=0.01)  # unblocks the thread if the queue is full
-            except queue.Empty:
-                continue
-        self._thread.join()
+        """End the thread and close the source."""
+        self._thread.shutdown()
+        close = getattr(self._source, 'close', None)
+        if close is not None:
+            close()
 
-    def _read(self) -> None:
-        end: BaseException | None = None
-        batch: list[T] = []
-        size = 1  # the first item is transferred immediately: the player waits for it
+    def _read(self, count: int) -> list[T]:
+        """Return the next items; those before an error first, then raise it."""
+        if self._error is not None:
+            raise self._error
+        found: list[T] = []
         try:
-            for item in self._source:
-                batch.append(item)
-                if len(batch) == size:
-                    self._batches.put(batch)
-                    batch, size = [], _BATCH_SIZE
-                if self._closing.is_set():
-                    break
-        except BaseException as error:  # transferred to the consumer
-            end = error
-        finally:
-            close = getattr(self._source, 'close', None)
-            if close is not None:
-                close()
-            self._batches.put(batch)
-            self._batches.put(end)
-
-
-class LatencyHistogram:
-    """Histogram of latencies with bins that grow by 2 %, from 1 µs."""
-
-    def __init__(self) -> None:
-        self._bins: dict[int, int] = {}
-        self.count = 0
-        self.max_ns = 0
-
-    def add(self, latency_ns: int) -> None:
-        """Count one latency; values below 1 µs count as 1 µs."""
-        latency_ns = max(latency_ns, _MIN_LATENCY_NS)
-        number = math.ceil(math.log(latency_ns / _MIN_LATENCY_NS) / _BIN_RATIO)
-        self._bins[number] = self._bins.get(number, 0) + 1
-        self.count += 1
-        self.max_ns = max(self.max_ns, latency_ns)
-
-    def percentile_ns(self, percent: float) -> int:
-        """Return a percentile with an error of at most 2 %; 0 without data."""
-        rank, cumulated = math.ceil(percent / 100.0 * self.count), 0
-        for number in sorted(self._bins.copy()):
-            cumulated += self._bins[number]
-            if cumulated >= max(rank, 1):
-                return min(round(_MIN_LATENCY_NS * math.exp(number * _BIN_RATIO)), self.max_ns)
-        return 0
+            for item in islice(self._source, count):
+                found.append(item)
+        except Exception as error:
+            self._error = error
+            if not found:
+                raise
+        return found
 
 
 def velocity_command_risk(recorded: str, name: str, type_name: str) -> str:

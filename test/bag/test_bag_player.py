@@ -27,7 +27,6 @@ from t3mpc_ros.bag.merged_reader import (
     transient_local_count,
 )
 from t3mpc_ros.bag.player import (
-    LatencyHistogram,
     PlaybackTimeline,
     ReadAheadQueue,
     velocity_command_risk,
@@ -724,32 +723,11 @@ def test_read_ahead_is_bounded_and_raises_errors_in_place():
 
     stream = ReadAheadQueue(source(), 200)
     assert next(stream) == 0
-    assert len(taken) <= 1 + 200 + 3 * 50
+    assert len(taken) <= 200
     assert [next(stream) for _ in range(599)] == list(range(1, 600)), 'all before the error'
     with pytest.raises(BagError, match='torn here'):
         next(stream)
-    with pytest.raises(StopIteration):
-        next(stream)
     stream.close()
-
-
-# -- latency --------------------------------------------------------------------------------------
-
-
-def test_latency_percentiles_have_an_error_of_two_percent():
-    rng = random.Random(3)
-    values = [round(rng.lognormvariate(11.0, 1.5)) for _ in range(5000)]
-    statistics = LatencyHistogram()
-    for value in values:
-        statistics.add(value)
-    ranked = sorted(max(value, 1000) for value in values)
-    for percent in (1, 50, 90, 99, 100):
-        exact = ranked[max(0, -(-percent * len(ranked) // 100) - 1)]
-        assert exact <= statistics.percentile_ns(percent) * 1.0001
-        assert statistics.percentile_ns(percent) <= exact * 1.021
-    assert statistics.max_ns == ranked[-1]
-    assert statistics.count == 5000
-    assert LatencyHistogram().percentile_ns(99) == 0
 
 
 def test_schedule_keeps_positions_when_a_seek_starts_a_loop(bag):

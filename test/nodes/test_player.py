@@ -303,7 +303,7 @@ def test_diagnostics_hold_position_and_latency(harness, tmp_path):
     values = {entry.key: entry.value for entry in status.values}
     assert (status.level, status.message) == (OK, 'playing')
     assert 0.0 < float(values['position_s']) < 9.98 == float(values['length_s'])
-    assert float(values['latency_p99_ms']) >= float(values['latency_p50_ms']) > 0.0
+    assert float(values['latency_max_ms']) > 0.0
 
 
 @pytest.mark.parametrize('allowed', [True, False])
@@ -486,7 +486,7 @@ def test_keys_pause_play_next_and_change_the_rate(terminal, tmp_path):
     shell.until(r'playing')
     shell.press(b'\x03')  # Ctrl-C keeps its meaning
     assert shell.wait() == 0
-    assert 'messages, timing error 50/99 %' in shell.text
+    assert 'messages, timing error at most' in shell.text
     assert shell.settings() == shell.before
 
 
@@ -505,7 +505,7 @@ def test_the_terminal_is_restored_after_a_signal(number, terminal, tmp_path):
 def test_the_terminal_is_restored_at_the_end_of_the_bag(terminal, tmp_path):
     bag = write(tmp_path / 'bag', texts(5))
     shell = terminal(f'storage.uris:=["{bag}"]')
-    shell.until('5 messages, timing error 50/99 %')
+    shell.until('5 messages, timing error at most')
     assert shell.wait() == 0
     assert shell.settings() == shell.before
 
@@ -532,7 +532,7 @@ def test_without_a_terminal_the_player_plays_to_the_end(graph, tmp_path):
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    assert '5 messages, timing error 50/99 %' in done.stderr
+    assert '5 messages, timing error at most' in done.stderr
     assert done.stdout == '', 'no progress line without a terminal'
     refused = subprocess.run(
         [*command, 'storage.uris:=["/nowhere"]'],

@@ -282,9 +282,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
             'rate': status.rate,
             'loops': status.loops,
             'messages': thread.published,
-            'latency_p50_ms': thread.latency.percentile_ns(50) / 1e6,
-            'latency_p99_ms': thread.latency.percentile_ns(99) / 1e6,
-            'latency_max_ms': thread.latency.max_ns / 1e6,
+            'latency_max_ms': thread.latency_max_ns / 1e6,
             'damaged': self._damaged,
             'excluded': ', '.join([*topics.unusable, *topics.blocked]),
         }
@@ -310,12 +308,8 @@ class PlayerNode(BaseNode[PlayerParameters]):
         if thread is not None:
             self._warn_of_damage()
             thread.stop()
-            latency = thread.latency
-            self.get_logger().info(
-                f'{thread.published} messages, timing error 50/99 %: '
-                f'{latency.percentile_ns(50) / 1e6:.2f}/{latency.percentile_ns(99) / 1e6:.2f} ms, '
-                f'maximum {latency.max_ns / 1e6:.2f} ms'
-            )
+            late = f'timing error at most {thread.latency_max_ns / 1e6:.2f} ms'
+            self.get_logger().info(f'{thread.published} messages, {late}')
         if self._reader is not None:
             self._reader.close()
             self._reader = None

@@ -15,7 +15,7 @@ import time
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 
-from t3mpc_ros.bag.player import DueMessage, LatencyHistogram, PlaybackTimeline
+from t3mpc_ros.bag.player import DueMessage, PlaybackTimeline
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import conversions
 
@@ -73,7 +73,8 @@ class PlayerThread:
         self._wake = threading.Event()
         self._closing = False
         self._thread = threading.Thread(target=self._run, name='player', daemon=True)
-        self.latency = LatencyHistogram()
+        self.latency_max_ns = 0
+        """Largest time from the due time of a message to its publication."""
         self.published = 0
         self.failure = ''
         """Why playback has ended early; empty if it has not."""
@@ -148,6 +149,6 @@ class PlayerThread:
             return
         publisher = self._publishers.get(message.topic)
         if publisher is not None:
-            self.latency.add(time.monotonic_ns() - due.due_ns)
+            self.latency_max_ns = max(self.latency_max_ns, time.monotonic_ns() - due.due_ns)
             publisher.publish(message.data)
             self.published += 1
