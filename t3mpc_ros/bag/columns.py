@@ -122,12 +122,7 @@ class _Batches:
 def read_columns(bag: BagReader, topics: Iterable[str]) -> dict[str, TopicColumns]:
     """Return the numbers of several topics of a bag, of the types in :data:`CDR_LAYOUTS`.
 
-    Raises
-    ------
-    DataError
-        A type has no layout here, or a message does not have the layout of its type.
-    BagError
-        The bag is damaged.
+    Another type, or a message with another layout, raises :class:`DataError`.
     """
     batches: dict[str, _Batches] = {}
     for name in topics:

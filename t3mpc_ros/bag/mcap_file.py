@@ -102,14 +102,10 @@ class RecordError(ValueError):
 
 
 def read_record(window: FileWindow, start: int, kind: int = 0) -> tuple[Any, int]:
-    """Return the record of the library at ``start`` and its end.
+    """Return the record of the library at ``start`` and its end, or raise :class:`RecordError`.
 
-    Its fields have the lengths that they state; the data of chunks and messages are not checked.
-
-    Raises
-    ------
-    RecordError
-        No complete and valid record begins there, or not one of the type ``kind`` (0 = any).
+    Its fields have the lengths that they state, and it has the type ``kind`` (0 = any); the data
+    of chunks and messages are not checked.
     """
     opcode, end = record_head(window, start)
     name = _record_name(opcode)
@@ -152,13 +148,9 @@ def _record_name(opcode: int) -> str:
 
 
 def chunk_data(chunk: Chunk) -> bytes:
-    """Return the decompressed records of a chunk.
+    """Return the decompressed records of a chunk; raise :class:`RecordError` if it is damaged.
 
-    Raises
-    ------
-    RecordError
-        The compression is unknown, decompression fails, or the checksum, or without a
-        checksum the size, is wrong.
+    Its checksum must be right, or without a checksum its size.
     """
     if chunk.compression not in ('', 'lz4', 'zstd'):
         raise RecordError(f'the compression of a chunk is unknown: {chunk.compression!r}')
@@ -244,12 +236,7 @@ class McapFile:
         """Yield the messages of ``topics`` from ``start_ns`` until before ``stop_ns``.
 
         They are in order of receipt, with equal times in the order of the file. Damaged chunks
-        are an error, or with ``skip_damaged`` counted in :attr:`damaged`.
-
-        Raises
-        ------
-        BagError
-            The file is damaged.
+        raise :class:`BagError`, or with ``skip_damaged`` are counted in :attr:`damaged`.
         """
         channels = self._summary.channels.values()
         names = {
@@ -294,13 +281,7 @@ class McapFile:
         return ''
 
     def attachments(self) -> list[tuple[int, Attachment]]:
-        """Return the attachments, each with the time at which it was read.
-
-        Raises
-        ------
-        BagError
-            An attachment is damaged.
-        """
+        """Return the attachments, each with the time at which it was read."""
         with self.path.open('rb') as file, read_errors(f'the attachments of {self.path}'):
             window = FileWindow(file)
             found = []

@@ -36,19 +36,8 @@ class ScheduledMessage(NamedTuple):
 class MergedReader:
     """Selected topics of several bags, merged by time of receipt; damaged chunks are skipped.
 
-    Parameters
-    ----------
-    bags
-        Open bags; :meth:`close` closes them.
-    offsets_ns
-        Offset of the stamps of each bag.
-    topic_filter
-        Selection and remapping; by default all topics under their recorded names.
-
-    Raises
-    ------
-    BagError
-        A topic has different types, after remapping.
+    ``offsets_ns`` are added to the stamps of each bag. A topic with two types after remapping
+    raises :class:`BagError`. :meth:`close` closes the bags.
     """
 
     def __init__(

@@ -130,13 +130,7 @@ class BagMetadata:
 
 
 def write_metadata(folder: Path, metadata: BagMetadata) -> None:
-    """Replace ``metadata.yaml`` of a folder atomically.
-
-    Raises
-    ------
-    OSError
-        The folder is not writable; an existing file is unchanged.
-    """
+    """Replace ``metadata.yaml`` of a folder atomically."""
     text = dump_yaml({_ROOT: metadata.to_mapping()})
     write_atomically(folder / METADATA_FILE_NAME, text)
 

@@ -170,13 +170,7 @@ class PlaybackParameters(Parameters):
         )
 
     def open_reader(self) -> tuple[MergedReader, tuple[str, ...]]:
-        """Return a reader of all bags, and the incomplete files, which are not played.
-
-        Raises
-        ------
-        BagError
-            A bag cannot be read, or a topic has two types.
-        """
+        """Return a reader of all bags, and the incomplete files, which are not played."""
         bags: list[BagReader] = []
         try:
             for path in self.uris:
@@ -197,13 +191,7 @@ class PlaybackParameters(Parameters):
         )
 
     def time_range_ns(self, reader: MergedReader) -> tuple[int, int]:
-        """Return the first and the last receive time to play.
-
-        Raises
-        ------
-        ParameterError
-            The start is after the end of the bag.
-        """
+        """Return the first and the last receive time to play."""
         begin_ns = reader.start_ns + round(self.start_offset * NANOSECONDS)
         if begin_ns > reader.end_ns:
             length = (reader.end_ns - reader.start_ns) / NANOSECONDS
@@ -233,19 +221,10 @@ class DueMessage(NamedTuple):
 class PlaybackTimeline:
     """Determines the messages that are due under pause, rate, seek, step and loop.
 
-    Parameters
-    ----------
-    schedule
-        Returns the messages from a bag time, see :meth:`MergedReader.schedule`; an iterator with
-        a ``close`` method is closed after use.
-    begin_ns, end_ns
-        Receive times to play.
-    origin_ns
-        Origin of the seconds in the error text of :meth:`seek`; by default ``begin_ns``.
-    rate
-        Seconds of the bag per second.
-    clock_rate
-        Rate of the clock ticks in Hz of the caller's clock; 0 = no clock ticks.
+    ``schedule`` returns the messages from a bag time, see :meth:`MergedReader.schedule`; it is
+    closed after use. Those received from ``begin_ns`` to ``end_ns`` are played; errors of
+    :meth:`seek` count seconds from ``origin_ns``. The clock ticks with ``clock_rate`` Hz of the
+    caller's clock, 0 = never.
     """
 
     def __init__(
@@ -288,11 +267,6 @@ class PlaybackTimeline:
         Messages are in order, and late ones are due immediately. The time of the next call is
         None if nothing is due before a call of another method. After a start or a seek the first
         call only reads the first message, so that the time for reading does not delay it.
-
-        Raises
-        ------
-        BagError
-            Reading the bag failed.
         """
         if not self._primed:
             self._advance()
@@ -381,25 +355,13 @@ class PlaybackTimeline:
         self._steps = 0
 
     def set_rate(self, now_ns: int, rate: float) -> None:
-        """Change the rate.
-
-        Raises
-        ------
-        ValueError
-            The rate is not a positive number.
-        """
+        """Change the rate, a positive number."""
         ratio = _rate_ratio(rate)
         self._bind(now_ns)
         self.rate, self._ratio = rate, ratio
 
     def seek(self, now_ns: int, stamp_ns: int) -> str:
-        """Continue at a bag time, with the transient-local messages before it.
-
-        Returns
-        -------
-        str
-            The reason of a rejection, or an empty text.
-        """
+        """Continue at a bag time, transient-local messages before it first; return the problem."""
         if not self._begin_ns <= stamp_ns <= self._end_ns:
             begin, end, target = (
                 (each - self._origin_ns) / NANOSECONDS
@@ -413,13 +375,7 @@ class PlaybackTimeline:
         return ''
 
     def play_next(self, now_ns: int, count: int = 1) -> str:
-        """Play the next ``count`` messages immediately while paused.
-
-        Returns
-        -------
-        str
-            The reason of a rejection, or an empty text.
-        """
+        """Play the next ``count`` messages immediately while paused; return the problem."""
         if not self.paused:
             return 'the player must be paused to play the next message'
         if self.finished:

@@ -112,13 +112,7 @@ class QosProfile:
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> 'QosProfile':
-        """Return the profile in ``mapping``; policies are names or numbers.
-
-        Raises
-        ------
-        QosError
-            A field is missing or has an unknown value.
-        """
+        """Return the profile in ``mapping``; policies are names or numbers."""
         try:
             return cls(
                 depth=int(mapping['depth']),
@@ -185,11 +179,7 @@ def read_qos_overrides(path: Path | str) -> dict[str, QosProfile]:
     """Return profiles by topic from a file in the format of ``--qos-profile-overrides-path``.
 
     Unspecified policies are those of the default publisher: reliable, volatile, keep last 10.
-
-    Raises
-    ------
-    QosError
-        The file cannot be read or is not a file that ``ros2 bag`` accepts.
+    What ``ros2 bag`` does not accept raises :class:`QosError`.
     """
     path = Path(path).expanduser()
     try:

@@ -142,27 +142,13 @@ class BagReader:
     def serialized_messages(
         self, topics: Collection[str] | None = None
     ) -> Iterator[SerializedMessage]:
-        """Yield the serialized messages of ``topics``, or of all, in order of receipt.
-
-        Raises
-        ------
-        BagError
-            The bag is damaged.
-        """
+        """Yield the serialized messages of ``topics``, or of all, in order of receipt."""
         return merge_streams(
             (file.start_ns, partial(file.messages, topics)) for file in self.files
         )
 
     def messages(self, topic: str) -> Iterator[tuple[float, Any]]:
-        """Yield (received, decoded message) in order of receipt.
-
-        Raises
-        ------
-        UnknownTopicError
-            The topic is not in the bag.
-        DataError
-            A message cannot be decoded.
-        """
+        """Yield (received, decoded message) in order of receipt, s."""
         if topic not in self.topics:
             available = ', '.join(self.topics) or 'no topic'
             raise UnknownTopicError(f'{topic} is not in {self.folder}, which contains {available}')
@@ -170,13 +156,7 @@ class BagReader:
             yield (message.received_ns - self.start_ns) / NANOSECONDS, self.decode(message)
 
     def decode(self, message: SerializedMessage) -> Any:
-        """Return a message of this bag as an object.
-
-        Raises
-        ------
-        DataError
-            It cannot be decoded.
-        """
+        """Return a message of this bag as an object."""
         type_name = self.topics[message.topic].type_name
         with read_errors(message.topic, DataError):
             if type_name not in self._decoders:
@@ -198,29 +178,12 @@ class BagReader:
         return store.deserialize_ros1 if is_ros1 else decode
 
     def series(self, topic: str, fields: Mapping[str, str]) -> dict[str, Array]:
-        """Return one array for each of ``fields``, with times of receipt and stamps.
+        """Return one array, shape (n,), for each of ``fields``, in order of receipt.
 
-        Parameters
-        ----------
-        topic
-            Full name.
-        fields
-            Path of each field in the message, such as ``'twist.twist.linear.x'`` or
-            ``'pose.covariance[7]'``. An element beyond the end of an array is NaN.
-
-        Returns
-        -------
-        dict
-            The fields; ``received``, the time of receipt; and ``stamp``, that of the header or,
-            for a type without a header, ``received``. All have shape (n,), n the number of
-            messages, in order of receipt.
-
-        Raises
-        ------
-        UnknownTopicError
-            The topic is not in the bag; :attr:`topics` lists the available ones.
-        DataError
-            The type has no such field, or the field is not a number.
+        ``fields`` are paths in the message by name, such as ``'twist.twist.linear.x'`` or
+        ``'pose.covariance[7]'``; an element beyond the end of an array is NaN, what is no number
+        raises :class:`DataError`. ``received``, the time of receipt, and ``stamp``, that of the
+        header or, for a type without a header, ``received``, are returned as well.
         """
         getters = [_field_getter(path) for path in fields.values()]
         rows = array('d')  # a list of floats would take five times the memory
@@ -237,13 +200,7 @@ class BagReader:
         return {name: np.ascontiguousarray(table[:, i]) for i, name in enumerate(names)}
 
     def attachments(self) -> dict[str, Attachment]:
-        """Return the attachments by name; the newest of each name.
-
-        Raises
-        ------
-        BagError
-            An attachment is damaged.
-        """
+        """Return the attachments by name; the newest of each name."""
         found = [pair for file in self.files for pair in file.attachments()]
         found.sort(key=lambda pair: pair[0])
         return {item.name: item for _, item in found}
@@ -266,16 +223,11 @@ class BagReader:
 
 
 def open_bag(path: Path | str) -> BagReader:
-    """Open the bag in a folder, or a single bag file.
+    """Open the bag in a folder, or a single bag file; it must have a complete file.
 
     All complete MCAP files of a folder are read, independently of ``metadata.yaml``, which is
     outdated if the recorder was killed. Bags that rosbag2 compressed, by file or by message, are
     read through their ``metadata.yaml``. Of the folder of a run, its bag is opened.
-
-    Raises
-    ------
-    BagError
-        The bag does not exist, has no complete file, or is damaged.
     """
     path = Path(path).expanduser()
     if not path.exists():
@@ -332,10 +284,7 @@ def merge_streams(
 ) -> Iterator[SerializedMessage]:
     """Merge sorted streams of messages by receive time; equal times keep the order of streams.
 
-    Parameters
-    ----------
-    streams
-        Each stream with a lower bound of its receive times, at which it is opened.
+    Each stream comes with a lower bound of its receive times, at which it is opened.
     """
     waiting = sorted((start_ns, number, make) for number, (start_ns, make) in enumerate(streams))
     waiting.reverse()
@@ -361,23 +310,11 @@ def merge_streams(
 
 
 def missing_sample_ratio(stamps: Array, rate: float) -> float:
-    """Return the ratio of missing samples, from 0 to 1.
+    """Return the ratio of missing samples, from 0 to 1, of stamps in seconds, shape (n,).
 
     The number of distinct finite stamps is compared with the number of periods of ``rate``
     between the first and the last one. Latency, bursts and the order have no influence, and a
     duplicate does not replace a missing sample. The ratio of fewer than two stamps is 0.
-
-    Parameters
-    ----------
-    stamps
-        Seconds, shape (n,).
-    rate
-        Nominal samples per second.
-
-    Raises
-    ------
-    ValueError
-        ``rate`` is not positive.
     """
     if not rate > 0.0:
         raise ValueError(f'rate must be positive: got {rate}')

@@ -43,12 +43,8 @@ class DataError(BagError):
 class MessageDefinitions:
     """Definitions of message types, with a cache.
 
-    Parameters
-    ----------
-    prefixes
-        Installation prefixes in order of precedence; the file of a type is
-        ``PREFIX/share/PACKAGE/msg/NAME.msg``. The default is :func:`installation_prefixes` of the
-        process environment.
+    The file of a type is ``PREFIX/share/PACKAGE/msg/NAME.msg``; ``prefixes`` are in order of
+    precedence, by default the :func:`installation_prefixes` of the process environment.
     """
 
     def __init__(self, prefixes: Iterable[Path] | None = None) -> None:
@@ -60,12 +56,8 @@ class MessageDefinitions:
         """Return the ``ros2msg`` text of ``type_name``, such as ``geometry_msgs/msg/Twist``.
 
         The definition of the type is followed by each of its direct and indirect dependencies
-        once, after a line of 80 ``=`` and a line ``MSG: package/Type``.
-
-        Raises
-        ------
-        UnknownTypeError
-            The type or one of its dependencies is neither installed nor part of Jazzy.
+        once, after a line of 80 ``=`` and a line ``MSG: package/Type``. A type that is neither
+        installed nor part of Jazzy raises :class:`UnknownTypeError`.
         """
         if type_name not in self._schemas:
             own = _full_name(type_name)

@@ -19,23 +19,9 @@ class TopicFilterError(BagError):
 class TopicPatterns:
     """Topic names with wildcards, and a regular expression for the full name.
 
-    Parameters
-    ----------
-    names
-        Names in which ``*`` matches any text including slashes. A name that begins with neither
-        ``/`` nor ``*`` is relative to ``namespace``.
-    regex
-        Regular expression that must match the full name from end to end, as in ``ros2 bag``;
-        empty = none.
-    parameter
-        Name of the parameter that sets ``regex``, for the error text.
-    namespace
-        Such as ``/robot``.
-
-    Raises
-    ------
-    TopicFilterError
-        ``regex`` is not a regular expression.
+    In ``names`` ``*`` matches any text including slashes; a name that begins with neither ``/``
+    nor ``*`` is relative to ``namespace``. ``regex`` must match the full name from end to end, as
+    in ``ros2 bag``; empty = none. An error names ``parameter``.
     """
 
     def __init__(
@@ -57,26 +43,10 @@ class TopicPatterns:
 class TopicFilter:
     """Filter of the recorder.
 
-    A topic is recorded if any of the inclusion rules matches and no exclusion rule does. Hidden
-    topics (a part of the name begins with ``_``) are recorded by their full name only.
-
-    Parameters
-    ----------
-    names
-        Full names, as resolved by the node.
-    patterns, regex
-        Inclusion rules, see :class:`TopicPatterns`, but a name that begins with ``*`` is relative.
-    types
-        Message types such as ``nav_msgs/msg/Odometry``.
-    exclude_topics, exclude_regex
-        Exclusion rules, see :class:`TopicPatterns`.
-    namespace
-        Namespace of the node, such as ``/robot``.
-
-    Raises
-    ------
-    TopicFilterError
-        ``regex`` or ``exclude_regex`` is not a regular expression.
+    A topic is recorded if any of the inclusion rules (full ``names``, ``patterns``, ``regex``,
+    message ``types``) matches and no exclusion rule does, see :class:`TopicPatterns`; but a
+    pattern that begins with ``*`` is relative. Hidden topics (a part of the name begins with
+    ``_``) are recorded by their full name only.
     """
 
     def __init__(
@@ -112,11 +82,6 @@ class PlayTopicFilter:
 
     A topic is played if ``topics`` or ``regex`` matches, or if both are empty, and no exclusion
     rule matches, see :class:`TopicPatterns`. ``remappings`` are new names by recorded names.
-
-    Raises
-    ------
-    TopicFilterError
-        ``regex`` or ``exclude_regex`` is not a regular expression.
     """
 
     def __init__(
@@ -144,13 +109,7 @@ class PlayTopicFilter:
 
 
 def parse_remappings(items: Sequence[str]) -> dict[str, str]:
-    """Return new names by recorded names from rules ``old:=new``.
-
-    Raises
-    ------
-    TopicFilterError
-        An item is not a rule, or a topic has two rules.
-    """
+    """Return new names by recorded names from rules ``old:=new``, one per topic."""
     result: dict[str, str] = {}
     for item in items:
         old, mark, new = (part.strip() for part in item.partition(':='))
@@ -168,13 +127,7 @@ def parse_remappings(items: Sequence[str]) -> dict[str, str]:
 
 
 def compile_regex(parameter: str, text: str) -> re.Pattern[str] | None:
-    """Return ``text`` as a regular expression; None if it is empty.
-
-    Raises
-    ------
-    TopicFilterError
-        ``text`` is invalid; the error names ``parameter`` and the position.
-    """
+    """Return ``text`` as a regular expression, None if empty; an error names ``parameter``."""
     if not text:
         return None
     try:

@@ -54,13 +54,7 @@ class DiskError(BagError):
 
 
 def read_attachment(path: Path, max_bytes: int, name: str = '') -> Attachment:
-    """Return the file at ``path`` as an attachment called ``name``, by default its file name.
-
-    Raises
-    ------
-    AttachmentError
-        The file does not exist, is not readable, or is larger than ``max_bytes``.
-    """
+    """Return the file at ``path`` as an attachment called ``name``, by default its file name."""
     try:
         with path.open('rb') as file:
             data = file.read(max_bytes + 1)
@@ -87,37 +81,15 @@ class BagWriter:
     is readable at any time, even after the recorder was killed. Before the disk is full, the file
     is completed.
 
-    Each file is complete in itself: schemas and channels of its messages, all metadata records,
-    all attachments. Transient-local messages of earlier files are not repeated: a reader of the
-    folder would receive them twice.
+    Each file is complete in itself: schemas and channels of its messages, all metadata records
+    (tables of text by title), all attachments. Transient-local messages of earlier files are not
+    repeated: a reader of the folder would receive them twice.
 
-    Parameters
-    ----------
-    folder
-        Created if missing, with its parents.
-    name
-        Stem of the file name; by default the name of the folder, as in rosbag2.
-    metadata_records
-        Tables of text by record name, stored as MCAP metadata records: parameters, version,
-        commit. The name ``rosbag2`` is reserved.
-    chunk_bytes, chunk_ns
-        A chunk is compressed and written at this size, or at this age of its oldest message,
-        by receive time or between two calls of :meth:`tick`. A killed recorder loses at most the
-        current chunk.
-    max_file_bytes, max_file_ns
-        Size of a file, and age of its first message, after which the next file begins; 0 = no
-        limit.
-    definitions
-        Source of schemas and type hashes.
-
-    Raises
-    ------
-    FolderError
-        The folder or the file cannot be created; also by :meth:`split` and :meth:`write`.
-    DiskError
-        Writing failed; by every method, once.
-    DataError
-        ``metadata_records`` contains values other than text, or a record called ``rosbag2``.
+    A chunk is compressed and written at ``chunk_bytes``, or when its oldest message is
+    ``chunk_ns`` old, by receive time or between two calls of :meth:`tick`: a killed recorder
+    loses at most the current chunk. The next file begins at ``max_file_bytes`` or
+    ``max_file_ns``, 0 = never. What cannot be created raises :class:`FolderError`; a failed write
+    raises :class:`DiskError`, once, from any method.
     """
 
     path: Path
@@ -225,19 +197,8 @@ class BagWriter:
     ) -> None:
         """Add a topic before its first message; adding it again has no effect.
 
-        Parameters
-        ----------
-        profiles
-            QoS profiles that the publishers offer.
-        type_hash
-            RIHS01 hash; if missing or invalid, that of the installed definition is used.
-
-        Raises
-        ------
-        UnknownTypeError
-            No definition of the type is available.
-        DataError
-            The topic was added with another type.
+        ``profiles`` are those that the publishers offer. Without a valid ``type_hash`` (RIHS01)
+        that of the installed definition is used.
         """
         if known := self._topics.get(name):
             if known.type_name != type_name:
@@ -273,18 +234,7 @@ class BagWriter:
     def write(self, topic: str, received_ns: int, published_ns: int, data: bytes) -> None:
         """Write one CDR message with its stamps in nanoseconds.
 
-        Raises
-        ------
-        UnknownTopicError
-            The topic was not added.
-        DataError
-            ``data`` is not bytes, or a stamp is negative.
-        DiskError
-            Writing failed. Raised once: later messages are only counted in :attr:`lost`.
-        FolderError
-            The next file cannot be created.
-        BagError
-            The writer is closed.
+        After a :class:`DiskError` later messages are only counted in :attr:`lost`.
         """
         if type(data) is not bytes:
             raise DataError(f'a message of {topic} must be bytes: got {type(data).__name__}')

@@ -27,17 +27,12 @@ class NodeFault:
 
 
 class DiagnosticsMonitor:
-    """Detects the beginning of faults of the monitored nodes.
+    """Detects the beginning of faults of the monitored nodes, by their names in the diagnostics.
 
     A fault begins when a healthy node reports an error (a stopped controller, an emergency stop,
     a lost link) or stops reporting. It ends with the next report below the error level; only then
     can the next fault of that node begin. A node that has not been healthy yet, because it waits
     for another node, has no fault.
-
-    Parameters
-    ----------
-    names
-        Names of the monitored nodes in the diagnostics.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -68,15 +63,7 @@ class DiagnosticsMonitor:
 
 
 class SnapshotRateLimiter:
-    """Limits the number and the rate of automatic snapshots.
-
-    Parameters
-    ----------
-    min_interval_ns
-        Minimum time between two automatic snapshots.
-    max_count
-        Maximum number of automatic snapshots per run.
-    """
+    """Limits the number of automatic snapshots in a run, and the time between two."""
 
     def __init__(self, min_interval_ns: int, max_count: int) -> None:
         self._min_interval_ns = min_interval_ns

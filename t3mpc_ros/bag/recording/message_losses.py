@@ -19,17 +19,7 @@ def message_loss_record(
     lost: Mapping[str, int],
     undiscovered: Mapping[str, int],
 ) -> dict[str, str]:
-    """Return the metadata record of missing messages, by cause and topic.
-
-    Parameters
-    ----------
-    dropped
-        Messages by topic that the full write queue dropped.
-    lost
-        Messages by topic that the middleware lost.
-    undiscovered
-        Messages by topic that were published before their publisher was discovered.
-    """
+    """Return the metadata record of missing messages, by cause (:data:`LOSS_CAUSES`) and topic."""
     causes = dict(zip(LOSS_CAUSES, (dropped, lost, undiscovered), strict=True))
     table = {cause: str(sum(counts.values())) for cause, counts in causes.items()}
     for cause, counts in causes.items():

@@ -22,14 +22,9 @@ MESSAGES_PER_SLICE = 200
 
 
 class CircularMessageCache:
-    """Messages of the last seconds, and the last transient-local messages before them.
+    """Messages of the last ``span_ns``, and the last transient-local messages before them.
 
-    Parameters
-    ----------
-    span_ns
-        Time of receipt that the cache covers, nanoseconds.
-    max_bytes
-        Maximum memory of the messages; at this limit the cache covers less time.
+    At ``max_bytes`` of memory it covers less time.
     """
 
     def __init__(self, span_ns: int, max_bytes: int) -> None:
@@ -78,16 +73,7 @@ class CircularMessageCache:
 class SnapshotWriter:
     """Caches the last seconds and writes them on request, one snapshot at a time.
 
-    Parameters
-    ----------
-    folder
-        Folder of the bag; snapshots are written to a folder below it.
-    cache
-        Cache of the messages.
-    definitions
-        Source of the message schemas.
-    thread
-        Thread that writes the snapshots.
+    ``thread`` writes each to a folder of its own in ``folder/snapshots``.
     """
 
     def __init__(
@@ -129,16 +115,8 @@ class SnapshotWriter:
     ) -> Path:
         """Start writing a snapshot and return its folder; raise :class:`BagError` if it cannot be.
 
-        Parameters
-        ----------
-        reason
-            Reason of the snapshot, for the folder name and the metadata.
-        now_ns
-            System time, ns since 1970, as the stamps of reception.
-        metadata_records, attachments
-            Further content of the bag.
-        finished
-            Called by the writing thread with success and a text.
+        The cache ends at ``now_ns``, system time. The writing thread calls ``finished`` with
+        success and a text.
         """
         if self.busy:
             raise BagError('another snapshot is being written: try again after it')

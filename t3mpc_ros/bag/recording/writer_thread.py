@@ -25,14 +25,8 @@ SHUTDOWN_TIMEOUT = 60.0
 class WriterThread:
     """Writes messages and runs tasks in first-in, first-out order.
 
-    Parameters
-    ----------
-    writer
-        Writer of the bag, which only this thread uses; None: the thread writes snapshots only.
-    max_bytes
-        Maximum memory of the messages, including those being written. Tasks are not limited.
-    clock
-        Returns steady time, ns.
+    Only this thread uses ``writer``; None: it writes snapshots only. The messages, with those
+    being written, take at most ``max_bytes``; tasks are not limited. ``clock`` is steady, ns.
     """
 
     def __init__(self, writer: BagWriter | None, max_bytes: int, clock: Callable[[], int]) -> None:

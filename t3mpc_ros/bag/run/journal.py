@@ -132,13 +132,7 @@ def parameters_to_json(revision: int, parameters: Mapping[str, Value]) -> str:
 
 
 def parameters_from_json(text: str) -> tuple[int, dict[str, object]]:
-    """Return the revision and the parameters of a text of :func:`parameters_to_json`.
-
-    Raises
-    ------
-    ValueError
-        The text has another format.
-    """
+    """Return the revision and the parameters of a text of :func:`parameters_to_json`."""
     try:
         content = json.loads(text)
         return int(content['revision']), dict(content['parameters'])

@@ -32,23 +32,9 @@ def save_model(
     parameters: Mapping[str, object],
     origin: Mapping[str, object] | None = None,
 ) -> None:
-    """Write a model file; on an error an existing one is unchanged.
+    """Write a model file; after a :class:`ModelError` an existing one is unchanged.
 
-    Parameters
-    ----------
-    path
-        The file.
-    arrays
-        Learned weights by name.
-    parameters
-        Parameters of the controller by name.
-    origin
-        Origin of the weights as JSON data, such as bags and their hashes.
-
-    Raises
-    ------
-    ModelError
-        The file is not writable; the text names the file and the reason.
+    ``arrays`` are learned weights by name; ``origin`` is JSON data, such as bags and their hashes.
     """
     header = json.dumps(
         {
@@ -75,24 +61,12 @@ def find_model(name: str) -> Path:
 
 
 def load_model(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Return the arrays of a model file.
-
-    Raises
-    ------
-    ModelError
-        The file is not readable, not a model file, or of another format.
-    """
+    """Return the arrays of a model file; an unusable one raises :class:`ModelError`."""
     return _read(path)[1]
 
 
 def read_model_header(path: Path) -> dict[str, Any]:
-    """Return the header of a model file: format, version, parameters and origin.
-
-    Raises
-    ------
-    ModelError
-        As :func:`load_model`.
-    """
+    """Return the header of a model file: format, version, parameters and origin."""
     return _read(path)[0]
 
 

@@ -40,18 +40,8 @@ class PlaybackStatus:
 class PlayerThread:
     """Publishes the due messages of a playback timeline.
 
-    Parameters
-    ----------
-    timeline
-        Decides which messages are due.
-    publishers
-        Publishers by topic.
-    clock
-        Publisher of the bag's time; None: the time is not published.
-    clock_with_messages
-        Whether the time is published before each message, too.
-    priority
-        Real-time priority of the thread (SCHED_FIFO); 0 = none.
+    Without ``clock`` the time of the bag is not published; with ``clock_with_messages`` it is
+    before each message, too. ``priority`` is that of SCHED_FIFO, 0 = none.
     """
 
     def __init__(

@@ -47,15 +47,7 @@ class PublishingRules:
 class TopicPublishers:
     """The publishers of the played topics; other topics are excluded from the reader.
 
-    Parameters
-    ----------
-    node
-        Node that publishes. The rule on velocity commands applies to the names after its
-        remapping.
-    reader
-        Reader of the bags.
-    rules
-        What may be published.
+    The rule on velocity commands applies to the names after the remapping of ``node``.
     """
 
     def __init__(self, node: Node, reader: MergedReader, rules: PublishingRules) -> None:

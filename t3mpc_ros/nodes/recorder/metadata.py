@@ -28,21 +28,8 @@ ParametersCallback = Callable[[str, str, Mapping[str, str]], None]
 class RecordingMetadata:
     """The metadata records and attachments of a recording.
 
-    Parameters
-    ----------
-    files
-        Files to attach at the start.
-    max_bytes
-        Maximum size of an attached file.
-    models
-        Whether to attach the model files of controllers.
-    now_ns
-        System time, ns since 1970.
-
-    Raises
-    ------
-    AttachmentError
-        A file cannot be read or is too large.
+    ``files`` are attached at the start, and with ``models`` the model files of controllers, each
+    of at most ``max_bytes``. A file that cannot be read raises :class:`AttachmentError`.
     """
 
     def __init__(self, files: Iterable[str], max_bytes: int, models: bool, now_ns: int) -> None:
@@ -104,15 +91,7 @@ class RecordingMetadata:
 
 
 class ParameterCollector:
-    """Reads the parameters of the package's nodes, once for each start of a node.
-
-    Parameters
-    ----------
-    node
-        Node that calls the parameter services.
-    callback
-        Called with the parameters of each node.
-    """
+    """Passes the parameters of the package's nodes to ``callback``, once per start of a node."""
 
     def __init__(self, node: Node, callback: ParametersCallback) -> None:
         self._node = node

@@ -78,13 +78,7 @@ class RawSubscription:
 
 
 class RawSubscriptions:
-    """The raw subscriptions of a recorder by topic.
-
-    Parameters
-    ----------
-    node
-        Node that subscribes.
-    """
+    """The raw subscriptions of a recorder by topic."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -114,12 +108,7 @@ class RawSubscriptions:
     def subscribe(self, topic: str, type_name: str, profile: QoSProfile) -> None:
         """Subscribe to a topic, in place of the former subscription to it.
 
-        Raises
-        ------
-        ImportError
-            The message type is not installed.
-        RCLError
-            This process uses the topic with another type.
+        Raises ImportError without the message type, RCLError if this process uses another one.
         """
         message = graph_introspection.message_class(type_name)
         replaced = self._subscriptions.get(topic)
@@ -219,18 +208,8 @@ class RawSubscriptions:
 class TopicDiscovery:
     """Finds the selected topics in the graph and subscribes with a QoS that fits all publishers.
 
-    Parameters
-    ----------
-    node
-        Node that queries the graph.
-    topic_filter
-        Selects the topics to record.
-    subscriptions
-        Subscriptions that are made and replaced.
-    take_messages
-        Called before a subscription is replaced, so that no received message is lost.
-    recorded
-        Returns whether messages of a topic were recorded already.
+    ``take_messages`` is called before a subscription is replaced, so that no received message is
+    lost; ``recorded`` returns whether messages of a topic were recorded already.
     """
 
     def __init__(
