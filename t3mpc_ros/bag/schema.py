@@ -8,7 +8,6 @@ file; types that are not installed are taken from the Jazzy definitions of the `
 
 from collections.abc import Iterable, Mapping
 from functools import cache
-import json
 import os
 from pathlib import Path
 import re
@@ -70,18 +69,11 @@ class MessageDefinitions:
         return self._schemas[type_name]
 
     def type_hash(self, type_name: str) -> str:
-        """Return the RIHS01 hash of a type (REP 2016), which Jazzy compares during discovery.
-
-        It is read from the ``.json`` file beside the ``.msg`` file, or computed from the schema.
-
-        Raises
-        ------
-        UnknownTypeError
-            As :meth:`schema`.
-        """
+        """Return the RIHS01 hash of a type (REP 2016), which Jazzy compares during discovery."""
         if type_name not in self._hashes:
-            own = _full_name(type_name)
-            self._hashes[type_name] = self._installed_hash(own) or self._computed_hash(own)
+            own, store = _full_name(type_name), get_typestore(Stores.EMPTY)
+            store.register(get_types_from_msg(self.schema(own), own))
+            self._hashes[type_name] = str(store.hash_rihs01(own))
         return self._hashes[type_name]
 
     def _collect(self, name: str, texts: dict[str, str], needed_by: str) -> None:
@@ -91,45 +83,20 @@ class MessageDefinitions:
                 self._collect(dependency, texts, needed_by=name)
 
     def _own_text(self, name: str, needed_by: str) -> str:
-        if path := self._installed(name, '.msg'):
+        package, _, own = name.partition('/msg/')
+        paths = [prefix / 'share' / package / 'msg' / f'{own}.msg' for prefix in self._prefixes]
+        if path := next((each for each in paths if each.is_file()), None):
             return path.read_text(encoding='utf-8')
         store = _jazzy()
         if name in store.fielddefs:
             text, _ = store.generate_msgdef(name, ros_version=2)
             return str(text).partition(SEPARATOR)[0]
-        searched = ', '.join(str(self._path(prefix, name, '.msg')) for prefix in self._prefixes)
+        searched = ', '.join(map(str, paths))
         dependent = f' (needed by {needed_by})' if needed_by else ''
         raise UnknownTypeError(
             f'no definition of {name}{dependent}; searched {searched or "no file"} '
             'and the Jazzy types of the rosbags library'
         )
-
-    def _installed_hash(self, name: str) -> str:
-        # The hash must be in the same folder as the definition: an overlay may redefine a type.
-        text, description = self._installed(name, '.msg'), self._installed(name, '.json')
-        if not text or not description or text.parent != description.parent:
-            return ''
-        try:
-            hashes = json.loads(description.read_text(encoding='utf-8'))['type_hashes']
-            return next(
-                (str(item['hash_string']) for item in hashes if item['type_name'] == name), ''
-            )
-        except (ValueError, KeyError, TypeError):
-            return ''
-
-    def _computed_hash(self, name: str) -> str:
-        store = get_typestore(Stores.EMPTY)
-        store.register(get_types_from_msg(self.schema(name), name))
-        return str(store.hash_rihs01(name))
-
-    def _installed(self, name: str, suffix: str) -> Path | None:
-        candidates = (self._path(prefix, name, suffix) for prefix in self._prefixes)
-        return next((path for path in candidates if path.is_file()), None)
-
-    @staticmethod
-    def _path(prefix: Path, name: str, suffix: str) -> Path:
-        package, _, own = name.partition('/msg/')
-        return prefix / 'share' / package / 'msg' / f'{own}{suffix}'
 
 
 def installation_prefixes(environment: Mapping[str, str]) -> tuple[Path, ...]:

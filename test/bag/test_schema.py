@@ -86,15 +86,6 @@ def test_installed_definitions_and_first_prefix_take_precedence(
     assert found.schema('std_msgs/msg/Float64') == 'float64 data\nfloat64 more\n'
 
 
-def test_hash_of_another_prefix_is_not_used(tmp_path):
-    """An overlay that redefines a type must not inherit the hash of the replaced definition."""
-    install(tmp_path / 'overlay', 'own_msgs/msg/Pair', 'float64 a\nfloat64 b\n')
-    install(tmp_path / 'underlay', 'own_msgs/msg/Pair', 'float64 a\n', 'RIHS01_old')
-    found = MessageDefinitions([tmp_path / 'overlay', tmp_path / 'underlay'])
-    assert found.type_hash('own_msgs/msg/Pair').startswith('RIHS01_')
-    assert found.type_hash('own_msgs/msg/Pair') != 'RIHS01_old'
-
-
 def test_custom_type_mixes_installed_and_library_definitions(tmp_path):
     text = (
         '# a comment with a Type in it\n'
@@ -116,14 +107,6 @@ def test_custom_type_mixes_installed_and_library_definitions(tmp_path):
         'MSG: builtin_interfaces/Time',
         'MSG: geometry_msgs/Point',
     ]
-
-
-def test_a_hash_is_computed_where_none_is_installed(tmp_path):
-    own_text = MessageDefinitions([]).schema('nav_msgs/msg/Odometry').partition(SEPARATOR)[0]
-    install(tmp_path, 'nav_msgs/msg/Odometry', own_text)
-    (tmp_path / 'share/nav_msgs/msg/Odometry.json').write_text('not json')
-    found = MessageDefinitions([tmp_path])
-    assert found.type_hash('nav_msgs/msg/Odometry') == JAZZY.hash_rihs01('nav_msgs/msg/Odometry')
 
 
 def test_unknown_type_error_lists_the_searched_paths(tmp_path):
