@@ -26,8 +26,6 @@ INSTALL = {
     'libelf-dev': 'apt-get install libelf-dev',
     'chromium': 'apt-get install chromium',
     'chromedriver': 'apt-get install chromium-driver',
-    'go': 'apt-get install golang-go',
-    'modules of Go': 'a connection to the proxy of Go modules',
     'node': 'apt-get install nodejs',
     'npm': 'apt-get install npm',
     'packages of npm': 'a connection to the registry of npm',
