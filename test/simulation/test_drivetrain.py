@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.simulation.plant.contact import BumperParameters
@@ -44,7 +45,7 @@ MOTOR = StepperMotorParameters()
 NO_FRICTION = FrictionParameters(viscous=0.0, coulomb=0.0)
 RADIUS, HALF = GEOMETRY.wheel_radius, GEOMETRY.half_separation
 BUMPER = BumperParameters().constants()
-NOWHERE = np.zeros((0, 4)), np.zeros((0, 3))
+NOWHERE = Obstacles(np.zeros((0, 4)), np.zeros((0, 3)))
 VOLTS = 12.0
 OWN = BODY.wheel_inertia
 
@@ -59,7 +60,7 @@ def rates(state, modes, torque, grip=1e9):
         body_constants(BODY, GEOMETRY),
         tyres,
         BUMPER,
-        *NOWHERE,
+        NOWHERE,
         slope,
         pushed,
     )

@@ -22,9 +22,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Pose, WheelSpeeds, wrap_angle
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.robot.command_limiter import ramp_towards
 from t3mpc_ros.simulation.plant.contact import Bumper, BumperParameters, contact_force
@@ -50,8 +51,7 @@ from t3mpc_ros.simulation.world import World, clearance, grip_at
 Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
-_NO_SEGMENTS = np.zeros((0, 4))
-_NO_CIRCLES = np.zeros((0, 3))
+_NO_OBSTACLES = Obstacles(np.zeros((0, 4)), np.zeros((0, 3)))
 ROLLING = 0
 """Mode of a rolling tyre; +1 and -1: it slides and pushes the body in that direction."""
 GRAVITY = 9.81
@@ -85,6 +85,18 @@ class Load(NamedTuple):
     """Blocked wheels, right first."""
     radius_multipliers: tuple[float, float] = (1.0, 1.0)
     """True wheel radii over the nominal one, right first."""
+
+
+class PulseTarget(NamedTuple):
+    """Target of the pulse generator."""
+
+    right: float
+    """pulses/s"""
+    left: float
+    reach: float
+    """Largest change of a rate, pulses/s²."""
+    volts: float
+    """Supply; 0 = no power, the rotors turn freely."""
 
 
 class Drivetrain:
@@ -128,6 +140,7 @@ class Drivetrain:
             work=np.zeros((4, 9)),
         )
         self._state, self._modes, self._field = self._arrays[:3]
+        self._integrate_steps = TypedKernel(integrate_drivetrain)
         self._blocked = (False, False)
         self._multipliers = (1.0, 1.0)
         self._read()
@@ -270,38 +283,26 @@ class Drivetrain:
         even = max(gap / (count * self.step), 1e-6)
         reach = min(even, acceleration) if acceleration > 0.0 else even
         right, left = wheels.right / self._microstep, wheels.left / self._microstep
-        self._integrate(right, left, reach / self._microstep, volts, disturbance, count)
+        target = PulseTarget(right, left, reach / self._microstep, volts)
+        self._integrate(target, disturbance, count)
 
-    def _integrate(
-        self,
-        right: float,
-        left: float,
-        reach: float,
-        volts: float,
-        disturbance: Disturbance,
-        count: int,
-    ) -> None:
-        """Integrate ``count`` steps; targets and ``reach`` as in integrate_drivetrain."""
+    def _integrate(self, target: PulseTarget, disturbance: Disturbance, count: int) -> None:
         x, y = self._now[0], self._now[1]
         world = self._world
-        segments, circles = _NO_SEGMENTS, _NO_CIRCLES
+        obstacles = _NO_OBSTACLES
         if world.segments.size or world.circles.size:
             near = self._radius + 2.0 * self.step * count  # 2 m/s: faster than any wheel
-            if clearance(x, y, world.segments, world.circles) < near:
-                segments, circles = world.segments, world.circles
+            if clearance(x, y, *world.obstacles) < near:
+                obstacles = world.obstacles
         if world.patches.size:
             self._tyres[2:] = self._grip * grip_at(x, y, world.patches)
-        integrate_drivetrain(
+        self._integrate_steps(
             self._arrays,
-            right,
-            left,
-            reach,
-            volts,
+            target,
             self._constants,
             self._tyres,
             disturbance.signals,
-            segments,
-            circles,
+            obstacles,
             self.steps_done,
             count,
         )
@@ -316,7 +317,8 @@ class Drivetrain:
         right, left = right / time, left / time
         if right != self._pulses[2] or left != self._pulses[3]:
             self._field[2], self._field[3] = right, left
-        self._integrate(right, left, 1.0, volts, disturbance, count)  # nothing to reach
+        # Nothing to reach.
+        self._integrate(PulseTarget(right, left, 1.0, volts), disturbance, count)
 
     def _block(self, wheel: int) -> None:
         """Stop a wheel at once; its tyre slides until the body has stopped too."""
@@ -390,6 +392,23 @@ class DrivetrainConstants(NamedTuple):
     wider_left: float
 
 
+class StepInputs(NamedTuple):
+    """What acts on the rotors within a step."""
+
+    rate_right: float
+    """Mean of the pulse rate, pulses/s."""
+    rate_left: float
+    position_right: float
+    """Mean position of the field, pulses."""
+    position_left: float
+    peak_right: float
+    """Pull-out torque, N m."""
+    peak_left: float
+    against_right: float
+    """Disturbance torque, N m."""
+    against_left: float
+
+
 class DrivetrainArrays(NamedTuple):
     """State of :func:`integrate_drivetrain`, changed in place."""
 
@@ -425,126 +444,182 @@ def body_constants(body: BodyParameters, geometry: WheelGeometry) -> Body:
 @kernel
 def integrate_drivetrain(
     arrays: DrivetrainArrays,
-    target_right: float,
-    target_left: float,
-    reach: float,
-    volts: float,
+    target: PulseTarget,
     constants: DrivetrainConstants,
     tyres: Array,
     disturbance: DisturbanceSignals,
-    segments: Array,
-    circles: Array,
+    obstacles: Obstacles,
     first: int,
     count: int,
 ) -> None:
     """Integrate rotors, tyres and body over ``count`` steps by the classical Runge-Kutta method.
 
+    Tyres change between rolling and sliding at the end of a step.
+
+    tyres, obstacles : see state_derivative
+    first : number of the first step since the start; the time is first times step
+    """
+    state, totals, step = arrays.state, arrays.totals, constants.step
+    for index in range(first, first + count):
+        slip_right, slip_left = state[5] - state[7], state[6] - state[8]
+        time = (index + 0.5) * step
+        inputs = advance_fields(arrays.field, target, constants, time, disturbance)
+        work = runge_kutta_step(arrays, inputs, constants, tyres, obstacles)
+        change_tyre_modes(arrays, constants, tyres, obstacles)
+        filter_motion(arrays, constants)
+        radius = constants.body.radius
+        totals[0] += 0.5 * step * radius * abs(slip_right + state[5] - state[7])
+        totals[1] += 0.5 * step * radius * abs(slip_left + state[6] - state[8])
+        totals[2] += step * work
+        totals[3] = max(totals[3], abs(arrays.work[3, 4]))
+
+
+@kernel
+def advance_fields(
+    field: Array,
+    target: PulseTarget,
+    constants: DrivetrainConstants,
+    time: float,
+    disturbance: DisturbanceSignals,
+) -> StepInputs:
+    """Ramp the pulse rates and advance the phases by one step; return what acts on the rotors.
+
     The field is constant between two pulses and jumps with each: its position is the whole number
     of pulses in the phase. Evaluated at the stages alone, the jumps would be late by up to half a
     step, an error of first order; within a step the staircase is therefore replaced by the
-    straight line with its mean and its slope. Tyres change between rolling and sliding at the end
-    of a step.
+    straight line with its mean and its slope.
 
-    target_* : target pulse rates (pulses/s); reach : largest change of a rate (pulses/s²)
-    volts : supply voltage; 0 = no power, the rotors turn freely
-    tyres, segments, circles : see state_derivative
-    first : number of the first step since the start; the time is first times step
+    time : middle of the step, s
     """
-    state, modes, field, totals = arrays.state, arrays.modes, arrays.field, arrays.totals
-    body, motor = constants.body, constants.motor
-    viscous, coulomb, width = constants.friction
-    bumper, microstep, step = constants.bumper, constants.microstep, constants.step
-    wider_right, wider_left = constants.wider_right, constants.wider_left
-    work = arrays.work
+    step, microstep, motor = constants.step, constants.microstep, constants.motor
+    rate_right, rate_left, reach = field[2], field[3], target.reach * step
+    field[2], field[3] = ramp_towards(rate_right, rate_left, target.right, target.left, reach)
+    reached = max(abs(target.right - rate_right), abs(target.left - rate_left)) / reach
+    mean_right = mean_rate(rate_right, target.right, reached)
+    mean_left = mean_rate(rate_left, target.left, reached)
+    start_right, start_left = field[0], field[1]
+    field[0], field[1] = start_right + step * mean_right, start_left + step * mean_left
+    return StepInputs(
+        mean_right,
+        mean_left,
+        mean_pulses(start_right, field[0]),
+        mean_pulses(start_left, field[1]),
+        pull_out_torque(mean_right * microstep, target.volts, motor),
+        pull_out_torque(mean_left * microstep, target.volts, motor),
+        disturbance_torque(0, time, disturbance),
+        disturbance_torque(1, time, disturbance),
+    )
+
+
+@kernel
+def runge_kutta_step(
+    arrays: DrivetrainArrays,
+    inputs: StepInputs,
+    constants: DrivetrainConstants,
+    tyres: Array,
+    obstacles: Obstacles,
+) -> float:
+    """Advance the state by one step; return the mean power (W) of the fields.
+
+    The torques of the last stage, at the end of the step, stay in the work space.
+    """
+    state, work, step = arrays.state, arrays.work, constants.step
     trial, slope, total = work[0], work[1], work[2]
     torque, pushed = work[3, 0:2], work[3, 2:5]
-    for index in range(first, first + count):
-        rate_right, rate_left = field[2], field[3]
-        slip_right, slip_left = state[5] - state[7], state[6] - state[8]
-        next_right, next_left = ramp_towards(
-            rate_right, rate_left, target_right, target_left, reach * step
-        )
-        widest = max(abs(target_right - rate_right), abs(target_left - rate_left))
-        reached = widest / (reach * step)
-        mean_right = mean_rate(rate_right, target_right, reached)
-        mean_left = mean_rate(rate_left, target_left, reached)
-        end_right, end_left = field[0] + step * mean_right, field[1] + step * mean_left
-        position_right, position_left = (
-            mean_pulses(field[0], end_right),
-            mean_pulses(field[1], end_left),
-        )
-        peak_right = pull_out_torque(mean_right * microstep, volts, motor)
-        peak_left = pull_out_torque(mean_left * microstep, volts, motor)
-        time = (index + 0.5) * step
-        against_right = disturbance_torque(0, time, disturbance)
-        against_left = disturbance_torque(1, time, disturbance)
-        slope[:] = 0.0
-        total[:] = 0.0
-        done = 0.0
-        for stage in range(4):
-            part = 0.5 if stage in (1, 2) else (1.0 if stage == 3 else 0.0)
-            weight = 1.0 / 3.0 if stage in (1, 2) else 1.0 / 6.0
-            for item in range(9):
-                trial[item] = state[item] + part * step * slope[item]
-            since = (part - 0.5) * step
-            rotor_right, rotor_left = trial[5] / wider_right, trial[6] / wider_left
-            pull_right = rotor_torque(
-                field[4]
-                + microstep * (position_right + since * mean_right)
-                - trial[3] / wider_right,
-                microstep * mean_right - rotor_right,
-                peak_right,
-                motor,
-            )
-            pull_left = rotor_torque(
-                field[5] + microstep * (position_left + since * mean_left) - trial[4] / wider_left,
-                microstep * mean_left - rotor_left,
-                peak_left,
-                motor,
-            )
-            done += weight * microstep * (pull_right * mean_right + pull_left * mean_left)
-            torque[0] = pull_right - against_right
-            torque[1] = pull_left - against_left
-            torque[0] -= friction_torque(rotor_right, viscous, coulomb, width)
-            torque[1] -= friction_torque(rotor_left, viscous, coulomb, width)
-            torque[0] /= wider_right
-            torque[1] /= wider_left
-            state_derivative(
-                trial, modes, torque, body, tyres, bumper, segments, circles, slope, pushed
-            )
-            for item in range(9):
-                total[item] += weight * slope[item]
+    slope[:] = 0.0
+    total[:] = 0.0
+    power = 0.0
+    for stage in range(4):
+        part = 0.5 if stage in (1, 2) else (1.0 if stage == 3 else 0.0)
+        weight = 1.0 / 3.0 if stage in (1, 2) else 1.0 / 6.0
         for item in range(9):
-            state[item] += step * total[item]
-        field[0], field[1] = end_right, end_left
-        field[2], field[3] = next_right, next_left
-        # The last stage is at the end of the step: its torques decide the modes of the tyres.
-        stopped = stops_sliding(state, modes)
+            trial[item] = state[item] + part * step * slope[item]
+        since = (part - 0.5) * step
+        pulled = rotor_torques(trial, arrays.field, inputs, since, constants, torque)
+        power += weight * constants.microstep * pulled
         state_derivative(
-            state, modes, torque, body, tyres, bumper, segments, circles, slope, pushed
+            trial, arrays.modes, torque, constants.body, tyres, constants.bumper, obstacles, slope,
+            pushed,
+        )  # fmt: skip
+        for item in range(9):
+            total[item] += weight * slope[item]
+    for item in range(9):
+        state[item] += step * total[item]
+    return power
+
+
+@kernel
+def rotor_torques(
+    now: Array,
+    field: Array,
+    inputs: StepInputs,
+    since: float,
+    constants: DrivetrainConstants,
+    torque: Array,
+) -> float:
+    """Write motor minus friction and disturbance; return torque times rate of the fields.
+
+    The result is in N m pulses/s: times the microstep it is their power.
+
+    since : time from the middle of the step, s
+    torque : shape (2,), written, N m, for wheels of the nominal radius
+    """
+    microstep = constants.microstep
+    viscous, coulomb, width = constants.friction
+    power = 0.0
+    for wheel in range(2):
+        wider = constants.wider_left if wheel else constants.wider_right
+        rate = inputs.rate_left if wheel else inputs.rate_right
+        position = inputs.position_left if wheel else inputs.position_right
+        rotor = now[5 + wheel] / wider
+        pull = rotor_torque(
+            field[4 + wheel] + microstep * (position + since * rate) - now[3 + wheel] / wider,
+            microstep * rate - rotor,
+            inputs.peak_left if wheel else inputs.peak_right,
+            constants.motor,
         )
-        slides = loses_grip(modes, pushed, body, tyres)
-        if stopped:
-            # Only tyres that the grip can hold: without grip no momentum is transferred.
-            begin_rolling(state, modes, body, tyres)
-        if stopped or slides:
-            state_derivative(
-                state, modes, torque, body, tyres, bumper, segments, circles, slope, pushed
-            )
-        radius, offset = body.radius, body.offset
-        speed = 0.5 * radius * (state[7] + state[8])
-        turning = body.turn * (state[7] - state[8])
-        low_pass(
-            arrays.filtered,
-            turning,
-            0.5 * radius * (slope[7] + slope[8]) - offset * turning * turning,
-            speed * turning + offset * body.turn * (slope[7] - slope[8]),
-            constants.share,
-        )
-        totals[0] += 0.5 * step * radius * abs(slip_right + state[5] - state[7])
-        totals[1] += 0.5 * step * radius * abs(slip_left + state[6] - state[8])
-        totals[2] += step * done
-        totals[3] = max(totals[3], abs(pushed[2]))
+        power += pull * rate
+        against = inputs.against_left if wheel else inputs.against_right
+        torque[wheel] = pull - against - friction_torque(rotor, viscous, coulomb, width)
+        torque[wheel] /= wider
+    return power
+
+
+@kernel
+def change_tyre_modes(
+    arrays: DrivetrainArrays,
+    constants: DrivetrainConstants,
+    tyres: Array,
+    obstacles: Obstacles,
+) -> None:
+    """Let tyres roll or slide after a step, with the torques of its last stage."""
+    state, modes, work, body = arrays.state, arrays.modes, arrays.work, constants.body
+    slope, torque, pushed = work[1], work[3, 0:2], work[3, 2:5]
+    bumper = constants.bumper
+    stopped = stops_sliding(state, modes)
+    state_derivative(state, modes, torque, body, tyres, bumper, obstacles, slope, pushed)
+    slides = loses_grip(modes, pushed, body, tyres)
+    if stopped:
+        # Only tyres that the grip can hold: without grip no momentum is transferred.
+        begin_rolling(state, modes, body, tyres)
+    if stopped or slides:
+        state_derivative(state, modes, torque, body, tyres, bumper, obstacles, slope, pushed)
+
+
+@kernel
+def filter_motion(arrays: DrivetrainArrays, constants: DrivetrainConstants) -> None:
+    """Advance the filter of the IMU by one step, with state and slope at its end."""
+    state, slope, body = arrays.state, arrays.work[1], constants.body
+    radius, offset = body.radius, body.offset
+    speed = 0.5 * radius * (state[7] + state[8])
+    turning = body.turn * (state[7] - state[8])
+    low_pass(
+        arrays.filtered,
+        turning,
+        0.5 * radius * (slope[7] + slope[8]) - offset * turning * turning,
+        speed * turning + offset * body.turn * (slope[7] - slope[8]),
+        constants.share,
+    )
 
 
 @kernel
@@ -555,8 +630,7 @@ def state_derivative(
     body: Body,
     tyres: Array,
     bumper: Bumper,
-    segments: Array,
-    circles: Array,
+    obstacles: Obstacles,
     slope: Array,
     pushed: Array,
 ) -> None:
@@ -566,7 +640,7 @@ def state_derivative(
     modes : shape (2,), see ROLLING
     torque : shape (2,), motor minus friction and disturbance, N m
     tyres : shape (4,), inertia of each wheel (kg m²), largest force of each tyre (N)
-    bumper, segments, circles : see contact_force; empty arrays = no wall is near
+    bumper, obstacles : see contact_force; empty arrays = no wall is near
     slope : shape (9,), written
     pushed : shape (3,), written: R F of both tyres (N m), force of the wall along the robot (N)
     """
@@ -575,6 +649,7 @@ def state_derivative(
     along, angular = 0.5 * radius * (right + left), turn * (right - left)
     cosine, sine = math.cos(now[2]), math.sin(now[2])
     wall = 0.0
+    segments, circles = obstacles
     if segments.shape[0] + circles.shape[0] > 0:
         push_x, push_y = contact_force(
             now[0], now[1], along * cosine, along * sine, bumper, segments, circles
