@@ -452,24 +452,32 @@ class Link:
 
     def _send(self, now_ns: int) -> None:
         """Send the request that is due, if any."""
-        if self._active is not None and self._session is not None:
+        if self._active is not None:
             self._send_active(self._active, now_ns)
         elif self._state in _HANDSHAKE_STATES and self._arbiter.estop and now_ns >= self._estop_ns:
-            self._estop_ns = now_ns + round(NANOSECONDS / self._parameters.cycle_rate)
-            if self._session is not None:  # not started yet, but ESTOP needs no session
-                self._transact(self._session.command(CommandFlag.ESTOP, 0, 0, 0, now_ns), now_ns)
-        elif now_ns < self._due_ns:
-            pass
-        elif self._state is LinkState.CLOSED:
-            self._state = LinkState.OPEN
-            self._actions.append(Open())
-        elif self._state is LinkState.PING and now_ns - self._since_ns >= _DONGLE_START_TIMEOUT_NS:
-            self.port_failed(reasons.NO_DONGLE, False, now_ns)
-        elif self._state is LinkState.PING:
-            self._write(self._transactions.ping(_PING_TIMEOUT_NS, now_ns))
-        elif self._state is LinkState.CFG:
-            self._write(self._transactions.configure(self._parameters.configure(0), now_ns))
-        elif self._handshake is not None:
+            self._send_estop(now_ns)
+        elif now_ns >= self._due_ns:
+            self._send_connecting(now_ns)
+
+    def _send_estop(self, now_ns: int) -> None:
+        """Repeat ESTOP with the cycles: it needs no session that has started."""
+        self._estop_ns = now_ns + round(NANOSECONDS / self._parameters.cycle_rate)
+        if self._session is not None:
+            self._transact(self._session.command(CommandFlag.ESTOP, 0, 0, 0, now_ns), now_ns)
+
+    def _send_connecting(self, now_ns: int) -> None:
+        """Take the next step from a closed port to a session."""
+        match self._state:
+            case LinkState.CLOSED:
+                self._state = LinkState.OPEN
+                self._actions.append(Open())
+            case LinkState.PING if now_ns - self._since_ns >= _DONGLE_START_TIMEOUT_NS:
+                self.port_failed(reasons.NO_DONGLE, False, now_ns)
+            case LinkState.PING:
+                self._write(self._transactions.ping(_PING_TIMEOUT_NS, now_ns))
+            case LinkState.CFG:
+                self._write(self._transactions.configure(self._parameters.configure(0), now_ns))
+        if self._handshake is not None:
             frame, what = self._handshake.next_request(now_ns)
             self._transact(frame, now_ns, what)
 
@@ -506,7 +514,12 @@ class Link:
             self._search_dongle(reasons.DONGLE_TIMEOUT, now_ns)
         elif self._state is LinkState.CFG:
             self._handle_configured(result, now_ns)
-        elif self._active is not None:
+        else:
+            self._handle_robot(result, now_ns)
+
+    def _handle_robot(self, result: TransactionResult, now_ns: int) -> None:
+        """Process the answer of the robot in a session, or in the handshake before it."""
+        if self._active is not None:
             reason = self._active.handle(result)
             if self._active.finished:
                 self._close(LinkState.DONE, reasons.SHUT_DOWN)
