@@ -22,6 +22,7 @@ a convex arena.
 
 from dataclasses import dataclass
 import math
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,15 +63,10 @@ class PortraitParameters(Parameters):
         modes=(2, 3, 3, 4, 4, 2, 3, 2, 4, 3, 2, 4),
         blend=2.0,
     )
-    mirror: bool = parameter(
-        True, 'draw one of the four mirror images of a portrait at each switch'
-    )
-    sample_step: float = parameter(
-        5e-4,
-        'system time between two points of a portrait, which are about 1 cm apart in 4 m',
-        's',
-        (1e-5, 0.5),
-    )
+    mirror: ClassVar[bool] = True
+    """Draw one of the four mirror images of a portrait at each switch."""
+    sample_step: ClassVar[float] = 5e-4
+    """System time between two points of a portrait, s: about 1 cm apart in 4 m."""
     smoothing: float = parameter(
         0.25,
         'standard deviation of the Gaussian window over the length of the path',
@@ -234,7 +230,7 @@ class PortraitPath:
 
     def _draw_mirror(self) -> NDArray[np.bool_]:
         drawn: NDArray[np.bool_] = self._mirrors.integers(0, 2, 2) == 1
-        return drawn if self._parameters.mirror else np.zeros(2, dtype=np.bool_)
+        return drawn
 
     def _line_to(self, point: Array) -> list[Array]:
         """Return the evenly spaced points from the last point to ``point``."""

@@ -9,6 +9,7 @@ signal; only then does Assumption 3 of the paper hold, that the outputs can reac
 
 from dataclasses import dataclass
 import math
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,31 +74,21 @@ class ReferenceParameters(Parameters):
         'seed of the initial perturbation and of random switching; 0: no perturbation',
         bounds=(0, None),
     )
-    perturbation: float = parameter(
-        0.5, 'maximum perturbation of each initial state', bounds=(1e-9, 5.0)
-    )
+    perturbation: ClassVar[float] = 0.5
+    """Maximum perturbation of each initial state by a seed, assumed."""
     settle: float = parameter(
         20.0,
         'system time simulated before the first sample, to reach the attractor',
         's',
         (0.1, 10000.0),
     )
-    solver_step: float = parameter(
-        1e-3,
-        'maximum solver step in system time; one sample is a whole number of steps',
-        's',
-        (1e-6, 2e-3),
-    )
-    memory_horizon: float = parameter(
-        1e5,
-        'system time over which the memory kernel is within its tolerance; '
-        'divided by the time scale, 23 days at the defaults',
-        's',
-        (10.0, 1e9),
-    )
-    memory_tolerance: float = parameter(
-        1e-8, 'relative error of the memory kernel', bounds=(1e-12, 1e-3)
-    )
+    solver_step: ClassVar[float] = 1e-3
+    """Maximum solver step in system time, s, assumed; one sample is a whole number of steps."""
+    memory_horizon: ClassVar[float] = 1e5
+    """System time over which the memory kernel is within its tolerance, s: 23 days at the default
+    time scale."""
+    memory_tolerance: ClassVar[float] = 1e-8
+    """Relative error of the memory kernel, assumed."""
     ramp: float = parameter(
         3.0, 'duration of the smooth increase from zero, for a robot at rest', 's', (0.0, 600.0)
     )

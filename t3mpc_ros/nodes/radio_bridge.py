@@ -14,7 +14,7 @@ import os
 from pathlib import Path
 import select
 import threading
-from typing import Any
+from typing import Any, ClassVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
 from t3mpc_ros.nodes.common import diagnostics, graph_introspection
@@ -69,7 +69,8 @@ class RadioBridgeParameters(RobotTopicParameters, RadioRobotParameters):
         'file with the key of the robot (32 hexadecimal digits), readable by its owner only; '
         'empty = no authentication',
     )
-    imu: ImuParameters = group(ImuParameters)
+    imu: ClassVar[ImuParameters] = ImuParameters()
+    """The board sets its registers; here for the covariances of imu/data_raw."""
     range_sensor: RangeSensorParameters = group(RangeSensorParameters)
     battery: BatteryParameters = group(BatteryParameters)
 

@@ -5,7 +5,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 import secrets
-from typing import Any
+from typing import Any, ClassVar
 
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry, Path
@@ -62,11 +62,8 @@ class ReferenceGeneratorParameters(PathReferenceParameters):
     frame_id: str = parameter('odom', 'frame of the reference pose')
     child_frame_id: str = parameter('base_link', 'frame of the reference twist')
     frames: FrameParameters = group(FrameParameters, inline=True)
-    path_points: int = parameter(
-        600,
-        'maximum number of poses in reference/path (one every 0.1 s); 0 = no path',
-        bounds=(0, 100_000),
-    )
+    path_points: ClassVar[int] = 600
+    """Maximum number of poses in reference/path."""
     enable_stamped_target_twist: bool = parameter(
         False, 'source twist: subscribe to target_twist as TwistStamped instead of Twist'
     )
@@ -235,9 +232,8 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             self._signals_publisher.publish(Int32MultiArray(data=list(signals)))
 
     def _append_to_path(self, state: State) -> None:
-        if self.parameters.path_points:
-            self._path.poses.append(conversions.pose_stamped(state, self._path.header.frame_id))
-            del self._path.poses[: -self.parameters.path_points]
+        self._path.poses.append(conversions.pose_stamped(state, self._path.header.frame_id))
+        del self._path.poses[: -self.parameters.path_points]
 
     def _publish_path(self) -> None:
         if self._path.poses:

@@ -4,7 +4,8 @@
 
 A module declares its parameters as a subclass of :class:`Parameters`. ROS parameters, YAML files,
 the documentation and recorded bags all use that one table. Tables nest: a field made with
-:func:`group` holds another table, whose parameters get dotted names (``law.gain``).
+:func:`group` holds another table, whose parameters get dotted names (``law.gain``). A value that
+nobody has a reason to set is a class variable beside them, a constant.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,7 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 import difflib
 from functools import partial
 import math
-from typing import Any, NamedTuple, Self, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, NamedTuple, Self, get_args, get_origin, get_type_hints
 
 Value = (
     bool
@@ -179,6 +180,14 @@ class Parameters:
         return tuple(entry.spec for entry in _entries(cls))
 
     @classmethod
+    def class_constants(cls) -> dict[str, Value]:
+        """Return the class variables by ROS name, groups included.
+
+        They were parameters once: older files and bags may hold them, with this value alone.
+        """
+        return dict(_constants(cls))
+
+    @classmethod
     def from_dict(cls, values: Mapping[str, object]) -> Self:
         """Return the table with ``values`` (by ROS name) in place of the defaults."""
         return cls().with_values(values)
@@ -189,17 +198,21 @@ class Parameters:
         Raises
         ------
         ParameterError
-            An unknown name (with the nearest known one), a wrong type, a value out of range, or
-            values that contradict.
+            An unknown name (with the nearest known one), a wrong type, a value out of range,
+            another value of a constant, or values that contradict.
         """
         known = {entry.spec.name: entry for entry in _entries(type(self))}
         checked: dict[tuple[str, ...], Value] = {}
-        for name in values:
-            if name not in known:
-                raise ParameterError(f'there is no parameter {name}{nearest_hint(name, known)}')
         for name, value in values.items():
-            # Checked before the group checks itself, so that the error contains the full name.
-            checked[known[name].path] = known[name].spec.check(value)
+            if name in known:
+                # Before the group checks itself, so that the error contains the full name.
+                checked[known[name].path] = known[name].spec.check(value)
+            elif (constant := self.class_constants().get(name)) is None:
+                raise ParameterError(f'there is no parameter {name}{nearest_hint(name, known)}')
+            elif (tuple(value) if isinstance(value, list) else value) != constant:
+                raise ParameterError(
+                    f'{name} is no longer a parameter, it is always {constant}: got {value}'
+                )
         return self._replace(checked)
 
     def check_read_only(self, after: Self) -> None:
@@ -255,6 +268,22 @@ def _entries(table: type[Parameters]) -> tuple[_Entry, ...]:
         _check_names(table.__name__, [entry.spec.name for entry in entries])
         _tables[table] = entries
     return _tables[table]
+
+
+def _constants(table: type[Parameters]) -> Iterator[tuple[str, Value]]:
+    groups = {item.name: item for item in fields(table)}
+    for name, hint in get_type_hints(table).items():
+        if get_origin(hint) is ClassVar:
+            value = getattr(table, name)
+            nested = isinstance(value, Parameters)
+            held = (value.to_dict() | value.class_constants()).items() if nested else [('', value)]
+        elif isinstance(hint, type) and issubclass(hint, Parameters):
+            held = _constants(hint)
+        else:
+            continue
+        inline = name in groups and groups[name].metadata.get('inline')
+        for inner, constant in held:
+            yield '.'.join(part for part in ('' if inline else name, inner) if part), constant
 
 
 def _check_names(table: str, names: list[str]) -> None:

@@ -18,6 +18,7 @@ and a scale error. The filter over (x, y, yaw, bias, scale) combines both:
 
 from dataclasses import dataclass
 import math
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -84,20 +85,11 @@ class GyroOdometryParameters(WheelOdometryParameters):
         bounds=(0.0, 0.5),
         dynamic=True,
     )
-    gyro_bias_limit: float = parameter(
-        0.7,
-        'largest accepted bias; half of it is the standard deviation of an unknown bias',
-        'rad/s',
-        (1e-3, 10.0),
-        source=f'{DATA_SHEET}: ±20 deg/s, and ±20 over temperature',
-    )
-    gyro_bias_drift: float = parameter(
-        5e-5,
-        'random walk of the bias: standard deviation after one second; larger during warm-up',
-        'rad/s/√s',
-        (0.0, 1.0),
-        dynamic=True,
-    )
+    gyro_bias_limit: ClassVar[float] = 0.7
+    """Largest accepted bias, rad/s: ±20 deg/s, and ±20 over temperature (data sheet). Half of it
+    is the standard deviation of an unknown bias."""
+    gyro_bias_drift: ClassVar[float] = 5e-5
+    """Random walk of the bias, rad/s/√s, assumed: standard deviation after one second."""
     gyro_delay: float = parameter(
         0.0048,
         'delay of the low-pass filter of the gyro, modelled as two equal poles (43 Hz)',
@@ -106,13 +98,8 @@ class GyroOdometryParameters(WheelOdometryParameters):
         dynamic=True,
         source='MPU-6000 register map RM-MPU-6000A r4.2: DLPF_CFG 3, 42 Hz',
     )
-    gyro_hold: float = parameter(
-        0.05,
-        'longest time represented by one gyro sample; the rest of a longer gap uses the steps',
-        's',
-        (1e-3, 10.0),
-        dynamic=True,
-    )
+    gyro_hold: ClassVar[float] = 0.05
+    """Longest time that a gyro sample represents, s, assumed; the rest of a gap uses the steps."""
     slip_threshold: float = parameter(
         0.25,
         'yaw rate difference between gyro and steps that indicates slip, plus three times the '
@@ -128,27 +115,13 @@ class GyroOdometryParameters(WheelOdometryParameters):
         (0.0, 10.0),
         dynamic=True,
     )
-    slip_inflation: float = parameter(
-        3000.0,
-        'factor on the variance of the wheel travel while gyro and steps disagree',
-        bounds=(1.0, 1e6),
-        dynamic=True,
-    )
-    standstill_time: float = parameter(
-        1.0,
-        'standstill time over which the bias is averaged, repeatedly',
-        's',
-        (0.1, 60.0),
-        dynamic=True,
-    )
-    standstill_spread: float = parameter(
-        0.0035,
-        'largest standard deviation of the gyro at a standstill; beyond it, or at a yaw rate of '
-        'more than three times this value, the robot is being moved',
-        'rad/s',
-        (1e-5, 1.0),
-        dynamic=True,
-    )
+    slip_inflation: ClassVar[float] = 3000.0
+    """Factor on the variance of the wheel travel while gyro and steps disagree, assumed."""
+    standstill_time: ClassVar[float] = 1.0
+    """Standstill over which the bias is averaged, repeatedly, s, assumed."""
+    standstill_spread: ClassVar[float] = 0.0035
+    """Largest standard deviation of the gyro at a standstill, rad/s, assumed; beyond it, or at a
+    yaw rate of more than three times this value, the robot is being moved."""
 
     def check_consistency(self) -> None:
         """Raise ParameterError when slip and a pushed robot cannot be distinguished."""

@@ -10,6 +10,7 @@ map RM-MPU-6000A-00, those of the GP2Y0A21YK0F those of Sharp's data sheet E4-A0
 
 from dataclasses import dataclass
 import math
+from typing import ClassVar
 
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
@@ -52,9 +53,8 @@ class ImuParameters(Parameters):
         'full scale of the gyro, deg/s (FS_SEL); 8 rad/s are 458 deg/s',
         choices=('250', '500', '1000', '2000'),
     )
-    accel_range: str = parameter(
-        '2', 'full scale of the accelerometer, g (AFS_SEL)', choices=('2', '4', '8', '16')
-    )
+    accel_range: ClassVar[str] = '2'
+    """Full scale of the accelerometer, g (AFS_SEL), as the firmware sets it."""
     low_pass: str = parameter(
         '3',
         'low-pass of gyro and accelerometer (DLPF_CFG): 256, 188, 98, 42, 20, 10 or 5 Hz',
@@ -68,14 +68,8 @@ class ImuParameters(Parameters):
         dynamic=True,
         source=f'{IMU_DATA_SHEET} 6.1, at 10 Hz',
     )
-    accel_noise: float = parameter(
-        400.0,
-        'noise density of the accelerometer',
-        'µg/√Hz',
-        (0.0, 1e5),
-        dynamic=True,
-        source=f'{IMU_DATA_SHEET} 6.2, at 10 Hz',
-    )
+    accel_noise: ClassVar[float] = 400.0
+    """Noise density of the accelerometer, µg/√Hz (data sheet 6.2, at 10 Hz)."""
 
     @property
     def rate_step(self) -> float:
@@ -116,9 +110,8 @@ RANGE_DATA_SHEET = 'Sharp E4-A00201EN'
 class RangeSensorParameters(Parameters):
     """Type, measuring range, beam and mounting of the range sensors."""
 
-    type: str = parameter(
-        'GP2Y0A21YK0F', 'type of the sensors', choices=('GP2Y0A21YK0F',), source=RANGE_DATA_SHEET
-    )
+    type: ClassVar[str] = 'GP2Y0A21YK0F'
+    """The sensors whose voltages the board converts."""
     minimum: float = parameter(
         0.10,
         'smallest distance; the board reports anything nearer as too near',

@@ -4,6 +4,7 @@
 
 from dataclasses import dataclass, replace
 import math
+from typing import ClassVar
 
 import numpy as np
 
@@ -84,9 +85,8 @@ class DigitalTwinParameters(PaperRobotParameters):
     wheel_separation_multiplier: float = parameter(
         1.0, 'true over nominal wheel separation', bounds=(0.8, 1.25)
     )
-    boot_time: float = parameter(
-        0.5, 'restart time of the board after a power loss', 's', (0.0, 10.0)
-    )
+    boot_time: ClassVar[float] = 0.5
+    """Restart time of the board after a power loss, s, assumed."""
     slip_stop: float = parameter(
         1.0,
         'longest disagreement of gyro and steps; beyond it the robot stops until no motion is '

@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from support.constants import with_constants
 
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.chaos.solver import FractionalSolver
@@ -148,8 +149,11 @@ def test_seed_zero_starts_at_the_initial_state_others_near_it():
     parameters = ReferenceParameters(settle=0.1)
     solver = FractionalSolver(hyperchaotic_system(), parameters.step, np.array(parameters.initial))
     start = solver.advance(round(0.1 / parameters.step))
-    small = {'settle': 0.1, 'perturbation': 1e-7}
-    exact, near, again, other = (samples(1, seed=seed, **small)[0].states for seed in (0, 1, 1, 2))
+    table = with_constants(ReferenceParameters, perturbation=1e-7)
+    exact, near, again, other = (
+        ChaoticReference(table(settle=0.1, seed=seed), GEOMETRY).advance().states
+        for seed in (0, 1, 1, 2)
+    )
     assert list(exact) == start.tolist()
     assert near == again
     assert len({exact, near, other}) == 3
@@ -160,9 +164,8 @@ def test_seed_zero_starts_at_the_initial_state_others_near_it():
 @pytest.mark.compiled
 def test_switch_times_do_not_reveal_the_perturbation():
     """With a common random stream the first dwell is the scaled perturbation of y1."""
-    parameters = ReferenceParameters.from_dict(
-        {'settle': 0.1, 'perturbation': 1e-6, 'switching.kind': 'random'}
-    )
+    table = with_constants(ReferenceParameters, perturbation=1e-6)
+    parameters = table.from_dict({'settle': 0.1, 'switching.kind': 'random'})
     dwells, shifts = [], []
     reference = ChaoticReference(parameters, GEOMETRY)
     base = np.array(reference.advance().states)

@@ -134,10 +134,10 @@ def test_a_blocked_wheel_is_detected_and_stops_the_robot(build, blocked, sign):
     """The steps are those of straight motion; the body turns about the blocked wheel."""
     bench = build(
         flat={'twin.faults.wheel_blocked': blocked},
-        parameters={'slip_stop': 0.5, 'odometry.standstill_time': 0.5},
+        parameters={'slip_stop': 0.5},
     )
     bench.connect()
-    bench.run(1.2)  # gyro bias calibrated
+    bench.run(2.2)  # gyro bias calibrated
     assert bench.robot._odometry.calibrated
     bench.drive(-sign * 5.0, -sign * 5.0)
     bench.run(0.45)

@@ -5,6 +5,7 @@
 from argparse import ArgumentTypeError
 from dataclasses import dataclass, replace
 import random
+from typing import ClassVar
 
 import pytest
 
@@ -143,6 +144,36 @@ def test_a_table_with_clashing_names_is_rejected():
                 use()
 
 
+@dataclass(frozen=True)
+class Wheel(Parameters):
+    width: ClassVar[float] = 0.02
+    radius: float = parameter(0.1, 'radius')
+
+
+@dataclass(frozen=True)
+class Cart(Parameters):
+    sizes: ClassVar[tuple[float, ...]] = (1.0, 2.0)
+    wheel: Wheel = group(Wheel)
+    front: Wheel = group(Wheel, inline=True)
+    spare: ClassVar[Wheel] = Wheel(radius=0.2)
+
+
+def test_a_former_parameter_is_accepted_with_its_value_alone():
+    constants = {
+        'sizes': (1.0, 2.0),
+        'wheel.width': 0.02,
+        'width': 0.02,
+        'spare.radius': 0.2,
+        'spare.width': 0.02,
+    }
+    assert Cart.class_constants() == constants
+    assert [spec.name for spec in Cart.specs()] == ['wheel.radius', 'radius']
+    assert Cart.from_dict(constants | {'sizes': [1.0, 2.0]}) == Cart()
+    with pytest.raises(ParameterError) as caught:
+        Cart.from_dict({'wheel.width': 0.03})
+    assert str(caught.value) == 'wheel.width is no longer a parameter, it is always 0.02: got 0.03'
+
+
 def test_direct_construction_is_validated():
     with pytest.raises(ParameterError):
         Inner(gain=0.0)
@@ -152,17 +183,17 @@ def test_direct_construction_is_validated():
 
 def test_assignments_are_parsed_by_the_type_of_the_parameter():
     """``link.rate=2M`` and the address 5433 remain text, ``true`` does not."""
-    words = ['address=5433', 'retries=3', 'cycle_rate=25', 'robot.invert_left=true', 'rate=2M']
+    words = ['address=5433', 'channel=3', 'cycle_rate=25', 'robot.invert_left=true', 'rate=2M']
     found = parse_assignments(LinkParameters, words)
     assert found == {
         'address': '5433',
-        'retries': 3,
+        'channel': 3,
         'cycle_rate': 25,
         'robot.invert_left': True,
         'rate': '2M',
     }
-    with pytest.raises(ParameterError, match="NAME=VALUE: got 'retries'"):
-        parse_assignments(LinkParameters, ['retries'])
+    with pytest.raises(ParameterError, match="NAME=VALUE: got 'channel'"):
+        parse_assignments(LinkParameters, ['channel'])
     with pytest.raises(ParameterError, match='nothing_such'):
         LinkParameters.from_dict(parse_assignments(LinkParameters, ['nothing_such=1']))
 

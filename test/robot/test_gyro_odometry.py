@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from support.constants import split_constants, with_constants
 from support.long_tests import few_of
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
@@ -92,7 +93,8 @@ class Robots:
 
 
 def make_odometries(count=1, **changes):
-    parameters = replace(PARAMETERS, **changes)
+    table, values = split_constants(GyroOdometryParameters, changes)
+    parameters = table(**values)
     return [GyroOdometry(parameters, GEOMETRY) for _ in range(count)]
 
 
@@ -577,4 +579,4 @@ def test_non_finite_input_is_rejected_without_side_effects(bad):
 
 def test_slip_threshold_below_standstill_spread_is_rejected():
     with pytest.raises(ParameterError, match='slip_threshold'):
-        GyroOdometryParameters(slip_threshold=0.02, standstill_spread=0.01)
+        with_constants(GyroOdometryParameters, standstill_spread=0.01)(slip_threshold=0.02)

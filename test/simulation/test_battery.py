@@ -98,14 +98,14 @@ def test_excess_power_collapses_the_voltage_with_finite_values():
 
 
 def test_weak_battery_collapses_under_idle_load():
-    cell = battery(resistance=10.0, idle_current=2.0)
+    cell = battery(resistance=10.0, charge=0.05)
     assert cell.collapsed
     assert all(map(math.isfinite, cell.draw(5.0, 0.1)))
 
 
 def test_collapse_and_low_warning_have_hysteresis():
-    cell = battery(charge=0.3, resistance=1.0, idle_current=0.0)
-    inside = open_circuit_voltage(0.3, 3)
+    cell = battery(charge=0.4, resistance=1.0)
+    inside = open_circuit_voltage(0.4, 3) - cell.parameters.idle_current
 
     def at(volts: float) -> None:
         """Draw the power that results in ``volts``."""

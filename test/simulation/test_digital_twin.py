@@ -12,6 +12,7 @@ import pytest
 from t3mpc_ros.geometry.types import Pose, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.interface import RANGE_SENSORS, RobotCommand, RobotInterface
+from t3mpc_ros.robot.sensor_conversions import ImuParameters
 from t3mpc_ros.simulation.digital_twin import (
     BROWN_OUT_REASON,
     DigitalTwin,
@@ -19,6 +20,7 @@ from t3mpc_ros.simulation.digital_twin import (
     make_robot,
 )
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobot
+from t3mpc_ros.simulation.sensors.imu import SimulatedImuParameters
 
 PERIOD = 10_000_000
 STILL = WheelSpeeds(0.0, 0.0)
@@ -186,7 +188,7 @@ def test_stale_command_is_rejected_before_sending():
 
 
 def test_brown_out_restarts_the_board_and_commands_resume():
-    robot = DigitalTwin(parameters(boot_time=0.5))
+    robot = DigitalTwin(parameters())
     drive(robot, [WheelSpeeds(4.0, 4.0)] * 100)
     before = robot.state
     faulty(robot, brown_out=True)
@@ -283,9 +285,10 @@ def test_integrated_gyro_equals_the_turn():
     assert turned == pytest.approx(truth, rel=0.002)
 
 
-def test_accelerometer_measures_linear_and_centripetal_parts():
-    quiet = {'imu__accel_noise': 0.0, 'imu__accel_offset': 0.0}
-    robot = DigitalTwin(parameters(body__com_offset=0.0, **quiet))
+def test_accelerometer_measures_linear_and_centripetal_parts(monkeypatch):
+    monkeypatch.setattr(ImuParameters, 'accel_noise', 0.0)
+    monkeypatch.setattr(SimulatedImuParameters, 'accel_offset', 0.0)
+    robot = DigitalTwin(parameters(body__com_offset=0.0))
     states = drive(robot, [WheelSpeeds(6.0, 4.0)] * 300)
     speed, turning = states[-1].truth.twist
     sideways = np.mean([state.imu.sideways for state in states[200:]])

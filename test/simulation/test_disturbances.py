@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from support.constants import with_constants
 
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.simulation.plant.disturbances import (
@@ -36,10 +37,10 @@ def test_friction_is_viscous_plus_smoothed_coulomb():
 def test_disturbance_never_exceeds_its_bound():
     generator = np.random.default_rng(2)
     for seed in range(20):
-        parameters = DisturbanceParameters(
+        share = float(generator.choice([0.0, 1.0, generator.uniform()]))
+        parameters = with_constants(DisturbanceParameters, walk_share=share)(
             bound=generator.uniform(0.0, 0.1),
             frequencies=tuple(generator.uniform(0.0, 5.0, generator.integers(0, 6)).tolist()),
-            walk_share=float(generator.choice([0.0, 1.0, generator.uniform()])),
             walk_rate=float(generator.choice([0.1, 100.0])),
         )
         disturbance = Disturbance(parameters, np.random.default_rng(seed))
@@ -50,7 +51,7 @@ def test_disturbance_never_exceeds_its_bound():
 
 
 def test_disturbance_reaches_its_bound_on_each_wheel():
-    parameters = DisturbanceParameters(bound=1.0, walk_share=0.0)
+    parameters = with_constants(DisturbanceParameters, walk_share=0.0)(bound=1.0)
     disturbance = Disturbance(parameters, np.random.default_rng(3))
     torques = np.array([disturbance.torque(0.05 * tick) for tick in range(8000)])
     assert np.abs(torques).max(axis=0) == pytest.approx([1.0, 1.0], abs=0.05)

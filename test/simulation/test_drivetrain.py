@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from support.constants import with_constants
 
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
@@ -94,7 +95,7 @@ def load(
     friction: FrictionParameters = NO_FRICTION,
     blocked: tuple[bool, bool] = (False, False),
 ) -> Load:
-    tyres = TyreParameters(grip=grip, load_share=1.0)
+    tyres = with_constants(TyreParameters, load_share=1.0)(grip=grip)
     return Load(BODY, GEOMETRY, friction, 1.0, tyres, grip_factor, blocked)
 
 
@@ -228,7 +229,7 @@ def test_tyre_slides_beyond_its_grip_in_the_pushed_direction():
 
 def test_undamped_swing_keeps_energy_to_order_four():
     """Without friction the sum of kinetic and magnetic energy is constant to order 4."""
-    motor = StepperMotorParameters(microsteps=256, damping=0.0)
+    motor = with_constants(StepperMotorParameters, damping=0.0)(microsteps=256)
     errors = []
     for step in (0.004, 0.002, 0.001):
         robot = swinging(motor, 0.0005)
@@ -259,7 +260,7 @@ def test_damping_and_friction_only_dissipate_energy():
 
 def test_field_work_equals_energy_gain():
     """Fields of 256 microsteps turn almost smoothly: their work is the energy of the robot."""
-    motor = StepperMotorParameters(microsteps=256, damping=0.0, step_rate=1e6)
+    motor = with_constants(StepperMotorParameters, damping=0.0)(microsteps=256)
     robot = drivetrain(motor=motor, step=0.00025)
     for _ in range(400):
         robot.run(WheelSpeeds(6.0, 3.0), 15.0, VOLTS, calm(), 4)

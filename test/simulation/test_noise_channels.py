@@ -22,7 +22,7 @@ from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensors
 from t3mpc_ros.simulation.transport_delay import TransportDelay
 
 NOISY = {'noise.variance': 1.0, 'disturbance.walk_rate': 0.01}
-IMU = {'imu.gyro_drift': 10.0, 'imu.gyro_noise': 0.5, 'imu.accel_noise': 1000.0}
+IMU = {'imu.gyro_drift': 10.0, 'imu.gyro_noise': 0.5}
 COUNT = 2000
 STILL = WheelSpeeds(0.0, 0.0)
 

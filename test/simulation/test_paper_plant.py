@@ -12,7 +12,7 @@ from support.equations import wheel_coriolis
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.command_limiter import ramp_towards
-from t3mpc_ros.simulation.plant.disturbances import Disturbance
+from t3mpc_ros.simulation.plant.disturbances import Disturbance, DisturbanceParameters
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant.paper_plant import (
     PaperPlant,
@@ -178,10 +178,11 @@ def test_torque_is_limited_per_wheel():
     assert wheels[:10, 0] == pytest.approx(0.01 / inertia * times, rel=1e-9)
 
 
-def test_torque_drive_matches_an_independent_solver():
+def test_torque_drive_matches_an_independent_solver(monkeypatch):
     """(3) and (10) with friction and disturbance, against an independent solver."""
     changes = {'drive__kind': 'torque', 'friction__viscous': 2e-4, 'friction__coulomb': 0.004}
-    changes |= {'disturbance__bound': 0.003, 'disturbance__walk_share': 0.0}
+    changes |= {'disturbance__bound': 0.003}
+    monkeypatch.setattr(DisturbanceParameters, 'walk_share', 0.0)
     simulated = robot(**changes)
     parameters = simulated.parameters
     geometry, friction = parameters.geometry, parameters.friction
@@ -229,6 +230,6 @@ def test_wheel_speed_never_exceeds_the_ceiling():
 
 def test_unstable_substep_is_rejected_with_the_stable_limit():
     with pytest.raises(ParameterError, match='substep must be at most'):
-        PaperRobotParameters.from_dict({'friction.coulomb': 1.0, 'friction.coulomb_width': 0.01})
+        PaperRobotParameters.from_dict({'friction.coulomb': 5.0})
     with pytest.raises(ParameterError, match='substep'):
         PaperRobotParameters.from_dict({'drive.lag': 0.001, 'mass_factor': 0.1, 'substep': 0.01})

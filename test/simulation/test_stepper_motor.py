@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 import pytest
+from support.constants import with_constants
 from support.long_tests import few_of
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
@@ -31,7 +32,7 @@ from t3mpc_ros.simulation.world import load_world
 GEOMETRY = WheelGeometry()
 BODY = BodyParameters()
 NO_FRICTION = FrictionParameters(viscous=0.0, coulomb=0.0)
-HOLDING_ON = TyreParameters(grip=5.0, load_share=1.0)
+HOLDING_ON = TyreParameters(grip=5.0)
 VOLTS = 12.0
 
 
@@ -260,7 +261,7 @@ def test_low_supply_voltage_loses_steps_at_high_speed():
 
 def test_rotor_oscillates_at_its_natural_frequency():
     """A released rotor oscillates with sqrt(N T / J), 15 Hz with this body."""
-    motor = StepperMotorParameters(microsteps=256, damping=0.0)
+    motor = with_constants(StepperMotorParameters, damping=0.0)(microsteps=256)
     robot = drivetrain(motor, step=0.0005)
     peak = pull_out_torque(0.0, VOLTS, motor.constants())
     inertia = needed_torque(motor, 1.0)

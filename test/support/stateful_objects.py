@@ -1312,7 +1312,7 @@ def configure(thing: object, parameters: object) -> None:
 
 
 LATE = (
-    *('*._signals.bound', '*._signals.walk_share'),  # with the next torque
+    '*._signals.bound',  # with the next torque
     '*._ramp.rate',  # with the next command
     *('*._dt', '*._colour', '*._walk_step'),  # with the next measurement
     *('*._voltage', '._supply', '._reports'),  # with the next draw, and the next report

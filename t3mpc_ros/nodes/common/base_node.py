@@ -255,9 +255,8 @@ def declare_parameters(node: Node, parameter_class: type[P], changed: Callable[[
     overrides = _overrides(node)
     specs = {spec.name: spec for spec in parameter_class.specs()}
     _reject_unknown(node, overrides, specs)
-    parameters = parameter_class.from_dict(
-        {name: overrides[name] for name in specs if name in overrides}
-    )
+    own = specs.keys() | parameter_class.class_constants().keys()
+    parameters = parameter_class.from_dict({k: v for k, v in overrides.items() if k in own})
     values = parameters.to_dict()
     for name, spec in specs.items():
         node.declare_parameter(
@@ -338,7 +337,8 @@ def _names_of_nodes() -> frozenset[str]:
     for node in NODES:
         # Only recorder and player need the bag libraries.
         with suppress(ModuleNotFoundError):
-            names |= {spec.name for spec in parameter_class(node).specs()}
+            table = parameter_class(node)
+            names |= {spec.name for spec in table.specs()} | table.class_constants().keys()
     return frozenset(names)
 
 

@@ -3,6 +3,7 @@
 """Parameters of the link: radio, cycle rate, and the parameters of the robot board."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
@@ -102,11 +103,8 @@ class LinkParameters(Parameters):
         '1M', 'air data rate, bit/s; 250k only with nRF24L01+ chips', choices=_RATES
     )
     power: str = parameter('0', 'transmitter output power, dBm', choices=_POWERS)
-    retries: int = parameter(
-        4,
-        'retransmissions without an acknowledgement, 0.7 ms each; late commands are worthless',
-        bounds=(0, 15),
-    )
+    retries: ClassVar[int] = 4
+    """Retransmissions without an acknowledgement, 0.7 ms each: late commands are worthless."""
     address: str = parameter(
         '54334d5043',
         'address of the robot: 10 hexadecimal digits, last transmitted byte first; this is T3MPC',

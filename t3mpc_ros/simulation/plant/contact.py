@@ -17,7 +17,7 @@ property.
 
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -42,14 +42,11 @@ class BumperParameters(Parameters):
     """Circular bumper around the pose of the robot."""
 
     radius: float = parameter(0.11, 'radius of the bumper', 'm', (0.01, 1.0))
-    stiffness: float = parameter(
-        2e4,
-        'force per depth. Without damping a robot of 1.5 kg at 0.5 m/s reaches a depth of 4.3 mm '
-        'and leaves the wall after 27 ms',
-        'N/m',
-        (1e3, 1e6),
-    )
-    damping: float = parameter(100.0, 'force per closing speed', 'N s/m', (0.0, 1e4))
+    stiffness: ClassVar[float] = 2e4
+    """Force per depth, N/m, assumed. Without damping a robot of 1.5 kg at 0.5 m/s reaches a depth
+    of 4.3 mm and leaves the wall after 27 ms."""
+    damping: ClassVar[float] = 100.0
+    """Force per closing speed, N s/m, assumed."""
 
     def constants(self) -> Bumper:
         """Return the argument of :func:`contact_force`."""

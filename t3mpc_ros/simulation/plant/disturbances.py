@@ -4,7 +4,7 @@
 
 from dataclasses import dataclass
 import math
-from typing import NamedTuple, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -24,13 +24,8 @@ class FrictionParameters(Parameters):
         2e-4, 'viscous friction torque per wheel speed', 'N m s/rad', (0.0, 10.0), dynamic=True
     )
     coulomb: float = parameter(0.004, 'Coulomb friction torque', 'N m', (0.0, 10.0), dynamic=True)
-    coulomb_width: float = parameter(
-        0.2,
-        'wheel speed within which the Coulomb torque changes sign (76 % of it at the width)',
-        'rad/s',
-        (1e-3, 100.0),
-        dynamic=True,
-    )
+    coulomb_width: ClassVar[float] = 0.2
+    """Wheel speed within which the Coulomb torque changes sign, rad/s, assumed: 76 % of it."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +41,8 @@ class DisturbanceParameters(Parameters):
         'Hz',
         (0.0, 100.0),
     )
-    walk_share: float = parameter(
-        0.3, 'part of the bound used by a random walk', bounds=(0.0, 1.0), dynamic=True
-    )
+    walk_share: ClassVar[float] = 0.3
+    """Part of the bound that a random walk uses, assumed."""
     walk_rate: float = parameter(
         0.5,
         'standard deviation of the walk after one second, relative to its part of the bound',
@@ -150,11 +144,8 @@ class Disturbance:
     @property
     def signals(self) -> DisturbanceSignals:
         """Argument of :func:`disturbance_torque`."""
-        parameters, signals = self.parameters, self._signals
-        if (parameters.bound, parameters.walk_share) != signals[:2]:
-            self._signals = signals._replace(
-                bound=parameters.bound, walk_share=parameters.walk_share
-            )
+        if self.parameters.bound != self._signals.bound:
+            self._signals = self._signals._replace(bound=self.parameters.bound)
         return self._signals
 
     @property

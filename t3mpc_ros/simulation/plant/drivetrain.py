@@ -17,7 +17,7 @@ modelled: sliding sideways, and load transfer between the wheels.
 
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -67,9 +67,8 @@ class TyreParameters(Parameters):
     grip: float = parameter(
         0.6, 'coefficient of friction between tyre and floor', bounds=(0.0, 5.0), dynamic=True
     )
-    load_share: float = parameter(
-        0.8, 'part of the weight on the driven axle; the rest is on the caster', bounds=(0.0, 1.0)
-    )
+    load_share: ClassVar[float] = 0.8
+    """Part of the weight on the driven axle, assumed; the rest is on the caster."""
 
 
 class Load(NamedTuple):

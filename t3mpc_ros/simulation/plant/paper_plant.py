@@ -4,7 +4,7 @@
 
 from dataclasses import dataclass, replace
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -130,15 +130,10 @@ class PaperRobotParameters(Parameters):
         's',
         (1e-5, 0.01),
     )
-    standstill_speed: float = parameter(
-        0.1, 'true wheel speed below which the robot is at standstill', 'rad/s', (0.0, 1.0)
-    )
-    max_catch_up_time: float = parameter(
-        1.0,
-        'longest time simulated after a gap between requests; the rest of the gap is skipped',
-        's',
-        (0.5, 60.0),
-    )
+    standstill_speed: ClassVar[float] = 0.1
+    """True wheel speed below which the robot is at standstill, rad/s, assumed."""
+    max_catch_up_time: ClassVar[float] = 1.0
+    """Longest time simulated after a gap between requests, s, assumed; the rest is skipped."""
     seed: int = parameter(1, 'seed of disturbance and noise', bounds=(0, None))
 
     @property

@@ -10,7 +10,7 @@ lost. T falls with the field speed because winding impedance and back-EMF reduce
 
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
@@ -65,26 +65,13 @@ class StepperMotorParameters(Parameters):
     phase_current: float = parameter(
         1.0, 'peak current set in the driver', 'A', (0.01, 50.0), dynamic=True
     )
-    damping: float = parameter(
-        0.01,
-        'torque per speed of the rotor against its field, near synchronism',
-        'N m s/rad',
-        (0.0, 1.0),
-    )
-    damping_width: float = parameter(
-        2.0,
-        'speed relative to the field at which the damping has fallen to a quarter: an unlocked '
-        'rotor is not dragged along',
-        'rad/s',
-        (0.01, 1000.0),
-    )
-    step_rate: float = parameter(
-        10_000.0,
-        'largest pulse rate of a wheel',
-        '1/s',
-        (1.0, 1e6),
-        source='one step for two ticks of a 20 kHz interrupt',
-    )
+    damping: ClassVar[float] = 0.01
+    """Torque per speed of the rotor against its field, near synchronism, N m s/rad, assumed."""
+    damping_width: ClassVar[float] = 2.0
+    """Speed relative to the field at which the damping has fallen to a quarter, rad/s, assumed: an
+    unlocked rotor is not dragged along."""
+    step_rate: ClassVar[float] = 10_000.0
+    """Largest pulse rate of a wheel, 1/s: one step for two ticks of a 20 kHz interrupt."""
 
     @property
     def microstep(self) -> float:

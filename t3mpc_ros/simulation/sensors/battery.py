@@ -5,6 +5,7 @@
 from bisect import bisect_right
 from dataclasses import dataclass
 import math
+from typing import ClassVar
 
 from t3mpc_ros.parameters.table import ParameterError, parameter
 from t3mpc_ros.robot.interface import BatteryReading
@@ -25,28 +26,17 @@ class SimulatedBatteryParameters(BatteryParameters):
     resistance: float = parameter(
         0.15, 'resistance of cells and wires', 'ohm', (1e-3, 10.0), dynamic=True
     )
-    idle_current: float = parameter(
-        0.3,
-        'current besides the motors: eight range sensors at 30 mA and the board behind a linear '
-        'regulator',
-        'A',
-        (0.0, 10.0),
-        dynamic=True,
-        source='Sharp E4-A00201EN: 30 mA each; the remaining 60 mA assumed',
-    )
+    idle_current: ClassVar[float] = 0.3
+    """Current besides the motors, A: eight range sensors at 30 mA (Sharp E4-A00201EN), and 60 mA
+    of the board, assumed."""
     low_voltage: float = parameter(
         10.2, 'voltage below which the robot reports a low battery', 'V', (0.0, 60.0), dynamic=True
     )
     brown_out: float = parameter(
         8.0, 'voltage below which motor drivers and board fail', 'V', (0.0, 60.0), dynamic=True
     )
-    hysteresis: float = parameter(
-        0.3,
-        'voltage above either threshold at which its condition ends',
-        'V',
-        (0.0, 5.0),
-        dynamic=True,
-    )
+    hysteresis: ClassVar[float] = 0.3
+    """Voltage above either threshold at which its condition ends, V, assumed."""
     charge: float = parameter(1.0, 'initial charge, 0 to 1', bounds=(0.0, 1.0))
 
     def check_consistency(self) -> None:

@@ -4,6 +4,7 @@
 
 from dataclasses import dataclass
 import math
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -46,14 +47,8 @@ class SimulatedImuParameters(ImuParameters):
         bounds=(0.0, 0.5),
         dynamic=True,
     )
-    accel_offset: float = parameter(
-        50.0,
-        'bound of the zero-g offset, which is drawn for each sensor and axis',
-        'mg',
-        (0.0, 1000.0),
-        dynamic=True,
-        source=f'{IMU_DATA_SHEET} 6.2, x and y axes',
-    )
+    accel_offset: ClassVar[float] = 50.0
+    """Bound of the zero-g offset, mg, drawn for each sensor and axis (data sheet 6.2, x and y)."""
 
     def share(self, step: float) -> float:
         """Return the argument of :func:`low_pass` for steps of ``step`` s: 1 - exp(-p step)."""

@@ -17,14 +17,14 @@ for 2 cm, and no object for contact. From 3.6 to 10 cm it reads "too near".
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from t3mpc_ros.parameters.table import ParameterError, parameter
+from t3mpc_ros.parameters.table import parameter
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.robot.sensor_conversions import (
-    RANGE_DATA_SHEET,
     RangeSensorParameters,
     decode_range,
     encode_range,
@@ -43,20 +43,10 @@ _EDGE, _POWER, _SHARPNESS = 0.0558, 1.63, 7.0  # m, 1, 1: from 1 to 8 cm
 class SimulatedRangeSensorParameters(RangeSensorParameters):
     """Timing and errors of the simulated range sensors; converter of the board."""
 
-    update_period: float = parameter(
-        0.0383,
-        'mean time of a measurement; the sensors are not synchronised',
-        's',
-        (0.001, 1.0),
-        source=f'{RANGE_DATA_SHEET}, figure 1',
-    )
-    period_spread: float = parameter(
-        0.0096,
-        'largest deviation of the period of a sensor from the mean',
-        's',
-        (0.0, 0.5),
-        source=f'{RANGE_DATA_SHEET}, figure 1',
-    )
+    update_period: ClassVar[float] = 0.0383
+    """Mean time of a measurement, s (data sheet, figure 1); the sensors are not synchronised."""
+    period_spread: ClassVar[float] = 0.0096
+    """Largest deviation of the period of a sensor from the mean, s (data sheet, figure 1)."""
     voltage_noise: float = parameter(
         0.01, 'standard deviation of the converted voltage', 'V', (0.0, 1.0), dynamic=True
     )
@@ -68,19 +58,10 @@ class SimulatedRangeSensorParameters(RangeSensorParameters):
         (0.0, 0.5),
         dynamic=True,
     )
-    adc_bits: int = parameter(
-        10, 'resolution of the converter', 'bit', (6, 16), source='ATmega: 10 bit'
-    )
-    adc_reference: float = parameter(5.0, 'full-scale voltage of the converter', 'V', (1.0, 10.0))
-
-    def check_consistency(self) -> None:
-        """Raise ParameterError when bounds cross or a sensor is mounted beyond the body."""
-        super().check_consistency()
-        if self.period_spread >= self.update_period:
-            raise ParameterError(
-                f'period_spread must be less than update_period ({self.update_period:g} s): '
-                f'got {self.period_spread:g}'
-            )
+    adc_bits: ClassVar[int] = 10
+    """Resolution of the converter of an ATmega."""
+    adc_reference: ClassVar[float] = 5.0
+    """Full-scale voltage of the converter, V: its supply."""
 
     @property
     def adc_steps(self) -> int:

@@ -1,0 +1,21 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Parameter tables with other values of their constants."""
+
+from t3mpc_ros.parameters.table import Parameters
+
+
+def with_constants(table: type[Parameters], **constants: object) -> type[Parameters]:
+    """Return a subclass of a table in which some class variables have other values."""
+    unknown = constants.keys() - table.class_constants().keys()
+    assert not unknown, f'{table.__name__} has no constants {unknown}'
+    return type(table.__name__, (table,), constants)
+
+
+def split_constants(
+    table: type[Parameters], values: dict[str, object]
+) -> tuple[type[Parameters], dict[str, object]]:
+    """Return the table with the constants among ``values``, and the other values."""
+    constants = {name: value for name, value in values.items() if name in table.class_constants()}
+    others = {name: value for name, value in values.items() if name not in constants}
+    return with_constants(table, **constants), others
