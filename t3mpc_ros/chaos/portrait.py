@@ -87,17 +87,8 @@ class PortraitParameters(Parameters):
 class PortraitPath:
     """Endless path through the portraits of one seed.
 
-    Parameters
-    ----------
-    system
-        Orders, initial state, perturbation and memory of system (85).
-    parameters
-        Arena, switching and smoothing.
-    speed
-        Speed at which the path is driven: the dwell times of the switching are those of a robot
-        that drives steadily, m/s.
-    seed
-        Not negative, of any length; 0: no perturbation.
+    Dwell times are those of a robot that drives steadily at ``speed`` (m/s). The seed has any
+    length; 0: no perturbation.
     """
 
     def __init__(
@@ -133,11 +124,6 @@ class PortraitPath:
         """Continue with the path of another seed, at first in a straight line to it.
 
         The seed is not published or logged.
-
-        Raises
-        ------
-        ValueError
-            The seed is negative.
         """
         if seed < 0:
             raise ValueError('seed must not be negative')  # without its value, which is secret

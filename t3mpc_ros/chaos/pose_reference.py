@@ -105,14 +105,8 @@ class PathClock:
 
     A path waits for a robot that has not set off, whose controller starts later, say, or that
     looks around or makes a detour. It does not know what holds the robot up, and so does not
-    wait forever: where it leads through an obstacle, no robot can follow.
-
-    Parameters
-    ----------
-    parameters
-        Distance and patience.
-    on_the_way
-        Whether the path also waits for a robot that has set off.
+    wait forever: where it leads through an obstacle, no robot can follow. ``on_the_way``: it
+    also waits for a robot that has set off.
     """
 
     def __init__(self, parameters: WaitParameters, *, on_the_way: bool = True) -> None:
@@ -180,16 +174,7 @@ class PathSource(Protocol):
 class PortraitSource:
     """The chaotic path of a seed, and of others after random times.
 
-    Parameters
-    ----------
-    parameters
-        System, arena, switching, times of new seeds, limits and rate.
-    geometry, start
-        Wheels of the robot, and its pose at rest.
-    seed
-        First seed; it also determines the times of the next ones.
-    next_seed
-        Returns each further seed.
+    The first seed also determines the times of the next ones, which ``next_seed`` returns.
     """
 
     def __init__(
@@ -234,16 +219,7 @@ class PortraitSource:
 class GivenPathSource:
     """A path of which points arrive now and then; the robot rests where no more are known.
 
-    Parameters
-    ----------
-    parameters
-        Limits and rate.
-    geometry, start
-        Wheels of the robot, and its pose at rest.
-    points
-        First points (m), shape (n, 2).
-    repeat
-        Whether the first points are driven again and again.
+    First points: m, shape (n, 2); with ``repeat`` they are driven again and again.
     """
 
     def __init__(
@@ -260,13 +236,7 @@ class GivenPathSource:
             self.add_points(points)
 
     def add_points(self, points: Array) -> None:
-        """Append points (m), shape (n, 2).
-
-        Raises
-        ------
-        PathError
-            They are not finite.
-        """
+        """Append points (m), shape (n, 2)."""
         self._timing.add_points(points)
         self._timing.drive_to_last_point()
 
@@ -279,15 +249,7 @@ class GivenPathSource:
 
 
 class TwistSource:
-    """Commanded twists as a reference within the limits, with the pose that they lead to.
-
-    Parameters
-    ----------
-    parameters
-        Limits, rate and time-out.
-    start
-        Pose of the robot, at rest.
-    """
+    """Commanded twists as a reference within the limits, with the pose that they lead to."""
 
     def __init__(self, parameters: PathReferenceParameters, start: Pose) -> None:
         self._limits = parameters.motion

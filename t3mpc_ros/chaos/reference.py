@@ -138,15 +138,7 @@ class ReferenceSample:
 
 
 class ChaoticReference:
-    """Generates the samples of the switching chaotic reference.
-
-    Parameters
-    ----------
-    parameters
-        System, scaling and switching.
-    geometry
-        Wheel radius and separation.
-    """
+    """Generates the samples of the switching chaotic reference."""
 
     def __init__(self, parameters: ReferenceParameters, geometry: WheelGeometry) -> None:
         self._parameters = parameters
@@ -166,11 +158,6 @@ class ChaoticReference:
 
         The seed may have any length: with 128 random bits a run cannot be predicted. The seed is
         not published or logged.
-
-        Raises
-        ------
-        ValueError
-            The seed is negative.
         """
         if seed is not None and seed < 0:
             raise ValueError('seed must not be negative')  # without its value, which is secret
@@ -188,13 +175,7 @@ class ChaoticReference:
         self._switches = 0
 
     def advance(self) -> ReferenceSample:
-        """Return the next sample; the first one after a reset has index 0.
-
-        Raises
-        ------
-        FloatingPointError
-            The solution of (85) is not finite.
-        """
+        """Return the next sample; the first one after a reset has index 0."""
         parameters = self._parameters
         if self._index:
             self._solver.advance(parameters.steps_per_sample)

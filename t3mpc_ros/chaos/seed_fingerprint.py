@@ -21,17 +21,7 @@ _PATTERN = re.compile(r'([0-9a-f]{32,}):([0-9a-f]{64})')
 def fingerprint_seed(seed: int, salt: bytes) -> str:
     """Return the fingerprint of ``seed``: salt and digest as hexadecimal digits, with a colon.
 
-    Parameters
-    ----------
-    seed
-        Not negative, of any length.
-    salt
-        At least :data:`SALT_BYTES` random bytes, new ones for each fingerprint.
-
-    Raises
-    ------
-    ValueError
-        The salt is too short, or the seed negative.
+    The salt has at least :data:`SALT_BYTES` random bytes, new ones for each fingerprint.
     """
     if len(salt) < SALT_BYTES:
         raise ValueError(f'salt must have at least {SALT_BYTES} bytes: got {len(salt)}')
@@ -44,10 +34,7 @@ def fingerprint_seed(seed: int, salt: bytes) -> str:
 def matches_fingerprint(text: str, seed: int) -> bool:
     """Return whether ``text`` is a fingerprint of ``seed``.
 
-    Raises
-    ------
-    ValueError
-        ``text`` does not have the form of a fingerprint.
+    ValueError: ``text`` does not have the form of a fingerprint.
     """
     match = _PATTERN.fullmatch(text)
     if not match or len(match[1]) % 2:

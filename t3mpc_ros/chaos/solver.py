@@ -48,11 +48,7 @@ def mode_weights(
               \phi_n(a) = \int_0^1 e^{-a u} (1 - u)\,du = \frac{a - 1 + e^{-a}}{a^2}
 
     Both closed forms cancel for small a (all digits at 1e-8), where the Taylor series is used.
-
-    Parameters
-    ----------
-    decay
-        a = rate * step, not negative, any shape.
+    ``decay`` is a = rate * step, not negative, any shape.
     """
     small = decay < 0.5
     a = np.where(small, 1.0, decay)
@@ -132,23 +128,9 @@ def advance_solution(
 class FractionalSolver:
     r"""Solves D^q y = f(y) step by step at constant cost and constant memory.
 
-    Parameters
-    ----------
-    system
-        Each state may have its own order; at order 1 the method is Heun's.
-    step
-        s.
-    initial
-        Shape (d,), the state at time zero, where the integral starts.
-    horizon
-        Longest lag (s) at which the kernel is within its tolerance; longer runs are safe.
-    tolerance
-        Relative error of the memory kernel at lags from one step to the horizon.
-
-    Raises
-    ------
-    ValueError
-        An argument is outside its range or has the wrong size.
+    ``initial`` (shape (d,)) is the state at time zero, where the integral starts; the memory
+    kernel has the relative error ``tolerance`` at lags from one step to ``horizon`` (s), and
+    longer runs are safe.
     """
 
     def __init__(
@@ -191,13 +173,7 @@ class FractionalSolver:
         self.reset(initial)
 
     def reset(self, initial: NDArray[np.float64] | None = None) -> None:
-        """Reset to time zero with an empty memory, and to another initial state if one is given.
-
-        Raises
-        ------
-        ValueError
-            The initial state has the wrong size or is not finite.
-        """
+        """Reset to time zero with an empty memory, to another initial state if one is given."""
         if initial is not None:
             if np.shape(initial) != self._initial.shape:
                 raise ValueError(
@@ -240,13 +216,7 @@ class FractionalSolver:
     def advance(self, steps: int = 1) -> NDArray[np.float64]:
         """Advance by ``steps`` steps and return a copy of the new state, shape (d,).
 
-        Raises
-        ------
-        ValueError
-            The number of steps is negative.
-        FloatingPointError
-            The solution is not finite: the step is too long, or the solution grows without
-            bound.
+        FloatingPointError: the step is too long, or the solution grows without bound.
         """
         if steps < 0:
             raise ValueError(f'steps must not be negative: got {steps}')

@@ -57,21 +57,9 @@ def fit_sum_of_exponentials(
 ) -> SumOfExponentials:
     """Return a sum that approximates k(t) with a relative error of at most ``tolerance``.
 
-    Parameters
-    ----------
-    order
-        q, above 0 and at most 1; at 1 the result is exactly one mode of rate 0 and weight 1.
-    shortest, horizon
-        The lags (s) between which the error is bounded.
-    tolerance
-        Relative, from 1e-12 to 0.1.
-
-    Raises
-    ------
-    ValueError
-        An argument is outside its range.
-    ArithmeticError
-        The tolerance is not reached; rounding permits it for lags up to 15 decades apart.
+    The lags are from ``shortest`` to ``horizon`` (s); at order q = 1 it is exactly one mode of
+    rate 0 and weight 1. ArithmeticError: the tolerance is not reached; rounding permits it for
+    lags up to 15 decades apart.
     """
     if not 0.0 < order <= 1.0:
         raise ValueError(f'order must be above 0 and at most 1: got {order}')

@@ -98,15 +98,9 @@ class SwitchingSchedule:
     *random* draws each dwell uniformly between its bounds and each next mode uniformly among the
     others, so that neither can be predicted without the seed. With one mode there are no switches.
 
-    Only the current dwell is kept: memory is constant, each switch passed costs one draw, and a
-    query about an earlier dwell restarts at time zero.
-
-    Parameters
-    ----------
-    parameters
-        Kind, modes and times.
-    seed
-        Not negative, of any length; kind *fixed* ignores it.
+    Only the current dwell is kept: memory is constant, each switch passed costs one draw, and
+    a query about an earlier dwell restarts at time zero. The seed has any length; kind *fixed*
+    ignores it.
     """
 
     def __init__(self, parameters: SwitchingParameters, seed: int = 0) -> None:
@@ -118,13 +112,7 @@ class SwitchingSchedule:
         self._restart()
 
     def at(self, time: float) -> SwitchingMode:
-        """Return the active mode at ``time`` (s since the start of the run).
-
-        Raises
-        ------
-        ValueError
-            The time is negative or not finite.
-        """
+        """Return the active mode at ``time`` (s since the start of the run)."""
         if not 0.0 <= time < math.inf:
             raise ValueError(f'time must be finite and not negative: got {time}')
         if time < self._dwell.since:

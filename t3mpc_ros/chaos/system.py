@@ -34,11 +34,6 @@ class QuadraticSystem:
     .. math:: D^{q_i} y_i = c_i + \sum_j L_{ij} y_j + \sum_{jk} Q_{ijk}\, y_j y_k
 
     Repeated terms are added. States are numbered from zero.
-
-    Raises
-    ------
-    ValueError
-        An order is outside (0, 1], a state does not exist, or a gain is not finite.
     """
 
     orders: tuple[float, ...]

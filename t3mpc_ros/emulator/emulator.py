@@ -61,23 +61,9 @@ class EmulatorParameters(Parameters):
 class Emulator:
     """A dongle on a serial line and a robot in its radio range, in virtual time.
 
-    Parameters
-    ----------
-    parameters
-        Constant during the life of the emulator.
-    key
-        Key of the robot, 16 bytes; empty for an open link.
-    seed
-        Seed of all random generators except those of the plant.
-    now_ns
-        Start of virtual time: both boards have booted, the robot is at rest.
-    erased
-        The EEPROM of the robot is blank: it has neither settings nor a key.
-
-    Raises
-    ------
-    FirmwareLibraryError
-        The C core of the firmware cannot be compiled: no compiler, for example.
+    At ``now_ns`` both boards have booted and the robot is at rest. ``erased``: its EEPROM
+    holds neither settings nor a key. ``seed`` is that of all but the plant.
+    FirmwareLibraryError: there is no C compiler, for example.
     """
 
     def __init__(
@@ -209,13 +195,7 @@ class Emulator:
     # -- faults -----------------------------------------------------------------------------------
 
     def schedule_fault(self, fault: Fault) -> None:
-        """Schedule a fault; its start counts from the start of the emulator.
-
-        Raises
-        ------
-        FaultError
-            The kind does not exist, or a number is out of range.
-        """
+        """Schedule a fault; its start counts from the start of the emulator."""
         self._schedule_fault(fault, self._start_ns)
 
     def inject(self, name: str, duration: float = math.nan, value: float = math.nan) -> None:
@@ -332,12 +312,8 @@ def _no_action() -> None:
 class StopTimeMonitor:
     """Measures the time from the last command to standstill, unless standstill was commanded.
 
-    Stops after silence, reset, emergency stop and shutdown of the host are measured.
-
-    Parameters
-    ----------
-    emulator
-        The monitor takes over ``on_command`` of its board.
+    Stops after silence, reset, emergency stop and shutdown of the host are measured. It takes
+    over ``on_command`` of the board.
     """
 
     def __init__(self, emulator: Emulator) -> None:

@@ -75,11 +75,6 @@ def parse_fault(text: str) -> Fault:
     """Return the fault written as ``name:at[:for[:value]]``, ``loss:5:inf:0.3`` for example.
 
     ``at`` (start) and ``for`` (duration) are in seconds.
-
-    Raises
-    ------
-    FaultError
-        The kind does not exist, a number is malformed or out of range.
     """
     name, *numbers = text.split(':')
     if not 1 <= len(numbers) <= 3:
@@ -126,13 +121,8 @@ class FaultInterval(NamedTuple):
 class FaultInjection:
     """Schedule of faults: which are active now, and when a random fault occurs.
 
-    Parameters
-    ----------
-    now_ns
-        Returns the virtual time.
-    seed
-        Seed of the random generators. Each kind of fault has its own generator, so faults do not
-        change each other's random sequence.
+    Each kind of fault has its own generator, so faults do not change the random sequence of
+    others. ``now_ns`` returns the virtual time.
     """
 
     def __init__(self, now_ns: Callable[[], int], seed: int) -> None:

@@ -98,17 +98,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 class Board:
     """One board of the library: ``call('run', 5)`` is ``t3_host_<kind>_run(board, 5)``.
 
-    Parameters
-    ----------
-    kind
-        ``robot`` or ``dongle``.
-    arguments
-        Those of ``t3_host_<kind>_new``.
-
-    Raises
-    ------
-    FirmwareLibraryError
-        The core cannot be compiled.
+    ``kind`` is ``robot`` or ``dongle``, the arguments are those of ``t3_host_<kind>_new``.
     """
 
     def __init__(self, kind: str, *arguments: Any) -> None:
@@ -135,13 +125,7 @@ class Board:
 
 @cache
 def load_library() -> ctypes.CDLL:
-    """Return the core with the signatures of its functions, compiled if necessary.
-
-    Raises
-    ------
-    FirmwareLibraryError
-        The core cannot be compiled or loaded.
-    """
+    """Return the core with the signatures of its functions, compiled if necessary."""
     try:
         library = ctypes.CDLL(str(compile_library()))
     except OSError as error:
@@ -157,14 +141,7 @@ def load_library() -> ctypes.CDLL:
 def compile_library() -> Path:
     """Return the path of the compiled core; compile it unless the cache holds it.
 
-    Raises
-    ------
-    CompilerMissingError
-        There is no compiler.
-    FirmwareLibraryError
-        The compiler fails.
-    OSError
-        No folder is writable.
+    CompilerMissingError: there is no compiler; FirmwareLibraryError: it fails.
     """
     target = writable_directory(os.environ, f'firmware-{_digest()}') / 'libt3core.so'
     if not target.exists():

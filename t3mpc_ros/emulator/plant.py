@@ -50,13 +50,9 @@ class Registers(NamedTuple):
 class Plant:
     """The robot without its board.
 
-    Parameters
-    ----------
-    parameters
-        Of the digital twin. Its command limiter, transport delay, odometry and slip monitor are
-        part of its board and unused here.
-    clock_rate
-        Rate of the clock of the board: 1.005 means 1.005 s on that clock per second.
+    Of the parameters of the twin, command limiter, transport delay, odometry and slip monitor
+    are part of the board and unused here. ``clock_rate`` 1.005: 1.005 s per second on the
+    clock of the board.
     """
 
     def __init__(self, parameters: DigitalTwinParameters, clock_rate: float = 1.0) -> None:

@@ -31,15 +31,8 @@ class PtyPortError(Exception):
 class PtyPort:
     """A pseudo-terminal and the symbolic link to it.
 
-    Parameters
-    ----------
-    link
-        Path of the port; an existing symbolic link is replaced.
-
-    Raises
-    ------
-    PtyPortError
-        The path exists and is no symbolic link, or its folder is not writable.
+    An existing symbolic link is replaced; PtyPortError: the path is something else, or its
+    folder is not writable.
     """
 
     def __init__(self, link: Path) -> None:
@@ -121,22 +114,8 @@ def serve(
 ) -> None:
     """Run the emulator on the wall clock until ``stopped()`` is true.
 
-    Parameters
-    ----------
-    emulator
-        Continues from its current virtual time.
-    port
-        Port of the dongle.
-    real_time_factor
-        Virtual seconds per second.
-    stopped
-        Polled at least 50 times a second.
-    restart_on_open
-        Whether opening a port reboots its board, as DTR does on most boards.
-    console_port
-        Port of the USB console of the robot board, if any.
-    on_update
-        Called after each update of the emulator.
+    ``stopped`` is polled at least 50 times a second, ``on_update`` called after each update.
+    ``restart_on_open``: opening a port reboots its board, as DTR does on most.
     """
     now_ns, clock = emulator.now_ns, time.monotonic()
     number, plugged_in, connected = emulator.port_number, emulator.port_open, False

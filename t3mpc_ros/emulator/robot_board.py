@@ -37,25 +37,9 @@ class RadioSettings(NamedTuple):
 class RobotBoard:
     """The robot board with its firmware.
 
-    Parameters
-    ----------
-    plant
-        Motors, sensors and battery.
-    key
-        16 bytes; empty for an open link.
-    noise
-        Start (32 bits) of what the board takes for noise; used for nonces only.
-    load
-        Loads the payload that the next packet fetches.
-    rate
-        Bit rate in the settings, as in CFG: 0 is 250 kbit/s.
-    channel
-        Channel in the settings; None: the EEPROM is blank.
-
-    Raises
-    ------
-    FirmwareLibraryError
-        The core of the firmware cannot be compiled.
+    ``load`` loads the payload that the next packet fetches. ``noise`` is the start (32 bits)
+    of what the board takes for noise, for nonces only. ``rate`` and ``channel`` are in the
+    settings, as in CFG; without a channel the EEPROM is blank.
     """
 
     def __init__(

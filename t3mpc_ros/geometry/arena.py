@@ -28,15 +28,8 @@ class Obstacles(NamedTuple):
 class Arena:
     """A convex polygon; a path in an L-shaped room has the hull as arena and walls to avoid.
 
-    Parameters
-    ----------
-    numbers
-        left, bottom, right, top of a rectangle; or x, y of three or more corners in turn, m.
-
-    Raises
-    ------
-    ParameterError
-        Another count of numbers, no area, or a corner at which the polygon is not convex.
+    Its numbers are left, bottom, right, top of a rectangle, or x, y of three or more corners
+    in turn, m.
     """
 
     def __init__(self, numbers: Sequence[float]) -> None:

@@ -26,11 +26,6 @@ def load_path(file: str | Path) -> Array:
     A file ``.csv`` has x and y in the columns of that name, or in the first two without a header;
     other columns are ignored. A file ``.yaml`` has the key ``points`` with a list of [x, y], and
     optionally ``closed: true``.
-
-    Raises
-    ------
-    PathError
-        The file cannot be read or is invalid; the text contains the file, the entry and the value.
     """
     path = Path(file)
     try:

@@ -127,17 +127,8 @@ def check_points(points: Array) -> None:
 class PathTiming:
     """Returns pose and twist period by period along a path that grows while it is driven.
 
-    Parameters
-    ----------
-    limits
-        Limits of the motion.
-    geometry
-        Relates twist and wheel speeds.
-    period
-        Time between two samples, s.
-    start
-        Pose at which the motion begins, at rest; without one it is the first point, facing the
-        second.
+    Without a start, the motion begins at rest in the first point, facing the second.
+    ``period`` in s.
     """
 
     def __init__(
@@ -188,10 +179,7 @@ class PathTiming:
     def add_points(self, points: Array) -> None:
         """Append points (m) of the path, shape (n, 2).
 
-        Raises
-        ------
-        PathError
-            The points are not finite, or the path has ended.
+        PathError: they are not finite, or the path has ended.
         """
         check_points(points)
         if self._ended:
@@ -220,13 +208,9 @@ class PathTiming:
     def advance(self, rate: float = 1.0) -> tuple[Pose, BodyTwist]:
         """Return pose (yaw in the range of floats, not wrapped) and twist, and go on by a period.
 
-        Without enough points the motion stops at the end of what is known.
-
-        Parameters
-        ----------
-        rate
-            Rate at which the time of the plan shall pass, from 0 (wait) to 1; it is reached as
-            soon as the limits allow, see :attr:`rate`.
+        Without enough points the motion stops at the end of what is known. ``rate``, from
+        0 (wait) to 1, is how fast the time of the plan shall pass; it is reached as soon
+        as the limits allow, see :attr:`rate`.
         """
         self._plan()
         count = len(self._nodes)
@@ -310,17 +294,7 @@ def time_path(
 ) -> TimedPath:
     """Return a whole path, driven as fast as the limits allow from rest to rest.
 
-    Parameters
-    ----------
-    points
-        m, shape (n, 2), at least two that differ; a closed path repeats its first point.
-    limits, geometry, period, start
-        See :class:`PathTiming`.
-
-    Raises
-    ------
-    PathError
-        The points are not finite, or all of them are at one place.
+    Points: m, shape (n, 2), at least two that differ; a closed path repeats its first point.
     """
     timing = PathTiming(limits, geometry, period, start)
     timing.add_points(points)

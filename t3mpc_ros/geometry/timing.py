@@ -8,19 +8,11 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 class SampleScheduler:
     """Assigns the samples of a fixed-rate grid to irregular timer calls, without losing any.
 
-    A late timer call returns every sample it missed, so a busy machine delays a stream but leaves
-    no gaps in it.
-
-    Parameters
-    ----------
-    rate
-        Samples per second.
-    burst
-        Longest delay (s) that is made up for; older samples are skipped and counted.
-    slack
-        Time (s) from the start of the grid to the first call. A timer of the same period then
-        finds one sample due in each call although some calls are slightly early; without slack an
-        early call finds none, and the next one two.
+    A late timer call returns every sample it missed, so a busy machine delays a stream but
+    leaves no gaps in it. At most ``burst`` (s) of a delay is made up for; older samples are
+    skipped and counted. ``slack`` (s) is the time from the start of the grid to the first
+    call: a timer of the same period then finds one sample due in each call although some calls
+    are slightly early.
     """
 
     def __init__(self, rate: float, burst: float = 0.5, slack: float = 0.0) -> None:
@@ -66,18 +58,11 @@ class SampleScheduler:
 class SimulatedTime:
     """Clock of a simulation, which runs faster or slower than real time, or step by step.
 
-    Samples form an exact grid that always starts at the same instant, and none is skipped: on a
-    machine that is too slow, time passes more slowly. The clock never passes the next sample, so
-    it never shows a time that has not been simulated.
-
-    Parameters
-    ----------
-    rate
-        Samples per second of simulated time.
-    real_time_factor
-        Simulated seconds per second; 0: the clock is stopped, and :meth:`step` advances it.
-    max_burst
-        Maximum number of samples returned at once, so that other callbacks run in between.
+    Samples form an exact grid that always starts at the same instant, and none is skipped: on
+    a machine that is too slow, time passes more slowly. The clock never passes the next
+    sample, so it never shows a time that has not been simulated. At most ``max_burst`` samples
+    are returned at once, so that other callbacks run in between; with ``real_time_factor`` 0
+    :meth:`step` advances the clock.
     """
 
     def __init__(
@@ -133,11 +118,7 @@ class SimulatedTime:
         """Return the stamps of the next ``count`` samples, and stop the clock at the last one.
 
         The first sample, at the start of the grid, is returned in addition to ``count``.
-
-        Raises
-        ------
-        ValueError
-            The clock is running.
+        ValueError: the clock is running.
         """
         if self._real_time_factor != 0.0:
             raise ValueError(f'real_time_factor must be 0 to step: got {self._real_time_factor:g}')

@@ -47,16 +47,10 @@ class TrajectorySamples(NamedTuple):
 class ReferenceTrajectory:
     """Interpolates a reference between stamped samples, and detects its jumps.
 
-    Samples may lie in the future: when the reference is stamped ahead by a lead time, its value
-    at the present time does not depend on when its messages arrive.
-
-    Parameters
-    ----------
-    jump
-        Body accelerations (m/s², rad/s²) above which two successive samples are a jump: the value
-        then steps at the later sample, and the rate in between is zero.
-    capacity
-        Maximum number of samples.
+    Samples may lie in the future: when the reference is stamped ahead by a lead time, its
+    value at the present time does not depend on when its messages arrive. Above the body
+    accelerations ``jump`` (m/s², rad/s²) two successive samples are a jump: the value then
+    steps at the later sample, and the rate in between is zero.
     """
 
     def __init__(self, jump: BodyTwist, capacity: int = 512) -> None:

@@ -80,19 +80,8 @@ def wrap_angle(angle: float) -> float:
 class StateArray:
     """A sequence of :class:`State`, stored as arrays.
 
-    Parameters
-    ----------
-    stamps_ns
-        Shape (n,).
-    poses
-        x, y (m) and yaw (rad), shape (n, 3).
-    twists
-        Linear (m/s) and angular velocity (rad/s), shape (n, 2).
-
-    Raises
-    ------
-    ValueError
-        The shapes do not match.
+    Stamps (ns) have the shape (n,), poses (x, y in m, yaw in rad) (n, 3), twists (m/s, rad/s)
+    (n, 2).
     """
 
     def __init__(self, stamps_ns: NDArray[np.int64], poses: Array, twists: Array) -> None:

@@ -19,12 +19,8 @@ def parse_assignments(table: type[Parameters], texts: Iterable[str]) -> dict[str
     """Return values by name, for :meth:`Parameters.from_dict`, which validates them.
 
     The value of a text parameter stays text, even if it looks like a number. Unknown names are
-    kept; :meth:`Parameters.from_dict` rejects them.
-
-    Raises
-    ------
-    ParameterError
-        An argument is not ``NAME=VALUE``.
+    kept; :meth:`Parameters.from_dict` rejects them. ParameterError: an argument is not
+    ``NAME=VALUE``.
     """
     text_parameters = {spec.name for spec in table.specs() if spec.kind is str and not spec.many}
     values: dict[str, object] = {}

@@ -26,10 +26,7 @@ class YamlError(ValueError):
 def read_yaml(path: str | os.PathLike[str]) -> object:
     """Return the content of a YAML file in UTF-8, in whatever locale.
 
-    Raises
-    ------
-    YamlError
-        It cannot be read, has more than :data:`MAX_FILE_SIZE` bytes, or see :func:`parse_yaml`.
+    YamlError: also for more than :data:`MAX_FILE_SIZE` bytes.
     """
     return parse_yaml(read_text(path))
 
@@ -51,10 +48,7 @@ def read_text(path: str | os.PathLike[str], max_size: int = MAX_FILE_SIZE) -> st
 def parse_yaml(text: str) -> object:
     """Return the content of a YAML text; an empty one is None.
 
-    Raises
-    ------
-    YamlError
-        The text is not YAML, or gives a key twice in one entry.
+    YamlError: it is not YAML, or gives a key twice in one entry.
     """
     try:
         return yaml.load(text, Loader=_Loader)

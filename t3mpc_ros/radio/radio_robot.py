@@ -81,16 +81,7 @@ class RadioRobot(RobotInterface):
     """Commands the robot through :class:`Link` and computes its odometry from the telemetry.
 
     The owner of the port calls :meth:`step` as for :class:`Link`. All times and stamps are
-    nanoseconds of one steady clock.
-
-    Parameters
-    ----------
-    parameters
-        Dynamic ones change through :meth:`configure`.
-    key
-        Key of the robot, 16 bytes; empty for an open link.
-    entropy
-        Source of session numbers and nonces.
+    nanoseconds of one steady clock. ``key`` and ``entropy`` as of :class:`Link`.
     """
 
     def __init__(

@@ -41,17 +41,8 @@ class PortError(Exception):
 class SerialPort:
     """An open serial port with short timeouts.
 
-    Parameters
-    ----------
-    path
-        Such as ``/dev/serial/by-id/…``, which stays the same over replugging.
-    device
-        Name of the expected device in error texts.
-
-    Raises
-    ------
-    PortError
-        The port cannot be opened. Later methods close it before they raise.
+    ``device`` is its name in error texts. PortError: it cannot be opened; later methods close
+    it before they raise.
     """
 
     def __init__(self, path: str, device: str = 'the dongle') -> None:
@@ -67,13 +58,7 @@ class SerialPort:
         """Whether the driver has a low-latency mode; FTDI needs it, CDC-ACM does not."""
 
     def fileno(self) -> int:
-        """Return the file descriptor, for ``select``.
-
-        Raises
-        ------
-        PortError
-            The port is closed.
-        """
+        """Return the file descriptor, for ``select``."""
         try:
             return int(self._serial.fileno())
         except _PORT_ERRORS as error:

@@ -77,15 +77,9 @@ def sensor_mounts(parameters: RangeSensorParameters) -> Array:
 def ray_ends(poses: Array, ranges: Array, mounts: Array) -> Array:
     """Return where the rays of range sensors end, m, shape (n, k, 2).
 
-    Parameters
-    ----------
-    poses
-        x, y (m), yaw (rad) of the robot, shape (n, 3).
-    ranges
-        Reach of each ray, m, shape (n, k); 0 gives the faces of the sensors, and a reach that is
-        not finite NaN.
-    mounts
-        As :func:`sensor_mounts`, shape (k, 3).
+    ``poses``: x, y (m), yaw (rad), shape (n, 3). ``ranges`` (m, shape (n, k)): 0 gives the
+    faces of the sensors, and a reach that is not finite NaN. ``mounts``: as
+    :func:`sensor_mounts`.
     """
     x, y, yaw = (column[:, None] for column in poses.T)
     ahead, left, direction = (column[None, :] for column in mounts.T)

@@ -174,16 +174,9 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
 
     Step counters count pulses, so the odometry is wrong exactly when steps are lost or a tyre
     slides; the gyro measures the resulting turn. Every random component has its own generator,
-    which draws the same numbers whatever the parameters: changing one does not shift the others.
-
-    Parameters
-    ----------
-    parameters
-        The dynamic ones are replaceable at run time.
-    schedule
-        Schedule of faults; by default the one that ``faults.schedule`` names.
-    speed_noise
-        Noise of the wheel speeds; by default white with the variance ``noise.variance``.
+    which draws the same numbers whatever the parameters: changing one does not shift the
+    others. Without a schedule the one that ``faults.schedule`` names applies; without noise of
+    the wheel speeds it is white, with the variance ``noise.variance``.
     """
 
     def __init__(
@@ -288,10 +281,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
     def set_pose(self, pose: Pose) -> None:
         """Move the robot to ``pose``; wheel speeds and odometry are unchanged.
 
-        Raises
-        ------
-        ValueError
-            The pose is not finite, or overlaps an obstacle of the world.
+        ValueError: the pose is not finite, or overlaps an obstacle of the world.
         """
         check_pose(pose)
         radius = self._parameters.bumper.radius

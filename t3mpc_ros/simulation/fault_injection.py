@@ -214,11 +214,6 @@ def load_schedule(name_or_path: str | Path) -> FaultSchedule:
     """Return the schedule of a YAML file, or the bundled one of that name; '' has no events.
 
     A text is a path if it ends in ``.yaml`` or ``.yml`` or contains a path separator.
-
-    Raises
-    ------
-    ScheduleError
-        There is no such schedule, or it is invalid.
     """
     name = os.fspath(name_or_path)
     if not name:

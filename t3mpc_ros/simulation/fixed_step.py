@@ -18,22 +18,11 @@ S = TypeVar('S', bound=Parameters)
 class FixedStepRobot(RobotInterface, ABC, Generic[S]):
     """Base of the simulated robots: time grid, command limiter and reported states.
 
-    The time grid starts at the first instant passed to any method. States are reported once per
-    control period; a command takes effect at the integration step in which it arrives. The states
-    depend on the parameters and the calls alone: equal runs are bit-equal.
-
-    Parameters
-    ----------
-    parameters
-        All parameters of the robot.
-    rate
-        Reports per second.
-    substeps
-        Integration steps between two reports.
-    max_catch_up_time
-        Longest time (s) simulated after a gap between calls; the rest of the gap is skipped.
-    limiter
-        Limits the commands.
+    The time grid starts at the first instant passed to any method. States are reported once
+    per control period; a command takes effect at the integration step in which it arrives. The
+    states depend on the parameters and the calls alone: equal runs are bit-equal. ``rate`` are
+    reports per second, ``substeps`` integration steps between two, and at most
+    ``max_catch_up_time`` (s) of a gap between calls is simulated.
     """
 
     def __init__(
@@ -127,13 +116,7 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
         return self._parameters
 
     def configure(self, parameters: S) -> None:
-        """Continue with other parameters, for example a heavier load.
-
-        Raises
-        ------
-        ParameterError
-            A read-only parameter differs.
-        """
+        """Continue with other parameters, for example a heavier load."""
         self._parameters.check_read_only(parameters)
         self._parameters = parameters
         self._apply_parameters()

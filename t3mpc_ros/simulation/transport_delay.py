@@ -35,13 +35,8 @@ class TransportDelay:
     """Delays, reorders and loses commands; it never changes, duplicates or creates one.
 
     All times are those of one clock. When it jumps back, the commands in transit are dropped,
-    because their arrival time is undefined.
-
-    Parameters
-    ----------
-    generator
-        Used by this delay alone. Two numbers are drawn for each command whatever its outcome, so
-        that a change of loss does not shift the delays.
+    because their arrival time is undefined. Two numbers of its own generator are drawn for
+    each command whatever its outcome, so that a change of loss does not shift the delays.
     """
 
     def __init__(self, generator: np.random.Generator) -> None:
@@ -70,21 +65,8 @@ class TransportDelay:
     ) -> None:
         """Send a command, which arrives after ``delay_s`` to ``delay_s + jitter_s``.
 
-        Parameters
-        ----------
-        command
-            Any command, even one that the limiter rejects.
-        now_ns
-            Time of sending.
-        delay_s, jitter_s
-            s; the part of the jitter is uniform.
-        loss
-            Fraction of the commands that is lost, 0 to 1.
-
-        Raises
-        ------
-        ValueError
-            A delay is negative or not finite, or the loss is not in [0, 1].
+        The part of the jitter is uniform; ``loss`` is the fraction of the commands that is
+        lost.
         """
         if not (0.0 <= delay_s < math.inf and 0.0 <= jitter_s < math.inf):
             raise ValueError(

@@ -84,11 +84,6 @@ class World:
         """Decide whether a disc at (x, y) touches no wall and is in no box or circle, all in m.
 
         Non-finite arguments are not free.
-
-        Raises
-        ------
-        ValueError
-            The radius is negative.
         """
         if radius < 0.0:
             raise ValueError(f'radius must be at least 0 m: got {radius:g}')
@@ -153,11 +148,6 @@ def load_world(path_or_name: str | Path) -> World:
 
     An empty name is the empty plain. A file with the name of a bundled world needs its folder:
     ``./room``.
-
-    Raises
-    ------
-    WorldError
-        There is no such world, or the file is invalid.
     """
     if path_or_name == '':
         return parse_world('name: plain', 'plain')
@@ -180,17 +170,7 @@ def load_world(path_or_name: str | Path) -> World:
 def parse_world(text: str, source: str) -> World:
     """Return the world of a YAML text.
 
-    Parameters
-    ----------
-    text
-        See ``docs/simulation.md``.
-    source
-        Its name in errors; without ``name`` in the text, its stem is the name of the world.
-
-    Raises
-    ------
-    WorldError
-        Contains ``source``, the entry, the bound and the value.
+    Errors begin with ``source``; without ``name`` in the text, its stem is that of the world.
     """
     try:
         return _world(parse_yaml(text), Path(source).stem)
@@ -342,12 +322,8 @@ def join_walls(segments: Array) -> Array:
 
     Ends within :data:`JOIN_TOLERANCE` of one another become bit-equal; a wall on which another
     one ends is split there, and duplicates are removed. Crossing walls are unchanged: at a
-    crossing the bumper is always in a corner.
-
-    Parameters
-    ----------
-    segments
-        Shape (n, 4), m; each longer than twice :data:`JOIN_TOLERANCE`.
+    crossing the bumper is always in a corner. Each wall (m, shape (n, 4)) is longer than twice
+    the tolerance.
     """
     points: Array = segments.reshape(-1, 2).copy()
     for index in range(1, len(points)):

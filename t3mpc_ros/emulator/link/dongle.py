@@ -29,21 +29,8 @@ _NEVER = _WORD
 class Dongle:
     """The dongle with its firmware.
 
-    Parameters
-    ----------
-    events
-        Queue in which later actions are scheduled.
-    channel
-        Radio channel; each packet is sent with the configuration of the dongle.
-    chip_ok
-        Returns whether the radio chip responds.
-    reply
-        Receives the bytes of each frame for the host.
-
-    Raises
-    ------
-    FirmwareLibraryError
-        The core of the firmware cannot be compiled.
+    ``chip_ok`` returns whether the radio chip responds, ``reply`` receives the bytes of each
+    frame for the host.
     """
 
     def __init__(

@@ -56,20 +56,9 @@ class RadioParameters(NamedTuple):
 class RadioChannel:
     """Carries packets from the dongle to the robot, and acknowledgements back.
 
-    Parameters
-    ----------
-    events
-        Queue in which receptions are scheduled.
-    robot
-        Configuration of the robot's transceiver.
-    advance_robot
-        Advances the robot to now; returns whether its receiver is on.
-    deliver
-        Receives each payload that reaches the robot.
-    faults
-        Faults of the radio.
-    generator
-        Random generator of this channel alone: two numbers per transmission, whatever the faults.
+    ``advance_robot`` advances the robot to now and returns whether its receiver is on;
+    ``deliver`` receives each payload that reaches it. Two numbers of its own generator are
+    drawn per transmission, whatever the faults.
     """
 
     def __init__(

@@ -16,18 +16,8 @@ _SPLIT_NS = 2_000_000
 class SerialLine:
     """Delivers blocks of data to the other end, in order and at the baud rate.
 
-    A block is delivered as a whole when its last byte arrives.
-
-    Parameters
-    ----------
-    events
-        Queue in which deliveries are scheduled.
-    faults
-        Faults of the line.
-    deliver
-        Receives each block on arrival.
-    byte_ns
-        Transmission time of a byte; 0 if the baud rate is simulated elsewhere.
+    A block is delivered as a whole when its last byte arrives. ``byte_ns`` is the transmission
+    time of a byte, 0 if the baud rate is simulated elsewhere.
     """
 
     def __init__(

@@ -90,17 +90,7 @@ class RobotDescription(NamedTuple):
 
 
 class RobotPublishers:
-    """Publishes each robot state as odometry, joint states, sensor messages and a transform.
-
-    Parameters
-    ----------
-    node
-        Node that publishes.
-    parameters
-        Rates and frames.
-    robot
-        Properties of the robot.
-    """
+    """Publishes each robot state as odometry, joint states, sensor messages and a transform."""
 
     def __init__(
         self, node: Node, parameters: RobotTopicParameters, robot: RobotDescription

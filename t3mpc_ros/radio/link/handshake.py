@@ -55,16 +55,7 @@ _RESULT_TEXTS = {
 class Session:
     """Builds the frames of one session, signed if there is a key.
 
-    Parameters
-    ----------
-    key
-        Long-term key; empty on an open link.
-    entropy
-        Source of the session number and the nonce.
-    before
-        Number of the previous session, which is not used again; 0 without one.
-    now_ns
-        Host time.
+    ``before`` is the number of the previous session, which is not used again; 0 without one.
     """
 
     def __init__(self, key: bytes, entropy: Entropy, before: int, now_ns: int) -> None:
@@ -154,14 +145,7 @@ class Session:
 class Handshake:
     """Handshake from HELLO to RUN.
 
-    Parameters
-    ----------
-    session
-        Session to start.
-    parameters
-        Contains the board parameters to write.
-    reason
-        Reason for the handshake; reported until there is a newer one.
+    ``reason`` for it is reported until there is a newer one.
     """
 
     def __init__(self, session: Session, parameters: LinkParameters, reason: str) -> None:

@@ -72,21 +72,7 @@ class PingRequest(NamedTuple):
 
 
 class ActiveSession:
-    """Cycles of command and state within a session, requests between them, and its end.
-
-    Parameters
-    ----------
-    parameters
-        Cycle rate and TTL.
-    session
-        Session of a finished handshake.
-    arbiter
-        Source of the setpoints.
-    statistics
-        Counts the cycles.
-    now_ns
-        Time of the first cycle.
-    """
+    """Cycles of command and state within a session, requests between them, and its end."""
 
     def __init__(
         self,
@@ -247,18 +233,10 @@ def _is_own_state(result: TransactionResult, command: Command) -> bool:
 class Link:
     """State machine of the link: decides what to send and when, from time, bytes and commands.
 
-    The owner of the port calls :meth:`step` when bytes arrive or the last ``Wait`` ends, executes
-    the returned actions, and reports with :meth:`port_opened` and :meth:`port_failed`. Times are
-    nanoseconds of one steady clock.
-
-    Parameters
-    ----------
-    parameters
-        Read-only.
-    key
-        Key of the robot, 16 bytes; empty for an open link.
-    entropy
-        Source of session numbers and nonces.
+    The owner of the port calls :meth:`step` when bytes arrive or the last ``Wait`` ends,
+    executes the returned actions, and reports with :meth:`port_opened` and
+    :meth:`port_failed`. Times are nanoseconds of one steady clock. ``key`` has 16 bytes, or
+    none for an open link; ``entropy`` is the source of session numbers and nonces.
     """
 
     def __init__(

@@ -30,11 +30,6 @@ class SetpointArbiter:
     """Selects the setpoint from the newest wheel speeds and the emergency stop.
 
     Which commands are followed, and for how long, is decided by the command limiter.
-
-    Parameters
-    ----------
-    parameters
-        Contains ``ttl`` and ``robot.max_speed``.
     """
 
     def __init__(self, parameters: LinkParameters) -> None:
@@ -88,14 +83,8 @@ class SetpointArbiter:
     ) -> Setpoint:
         """Return the setpoint.
 
-        Parameters
-        ----------
-        robot_latched
-            Whether the last status reports an emergency stop.
-        now_ns
-            Host time.
-        robot_silent
-            Whether the robot does not answer: it may still receive, and would move unobserved.
+        ``robot_latched``: the last status reports an emergency stop. A silent robot may
+        still receive, and would move unobserved.
         """
         self._sent_wheels = ZERO_WHEEL_SPEEDS
         self._button_held &= robot_latched  # a latch that is gone was another one

@@ -72,12 +72,8 @@ class LinkQuality(NamedTuple):
 class LinkStatistics:
     """Collects the events of the link and computes its quality.
 
-    Parameters
-    ----------
-    period
-        Period of the cycles, s.
-    timeout
-        Age of the telemetry above which the level is ERROR, s: the robot has stopped by then.
+    ``period`` of the cycles in s; above the age ``timeout`` (s) of the telemetry the level is
+    ERROR: the robot has stopped by then.
     """
 
     def __init__(self, period: float, timeout: float) -> None:

@@ -87,10 +87,7 @@ class TelemetryDecoder:
     def configure(self, steps: int, gyro_range: int) -> None:
         """Set the microsteps per revolution and the full scale of the gyro (deg/s).
 
-        Raises
-        ------
-        ValueError
-            ``steps`` is below 1, or the MPU6050 lacks the range.
+        ValueError: a count below 1, or a range that the MPU6050 lacks.
         """
         if steps < 1:
             raise ValueError(f'steps per revolution must be at least 1: got {steps}')

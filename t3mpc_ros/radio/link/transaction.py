@@ -71,13 +71,7 @@ class _PendingRequest(NamedTuple):
 
 
 class TransactionLayer:
-    """Numbers and encodes requests, and matches replies with them.
-
-    Parameters
-    ----------
-    statistics
-        Counts exchanges and malformed frames.
-    """
+    """Numbers and encodes requests, and matches replies with them."""
 
     def __init__(self, statistics: LinkStatistics) -> None:
         self._statistics = statistics

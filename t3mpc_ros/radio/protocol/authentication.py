@@ -53,11 +53,7 @@ def read_key(path: Path) -> bytes:
     """Return the key in a file of 32 hexadecimal digits that only its owner can read.
 
     A leading ``~`` is the home folder: a shell does not expand it in ``key_file:=~/key``.
-
-    Raises
-    ------
-    KeyFileError
-        The file is unreadable, readable by others, or holds no key. The text never quotes it.
+    KeyFileError, whose text never quotes it: unreadable, readable by others, or no key.
     """
     try:
         path = path.expanduser()
@@ -130,12 +126,7 @@ def frame_tag(frame: SignedFrame, key: bytes, epoch: int) -> bytes:
 class Signer:
     """Host end of a session: signs frames and counts the epoch.
 
-    Parameters
-    ----------
-    key
-        Session key.
-    host_us
-        ``host_us`` of the HELLO.
+    ``host_us`` is that of the HELLO.
     """
 
     def __init__(self, key: bytes, host_us: int) -> None:
@@ -151,13 +142,9 @@ class Signer:
     def sign(self, frame: AnySignedFrame) -> AnySignedFrame:
         """Return the frame with its tag.
 
-        A lower ``host_us`` than before counts as a wrap: frames are signed in order of time, each
-        within 71 minutes of the one before.
-
-        Raises
-        ------
-        ValueError
-            ``host_us`` equals that of the frame before: the robot would reject it as a replay.
+        A lower ``host_us`` than before counts as a wrap: frames are signed in order of
+        time, each within 71 minutes of the one before. ValueError: ``host_us`` equals that
+        of the frame before; the robot would reject it as a replay.
         """
         if frame.host_us == self._last:
             raise ValueError(f'host_us must increase: got {frame.host_us} twice')
@@ -173,13 +160,7 @@ _MASK_64 = 0xFFFFFFFFFFFFFFFF
 
 
 def siphash(key: bytes, message: bytes) -> bytes:
-    """Return the 8 bytes (little endian) of SipHash-2-4 of ``message`` under ``key``.
-
-    Raises
-    ------
-    ValueError
-        The key is not 16 bytes long.
-    """
+    """Return the 8 bytes (little endian) of SipHash-2-4 of ``message`` under ``key``."""
     if len(key) != KEY_SIZE:
         raise ValueError(f'key must be {KEY_SIZE} bytes long: got {len(key)}')
     low, high = int.from_bytes(key[:8], 'little'), int.from_bytes(key[8:], 'little')

@@ -102,14 +102,8 @@ class ClockModel:
     def add(self, robot_us: int, sent_ns: int, returned_ns: int, travel_ns: int) -> None:
         """Add a transaction whose first packet had no retransmission.
 
-        Parameters
-        ----------
-        robot_us
-            Reception of the CMD, by the robot clock.
-        sent_ns, returned_ns
-            Transmission by the host, and return of the result.
-        travel_ns
-            Minimum delay to the robot: :func:`forward_delay_ns`.
+        ``robot_us`` is the reception of the CMD by the robot clock, ``travel_ns`` the
+        minimum delay to the robot: :func:`forward_delay_ns`.
         """
         samples = self._samples
         samples.append((robot_us, sent_ns + travel_ns, returned_ns - sent_ns))
@@ -118,13 +112,7 @@ class ClockModel:
         self._fit()
 
     def to_host_ns(self, robot_us: int) -> int:
-        """Return the host time (ns) of a robot time.
-
-        Raises
-        ------
-        ValueError
-            There is no sample yet.
-        """
+        """Return the host time (ns) of a robot time."""
         if not self._samples:
             raise ValueError('clock model must have at least one transaction: got none')
         since = (robot_us - self._origin_us) * _MICROSECOND

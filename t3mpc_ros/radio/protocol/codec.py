@@ -64,10 +64,7 @@ class ExchangeStatus(NamedTuple):
 def decode_exchange_status(status: int) -> ExchangeStatus:
     """Return the decoded status byte of a RESULT.
 
-    Raises
-    ------
-    FrameError
-        Bits of the status contradict each other.
+    FrameError: bits contradict each other.
     """
     acknowledged, has_payload, failed, skipped = (bool(status & bit) for bit in (1, 2, 4, 8))
     retransmissions = status >> 4
@@ -87,10 +84,7 @@ def encode(
 ) -> bytes:
     """Return the bytes of a frame, without the CRC of the serial line.
 
-    Raises
-    ------
-    FrameError
-        A value does not fit; the text names frame, field, bound and value.
+    FrameError: a value does not fit; the text names frame, field, bound and value.
     """
     layout = _LAYOUTS[type(frame)]
     # The last field shows whether the optional end (nonce, tag, address) is present.

@@ -23,13 +23,7 @@ def crc16(data: bytes) -> int:
 
 
 def cobs_encode(data: bytes) -> bytes:
-    """Return ``data`` encoded without zero bytes, one byte longer (COBS; at most 254 bytes).
-
-    Raises
-    ------
-    ValueError
-        ``data`` is longer.
-    """
+    """Return ``data`` encoded without zero bytes, one byte longer (COBS; at most 254 bytes)."""
     if len(data) > 254:
         raise ValueError(f'data must be at most 254 bytes long: got {len(data)}')
     return b''.join(bytes([len(run) + 1]) + run for run in data.split(b'\0'))
@@ -51,10 +45,7 @@ def cobs_decode(encoded: bytes) -> bytes | None:
 def encode_frame(frame: bytes) -> bytes:
     """Return the bytes of a frame on the serial line: COBS of frame and CRC, then a zero.
 
-    Raises
-    ------
-    ValueError
-        The frame is empty or longer than :data:`FRAME_LIMIT`.
+    A frame has 1 to :data:`FRAME_LIMIT` bytes.
     """
     if not 1 <= len(frame) <= FRAME_LIMIT:
         raise ValueError(f'frame must have 1 to {FRAME_LIMIT} bytes: got {len(frame)}')

@@ -123,12 +123,8 @@ def disturbance_torque(wheel: int, time: float, signals: DisturbanceSignals) -> 
 class Disturbance:
     """Random part of the disturbance torque of a run.
 
-    Parameters
-    ----------
-    parameters
-        A change takes effect at the next :meth:`draw`.
-    generator
-        Used by this disturbance alone, so that other random numbers do not shift its own.
+    The generator is its own, so that other random numbers do not shift these; a change of the
+    parameters takes effect at the next :meth:`draw`.
     """
 
     def __init__(self, parameters: DisturbanceParameters, generator: np.random.Generator) -> None:

@@ -101,16 +101,7 @@ class PulseTarget(NamedTuple):
 class Drivetrain:
     """Motors, tyres and body: the arrays of :func:`integrate_drivetrain`, and their meaning.
 
-    Parameters
-    ----------
-    motor, bumper
-        Both motors, and the disc that touches walls.
-    world
-        Walls and patches.
-    step
-        Length of an integration step, s.
-    share
-        Of the IMU filter, see ``SimulatedImuParameters.share``.
+    ``step`` in s; ``share`` of the IMU filter: see ``SimulatedImuParameters.share``.
     """
 
     def __init__(

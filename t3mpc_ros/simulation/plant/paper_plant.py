@@ -205,13 +205,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         self._reports.append(self._make_state(0))
 
     def apply(self, command: RobotCommand, now_ns: int) -> str:
-        """Follow ``command`` from now on, or return why it is rejected.
-
-        Raises
-        ------
-        ValueError
-            The drive accepts torques only, see :meth:`step_torque`.
-        """
+        """Follow ``command`` from now on, or return why it is rejected."""
         if self._parameters.drive.kind == 'torque':
             raise ValueError('drive.kind must be velocity to take wheel speeds: got torque')
         return super().apply(command, now_ns)
@@ -220,11 +214,6 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         """Apply torques (N m) for one control period and return the state at its end.
 
         Torques that are not finite brake the wheels, as an emergency stop does.
-
-        Raises
-        ------
-        ValueError
-            The drive accepts wheel speeds only.
         """
         if self._parameters.drive.kind != 'torque':
             raise ValueError('drive.kind must be torque to take torques: got velocity')
@@ -237,13 +226,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         return self._advance_period()
 
     def set_pose(self, pose: Pose) -> None:
-        """Move the robot to ``pose``; wheel speeds and odometry are unchanged.
-
-        Raises
-        ------
-        ValueError
-            The pose is not finite.
-        """
+        """Move the robot to ``pose``; wheel speeds and odometry are unchanged."""
         check_pose(pose)
         self._plant.pose = pose
         self._refresh_state()
@@ -357,12 +340,8 @@ class DisturbedPlant:
 class PaperPlant:
     """Wheels, body and drive: the arrays of :func:`integrate_plant`.
 
-    Parameters
-    ----------
-    parameters
-        Only the kind and the dead time are used here; :meth:`load` sets the rest.
-    step
-        Length of an integration step, s. The dead time is rounded to whole steps.
+    The dead time is rounded to whole steps (``step`` in s); :meth:`load` sets all parameters
+    but it and the kind.
     """
 
     def __init__(self, parameters: DriveParameters, step: float) -> None:

@@ -66,10 +66,7 @@ def open_circuit_voltage(charge: float, cells: int = 1) -> float:
 class SimulatedBattery:
     """Charge and terminal voltage under load.
 
-    Parameters
-    ----------
-    parameters
-        Replaceable at run time; the charge is kept.
+    Parameters are replaceable at run time; the charge is kept.
     """
 
     def __init__(self, parameters: SimulatedBatteryParameters) -> None:
@@ -109,11 +106,6 @@ class SimulatedBattery:
         More than E²/4R cannot be drawn: the voltage is then E/2, and the battery collapses. An
         empty battery is disconnected by its protection: no voltage, no current. Regenerated
         (negative) power is dissipated in the drivers.
-
-        Raises
-        ------
-        ValueError
-            A number is not finite, or ``dt`` is negative; the state is unchanged then.
         """
         if not (math.isfinite(power + sag) and 0.0 <= dt < math.inf):
             raise ValueError(

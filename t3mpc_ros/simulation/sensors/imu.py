@@ -80,16 +80,10 @@ def low_pass(
 class SimulatedImu:
     """Converts filtered motion to the register values of the chip.
 
-    The noise passes the same two poles as the motion, so its low-frequency density is that of the
-    data sheet at every setting and rate.
-
-    Parameters
-    ----------
-    parameters
-        Replaceable at run time.
-    generator
-        Used by this sensor alone. Three numbers are drawn for the sensor, one at each power-up,
-        and seven at each measurement, whatever the parameters.
+    The noise passes the same two poles as the motion, so its low-frequency density is that of
+    the data sheet at every setting and rate. The generator is its own: three numbers are drawn
+    for the sensor, one at each power-up and seven at each measurement, whatever the
+    parameters, which are replaceable at run time.
     """
 
     def __init__(self, parameters: SimulatedImuParameters, generator: np.random.Generator) -> None:
@@ -141,19 +135,7 @@ class SimulatedImu:
     def measure(self, filtered: Array, dt: float, bias_jump: float = 0.0) -> ImuSample:
         """Return the sample measured ``dt`` seconds after the last measurement.
 
-        Parameters
-        ----------
-        filtered
-            See :func:`low_pass`; its second column is measured.
-        dt
-            s; time over which bias and noise evolve.
-        bias_jump
-            rad/s added to the bias while this fault is active.
-
-        Raises
-        ------
-        ValueError
-            ``dt`` is negative or not finite.
+        ``filtered``: see :func:`low_pass`; ``bias_jump`` (rad/s) is a fault.
         """
         if dt != self._dt:
             self._tune(dt)

@@ -113,12 +113,8 @@ _READINGS = tuple(map(decode_range, range(256)))
 class SimulatedRangeSensors:
     """Timing and last reading of each of the eight sensors.
 
-    Parameters
-    ----------
-    parameters
-        Replaceable at run time; the periods stay as drawn.
-    generator
-        Used by these sensors alone: 24 numbers at the start, one at each measurement.
+    The generator is their own: 24 numbers at the start, one at each measurement. Parameters
+    are replaceable at run time; the periods stay as drawn.
     """
 
     def __init__(
