@@ -10,7 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.path_timing import PathError
-from t3mpc_ros.parameters.yaml_files import YamlError, parse_yaml, read_text, shortened
+from t3mpc_ros.parameters.yaml_files import (
+    EntryError,
+    check_entry,
+    check_flag,
+    check_list,
+    file_errors,
+    parse_yaml,
+    read_text,
+    shortened,
+)
 
 Array = NDArray[np.float64]
 
@@ -28,23 +37,15 @@ def load_path(file: str | Path) -> Array:
     optionally ``closed: true``.
     """
     path = Path(file)
-    try:
-        text = read_text(path, MAX_FILE_SIZE)
-    except YamlError as error:
-        raise PathError(f'{path} {error}') from error
     readers = {'.csv': _csv_rows, '.yaml': _yaml_rows, '.yml': _yaml_rows}
-    if path.suffix.lower() not in readers:
+    suffix = path.suffix.lower()
+    if suffix not in readers:
         raise PathError(f'{path} must end in .csv or .yaml: got {path.suffix or "no suffix"!r}')
-    try:
-        points = np.array(
-            [_point(where, row) for where, row in readers[path.suffix.lower()](text)]
-        ).reshape(-1, 2)
+    with file_errors(path, PathError):
+        rows = readers[suffix](read_text(path, MAX_FILE_SIZE))
+        points = np.array([_point(where, row) for where, row in rows]).reshape(-1, 2)
         if len(points) < 2 or not np.ptp(points, axis=0).any():
-            raise PathError(f'two points that differ are needed: got {len(points)}')
-    except YamlError as error:
-        raise PathError(f'{path} {error}') from error
-    except PathError as error:
-        raise PathError(f'{path}: {error}') from error.__cause__
+            raise EntryError(f'two points that differ are needed: got {len(points)}')
     return points
 
 
@@ -54,26 +55,20 @@ def _csv_rows(text: str) -> list[tuple[str, object]]:
     if rows and not _is_number(rows[0][0]):
         header = [name.strip().lower() for name in rows.pop(0)]
         if 'x' not in header or 'y' not in header:
-            raise PathError(f'the header must have x and y: got {", ".join(header)}')
+            raise EntryError(f'the header must have x and y: got {", ".join(header)}')
         columns = header.index('x'), header.index('y')
     found: list[tuple[str, object]] = []
     for number, row in enumerate(rows):
         if len(row) <= max(columns):
-            raise PathError(f'point {number} must have x and y: got {row}')
+            raise EntryError(f'point {number} must have x and y: got {row}')
         found.append((f'point {number}', [row[column] for column in columns]))
     return found
 
 
 def _yaml_rows(text: str) -> list[tuple[str, object]]:
-    content = parse_yaml(text)
-    if not isinstance(content, dict) or not isinstance(content.get('points'), list):
-        raise PathError('must have points: [[x, y], ...]')
-    if unknown := set(map(str, content)) - {'points', 'closed', 'name'}:
-        raise PathError(f'there is no entry {min(unknown)}; known are points, closed, name')
-    closed = content.get('closed', False)
-    if not isinstance(closed, bool):
-        raise PathError(f'closed must be true or false: got {shortened(closed)}')
-    points = content['points']
+    content = check_entry(parse_yaml(text), 'the path', ('points',), ('closed', 'name'))
+    points = check_list(content['points'], 'points')
+    closed = check_flag(content.get('closed', False), 'closed')
     return [(f'points[{n}]', point) for n, point in enumerate(points + points[:1] * closed)]
 
 
@@ -87,7 +82,7 @@ def _is_number(text: str) -> bool:
 
 def _point(where: str, row: object) -> tuple[float, float]:
     if not isinstance(row, list) or len(row) != 2:
-        raise PathError(f'{where} must be [x, y] in m: got {shortened(row)}')
+        raise EntryError(f'{where} must be [x, y] in m: got {shortened(row)}')
     found = []
     for name, value in zip('xy', row, strict=True):
         try:
@@ -95,7 +90,7 @@ def _point(where: str, row: object) -> tuple[float, float]:
         except (TypeError, ValueError):
             number = math.nan
         if not abs(number) <= MAX_COORDINATE:
-            raise PathError(
+            raise EntryError(
                 f'{name} of {where} must be a number of at most {MAX_COORDINATE:g} m: '
                 f'got {shortened(value)}'
             )

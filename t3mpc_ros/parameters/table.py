@@ -37,6 +37,15 @@ def nearest_hint(name: str, known: Iterable[str]) -> str:
     return f'; did you mean {near[0]}?' if near else ''
 
 
+def number_hint(value: object) -> str:
+    """Return a hint for a number that YAML reads as text, such as ``1e-3``; otherwise ''."""
+    try:
+        number = isinstance(value, str) and math.isfinite(float(value))
+    except ValueError:
+        return ''
+    return ', which YAML reads as text; write -0.9 or 1.0e-3' if number else ''
+
+
 @dataclass(frozen=True, slots=True)
 class ParameterSpec:
     """Name, type, default, range and description of one parameter."""
@@ -89,9 +98,15 @@ class ParameterSpec:
 
     def _check_one(self, value: object) -> bool | int | float | str:
         if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
+            try:
+                value = float(value)
+            except OverflowError:
+                raise ParameterError(f'{self.name} must be {self.bounds_text()}') from None
         if type(value) is not self.kind:
-            raise ParameterError(f'{self.name} must be {_TYPE_NAMES[self.kind]}: got {value!r}')
+            hint = number_hint(value) if self.kind is float else ''
+            raise ParameterError(
+                f'{self.name} must be {_TYPE_NAMES[self.kind]}: got {value!r}{hint}'
+            )
         if isinstance(value, float) and not math.isfinite(value):
             raise ParameterError(f'{self.name} must be finite: got {value}')
         if self.choices and value not in self.choices:

@@ -2,12 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """YAML files that users write: worlds, fault schedules, paths, profiles, settings of a robot."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import reprlib
 from typing import Any
 
 import yaml
+
+from t3mpc_ros.parameters.table import nearest_hint, number_hint
 
 MAX_FILE_SIZE = 1_000_000
 """Bytes."""
@@ -21,6 +25,21 @@ _SHORT.maxstring = _SHORT.maxother = 80
 
 class YamlError(ValueError):
     """What is read is not such a file; the text goes on after the name of the file."""
+
+
+class EntryError(ValueError):
+    """An invalid value in a file; the text has its key, the bound and the value."""
+
+
+@contextmanager
+def file_errors(name: object, kind: type[ValueError]) -> Iterator[None]:
+    """Raise errors of this module as ``kind``, with the name of the file in front."""
+    try:
+        yield
+    except EntryError as error:
+        raise kind(f'{name}: {error}') from error
+    except YamlError as error:
+        raise kind(f'{name} {error}') from error
 
 
 def read_yaml(path: str | os.PathLike[str]) -> object:
@@ -66,6 +85,50 @@ def shortened(value: object) -> str:
     """
     text = _SHORT.repr(value)
     return text if len(text) <= 80 else f'{text[:77]}...'
+
+
+def check_entry(
+    content: object, where: str, needed: tuple[str, ...], optional: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """Return a mapping that has the needed keys, and no others than these and the optional."""
+    known = (*needed, *optional)
+    if not isinstance(content, dict):
+        raise EntryError(f'{where} must hold {", ".join(known)} by name: got {shortened(content)}')
+    for name in content:
+        if name not in known:
+            near = nearest_hint(str(name), known) or f'; known are {", ".join(known)}'
+            raise EntryError(f'{where} has no {shortened(name)}{near}')
+    for name in needed:
+        if name not in content:
+            raise EntryError(f'{where} must have {name}: got {shortened(content)}')
+    return content
+
+
+def check_list(content: object, where: str, least: int = 0, most: int | None = None) -> list[Any]:
+    """Return a list of ``least`` to ``most`` entries."""
+    if not isinstance(content, list):
+        raise EntryError(f'{where} must be a list: got {shortened(content)}')
+    if len(content) < least or (most is not None and len(content) > most):
+        span = f'{least}' if least == most else f'from {least} to {most}'
+        raise EntryError(f'{where} must have {span} entries: got {len(content)}')
+    return content
+
+
+def check_number(content: object, where: str, low: float, high: float, unit: str = '') -> float:
+    """Return a number from ``low`` to ``high``."""
+    bounds = f'{where} must be a number from {low:g} to {high:g} {unit}'.rstrip()
+    if isinstance(content, bool) or not isinstance(content, int | float):
+        raise EntryError(f'{bounds}: got {shortened(content)}{number_hint(content)}')
+    if not low <= content <= high:  # false for NaN, too
+        raise EntryError(f'{bounds}: got {shortened(content)}')
+    return float(content)
+
+
+def check_flag(content: object, where: str) -> bool:
+    """Return true or false."""
+    if not isinstance(content, bool):
+        raise EntryError(f'{where} must be true or false: got {shortened(content)}')
+    return content
 
 
 class _Loader(yaml.SafeLoader):

@@ -5,6 +5,7 @@
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import count
 import math
 import os
 from pathlib import Path
@@ -17,7 +18,15 @@ from t3mpc_ros.parameters.table import (
     nearest_hint,
     parameter,
 )
-from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml, shortened
+from t3mpc_ros.parameters.yaml_files import (
+    EntryError,
+    check_entry,
+    check_list,
+    check_number,
+    file_errors,
+    read_yaml,
+    shortened,
+)
 
 SCHEDULES_FOLDER = Path(__file__).resolve().parent / 'schedules'
 """Folder of the bundled schedules."""
@@ -124,22 +133,22 @@ class FaultEvent:
     """s; the key ``for`` in a file"""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, 'at', _seconds('at', self.at, 0.0))
-        if self.duration != math.inf:
-            object.__setattr__(self, 'duration', _seconds('for', self.duration, MIN_DURATION))
+        try:
+            object.__setattr__(self, 'at', check_number(self.at, 'at', 0.0, _MAX_TIME, 's'))
+            if self.duration != math.inf:
+                duration = check_number(self.duration, 'for', MIN_DURATION, _MAX_TIME, 's')
+                object.__setattr__(self, 'duration', duration)
+        except EntryError as error:
+            raise ScheduleError(str(error)) from None
         if not isinstance(self.fault, str) or self.fault not in FAULTS:
             raise ScheduleError(
                 f'fault must be one of {", ".join(FAULTS)}: '
                 f'got {shortened(self.fault)}{nearest_hint(str(self.fault), FAULTS)}'
             )
-        spec = FAULTS[self.fault]
         try:
-            object.__setattr__(self, 'value', spec.check(self.value))
+            object.__setattr__(self, 'value', FAULTS[self.fault].check(self.value))
         except ParameterError as error:
-            hint = _number_hint(self.value) if spec.kind is float else ''
-            raise ScheduleError(f'value: {error}{hint}') from None
-        except OverflowError:  # an integer too large for a float
-            raise ScheduleError(f'value: {self.fault} must be {spec.bounds_text()}') from None
+            raise ScheduleError(f'value: {error}') from None
 
     @property
     def until(self) -> float:
@@ -230,64 +239,17 @@ def load_schedule(name_or_path: str | Path) -> FaultSchedule:
                 f'got {name}{nearest_hint(str(name), bundled)}'
             )
         path = SCHEDULES_FOLDER / f'{name}.yaml'
-    try:
-        return FaultSchedule(map(_event, *_entries(read_yaml(path))), name=path.stem)
-    except YamlError as error:
-        raise ScheduleError(f'{name} {error}') from None
-    except ScheduleError as error:
-        raise ScheduleError(f'{name}: {error}') from None
+    with file_errors(name, ScheduleError):
+        content = read_yaml(path)
+        if isinstance(content, dict):
+            content = check_entry(content, 'the schedule', ('events',))['events']
+        return FaultSchedule(map(_event, count(), check_list(content, 'events')), path.stem)
 
 
-def _entries(content: object) -> tuple[list[str], list[object]]:
-    """Return the names of the entries, and the entries."""
-    if isinstance(content, dict):
-        for key in content:
-            if key != 'events':
-                raise ScheduleError(f'the only key must be events: got {key}')
-        content = content.get('events')
-    if not isinstance(content, list):
-        raise ScheduleError(f'events must be a list of entries: got {shortened(content)}')
-    return [f'events[{index}]' for index in range(len(content))], content
-
-
-_KEYS = ('at', 'fault', 'value', 'for')
-
-
-def _event(name: str, entry: object) -> FaultEvent:
-    if not isinstance(entry, dict):
-        raise ScheduleError(
-            f'{name} must be a mapping of {", ".join(_KEYS)}: got {shortened(entry)}'
-        )
-    for key in entry:
-        if key not in _KEYS:
-            near = nearest_hint(str(key), _KEYS)
-            raise ScheduleError(
-                f'{name} must have no more than {", ".join(_KEYS)}: got {key}{near}'
-            )
-    for key in _KEYS[:3]:
-        if key not in entry:
-            raise ScheduleError(f'{name}.{key} is missing: got {shortened(entry)}')
+def _event(index: int, content: object) -> FaultEvent:
+    where = f'events[{index}]'
+    entry = check_entry(content, where, ('at', 'fault', 'value'), ('for',))
     try:
         return FaultEvent(entry['at'], entry['fault'], entry['value'], entry.get('for', math.inf))
     except ScheduleError as error:
-        raise ScheduleError(f'{name}.{error}') from None
-
-
-def _seconds(name: str, value: object, low: float) -> float:
-    """Return ``value`` as seconds, or raise :class:`ScheduleError`."""
-    bound = f'{name} must be at least {low:g} s'
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ScheduleError(f'{bound}: got {shortened(value)}{_number_hint(value)}')
-    if not low <= value <= _MAX_TIME:  # not so for NaN either
-        raise ScheduleError(f'{bound} and at most {_MAX_TIME:g}: got {shortened(value)}')
-    return float(value)
-
-
-def _number_hint(value: object) -> str:
-    """Return a hint for a number that YAML reads as text, such as ``1e-3``; otherwise nothing."""
-    try:
-        number = isinstance(value, str) and math.isfinite(float(value))
-    except ValueError:
-        return ''
-    hint = '; YAML reads a number only without quotation marks and with a point, as in 1.0e-3'
-    return hint if number else ''
+        raise EntryError(f'{where}.{error}') from None

@@ -8,12 +8,10 @@ arrays of a :class:`World`: ``segments`` (n, 4: ax, ay, bx, by), ``circles`` (m,
 may be empty.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
 from pathlib import Path
-import re
-import reprlib
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +20,18 @@ import numpy.typing as npt
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import nearest_hint
-from t3mpc_ros.parameters.yaml_files import YamlError, parse_yaml, read_text
+from t3mpc_ros.parameters.yaml_files import (
+    EntryError,
+    YamlError,
+    check_entry,
+    check_flag,
+    check_list,
+    check_number,
+    file_errors,
+    parse_yaml,
+    read_text,
+    shortened,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -38,7 +47,6 @@ MAX_CIRCLES = 500
 MAX_PATCHES = 100
 JOIN_TOLERANCE = 1e-4
 """m: ends nearer than this to each other, or to a wall, touch."""
-_NUMBER_PATTERN = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?', re.IGNORECASE)
 
 
 class WorldError(ValueError):
@@ -172,63 +180,61 @@ def parse_world(text: str, source: str) -> World:
 
     Errors begin with ``source``; without ``name`` in the text, its stem is that of the world.
     """
-    try:
+    with file_errors(source, WorldError):
         return _world(parse_yaml(text), Path(source).stem)
-    except YamlError as error:
-        raise WorldError(f'{source} {error}') from error
-    except WorldError as error:
-        raise WorldError(f'{source}: {error}') from error.__cause__
 
 
 def _world(content: object, stem: str) -> World:
-    read = _entry(content, 'the world', (), ('name', 'walls', 'boxes', 'circles', 'patches'))
+    lists = ('walls', 'boxes', 'circles', 'patches')
+    read = check_entry(content, 'the world', (), ('name', *lists))
     name = read.get('name', stem)
     if not isinstance(name, str) or not name:
-        raise WorldError(f'name must be a text: got {reprlib.repr(name)}')
+        raise EntryError(f'name must be a text: got {shortened(name)}')
     pieces: list[tuple[float, ...]] = []
-    for where, wall in _entries(read, 'walls', MAX_SEGMENTS):
+    for where, wall in _entries(read, 'walls', MAX_SEGMENTS, ('points',), 'closed'):
         pieces += _wall(wall, where)
         _check_count(len(pieces))
     boxes = []
-    for where, box in _entries(read, 'boxes', MAX_SEGMENTS // 4):
+    for where, box in _entries(read, 'boxes', MAX_SEGMENTS // 4, ('center', 'size'), 'yaw'):
         boxes.append(_box(box, where))
         pieces += _sides(*boxes[-1])
         _check_count(len(pieces))
     segments = join_walls(_rows(pieces, 4))
     _check_count(len(segments))
-    circles = [_circle(*each, ()) for each in _entries(read, 'circles', MAX_CIRCLES)]
-    patches = [_circle(*each, ('grip',)) for each in _entries(read, 'patches', MAX_PATCHES)]
+    disc = 'center', 'radius'
+    circles = [_disc(*each) for each in _entries(read, 'circles', MAX_CIRCLES, disc)]
+    patches = [
+        (*_disc(where, each), check_number(each['grip'], f'{where}.grip', 0.0, 1.0))
+        for where, each in _entries(read, 'patches', MAX_PATCHES, (*disc, 'grip'))
+    ]
     return World(name, segments, _rows(circles, 3), _rows(patches, 4), _rows(boxes, 5))
 
 
-def _wall(content: object, where: str) -> Iterator[tuple[float, ...]]:
-    read = _entry(content, where, ('points',), ('closed',))
-    closed = read.get('closed', False)
-    if not isinstance(closed, bool):
-        raise WorldError(f'{where}.closed must be true or false: got {reprlib.repr(closed)}')
-    least = 3 if closed else 2
-    given = _list(read['points'], f'{where}.points', least, MAX_SEGMENTS + 1)
-    points = [_point(point, f'{where}.points[{index}]') for index, point in enumerate(given)]
+def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:
+    closed = check_flag(read.get('closed', False), f'{where}.closed')
+    given = check_list(read['points'], f'{where}.points', 3 if closed else 2, MAX_SEGMENTS + 1)
+    points = [_pair(point, f'{where}.points[{index}]') for index, point in enumerate(given)]
     for index in range(0 if closed else 1, len(points)):
         length = math.dist(points[index - 1], points[index])
         if length < MIN_SIZE:
             last = '; leave the last point out, closed adds it' if index == 0 else ''
-            raise WorldError(
+            raise EntryError(
                 f'{where}.points[{index}] must be at least {MIN_SIZE:g} m from the point before '
                 f'it: got {length:g} m{last}'
             )
         yield *points[index - 1], *points[index]
 
 
-def _box(content: object, where: str) -> tuple[float, ...]:
-    read = _entry(content, where, ('center', 'size'), ('yaw',))
-    size = _list(read['size'], f'{where}.size', 2, 2)
+def _box(read: dict[str, Any], where: str) -> tuple[float, float, float, float, float]:
     # More than a full turn is a yaw in degrees.
-    return (
-        *_point(read['center'], f'{where}.center'),
-        *(_number(size[i], f'{where}.size[{i}]', MIN_SIZE, MAX_COORDINATE, ' m') for i in (0, 1)),
-        _number(read.get('yaw', 0.0), f'{where}.yaw', -math.tau, math.tau, ' rad'),
-    )
+    yaw = check_number(read.get('yaw', 0.0), f'{where}.yaw', -math.tau, math.tau, 'rad')
+    size = _pair(read['size'], f'{where}.size', MIN_SIZE)
+    return *_pair(read['center'], f'{where}.center'), *size, yaw
+
+
+def _disc(where: str, read: dict[str, Any]) -> tuple[float, float, float]:
+    radius = check_number(read['radius'], f'{where}.radius', MIN_SIZE, MAX_COORDINATE, 'm')
+    return *_pair(read['center'], f'{where}.center'), radius
 
 
 def _sides(
@@ -244,76 +250,31 @@ def _sides(
         yield *corners[index - 1], *corners[index]
 
 
-def _circle(where: str, content: object, more: tuple[str, ...]) -> tuple[float, ...]:
-    read = _entry(content, where, ('center', 'radius', *more), ())
+def _entries(
+    read: dict[str, Any], name: str, most: int, needed: tuple[str, ...], *optional: str
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    for index, content in enumerate(check_list(read.get(name, []), name, 0, most)):
+        where = f'{name}[{index}]'
+        yield where, check_entry(content, where, needed, optional)
+
+
+def _pair(content: object, where: str, low: float = -MAX_COORDINATE) -> tuple[float, float]:
+    x, y = check_list(content, where, 2, 2)
     return (
-        *_point(read['center'], f'{where}.center'),
-        _number(read['radius'], f'{where}.radius', MIN_SIZE, MAX_COORDINATE, ' m'),
-        *(_number(read[name], f'{where}.{name}', 0.0, 1.0, '') for name in more),
+        check_number(x, f'{where}[0]', low, MAX_COORDINATE, 'm'),
+        check_number(y, f'{where}[1]', low, MAX_COORDINATE, 'm'),
     )
-
-
-def _entry(
-    content: object, where: str, needed: tuple[str, ...], optional: tuple[str, ...]
-) -> dict[str, Any]:
-    known = (*needed, *optional)
-    if not isinstance(content, dict):
-        raise WorldError(
-            f'{where} must hold {", ".join(known)} by name: got {reprlib.repr(content)}'
-        )
-    for name in content:
-        if name not in known:
-            near = nearest_hint(str(name), known) or f'; known are {", ".join(known)}'
-            raise WorldError(f'{where} has no {reprlib.repr(name)}{near}')
-    for name in needed:
-        if name not in content:
-            raise WorldError(f'{where} must have a {name}')
-    return content
-
-
-def _entries(read: dict[str, Any], name: str, most: int) -> Iterator[tuple[str, object]]:
-    for index, entry in enumerate(_list(read.get(name, []), name, 0, most)):
-        yield f'{name}[{index}]', entry
-
-
-def _list(content: object, where: str, least: int, most: int) -> list[Any]:
-    if not isinstance(content, list):
-        raise WorldError(f'{where} must be a list: got {reprlib.repr(content)}')
-    if not least <= len(content) <= most:
-        span = f'{least}' if least == most else f'from {least} to {most}'
-        raise WorldError(f'{where} must have {span} entries: got {len(content)}')
-    return content
-
-
-def _point(content: object, where: str) -> tuple[float, float]:
-    x, y = _list(content, where, 2, 2)
-    return (
-        _number(x, f'{where}[0]', -MAX_COORDINATE, MAX_COORDINATE, ' m'),
-        _number(y, f'{where}[1]', -MAX_COORDINATE, MAX_COORDINATE, ' m'),
-    )
-
-
-def _number(content: object, where: str, low: float, high: float, unit: str) -> float:
-    bounds = f'{where} must be a number from {low:g} to {high:g}{unit}'
-    if isinstance(content, bool) or not isinstance(content, int | float):
-        # PyYAML requires a digit between sign and point, and an exponent with point and sign.
-        number_like = isinstance(content, str) and _NUMBER_PATTERN.fullmatch(content)
-        hint = ', which YAML reads as text; write -0.9 or 1.0e-3' if number_like else ''
-        raise WorldError(f'{bounds}: got {reprlib.repr(content)}{hint}')
-    if not low <= content <= high:  # false for NaN, too
-        raise WorldError(f'{bounds}: got {reprlib.repr(content)}')
-    return float(content)
 
 
 def _check_count(count: int) -> None:
     if count > MAX_SEGMENTS:
-        raise WorldError(
+        raise EntryError(
             f'walls and boxes must have at most {MAX_SEGMENTS} segments together: '
             f'got {count} or more'
         )
 
 
-def _rows(rows: list[tuple[float, ...]], width: int) -> Array:
+def _rows(rows: Sequence[tuple[float, ...]], width: int) -> Array:
     return np.array(rows, dtype=np.float64).reshape(-1, width)
 
 

@@ -67,8 +67,8 @@ def test_path_files_are_read(tmp_path, name, text):
         ('a.csv', '0,0\n1\n', 'point 1'),
         ('a.yaml', 'points: [[0, 0], [1, true]]', r'y of points\[1\]'),
         ('a.yaml', 'points: [[0, 0], [0, 0]]', 'two points'),
-        ('a.yaml', 'poses: 3', 'must have points'),
-        ('a.yaml', 'points: [[0, 0], [1, 0]]\nclose: true', 'no entry close'),
+        ('a.yaml', 'poses: 3', "has no 'poses'"),
+        ('a.yaml', 'points: [[0, 0], [1, 0]]\nclose: true', "has no 'close'; did you mean closed"),
         ('a.txt', '0 0', 'must end in'),
     ],
 )

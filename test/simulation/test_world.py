@@ -231,10 +231,10 @@ BAD = {
     'circles: [{center: [0, true], radius: 1}]': 'circles[0].center[1] must be a number',
     'circles: [{center: [0], radius: 1}]': 'circles[0].center must have 2 entries: got 1',
     'circles: [{center: 3, radius: 1}]': 'circles[0].center must be a list: got 3',
-    'circles: [{center: [0, 0]}]': 'circles[0] must have a radius',
+    'circles: [{center: [0, 0]}]': 'circles[0] must have radius',
     'circles: [7]': 'circles[0] must hold center, radius by name: got 7',
     f'patches: [{{{CIRCLE}, grip: 1.2}}]': 'patches[0].grip must be a number from 0 to 1: got 1.2',
-    f'patches: [{{{CIRCLE}}}]': 'patches[0] must have a grip',
+    f'patches: [{{{CIRCLE}}}]': 'patches[0] must have grip',
     f'circles: [{{{CIRCLE}, grip: 1}}]': "circles[0] has no 'grip'",
     'boxes: [{center: [0, 0], size: [1, 1], yaw: 45}]': (
         'boxes[0].yaw must be a number from -6.28319 to 6.28319 rad: got 45'
