@@ -32,9 +32,8 @@ from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.chaos.system import hyperchaotic_system
 from t3mpc_ros.geometry.arena import Arena
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
-
-Array = NDArray[np.float64]
 
 SPACING = 0.01
 """Distance of the points of the path, m."""

@@ -9,16 +9,13 @@ import math
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
-from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, Pose
+from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, Array, BodyTwist, Pose
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
-
-Array = NDArray[np.float64]
 
 APPROACH = 0.02
 """Distance from which on a robot has come nearer or set off, m: above the noise of a pose."""

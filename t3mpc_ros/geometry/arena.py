@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError
-
-Array = NDArray[np.float64]
 
 _SLICES = 257
 """Vertical lines at which area and height of the arena are tabulated."""

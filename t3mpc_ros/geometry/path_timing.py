@@ -27,14 +27,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, Pose
+from t3mpc_ros.geometry.types import STANDSTILL, Array, BodyTwist, Pose
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = NDArray[np.float64]
 
 STEP = 0.004
 """Grid of the path parameter u, m."""

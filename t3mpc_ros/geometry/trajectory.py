@@ -7,10 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, State
+from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, State
 from t3mpc_ros.kernels import TypedKernel, kernel
 
-Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 
@@ -54,7 +53,8 @@ class ReferenceTrajectory:
     """
 
     def __init__(self, jump: BodyTwist, capacity: int = 512) -> None:
-        self._capacity = capacity
+        self.capacity = capacity
+        """Maximum number of samples."""
         self._write_sample = TypedKernel(write_sample)
         # Twice as long as needed: every ``capacity`` samples the newest ones move to the front.
         self.buffer = TrajectorySamples(
@@ -93,7 +93,7 @@ class ReferenceTrajectory:
         if last == len(stamps):
             self._move_to_front()
             first, last = bounds.tolist()
-        if last - first == self._capacity:
+        if last - first == self.capacity:
             first += 1
         bounds[:] = first, last + 1
         self.newest_ns = stamp_ns
@@ -101,11 +101,6 @@ class ReferenceTrajectory:
         if self._write_sample(self.buffer, stamp_ns, twist.linear, twist.angular):
             self._add_jump(last)
         return True
-
-    @property
-    def capacity(self) -> int:
-        """Maximum number of samples."""
-        return self._capacity
 
     @property
     def has_jumps(self) -> bool:

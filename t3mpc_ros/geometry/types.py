@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+"""Of any shape; docstrings give shape and units."""
 
 NANOSECONDS = 1_000_000_000
 """Nanoseconds per second: stamps are ``int`` nanoseconds, durations ``float`` seconds."""

@@ -12,13 +12,11 @@ from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-import numpy.typing as npt
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
-
-Array = npt.NDArray[np.float64]
 
 _TYRE_WIDTH = 0.02  # m
 _SENSOR_SIZE = '0.013 0.037 0.013'  # m: depth, width and height of the GP2Y0A21YK0F

@@ -75,7 +75,7 @@ def a_counter(source):
         used.add(source.randrange(2**32))
     before = used.total
     used.rebase()
-    yield used, fresh, ('_total',)
+    yield used, fresh, ('total',)
     for _ in range(3):
         value = source.randrange(2**32)
         yield used.add(value) - before, fresh.add(value), ()
@@ -118,7 +118,7 @@ def a_telemetry_decoder(source):
     now_ns += source.randrange(1, 5) * SECOND
     clock_us = robot.time_us(now_ns) + 2**31  # none that the old clock could show
     robot.boot(now_ns, clock_us % 2**32)
-    kept = '_base', '_time._total', '_left._total', '_right._total', '_rebooted'
+    kept = '_base', '_time.total', '_left.total', '_right.total', 'rebooted'
     for _ in range(3):
         now_ns += 20 * MS
         got, expected = (_decode(each, robot, now_ns, True) for each in (used, fresh))
@@ -183,7 +183,7 @@ def a_handshake(source):
             if isinstance(request, frames.ParamGet | frames.ParamSet):
                 each.next_request(now_ns)
             each.handle(_result(request, robot.answer))
-        yield used, fresh, ('_reason', '_session')
+        yield used, fresh, ('reason', '_session')
 
 
 def _result(request, uplink):
@@ -258,8 +258,8 @@ def _live(source, make):
 
 
 LINK_KEPT = (
-    '_arbiter', '_statistics', '_decoder', '_telemetry', '_received_ns', '_info',
-    '_board_parameters', '_transactions._id', '_transactions._statistics', '_session._number',
+    '_arbiter', '_statistics', '_decoder', 'telemetry', '_received_ns', 'info',
+    '_board_parameters', '_transactions._id', '_transactions._statistics', '_session.number',
     '_session._nonce', '_session._last_us', '_session._hello_us', '_session._signer', '_estop_ns',
     '_active._arbiter', '_active._statistics', '_active._session',
     *(f'_transactions._decoder.{name}' for name in COUNTERS),

@@ -85,7 +85,7 @@ class Person:
             self.bench.wait(0.2)  # as a person; the sensors measure every 48 ms at least
             return ''
         if 'Voltage of the meter' in question:
-            self.plant._battery._charge = 1.0 if 'first' in question else 0.1
+            self.plant._battery.charge = 1.0 if 'first' in question else 0.1
             self.bench.wait(0.1)
             volts = self.plant._battery.voltage + MARKS.voltage * self.random.standard_normal()
             return f'{volts:.2f}'

@@ -22,18 +22,6 @@ from t3mpc_ros.radio.protocol.authentication import (
     session_key,
     sign_hello,
 )
-from t3mpc_ros.radio.protocol.frames import (
-    BOARD_PARAMETERS,
-    VERSION,
-    Command,
-    Downlink,
-    Hello,
-    Info,
-    Param,
-    ParamGet,
-    ParamSet,
-    Poll,
-)
 
 Entropy = Callable[[int], bytes]
 """Returns a number of unpredictable bytes."""
@@ -61,7 +49,8 @@ class Session:
     def __init__(self, key: bytes, entropy: Entropy, before: int, now_ns: int) -> None:
         self._key = key
         drawn = entropy(1)[0]
-        self._number = 1 + ((before + drawn % 254) % 255 if before else drawn % 255)
+        self.number = 1 + ((before + drawn % 254) % 255 if before else drawn % 255)
+        """Session number, 1 to 255."""
         self._last_us = now_ns // 1000
         self._seq = 0
         self._request = 0
@@ -72,21 +61,16 @@ class Session:
         self.echo_us: int | None = None
         """Robot time of the newest STATE; None before the first: the robot refuses every CMD."""
 
-    @property
-    def number(self) -> int:
-        """Session number, 1 to 255."""
-        return self._number
-
-    def hello(self, now_ns: int) -> Hello:
+    def hello(self, now_ns: int) -> frames.Hello:
         """Return the HELLO of this session."""
         if not self._key:
-            return Hello(self._number, 0)
+            return frames.Hello(self.number, 0)
         self._hello_us = self._stamp(now_ns)
-        return sign_hello(self._key, self._number, 0, self._hello_us, self._nonce)
+        return sign_hello(self._key, self.number, 0, self._hello_us, self._nonce)
 
-    def accept(self, info: Info) -> str:
+    def accept(self, info: frames.Info) -> str:
         """Start the session with the INFO of the robot; return the problem if there is one."""
-        if info.protocol != VERSION:
+        if info.protocol != frames.VERSION:
             return reasons.robot_version(info.protocol)
         if info.settings == frames.SETTINGS_MISSING:
             return reasons.SETTINGS_MISSING
@@ -100,31 +84,33 @@ class Session:
             return reasons.ROBOT_KEY_MISSING
         if info.nonce and not self._key:
             return reasons.HOST_KEY_MISSING
-        if info.session != self._number:
+        if info.session != self.number:
             return reasons.refused('HELLO', info.refusal)
         if self._key:
             key = session_key(self._key, self._nonce, info.nonce)
             self._signer = Signer(key, self._hello_us)
         return ''
 
-    def command(self, flags: int, ttl: int, left: int, right: int, now_ns: int) -> Command:
+    def command(self, flags: int, ttl: int, left: int, right: int, now_ns: int) -> frames.Command:
         """Return the next CMD; without an echo it can only be an emergency stop."""
         self._seq = self._seq + 1 & _BYTE
         echo_us = 0 if self.echo_us is None else self.echo_us
-        frame = Command(self._number, self._seq, flags, ttl, left, right, echo_us)
+        frame = frames.Command(self.number, self._seq, flags, ttl, left, right, echo_us)
         return self._sign(frame, now_ns)
 
-    def set(self, number: int, value: int, now_ns: int) -> ParamSet:
+    def set(self, number: int, value: int, now_ns: int) -> frames.ParamSet:
         """Return a PARAM_SET."""
-        return self._sign(ParamSet(self._number, self._next_request(), number, value), now_ns)
+        return self._sign(
+            frames.ParamSet(self.number, self._next_request(), number, value), now_ns
+        )
 
-    def get(self, number: int) -> ParamGet:
+    def get(self, number: int) -> frames.ParamGet:
         """Return a PARAM_GET."""
-        return ParamGet(self._number, self._next_request(), number)
+        return frames.ParamGet(self.number, self._next_request(), number)
 
-    def poll(self, what: int) -> Poll:
+    def poll(self, what: int) -> frames.Poll:
         """Return a POLL."""
-        return Poll(self._number, self._seq, what)
+        return frames.Poll(self.number, self._seq, what)
 
     def _sign(self, frame: AnySignedFrame, now_ns: int) -> AnySignedFrame:
         if self._signer is None:
@@ -152,38 +138,22 @@ class Handshake:
         self._session = session
         self._targets = parameters.robot.to_wire()
         self._channel = parameters.channel
-        self._state = LinkState.HELLO
-        self._reason = reason
+        self.state = LinkState.HELLO
+        """HELLO, INFO or PARAMS; RUN when the handshake is complete."""
+        self.reason = reason
+        """Reason why the handshake is not complete."""
         self._pending: deque[tuple[int, int | None]] = deque()
         self._attempts = 0
-        self._info: Info | None = None
-        self._board_parameters: dict[int, int] = {}
-
-    @property
-    def state(self) -> LinkState:
-        """HELLO, INFO or PARAMS; RUN when the handshake is complete."""
-        return self._state
-
-    @property
-    def reason(self) -> str:
-        """Reason why the handshake is not complete."""
-        return self._reason
-
-    @property
-    def info(self) -> Info | None:
+        self.info: frames.Info | None = None
         """Identity of the robot, once the session has started."""
-        return self._info
-
-    @property
-    def board_parameters(self) -> dict[int, int]:
+        self.board_parameters: dict[int, int] = {}
         """Board parameters as read back, by id."""
-        return self._board_parameters
 
-    def next_request(self, now_ns: int) -> tuple[Downlink, int]:
+    def next_request(self, now_ns: int) -> tuple[frames.Downlink, int]:
         """Return the payload to send now, and the frame to POLL after it."""
-        if self._state is LinkState.HELLO:
+        if self.state is LinkState.HELLO:
             return self._session.hello(now_ns), frames.INFO
-        if self._state is LinkState.INFO:
+        if self.state is LinkState.INFO:
             return self._session.poll(frames.INFO), frames.INFO
         number, value = self._pending[0]
         if value is None:
@@ -192,28 +162,28 @@ class Handshake:
 
     def handle(self, result: TransactionResult) -> int:
         """Process a result; return the delay before the next request, ns."""
-        if self._state is LinkState.PARAMS:
+        if self.state is LinkState.PARAMS:
             return self._handle_parameter(result)
-        if isinstance(result.uplink, Info):
+        if isinstance(result.uplink, frames.Info):
             return self._handle_info(result.uplink)
         if result.uplink is None:
-            self._state = LinkState.HELLO
-            self._reason = (
+            self.state = LinkState.HELLO
+            self.reason = (
                 reasons.robot_version(result.foreign_version)
                 if result.foreign_version
                 else reasons.robot_absent(self._channel)
             )
             return _RETRY_NS
-        self._state = LinkState.INFO
+        self.state = LinkState.INFO
         return 0
 
-    def _handle_info(self, info: Info) -> int:
+    def _handle_info(self, info: frames.Info) -> int:
         problem = self._session.accept(info)
         if problem:
-            self._state, self._reason = LinkState.HELLO, problem
+            self.state, self.reason = LinkState.HELLO, problem
             return _RETRY_NS
-        self._info = info
-        self._state = LinkState.PARAMS
+        self.info = info
+        self.state = LinkState.PARAMS
         self._queue_parameters(info.parameters)
         return 0
 
@@ -221,32 +191,37 @@ class Handshake:
         """Queue all writes and reads; older firmware has fewer parameters."""
         self._pending.clear()
         self._pending.extend((number, self._targets[number]) for number in self._targets)
-        self._pending.extend((number, None) for number in range(min(count, len(BOARD_PARAMETERS))))
+        self._pending.extend(
+            (number, None) for number in range(min(count, len(frames.BOARD_PARAMETERS)))
+        )
 
     def _handle_parameter(self, result: TransactionResult) -> int:
         number, target = self._pending[0]
         answer = result.uplink
         expected_seq = getattr(result.request, 'seq', None)
-        if not isinstance(answer, Param) or (answer.id, answer.seq) != (number, expected_seq):
+        if not isinstance(answer, frames.Param) or (answer.id, answer.seq) != (
+            number,
+            expected_seq,
+        ):
             self._attempts += 1
             if self._attempts >= _MAX_ATTEMPTS:
-                self._attempts, self._state = 0, LinkState.HELLO
-                self._reason = reasons.robot_absent(self._channel)
+                self._attempts, self.state = 0, LinkState.HELLO
+                self.reason = reasons.robot_absent(self._channel)
             return 0 if result.uplink is not None else _RETRY_NS // 5
         self._attempts = 0
-        name = BOARD_PARAMETERS[number].name
+        name = frames.BOARD_PARAMETERS[number].name
         if answer.rc != frames.OK:
             text = _RESULT_TEXTS[answer.rc].format(low=answer.low, high=answer.high)
-            what = f'{name} = {target}' if isinstance(result.request, ParamSet) else name
-            self._reason = f'parameter {what} was refused: the robot {text}'
+            what = f'{name} = {target}' if isinstance(result.request, frames.ParamSet) else name
+            self.reason = f'parameter {what} was refused: the robot {text}'
             return _RETRY_NS if answer.rc == frames.BUSY else _REJECTED_RETRY_NS
-        self._board_parameters[number] = answer.value
+        self.board_parameters[number] = answer.value
         expected = self._targets.get(number, answer.value)
         if answer.value != expected:
-            self._reason = f'parameter {name} must be {expected}: the robot keeps {answer.value}'
-            self._queue_parameters(self._info.parameters if self._info else 0)
+            self.reason = f'parameter {name} must be {expected}: the robot keeps {answer.value}'
+            self._queue_parameters(self.info.parameters if self.info else 0)
             return _REJECTED_RETRY_NS
         self._pending.popleft()
         if not self._pending:
-            self._state = LinkState.RUN
+            self.state = LinkState.RUN
         return 0

@@ -22,19 +22,6 @@ from t3mpc_ros.radio.link.telemetry import GYRO_RANGE, Telemetry, TelemetryDecod
 from t3mpc_ros.radio.link.transaction import TransactionLayer, TransactionResult
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_exchange_status
-from t3mpc_ros.radio.protocol.frames import (
-    BOARD_PARAMETERS,
-    Command,
-    CommandFlag,
-    Configured,
-    Downlink,
-    Info,
-    Poll,
-    Refusal,
-    Result,
-    State,
-    StatusFlag,
-)
 from t3mpc_ros.robot.interface import BatteryReading
 
 _MIN_REOPEN_NS, _MAX_REOPEN_NS = NANOSECONDS // 5, 2 * NANOSECONDS
@@ -45,7 +32,7 @@ _DEFECT_RETRY_NS = NANOSECONDS
 _MAX_TIMEOUTS = 5
 """Consecutive requests without a reply before the link searches for the dongle again."""
 _HANDSHAKE_STATES = (LinkState.HELLO, LinkState.INFO, LinkState.PARAMS)
-_GYRO_RANGE_ID = [parameter.name for parameter in BOARD_PARAMETERS].index('gyro_range')
+_GYRO_RANGE_ID = [parameter.name for parameter in frames.BOARD_PARAMETERS].index('gyro_range')
 
 _MIN_IDLE_NS = NANOSECONDS // 100
 """Idle time before the next cycle that a request needs."""
@@ -93,7 +80,7 @@ class ActiveSession:
         self._accepted_ns = self._answered_ns = now_ns
         # With slow cycles a single answer is a cycle old when the next command is due.
         self._silence_ns = max(round(parameters.ttl * NANOSECONDS), 2 * self._period_ns)
-        self._status = StatusFlag(0)
+        self._status = frames.StatusFlag(0)
         self._lost = 0
         self._stops: int | None = None
         self._stop_until_ns = 0
@@ -119,7 +106,7 @@ class ActiveSession:
             self._stops, self._stop_until_ns = _MIN_STOP_COMMANDS, now_ns + _STOP_TIMEOUT_NS
             self._due_ns = now_ns
 
-    def next(self, now_ns: int) -> Downlink | PingRequest | None:
+    def next(self, now_ns: int) -> frames.Downlink | PingRequest | None:
         """Return the request to send now, if any; a POLL for STATE follows each payload."""
         if now_ns < self._due_ns:
             return self._next_request(now_ns) if self._due_ns - now_ns >= _MIN_IDLE_NS else None
@@ -134,19 +121,19 @@ class ActiveSession:
 
     def handle(self, result: TransactionResult) -> str:
         """Process a result; return the reason for a new handshake, empty if none is needed."""
-        if isinstance(result.uplink, State):
+        if isinstance(result.uplink, frames.State):
             self._continue_cycles(result)
         if result.uplink is not None:
             self._answered_ns = result.returned_ns
-        if isinstance(result.request, Command):
-            answered = isinstance(result.uplink, State)
+        if isinstance(result.request, frames.Command):
+            answered = isinstance(result.uplink, frames.State)
             complete = answered and _is_own_state(result, result.request)
             self._statistics.add_cycle(result.round_trip if complete else None)
             self._lost = 0 if answered else self._lost + 1
             self._count_disable(result)
-        elif isinstance(result.request, Poll) and result.request.what == frames.STATE:
-            self._lost = 0 if isinstance(result.uplink, State) else self._lost + 1
-        if isinstance(result.uplink, State):
+        elif isinstance(result.request, frames.Poll) and result.request.what == frames.STATE:
+            self._lost = 0 if isinstance(result.uplink, frames.State) else self._lost + 1
+        if isinstance(result.uplink, frames.State):
             return self._check_state(result, result.uplink)
         if self._lost >= _MAX_LOST_CYCLES:
             return reasons.robot_absent(self._parameters.channel)
@@ -159,10 +146,10 @@ class ActiveSession:
         """
         if self.is_silent(result.returned_ns):
             self._due_ns = self._accepted_ns = result.returned_ns
-        elif isinstance(result.request, Poll) and result.request.what == frames.STATE:
+        elif isinstance(result.request, frames.Poll) and result.request.what == frames.STATE:
             self._due_ns = result.returned_ns
 
-    def _next_request(self, now_ns: int) -> Downlink | PingRequest | None:
+    def _next_request(self, now_ns: int) -> frames.Downlink | PingRequest | None:
         """Return the request that is due between cycles, if any."""
         if self._stops is not None:
             return None
@@ -174,17 +161,17 @@ class ActiveSession:
             return PingRequest()
         return None
 
-    def _next_command(self, now_ns: int) -> Downlink:
+    def _next_command(self, now_ns: int) -> frames.Downlink:
         if self._stops is not None:
-            standing = not self._status & StatusFlag.MOVING and self._stops <= 0
+            standing = not self._status & frames.StatusFlag.MOVING and self._stops <= 0
             disable = standing or now_ns >= self._stop_until_ns
             self._stops = min(self._stops - 1, -1 if disable else self._stops)
-            flags = CommandFlag(0) if disable else CommandFlag.ENABLE
+            flags = frames.CommandFlag(0) if disable else frames.CommandFlag.ENABLE
             return self._session.command(flags, self._parameters.ttl_units, 0, 0, now_ns)
         if self._session.echo_us is None and not self._arbiter.estop:
             return self._session.poll(frames.STATE)
         setpoint = self._arbiter.next_setpoint(
-            bool(self._status & StatusFlag.ESTOP), now_ns, self.is_silent(now_ns)
+            bool(self._status & frames.StatusFlag.ESTOP), now_ns, self.is_silent(now_ns)
         )
         flags, left, right, ttl = setpoint
         return self._session.command(flags, ttl, left, right, now_ns)
@@ -194,19 +181,23 @@ class ActiveSession:
 
         After a pause of the host, the first one is refused for its echo.
         """
-        if self._stops is None or not isinstance(result.request, Command) or result.request.flags:
+        if (
+            self._stops is None
+            or not isinstance(result.request, frames.Command)
+            or result.request.flags
+        ):
             return
         state = result.uplink
-        disabled = isinstance(state, State) and not state.status & StatusFlag.ENABLED
+        disabled = isinstance(state, frames.State) and not state.status & frames.StatusFlag.ENABLED
         self._disable_attempts = 0 if disabled else self._disable_attempts - 1
 
-    def _check_state(self, result: TransactionResult, state: State) -> str:
-        self._status = StatusFlag(state.status)
-        if state.session != self._session.number or state.status & StatusFlag.NO_SESSION:
+    def _check_state(self, result: TransactionResult, state: frames.State) -> str:
+        self._status = frames.StatusFlag(state.status)
+        if state.session != self._session.number or state.status & frames.StatusFlag.NO_SESSION:
             return 'the robot has lost its session'
-        if isinstance(result.request, Command):
+        if isinstance(result.request, frames.Command):
             # ESTOP is always executed, whether or not the rest of the command is accepted.
-            if state.seq == result.request.seq or result.request.flags & CommandFlag.ESTOP:
+            if state.seq == result.request.seq or result.request.flags & frames.CommandFlag.ESTOP:
                 self._accepted_ns = result.returned_ns
                 return ''
             refused_ns = result.returned_ns - self._accepted_ns
@@ -218,13 +209,13 @@ class ActiveSession:
         return ''
 
 
-def _is_own_state(result: TransactionResult, command: Command) -> bool:
+def _is_own_state(result: TransactionResult, command: frames.Command) -> bool:
     """Return whether a STATE was sampled in this cycle: the CMD itself fetches an older one.
 
     A retransmitted CMD may fetch its own STATE; the POLL then returns none.
     """
     fetched = (
-        isinstance(result.reply, Result)
+        isinstance(result.reply, frames.Result)
         and decode_exchange_status(result.reply.second).has_payload
     )
     return fetched or getattr(result.uplink, 'seq', None) == command.seq
@@ -252,7 +243,8 @@ class Link:
         self._transactions = TransactionLayer(self._statistics)
         self._arbiter = SetpointArbiter(parameters)
         self._decoder = TelemetryDecoder()
-        self._state = LinkState.CLOSED
+        self.state = LinkState.CLOSED
+        """State of the connection."""
         self._reason = LinkState.CLOSED.value
         self._actions: list[PortAction] = []
         self._due_ns = 0
@@ -263,28 +255,20 @@ class Link:
         self._session: Session | None = None
         self._handshake: Handshake | None = None
         self._active: ActiveSession | None = None
-        self._info: Info | None = None
+        self.info: frames.Info | None = None
+        """Identity of the robot; None before the first session."""
         self._board_parameters: dict[int, int] = {}
-        self._telemetry: Telemetry | None = None
+        self.telemetry: Telemetry | None = None
+        """Newest measurement."""
         self._received_ns: int | None = None
         self._shutting_down = False
 
     # -- status -----------------------------------------------------------------------------------
 
     @property
-    def state(self) -> LinkState:
-        """State of the connection."""
-        return self._state
-
-    @property
     def authenticated(self) -> bool:
         """Whether commands are signed and the robot verifies them."""
-        return bool(self._key) and self._state in (LinkState.PARAMS, LinkState.RUN, LinkState.STOP)
-
-    @property
-    def telemetry(self) -> Telemetry | None:
-        """Newest measurement."""
-        return self._telemetry
+        return bool(self._key) and self.state in (LinkState.PARAMS, LinkState.RUN, LinkState.STOP)
 
     @property
     def next_cycle_ns(self) -> int | None:
@@ -297,15 +281,10 @@ class Link:
         return self._arbiter.sent_wheels
 
     @property
-    def info(self) -> Info | None:
-        """Identity of the robot; None before the first session."""
-        return self._info
-
-    @property
     def board_parameters(self) -> dict[str, int]:
         """Board parameters as read back, in their units on the wire."""
         return {
-            BOARD_PARAMETERS[number].name: value
+            frames.BOARD_PARAMETERS[number].name: value
             for number, value in self._board_parameters.items()
         }
 
@@ -333,21 +312,21 @@ class Link:
 
     def reason(self, now_ns: int) -> str:
         """Return why the robot does not move; empty when it follows commands."""
-        if self._state in _HANDSHAKE_STATES and self._handshake is not None:
+        if self.state in _HANDSHAKE_STATES and self._handshake is not None:
             return self._handshake.reason
-        if self._state is not LinkState.RUN:
+        if self.state is not LinkState.RUN:
             return self._reason
         silence = min(self._age(now_ns), (now_ns - self._since_ns) / NANOSECONDS)
         if silence > self._parameters.ttl:
             return reasons.robot_absent(self._parameters.channel)
-        status = self._telemetry.raw.status if self._telemetry is not None else StatusFlag(0)
-        if reason := self._arbiter.reason(bool(status & StatusFlag.ESTOP)):
+        status = self.telemetry.raw.status if self.telemetry is not None else frames.StatusFlag(0)
+        if reason := self._arbiter.reason(bool(status & frames.StatusFlag.ESTOP)):
             return reason
-        if status & StatusFlag.TTL_EXPIRED:
+        if status & frames.StatusFlag.TTL_EXPIRED:
             return reasons.TTL_EXPIRED
-        if status & StatusFlag.ENABLED:
+        if status & frames.StatusFlag.ENABLED:
             return ''
-        low = status & StatusFlag.LOW_BATTERY
+        low = status & frames.StatusFlag.LOW_BATTERY
         return reasons.BATTERY_CUTOFF if low else reasons.DRIVES_DISABLED
 
     # -- commands ---------------------------------------------------------------------------------
@@ -369,7 +348,7 @@ class Link:
 
     def release_estop(self, now_ns: int) -> str:
         """Release the emergency stop of host and robot; return why that is not needed."""
-        robot_latched = self._telemetry is not None and self._telemetry.status.estop
+        robot_latched = self.telemetry is not None and self.telemetry.status.estop
         return self._arbiter.release(robot_latched, now_ns)
 
     def shut_down(self) -> None:
@@ -391,9 +370,9 @@ class Link:
         The port of an absent device is retried five times a second; after any other failure the
         retry interval doubles up to 2 s.
         """
-        if self._state is LinkState.DONE:
+        if self.state is LinkState.DONE:
             return
-        if self._state is not LinkState.OPEN:
+        if self.state is not LinkState.OPEN:
             self._statistics.port_failures += 1
         self._close(LinkState.CLOSED, text)
         self._due_ns = now_ns + (_MIN_REOPEN_NS if absent else self._reopen_ns)
@@ -418,13 +397,13 @@ class Link:
     # -- internal ---------------------------------------------------------------------------------
 
     def _until_ns(self, now_ns: int) -> int:
-        if self._state in (LinkState.OPEN, LinkState.DONE):
+        if self.state in (LinkState.OPEN, LinkState.DONE):
             return now_ns + NANOSECONDS
         if self._transactions.deadline_ns is not None:
             return self._transactions.deadline_ns
         if self._active is not None:
             return self._active.due_ns
-        if self._state in _HANDSHAKE_STATES and self._arbiter.estop:
+        if self.state in _HANDSHAKE_STATES and self._arbiter.estop:
             return min(self._due_ns, self._estop_ns)
         return self._due_ns
 
@@ -432,7 +411,7 @@ class Link:
         """Send the request that is due, if any."""
         if self._active is not None:
             self._send_active(self._active, now_ns)
-        elif self._state in _HANDSHAKE_STATES and self._arbiter.estop and now_ns >= self._estop_ns:
+        elif self.state in _HANDSHAKE_STATES and self._arbiter.estop and now_ns >= self._estop_ns:
             self._send_estop(now_ns)
         elif now_ns >= self._due_ns:
             self._send_connecting(now_ns)
@@ -441,13 +420,15 @@ class Link:
         """Repeat ESTOP with the cycles: it needs no session that has started."""
         self._estop_ns = now_ns + round(NANOSECONDS / self._parameters.cycle_rate)
         if self._session is not None:
-            self._transact(self._session.command(CommandFlag.ESTOP, 0, 0, 0, now_ns), now_ns)
+            self._transact(
+                self._session.command(frames.CommandFlag.ESTOP, 0, 0, 0, now_ns), now_ns
+            )
 
     def _send_connecting(self, now_ns: int) -> None:
         """Take the next step from a closed port to a session."""
-        match self._state:
+        match self.state:
             case LinkState.CLOSED:
-                self._state = LinkState.OPEN
+                self.state = LinkState.OPEN
                 self._actions.append(Open())
             case LinkState.PING if now_ns - self._since_ns >= _DONGLE_START_TIMEOUT_NS:
                 self.port_failed(reasons.NO_DONGLE, False, now_ns)
@@ -466,7 +447,7 @@ class Link:
         elif frame is not None:
             self._transact(frame, now_ns)
 
-    def _transact(self, first: Downlink, now_ns: int, what: int = frames.STATE) -> None:
+    def _transact(self, first: frames.Downlink, now_ns: int, what: int = frames.STATE) -> None:
         if self._session is not None:
             poll = self._session.poll(what)
             self._write(
@@ -482,15 +463,15 @@ class Link:
             self._statistics.dongle = result.reply
         if isinstance(result.uplink, frames.Aux):
             self._statistics.robot = result.uplink
-        if isinstance(result.uplink, State):
+        if isinstance(result.uplink, frames.State):
             self._handle_state(result, result.uplink)
-        if self._state is LinkState.PING:
+        if self.state is LinkState.PING:
             self._handle_pong(result, now_ns)
         elif result.dongle_restarted:
             self._configure_radio(now_ns)  # the restart cleared its configuration
         elif self._transactions.timeouts >= _MAX_TIMEOUTS:
             self._search_dongle(reasons.DONGLE_TIMEOUT, now_ns)
-        elif self._state is LinkState.CFG:
+        elif self.state is LinkState.CFG:
             self._handle_configured(result, now_ns)
         else:
             self._handle_robot(result, now_ns)
@@ -505,11 +486,11 @@ class Link:
                 self._start_handshake(reason, now_ns)
         elif self._handshake is not None and not isinstance(result.request, frames.Command):
             self._due_ns = now_ns + self._handshake.handle(result)
-            self._state = self._handshake.state
-            if self._state is LinkState.RUN:
+            self.state = self._handshake.state
+            if self.state is LinkState.RUN:
                 self._start_session(self._handshake, now_ns)
 
-    def _handle_state(self, result: TransactionResult, state: State) -> None:
+    def _handle_state(self, result: TransactionResult, state: frames.State) -> None:
         """Process a STATE; it is a clock sample if it answers the command sent."""
         own = self._active is not None and state.seq == getattr(result.request, 'seq', None)
         timing = result.timing if own else None
@@ -518,7 +499,7 @@ class Link:
         if telemetry is not None:
             if self._session is not None:
                 self._session.echo_us = state.time_us
-            self._telemetry = telemetry
+            self.telemetry = telemetry
             self._received_ns = result.returned_ns
 
     def _handle_pong(self, result: TransactionResult, now_ns: int) -> None:
@@ -541,7 +522,7 @@ class Link:
 
     def _handle_configured(self, result: TransactionResult, now_ns: int) -> None:
         reply = result.reply
-        if isinstance(reply, Configured) and isinstance(result.request, frames.Configure):
+        if isinstance(reply, frames.Configured) and isinstance(result.request, frames.Configure):
             if not reply.chip_ok:
                 self._search_dongle(reasons.NO_CHIP, now_ns)
                 return
@@ -549,7 +530,7 @@ class Link:
                 self._start_handshake(reasons.robot_absent(self._parameters.channel), now_ns)
                 return
             self._reason = reasons.RADIO_NOT_CONFIGURED
-        elif isinstance(reply, Refusal) and reply.code == frames.UNKNOWN:
+        elif isinstance(reply, frames.Refusal) and reply.code == frames.UNKNOWN:
             # Its console answers PING as well. The port stays open: opening it resets the robot.
             self._reason = reasons.ROBOT_USB
             self._due_ns = now_ns + _DEFECT_RETRY_NS
@@ -572,7 +553,7 @@ class Link:
         self._due_ns = now_ns
 
     def _start_session(self, handshake: Handshake, now_ns: int) -> None:
-        self._info, self._board_parameters = handshake.info, handshake.board_parameters
+        self.info, self._board_parameters = handshake.info, handshake.board_parameters
         if self._session is None or handshake.info is None:
             return
         steps = handshake.info.steps_per_rev * handshake.info.microsteps
@@ -589,20 +570,20 @@ class Link:
         )
 
     def _continue_stop(self, now_ns: int) -> None:
-        if self._state is LinkState.RUN and self._active is not None:
-            self._state, self._reason = LinkState.STOP, LinkState.STOP.value
+        if self.state is LinkState.RUN and self._active is not None:
+            self.state, self._reason = LinkState.STOP, LinkState.STOP.value
             self._active.begin_stop(now_ns)
-        elif self._state not in (LinkState.STOP, LinkState.DONE):
+        elif self.state not in (LinkState.STOP, LinkState.DONE):
             self._close(LinkState.DONE, reasons.SHUT_DOWN)
 
     def _close(self, state: LinkState, reason: str) -> None:
-        if self._state is not LinkState.CLOSED:
+        if self.state is not LinkState.CLOSED:
             self._actions.append(Close())
         self._transactions.reset()
         self._enter(state, reason)
 
     def _enter(self, state: LinkState, reason: str) -> None:
-        self._state, self._reason = state, reason
+        self.state, self._reason = state, reason
         self._handshake = self._active = None
 
     def _age(self, now_ns: int) -> float:

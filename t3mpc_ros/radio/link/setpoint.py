@@ -37,21 +37,13 @@ class SetpointArbiter:
         self._wheels: WheelSpeeds | None = None
         self._until_ns = 0
         self._reason = reasons.NO_COMMAND
-        self._estop = ''
+        self.estop = ''
+        """Reason of the emergency stop latched on the host; empty if none is."""
         self._release_until_ns: int | None = None
         self._release_frames = 0
         self._button_held = False
-        self._sent_wheels = ZERO_WHEEL_SPEEDS
-
-    @property
-    def estop(self) -> str:
-        """Reason of the emergency stop latched on the host; empty if none is."""
-        return self._estop
-
-    @property
-    def sent_wheels(self) -> WheelSpeeds:
+        self.sent_wheels = ZERO_WHEEL_SPEEDS
         """Wheel speeds of the last setpoint, after every limit."""
-        return self._sent_wheels
 
     def command(self, wheels: WheelSpeeds, until_ns: int) -> None:
         """Select finite wheel speeds (rad/s) until ``until_ns``, unless others replace them."""
@@ -64,14 +56,14 @@ class SetpointArbiter:
 
     def latch(self, reason: str) -> None:
         """Latch the emergency stop."""
-        self._estop = f'emergency stop: {reason}'
+        self.estop = f'emergency stop: {reason}'
         self.clear(reasons.NO_COMMAND)
 
     def release(self, robot_latched: bool, now_ns: int) -> str:
         """Release the emergency stop of host and robot; return why that is not needed."""
-        if not self._estop and not robot_latched:
+        if not self.estop and not robot_latched:
             return 'no emergency stop is latched'
-        self._estop = ''
+        self.estop = ''
         self._button_held = False
         self._release_until_ns = now_ns + _RELEASE_TIMEOUT_NS
         self._release_frames = _MIN_RELEASE_FRAMES
@@ -86,10 +78,10 @@ class SetpointArbiter:
         ``robot_latched``: the last status reports an emergency stop. A silent robot may
         still receive, and would move unobserved.
         """
-        self._sent_wheels = ZERO_WHEEL_SPEEDS
+        self.sent_wheels = ZERO_WHEEL_SPEEDS
         self._button_held &= robot_latched  # a latch that is gone was another one
         ttl = self._parameters.ttl_units
-        if self._estop:
+        if self.estop:
             return Setpoint(CommandFlag.ESTOP, 0, 0, ttl)
         if self._release_until_ns is not None:
             self._release_frames -= 1
@@ -105,15 +97,15 @@ class SetpointArbiter:
         limit = self._parameters.robot.max_speed
         scale = 1.0 if fastest <= limit else limit / fastest
         right, left = (round(1000.0 * scale * speed) for speed in self._wheels)
-        self._sent_wheels = WheelSpeeds(right / 1000.0, left / 1000.0)
+        self.sent_wheels = WheelSpeeds(right / 1000.0, left / 1000.0)
         # If the host dies now, the robot stops when the command expires, not later.
         ttl = min(ttl, max(1, (self._until_ns - now_ns) // TTL_UNIT_NS))
         return Setpoint(CommandFlag.ENABLE, left, right, ttl)
 
     def reason(self, robot_latched: bool) -> str:
         """Return why standstill is selected; empty while a command is followed."""
-        if self._estop:
-            return self._estop
+        if self.estop:
+            return self.estop
         if robot_latched:
             return reasons.ESTOP_BUTTON_HELD if self._button_held else reasons.ROBOT_ESTOP
         return '' if self._wheels is not None else self._reason

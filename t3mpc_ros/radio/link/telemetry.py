@@ -62,14 +62,10 @@ class TelemetryDecoder:
         self._wheels = WheelSpeeds(0.0, 0.0)
         self._last: State | None = None
         self._last_ns = 0
-        self._rebooted = False
+        self.rebooted = False
+        """Whether the robot restarted before the last measurement."""
         self._step = math.tau / (STEPS_PER_REV * MICROSTEPS)
         self.configure(STEPS_PER_REV * MICROSTEPS, GYRO_RANGE)
-
-    @property
-    def rebooted(self) -> bool:
-        """Whether the robot restarted before the last measurement."""
-        return self._rebooted
 
     @property
     def skew(self) -> float:
@@ -102,8 +98,8 @@ class TelemetryDecoder:
         self, state: State, now_ns: int, timing: CommandTiming | None = None
     ) -> Telemetry | None:
         """Return the measurement of a STATE; None if it is not newer than the last one."""
-        self._rebooted = self._has_restarted(state, now_ns)
-        if self._rebooted:
+        self.rebooted = self._has_restarted(state, now_ns)
+        if self.rebooted:
             for counter in (self._time, self._left, self._right):
                 counter.rebase()
             self._clock.reset()
@@ -144,7 +140,7 @@ class TelemetryDecoder:
         return abs(error) > _MAX_CLOCK_ERROR + _MAX_CLOCK_ERROR_RATIO * elapsed_us / 1e6
 
     def _update_speed(self, elapsed_us: int, right: int, left: int) -> None:
-        if self._rebooted:
+        if self.rebooted:
             self._wheels = WheelSpeeds(0.0, 0.0)
         elapsed = elapsed_us / 1e6 * (1.0 + self._clock.skew)
         if 0.0 < elapsed <= _MAX_SPEED_INTERVAL:

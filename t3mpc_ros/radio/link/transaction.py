@@ -7,28 +7,13 @@ from typing import NamedTuple
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.radio.link.statistics import LinkStatistics
 from t3mpc_ros.radio.link.telemetry import CommandTiming
+from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.clock_sync import forward_delay_ns, wrapped_difference
 from t3mpc_ros.radio.protocol.codec import (
     decode_exchange_status,
     decode_from_dongle,
     decode_uplink,
     encode,
-)
-from t3mpc_ros.radio.protocol.frames import (
-    Command,
-    Configure,
-    Configured,
-    Downlink,
-    FrameError,
-    FrameErrorKind,
-    FromDongle,
-    Ping,
-    Poll,
-    Pong,
-    Refusal,
-    Result,
-    Transmit,
-    Uplink,
 )
 from t3mpc_ros.radio.protocol.framing import FrameCounts, FrameDecoder, encode_frame
 
@@ -41,11 +26,11 @@ _MAX_CLOCK_ERROR_US = 1_000_000
 class TransactionResult(NamedTuple):
     """Result of a request to the dongle."""
 
-    request: Ping | Configure | Downlink
+    request: frames.Ping | frames.Configure | frames.Downlink
     """The request; for a transaction, its first payload."""
-    reply: FromDongle | None
+    reply: frames.FromDongle | None
     """Reply of the dongle; None after a timeout."""
-    uplink: Uplink | None
+    uplink: frames.Uplink | None
     """Answer of the robot; None if missing or malformed."""
     sent_ns: int
     returned_ns: int
@@ -62,7 +47,7 @@ class TransactionResult(NamedTuple):
 
 
 class _PendingRequest(NamedTuple):
-    request: Ping | Configure | Downlink
+    request: frames.Ping | frames.Configure | frames.Downlink
     id: int
     sent_ns: int
     deadline_ns: int
@@ -80,17 +65,13 @@ class TransactionLayer:
         self._id = 0
         self._dongle: tuple[int, int] | None = None
         """Dongle clock (us) and host clock (ns) at its last reply."""
-        self._timeouts = 0
+        self.timeouts = 0
+        """Number of consecutive requests without a reply."""
 
     @property
     def frame_counts(self) -> FrameCounts:
         """Counters of the received frames."""
         return self._decoder.counts
-
-    @property
-    def timeouts(self) -> int:
-        """Number of consecutive requests without a reply."""
-        return self._timeouts
 
     @property
     def deadline_ns(self) -> int | None:
@@ -102,26 +83,28 @@ class TransactionLayer:
         self._decoder.reset()
         self._pending = None
         self._dongle = None
-        self._timeouts = 0
+        self.timeouts = 0
 
     def ping(self, timeout_ns: int, now_ns: int) -> bytes:
         """Return the bytes of a PING with its own timeout."""
         self._id = self._id + 1 & 0xFF
-        frame = Ping(self._id, (now_ns // 1000 & 0xFFFFFFFF).to_bytes(4, 'little'))
+        frame = frames.Ping(self._id, (now_ns // 1000 & 0xFFFFFFFF).to_bytes(4, 'little'))
         # The zero ends a partial frame that the dongle may have received.
         return b'\0' + self._send(frame, encode(frame), 0, timeout_ns, now_ns)
 
-    def configure(self, frame: Configure, now_ns: int) -> bytes:
+    def configure(self, frame: frames.Configure, now_ns: int) -> bytes:
         """Return the bytes of a CFG."""
         self._id = self._id + 1 & 0xFF
         frame = frame._replace(id=self._id)
         return self._send(frame, encode(frame), 0, _REPLY_TIMEOUT_NS, now_ns)
 
-    def transact(self, first: Downlink, second: Poll, gap: int, now_ns: int) -> bytes:
+    def transact(
+        self, first: frames.Downlink, second: frames.Poll, gap: int, now_ns: int
+    ) -> bytes:
         """Return the bytes of a TX."""
         self._id = self._id + 1 & 0xFF
         payload = encode(first)
-        frame = encode(Transmit(self._id, gap, payload, encode(second)))
+        frame = encode(frames.Transmit(self._id, gap, payload, encode(second)))
         return self._send(first, frame, len(payload), _REPLY_TIMEOUT_NS, now_ns)
 
     def feed(self, data: bytes, now_ns: int) -> list[TransactionResult]:
@@ -130,13 +113,13 @@ class TransactionLayer:
         for frame in self._decoder.feed(data):
             try:
                 reply = decode_from_dongle(frame)
-            except FrameError:
+            except frames.FrameError:
                 self._statistics.malformed += 1
                 continue
             pending = self._pending
             if pending is not None and _is_reply_to(reply, pending):
                 self._pending = None
-                self._timeouts = 0
+                self.timeouts = 0
                 results.append(self._result(pending, reply, now_ns))
         return results
 
@@ -146,12 +129,12 @@ class TransactionLayer:
         if pending is None or now_ns < pending.deadline_ns:
             return None
         self._pending = None
-        self._timeouts += 1
+        self.timeouts += 1
         return TransactionResult(pending.request, None, None, pending.sent_ns, now_ns, None, False)
 
     def _send(
         self,
-        request: Ping | Configure | Downlink,
+        request: frames.Ping | frames.Configure | frames.Downlink,
         frame: bytes,
         payload_bytes: int,
         timeout_ns: int,
@@ -164,12 +147,12 @@ class TransactionLayer:
         return wire
 
     def _result(
-        self, pending: _PendingRequest, reply: FromDongle, now_ns: int
+        self, pending: _PendingRequest, reply: frames.FromDongle, now_ns: int
     ) -> TransactionResult:
         uplink, timing, restarted, foreign_version = None, None, False, 0
-        if isinstance(reply, Pong):
+        if isinstance(reply, frames.Pong):
             restarted = self._detect_restart(reply.time_us, now_ns)
-        elif isinstance(reply, Result):
+        elif isinstance(reply, frames.Result):
             restarted = self._detect_restart(reply.dongle_us, now_ns)
             first = decode_exchange_status(reply.first)
             second = decode_exchange_status(reply.second)
@@ -179,12 +162,12 @@ class TransactionLayer:
             if reply.payload:
                 try:
                     uplink = decode_uplink(reply.payload)
-                except FrameError as error:
+                except frames.FrameError as error:
                     self._statistics.malformed += 1
-                    if error.kind is FrameErrorKind.VERSION:
+                    if error.kind is frames.FrameErrorKind.VERSION:
                         foreign_version = reply.payload[0] >> 4
             prompt = not first.retransmissions and second.has_payload
-            if isinstance(pending.request, Command) and prompt:
+            if isinstance(pending.request, frames.Command) and prompt:
                 delay = forward_delay_ns(pending.wire_bytes, pending.payload_bytes)
                 timing = CommandTiming(pending.sent_ns, delay)
         return TransactionResult(
@@ -208,12 +191,14 @@ class TransactionLayer:
         return abs(error) > _MAX_CLOCK_ERROR_US + elapsed_us // 50
 
 
-def _is_reply_to(reply: FromDongle, pending: _PendingRequest) -> bool:
+def _is_reply_to(reply: frames.FromDongle, pending: _PendingRequest) -> bool:
     """Return whether a reply answers the request in pending."""
-    if isinstance(reply, Refusal):
+    if isinstance(reply, frames.Refusal):
         return True  # without an id, but only one request is in pending
-    if isinstance(reply, Pong):
-        return isinstance(pending.request, Ping) and reply.echo == pending.request.echo
-    if isinstance(reply, Configured):
-        return isinstance(pending.request, Configure) and reply.id == pending.id
-    return not isinstance(pending.request, Ping | Configure) and reply.id == pending.id
+    if isinstance(reply, frames.Pong):
+        return isinstance(pending.request, frames.Ping) and reply.echo == pending.request.echo
+    if isinstance(reply, frames.Configured):
+        return isinstance(pending.request, frames.Configure) and reply.id == pending.id
+    return (
+        not isinstance(pending.request, frames.Ping | frames.Configure) and reply.id == pending.id
+    )

@@ -132,12 +132,8 @@ class Signer:
     def __init__(self, key: bytes, host_us: int) -> None:
         self._key = key
         self._last = host_us
-        self._epoch = 0
-
-    @property
-    def epoch(self) -> int:
+        self.epoch = 0
         """Number of wraps of host_us since HELLO."""
-        return self._epoch
 
     def sign(self, frame: AnySignedFrame) -> AnySignedFrame:
         """Return the frame with its tag.
@@ -149,9 +145,9 @@ class Signer:
         if frame.host_us == self._last:
             raise ValueError(f'host_us must increase: got {frame.host_us} twice')
         if frame.host_us < self._last:
-            self._epoch += 1
+            self.epoch += 1
         self._last = frame.host_us
-        return frame._replace(tag=frame_tag(frame, self._key, self._epoch))
+        return frame._replace(tag=frame_tag(frame, self._key, self.epoch))
 
 
 # -- SipHash-2-4 ----------------------------------------------------------------------------------

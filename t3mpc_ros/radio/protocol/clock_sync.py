@@ -45,21 +45,17 @@ class CounterUnwrapper:
 
     def __init__(self) -> None:
         self._last: int | None = None
-        self._total = 0
-
-    @property
-    def total(self) -> int:
+        self.total = 0
         """Sum of all differences since the first value."""
-        return self._total
 
     def add(self, value: int) -> int:
         """Return the total at the counter value ``value`` (signed or unsigned)."""
         if self._last is None:
             self._last = value
-            return self._total
-        self._total += wrapped_difference(self._last, value)
+            return self.total
+        self.total += wrapped_difference(self._last, value)
         self._last = value
-        return self._total
+        return self.total
 
     def rebase(self) -> None:
         """Keep the total; the next value is the new origin of the counter."""

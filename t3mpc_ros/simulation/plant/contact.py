@@ -19,14 +19,10 @@ from dataclasses import dataclass
 import math
 from typing import ClassVar, NamedTuple
 
-import numpy as np
-import numpy.typing as npt
-
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.world import nearest_on_segment
-
-Array = npt.NDArray[np.float64]
 
 
 class Bumper(NamedTuple):

@@ -7,13 +7,10 @@ import math
 from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.geometry.types import Array, WheelSpeeds
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import Pose, WheelSpeeds, wrap_angle
+from t3mpc_ros.geometry.types import Array, Pose, WheelSpeeds, wrap_angle
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.robot.command_limiter import ramp_towards
@@ -48,7 +48,6 @@ from t3mpc_ros.simulation.plant.stepper_motor import (
 from t3mpc_ros.simulation.sensors.imu import low_pass
 from t3mpc_ros.simulation.world import World, clearance, grip_at
 
-Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 _NO_OBSTACLES = Obstacles(np.zeros((0, 4)), np.zeros((0, 3)))

@@ -15,13 +15,11 @@ reduction give (12).
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

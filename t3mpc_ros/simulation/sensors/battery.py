@@ -71,7 +71,8 @@ class SimulatedBattery:
 
     def __init__(self, parameters: SimulatedBatteryParameters) -> None:
         self.parameters = parameters
-        self._charge = parameters.charge
+        self.charge = parameters.charge
+        """Remaining charge, 0 to 1."""
         self._low = self._collapsed = False
         self.draw(0.0, 0.0)
 
@@ -79,11 +80,6 @@ class SimulatedBattery:
     def voltage(self) -> float:
         """Terminal voltage under the load of the last draw, V."""
         return self._voltage
-
-    @property
-    def charge(self) -> float:
-        """Remaining charge, 0 to 1."""
-        return self._charge
 
     @property
     def low(self) -> bool:
@@ -113,27 +109,27 @@ class SimulatedBattery:
                 f'got {power} W, {sag} V, {dt} s'
             )
         parameters = self.parameters
-        beyond = self._charge <= 0.0
+        beyond = self.charge <= 0.0
         volts = current = 0.0
         if not beyond:
             inner, idle = parameters.resistance, parameters.idle_current
-            open_circuit = open_circuit_voltage(self._charge, parameters.cells) - sag
+            open_circuit = open_circuit_voltage(self.charge, parameters.cells) - sag
             half = 0.5 * (open_circuit - inner * idle)
             left = half * half - inner * max(power, 0.0)
             beyond = left < 0.0 or half <= 0.0
             volts = half + math.sqrt(max(left, 0.0)) if half > 0.0 else 0.0
             current = max(open_circuit - volts, 0.0) / inner
             full = parameters.capacity * _SECONDS_PER_HOUR
-            if current * dt < self._charge * full:
-                self._charge -= current * dt / full
+            if current * dt < self.charge * full:
+                self.charge -= current * dt / full
             else:
                 # Empty within the step: the current is the mean over the step.
-                current = self._charge * full / dt
-                self._charge = 0.0
+                current = self.charge * full / dt
+                self.charge = 0.0
         self._voltage = volts
         back = parameters.hysteresis
         self._low = volts < parameters.low_voltage + (back if self._low else 0.0)
         self._collapsed = beyond or volts < parameters.brown_out + (
             back if self._collapsed else 0.0
         )
-        return BatteryReading(volts, current, self._charge)
+        return BatteryReading(volts, current, self.charge)

@@ -7,14 +7,12 @@ import math
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import parameter
 from t3mpc_ros.robot.interface import ImuSample
 from t3mpc_ros.robot.sensor_conversions import GRAVITY, IMU_DATA_SHEET, ImuParameters
-
-Array = npt.NDArray[np.float64]
 
 _LOWEST, _HIGHEST = -32768.0, 32767.0
 _DEGREE = math.pi / 180.0

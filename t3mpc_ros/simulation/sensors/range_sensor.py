@@ -20,7 +20,6 @@ import math
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from t3mpc_ros.parameters.table import parameter
 from t3mpc_ros.robot.interface import RANGE_SENSORS
@@ -29,8 +28,6 @@ from t3mpc_ros.robot.sensor_conversions import (
     decode_range,
     encode_range,
 )
-
-Array = npt.NDArray[np.float64]
 
 # Least squares through figure 2, in relative errors.
 _SLOPE, _SHIFT, _FLOOR = 0.282, 0.0257, 0.061  # V m, m, V: from 10 to 80 cm
