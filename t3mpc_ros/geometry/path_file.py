@@ -7,21 +7,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.path_timing import PathError
-from t3mpc_ros.parameters.yaml_files import (
-    EntryError,
-    check_entry,
-    check_flag,
-    check_list,
-    file_errors,
-    parse_yaml,
-    read_text,
-    shortened,
-)
-
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.parameters import yaml_files
 
 MAX_FILE_SIZE = 20_000_000
 """Bytes."""
@@ -41,11 +30,11 @@ def load_path(file: str | Path) -> Array:
     suffix = path.suffix.lower()
     if suffix not in readers:
         raise PathError(f'{path} must end in .csv or .yaml: got {path.suffix or "no suffix"!r}')
-    with file_errors(path, PathError):
-        rows = readers[suffix](read_text(path, MAX_FILE_SIZE))
+    with yaml_files.file_errors(path, PathError):
+        rows = readers[suffix](yaml_files.read_text(path, MAX_FILE_SIZE))
         points = np.array([_point(where, row) for where, row in rows]).reshape(-1, 2)
         if len(points) < 2 or not np.ptp(points, axis=0).any():
-            raise EntryError(f'two points that differ are needed: got {len(points)}')
+            raise yaml_files.EntryError(f'two points that differ are needed: got {len(points)}')
     return points
 
 
@@ -55,20 +44,22 @@ def _csv_rows(text: str) -> list[tuple[str, object]]:
     if rows and not _is_number(rows[0][0]):
         header = [name.strip().lower() for name in rows.pop(0)]
         if 'x' not in header or 'y' not in header:
-            raise EntryError(f'the header must have x and y: got {", ".join(header)}')
+            raise yaml_files.EntryError(f'the header must have x and y: got {", ".join(header)}')
         columns = header.index('x'), header.index('y')
     found: list[tuple[str, object]] = []
     for number, row in enumerate(rows):
         if len(row) <= max(columns):
-            raise EntryError(f'point {number} must have x and y: got {row}')
+            raise yaml_files.EntryError(f'point {number} must have x and y: got {row}')
         found.append((f'point {number}', [row[column] for column in columns]))
     return found
 
 
 def _yaml_rows(text: str) -> list[tuple[str, object]]:
-    content = check_entry(parse_yaml(text), 'the path', ('points',), ('closed', 'name'))
-    points = check_list(content['points'], 'points')
-    closed = check_flag(content.get('closed', False), 'closed')
+    content = yaml_files.check_entry(
+        yaml_files.parse_yaml(text), 'the path', ('points',), ('closed', 'name')
+    )
+    points = yaml_files.check_list(content['points'], 'points')
+    closed = yaml_files.check_flag(content.get('closed', False), 'closed')
     return [(f'points[{n}]', point) for n, point in enumerate(points + points[:1] * closed)]
 
 
@@ -82,7 +73,9 @@ def _is_number(text: str) -> bool:
 
 def _point(where: str, row: object) -> tuple[float, float]:
     if not isinstance(row, list) or len(row) != 2:
-        raise EntryError(f'{where} must be [x, y] in m: got {shortened(row)}')
+        raise yaml_files.EntryError(
+            f'{where} must be [x, y] in m: got {yaml_files.shortened(row)}'
+        )
     found = []
     for name, value in zip('xy', row, strict=True):
         try:
@@ -90,9 +83,9 @@ def _point(where: str, row: object) -> tuple[float, float]:
         except (TypeError, ValueError):
             number = math.nan
         if not abs(number) <= MAX_COORDINATE:
-            raise EntryError(
+            raise yaml_files.EntryError(
                 f'{name} of {where} must be a number of at most {MAX_COORDINATE:g} m: '
-                f'got {shortened(value)}'
+                f'got {yaml_files.shortened(value)}'
             )
         found.append(number)
     return found[0], found[1]

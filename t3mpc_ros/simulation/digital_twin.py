@@ -11,18 +11,10 @@ import numpy as np
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import Pose, State, WheelSpeeds, check_pose
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
+from t3mpc_ros.robot import interface
 from t3mpc_ros.robot.command_limiter import CommandLimiter
 from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
-from t3mpc_ros.robot.interface import (
-    RANGE_SENSORS,
-    ZERO_WHEEL_SPEEDS,
-    ImuSample,
-    RobotCommand,
-    RobotState,
-    RobotStatus,
-    WheelAngles,
-)
 from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON, SlipMonitor
 from t3mpc_ros.simulation.fault_injection import (
     FaultParameters,
@@ -53,7 +45,7 @@ from t3mpc_ros.simulation.transport_delay import TransportDelay
 from t3mpc_ros.simulation.world import cast_rays, clearance, grip_at, load_world
 
 BROWN_OUT_REASON = 'brown-out: the board restarts'
-_NO_OBSTACLE = (math.inf,) * len(RANGE_SENSORS)
+_NO_OBSTACLE = (math.inf,) * len(interface.RANGE_SENSORS)
 
 
 @dataclass(frozen=True)
@@ -222,13 +214,13 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         self._boots_until = 0
         """Integration step at which the board has restarted."""
         self._slip_monitor = SlipMonitor()
-        self._measured = ZERO_WHEEL_SPEEDS
+        self._measured = interface.ZERO_WHEEL_SPEEDS
         self._measured_at = 0
         self._counters = (0, 0)
         self._turned = (0.0, 0.0)
         """Angles (rad) from the pulses since the start, over all restarts of the board."""
         self._field_work = 0.0
-        self._sample: ImuSample | None = None
+        self._sample: interface.ImuSample | None = None
         self._supply = self._battery.draw(0.0, 0.0)
         self._limited_command = self._limiter.advance(0, 0.0)
         self._apply_parameters()
@@ -236,7 +228,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
 
     # -- robot interface --------------------------------------------------------------------------
 
-    def apply(self, command: RobotCommand, now_ns: int) -> str:
+    def apply(self, command: interface.RobotCommand, now_ns: int) -> str:
         """Send ``command`` to the board, or return why the host rejects it.
 
         The reason of the state shows the decision of the board on arrival.
@@ -295,7 +287,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
 
     def warm_up(self) -> None:
         """Compile every kernel of a step, on a separate robot."""
-        DigitalTwin(self._parameters).step(ZERO_WHEEL_SPEEDS)
+        DigitalTwin(self._parameters).step(interface.ZERO_WHEEL_SPEEDS)
         world = load_world('room')
         clearance(0.0, 0.0, world.segments, world.circles)
         grip_at(0.0, 0.0, world.patches)
@@ -456,10 +448,10 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         if self._battery.collapsed and not self._restarting:
             self._lose_power()
 
-    def _make_state(self, stamp_ns: int) -> RobotState:
+    def _make_state(self, stamp_ns: int) -> interface.RobotState:
         geometry, limiter, drivetrain = self._parameters.geometry, self._limiter, self._drivetrain
         odometry, limited_command = self._odometry, self._limited_command
-        status = RobotStatus(
+        status = interface.RobotStatus(
             enabled=not limiter.estop and not self._restarting,
             moving=self._moving(),
             estop=limiter.estop,
@@ -469,10 +461,10 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             imu_fault=self._sample is None,
             low_battery=self._battery.low,
         )
-        return RobotState(
+        return interface.RobotState(
             stamp_ns=stamp_ns,
             wheels=self._measured,
-            angles=WheelAngles(*self._turned),
+            angles=interface.WheelAngles(*self._turned),
             odometry=State(stamp_ns, odometry.pose, twist_from_wheels(self._measured, geometry)),
             covariance=odometry.covariance,
             commanded=limited_command.wheels,

@@ -10,6 +10,7 @@ import math
 import os
 from pathlib import Path
 
+from t3mpc_ros.parameters import yaml_files
 from t3mpc_ros.parameters.table import (
     ParameterError,
     Parameters,
@@ -17,15 +18,6 @@ from t3mpc_ros.parameters.table import (
     Value,
     nearest_hint,
     parameter,
-)
-from t3mpc_ros.parameters.yaml_files import (
-    EntryError,
-    check_entry,
-    check_list,
-    check_number,
-    file_errors,
-    read_yaml,
-    shortened,
 )
 
 SCHEDULES_FOLDER = Path(__file__).resolve().parent / 'schedules'
@@ -134,16 +126,20 @@ class FaultEvent:
 
     def __post_init__(self) -> None:
         try:
-            object.__setattr__(self, 'at', check_number(self.at, 'at', 0.0, _MAX_TIME, 's'))
+            object.__setattr__(
+                self, 'at', yaml_files.check_number(self.at, 'at', 0.0, _MAX_TIME, 's')
+            )
             if self.duration != math.inf:
-                duration = check_number(self.duration, 'for', MIN_DURATION, _MAX_TIME, 's')
+                duration = yaml_files.check_number(
+                    self.duration, 'for', MIN_DURATION, _MAX_TIME, 's'
+                )
                 object.__setattr__(self, 'duration', duration)
-        except EntryError as error:
+        except yaml_files.EntryError as error:
             raise ScheduleError(str(error)) from None
         if not isinstance(self.fault, str) or self.fault not in FAULTS:
             raise ScheduleError(
                 f'fault must be one of {", ".join(FAULTS)}: '
-                f'got {shortened(self.fault)}{nearest_hint(str(self.fault), FAULTS)}'
+                f'got {yaml_files.shortened(self.fault)}{nearest_hint(str(self.fault), FAULTS)}'
             )
         try:
             object.__setattr__(self, 'value', FAULTS[self.fault].check(self.value))
@@ -239,17 +235,19 @@ def load_schedule(name_or_path: str | Path) -> FaultSchedule:
                 f'got {name}{nearest_hint(str(name), bundled)}'
             )
         path = SCHEDULES_FOLDER / f'{name}.yaml'
-    with file_errors(name, ScheduleError):
-        content = read_yaml(path)
+    with yaml_files.file_errors(name, ScheduleError):
+        content = yaml_files.read_yaml(path)
         if isinstance(content, dict):
-            content = check_entry(content, 'the schedule', ('events',))['events']
-        return FaultSchedule(map(_event, count(), check_list(content, 'events')), path.stem)
+            content = yaml_files.check_entry(content, 'the schedule', ('events',))['events']
+        return FaultSchedule(
+            map(_event, count(), yaml_files.check_list(content, 'events')), path.stem
+        )
 
 
 def _event(index: int, content: object) -> FaultEvent:
     where = f'events[{index}]'
-    entry = check_entry(content, where, ('at', 'fault', 'value'), ('for',))
+    entry = yaml_files.check_entry(content, where, ('at', 'fault', 'value'), ('for',))
     try:
         return FaultEvent(entry['at'], entry['fault'], entry['value'], entry.get('for', math.inf))
     except ScheduleError as error:
-        raise EntryError(f'{where}.{error}') from None
+        raise yaml_files.EntryError(f'{where}.{error}') from None

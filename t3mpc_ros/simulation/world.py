@@ -18,22 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
+from t3mpc_ros.parameters import yaml_files
 from t3mpc_ros.parameters.table import nearest_hint
-from t3mpc_ros.parameters.yaml_files import (
-    EntryError,
-    YamlError,
-    check_entry,
-    check_flag,
-    check_list,
-    check_number,
-    file_errors,
-    parse_yaml,
-    read_text,
-    shortened,
-)
-
-Array = npt.NDArray[np.float64]
 
 WORLDS_FOLDER = Path(__file__).resolve().parent / 'worlds'
 """Folder of the bundled worlds."""
@@ -164,8 +152,8 @@ def load_world(path_or_name: str | Path) -> World:
     if path_or_name in names:
         path = WORLDS_FOLDER / f'{path_or_name}.yaml'
     try:
-        text = read_text(path)
-    except YamlError as error:
+        text = yaml_files.read_text(path)
+    except yaml_files.YamlError as error:
         if not isinstance(error.__cause__, FileNotFoundError):
             raise WorldError(f'{path} {error}') from error
         raise WorldError(
@@ -180,16 +168,16 @@ def parse_world(text: str, source: str) -> World:
 
     Errors begin with ``source``; without ``name`` in the text, its stem is that of the world.
     """
-    with file_errors(source, WorldError):
-        return _world(parse_yaml(text), Path(source).stem)
+    with yaml_files.file_errors(source, WorldError):
+        return _world(yaml_files.parse_yaml(text), Path(source).stem)
 
 
 def _world(content: object, stem: str) -> World:
     lists = ('walls', 'boxes', 'circles', 'patches')
-    read = check_entry(content, 'the world', (), ('name', *lists))
+    read = yaml_files.check_entry(content, 'the world', (), ('name', *lists))
     name = read.get('name', stem)
     if not isinstance(name, str) or not name:
-        raise EntryError(f'name must be a text: got {shortened(name)}')
+        raise yaml_files.EntryError(f'name must be a text: got {yaml_files.shortened(name)}')
     pieces: list[tuple[float, ...]] = []
     for where, wall in _entries(read, 'walls', MAX_SEGMENTS, ('points',), 'closed'):
         pieces += _wall(wall, where)
@@ -204,21 +192,23 @@ def _world(content: object, stem: str) -> World:
     disc = 'center', 'radius'
     circles = [_disc(*each) for each in _entries(read, 'circles', MAX_CIRCLES, disc)]
     patches = [
-        (*_disc(where, each), check_number(each['grip'], f'{where}.grip', 0.0, 1.0))
+        (*_disc(where, each), yaml_files.check_number(each['grip'], f'{where}.grip', 0.0, 1.0))
         for where, each in _entries(read, 'patches', MAX_PATCHES, (*disc, 'grip'))
     ]
     return World(name, segments, _rows(circles, 3), _rows(patches, 4), _rows(boxes, 5))
 
 
 def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:
-    closed = check_flag(read.get('closed', False), f'{where}.closed')
-    given = check_list(read['points'], f'{where}.points', 3 if closed else 2, MAX_SEGMENTS + 1)
+    closed = yaml_files.check_flag(read.get('closed', False), f'{where}.closed')
+    given = yaml_files.check_list(
+        read['points'], f'{where}.points', 3 if closed else 2, MAX_SEGMENTS + 1
+    )
     points = [_pair(point, f'{where}.points[{index}]') for index, point in enumerate(given)]
     for index in range(0 if closed else 1, len(points)):
         length = math.dist(points[index - 1], points[index])
         if length < MIN_SIZE:
             last = '; leave the last point out, closed adds it' if index == 0 else ''
-            raise EntryError(
+            raise yaml_files.EntryError(
                 f'{where}.points[{index}] must be at least {MIN_SIZE:g} m from the point before '
                 f'it: got {length:g} m{last}'
             )
@@ -227,13 +217,15 @@ def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:
 
 def _box(read: dict[str, Any], where: str) -> tuple[float, float, float, float, float]:
     # More than a full turn is a yaw in degrees.
-    yaw = check_number(read.get('yaw', 0.0), f'{where}.yaw', -math.tau, math.tau, 'rad')
+    yaw = yaml_files.check_number(read.get('yaw', 0.0), f'{where}.yaw', -math.tau, math.tau, 'rad')
     size = _pair(read['size'], f'{where}.size', MIN_SIZE)
     return *_pair(read['center'], f'{where}.center'), *size, yaw
 
 
 def _disc(where: str, read: dict[str, Any]) -> tuple[float, float, float]:
-    radius = check_number(read['radius'], f'{where}.radius', MIN_SIZE, MAX_COORDINATE, 'm')
+    radius = yaml_files.check_number(
+        read['radius'], f'{where}.radius', MIN_SIZE, MAX_COORDINATE, 'm'
+    )
     return *_pair(read['center'], f'{where}.center'), radius
 
 
@@ -253,22 +245,22 @@ def _sides(
 def _entries(
     read: dict[str, Any], name: str, most: int, needed: tuple[str, ...], *optional: str
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    for index, content in enumerate(check_list(read.get(name, []), name, 0, most)):
+    for index, content in enumerate(yaml_files.check_list(read.get(name, []), name, 0, most)):
         where = f'{name}[{index}]'
-        yield where, check_entry(content, where, needed, optional)
+        yield where, yaml_files.check_entry(content, where, needed, optional)
 
 
 def _pair(content: object, where: str, low: float = -MAX_COORDINATE) -> tuple[float, float]:
-    x, y = check_list(content, where, 2, 2)
+    x, y = yaml_files.check_list(content, where, 2, 2)
     return (
-        check_number(x, f'{where}[0]', low, MAX_COORDINATE, 'm'),
-        check_number(y, f'{where}[1]', low, MAX_COORDINATE, 'm'),
+        yaml_files.check_number(x, f'{where}[0]', low, MAX_COORDINATE, 'm'),
+        yaml_files.check_number(y, f'{where}[1]', low, MAX_COORDINATE, 'm'),
     )
 
 
 def _check_count(count: int) -> None:
     if count > MAX_SEGMENTS:
-        raise EntryError(
+        raise yaml_files.EntryError(
             f'walls and boxes must have at most {MAX_SEGMENTS} segments together: '
             f'got {count} or more'
         )

@@ -10,17 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
-from t3mpc_ros.geometry.types import Pose, State, WheelSpeeds, check_pose, wrap_angle
+from t3mpc_ros.geometry.types import Array, Pose, State, WheelSpeeds, check_pose, wrap_angle
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+from t3mpc_ros.robot import interface
 from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters, ramp_towards
-from t3mpc_ros.robot.interface import (
-    ZERO_WHEEL_SPEEDS,
-    RobotCommand,
-    RobotState,
-    RobotStatus,
-    WheelAngles,
-)
 from t3mpc_ros.robot.wheel_odometry import WheelOdometry, WheelOdometryParameters
 from t3mpc_ros.simulation.fixed_step import FixedStepRobot
 from t3mpc_ros.simulation.plant.disturbances import (
@@ -43,8 +37,6 @@ from t3mpc_ros.simulation.plant.dynamics import (
     wheel_acceleration,
     wheel_inertia,
 )
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -196,7 +188,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         self._odometry = WheelOdometry(parameters.odometry, parameters.geometry)
         self._physics = DisturbedPlant(parameters)
         self._plant = self._physics.plant
-        self._measured = ZERO_WHEEL_SPEEDS
+        self._measured = interface.ZERO_WHEEL_SPEEDS
         self._torque = (0.0, 0.0)
         self._limited_command = self._limiter.advance(0, 0.0)
         self._measured_at = 0
@@ -204,13 +196,13 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         self._apply_parameters()
         self._reports.append(self._make_state(0))
 
-    def apply(self, command: RobotCommand, now_ns: int) -> str:
+    def apply(self, command: interface.RobotCommand, now_ns: int) -> str:
         """Follow ``command`` from now on, or return why it is rejected."""
         if self._parameters.drive.kind == 'torque':
             raise ValueError('drive.kind must be velocity to take wheel speeds: got torque')
         return super().apply(command, now_ns)
 
-    def step_torque(self, right: float, left: float) -> RobotState:
+    def step_torque(self, right: float, left: float) -> interface.RobotState:
         """Apply torques (N m) for one control period and return the state at its end.
 
         Torques that are not finite brake the wheels, as an emergency stop does.
@@ -219,9 +211,9 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
             raise ValueError('drive.kind must be torque to take torques: got velocity')
         # The limiter decides only whether the torque may act.
         finite = math.isfinite(right) and math.isfinite(left)
-        wheels = ZERO_WHEEL_SPEEDS if finite else WheelSpeeds(math.nan, math.nan)
+        wheels = interface.ZERO_WHEEL_SPEEDS if finite else WheelSpeeds(math.nan, math.nan)
         now_ns = self._run_to(self._now_ns())
-        self._limiter.accept(RobotCommand(wheels, now_ns), now_ns)
+        self._limiter.accept(interface.RobotCommand(wheels, now_ns), now_ns)
         self._torque = (float(right), float(left))
         return self._advance_period()
 
@@ -237,7 +229,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         if self._parameters.drive.kind == 'torque':
             robot.step_torque(0.0, 0.0)
         else:
-            robot.step(ZERO_WHEEL_SPEEDS)
+            robot.step(interface.ZERO_WHEEL_SPEEDS)
 
     # -- simulation step --------------------------------------------------------------------------
 
@@ -263,19 +255,19 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         self._odometry.update_from_speeds(mean, dt, self._parameters.noise.variance)
         self._measured = now
 
-    def _make_state(self, stamp_ns: int) -> RobotState:
+    def _make_state(self, stamp_ns: int) -> interface.RobotState:
         geometry, limiter, plant = self._parameters.geometry, self._limiter, self._plant
-        status = RobotStatus(
+        status = interface.RobotStatus(
             enabled=not limiter.estop,
             moving=self._moving(),
             estop=limiter.estop,
             timed_out=limiter.timed_out,
             limited=self._limited_command.limited,
         )
-        return RobotState(
+        return interface.RobotState(
             stamp_ns=stamp_ns,
             wheels=self._measured,
-            angles=WheelAngles(*plant.angles),
+            angles=interface.WheelAngles(*plant.angles),
             odometry=State(
                 stamp_ns, self._odometry.pose, twist_from_wheels(self._measured, geometry)
             ),
