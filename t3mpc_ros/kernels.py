@@ -9,7 +9,7 @@ from importlib import import_module
 import os
 from pathlib import Path
 import tempfile
-from typing import Any, Generic, ParamSpec, TypeVar, cast
+from typing import Any, Generic, ParamSpec, Self, TypeVar, cast
 
 import numba
 from numba import config
@@ -175,10 +175,10 @@ class Kernel(Generic[P, R]):
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Return ``function``, compiled to machine code on its first call and cached on disk.
 
-    A kernel takes arrays, numbers and named tuples of both only, and allocates no array. Division
-    by zero gives inf or NaN as in IEEE 754 instead of an exception; arguments are validated
-    before the kernel is called. Constants that may change are passed as arguments, because the
-    cache does not detect a changed global.
+    A kernel takes arrays, numbers, structures and named tuples of them only, and allocates no
+    array. Division by zero gives inf or NaN as in IEEE 754 instead of an exception; arguments are
+    validated before the kernel is called. Constants that may change are passed as arguments,
+    because the cache does not detect a changed global.
 
     With ``NUMBA_DISABLE_JIT=1`` it is ``function`` itself, for debuggers and for the measurement
     of coverage: a hundred times slower, and a plain number divided by zero is an error there.
@@ -219,6 +219,25 @@ class TypedKernel(Generic[P, R]):
         code: Callable[P, R] = cast('Kernel[P, R]', self._function).compiled.compile(types)
         self._code = code
         return code
+
+
+class Structure:
+    """Named numbers that kernels change in place: a class annotates and explains its fields.
+
+    The object is a NumPy record, which kernels take by reference: ``state.count += 1.0`` in a
+    kernel is seen by every owner of the structure.
+    """
+
+    @classmethod
+    def new(cls, **values: float) -> Self:
+        """Return a structure whose fields are zero unless given."""
+        fields = cls.__annotations__
+        if taken := [name for name in fields if hasattr(np.record, name)]:
+            raise ValueError(f'names of fields must not be those of NumPy: got {taken}')
+        structure = np.zeros(1, np.dtype(list(fields.items()))).view(np.recarray)[0]
+        for name, value in values.items():
+            setattr(structure, name, value)
+        return cast('Self', structure)
 
 
 def contiguous(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -23,15 +23,12 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from t3mpc_ros.control.speed_filter import PREDICTED, SpeedFilterParameters, SpeedKalmanFilter
+from t3mpc_ros.control.speed_filter import SpeedFilterParameters, SpeedKalmanFilter
 from t3mpc_ros.geometry.kinematics import WheelGeometry, body_speeds
-from t3mpc_ros.geometry.types import BodyTwist
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.geometry.types import Array, BodyTwist
+from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = NDArray[np.float64]
 
 REST_FACTOR = 5.0
 """A wheel within this multiple of the standard deviation of its measurement may be at rest."""
@@ -94,21 +91,7 @@ class LimitParameters(Parameters):
 class VelocityActuation:
     """Estimates the wheel speeds and sends the commands that realise accelerations (E19).
 
-    Parameters
-    ----------
-    filter_parameters
-        Noise model of the sensors, lag and dead time of the drive.
-    limits, geometry
-        Limits of the command, and the lengths that relate wheel speeds and twist.
-    drive
-        ``'velocity'`` or ``'torque'``; the limits apply to ``'velocity'`` only.
-    period
-        Nominal control period T, s.
-
-    Raises
-    ------
-    ValueError
-        The drive is unknown, or the period is not positive.
+    The limits apply to the drive ``'velocity'`` only, not to ``'torque'``; ``period`` is T, s.
     """
 
     def __init__(
@@ -121,31 +104,28 @@ class VelocityActuation:
     ) -> None:
         if not period > 0.0:
             raise ValueError(f'period must be positive: got {period} s')
-        self._filter = SpeedKalmanFilter(filter_parameters, drive, period)
+        self.speed_filter = SpeedKalmanFilter(filter_parameters, drive, period)
+        state = self.speed_filter.state
+        self.speeds = state.speeds
+        """Estimated chi at the last measurement, rad/s, shape (2,)."""
+        self.predicted = state.predicted
+        """Predicted chi when the next command takes effect, rad/s, shape (2,)."""
         self._limits = wheel_limits(limits, geometry)
         self._geometry = geometry
         self._lengths = geometry.wheel_radius, geometry.half_separation
-        self._velocity = drive == 'velocity'
+        self.takes_speeds = drive == 'velocity'
+        """Whether the drive takes wheel speeds, not torques."""
         self._period = period
         self._rest_speed = REST_FACTOR * math.sqrt(filter_parameters.noise_variance)
         lag = filter_parameters.lag
         self._servo_step = 1.0 - math.exp(-period / lag)
-        self._disturbance_gain = self._servo_step * lag / period if self._velocity else 1.0
+        self._disturbance_gain = self._servo_step * lag / period if self.takes_speeds else 1.0
         self.applied: Array = np.zeros(2)
         """Acceleration u that the last command realises, rad/s², shape (2,)."""
         self.command: Array = np.zeros(2)
         """Last commanded wheel speeds, rad/s, shape (2,); zeros with a torque drive."""
+        self._actuation_command = TypedKernel(actuation_command)
         self.reset(np.zeros(2))
-
-    @property
-    def speeds(self) -> Array:
-        """Estimated chi at the last measurement, rad/s, shape (2,)."""
-        return self._filter.speeds
-
-    @property
-    def predicted(self) -> Array:
-        """Predicted chi when the next command takes effect, rad/s, shape (2,)."""
-        return self._filter.predicted
 
     @property
     def disturbance(self) -> Array:
@@ -154,26 +134,16 @@ class VelocityActuation:
         A servo attenuates a disturbance: with the velocity drive, d is (1 - exp(-T/lag)) lag/T
         of the physical disturbance acceleration, 79 % by default.
         """
-        return self._disturbance_gain * self._filter.disturbance
-
-    @property
-    def speed_filter(self) -> SpeedKalmanFilter:
-        """The filter of the wheel speeds."""
-        return self._filter
-
-    @property
-    def takes_speeds(self) -> bool:
-        """Whether the drive takes wheel speeds, not torques."""
-        return self._velocity
+        return self._disturbance_gain * self.speed_filter.state.disturbance
 
     @property
     def dead_time(self) -> float:
         """Time until the next command takes effect, s."""
-        return self._filter.dead_time
+        return self.speed_filter.dead_time
 
     def set_dead_time(self, dead_time: float) -> None:
         """Use another dead time (s) from the next step on."""
-        self._filter.set_dead_time(dead_time)
+        self.speed_filter.set_dead_time(dead_time)
 
     @property
     def twist(self) -> BodyTwist:
@@ -186,23 +156,16 @@ class VelocityActuation:
         self._limits = wheel_limits(limits, self._geometry)
 
     def reset(self, speeds: Array, last_command: Array | None = None) -> None:
-        """Restart at measured wheel speeds.
+        """Restart at measured wheel speeds, rad/s, shape (2,).
 
-        The next command is within the acceleration limits of the last one. A robot that moves is
-        taken over at its speed. One that may as well stand starts from standstill: its first
-        command would otherwise be a step to the noise of one measurement.
-
-        Parameters
-        ----------
-        speeds
-            Measured wheel speeds, rad/s, shape (2,).
-        last_command
-            Wheel speeds that were commanded last, rad/s, shape (2,); without them the robot
-            was commanded to stop, or by others.
+        The next command is within the acceleration limits of the last one; without that one the
+        robot was commanded to stop, or by others. A robot that moves is taken over at its speed.
+        One that may as well stand starts from standstill: its first command would otherwise be a
+        step to the noise of one measurement.
         """
-        if self._velocity and np.abs(speeds).max() <= self._rest_speed:
+        if self.takes_speeds and np.abs(speeds).max() <= self._rest_speed:
             speeds = np.zeros(2)
-        self._filter.reset(speeds)
+        self.speed_filter.reset(speeds)
         self.applied[:] = 0.0
         self._sent = False
         self.limited = False
@@ -210,30 +173,24 @@ class VelocityActuation:
         self.command[:] = 0.0
         if last_command is not None:
             self.command[:] = last_command
-        elif self._velocity:
+        elif self.takes_speeds:
             right, left = speeds.tolist()
             self.command[:] = speeds * limit_scale(right, left, self._limits[0])
 
     def observe(self, measured: Array, dt: float) -> None:
         """Update the filter with wheel speeds (rad/s) measured ``dt`` s after the last ones."""
-        applied = self.command if self._velocity else self.applied
-        self._filter.update(applied, measured, dt, sent=self._sent)
+        applied = self.command if self.takes_speeds else self.applied
+        self.speed_filter.update(applied, measured, dt, sent=self._sent)
 
     def send_acceleration(self, acceleration: Array) -> Array:
-        """Command wheel accelerations by E19; return those within the limits, rad/s², shape (2,).
-
-        Parameters
-        ----------
-        acceleration
-            Desired wheel accelerations u, rad/s², shape (2,).
-        """
+        """Command u by E19, and return the part within the limits, rad/s², shape (2,)."""
         self._sent = True
-        if not self._velocity:
+        if not self.takes_speeds:
             self.applied[:] = acceleration
             return self.applied
-        self.limited = actuation_command(
-            acceleration,
-            self._filter.state,
+        self.limited = self._actuation_command(
+            contiguous(acceleration),
+            self.predicted,
             self.command,
             self._limits,
             self._period,
@@ -252,19 +209,8 @@ class VelocityActuation:
         self.applied[:] = 0.0
 
     def set_command(self, wheels: Array) -> None:
-        """Replace the last command, for example by the one of a recorded run.
-
-        Parameters
-        ----------
-        wheels
-            Commanded wheel speeds, rad/s, shape (2,); no limit is applied.
-
-        Raises
-        ------
-        ValueError
-            The drive is a torque drive, or ``wheels`` are not two finite numbers.
-        """
-        if not self._velocity:
+        """Replace the last command by wheel speeds (rad/s) of a recorded run, without limits."""
+        if not self.takes_speeds:
             raise ValueError('only a velocity drive has a command of wheel speeds')
         if np.shape(wheels) != (2,) or not np.isfinite(wheels).all():
             raise ValueError(f'wheels must be two finite numbers: got {wheels}')
@@ -335,7 +281,7 @@ def limit_command(
 @kernel
 def actuation_command(
     acceleration: Array,
-    state: Array,
+    predicted: Array,
     command: Array,
     limits: Array,
     period: float,
@@ -345,13 +291,12 @@ def actuation_command(
     """Write the command of E19 and the acceleration it realises; return whether it is limited.
 
     acceleration : shape (2,), desired u, rad/s²
-    state        : shape (3, 2), state of the speed filter
+    predicted    : shape (2,), chi when the command takes effect, rad/s
     command      : shape (2,), the previous command, overwritten by the next one, rad/s
     limits       : shape (2, 3), see :func:`wheel_limits`
     command_gain : T / (1 - exp(-T/lag)), s
     applied      : shape (2,), overwritten, the u that the command realises, rad/s²
     """
-    predicted = state[PREDICTED]
     right = predicted[0] + command_gain * acceleration[0]
     left = predicted[1] + command_gain * acceleration[1]
     limited = limit_command(right, left, command, limits, period, command)

@@ -34,15 +34,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, estimate
 from t3mpc_ros.fuzzy.inference import FuzzyTables
 from t3mpc_ros.fuzzy.sets import FuzzyParameters
-from t3mpc_ros.kernels import TypedKernel, kernel
+from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.kernels import Structure, TypedKernel, kernel
 from t3mpc_ros.parameters.table import Parameters, group, parameter
-
-Array = NDArray[np.float64]
 
 HISTORY = 64
 """Number of commands kept."""
@@ -102,13 +100,42 @@ class BodyCorrectionParameters(Parameters):
     )
 
 
-(
-    YAW, STARTED, BLOCK_TIME, RAW_SUM, RESIDUAL_SUM, RAW_POWER, RESIDUAL_POWER,
-    AUTHORITY, YAW_ERROR, LAST_REFERENCE, COMMANDS, COMMAND_SUM, COMMAND_POWER,
-    ERROR_SUM, ERROR_POWER,
-) = range(15)  # fmt: skip
-"""Entries of the memory: yaw, and the rest in wheel speeds (rad/s) and s. RAW is w_a - w_c with
-the residual clipped, ERROR without."""
+class BodyMemory(Structure):
+    """What :func:`correct_body` remembers, in wheel speeds (rad/s) and s.
+
+    Sums are over the present block, powers are means over the past blocks. *raw* is w_a - w_c with
+    the residual clipped, *error* without; *residual* is what the map leaves of it.
+    """
+
+    yaw: float
+    """Last yaw of the odometry, rad."""
+    started: bool
+    """Whether there is one."""
+    last_reference: float
+    yaw_error: float
+    """Integral of w_a - w_r."""
+    commands: int
+    """Number of known commands, at most HISTORY."""
+    block_time: float
+    raw_sum: float
+    residual_sum: float
+    command_sum: float
+    error_sum: float
+    raw_power: float
+    residual_power: float
+    command_power: float
+    error_power: float
+    authority: float
+    """Share of the correction that is in use."""
+
+
+DRIVE = (
+    *('started', 'yaw_error', 'commands'),
+    *('block_time', 'raw_sum', 'residual_sum', 'command_sum', 'error_sum'),
+)
+"""Fields of the memory that belong to one drive."""
+SKILL = 'raw_power', 'residual_power', 'command_power', 'error_power', 'authority'
+"""Fields that say how well the map predicts."""
 
 
 class BodyConstants(NamedTuple):
@@ -132,11 +159,10 @@ class BodyConstants(NamedTuple):
     """rad/s"""
 
 
-class BodyMemory(NamedTuple):
+class BodyState(NamedTuple):
     """State of :func:`correct_body`, changed in place."""
 
-    sums: Array
-    """Entries YAW ... ERROR_POWER."""
+    memory: BodyMemory
     history: Array
     """Commands, newest first, rad/s, shape (n, 2)."""
     point: Array
@@ -148,14 +174,8 @@ class BodyMemory(NamedTuple):
 class BodyCorrection:
     """Corrects the reference of the wheels such that the body turns as the reference does: E20.
 
-    Parameters
-    ----------
-    parameters
-        Learning and bounds.
-    wheel_radius, half_separation
-        Nominal R and b, m.
-    period
-        Control period, s.
+    ``wheel_radius`` and ``half_separation`` are the nominal R and b, m; ``period`` is that of
+    control, s.
     """
 
     def __init__(
@@ -168,10 +188,8 @@ class BodyCorrection:
         self._turn = wheel_radius / half_separation
         self._period = period
         self.fuzzy = FuzzyEstimator(parameters.fuzzy, AdaptationParameters(), outputs=1)
-        self._state = BodyMemory(
-            np.zeros(ERROR_POWER + 1), np.zeros((HISTORY, 2)), np.zeros(2), np.zeros(1)
-        )
-        self._memory = self._state.sums
+        self._memory = BodyMemory.new()
+        self._state = BodyState(self._memory, np.zeros((HISTORY, 2)), np.zeros(2), np.zeros(1))
         self._correct_body = TypedKernel(correct_body)
         self.configure(parameters)
 
@@ -192,44 +210,35 @@ class BodyCorrection:
     @property
     def authority(self) -> float:
         """Fraction of the correction in use, in [0, 1]."""
-        return float(self._memory[AUTHORITY])
+        return float(self._memory.authority)
 
     @property
     def yaw_error(self) -> float:
         """Yaw of the robot minus that of the reference since the start of the drive, rad."""
-        return float(self._memory[YAW_ERROR] * self._turn)
+        return float(self._memory.yaw_error * self._turn)
 
     def restart(self) -> None:
         """Start a drive: clear yaw error and history; map and skill are kept."""
         self._state.history[:] = 0.0
-        for entry in (
-            STARTED,
-            BLOCK_TIME,
-            RAW_SUM,
-            RESIDUAL_SUM,
-            YAW_ERROR,
-            COMMANDS,
-            COMMAND_SUM,
-            ERROR_SUM,
-        ):
-            self._memory[entry] = 0.0
+        for name in DRIVE:
+            setattr(self._memory, name, 0)
 
     def reset(self) -> None:
         """Discard the map and its skill too."""
-        self._memory[:] = 0.0
+        for name in BodyMemory.__annotations__:
+            setattr(self._memory, name, 0)
         self.fuzzy.reset()
         self.restart()
 
-    def snapshot(self) -> tuple[Array, Array]:
-        """Return copies of map and memory for :meth:`rollback`."""
-        return self.fuzzy.coefficients, self._memory.copy()
+    def snapshot(self) -> tuple[Array, dict[str, float]]:
+        """Return map and skill for :meth:`rollback`."""
+        return self.fuzzy.coefficients, {name: getattr(self._memory, name) for name in SKILL}
 
-    def rollback(self, snapshot: tuple[Array, Array]) -> None:
+    def rollback(self, snapshot: tuple[Array, dict[str, float]]) -> None:
         """Restore the map and its skill; the yaw error since is kept."""
-        coefficients, memory = snapshot
-        self.fuzzy.coefficients = coefficients
-        for entry in (RAW_POWER, RESIDUAL_POWER, COMMAND_POWER, ERROR_POWER, AUTHORITY):
-            self._memory[entry] = memory[entry]
+        self.fuzzy.coefficients, skill = snapshot
+        for name, value in skill.items():
+            setattr(self._memory, name, value)
 
     def step(
         self,
@@ -244,22 +253,12 @@ class BodyCorrection:
     ) -> float:
         """Return the correction (rad/s): added to the right, subtracted from the left wheel.
 
-        Parameters
-        ----------
-        yaw
-            Yaw of the odometry, rad.
-        elapsed
-            Time since the last step, s.
-        reference
-            Reference of the wheels now, rad/s, shape (2,).
-        planned
-            Reference of the wheels to which the correction is added, rad/s, shape (2,).
-        sent
-            Wheel speeds commanded at the last step, rad/s, shape (2,).
-        delay
-            Time between a command and the motion it causes, s.
-        learn
-            Whether the map adapts.
+        yaw       : of the odometry, rad, ``elapsed`` s after the last one
+        reference : of the wheels now, rad/s, shape (2,)
+        planned   : reference to which the correction is added, rad/s, shape (2,)
+        sent      : wheel speeds commanded at the last step, rad/s, shape (2,)
+        delay     : time between a command and the motion it causes, s
+        learn     : whether the map adapts
         """
         return self._correct_body(
             yaw,
@@ -285,7 +284,7 @@ def correct_body(
     delay: float,
     learn: bool,
     constants: BodyConstants,
-    state: BodyMemory,
+    state: BodyState,
     fuzzy: FuzzyTables,
 ) -> float:
     """Learn from the last period (E20) and return the correction (E21), rad/s.
@@ -294,47 +293,25 @@ def correct_body(
     """
     turn, period = constants.turn, constants.period
     memory, history, point, output = state
-    coefficients, phi = fuzzy.coefficients, fuzzy.phi
     # A gap of n periods repeats the last command n times: nothing else was sent.
     count = min(max(int(round(elapsed / period)), 1), history.shape[0])
     for j in range(history.shape[0] - 1, count - 1, -1):
         history[j, 0], history[j, 1] = history[j - count, 0], history[j - count, 1]
     for j in range(count):
         history[j, 0], history[j, 1] = sent[0], sent[1]
-    memory[COMMANDS] = min(memory[COMMANDS] + count, 1.0 * history.shape[0])
+    memory.commands = min(memory.commands + count, history.shape[0])
     turning = 0.5 * (reference[0] - reference[1])
-    if memory[STARTED] > 0.0 and elapsed > 0.0:
-        change = yaw - memory[YAW]
+    if memory.started and elapsed > 0.0:
+        change = yaw - memory.yaw
         change -= 2.0 * math.pi * math.floor(change / (2.0 * math.pi) + 0.5)
         achieved = change / (elapsed * turn)
-        memory[YAW_ERROR] += elapsed * (achieved - 0.5 * (turning + memory[LAST_REFERENCE]))
+        memory.yaw_error += elapsed * (achieved - 0.5 * (turning + memory.last_reference))
         # Middle of the last period, one delay earlier; row 0 was sent one period ago.
         position = (delay + 0.5 * elapsed) / period - 1.0
-        if position + 2.0 < memory[COMMANDS] and count == 1:
-            position = max(position, 0.0)
-            row = int(position)
-            part = position - row
-            for i in range(2):
-                point[i] = (1.0 - part) * history[row, i] + part * history[row + 1, i]
-            estimate(point, fuzzy, output)
-            raw = achieved - 0.5 * (point[0] - point[1])
-            residual = raw - output[0]
-            power = 0.0
-            for k in range(phi.size):
-                power += phi[k] * phi[k]
-            if learn and power > 0.0 and abs(residual) < OUTLIER:
-                memory[ERROR_SUM] += raw * elapsed
-                residual = min(max(residual, -CLIP), CLIP)
-                raw = residual + output[0]
-                gain = min(constants.learning_rate * elapsed, 1.0) * residual / power
-                for k in range(phi.size):
-                    coefficients[0, k] += gain * phi[k]
-                memory[RAW_SUM] += raw * elapsed
-                memory[RESIDUAL_SUM] += residual * elapsed
-                memory[COMMAND_SUM] += 0.5 * (point[0] ** 2 + point[1] ** 2) * elapsed
-                memory[BLOCK_TIME] += elapsed
-    memory[YAW], memory[STARTED], memory[LAST_REFERENCE] = yaw, 1.0, turning
-    if memory[BLOCK_TIME] >= BLOCK:
+        if position + 2.0 < memory.commands and count == 1:
+            learn_turning(achieved, max(position, 0.0), elapsed, learn, constants, state, fuzzy)
+    memory.yaw, memory.started, memory.last_reference = yaw, True, turning
+    if memory.block_time >= BLOCK:
         update_authority(memory, constants.share, constants.dead_zone)
     point[0], point[1] = planned[0], planned[1]
     estimate(point, fuzzy, output)
@@ -342,30 +319,66 @@ def correct_body(
     correction = -min(max(output[0], -bound), bound)
     bound = constants.yaw_bound
     if bound > 0.0:
-        correction -= bound * math.tanh(constants.yaw_gain * memory[YAW_ERROR] / bound)
-    return float(memory[AUTHORITY] * correction)
+        correction -= bound * math.tanh(constants.yaw_gain * memory.yaw_error / bound)
+    return float(memory.authority * correction)
 
 
 @kernel
-def update_authority(memory: Array, share: float, dead_zone: float) -> None:
+def learn_turning(
+    achieved: float,
+    position: float,
+    elapsed: float,
+    learn: bool,
+    constants: BodyConstants,
+    state: BodyState,
+    fuzzy: FuzzyTables,
+) -> None:
+    """Adapt the map to the turning ``achieved`` (rad/s) by the commands of a row (E20)."""
+    memory, history, point, output = state
+    coefficients, phi = fuzzy.coefficients, fuzzy.phi
+    row = int(position)
+    part = position - row
+    for i in range(2):
+        point[i] = (1.0 - part) * history[row, i] + part * history[row + 1, i]
+    estimate(point, fuzzy, output)
+    raw = achieved - 0.5 * (point[0] - point[1])
+    residual = raw - output[0]
+    power = 0.0
+    for k in range(phi.size):
+        power += phi[k] * phi[k]
+    if learn and power > 0.0 and abs(residual) < OUTLIER:
+        memory.error_sum += raw * elapsed
+        residual = min(max(residual, -CLIP), CLIP)
+        raw = residual + output[0]
+        gain = min(constants.learning_rate * elapsed, 1.0) * residual / power
+        for k in range(phi.size):
+            coefficients[0, k] += gain * phi[k]
+        memory.raw_sum += raw * elapsed
+        memory.residual_sum += residual * elapsed
+        memory.command_sum += 0.5 * (point[0] ** 2 + point[1] ** 2) * elapsed
+        memory.block_time += elapsed
+
+
+@kernel
+def update_authority(memory: BodyMemory, share: float, dead_zone: float) -> None:
     """Update the powers of both residuals by one block, and the authority.
 
     share : part of the powers that the block replaces
     dead_zone : error that counts as noise, rad/s
     """
-    raw, residual = memory[RAW_SUM] / memory[BLOCK_TIME], memory[RESIDUAL_SUM] / memory[BLOCK_TIME]
-    memory[RAW_POWER] += share * (raw * raw - memory[RAW_POWER])
-    memory[RESIDUAL_POWER] += share * (residual * residual - memory[RESIDUAL_POWER])
-    commanded = memory[COMMAND_SUM] / memory[BLOCK_TIME]
-    memory[COMMAND_POWER] += share * (commanded - memory[COMMAND_POWER])
-    error = memory[ERROR_SUM] / memory[BLOCK_TIME]
-    memory[ERROR_POWER] += share * (error * error - memory[ERROR_POWER])
-    memory[BLOCK_TIME] = memory[RAW_SUM] = memory[RESIDUAL_SUM] = memory[COMMAND_SUM] = 0.0
-    memory[ERROR_SUM] = 0.0
-    if memory[ERROR_POWER] > IMPLAUSIBLE**2 * memory[COMMAND_POWER]:
-        memory[AUTHORITY] = 0.0
+    raw, residual = memory.raw_sum / memory.block_time, memory.residual_sum / memory.block_time
+    memory.raw_power += share * (raw * raw - memory.raw_power)
+    memory.residual_power += share * (residual * residual - memory.residual_power)
+    commanded = memory.command_sum / memory.block_time
+    memory.command_power += share * (commanded - memory.command_power)
+    error = memory.error_sum / memory.block_time
+    memory.error_power += share * (error * error - memory.error_power)
+    memory.block_time = memory.raw_sum = memory.residual_sum = memory.command_sum = 0.0
+    memory.error_sum = 0.0
+    if memory.error_power > IMPLAUSIBLE**2 * memory.command_power:
+        memory.authority = 0.0
         return
-    if memory[RAW_POWER] > 0.0:
-        noise = memory[RESIDUAL_POWER] + dead_zone * dead_zone
-        skill = 1.0 - noise / memory[RAW_POWER]
-        memory[AUTHORITY] = min(max((skill - NO_SKILL) / (FULL_SKILL - NO_SKILL), 0.0), 1.0)
+    if memory.raw_power > 0.0:
+        noise = memory.residual_power + dead_zone * dead_zone
+        skill = 1.0 - noise / memory.raw_power
+        memory.authority = min(max((skill - NO_SKILL) / (FULL_SKILL - NO_SKILL), 0.0), 1.0)

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Control law of the paper for two wheels: Fig. 1, equations (64)-(84)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,8 +202,9 @@ def compensator(error: float, bound: float, smoothing: float) -> float:
 # -- stability: the bound E14 of V (74), and the certificate at run time --------------------------
 
 
-@kernel
-def lyapunov_rate_bound(errors: Array, gain: float, bound: float, smoothing: float) -> float:
+def lyapunov_rate_bound(
+    errors: Sequence[float], gain: float, bound: float, smoothing: float
+) -> float:
     r"""Return the upper bound of V' under the law, rad²/s³: (83) as corrected by E14.
 
     .. math:: \dot V \le -K\|\delta\|^2 + 0.2785\,\epsilon \sum_i(\bar\omega_i + \bar v_{p,i})
@@ -218,15 +219,14 @@ def lyapunov_rate_bound(errors: Array, gain: float, bound: float, smoothing: flo
     :math:`V(t) \le V(0) - K\int\|\delta\|^2 + 0.2785\,\epsilon\, t
     \sum_i(\bar\omega_i + \bar v_{p,i})`.
     """
-    return -gain * squared_norm(errors) + TANH_GAP * smoothing * bound * errors.size
+    return -gain * squared_norm(errors) + TANH_GAP * smoothing * bound * len(errors)
 
 
-@kernel
-def squared_norm(errors: Array) -> float:
-    """Return |delta|², rad²/s²."""
-    total: float = 0.0
-    for i in range(errors.size):
-        total += errors[i] * errors[i]
+def squared_norm(errors: Sequence[float]) -> float:
+    """Return |delta|², rad²/s²; ``sum`` rounds differently from one Python to the next."""
+    total = 0.0
+    for error in errors:
+        total += error * error
     return total
 
 
@@ -238,17 +238,12 @@ def ultimate_bound(gain: float, bound: float, smoothing: float, wheels: int = 2)
 class CertificateReading(NamedTuple):
     """Value of V, its rate and the bound of the rate at one step."""
 
-    value: float
+    value: float = 0.0
     """Half of |delta|², rad²/s²: the measurable part of V (74)."""
-    rate: float
+    rate: float = 0.0
     """Measured rate of the value, averaged over the window, rad²/s³."""
-    bound: float
+    bound: float = 0.0
     """Upper bound of the rate by E14, averaged over the window, rad²/s³."""
-
-    @classmethod
-    def from_state(cls, state: Array) -> Self:
-        """Return the reading in the state of :func:`update_certificate`."""
-        return cls(*state[:STARTED].tolist())
 
     @property
     def margin(self) -> float:
@@ -269,67 +264,38 @@ class Certificate:
     estimation error, g* - g plus disturbance, is within omega-bar. A negative margin shows a
     larger error, or a recent jump of the reference.
 
-    Parameters
-    ----------
-    window
-        Time constant (s) of the averages: single differences are mostly measurement noise.
+    ``window`` is the time constant (s) of the averages: single differences are mostly measurement
+    noise.
     """
 
     def __init__(self, window: float = 0.5) -> None:
         self.window = window
-        self.state: Array = np.zeros(4)
-        """State of :func:`update_certificate`."""
         self.reset()
 
     def reset(self) -> None:
         """Clear the averages."""
-        self.state[:] = 0.0
-
-    @property
-    def reading(self) -> CertificateReading:
+        self.reading = CertificateReading()
         """Reading at the last step."""
-        return CertificateReading.from_state(self.state)
+        self._started = False
 
     def update(
-        self, errors: Array, parameters: LawParameters, bound: float, dt: float
+        self, errors: Sequence[float], gain: float, bound: float, smoothing: float, dt: float
     ) -> CertificateReading:
-        """Return the reading after an error sample (rad/s), ``dt`` seconds after the last one."""
-        update_certificate(
-            errors, parameters.gain, bound, parameters.smoothing, dt, self.window, self.state
+        """Return the reading after errors (rad/s), ``dt`` s after the last ones.
+
+        gain, bound, smoothing : as in :func:`law_terms`
+        """
+        last, value = self.reading, 0.5 * squared_norm(errors)
+        rate = (value - last.value) / dt if self._started else 0.0
+        allowed = lyapunov_rate_bound(errors, gain, bound, smoothing)
+        weight = min(1.0, dt / self.window)
+        self._started = True
+        self.reading = CertificateReading(
+            value,
+            last.rate + weight * (rate - last.rate),
+            last.bound + weight * (allowed - last.bound),
         )
         return self.reading
-
-
-VALUE, RATE, BOUND, STARTED = range(4)
-"""Elements of the state of a certificate: the numbers of a :class:`CertificateReading`, and
-whether there was a previous step, 0 or 1."""
-
-
-@kernel
-def update_certificate(
-    errors: Array,
-    gain: float,
-    bound: float,
-    smoothing: float,
-    dt: float,
-    window: float,
-    state: Array,
-) -> None:
-    """Update the rate of V and the bound of E14, both averaged over the window.
-
-    errors     : shape (n,), rad/s
-    gain, bound, smoothing : as in :func:`law_terms`
-    dt, window : s
-    state      : shape (4,), at VALUE, RATE, BOUND, STARTED
-    """
-    value = 0.5 * squared_norm(errors)
-    rate = (value - state[VALUE]) / dt if state[STARTED] > 0.0 else 0.0
-    allowed = lyapunov_rate_bound(errors, gain, bound, smoothing)
-    weight = min(1.0, dt / window)
-    state[RATE] += weight * (rate - state[RATE])
-    state[BOUND] += weight * (allowed - state[BOUND])
-    state[VALUE] = value
-    state[STARTED] = 1.0
 
 
 # -- the controller ----------------------------------------------------------------------
@@ -370,8 +336,9 @@ class Nt3fsMpcController:
             np.zeros(2),
             np.zeros((len(TERM_NAMES), 2)),
             np.zeros(2),
-            self._certificate.state,
         )
+        self.terms, self.command = self._output.terms, self._output.command
+        """Terms of the last step, rows as in ``TERM_NAMES``, and their sum u, rad/s²."""
         self.saturated = False
         """Whether a limit changed the last command."""
         self._step_law = TypedKernel(step_law)
@@ -450,21 +417,6 @@ class Nt3fsMpcController:
         return self._friction.coefficients
 
     @property
-    def terms(self) -> Array:
-        """Terms of the last step, rows as in ``TERM_NAMES``, rad/s²."""
-        return self._output.terms
-
-    @property
-    def command(self) -> Array:
-        """Their sum u, rad/s²."""
-        return self._output.command
-
-    @property
-    def certificate_state(self) -> Array:
-        """State of the certificate, see :func:`update_certificate`."""
-        return self._certificate.state
-
-    @property
     def certificate(self) -> CertificateReading:
         """Reading of the certificate at the last step."""
         return self._certificate.reading
@@ -512,6 +464,10 @@ class Nt3fsMpcController:
             self._output,
         ):
             raise ValueError(f'speeds must be finite: got {speeds}')
+        gains = self._gains
+        self._certificate.update(
+            self.predictive.signals.errors.tolist(), gains.gain, gains.bound, gains.smoothing, dt
+        )
         return self.command
 
     def set_applied(self, acceleration: Array, *, saturated: bool) -> None:
@@ -541,7 +497,6 @@ class Nt3fsMpcController:
             gain=law.gain,
             bound=self._bound(),
             smoothing=law.smoothing,
-            window=self._certificate.window,
             gamma=adaptation.gamma,
             radius=self.fuzzy.radius,
             leakage=adaptation.sigma_modification,
@@ -566,7 +521,6 @@ class LawGains(NamedTuple):
     gain: float
     bound: float
     smoothing: float
-    window: float
     gamma: float
     radius: float
     leakage: float
@@ -588,8 +542,6 @@ class LawOutput(NamedTuple):
     """Terms of u, rows as in ``TERM_NAMES``, rad/s², shape (5, n)."""
     command: Array
     """u, rad/s², shape (n,)."""
-    certificate: Array
-    """State of :func:`update_certificate`."""
 
 
 @kernel
@@ -605,7 +557,7 @@ def step_law(
     friction: FrictionTables,
     output: LawOutput,
 ) -> bool:
-    """Write terms and command of the law, adapt the fuzzy systems, update the certificate.
+    """Write terms and command of the law, and adapt the fuzzy systems.
 
     Returns False, and changes nothing, if a speed is not finite.
 
@@ -664,15 +616,6 @@ def step_law(
                 gains.dead_zone,
                 gains.step_limit,
             )
-    update_certificate(
-        predictive.errors,
-        gains.gain,
-        gains.bound,
-        gains.smoothing,
-        dt,
-        gains.window,
-        output.certificate,
-    )
     return True
 
 

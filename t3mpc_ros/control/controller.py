@@ -170,8 +170,8 @@ class Status(NamedTuple):
     """Shape (5, 2), rows as in ``TERM_NAMES``, rad/s²."""
     applied: Array
     """Wheel accelerations after the limits, rad/s²."""
-    certificate_state: Array
-    """State of :func:`t3mpc_ros.control.control_law.update_certificate`."""
+    certificate: CertificateReading
+    """Reading of the run-time certificate."""
     skill: Array
     """Skill of the predictor in the middle of its horizon."""
     limited: bool
@@ -184,23 +184,17 @@ class Status(NamedTuple):
         return estimate
 
     @property
-    def certificate(self) -> CertificateReading:
-        """Reading of the run-time certificate."""
-        return CertificateReading.from_state(self.certificate_state)
-
-    @property
     def scalars(self) -> list[float]:
         """Values of the :data:`SCALAR_NAMES`; NaN where there is none."""
         terms = self.terms.ravel().tolist()
-        value, rate, bound, _ = self.certificate_state.tolist()
         return [
             *self.error.tolist(),
             *(0.0 - term for term in terms[:2]),
             *self.skill.tolist(),
             *terms,
             *self.applied.tolist(),
-            value,
-            bound - rate,
+            self.certificate.value,
+            self.certificate.margin,
         ]
 
 
@@ -686,7 +680,7 @@ class Controller:
             error,
             law.terms.copy() if moves else np.zeros_like(law.terms),
             np.zeros(2) if applied is None else applied,
-            law.certificate_state.copy(),
+            law.certificate,
             law.predictive.skill,
             reason.moves and self._actuation.limited,
         )
@@ -722,7 +716,7 @@ class SwitchingTracker:
         """Use new values of the dynamic parameters from the next step on."""
         self.parameters = parameters
         self.law.configure(parameters)
-        self.transition.configure(parameters.jump_transition)
+        self.transition.parameters = parameters.jump_transition
 
     def reset(self) -> None:
         """Discard jumps and state; the weights are kept."""

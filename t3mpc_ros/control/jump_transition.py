@@ -9,14 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = NDArray[np.float64]
-Stamps = NDArray[np.int64]
-Flags = NDArray[np.bool_]
-
-NANOSECONDS = 1e9
 
 
 @dataclass(frozen=True)
@@ -92,16 +87,8 @@ class JumpTransition:
     at once. The *command* crosses with a, one servo lag in advance, and rbar is the response of
     the servo to it.
 
-    Parameters
-    ----------
-    parameters
-        Acceleration of the ramp.
-    lag
-        Time constant of the servo, s; 0 for a torque drive.
-    period
-        Control period, s.
-    motor_limit
-        Of a torque drive, whose ramps it determines; None: the parameters do.
+    ``lag`` (s) is the time constant of the servo, 0 for a torque drive; there, ``motor_limit``
+    determines the ramps. ``period`` is that of control, s.
     """
 
     def __init__(
@@ -111,53 +98,24 @@ class JumpTransition:
         period: float,
         motor_limit: MotorLimit | None = None,
     ) -> None:
-        self._parameters = parameters
+        self.parameters = parameters
         self._motor_limit = motor_limit
         self._lag = lag
         self._period = period
         self.count = 0
-        """Number of unfinished transitions."""
-        self._transitions = Transitions(
-            np.zeros((8, 4, 2)), np.zeros(8, dtype=np.int64), np.zeros(8, dtype=np.bool_)
-        )
-        self._plan = Plan(np.zeros(2), np.zeros(2), np.zeros((4, 2)))
+        """Number of unfinished transitions; without one rbar is r."""
+        rows, instants = np.zeros((4, 8, 2)), np.zeros(8, dtype=np.int64)
+        self._transitions = Transitions._make((*rows, instants, np.zeros(8, dtype=np.bool_)))
+        self.plan = Plan(*np.zeros((6, 2)))
+        """Results of the last step."""
+        self.reachable, self.rate = self.plan[:2]
         self._step_transitions = TypedKernel(step_transitions)
-
-    @property
-    def reachable(self) -> Array:
-        """Return rbar at the last step, rad/s, shape (2,)."""
-        return self._plan.reachable
-
-    @property
-    def rate(self) -> Array:
-        """Derivative of rbar until the next step, rad/s², shape (2,)."""
-        return self._plan.rate
-
-    def configure(self, parameters: JumpTransitionParameters) -> None:
-        """Use new values of the dynamic parameters from the next step on."""
-        self._parameters = parameters
 
     def reset(self) -> None:
         """Discard all jumps: rbar is r."""
         self.count = 0
-        self._plan.sums[:] = 0.0
-
-    @property
-    def offset(self) -> Array:
-        """Offset h at the last step, rad/s, shape (2,)."""
-        row: Array = self._plan.sums[OFFSET]
-        return row
-
-    @property
-    def offset_next(self) -> Array:
-        """Offset h one period later, rad/s, shape (2,)."""
-        row: Array = self._plan.sums[OFFSET_NEXT]
-        return row
-
-    @property
-    def active(self) -> bool:
-        """Whether rbar may differ from r."""
-        return self.count > 0
+        for values in self.plan[2:]:
+            values[:] = 0.0
 
     def future_jumps(self, now_ns: int, span: float, rows: int) -> Array:
         """Return the future jumps of delta = chi - r, shape (rows, 2), rad/s.
@@ -170,7 +128,7 @@ class JumpTransition:
             ahead = (int(self._transitions.instants[k]) - now_ns) / NANOSECONDS
             row = math.ceil(ahead / span - 1e-9) - 1
             if 0 <= row < rows:
-                change[row] -= self._transitions.ramps[k, JUMP]
+                change[row] -= self._transitions.jumps[k]
         return change
 
     def pop_passed(self, now_ns: int) -> Array:
@@ -178,54 +136,44 @@ class JumpTransition:
         total = np.zeros(2)
         for k in reversed(range(self.count)):
             if self._transitions.instants[k] <= now_ns:
-                total += self._transitions.ramps[k, JUMP]
+                total += self._transitions.jumps[k]
                 for rows in self._transitions:
                     rows[k : self.count - 1] = rows[k + 1 : self.count].copy()
                 self.count -= 1
         return total
 
     def announce(self, instant_ns: int, jump: Array, slope_after: Array) -> None:
-        """Add a jump of r, past or future.
+        """Add a jump of r, past or future, shape (2,) each.
 
-        Parameters
-        ----------
-        instant_ns
-            First instant with the new value, ns.
-        jump
-            Change in addition to the previous slope, rad/s, shape (2,).
-        slope_after
-            r' after the jump, rad/s², shape (2,).
+        instant_ns  : first instant with the new value, ns
+        jump        : change in addition to the previous slope, rad/s
+        slope_after : r' after the jump, rad/s²
         """
         k = self.count
         if k == len(self._transitions.instants):
             longer = (np.concatenate((rows, np.zeros_like(rows))) for rows in self._transitions)
             self._transitions = Transitions._make(longer)
-        ramps, instants, passed = self._transitions
         limit = self._motor_limit
-        known = (math.nan, math.nan) if limit is None else limit.accelerations(jump)
-        ramps[k] = (jump, slope_after, (0.0, 0.0), known)
-        instants[k] = instant_ns
-        passed[k] = False
+        ramp = (math.nan, math.nan) if limit is None else limit.accelerations(jump)
+        added = (jump, slope_after, 0.0, ramp, instant_ns, False)
+        for rows, value in zip(self._transitions, added, strict=True):
+            rows[k] = value
         self.count += 1
 
     def withdraw(self, instant_ns: int) -> None:
         """Cancel the jumps announced for ``instant_ns`` or later."""
-        ramps, instants, passed = self._transitions
+        known = self._transitions
         for k in range(self.count):
-            if not passed[k] and instants[k] >= instant_ns:
-                ramps[k, JUMP] = 0.0
-                instants[k] = instant_ns
-                passed[k] = True
+            if not known.passed[k] and known.instants[k] >= instant_ns:
+                known.jumps[k] = 0.0
+                known.instants[k] = instant_ns
+                known.passed[k] = True
 
     def step(self, now_ns: int, reference: Array, reference_next: Array) -> None:
-        """Update ``reachable``, ``rate`` and the offsets for the period that starts at ``now_ns``.
+        """Update :attr:`plan` for the period that starts at ``now_ns``.
 
-        Parameters
-        ----------
-        now_ns
-            Instant at which the next command takes effect, ns.
-        reference, reference_next
-            r at that instant and one period later, including its jumps, rad/s, shape (2,).
+        now_ns : instant at which the next command takes effect, ns
+        reference, reference_next : r then and one period later, with its jumps, rad/s, shape (2,)
         """
         self.count = self._step_transitions(
             self._transitions,
@@ -235,39 +183,43 @@ class JumpTransition:
             contiguous(reference_next),
             self._period,
             self._lag,
-            self._parameters.acceleration,
-            self._plan,
+            self.parameters.acceleration,
+            self.plan,
         )
-
-
-JUMP, SLOPE_AFTER, COVERED, ACCELERATION = range(4)
-"""Rows of a transition: jump (rad/s), r' after it (rad/s²), commanded part of the jump (rad/s),
-acceleration of a torque drive, or NaN (rad/s²)."""
-RESPONSE, PASSED, OFFSET, OFFSET_NEXT = range(4)
-"""Rows of the sums over all transitions (rad/s): servo response to the commanded parts, jumps
-that r has made, and h now and one period later."""
 
 
 class Transitions(NamedTuple):
     """Jumps that are known, for kernels; the first ``count`` rows are valid."""
 
-    ramps: Array
-    """Rows JUMP to ACCELERATION of each, shape (n, 4, 2)."""
-    instants: Stamps
+    jumps: Array
+    """Change of r, rad/s, shape (n, 2)."""
+    slopes_after: Array
+    """r' after the jump, rad/s², shape (n, 2)."""
+    covered: Array
+    """Commanded part of the jump, rad/s, shape (n, 2)."""
+    accelerations: Array
+    """Of the ramp of a torque drive, else NaN, rad/s², shape (n, 2)."""
+    instants: NDArray[np.int64]
     """When r jumps, ns, shape (n,)."""
-    passed: Flags
+    passed: NDArray[np.bool_]
     """Whether it has, shape (n,)."""
 
 
 class Plan(NamedTuple):
-    """Results of :func:`step_transitions`."""
+    """Results of :func:`step_transitions`, shape (2,) each; rad/s but for the rate."""
 
     reachable: Array
-    """rbar now, rad/s, shape (2,)."""
+    """rbar now."""
     rate: Array
-    """Its derivative until the next step, rad/s², shape (2,)."""
-    sums: Array
-    """Rows RESPONSE, PASSED, OFFSET and OFFSET_NEXT, shape (4, 2)."""
+    """Its derivative until the next step, rad/s²."""
+    response: Array
+    """Response of the servo to the commanded parts of all jumps."""
+    passed: Array
+    """Sum of the jumps that r has made."""
+    offset: Array
+    """h now."""
+    offset_next: Array
+    """h one period later."""
 
 
 @kernel
@@ -290,108 +242,103 @@ def step_transitions(
     acceleration : of the ramp, rad/s²
     plan         : updated
     """
-    sums = plan.sums
-    ramps, instants, passed = transitions.ramps, transitions.instants, transitions.passed
+    jumps, instants, passed = transitions.jumps, transitions.instants, transitions.passed
     if count > 0:
         keep = math.exp(-period / lag) if lag > 0.0 else 0.0
         until_ns = now_ns + round(period * NANOSECONDS)
         # The command precedes the response of the servo; and the sampled r jumps within the
         # period before the instant, on average in its middle.
         lead = period * (keep / (1.0 - keep) + 0.5)
-        for k in range(count):
-            mark_passed(transitions, k, sums, now_ns)
+        mark_passed(transitions, count, plan, now_ns)
         for i in range(2):
-            sums[OFFSET, i] = sums[RESPONSE, i] - sums[PASSED, i]
+            plan.offset[i] = plan.response[i] - plan.passed[i]
             rise = reference_next[i] - reference[i]
             for k in range(count):
                 if not passed[k] and until_ns >= instants[k]:
-                    rise -= ramps[k, JUMP, i]
+                    rise -= jumps[k, i]
             commanded = 0.0
             for k in range(count):
                 left = (instants[k] - now_ns) / NANOSECONDS - lead
-                advance(ramps[k], i, passed[k], left, rise / period, period, acceleration)
-                commanded += ramps[k, COVERED, i]
-            sums[RESPONSE, i] += (1.0 - keep) * (commanded - sums[RESPONSE, i])
-        for k in range(count):
-            mark_passed(transitions, k, sums, until_ns)
+                advance(transitions, k, i, left, rise / period, period, acceleration)
+                commanded += transitions.covered[k, i]
+            plan.response[i] += (1.0 - keep) * (commanded - plan.response[i])
+        mark_passed(transitions, count, plan, until_ns)
         for i in range(2):
-            sums[OFFSET_NEXT, i] = sums[RESPONSE, i] - sums[PASSED, i]
+            plan.offset_next[i] = plan.response[i] - plan.passed[i]
         # After 30 lags the remaining response is below rounding.
         over_ns = now_ns - round(30.0 * lag * NANOSECONDS)
-        count = remove_finished(transitions, count, sums, over_ns)
+        count = remove_finished(transitions, count, plan, over_ns)
     else:
-        sums[OFFSET] = 0.0
-        sums[OFFSET_NEXT] = 0.0
+        plan.offset[:] = 0.0
+        plan.offset_next[:] = 0.0
     for i in range(2):
-        plan.reachable[i] = reference[i] + sums[OFFSET, i]
-        after = reference_next[i] + sums[OFFSET_NEXT, i]
+        plan.reachable[i] = reference[i] + plan.offset[i]
+        after = reference_next[i] + plan.offset_next[i]
         plan.rate[i] = (after - plan.reachable[i]) / period
     return count
 
 
 @kernel
-def mark_passed(transitions: Transitions, k: int, sums: Array, now_ns: int) -> None:
-    """Add jump ``k`` to the passed ones once its instant is reached."""
-    if not transitions.passed[k] and now_ns >= transitions.instants[k]:
-        transitions.passed[k] = True
-        for i in range(2):
-            sums[PASSED, i] += transitions.ramps[k, JUMP, i]
+def mark_passed(transitions: Transitions, count: int, plan: Plan, now_ns: int) -> None:
+    """Add each jump to the passed ones once its instant is reached."""
+    for k in range(count):
+        if not transitions.passed[k] and now_ns >= transitions.instants[k]:
+            transitions.passed[k] = True
+            for i in range(2):
+                plan.passed[i] += transitions.jumps[k, i]
 
 
 @kernel
 def advance(
-    transition: Array,
+    transitions: Transitions,
+    k: int,
     i: int,
-    passed: bool,
     left: float,
     slope: float,
     period: float,
     acceleration: float,
 ) -> None:
-    """Advance the ramp of wheel ``i`` by one period after its start.
+    """Advance the ramp of jump ``k`` and wheel ``i`` by one period after its start.
 
-    transition   : shape (4, 2), rows JUMP to ACCELERATION
-    passed       : whether r has jumped
     left         : time until the jump, less the lead of the command, s
     slope        : r' without the jump, rad/s²
     acceleration : of the ramp, unless the transition has its own, rad/s²
     """
-    size = abs(transition[JUMP, i])
-    rest = transition[JUMP, i] - transition[COVERED, i]
+    size = abs(transitions.jumps[k, i])
+    rest = transitions.jumps[k, i] - transitions.covered[k, i]
     if rest == 0.0:
         return
     sign = math.copysign(1.0, rest)
-    if not math.isnan(transition[ACCELERATION, i]):
-        acceleration = transition[ACCELERATION, i]
-    after = max(acceleration - sign * transition[SLOPE_AFTER, i], 0.2 * acceleration)
+    if not math.isnan(transitions.accelerations[k, i]):
+        acceleration = transitions.accelerations[k, i]
+    after = max(acceleration - sign * transitions.slopes_after[k, i], 0.2 * acceleration)
     before = after
-    if not passed:
+    if not transitions.passed[k]:
         before = max(acceleration - sign * slope, 0.2 * acceleration)
     fraction = math.sqrt(before) / (math.sqrt(before) + math.sqrt(after))
     # The first step is a fraction of a period: the ramp starts at its instant, not at a sample.
     time = min(fraction * size / before - left + period, period)
     if time > 0.0:
-        transition[COVERED, i] += sign * min(before * time, abs(rest))
+        transitions.covered[k, i] += sign * min(before * time, abs(rest))
 
 
 @kernel
-def remove_finished(transitions: Transitions, count: int, sums: Array, over_ns: int) -> int:
+def remove_finished(transitions: Transitions, count: int, plan: Plan, over_ns: int) -> int:
     """Remove the transitions finished since ``over_ns``; return the number of the others."""
-    ramps, instants, passed = transitions.ramps, transitions.instants, transitions.passed
+    jumps, slopes, covered, accelerations, instants, passed = transitions
     kept = 0
     for k in range(count):
         done = passed[k] and instants[k] <= over_ns
         for i in range(2):
-            done = done and ramps[k, COVERED, i] == ramps[k, JUMP, i]
-        if done:
-            for i in range(2):
-                sums[RESPONSE, i] -= ramps[k, JUMP, i]
-                sums[PASSED, i] -= ramps[k, JUMP, i]
-        else:
-            for row in range(4):
-                for i in range(2):
-                    ramps[kept, row, i] = ramps[k, row, i]
-            instants[kept] = instants[k]
-            passed[kept] = passed[k]
+            done = done and covered[k, i] == jumps[k, i]
+        for i in range(2):
+            if done:
+                plan.response[i] -= jumps[k, i]
+                plan.passed[i] -= jumps[k, i]
+            else:
+                jumps[kept, i], slopes[kept, i] = jumps[k, i], slopes[k, i]
+                covered[kept, i], accelerations[kept, i] = covered[k, i], accelerations[k, i]
+        if not done:
+            instants[kept], passed[kept] = instants[k], passed[k]
             kept += 1
     return kept

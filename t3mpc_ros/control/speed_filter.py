@@ -4,14 +4,13 @@
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -38,9 +37,34 @@ class SpeedFilterParameters(Parameters):
     dead_time: float = parameter(0.01, 'dead time of the velocity drive', 's', (0.0, 0.5))
 
 
-SPEEDS, DISTURBANCE, PREDICTED = range(3)
-"""Rows of the filter state: wheel speeds, disturbance acceleration, and wheel speeds at the
-instant at which the next command takes effect."""
+class FilterState(NamedTuple):
+    """State of both wheels, for kernels; shape (2,) each."""
+
+    speeds: Array
+    """Estimated chi at the last measurement, rad/s."""
+    disturbance: Array
+    """Estimated disturbance acceleration, rad/s²."""
+    predicted: Array
+    """Predicted chi when a command sent now takes effect, rad/s."""
+
+
+class DriveModel(NamedTuple):
+    """Constants of :func:`update_filter`."""
+
+    velocity: bool
+    """Whether the drive takes wheel speeds; else accelerations."""
+    filtered: bool
+    """Whether measured speeds are filtered; else they are the estimate."""
+    speed_gain: float
+    """Stationary Kalman gain of chi."""
+    disturbance_gain: float
+    """Stationary Kalman gain of d, 1/s."""
+    lag: float
+    """s"""
+    period: float
+    """Nominal time between steps, s."""
+    late: float
+    """Dead time beyond whole periods, as a fraction of a period."""
 
 
 class SpeedKalmanFilter:
@@ -49,123 +73,56 @@ class SpeedKalmanFilter:
     Each wheel has two states, speed chi (rad/s) and disturbance acceleration d (rad/s²), a random
     walk. With a torque drive chi' = u + d, u the applied acceleration; with a velocity drive
     chi' = (c - chi)/lag + d, c the command that took effect one dead time after it was sent. The
-    gain is the stationary solution of the discrete Riccati equation for the nominal period, so a
-    step needs a few multiplications only.
-
-    Parameters
-    ----------
-    parameters
-        Noise, disturbance, lag and dead time.
-    drive
-        ``'velocity'`` or ``'torque'``.
-    period
-        Nominal time between steps, s.
+    gain is the stationary solution of the discrete Riccati equation for the nominal ``period``
+    (s), so a step needs a few multiplications only.
     """
 
     def __init__(self, parameters: SpeedFilterParameters, drive: str, period: float) -> None:
         if drive not in ('velocity', 'torque'):
             raise ValueError(f"drive must be 'velocity' or 'torque': got {drive!r}")
-        self._parameters = parameters
-        self._velocity = drive == 'velocity'
-        self._period = period
-        self._gain = stationary_gain(self._transition(period), parameters, period)
+        self.parameters = parameters
+        velocity, lag = drive == 'velocity', parameters.lag
+        transition = np.array([[1.0, period], [0.0, 1.0]])
+        if velocity:
+            decay = math.exp(-period / lag)
+            transition = np.array([[decay, lag * (1.0 - decay)], [0.0, 1.0]])
+        gains = stationary_gain(transition, parameters, period).tolist()
+        self.model = DriveModel(velocity, parameters.enabled, gains[0], gains[1], lag, period, 0.0)
         self._commands: Array = np.zeros((2, 2))
         self.set_dead_time(parameters.dead_time)
-        self.state: Array = np.zeros((3, 2))
-        """Rows SPEEDS, DISTURBANCE and PREDICTED."""
-
-    # Properties, not stored views: after a deep copy stored views would not share memory with
-    # the copied state.
-    @property
-    def speeds(self) -> Array:
-        """Estimated wheel speeds, rad/s, shape (2,)."""
-        row: Array = self.state[SPEEDS]
-        return row
-
-    @property
-    def disturbance(self) -> Array:
-        """Estimated disturbance acceleration, rad/s², shape (2,)."""
-        row: Array = self.state[DISTURBANCE]
-        return row
-
-    @property
-    def predicted(self) -> Array:
-        """Predicted wheel speeds when a command sent now takes effect, rad/s, shape (2,)."""
-        row: Array = self.state[PREDICTED]
-        return row
-
-    @property
-    def parameters(self) -> SpeedFilterParameters:
-        """Noise model, lag and configured dead time."""
-        return self._parameters
-
-    @property
-    def gain(self) -> Array:
-        """Stationary Kalman gain of chi (1) and of d (1/s)."""
-        return self._gain
+        self.state = FilterState(*np.zeros((3, 2)))
+        self._update = TypedKernel(update_filter)
 
     @property
     def dead_time(self) -> float:
         """Time between sending a command and its effect, s; 0 with a torque drive."""
-        return self._dead_time if self._velocity else 0.0
+        return self._dead_time if self.model.velocity else 0.0
 
     def set_dead_time(self, dead_time: float) -> None:
         """Use another dead time (s) from the next step on; the estimates are kept."""
         self._dead_time = dead_time
         # Rounded: a dead time of exactly one period must not count as 0.999... periods.
-        periods = round(dead_time / self._period, 9)
-        self._late = periods % 1.0
+        periods = round(dead_time / self.model.period, 9)
+        self.model = self.model._replace(late=periods % 1.0)
         before, count = self._commands, int(periods) + 2
         first = np.repeat(before[:1], max(count - len(before), 0), axis=0)
         self._commands = np.concatenate((first, before))[-count:]
 
     def reset(self, speeds: Array) -> None:
         """Restart at measured wheel speeds (rad/s) with equal commands and no disturbance."""
-        self.state[:] = speeds
-        self.state[DISTURBANCE] = 0.0
+        self.state.speeds[:] = self.state.predicted[:] = speeds
+        self.state.disturbance[:] = 0.0
         self._commands[:] = speeds
 
-    def predict(self, applied: Array, dt: float) -> None:
-        """Propagate the state over ``dt`` seconds.
-
-        Parameters
-        ----------
-        applied
-            Commanded wheel speeds (rad/s) of a velocity drive, or accelerations (rad/s²) of a
-            torque drive, shape (2,).
-        dt
-            Time since the last step, s.
-        """
-        lag = self._parameters.lag
-        predict(self.state, self._commands, applied, dt, self._velocity, self._late, lag)
-
-    def correct(self, measured: Array) -> Array:
-        """Return the estimate (rad/s) corrected by measured wheel speeds (rad/s), shape (2,)."""
-        self.update(self.speeds, measured, self._period, sent=False)
-        return self.speeds
-
     def update(self, applied: Array, measured: Array, dt: float, *, sent: bool) -> None:
-        """Run :meth:`predict`, if a command was ``sent``, and :meth:`correct`."""
-        update_filter(
-            self.state,
-            self._commands,
-            applied,
-            measured,
-            sent,
-            dt,
-            self._parameters.enabled,
-            self._gain,
-            self._velocity,
-            self._late,
-            self._parameters.lag,
-            self._period,
-        )
+        """Propagate over ``dt`` s, if a command was ``sent``, and correct by a measurement.
 
-    def _transition(self, period: float) -> Array:
-        if not self._velocity:
-            return np.array([[1.0, period], [0.0, 1.0]])
-        decay = math.exp(-period / self._parameters.lag)
-        return np.array([[decay, self._parameters.lag * (1.0 - decay)], [0.0, 1.0]])
+        applied  : commanded wheel speeds (rad/s) or accelerations (rad/s²), shape (2,)
+        measured : wheel speeds, rad/s, shape (2,)
+        """
+        self._update(
+            self.state, self._commands, applied, contiguous(measured), sent, dt, self.model
+        )
 
 
 def stationary_gain(transition: Array, parameters: SpeedFilterParameters, period: float) -> Array:
@@ -222,22 +179,13 @@ def delayed_servo_response(
 
 
 @kernel
-def predict_actuation(
-    speeds: Array,
-    commands: Array,
-    disturbance: Array,
-    late: float,
-    lag: float,
-    period: float,
-    out: Array,
-) -> None:
-    """Write the wheel speeds (rad/s) at which a command sent now takes effect, shape (2,).
+def predict_actuation(state: FilterState, commands: Array, model: DriveModel) -> None:
+    """Write the wheel speeds at which a command sent now takes effect.
 
     commands : shape (n + 2, 2), newest last, rad/s; n whole periods of dead time
-    late     : the remaining dead time, as a fraction of a period
     """
-    for i in range(speeds.size):
-        out[i] = speeds[i]
+    out, disturbance = state.predicted, state.disturbance
+    late, lag, period = model.late, model.lag, model.period
     whole = commands.shape[0] - 2
     for j in range(whole):
         delayed_servo_response(out, commands, j + 1, late, disturbance, lag, period, out)
@@ -246,83 +194,43 @@ def predict_actuation(
 
 
 @kernel
-def predict(
-    state: Array,
-    commands: Array,
-    applied: Array,
-    dt: float,
-    velocity: bool,
-    late: float,
-    lag: float,
+def propagate(
+    state: FilterState, commands: Array, applied: Array, dt: float, model: DriveModel
 ) -> None:
-    """Propagate the wheel speeds over ``dt`` seconds.
-
-    state    : shape (3, 2), rows SPEEDS (rad/s), DISTURBANCE (rad/s²), PREDICTED (rad/s)
-    commands : shape (n + 2, 2), newest last, rad/s; a velocity drive appends ``applied``
-    applied  : shape (2,), rad/s with a velocity drive, rad/s² with a torque drive
-    late, lag: as in :func:`predict_actuation`
-    """
-    speeds, disturbance = state[SPEEDS], state[DISTURBANCE]
-    if velocity:
+    """Propagate the wheel speeds over ``dt`` seconds; a velocity drive appends ``applied``."""
+    speeds, disturbance = state.speeds, state.disturbance
+    if model.velocity:
         last = commands.shape[0] - 1
         for i in range(speeds.size):
             for j in range(last):
                 commands[j, i] = commands[j + 1, i]
             commands[last, i] = applied[i]
-        delayed_servo_response(speeds, commands, 0, late, disturbance, lag, dt, speeds)
+        delayed_servo_response(speeds, commands, 0, model.late, disturbance, model.lag, dt, speeds)
     else:
         for i in range(speeds.size):
             speeds[i] += dt * (applied[i] + disturbance[i])
 
 
 @kernel
-def correct(
-    state: Array,
-    commands: Array,
-    measured: Array,
-    enabled: bool,
-    gain: Array,
-    velocity: bool,
-    late: float,
-    lag: float,
-    period: float,
-) -> None:
-    """Correct the state by measured speeds, and predict the speeds at the next command's effect.
-
-    state, commands   : as in :func:`predict`
-    measured          : shape (2,), rad/s
-    enabled, gain     : whether to filter, and the stationary gain, shape (2,)
-    late, lag, period : as in :func:`predict_actuation`
-    """
-    speeds, disturbance, predicted = state[SPEEDS], state[DISTURBANCE], state[PREDICTED]
-    for i in range(speeds.size):
-        if enabled:
-            innovation = measured[i] - speeds[i]
-            speeds[i] += gain[0] * innovation
-            disturbance[i] += gain[1] * innovation
-        else:
-            speeds[i] = measured[i]
-        predicted[i] = speeds[i]
-    if velocity:
-        predict_actuation(speeds, commands, disturbance, late, lag, period, predicted)
-
-
-@kernel
 def update_filter(
-    state: Array,
+    state: FilterState,
     commands: Array,
     applied: Array,
     measured: Array,
     sent: bool,
     dt: float,
-    enabled: bool,
-    gain: Array,
-    velocity: bool,
-    late: float,
-    lag: float,
-    period: float,
+    model: DriveModel,
 ) -> None:
-    """Run :func:`predict`, if a command was ``sent``, and :func:`correct` in one call."""
+    """Run a step of the filter; arguments as in :meth:`SpeedKalmanFilter.update`."""
     if sent:
-        predict(state, commands, applied, dt, velocity, late, lag)
-    correct(state, commands, measured, enabled, gain, velocity, late, lag, period)
+        propagate(state, commands, applied, dt, model)
+    for i in range(measured.size):
+        if model.filtered:
+            innovation = measured[i] - state.speeds[i]
+            state.speeds[i] += model.speed_gain * innovation
+            state.disturbance[i] += model.disturbance_gain * innovation
+        else:
+            state.speeds[i] = measured[i]
+        state.predicted[i] = state.speeds[i]
+    if model.velocity:
+        predict_actuation(state, commands, model)

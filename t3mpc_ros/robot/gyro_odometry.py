@@ -21,11 +21,10 @@ import math
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import ORIGIN, Pose, check_pose
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.geometry.types import ORIGIN, Array, Pose, check_pose
+from t3mpc_ros.kernels import Structure, TypedKernel, kernel
 from t3mpc_ros.parameters.table import ParameterError, parameter
 from t3mpc_ros.robot.wheel_odometry import (
     WheelOdometryParameters,
@@ -34,21 +33,8 @@ from t3mpc_ros.robot.wheel_odometry import (
     wrap_to_pi,
 )
 
-Array = npt.NDArray[np.float64]
-
 DATA_SHEET = 'data sheet PS-MPU-6000A r3.4'
 
-# Memory of the filter besides pose and covariance; rates in rad/s, times in s. SUSPECT is a bias
-# measurement that needs confirmation.
-(
-    BIAS, CALIBRATED,
-    FIRST_POLE, SECOND_POLE, LAST_RATE, LAST_DT,
-    DISAGREEMENT, DISAGREES_FOR, SLIPPING,
-    STANDSTILL_FOR, PUSHED, COUNT, TIME, SUM, SQUARES,
-    SUSPECT, SUSPECT_VARIANCE,
-) = range(17)  # fmt: skip
-MEMORY_SIZE = 17
-"""Number of these entries."""
 STANDSTILL_RATE = 1e-4
 """rad/s, far below the gyro noise: the response of its filter to a turn has decayed."""
 MIN_SAMPLES = 20
@@ -132,6 +118,55 @@ class GyroOdometryParameters(WheelOdometryParameters):
             )
 
 
+class GyroMemory(Structure):
+    """Memory of the filter besides pose and covariance; rates in rad/s, times in s."""
+
+    bias: float
+    calibrated: bool
+    """Whether the bias has been measured at a standstill; the gyro is then in use."""
+    first_pole: float
+    second_pole: float
+    """State of the low-pass filter of the gyro."""
+    last_rate: float
+    last_dt: float
+    """0 before the first rate."""
+    disagreement: float
+    """Rate of the gyro beyond that of the steps, smoothed."""
+    disagrees_for: float
+    slipping: bool
+    standstill_for: float
+    pushed_for: float
+    """Time for which a robot at a standstill still counts as pushed."""
+    count: float
+    """Samples in the average of a standstill; the next three are their duration and sums."""
+    time: float
+    total: float
+    squares: float
+    suspect: float
+    """Measurement of the bias that needs confirmation."""
+    suspect_variance: float
+    """Its variance, (rad/s)²; 0 without one."""
+
+
+class GyroConstants(Structure):
+    """Constants of :func:`update_filter`; names and units as in the parameters."""
+
+    radius: float
+    half: float
+    per_metre: float
+    inflation: float
+    noise: float
+    tolerance: float
+    drift: float
+    delay: float
+    hold: float
+    slip_threshold: float
+    slip_time: float
+    standstill_time: float
+    spread: float
+    bias_limit: float
+
+
 class GyroOdometry:
     """Pose and covariance from step counters and a yaw gyro.
 
@@ -142,13 +177,6 @@ class GyroOdometry:
     motion below ``slip_threshold``: yaw then drifts at that rate until the next standstill, which
     corrects about half of the drift and leaves the rest in the covariance; external rotation at a
     standstill that is perfectly even, or slower than three times ``standstill_spread``.
-
-    Parameters
-    ----------
-    parameters
-        Replaceable at run time.
-    geometry
-        Nominal R and 2b.
     """
 
     def __init__(self, parameters: GyroOdometryParameters, geometry: WheelGeometry) -> None:
@@ -156,10 +184,11 @@ class GyroOdometry:
         self._pose: Array = np.zeros(3)
         self._covariance: Array = np.zeros((5, 5))
         self._drift: Array = np.zeros((5, 5))
-        self._memory: Array = np.zeros(MEMORY_SIZE)
+        self._memory = GyroMemory.new()
+        self._update_filter = TypedKernel(update_filter)
         self.parameters = parameters
         self.update(0.0, 0.0, None, 1.0)  # compile now, not within a step
-        self._memory[:] = 0.0
+        self._memory = GyroMemory.new()
         self._drift[:] = 0.0
         self._covariance[3, 3] = (0.5 * parameters.gyro_bias_limit) ** 2
         self._covariance[4, 4] = 1.0  # in units of the tolerance, which may change
@@ -172,23 +201,21 @@ class GyroOdometry:
     @parameters.setter
     def parameters(self, parameters: GyroOdometryParameters) -> None:
         self._parameters = parameters
-        self._values: Array = np.array(
-            [
-                self._geometry.wheel_radius,
-                self._geometry.half_separation,
-                parameters.variance_per_metre,
-                parameters.slip_inflation,
-                parameters.gyro_noise,
-                parameters.gyro_scale_tolerance,
-                parameters.gyro_bias_drift,
-                parameters.gyro_delay,
-                parameters.gyro_hold,
-                parameters.slip_threshold,
-                parameters.slip_time,
-                parameters.standstill_time,
-                parameters.standstill_spread,
-                parameters.gyro_bias_limit,
-            ]
+        self._constants = GyroConstants.new(
+            radius=self._geometry.wheel_radius,
+            half=self._geometry.half_separation,
+            per_metre=parameters.variance_per_metre,
+            inflation=parameters.slip_inflation,
+            noise=parameters.gyro_noise,
+            tolerance=parameters.gyro_scale_tolerance,
+            drift=parameters.gyro_bias_drift,
+            delay=parameters.gyro_delay,
+            hold=parameters.gyro_hold,
+            slip_threshold=parameters.slip_threshold,
+            slip_time=parameters.slip_time,
+            standstill_time=parameters.standstill_time,
+            spread=parameters.standstill_spread,
+            bias_limit=parameters.gyro_bias_limit,
         )
 
     @property
@@ -204,7 +231,7 @@ class GyroOdometry:
     @property
     def bias(self) -> float:
         """Estimated gyro bias, rad/s."""
-        return float(self._memory[BIAS])
+        return float(self._memory.bias)
 
     @property
     def bias_std(self) -> float:
@@ -214,26 +241,20 @@ class GyroOdometry:
     @property
     def calibrated(self) -> bool:
         """Whether the bias has been measured at a standstill; the gyro is then in use."""
-        return bool(self._memory[CALIBRATED] > 0.0)
+        return bool(self._memory.calibrated)
 
     @property
     def slipping(self) -> bool:
         """Whether gyro and steps have disagreed for ``slip_time``: a wheel slips or is blocked."""
-        return bool(self._memory[SLIPPING] > 0.0)
+        return bool(self._memory.slipping)
 
     @property
     def slipping_for(self) -> float:
         """Time (s) for which gyro and steps have disagreed, zero unless :attr:`slipping`."""
-        return float(self._memory[DISAGREES_FOR]) if self.slipping else 0.0
+        return float(self._memory.disagrees_for) if self.slipping else 0.0
 
     def reset(self, pose: Pose = ORIGIN) -> None:
-        """Set the pose and clear its covariance; the bias estimate is kept.
-
-        Raises
-        ------
-        ValueError
-            The pose is not finite.
-        """
+        """Set a finite pose and clear its covariance; the bias estimate is kept."""
         check_pose(pose)
         self._pose[:] = pose
         for matrix in (self._covariance, self._drift):
@@ -242,7 +263,7 @@ class GyroOdometry:
 
     def forget_bias(self) -> None:
         """Reset the bias estimate, as after a power loss of the sensor."""
-        self._memory[BIAS] = self._memory[CALIBRATED] = 0.0
+        self._memory.bias, self._memory.calibrated = 0.0, False
         clear_window(self._memory)
         for matrix in (self._covariance, self._drift):
             matrix[3, :] = 0.0
@@ -252,26 +273,14 @@ class GyroOdometry:
     def update(
         self, right: float, left: float, gyro: float | None, dt: float, jitter: float = 0.0
     ) -> None:
-        """Update the estimate by the measurements of the last ``dt`` seconds.
+        """Update the estimate by the finite measurements of the last ``dt`` seconds.
 
-        Parameters
-        ----------
-        right, left
-            Angles (rad) by which the wheels turned since the last call, from the step counters;
-            exactly zero without a step.
-        gyro
-            Yaw rate (rad/s, counter-clockwise) sampled at the end of that time, bias included,
-            without ``gyro_scale``; None when the sensor does not respond.
-        dt
-            Seconds since the last call.
-        jitter
-            Variance (rad²) of each angle that does not depend on the travel.
-
-        Raises
-        ------
-        ValueError
-            A number is not finite, dt not positive, or jitter negative; the state is unchanged
-            then.
+        right, left : angles (rad) by which the wheels turned since the last call, from the step
+                      counters; exactly zero without a step
+        gyro        : yaw rate (rad/s, counter-clockwise) sampled at the end of that time, bias
+                      included, without ``gyro_scale``; None when the sensor does not respond
+        dt          : s, above 0
+        jitter      : variance (rad²) of each angle that does not depend on the travel
         """
         rate = 0.0 if gyro is None else self._parameters.gyro_scale * float(gyro)
         if not math.isfinite(right + left + rate + dt + jitter):
@@ -285,12 +294,12 @@ class GyroOdometry:
             )
         if gyro is None or not self._parameters.use_gyro:
             rate = math.nan
-        update_filter(
+        self._update_filter(
             self._pose,
             self._covariance,
             self._drift,
             self._memory,
-            self._values,
+            self._constants,
             float(right),
             float(left),
             rate,
@@ -300,7 +309,7 @@ class GyroOdometry:
 
 
 @kernel
-def delayed_rate(memory: Array, rate: float, dt: float, delay: float) -> float:
+def delayed_rate(memory: GyroMemory, rate: float, dt: float, delay: float) -> float:
     """Return the output (rad/s) of a gyro with this ``delay`` (s) at the end of ``dt``.
 
     ``rate`` is the mean over ``dt``. Within ``dt`` the rate changes linearly with the slope of
@@ -308,38 +317,38 @@ def delayed_rate(memory: Array, rate: float, dt: float, delay: float) -> float:
     poles have half the delay each and are integrated exactly.
     """
     slope = 0.0
-    if memory[LAST_DT] > 0.0:
-        slope = 2.0 * (rate - memory[LAST_RATE]) / (dt + memory[LAST_DT])
+    if memory.last_dt > 0.0:
+        slope = 2.0 * (rate - memory.last_rate) / (dt + memory.last_dt)
     else:  # the first call starts in steady state
-        memory[FIRST_POLE] = memory[SECOND_POLE] = rate
-    memory[LAST_RATE], memory[LAST_DT] = rate, dt
+        memory.first_pole = memory.second_pole = rate
+    memory.last_rate, memory.last_dt = rate, dt
     pole, start = 0.5 * delay, rate - 0.5 * slope * dt
     decay = math.exp(-dt / pole)
-    first = memory[FIRST_POLE] - (start - slope * pole)
-    second = memory[SECOND_POLE] - (start - 2.0 * slope * pole)
-    memory[FIRST_POLE] = start + slope * (dt - pole) + first * decay
-    memory[SECOND_POLE] = start + slope * (dt - 2.0 * pole) + (second + first * dt / pole) * decay
-    return float(memory[SECOND_POLE])
+    first = memory.first_pole - (start - slope * pole)
+    second = memory.second_pole - (start - 2.0 * slope * pole)
+    memory.first_pole = start + slope * (dt - pole) + first * decay
+    memory.second_pole = start + slope * (dt - 2.0 * pole) + (second + first * dt / pole) * decay
+    return float(memory.second_pole)
 
 
 @kernel
-def detect_slip(memory: Array, excess: float, dt: float, limit: float, time: float) -> bool:
-    """Decide whether gyro and steps disagree now; after ``time`` set SLIPPING in ``memory``.
+def detect_slip(memory: GyroMemory, excess: float, dt: float, limit: float, time: float) -> bool:
+    """Decide whether gyro and steps disagree now; after ``time`` set ``memory.slipping``.
 
     excess : gyro minus steps, rad/s
     limit : of the magnitude of the smoothed excess, rad/s; half of it ends a slip
     time : duration of a disagreement that counts as slip, s
     """
     smoothing = time / 3.0
-    memory[DISAGREEMENT] += (excess - memory[DISAGREEMENT]) * dt / (smoothing + dt)
-    if memory[SLIPPING] > 0.0:
+    memory.disagreement += (excess - memory.disagreement) * dt / (smoothing + dt)
+    if memory.slipping:
         limit *= 0.5
-    if abs(memory[DISAGREEMENT]) <= limit:
-        memory[DISAGREES_FOR] = memory[SLIPPING] = 0.0
+    if abs(memory.disagreement) <= limit:
+        memory.disagrees_for, memory.slipping = 0.0, False
         return False
-    memory[DISAGREES_FOR] += dt
-    if memory[DISAGREES_FOR] >= time:
-        memory[SLIPPING] = 1.0
+    memory.disagrees_for += dt
+    if memory.disagrees_for >= time:
+        memory.slipping = True
     return True
 
 
@@ -370,9 +379,9 @@ def propagate_covariance(
 
 
 @kernel
-def clear_window(memory: Array) -> None:
+def clear_window(memory: GyroMemory) -> None:
     """Start a new standstill average of the gyro."""
-    memory[COUNT] = memory[TIME] = memory[SUM] = memory[SQUARES] = 0.0
+    memory.count = memory.time = memory.total = memory.squares = 0.0
 
 
 @kernel
@@ -380,7 +389,7 @@ def estimate_bias(
     pose: Array,
     covariance: Array,
     drift: Array,
-    memory: Array,
+    memory: GyroMemory,
     variance: float,
     spread: float,
     limit: float,
@@ -395,33 +404,33 @@ def estimate_bias(
     variance : of the mean, from the noise alone, above 0, (rad/s)²
     spread : largest standard deviation of the samples; limit : largest bias, rad/s
     """
-    count = memory[COUNT]
-    innovation = memory[SUM] / count
-    scatter = max(memory[SQUARES] - innovation * memory[SUM], 0.0) / (count - 1.0)
+    count = memory.count
+    innovation = memory.total / count
+    scatter = max(memory.squares - innovation * memory.total, 0.0) / (count - 1.0)
     clear_window(memory)
-    if scatter > spread * spread or abs(memory[BIAS] + innovation) > limit:
-        memory[SUSPECT_VARIANCE] = 0.0
+    if scatter > spread * spread or abs(memory.bias + innovation) > limit:
+        memory.suspect_variance = 0.0
         return
     variance = max(variance, scatter / count)
-    if memory[CALIBRATED] > 0.0 and innovation**2 > 25.0 * (covariance[3, 3] + variance):
-        first = memory[SUSPECT_VARIANCE] == 0.0
-        apart = (innovation - memory[SUSPECT]) ** 2
-        if first or apart > 25.0 * (memory[SUSPECT_VARIANCE] + variance):
-            memory[SUSPECT], memory[SUSPECT_VARIANCE] = innovation, variance
+    if memory.calibrated and innovation**2 > 25.0 * (covariance[3, 3] + variance):
+        first = memory.suspect_variance == 0.0
+        apart = (innovation - memory.suspect) ** 2
+        if first or apart > 25.0 * (memory.suspect_variance + variance):
+            memory.suspect, memory.suspect_variance = innovation, variance
             return
         factor = innovation * innovation / drift[3, 3]
         for row in range(4):
             for column in range(4):
                 covariance[row, column] += factor * drift[row, column]
-    memory[SUSPECT_VARIANCE] = 0.0
-    memory[CALIBRATED] = 1.0
+    memory.suspect_variance = 0.0
+    memory.calibrated = True
     drift[:] = 0.0
 
     total = covariance[3, 3] + variance
     for row in range(3):
         pose[row] += covariance[row, 3] / total * innovation
     pose[2] = wrap_to_pi(pose[2])
-    memory[BIAS] += covariance[3, 3] / total * innovation
+    memory.bias += covariance[3, 3] / total * innovation
     bias_column = (covariance[0, 3], covariance[1, 3], covariance[2, 3], covariance[3, 3])
     for row in range(4):
         for column in range(4):
@@ -433,8 +442,8 @@ def update_filter(
     pose: Array,
     covariance: Array,
     drift: Array,
-    memory: Array,
-    values: Array,
+    memory: GyroMemory,
+    constants: GyroConstants,
     right: float,
     left: float,
     gyro: float,
@@ -450,35 +459,26 @@ def update_filter(
     pose : shape (3,), m, m, rad; covariance : shape (5, 5); both changed in place
     drift : shape (5, 5), covariance that a random walk of the bias by 1 rad/s/√s would have
         added since the last bias measurement
-    memory : shape (MEMORY,); values : shape (14,), see ``GyroOdometry.parameters``
     right, left : rad; gyro : rad/s, NaN without one; dt : s; jitter : rad², of each angle
     """
-    radius, half, per_metre, inflation = values[0], values[1], values[2], values[3]
-    noise, tolerance, walk, delay, hold = values[4], values[5], values[6], values[7], values[8]
-    limit, slip_time, window, spread = values[9], values[10], values[11], values[12]
+    radius, half, per_metre = constants.radius, constants.half, constants.per_metre
     has_gyro = not math.isnan(gyro)
     run_right, run_left, share = radius * right, radius * left, 0.5 / half
-    delayed = delayed_rate(memory, share * (run_right - run_left) / dt, dt, delay)
+    steps_rate = share * (run_right - run_left) / dt
+    delayed = delayed_rate(memory, steps_rate, dt, constants.delay)
     still = right == 0.0 and left == 0.0 and abs(delayed) < STANDSTILL_RATE
-    memory[STANDSTILL_FOR] = memory[STANDSTILL_FOR] + dt if still else 0.0
+    memory.standstill_for = memory.standstill_for + dt if still else 0.0
 
     # Variance of the travels, and gain of the gyro.
     gyro_excess = turn = noise_turn = gain_right = gain_left = 0.0
     constant = radius * radius * jitter
     path_right, path_left, rough = abs(run_right), abs(run_left), per_metre
-    if has_gyro and memory[CALIBRATED] > 0.0:
-        rate = gyro - memory[BIAS]
-        excess, brief = rate - delayed, min(dt, hold)
-        disagrees = detect_slip(
-            memory, excess, brief, limit + 3.0 * tolerance * abs(rate), slip_time
-        )
-        # A hand that pushes back and forth passes through zero: the push lasts until the end.
-        memory[PUSHED] = max(memory[PUSHED] - dt, 0.0)
-        if memory[STANDSTILL_FOR] > slip_time and abs(memory[DISAGREEMENT]) > 3.0 * spread:
-            memory[PUSHED] = window
-        pushed = still and memory[PUSHED] > 0.0
-        if disagrees or pushed:  # travel that the steps do not count
-            rough *= inflation
+    if has_gyro and memory.calibrated:
+        rate = gyro - memory.bias
+        excess = rate - delayed
+        if is_disturbed(memory, excess, rate, dt, still, constants):
+            # Travel that the steps do not count.
+            rough *= constants.inflation
             path_right += half * abs(excess) * dt
             path_left += half * abs(excess) * dt
         elif right == 0.0 and left == 0.0 and not still:
@@ -488,14 +488,16 @@ def update_filter(
         noise_steps = share * share * (noise_right + noise_left)
         if noise_steps > 0.0:
             # One sample represents all of dt, but its noise does not average over it.
-            noise_turn = noise * noise * dt * max(1.0, 0.5 * dt / delay)
-            noise_turn += noise_steps * max(0.0, dt / hold - 1.0)
+            noise_turn = (
+                constants.noise * constants.noise * dt * max(1.0, 0.5 * dt / constants.delay)
+            )
+            noise_turn += noise_steps * max(0.0, dt / constants.hold - 1.0)
             gain_right = share * noise_right / (noise_steps + noise_turn)
             gain_left = -share * noise_left / (noise_steps + noise_turn)
-        gyro_excess, turn = excess * dt, tolerance * rate * dt
+        gyro_excess, turn = excess * dt, constants.tolerance * rate * dt
     else:
-        memory[DISAGREEMENT] = memory[DISAGREES_FOR] = memory[SLIPPING] = 0.0
-        memory[PUSHED] = 0.0
+        memory.disagreement = memory.disagrees_for = memory.pushed_for = 0.0
+        memory.slipping = False
         noise_right, noise_left = rough * path_right + constant, rough * path_left + constant
 
     across_x, across_y, right_x, right_y, left_x, left_y, bend = integrate_arc(
@@ -512,24 +514,61 @@ def update_filter(
     add_noise(covariance, noise_right, right_x - part_x, right_y - part_y, bend - part_bend)
     add_noise(covariance, noise_left, left_x + part_x, left_y + part_y, part_bend - bend)
     add_noise(covariance, noise_turn, fused[0], fused[1], fused[2])
-    covariance[3, 3] += walk * walk * dt
+    covariance[3, 3] += constants.drift * constants.drift * dt
     drift[3, 3] += dt
 
-    if not (still and has_gyro):
-        clear_window(memory)
-        memory[SUSPECT_VARIANCE] = 0.0
+    if still and has_gyro:
+        average_standstill(pose, covariance, drift, memory, gyro - memory.bias, dt, constants)
     else:
-        deviation = gyro - memory[BIAS]
-        memory[COUNT] += 1.0
-        memory[TIME] += dt
-        memory[SUM] += deviation
-        memory[SQUARES] += deviation * deviation
-        if memory[TIME] >= window and memory[COUNT] >= MIN_SAMPLES:
-            single = max(1.0 / memory[TIME], 0.5 / (delay * memory[COUNT]))
-            estimate_bias(
-                pose, covariance, drift, memory, noise * noise * single, spread, values[13]
-            )
+        clear_window(memory)
+        memory.suspect_variance = 0.0
     for row in range(1, 5):  # keep it symmetric despite rounding over hours
         for column in range(row):
             mean = 0.5 * (covariance[row, column] + covariance[column, row])
             covariance[row, column] = covariance[column, row] = mean
+
+
+@kernel
+def is_disturbed(
+    memory: GyroMemory,
+    excess: float,
+    rate: float,
+    dt: float,
+    still: bool,
+    constants: GyroConstants,
+) -> bool:
+    """Decide whether a wheel slips now, or somebody pushes a robot that is ``still``.
+
+    excess : gyro minus steps, rad/s; rate : of the gyro, without bias, rad/s
+    """
+    limit = constants.slip_threshold + 3.0 * constants.tolerance * abs(rate)
+    disagrees = detect_slip(memory, excess, min(dt, constants.hold), limit, constants.slip_time)
+    # A hand that pushes back and forth passes through zero: the push lasts until the end.
+    memory.pushed_for = max(memory.pushed_for - dt, 0.0)
+    rests = memory.standstill_for > constants.slip_time
+    if rests and abs(memory.disagreement) > 3.0 * constants.spread:
+        memory.pushed_for = constants.standstill_time
+    return disagrees or (still and memory.pushed_for > 0.0)
+
+
+@kernel
+def average_standstill(
+    pose: Array,
+    covariance: Array,
+    drift: Array,
+    memory: GyroMemory,
+    deviation: float,
+    dt: float,
+    constants: GyroConstants,
+) -> None:
+    """Add a sample of the gyro (rad/s, without bias); measure the bias over a full window."""
+    memory.count += 1.0
+    memory.time += dt
+    memory.total += deviation
+    memory.squares += deviation * deviation
+    if memory.time >= constants.standstill_time and memory.count >= MIN_SAMPLES:
+        single = max(1.0 / memory.time, 0.5 / (constants.delay * memory.count))
+        variance = constants.noise * constants.noise * single
+        estimate_bias(
+            pose, covariance, drift, memory, variance, constants.spread, constants.bias_limit
+        )

@@ -266,15 +266,15 @@ def test_e14_print_83_is_violated_where_the_correction_holds():
 
 
 def test_certificate_holds_for_a_decaying_error_only():
-    law = LawParameters(gain=5.0, error_bound=0.0, smoothing=1.0)
     watch = Certificate(window=0.2)
     for k in range(200):
-        reading = watch.update(np.array([1.0, -1.0]) * math.exp(-5.0 * 0.01 * k), law, 0.0, 0.01)
+        error = math.exp(-5.0 * 0.01 * k)
+        reading = watch.update([error, -error], 5.0, 0.0, 1.0, 0.01)
     assert reading.holds
     assert reading.value < 1e-7
     watch.reset()
     for k in range(50):
-        reading = watch.update(np.array([1.0, 1.0]) * (1.0 + 0.05 * k), law, 0.0, 0.01)
+        reading = watch.update(2 * [1.0 + 0.05 * k], 5.0, 0.0, 1.0, 0.01)
     assert not reading.holds
     assert reading.margin < 0.0
 

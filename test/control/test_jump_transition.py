@@ -27,10 +27,10 @@ def _transition(jump, slopes=(0.0, 0.0), *, lag=0.0, known=100, at=100, steps=25
         if n == known:
             transition.announce(at * NS, np.array([jump, -jump]), np.array([after, -after]))
         transition.step(n * NS, r[n], r[n + 1])
-        reachable[n] = r[n] + transition.offset
-        reachable_next = r[n + 1] + transition.offset_next
+        reachable[n] = r[n] + transition.plan.offset
+        reachable_next = r[n + 1] + transition.plan.offset_next
         commands[n] = reachable[n] + (reachable_next - reachable[n]) / servo_step
-    assert not transition.active
+    assert transition.count == 0
     return r[:-1], reachable, commands
 
 
@@ -88,7 +88,7 @@ def test_a_torque_drive_crosses_with_the_torque_of_its_motors(jump):
     for n in range(steps):
         transition.step(n * NS, r[n], r[n + 1])
         reachable[n] = transition.reachable
-    assert not transition.active
+    assert transition.count == 0
     needed = np.abs(np.diff(reachable, axis=0) / T @ inertia)
     assert needed.max() <= 1.01 * torque
     assert needed.max() >= 0.95 * torque
@@ -119,10 +119,10 @@ def test_two_transitions_may_overlap():
     reachable = []
     for n in range(200):
         transition.step(n * NS, r[n], r[n + 1])
-        reachable.append(r[n] + transition.offset)
+        reachable.append(r[n] + transition.plan.offset)
     assert np.max(np.abs(np.diff(reachable, axis=0))) <= 2.0 * A * T
     np.testing.assert_allclose(reachable[-1], -2.0, atol=1e-9)
-    assert not transition.active
+    assert transition.count == 0
 
 
 def test_a_withdrawn_jump_leaves_no_offset():
@@ -135,11 +135,11 @@ def test_a_withdrawn_jump_leaves_no_offset():
         if n == 25:
             transition.withdraw(25 * NS)
         transition.step(n * NS, r, r)
-        offsets.append(transition.offset.copy())
+        offsets.append(transition.plan.offset.copy())
     assert np.max(np.abs(offsets)) > 0.5  # the transition had started
     assert np.max(np.abs(np.diff(offsets, axis=0))) <= A * T * (1 + 1e-9)
     np.testing.assert_allclose(offsets[-1], 0.0, atol=1e-9)
-    assert not transition.active
+    assert transition.count == 0
 
 
 def test_jumps_from_the_instant_of_a_withdrawal_on_do_not_occur():
@@ -165,6 +165,6 @@ def test_future_jumps_enter_psi_free_in_their_period():
 def test_without_jumps_the_offset_is_zero():
     transition = JumpTransition(JumpTransitionParameters(), 0.02, T)
     transition.step(0, np.ones(2), np.zeros(2))
-    assert not transition.active
-    np.testing.assert_array_equal(transition.offset, 0.0)
-    np.testing.assert_array_equal(transition.offset_next, 0.0)
+    assert transition.count == 0
+    np.testing.assert_array_equal(transition.plan.offset, 0.0)
+    np.testing.assert_array_equal(transition.plan.offset_next, 0.0)

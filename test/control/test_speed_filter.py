@@ -31,13 +31,12 @@ def test_the_filter_reduces_noise_and_finds_the_disturbance(drive):
             chi = decay * chi + (1 - decay) * (delayed[0] + parameters.lag * disturbance)
         else:
             chi = chi + 0.01 * (command + disturbance)
-        speed_filter.predict(command, 0.01)
         measured = chi + rng.normal(scale=0.2, size=2)
-        estimate = speed_filter.correct(measured)
+        speed_filter.update(command, measured, 0.01, sent=True)
         if k > 500:
             raw.append(measured - chi)
-            filtered.append(estimate - chi)
-            estimates.append(speed_filter.disturbance.copy())
+            filtered.append(speed_filter.state.speeds - chi)
+            estimates.append(speed_filter.state.disturbance.copy())
     ratio = np.std(filtered) / np.std(raw)
     assert ratio < 0.6
     np.testing.assert_allclose(np.mean(estimates, axis=0), disturbance, atol=0.6)  # three sigma
@@ -62,10 +61,8 @@ def test_without_noise_or_disabled_the_measurement_is_used():
         SpeedFilterParameters(noise_variance=0.0),
     ):
         speed_filter = SpeedKalmanFilter(parameters, 'torque', 0.01)
-        speed_filter.predict(np.array([5.0, 5.0]), 0.01)
-        np.testing.assert_allclose(
-            speed_filter.correct(np.array([1.0, 2.0])), [1.0, 2.0], rtol=1e-3
-        )
+        speed_filter.update(np.array([5.0, 5.0]), np.array([1.0, 2.0]), 0.01, sent=True)
+        np.testing.assert_allclose(speed_filter.state.speeds, [1.0, 2.0], rtol=1e-3)
 
 
 def test_an_unknown_drive_is_rejected():

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.kernels import Kernel, TypedKernel
+from t3mpc_ros.kernels import Kernel, Structure, TypedKernel
 
 SINGLY = 300
 """Most elements of an array that are named one by one."""
@@ -102,6 +102,8 @@ def _parts(thing: Any) -> Iterator[tuple[str, Any]]:
             yield f'[{key!r}]', thing[key]
     elif isinstance(thing, set | frozenset):
         yield from ((f'{{{item!r}}}', None) for item in sorted(thing, key=repr))
+    elif isinstance(thing, np.record):
+        yield from ((f'.{name}', getattr(thing, name).item()) for name in thing.dtype.names)
     elif hasattr(thing, '_fields'):
         yield from ((f'.{name}', getattr(thing, name)) for name in thing._fields)
     elif isinstance(thing, list | tuple | deque):
@@ -195,6 +197,8 @@ def _put(target: Any, name: str, value: Any) -> None:
         now[...] = value  # views and kernels share its memory
     elif isinstance(target, deque | list):
         target[int(name[1:-1])] = value
+    elif isinstance(target, np.record):
+        setattr(target, name[1:], value)
     else:
         object.__setattr__(target, name[1:], value)
 
@@ -346,7 +350,10 @@ def check_round_trip(entry: Configured) -> None:
 
 
 def classes_of(packages: tuple[str, ...]) -> dict[str, type]:
-    """Return the classes with a state of their own, by name: not frozen, no tuple, no error."""
+    """Return the classes with a state of their own, by name: not frozen, no tuple, no error.
+
+    A structure is the state of its owner.
+    """
     found = {}
     for name in packages:
         package = importlib.import_module(f't3mpc_ros.{name}')
@@ -359,6 +366,8 @@ def classes_of(packages: tuple[str, ...]) -> dict[str, type]:
 
 
 def _may_change(kind: type) -> bool:
-    if issubclass(kind, tuple | BaseException | enum.Enum) or getattr(kind, '_is_protocol', False):
+    if issubclass(kind, tuple | BaseException | enum.Enum | Structure) or getattr(
+        kind, '_is_protocol', False
+    ):
         return False
     return not (dataclasses.is_dataclass(kind) and kind.__dataclass_params__.frozen)

@@ -25,11 +25,11 @@ from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.chaos.system import hyperchaotic_system
 from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
+from t3mpc_ros.control.body_correction import SKILL as SKILL_FIELDS
 from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
 from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParameters
 from t3mpc_ros.control.control_law import (
     Certificate,
-    LawParameters,
     Nt3fsMpcController,
     Nt3fsMpcParameters,
 )
@@ -170,7 +170,7 @@ def drive_filter(kalman, r):
     found = []
     for _ in range(20):
         kalman.update(pair(r), pair(r), gap(r), sent=r.random() < 0.9)
-        found += properties(kalman, 'speeds', 'disturbance', 'predicted', 'dead_time', 'gain')
+        found += [*(array.copy() for array in kalman.state), kalman.dead_time]
     return found
 
 
@@ -225,7 +225,7 @@ def drive_shaper(shaper, r):
 
 def drive_certificate(certificate, r):
     """Give errors."""
-    return [certificate.update(pair(r), LawParameters(), 9.0, gap(r)) for _ in range(20)]
+    return [certificate.update(pair(r).tolist(), 15.0, 9.0, 0.6, gap(r)) for _ in range(20)]
 
 
 def drive_law(law, r):
@@ -267,7 +267,8 @@ def drive_jumps(transition, r):
         now += PERIOD_NS
         reference = np.array([level + 0.1 * k, -level])
         transition.step(now, reference, reference + 0.1)
-        found += properties(transition, 'reachable', 'rate', 'offset', 'offset_next', 'active')
+        found += [array.copy() for array in transition.plan]
+        found.append(transition.count)
         found.append(transition.future_jumps(now, 0.05, 4))
         if r.random() < 0.15 or k == 57:
             transition.announce(now + r.choice((-1, 1, 5)) * PERIOD_NS, pair(r, 3.0), pair(r, 1.0))
@@ -766,6 +767,8 @@ LAST = (
     '._output.command',
     '._output.estimate',
     '._output.terms',
+    '.command',
+    '.terms',
     '.fuzzy._phi',
     '.fuzzy.tables.phi',
 )
@@ -780,11 +783,16 @@ MACHINE = tuple(
     )
 )
 SKILL = '.signals.skills', '._skill'
-RAMPS = '._plan.rate', '._plan.reachable', '._transitions'
+RAMPS = '.plan.rate', '.plan.reachable', '.rate', '.reachable', '._transitions'
 BODY_SKILL = tuple(
-    f'{name}[{k}]' for name in ('._memory', '._state.sums') for k in (5, 6, 7, 12, 14)
+    f'{memory}.{name}' for memory in ('._memory', '._state.memory') for name in SKILL_FIELDS
 )
-BODY_OLD = tuple(f'{name}[{k}]' for name in ('._memory', '._state.sums') for k in (0, 9))
+BODY_OLD = tuple(
+    f'{memory}.{name}'
+    for memory in ('._memory', '._state.memory')
+    for name in ('yaw', 'last_reference')
+)
+GYRO_RESPONSE = 'first_pole', 'second_pole', 'last_rate', 'last_dt', 'standstill_for'
 
 
 def below(name: str, paths: tuple[str, ...]) -> tuple[str, ...]:
@@ -845,7 +853,7 @@ FRESH = {
                 lambda f: f.set_dead_time(0.0437),
                 kept=('.state',),
                 continued=('._commands',),
-                scratch=('._parameters.dead_time',),
+                scratch=('.parameters.dead_time',),
                 built=lambda: SpeedKalmanFilter(
                     SpeedFilterParameters(dead_time=0.0437), 'velocity', PERIOD
                 ),
@@ -928,7 +936,7 @@ FRESH = {
                 lambda c: (c.reset(), c.reset_estimate()),
                 kept=below('.predictive', MACHINE),
                 continued=below('.predictive', SKILL),
-                scratch=LAST[:3],
+                scratch=LAST[:5],
             ),
         },
     ),
@@ -954,7 +962,7 @@ FRESH = {
                 scratch=(
                     *('._ahead_ns', '._sampled', '._shaper', '._keep_out._nearest'),
                     *below('._tracker.transition', RAMPS),
-                    *('._tracker.law._output.command', '._tracker.law._output.terms'),
+                    *below('._tracker.law', (LAST[0], *LAST[2:5])),
                     *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
                 ),
             )
@@ -970,7 +978,7 @@ FRESH = {
                 scratch=(
                     *('._sampled', '._shaper'),
                     *below('._tracker.transition', RAMPS),
-                    *below('._tracker.law', LAST[:3]),
+                    *below('._tracker.law', LAST[:5]),
                     *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
                 ),
             ),
@@ -996,7 +1004,7 @@ FRESH = {
                 scratch=(
                     *('._sampled', '._shaper'),
                     *below('._tracker.transition', RAMPS),
-                    *below('._tracker.law', LAST[:3]),
+                    *below('._tracker.law', LAST[:5]),
                     *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
                 ),
             ),
@@ -1108,7 +1116,7 @@ FRESH = {
                 lambda o: o.forget_bias(),
                 # The response of the gyro's filter to the steps, and for how long they rest.
                 kept=(
-                    *('._pose', *(f'._memory[{k}]' for k in (2, 3, 4, 5, 9))),
+                    *('._pose', *(f'._memory.{name}' for name in GYRO_RESPONSE)),
                     *(
                         f'._{matrix}[{row}][{column}]'
                         for matrix in ('covariance', 'drift')
@@ -1117,7 +1125,7 @@ FRESH = {
                     ),
                 ),
                 # Not read before the bias is known again.
-                scratch=tuple(f'._memory[{k}]' for k in (6, 7, 8)),
+                scratch=('._memory.disagreement', '._memory.disagrees_for', '._memory.slipping'),
             ),
         },
     ),
@@ -1197,7 +1205,14 @@ FRESH = {
                     *('._imu._generator', '._channel._generator', '._channel._clock_ns'),
                     *below('._channel', COUNTS[:3]),
                     *('._limiter._ramp', '._limiter._estop', '._limited_command'),
-                    *('._odometry._pose', *(f'._odometry._memory[{k}]' for k in (2, 3, 5, 9))),
+                    *(
+                        '._odometry._pose',
+                        *(
+                            f'._odometry._memory.{name}'
+                            for name in GYRO_RESPONSE
+                            if name != 'last_rate'
+                        ),
+                    ),
                     *(f'._odometry._covariance[{k}]' for k in (0, 1, 2)),
                 ),
                 scratch=('._channel._cleared', *below('._imu', IMU_TUNING)),
@@ -1340,7 +1355,7 @@ CONFIGURED = {
     JumpTransition: Configured(
         JumpTransitionParameters(),
         lambda p: JumpTransition(p, 0.02, PERIOD),
-        configure,
+        assign,
         drive_jumps,
         elsewhere=('preview',),
     ),
