@@ -36,8 +36,7 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, estimate
-from t3mpc_ros.fuzzy.inference import FuzzyTables
-from t3mpc_ros.fuzzy.sets import FuzzyParameters
+from t3mpc_ros.fuzzy.inference import FuzzyParameters, FuzzyTables
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import Structure, TypedKernel, kernel
 from t3mpc_ros.parameters.table import Parameters, group, parameter

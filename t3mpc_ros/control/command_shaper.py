@@ -19,13 +19,10 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,18 +8,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from t3mpc_ros.control.friction_term import (
-    FrictionTables,
-    FrictionTermParameters,
-    add_friction,
-)
 from t3mpc_ros.control.jump_transition import JumpTransitionParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, adapt, estimate
-from t3mpc_ros.fuzzy.inference import FuzzyTables
-from t3mpc_ros.fuzzy.sets import FuzzyParameters
+from t3mpc_ros.fuzzy.inference import FuzzyParameters, FuzzyTables
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
 from t3mpc_ros.mpc.predictive_controller import (
     PredictiveController,
@@ -27,8 +21,6 @@ from t3mpc_ros.mpc.predictive_controller import (
     Signals,
 )
 from t3mpc_ros.parameters.table import Parameters, group, parameter
-
-Array = NDArray[np.float64]
 
 TERM_NAMES = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
 """Summands of the law, in the order of the rows of ``terms``."""
@@ -67,6 +59,41 @@ class LawParameters(Parameters):
         0.62,
         'width epsilon of the compensator tanh(delta/epsilon): the error bound E14 grows with '
         '0.2785 epsilon, small values chatter with noise',
+        'rad/s',
+        (1e-3, 100.0),
+        dynamic=True,
+    )
+
+
+@dataclass(frozen=True)
+class FrictionTermParameters(Parameters):
+    """Adaptation of the Coulomb friction in the estimate g, E23.
+
+    Coulomb friction changes by twice its value within some tenths of a rad/s about standstill. The
+    Gaussian sets of (16)-(33), which must be wider than the noise of their inputs, smear this
+    change out, and the adaptation has to learn the friction anew after each change of direction.
+    It is linear in its own parameters, though, so g gets one more basis:
+
+        g_i = alpha_i^T Phi + phi_i^T s,    s_j = tanh(r_j/w),    d phi_i/dt = gamma_f s delta_i
+
+    This is (77)-(78) for another basis, with the same modifications. Both wheels have both
+    elements of s, because the inertia of the body couples them. V of (74) gets
+    |phi*_i - phi_i|²/(2 gamma_f) for each wheel; its derivative along (72)-(73) is (79) as before.
+    The friction is that at r, not at chi, whose noise would switch it; the difference is part of
+    omega.
+    """
+
+    gamma: float = parameter(
+        10.0,
+        'adaptation gain of the Coulomb friction in g, as gamma of (77)-(78) for a basis of size '
+        'one; for a drive that friction slows. 0: without this basis, g is (31) as printed',
+        '1/s²',
+        (0.0, 1e4),
+        dynamic=True,
+    )
+    width: float = parameter(
+        0.3,
+        'wheel speed of the reference at which the friction has 76 % of its value',
         'rad/s',
         (1e-3, 100.0),
         dynamic=True,
@@ -137,6 +164,36 @@ def fitting_gain(parameters: Nt3fsMpcParameters, drive: str) -> tuple[float, flo
         return total, smoothing
     smoothing = min(max(smoothing, 2.0 * bound / total), 100.0)
     return total - bound / smoothing, smoothing
+
+
+class FrictionTables(NamedTuple):
+    """Basis and coefficients, for kernels."""
+
+    basis: Array
+    """s of the last evaluation, shape (n,)."""
+    coefficients: Array
+    """phi, rad/s², shape (n, n): row i for the estimate of wheel i."""
+
+    @classmethod
+    def of(cls, wheels: int) -> 'FrictionTables':
+        """Return tables of a friction that is not known."""
+        return cls(np.zeros(wheels), np.zeros((wheels, wheels)))
+
+
+@kernel
+def add_friction(reference: Array, width: float, tables: FrictionTables, outputs: Array) -> None:
+    """Write the basis s of E23, and add the friction to the estimates g of (31).
+
+    reference : shape (n,), r, rad/s
+    width     : w, rad/s
+    outputs   : shape (n,), g, rad/s², updated
+    """
+    basis, coefficients = tables.basis, tables.coefficients
+    for j in range(basis.size):
+        basis[j] = math.tanh(reference[j] / width)
+    for i in range(outputs.size):
+        for j in range(basis.size):
+            outputs[i] += coefficients[i, j] * basis[j]
 
 
 # -- law (66)-(67) and compensator (81)-(82) --------------------------------------------------

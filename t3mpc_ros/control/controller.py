@@ -10,7 +10,6 @@ import math
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
@@ -18,13 +17,13 @@ from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParamet
 from t3mpc_ros.control.control_law import (
     TERM_NAMES,
     CertificateReading,
+    FrictionTermParameters,
     LawParameters,
     Nt3fsMpcController,
     Nt3fsMpcParameters,
     fitting_gain,
 )
 from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
-from t3mpc_ros.control.friction_term import FrictionTermParameters
 from t3mpc_ros.control.jump_transition import JumpTransition, MotorLimit
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
@@ -48,14 +47,13 @@ from t3mpc_ros.geometry.types import (
     NANOSECONDS,
     ORIGIN,
     STANDSTILL,
+    Array,
     BodyTwist,
     State,
     WheelSpeeds,
 )
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import ParameterError, group, parameter, with_default
-
-Array = NDArray[np.float64]
 
 JUMP_DETECTION_FACTOR = 2.2
 """A reference acceleration above this multiple of the acceleration limit is a jump."""

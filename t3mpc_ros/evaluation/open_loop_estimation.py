@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
 from t3mpc_ros.evaluation.reporting import Table, progress_bar
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
-from t3mpc_ros.fuzzy.sets import FuzzyParameters
+from t3mpc_ros.fuzzy.inference import FuzzyParameters
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
 

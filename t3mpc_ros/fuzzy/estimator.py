@@ -6,14 +6,19 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from t3mpc_ros.fuzzy.inference import FuzzyTables, combine, compute_basis, evaluate_basis
-from t3mpc_ros.fuzzy.sets import FuzzyParameters, FuzzySets, build_sets
+from t3mpc_ros.fuzzy.inference import (
+    FuzzyParameters,
+    FuzzySets,
+    FuzzyTables,
+    build_sets,
+    combine,
+    compute_basis,
+    evaluate_basis,
+)
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.mpc.quadratic_program import cholesky, solve_lower, solve_upper
-
-Array = NDArray[np.float64]
 
 
 class LayerSizes(NamedTuple):

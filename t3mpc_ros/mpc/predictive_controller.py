@@ -8,22 +8,24 @@ import math
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.mpc.boltzmann_machine import (
     LayerSizes,
     make_machine,
     reset_history,
 )
-from t3mpc_ros.mpc.prediction import predict_responses, predicted_errors, toeplitz
 from t3mpc_ros.mpc.predictor import (
     LearningConstants,
     Predictor,
     WheelState,
     authority,
     observe,
+    predict_responses,
+    predicted_errors,
     skill_score,
+    toeplitz,
 )
 from t3mpc_ros.mpc.pretraining import (
     ExcitationParameters,
@@ -41,8 +43,6 @@ from t3mpc_ros.mpc.quadratic_program import (
     solve_quadratic_program,
 )
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.mpc.boltzmann_machine import (
     BoltzmannMachine,
@@ -18,8 +18,6 @@ from t3mpc_ros.mpc.boltzmann_machine import (
     set_visible,
 )
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

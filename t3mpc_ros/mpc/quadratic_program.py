@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
@@ -146,18 +146,7 @@ def solve_quadratic_program(
         dependent = is_dependent(worst, work.active, count, work.components)
         row_normal(worst, side, work.lower, work.normal)
         project_out(work, count)
-        # Largest dual step before an active multiplier is zero.
-        longest, drop = math.inf, -1
-        for k in range(count - 1, -1, -1):
-            rate = work.projection[k]
-            for j in range(k + 1, count):
-                rate -= work.triangle[k, j] * work.projection[j]
-            work.projection[k] = rate / work.triangle[k, k]
-            if (
-                work.projection[k] > 1e-12
-                and work.active_multipliers[k] < longest * work.projection[k]
-            ):
-                longest, drop = work.active_multipliers[k] / work.projection[k], k
+        longest, drop = longest_dual_step(work, count)
         # Step to the new bound, infinite for a dependent normal.
         needed = math.inf
         if not dependent:
@@ -186,13 +175,37 @@ def solve_quadratic_program(
             for k in range(count):
                 work.active_multipliers[k] -= step * work.projection[k]
             count -= 1
-            for k in range(drop, count):
-                work.active[k] = work.active[k + 1]
-                work.sides[k] = work.sides[k + 1]
-                work.active_multipliers[k] = work.active_multipliers[k + 1]
-            rebuild_basis(work, count)
+            remove_row(work, drop, count)
     work.changes[:] = 0.0
     return UNFINISHED
+
+
+@kernel
+def longest_dual_step(work: Workspace, count: int) -> tuple[float, int]:
+    """Return the largest step before an active multiplier is zero, and its row, -1 without one.
+
+    ``work.projection`` becomes the decrease of the multipliers for each unit of the step.
+    """
+    longest, drop = math.inf, -1
+    for k in range(count - 1, -1, -1):
+        rate = work.projection[k]
+        for j in range(k + 1, count):
+            rate -= work.triangle[k, j] * work.projection[j]
+        rate /= work.triangle[k, k]
+        work.projection[k] = rate
+        if rate > 1e-12 and work.active_multipliers[k] < longest * rate:
+            longest, drop = work.active_multipliers[k] / rate, k
+    return longest, drop
+
+
+@kernel
+def remove_row(work: Workspace, drop: int, count: int) -> None:
+    """Remove active row ``drop``, of which ``count`` remain."""
+    for k in range(drop, count):
+        work.active[k] = work.active[k + 1]
+        work.sides[k] = work.sides[k + 1]
+        work.active_multipliers[k] = work.active_multipliers[k + 1]
+    rebuild_basis(work, count)
 
 
 @kernel

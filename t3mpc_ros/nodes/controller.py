@@ -25,8 +25,7 @@ from t3mpc_ros.control.controller import (
     Status,
     StepperControllerParameters,
 )
-from t3mpc_ros.control.odometry_plausibility import InputMonitor
-from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.control.watchdog import InputMonitor, Reason
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes.common import conversions, graph_introspection, qos

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import ORIGIN, Pose, WheelSpeeds, check_pose
+from t3mpc_ros.geometry.types import ORIGIN, Array, Pose, WheelSpeeds, check_pose
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

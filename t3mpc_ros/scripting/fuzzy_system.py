@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from t3mpc_ros.fuzzy.inference import FuzzyTables, evaluate_basis
-from t3mpc_ros.fuzzy.sets import FuzzyParameters, build_sets
+from t3mpc_ros.fuzzy.inference import FuzzyParameters, FuzzyTables, build_sets, evaluate_basis
 from t3mpc_ros.scripting.references import numbers
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
 

@@ -22,7 +22,7 @@ from t3mpc_ros.control.control_law import (
 )
 from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
-from t3mpc_ros.fuzzy.sets import FuzzyParameters
+from t3mpc_ros.fuzzy.inference import FuzzyParameters
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.simulation.plant.dynamics import (

@@ -5,8 +5,14 @@
 import numpy as np
 import pytest
 
-from t3mpc_ros.control.control_law import FRICTION_WEIGHTS, Nt3fsMpcController, Nt3fsMpcParameters
-from t3mpc_ros.control.friction_term import FrictionTables, FrictionTermParameters, add_friction
+from t3mpc_ros.control.control_law import (
+    FRICTION_WEIGHTS,
+    FrictionTables,
+    FrictionTermParameters,
+    Nt3fsMpcController,
+    Nt3fsMpcParameters,
+    add_friction,
+)
 from t3mpc_ros.fuzzy.estimator import adapt
 
 DT = 0.01

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
-from t3mpc_ros.control.free_space_map import CLEARINGS, FREE, OCCUPIED, UNKNOWN
 from t3mpc_ros.control.keep_out import (
+    CLEARINGS,
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
     Activity,
     KeepOut,
     KeepOutParameters,

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from t3mpc_ros.control.odometry_plausibility import InputMonitor
+from t3mpc_ros.control.watchdog import InputMonitor
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
 
 

@@ -15,8 +15,7 @@ import yaml
 
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
-from t3mpc_ros.control.odometry_plausibility import InputMonitor
-from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.control.watchdog import InputMonitor, Reason
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, Pose, State
 
 pytestmark = pytest.mark.compiled

@@ -17,8 +17,7 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
     SlidingMode,
     observer_gains,
 )
-from t3mpc_ros.fuzzy.inference import compute_basis
-from t3mpc_ros.fuzzy.sets import build_sets
+from t3mpc_ros.fuzzy.inference import build_sets, compute_basis
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
 from t3mpc_ros.simulation.plant.dynamics import dynamics_vector, wheel_acceleration, wheel_inertia

@@ -26,8 +26,7 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
     torque_robot,
 )
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
-from t3mpc_ros.fuzzy.inference import compute_basis
-from t3mpc_ros.fuzzy.sets import FuzzyParameters
+from t3mpc_ros.fuzzy.inference import FuzzyParameters, compute_basis
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia

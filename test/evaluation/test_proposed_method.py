@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from support.long_tests import few_of
 
+from t3mpc_ros.control.control_law import FrictionTermParameters
 from t3mpc_ros.control.controller import Controller, ControllerParameters
-from t3mpc_ros.control.friction_term import FrictionTermParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
 from t3mpc_ros.evaluation.cases import PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import paired

@@ -9,8 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, adapt, beyond_dead_zone
-from t3mpc_ros.fuzzy.inference import compute_basis
-from t3mpc_ros.fuzzy.sets import FuzzyParameters, build_sets
+from t3mpc_ros.fuzzy.inference import FuzzyParameters, build_sets, compute_basis
 
 Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
 

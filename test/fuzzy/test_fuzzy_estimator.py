@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
-from t3mpc_ros.fuzzy.inference import compute_basis
-from t3mpc_ros.fuzzy.sets import FuzzyParameters, build_sets
+from t3mpc_ros.fuzzy.inference import FuzzyParameters, build_sets, compute_basis
 
 Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
 

@@ -12,8 +12,16 @@ from scipy.optimize import minimize_scalar
 from scipy.special import logsumexp
 from support.equations import memberships, output_by_double_sum
 
-from t3mpc_ros.fuzzy.inference import compute_basis, firing_strengths, fuzzify
-from t3mpc_ros.fuzzy.sets import FuzzyParameters, FuzzySets, build_sets, slice_levels, type3_widths
+from t3mpc_ros.fuzzy.inference import (
+    FuzzyParameters,
+    FuzzySets,
+    build_sets,
+    compute_basis,
+    firing_strengths,
+    fuzzify,
+    slice_levels,
+    type3_widths,
+)
 
 Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
 

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from t3mpc_ros.fuzzy.sets import (
+from t3mpc_ros.fuzzy.inference import (
     LOWER,
     MAX_COEFFICIENTS,
     UPPER,

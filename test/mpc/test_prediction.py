@@ -15,7 +15,7 @@ from t3mpc_ros.mpc.boltzmann_machine import (
     reset_history,
     set_visible,
 )
-from t3mpc_ros.mpc.prediction import (
+from t3mpc_ros.mpc.predictor import (
     free_response,
     predict_responses,
     predicted_errors,

@@ -83,7 +83,7 @@ def test_the_import_loads_no_library():
 def test_generator_and_fuzzy_system_are_functions_in_any_order():
     """Both are packages, too: importing a module of one must not replace the function."""
     import t3mpc_ros.chaos.system
-    import t3mpc_ros.fuzzy.sets
+    import t3mpc_ros.fuzzy.inference
 
     assert t3mpc_ros.chaos is t3.chaos is sys.modules['t3mpc_ros.chaos']
     assert t3.chaos(tspan=(0.0, 0.1)).y.shape == (11, 4)

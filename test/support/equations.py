@@ -12,8 +12,7 @@ import numpy.typing as npt
 from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.system import QuadraticSystem, Terms, right_hand_side
-from t3mpc_ros.fuzzy.inference import fuzzify, square_distances
-from t3mpc_ros.fuzzy.sets import LOWER, UPPER, FuzzySets
+from t3mpc_ros.fuzzy.inference import LOWER, UPPER, FuzzySets, fuzzify, square_distances
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import Pose, WheelSpeeds
 from t3mpc_ros.kernels import kernel

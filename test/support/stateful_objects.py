@@ -54,7 +54,7 @@ from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultInjectio
 from t3mpc_ros.emulator.link.serial_line import SerialLine
 from t3mpc_ros.emulator.plant import Plant
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
-from t3mpc_ros.fuzzy.sets import FuzzyParameters
+from t3mpc_ros.fuzzy.inference import FuzzyParameters
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, SimulatedTime

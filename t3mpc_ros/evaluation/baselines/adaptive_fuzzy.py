@@ -13,7 +13,7 @@ from t3mpc_ros.control.control_law import compensator
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
 from t3mpc_ros.evaluation.baselines.feedback_control import FeedbackBaseline, FeedbackParameters
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
-from t3mpc_ros.fuzzy.sets import FuzzyParameters
+from t3mpc_ros.fuzzy.inference import FuzzyParameters
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 Array = NDArray[np.float64]
