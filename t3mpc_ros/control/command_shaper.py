@@ -58,12 +58,8 @@ class CommandShaperParameters(Parameters):
 class CommandShaper:
     """Shapes the reference of both wheels; it needs the reference :attr:`lead` in advance.
 
-    Parameters
-    ----------
-    parameters
-        Frequencies; both 0: the reference is unchanged and the lead is 0.
-    period
-        Control period, s.
+    parameters : frequencies; both 0: the reference is unchanged and the lead is 0
+    period : control period, s
     """
 
     def __init__(self, parameters: CommandShaperParameters, period: float) -> None:
@@ -95,12 +91,8 @@ class CommandShaper:
     def step(self, planned: Array, elapsed: float) -> None:
         """Update :attr:`reference` and :attr:`rate`.
 
-        Parameters
-        ----------
-        planned
-            Reachable reference one lead after the instant, rad/s, shape (2,).
-        elapsed
-            Time since the last step (s); over a gap the reference is interpolated.
+        planned : reachable reference one lead after the instant, rad/s, shape (2,)
+        elapsed : time since the last step (s); over a gap the reference is interpolated
         """
         count = min(max(round(elapsed / self._period), 1), len(self._planned))
         shape(

@@ -146,12 +146,7 @@ def fitting_gain(parameters: Nt3fsMpcParameters, drive: str) -> tuple[float, flo
 
     Epsilon is ``law.smoothing``, or larger: the compensator has at most half of the slope.
 
-    Parameters
-    ----------
-    parameters
-        Compensator, filter and rate.
-    drive
-        ``'velocity'`` or ``'torque'``.
+    drive : ``'velocity'`` or ``'torque'``
     """
     period, filtered = 1.0 / parameters.rate, parameters.speed_filter
     if drive == 'velocity':
@@ -244,14 +239,9 @@ def law_terms(
 def compensator(error: float, bound: float, smoothing: float) -> float:
     """Return v_c (rad/s²) for one wheel, equations (81)-(82) with the width of E14.
 
-    Parameters
-    ----------
-    error
-        delta, rad/s.
-    bound
-        omega-bar + v_p-bar, rad/s².
-    smoothing
-        epsilon, rad/s; the paper's tanh(delta) has epsilon = 1 rad/s.
+    error : delta, rad/s
+    bound : omega-bar + v_p-bar, rad/s²
+    smoothing : epsilon, rad/s; the paper's tanh(delta) has epsilon = 1 rad/s
     """
     return -bound * math.tanh(error / smoothing)
 
@@ -372,11 +362,6 @@ class Nt3fsMpcController:
     each other. The fuzzy systems therefore learn from delta - integral_transfer v_p. A v_p that
     compensates the unlearnt part, v_p = -(g* - g), adds -integral_transfer (g* - g)² to (76):
     the stability proof remains valid.
-
-    Parameters
-    ----------
-    parameters
-        The parts and their gains.
     """
 
     def __init__(self, parameters: Nt3fsMpcParameters) -> None:
@@ -434,11 +419,7 @@ class Nt3fsMpcController:
     def set_weights(self, weights: Mapping[str, Array]) -> None:
         """Use weights as returned by :meth:`get_weights`; those of the friction may be missing.
 
-        Raises
-        ------
-        ValueError
-            A name is missing or unknown, a shape does not fit the parameters, or a number is not
-            finite; the predictor is then unchanged.
+        Values that do not fit raise ValueError; the predictor is then unchanged.
         """
         predictive = {
             name.removeprefix('predictive.'): value
@@ -494,17 +475,11 @@ class Nt3fsMpcController:
     ) -> Array:
         """Return the wheel accelerations u (rad/s²) of (66)-(67), shape (2,).
 
-        Parameters
-        ----------
-        speeds
-            Wheel speeds chi, predicted for the instant at which u takes effect, rad/s, shape (2,).
-        reference, reference_rate
-            Reachable reference r (rad/s) at that instant and its derivative until the next step
-            (rad/s²), shape (2,).
-        dt
-            Time since the last step, s.
-        future_jumps
-            Future jumps of the error, see :meth:`PredictiveController.step`.
+        speeds : chi predicted for the instant at which u takes effect, rad/s, shape (2,)
+        reference : reachable r at that instant, rad/s, shape (2,)
+        reference_rate : its derivative until the next step, rad/s², shape (2,)
+        dt : time since the last step, s
+        future_jumps : future jumps of the error, see :meth:`PredictiveController.step`
         """
         speeds, reference = contiguous(speeds), contiguous(reference)
         self.predictive.advance(speeds, reference, future_jumps)
@@ -530,13 +505,9 @@ class Nt3fsMpcController:
     def set_applied(self, acceleration: Array, *, saturated: bool) -> None:
         """Set the acceleration that the actuation applied at the last step.
 
-        Parameters
-        ----------
-        acceleration
-            Applied wheel accelerations, rad/s², shape (2,).
-        saturated
-            Whether a limit changed the command. The adaptation then pauses, because the error is
-            not an estimation error, and the predictor uses the applied part of v_p.
+        acceleration : applied wheel accelerations, rad/s², shape (2,)
+        saturated : whether a limit changed the command. The adaptation then pauses, because the
+            error is not an estimation error, and the predictor uses the applied part of v_p.
         """
         self.saturated = saturated
         if saturated and not self._set_applied_term(

@@ -201,12 +201,8 @@ class Controller:
 
     The output is a function of the messages in their order; the controller reads no clock.
 
-    Parameters
-    ----------
-    parameters
-        Replaceable at run time, see :meth:`configure`.
-    obstacles
-        Known walls and pillars in the frame of the odometry, for the keep-out.
+    parameters : replaceable at run time, see :meth:`configure`
+    obstacles : known walls and pillars in the frame of the odometry, for the keep-out
     """
 
     def __init__(
@@ -298,13 +294,7 @@ class Controller:
         return self.law.get_weights() | {BODY_WEIGHTS: self._body.fuzzy.coefficients}
 
     def set_weights(self, weights: Mapping[str, Array]) -> None:
-        """Use weights as returned by :meth:`get_weights`; those of the body may be missing.
-
-        Raises
-        ------
-        ValueError
-            See :meth:`Nt3fsMpcController.set_weights`.
-        """
+        """Use weights as returned by :meth:`get_weights`; those of the body may be missing."""
         body = weights.get(BODY_WEIGHTS)
         if body is not None:
             self._body.fuzzy.coefficients = body
@@ -392,12 +382,9 @@ class Controller:
     def step(self, odometry: State) -> tuple[BodyTwist, Status]:
         """Return the twist to command now, and the status.
 
-        Parameters
-        ----------
-        odometry
-            State of the robot. A second message with the same stamp changes nothing. A message
-            that is not finite, out of order or too late stops the robot, with the reason in the
-            status.
+        odometry : state of the robot. A second message with the same stamp changes nothing. A
+            message that is not finite, out of order or too late stops the robot, with the reason
+            in the status.
         """
         stamp = odometry.stamp_ns
         if stamp == self._last_stamp_ns:
@@ -689,14 +676,9 @@ class SwitchingTracker:
 
     All times are the instant at which the result takes effect.
 
-    Parameters
-    ----------
-    parameters
-        Control law and treatment of jumps.
-    drive
-        ``'velocity'`` or ``'torque'``; with ``'velocity'`` the transition includes the servo lag.
-    motor_limit
-        Of a torque drive, if it is known.
+    drive : ``'velocity'`` or ``'torque'``; with ``'velocity'`` the transition includes the servo
+        lag
+    motor_limit : of a torque drive, if it is known
     """
 
     def __init__(
@@ -731,16 +713,11 @@ class SwitchingTracker:
     ) -> Array:
         """Return u (rad/s²), shape (2,).
 
-        Parameters
-        ----------
-        now_ns
-            The instant at which u takes effect, ns.
-        speeds
-            Predicted wheel speeds at that instant, rad/s, shape (2,).
-        reference, reference_next
-            Reference at that instant and one period later, including jumps, rad/s, shape (2,).
-        dt
-            Time since the last step, s.
+        now_ns : the instant at which u takes effect, ns
+        speeds : predicted wheel speeds at that instant, rad/s, shape (2,)
+        reference, reference_next : reference at that instant and one period later, including
+            jumps, rad/s, shape (2,)
+        dt : time since the last step, s
         """
         if self.parameters.jump_transition.method == 'predictive':
             return self._step_predictive(now_ns, speeds, reference, reference_next, dt)

@@ -113,15 +113,10 @@ class MapGrid(NamedTuple):
 class FreeSpaceMap:
     """Cells around the origin of the odometry.
 
-    Parameters
-    ----------
-    parameters
-        Size and trust.
-    mounts
-        x, y (m) and direction (rad) of each sensor's face in the frame of the robot, shape (s, 3).
-    segments, circles
-        Known obstacles: walls (ax, ay, bx, by), shape (n, 4), and pillars (x, y, radius), shape
-        (m, 3), in the frame of the odometry, m.
+    mounts : x, y (m) and direction (rad) of each sensor's face in the frame of the robot, shape
+        (s, 3)
+    segments, circles : known obstacles: walls (ax, ay, bx, by), shape (n, 4), and pillars (x, y,
+        radius), shape (m, 3), in the frame of the odometry, m
     """
 
     def __init__(
@@ -338,14 +333,7 @@ class Activity(enum.Enum):
 class KeepOut:
     """Reshapes twists by the map that it builds from the range readings.
 
-    Parameters
-    ----------
-    parameters
-        Distances and times.
-    limits
-        Largest |v| (m/s) and |omega| (rad/s).
-    obstacles
-        Known walls and pillars.
+    limits : largest |v| (m/s) and |omega| (rad/s)
     """
 
     def __init__(
@@ -391,14 +379,9 @@ class KeepOut:
     def step(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist nearest to ``wanted``, or one that looks around.
 
-        Parameters
-        ----------
-        wanted
-            Twist that follows the path.
-        pose
-            Predicted pose at the instant at which the twist takes effect.
-        elapsed
-            Time since the last step, s.
+        wanted : twist that follows the path
+        pose : predicted pose at the instant at which the twist takes effect
+        elapsed : time since the last step, s
         """
         if not self._standing_room:
             # The robot stands where it stands; and it looks around once.

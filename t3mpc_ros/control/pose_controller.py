@@ -160,10 +160,7 @@ class PoseReference:
 class PoseController:
     """Follows the pose of the reference, and returns to it after a detour.
 
-    Parameters
-    ----------
-    parameters
-        Replaceable at run time.
+    parameters : replaceable at run time
     """
 
     def __init__(self, parameters: PoseLoopParameters) -> None:
@@ -180,12 +177,9 @@ class PoseController:
     def step(self, reference: Pose, pose: Pose, twist: BodyTwist) -> BodyTwist:
         """Return the twist to track.
 
-        Parameters
-        ----------
-        reference, twist
-            Pose and twist of the reference at the instant at which the result takes effect.
-        pose
-            Predicted pose of the robot at that instant.
+        reference, twist : pose and twist of the reference at the instant at which the result takes
+            effect
+        pose : predicted pose of the robot at that instant
         """
         parameters = self.parameters
         self.error = error = pose_error(reference, pose)

@@ -112,16 +112,10 @@ class InputWatchdog:
     ) -> Reason:
         """Return TRACKING if the robot may move at this odometry stamp, else the reason to stop.
 
-        Parameters
-        ----------
-        stamp_ns
-            Stamp of the odometry.
-        finite
-            Whether every number of the odometry is finite.
-        known
-            Whether the reference is known at this stamp.
-        speed, error
-            Largest magnitudes of measured wheel speed and of tracking error, rad/s.
+        stamp_ns : stamp of the odometry
+        finite : whether every number of the odometry is finite
+        known : whether the reference is known at this stamp
+        speed, error : largest magnitudes of measured wheel speed and of tracking error, rad/s
         """
         if self._reference_pending:
             self._reference_pending = False
@@ -245,10 +239,7 @@ class InputMonitor:
 
     The results are for diagnostics only; they change no command.
 
-    Parameters
-    ----------
-    rate
-        Set rate, Hz.
+    rate : set rate, Hz
     """
 
     def __init__(self, rate: float) -> None:

@@ -175,22 +175,6 @@ class FuzzyEstimator:
     All outputs share one basis, as in (70)-(71): the inputs and the sets are the same, and an
     error of the coefficients alpha* - alpha causes the error (alpha* - alpha)ᵀ Phi of g. The
     object owns the work space, so a call runs one kernel and allocates only the result.
-
-    Parameters
-    ----------
-    parameters
-        Fuzzy sets.
-    adaptation
-        Gains and bounds of the adaptation.
-    outputs
-        Number of outputs m, two for two wheels.
-    inputs
-        Number of inputs n, two for two wheels.
-
-    Raises
-    ------
-    ValueError
-        Inputs or outputs are fewer than one, or there are too many rules.
     """
 
     def __init__(
@@ -228,15 +212,8 @@ class FuzzyEstimator:
     def evaluate(self, inputs: Array) -> Array:
         """Return the estimates g (rad/s²), shape (m,), equation (31), and store the basis.
 
-        Parameters
-        ----------
-        inputs
-            U, the wheel speeds chi, shape (n,), rad/s.
-
-        Raises
-        ------
-        ValueError
-            The inputs are not n finite numbers; the basis is unchanged.
+        inputs : U, the wheel speeds chi, shape (n,), rad/s
+        Values that do not fit raise ValueError and change nothing.
         """
         values = np.ascontiguousarray(inputs, dtype=np.float64)
         sets = self._sets
@@ -250,18 +227,9 @@ class FuzzyEstimator:
 
         The basis is that of the last :meth:`evaluate`; without one the coefficients do not change.
 
-        Parameters
-        ----------
-        errors
-            delta = chi - r at the same instant, shape (m,), rad/s.
-        dt
-            Time since the last step, s.
-
-        Raises
-        ------
-        ValueError
-            The errors are not m finite numbers, or dt is negative or not finite; the coefficients
-            are unchanged.
+        errors : delta = chi - r at the same instant, shape (m,), rad/s
+        dt : time since the last step, s
+        Values that do not fit raise ValueError and change nothing.
         """
         if not 0.0 <= dt < math.inf:
             raise ValueError(f'dt must be finite and not negative: got {dt} s')
@@ -294,11 +262,6 @@ class FuzzyEstimator:
 
         They are the consequents of the rules (28), one at the lower and one at the upper level
         of each slice. The next adaptation step projects coefficients outside the ball onto it.
-
-        Raises
-        ------
-        ValueError
-            Set to an array of another shape, or with a number that is not finite.
         """
         return self._coefficients.copy()
 

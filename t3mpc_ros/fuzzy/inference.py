@@ -106,11 +106,6 @@ class FuzzySets:
 
     n inputs, M sets per input, lambda slices. The rules are all M**n combinations; the set of the
     last input changes fastest.
-
-    Raises
-    ------
-    ValueError
-        A table has the wrong shape or a value out of range.
     """
 
     centres: Array
@@ -229,13 +224,7 @@ def type3_widths(width: float, levels: Array) -> Array:
 
 
 def build_sets(parameters: FuzzyParameters, inputs: int = 2) -> FuzzySets:
-    """Return the tables for ``inputs`` equal inputs.
-
-    Raises
-    ------
-    ValueError
-        There is no input, or there are too many combinations of sets.
-    """
+    """Return the tables for ``inputs`` equal inputs."""
     if inputs < 1:
         raise ValueError(f'inputs must be at least 1: got {inputs}')
     if parameters.kind == 'type3':
@@ -479,11 +468,6 @@ def compute_basis(inputs: Array, sets: FuzzySets) -> Array:
     """Return the basis Phi of one input vector, shape (2 r lambda,), equation (33) with E8.
 
     For experiments and figures: it allocates memory, which a control step must not.
-
-    Raises
-    ------
-    ValueError
-        The inputs are not ``sets.inputs`` finite numbers.
     """
     values = np.ascontiguousarray(inputs, dtype=np.float64)
     if values.shape != (sets.inputs,) or not np.isfinite(values).all():

@@ -108,22 +108,8 @@ def make_machine(
     equally; with independent random weights their condition number is raised to the third power.
     This requires at least as many hidden as visible units.
 
-    Parameters
-    ----------
-    shape
-        Sizes of the layers.
-    delta_scale, move_scale
-        Values that are 1 inside the machine: rad/s and rad/s².
-    spread
-        Length of each row of X_v; at 2 an eta_0 in the linear range is reconstructed exactly.
-    generator
-        Source of the random directions.
-
-    Raises
-    ------
-    ValueError
-        There are fewer hidden than visible units, a number of lags is below one, or a scale is
-        not positive.
+    delta_scale, move_scale : values that are 1 inside the machine: rad/s and rad/s²
+    spread : length of each row of X_v; at 2 an eta_0 in the linear range is reconstructed exactly
     """
     if shape.delta_lags < 1 or shape.move_lags < 1:
         raise ValueError(f'shape must have at least one lag of each kind: got {shape}')

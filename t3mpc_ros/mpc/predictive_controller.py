@@ -442,23 +442,8 @@ class PredictiveController:
     to its prediction, so a jump of any size is not learned as dynamics and does not saturate the
     machine.
 
-    Parameters
-    ----------
-    parameters
-        Parameters of the controller.
-    period
-        Control period, s.
-    feedback_gain
-        K of the control law (1/s); it replaces the one in ``parameters.nominal``.
-    outputs
-        Number of wheels.
-
-    Raises
-    ------
-    ParameterError
-        The lags of v_p do not cover the nominal dead time at this period.
-    ValueError
-        ``period``, ``feedback_gain`` or ``outputs`` is not positive.
+    period : control period, s
+    feedback_gain : K of the control law (1/s); it replaces the one in ``parameters.nominal``
     """
 
     def __init__(
@@ -523,15 +508,7 @@ class PredictiveController:
     def configure(
         self, parameters: PredictiveParameters, feedback_gain: float | None = None
     ) -> None:
-        """Replace dynamic parameters, and K (1/s), from the next step on.
-
-        Raises
-        ------
-        ParameterError
-            A read-only parameter differs.
-        ValueError
-            ``feedback_gain`` is not positive.
-        """
+        """Replace dynamic parameters, and K (1/s), from the next step on."""
         self.parameters.check_read_only(parameters)
         if feedback_gain is not None:
             if not feedback_gain > 0.0:
@@ -544,18 +521,11 @@ class PredictiveController:
     def pretrain(self, errors: Array | None = None, moves: Array | None = None) -> None:
         """Create new machines and pretrain them, then :meth:`reset`.
 
-        Parameters
-        ----------
-        errors, moves
-            A recorded run, oldest first, one row per predictive period, shape (N, outputs):
-            errors (rad/s) and the v_p applied after each (rad/s²), NaN where unknown and in a row
-            between two runs. The longest stretch without a gap in the last quarter is the trial
-            run for the skill. Without a recorded run both are simulated with the nominal loop.
-
-        Raises
-        ------
-        ValueError
-            Their shapes are not (N, outputs), they are infinite, or too few values are known.
+        errors, moves : a recorded run, oldest first, one row per predictive period, shape (N,
+            outputs): errors (rad/s) and the v_p applied after each (rad/s²), NaN where unknown and
+            in a row between two runs. The longest stretch without a gap in the last quarter is the
+            trial run for the skill. Without a recorded run both are simulated with the nominal
+            loop.
         """
         parameters, outputs = self.parameters, self.status.size
         recorded = None
@@ -622,11 +592,7 @@ class PredictiveController:
     def set_weights(self, weights: Mapping[str, Array]) -> None:
         """Set the arrays of :meth:`get_weights`, and measure the skill on the trial run.
 
-        Raises
-        ------
-        ValueError
-            A name is missing or unknown, a shape differs, a number is not finite, or the scales
-            differ; nothing is changed.
+        Values that do not fit raise ValueError and change nothing.
         """
         now = self.get_weights()
         if set(weights) != set(now):
@@ -670,19 +636,11 @@ class PredictiveController:
     def step(self, errors: Array, known_change: Array | None = None) -> Array:
         """Return v_p (rad/s²), shape (outputs,), equation (63).
 
-        Parameters
-        ----------
-        errors
-            Measured or estimated tracking errors delta = chi - r, rad/s, shape (outputs,).
-        known_change
-            Known future jumps of delta, shape (n_p, outputs), rad/s: row j is the sum of the jumps
-            between t + jT and t + (j+1)T. Each is added to Psi_free from its time on, and
-            decays. Used only in steps that solve the quadratic program, see :attr:`due`.
-
-        Raises
-        ------
-        ValueError
-            A shape is wrong or an error is not finite; nothing is changed.
+        errors : measured or estimated tracking errors delta = chi - r, rad/s, shape (outputs,)
+        known_change : known future jumps of delta, shape (n_p, outputs), rad/s: row j is the sum
+            of the jumps between t + jT and t + (j+1)T. Each is added to Psi_free from its time on,
+            and decays. Used only in steps that solve the quadratic program, see :attr:`due`.
+        Values that do not fit raise ValueError and change nothing.
         """
         errors = np.ascontiguousarray(errors, dtype=np.float64)
         if errors.shape != self.status.shape:

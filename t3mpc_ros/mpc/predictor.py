@@ -310,19 +310,9 @@ class WheelState(NamedTuple):
 class Predictor:
     """Machine of one output, with its learning state, its history and a trial run.
 
-    Parameters
-    ----------
-    machine
-        Initial weights; the arrays are changed in place.
-    horizon
-        n_p.
-    trial
-        (errors, moves) of a run that is not used for fitting, *newest first*.
-
-    Raises
-    ------
-    ValueError
-        The trial run is too short for a prediction.
+    machine : initial weights; the arrays are changed in place
+    horizon : n_p
+    trial : (errors, moves) of a run that is not used for fitting, *newest first*
     """
 
     def __init__(

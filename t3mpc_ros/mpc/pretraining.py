@@ -67,14 +67,9 @@ class ExcitationParameters(Parameters):
 def ridge_regression(features: Array, targets: Array, penalty: float) -> Array:
     """Return the X_o that minimises |targets - features X_o|² + p |X_o|².
 
-    Parameters
-    ----------
-    features
-        mu_1 of each instant, shape (N, hidden).
-    targets
-        delta of each instant over its scale, shape (N,).
-    penalty
-        p as a fraction of the mean of the diagonal of featuresᵀ features.
+    features : mu_1 of each instant, shape (N, hidden)
+    targets : delta of each instant over its scale, shape (N,)
+    penalty : p as a fraction of the mean of the diagonal of featuresᵀ features
     """
     square = features.T @ features
     weight = penalty * np.trace(square) / square.shape[0] + np.finfo(np.float64).tiny
@@ -119,23 +114,11 @@ def pretrain(
 ) -> None:
     """Fit the machine to a run: CD-1 epochs for X_v (43), then ridge regression for X_o.
 
-    Parameters
-    ----------
-    machine, rls
-        Changed in place; the run becomes the prior of the RLS state.
-    errors, moves
-        The run, *newest first*, in rad/s and rad/s²: simulated or recorded, NaN in gaps.
-    excitation
-        Epochs, rate and ridge penalty.
-    trust
-        Weight of the prior, as a number of later instants.
-    noise
-        Standard deviation of the noise of the errors, rad/s.
-
-    Raises
-    ------
-    ValueError
-        The arrays differ in length, are infinite, or too short to fit the output layer.
+    machine, rls : changed in place; the run becomes the prior of the RLS state
+    errors, moves : the run, *newest first*, in rad/s and rad/s²: simulated or recorded, NaN in
+        gaps
+    trust : weight of the prior, as a number of later instants
+    noise : standard deviation of the noise of the errors, rad/s
     """
     lags = max(machine.delta_lags, machine.lags.size - machine.delta_lags)
     count, hidden = max(errors.size - lags, 0), machine.output_weights.size
@@ -270,14 +253,7 @@ def simulate_excitation(
     v_p and the disturbance w are random levels of a given mean duration; v_p changes only with
     the predictive period. The feedback acts on the noisy error.
 
-    Parameters
-    ----------
-    loop, excitation, timing
-        The nominal dynamics, the signals and the periods.
-    move_scale
-        Scale of v_p (rad/s²), of which ``excitation.move`` is a fraction.
-    generator
-        Random number generator.
+    move_scale : scale of v_p (rad/s²), of which ``excitation.move`` is a fraction
     """
     count = max(round(excitation.duration / timing.span), 2)
     fine = count * timing.decimation
@@ -327,15 +303,7 @@ def split_runs(errors: Array, moves: Array, outputs: int) -> list[list[tuple[Arr
 
     The rest is reduced to its longest stretch without a gap, as a trial run needs.
 
-    Parameters
-    ----------
-    errors, moves
-        A recorded run, oldest first, shape (N, outputs); NaN where unknown.
-
-    Raises
-    ------
-    ValueError
-        The shapes differ, or the number of columns is not the number of outputs.
+    errors, moves : a recorded run, oldest first, shape (N, outputs); NaN where unknown
     """
     if errors.shape != moves.shape or errors.shape[1:] != (outputs,):
         raise ValueError(

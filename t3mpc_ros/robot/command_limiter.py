@@ -83,14 +83,9 @@ class CommandLimiterParameters(Parameters):
     def check_stopping_time(self, silence: float, deceleration: float, names: str) -> None:
         """Raise ParameterError when the robot could take longer than allowed to stop.
 
-        Parameters
-        ----------
-        silence
-            Time from the last command to the beginning of the stop, s.
-        deceleration
-            Deceleration of the stop, rad/s².
-        names
-            What these depend on, for the error text.
+        silence : time from the last command to the beginning of the stop, s
+        deceleration : deceleration of the stop, rad/s²
+        names : what these depend on, for the error text
         """
         time = silence + self.wheel_speed / deceleration
         if time > self.max_stopping_time + 1e-9:
@@ -153,12 +148,8 @@ class CommandLimiter:
     than the timeout, or than the one before it, is rejected. A command beyond a limit is scaled
     in both wheels by the same factor. Changes of speed are ramped, likewise by one factor.
 
-    Parameters
-    ----------
-    parameters
-        Replaceable at run time.
-    geometry
-        Converts wheel speeds to (v, omega) for the limits.
+    parameters : replaceable at run time
+    geometry : converts wheel speeds to (v, omega) for the limits
     """
 
     def __init__(self, parameters: CommandLimiterParameters, geometry: WheelGeometry) -> None:

@@ -35,14 +35,9 @@ class SlipMonitor:
     def update(self, slipping_for: float, limit: float, now: float) -> bool:
         """Decide whether the robot must stand still at ``now`` (s).
 
-        Parameters
-        ----------
-        slipping_for
-            Time for which gyro and steps have disagreed, s; 0 when they agree.
-        limit
-            Largest permitted ``slipping_for``, s; 0 disables the stop.
-        now
-            s, of the clock of :meth:`rejects`.
+        slipping_for : time for which gyro and steps have disagreed, s; 0 when they agree
+        limit : largest permitted ``slipping_for``, s; 0 disables the stop
+        now : s, of the clock of :meth:`rejects`
         """
         if limit > 0.0 and slipping_for > limit:
             if not self.stopped:

@@ -125,12 +125,8 @@ class WheelOdometry:
 
     Commands are never integrated: after a timeout the robot stops despite its last command.
 
-    Parameters
-    ----------
-    parameters
-        Replaceable at run time.
-    geometry
-        Nominal R and 2b.
+    parameters : replaceable at run time
+    geometry : nominal R and 2b
     """
 
     def __init__(self, parameters: WheelOdometryParameters, geometry: WheelGeometry) -> None:
@@ -150,13 +146,7 @@ class WheelOdometry:
         return self._covariance.copy()
 
     def reset(self, pose: Pose = ORIGIN) -> None:
-        """Set the pose, and the covariance to zero.
-
-        Raises
-        ------
-        ValueError
-            The pose is not finite.
-        """
+        """Set the pose, and the covariance to zero."""
         check_pose(pose)
         self._pose[:] = pose
         self._covariance[:] = 0.0
@@ -166,11 +156,7 @@ class WheelOdometry:
 
         ``jitter`` is a variance (rad²) of each angle that does not depend on the travel.
         With step counters a lost report costs no accuracy.
-
-        Raises
-        ------
-        ValueError
-            A number is not finite; the state is unchanged then.
+        Values that do not fit raise ValueError and change nothing.
         """
         if not (math.isfinite(right) and math.isfinite(left) and math.isfinite(jitter)):
             raise ValueError(f'wheel angles must be finite: got {right}, {left}, {jitter}')
