@@ -67,21 +67,13 @@ class CommandShaper:
         self._delays = np.array(parameters.delays) / period
         latest = float(self._delays.max())
         self._ahead = math.ceil(latest - 1e-9) + 1 if latest > 0.0 else 0
+        self.lead_ns = round(self._ahead * period * NANOSECONDS)
+        """Time by which the reference of :meth:`step` is ahead of the shaped one, ns."""
         self._planned: Array = np.zeros((2 * self._ahead + 2, 2))
         self.reference: Array = np.zeros(2)
         """Shaped reference at the instant, rad/s, shape (2,)."""
         self.rate: Array = np.zeros(2)
         """Its derivative until one period later, rad/s², shape (2,)."""
-
-    @property
-    def active(self) -> bool:
-        """Whether there is a frequency."""
-        return self._ahead > 0
-
-    @property
-    def lead_ns(self) -> int:
-        """Time by which the reference of :meth:`step` is ahead of the shaped one, ns."""
-        return round(self._ahead * self._period * NANOSECONDS)
 
     def reset(self, speeds: Array) -> None:
         """Start at wheel speeds (rad/s), shape (2,), held up to now and for the lead."""

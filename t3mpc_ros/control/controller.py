@@ -210,32 +210,38 @@ class Controller:
     ) -> None:
         self.parameters = parameters
         self._pose_reference = PoseReference()
-        self._pose = PoseController(parameters.pose)
-        self._keep_out = (
+        self.pose_controller = PoseController(parameters.pose)
+        """The pose loop."""
+        self.keep_out = (
             KeepOut(parameters.keep_out, _largest(parameters.limits), obstacles)
             if parameters.keep_out.enabled
             else None
         )
+        """The keep-out, None unless it is enabled."""
         self._place = ORIGIN
         self._tracker = SwitchingTracker(parameters.resolved(), 'velocity')
         self._period = 1.0 / parameters.rate
         self._period_ns = round(self._period * NANOSECONDS)
-        self._actuation = VelocityActuation(
+        self.actuation = VelocityActuation(
             parameters.speed_filter,
             parameters.limits,
             parameters.geometry,
             'velocity',
             self._period,
         )
-        self._dead_time_ns = round(self._actuation.dead_time * NANOSECONDS)
-        self._dead_time = self._make_dead_time_estimator()
-        self._disturbed = False
+        """Speed filter and last command; a replay sets the recorded commands here."""
+        self._dead_time_ns = round(self.actuation.dead_time * NANOSECONDS)
+        self.dead_time = self._make_dead_time_estimator()
+        """Estimate of the dead time."""
+        self.disturbed = False
+        """Whether the response is disturbed, so that nothing is learned from it."""
         self._before_disturbance: tuple[Any, Any] | None = None
         self._shaper = CommandShaper(parameters.command_shaper, self._period)
         geometry = parameters.geometry
-        self._body = BodyCorrection(
+        self.body = BodyCorrection(
             parameters.body, geometry.wheel_radius, geometry.half_separation, self._period
         )
+        """The correction of the yaw rate with its map."""
         self._ahead_ns = 0
         """Time by which the plan is ahead of the command, ns; 0 without a known future."""
         self._sampling = Sampling.of(parameters)
@@ -260,50 +266,20 @@ class Controller:
         return self._tracker.law
 
     @property
-    def body(self) -> BodyCorrection:
-        """The correction of the yaw rate with its map."""
-        return self._body
-
-    @property
-    def dead_time(self) -> DeadTimeEstimator:
-        """Estimate of the dead time."""
-        return self._dead_time
-
-    @property
-    def disturbed(self) -> bool:
-        """Whether the response is disturbed, so that nothing is learned from it."""
-        return self._disturbed
-
-    @property
-    def pose_controller(self) -> PoseController:
-        """The pose loop."""
-        return self._pose
-
-    @property
-    def keep_out(self) -> KeepOut | None:
-        """The keep-out, None unless it is enabled."""
-        return self._keep_out
-
-    @property
     def gain(self) -> float:
         """Feedback gain K in use, 1/s."""
         return self._tracker.parameters.law.gain
 
     def get_weights(self) -> dict[str, Array]:
         """Return all adapted arrays by name: those of the law, and the map of the body."""
-        return self.law.get_weights() | {BODY_WEIGHTS: self._body.fuzzy.coefficients}
+        return self.law.get_weights() | {BODY_WEIGHTS: self.body.fuzzy.coefficients}
 
     def set_weights(self, weights: Mapping[str, Array]) -> None:
         """Use weights as returned by :meth:`get_weights`; those of the body may be missing."""
         body = weights.get(BODY_WEIGHTS)
         if body is not None:
-            self._body.fuzzy.coefficients = body
+            self.body.fuzzy.coefficients = body
         self.law.set_weights({name: v for name, v in weights.items() if name != BODY_WEIGHTS})
-
-    @property
-    def actuation(self) -> VelocityActuation:
-        """Speed filter and last command; a replay sets the recorded commands here."""
-        return self._actuation
 
     def warm_up(self) -> None:
         """Compile and pretrain, so that no step has to; the state of the controller is kept."""
@@ -319,15 +295,15 @@ class Controller:
     def configure(self, parameters: ControllerParameters) -> None:
         """Use new values of the dynamic parameters from the next step on."""
         if parameters.estimate_dead_time and not self.parameters.estimate_dead_time:
-            self._dead_time.reset(self._actuation.speeds)
+            self.dead_time.reset(self.actuation.speeds)
         self.parameters = parameters
         self._tracker.configure(parameters.resolved())
-        self._body.configure(parameters.body)
-        self._pose.parameters = parameters.pose
-        self._actuation.configure(parameters.limits)
+        self.body.configure(parameters.body)
+        self.pose_controller.parameters = parameters.pose
+        self.actuation.configure(parameters.limits)
         self._trajectory.set_jump(_least_jump(parameters.limits))
-        if self._keep_out is not None:
-            self._keep_out.limits = _largest(parameters.limits)
+        if self.keep_out is not None:
+            self.keep_out.limits = _largest(parameters.limits)
         self._sampling = Sampling.of(parameters)
 
     def enable(self, on: bool) -> None:
@@ -342,25 +318,25 @@ class Controller:
         self._clear_reference()
         self.law.reset_estimate()
         self.law.predictive.pretrain()
-        self._body.reset()
-        self._dead_time = self._make_dead_time_estimator()
-        self._disturbed, self._before_disturbance = False, None
+        self.body.reset()
+        self.dead_time = self._make_dead_time_estimator()
+        self.disturbed, self._before_disturbance = False, None
         self._snapshots.clear()
         self._set_dead_time(self.parameters.speed_filter.dead_time)
         self._steps_since_snapshot = 0
         self._stop()
         self._response.reset()
-        self._pose.reset()
+        self.pose_controller.reset()
         self._place = ORIGIN
         self._last_stamp_ns = None
         self.status = self._make_status(0, Reason.NO_ODOMETRY, np.full(2, math.nan))
-        if self._keep_out is not None:
-            self._keep_out.reset()
+        if self.keep_out is not None:
+            self.keep_out.reset()
 
     def add_range(self, sensor: int, reading: float) -> None:
         """Add a range reading (m, REP 117) of a sensor, taken at the pose of the last odometry."""
-        if self._keep_out is not None and self._last_stamp_ns is not None:
-            self._keep_out.add_reading(sensor, reading, self._place)
+        if self.keep_out is not None and self._last_stamp_ns is not None:
+            self.keep_out.add_reading(sensor, reading, self._place)
 
     def add_reference(self, reference: State) -> bool:
         """Store a reference sample; return False if it is not finite and therefore ignored."""
@@ -388,14 +364,14 @@ class Controller:
         """
         stamp = odometry.stamp_ns
         if stamp == self._last_stamp_ns:
-            return self._actuation.twist, self.status
+            return self.actuation.twist, self.status
         restarted = self._last_stamp_ns is not None and stamp < self._last_stamp_ns
         self._last_stamp_ns = stamp
         elapsed = self._watchdog.elapsed(stamp)
         if restarted:
             self._clear_reference()
-            if self._keep_out is not None:
-                self._keep_out.reset()
+            if self.keep_out is not None:
+                self.keep_out.reset()
         plan_ns, reason = self._sample_plan(odometry)
         if reason.moves and restarted:
             reason = Reason.ODOMETRY_RESTARTED
@@ -405,7 +381,7 @@ class Controller:
             self.status = self._make_status(stamp, reason, speeds - reference)
             return STANDSTILL, self.status
 
-        actuation, dt = self._actuation, elapsed or self._period
+        actuation, dt = self.actuation, elapsed or self._period
         restart = elapsed is None or not self._moving
         if restart:
             actuation.reset(speeds)
@@ -419,7 +395,7 @@ class Controller:
         self._observe(speeds, dt, restart=restart)
         if self.parameters.pose.enabled:
             if restart:
-                self._pose.reset()
+                self.pose_controller.reset()
             self._follow_pose(odometry, begin, end, dt)
         if restart:
             self._begin_plan(stamp, plan_ns)
@@ -458,19 +434,19 @@ class Controller:
 
     def _observe(self, speeds: Array, dt: float, *, restart: bool) -> None:
         """Update the estimates of speeds, disturbance and dead time, ``dt`` s after the last."""
-        self._actuation.observe(speeds, dt)
+        self.actuation.observe(speeds, dt)
         if restart:
-            self._dead_time.reset(speeds)
-            self._disturbed, self._before_disturbance = False, None
+            self.dead_time.reset(speeds)
+            self.disturbed, self._before_disturbance = False, None
         else:
             self._update_dead_time(speeds, dt)
 
     def _begin_plan(self, stamp_ns: int, plan_ns: int) -> None:
         """Begin to move at the predicted speeds, towards the reference at ``plan_ns``."""
-        predicted = self._actuation.predicted
+        predicted = self.actuation.predicted
         self._tracker.begin(plan_ns, predicted, self._sampled.begin)
         self._shaper.reset(predicted)
-        self._body.restart()
+        self.body.restart()
         self._moving = True
         self._announced.clear()
         known_ns = plan_ns if self.parameters.jump_transition.preview else stamp_ns
@@ -480,7 +456,7 @@ class Controller:
         self, plan_ns: int, yaw: float, begin: Array, end: Array, elapsed: float
     ) -> Array:
         """Return u (rad/s²), shape (2,), for the plan from ``begin`` to ``end`` (rad/s)."""
-        tracker, speeds = self._tracker, self._actuation.predicted
+        tracker, speeds = self._tracker, self.actuation.predicted
         corrects_body = self.parameters.composition == 'body' and self.parameters.body.enabled
         if self._ahead_ns == 0 and not corrects_body:
             return tracker.step(plan_ns, speeds, begin, end, elapsed)
@@ -490,14 +466,14 @@ class Controller:
             planned, rate = self._shaper.reference, self._shaper.rate
         if corrects_body:
             filtered = self.parameters.speed_filter
-            correction = self._body.step(
+            correction = self.body.step(
                 yaw,
                 elapsed,
                 self._sampled.reference,
                 planned,
-                self._actuation.command,
-                self._actuation.dead_time + filtered.lag + 0.5 * self._period,
-                learn=not self._disturbed,
+                self.actuation.command,
+                self.actuation.dead_time + filtered.lag + 0.5 * self._period,
+                learn=not self.disturbed,
             )
             planned = planned + np.array([correction, -correction])
         return self.law.step(speeds, planned, rate, elapsed)
@@ -505,22 +481,22 @@ class Controller:
     def _follow_pose(self, odometry: State, begin: Array, end: Array, elapsed: float) -> None:
         """Change the plan from ``begin`` to ``end`` (rad/s) by pose loop and keep-out."""
         parameters, geometry = self.parameters, self.parameters.geometry
-        horizon = self._actuation.dead_time + parameters.speed_filter.lag
+        horizon = self.actuation.dead_time + parameters.speed_filter.lag
         reference = self._pose_reference.at(odometry.stamp_ns + round(horizon * NANOSECONDS))
         if reference is None:
             return
         # The commands of the dead time are on their way: the robot will be there.
-        command = WheelSpeeds(*self._actuation.command.tolist())
+        command = WheelSpeeds(*self.actuation.command.tolist())
         pose = advance_pose(odometry.pose, twist_from_wheels(command, geometry), horizon)
         now, later = WheelSpeeds(*begin.tolist()), WheelSpeeds(*end.tolist())
         planned = twist_from_wheels(now, geometry)
-        twist, keep_out = self._pose.step(reference, pose, planned), self._keep_out
+        twist, keep_out = self.pose_controller.step(reference, pose, planned), self.keep_out
         if keep_out is not None:
-            if self._pose.rejoining:
-                velocity = keep_out.guide(self._pose.closing_velocity(planned), pose)
-                twist = self._pose.drive_along(velocity)
+            if self.pose_controller.rejoining:
+                velocity = keep_out.guide(self.pose_controller.closing_velocity(planned), pose)
+                twist = self.pose_controller.drive_along(velocity)
             twist = keep_out.step(twist, pose, elapsed)
-        if self._pose.rejoining or (keep_out is not None and keep_out.changed):
+        if self.pose_controller.rejoining or (keep_out is not None and keep_out.changed):
             later = now
         wheels = wheels_from_twist(twist, geometry)
         for i in range(2):
@@ -563,32 +539,32 @@ class Controller:
         speeds, reference, begin, end = self._sampled
         if self.parameters.pose.enabled:
             self._follow_pose(odometry, begin, end, elapsed)
-            self._actuation.send_speeds(begin)
+            self.actuation.send_speeds(begin)
         else:
-            self._actuation.send_speeds(reference)
-        self._response.add_command(*self._actuation.command.tolist())
+            self.actuation.send_speeds(reference)
+        self._response.add_command(*self.actuation.command.tolist())
         error = speeds - reference
         self.status = self._make_status(odometry.stamp_ns, Reason.NOT_FOLLOWING, error)
-        return self._actuation.twist, self.status
+        return self.actuation.twist, self.status
 
     def _update_dead_time(self, speeds: Array, elapsed: float) -> None:
         """Update the dead time in use; after a disturbance, discard what was learnt during it."""
-        estimator, actuation = self._dead_time, self._actuation
-        dead_time, self._disturbed = self.parameters.speed_filter.dead_time, False
+        estimator, actuation = self.dead_time, self.actuation
+        dead_time, self.disturbed = self.parameters.speed_filter.dead_time, False
         if self.parameters.estimate_dead_time:
-            self._disturbed = estimator.step(speeds, actuation.command, elapsed)
+            self.disturbed = estimator.step(speeds, actuation.command, elapsed)
             dead_time = estimator.dead_time_in_use
-        if self._disturbed and self._before_disturbance is None and self._snapshots:
+        if self.disturbed and self._before_disturbance is None and self._snapshots:
             self._before_disturbance = self._snapshots[0]
             self._snapshots.clear()
-        elif not self._disturbed and self._before_disturbance is not None:
+        elif not self.disturbed and self._before_disturbance is not None:
             self._rollback(self._before_disturbance)
             self._before_disturbance = None
         if abs(dead_time - actuation.dead_time) > MIN_DEAD_TIME_CHANGE:
             self._set_dead_time(dead_time)
 
     def _set_dead_time(self, dead_time: float) -> None:
-        self._actuation.set_dead_time(dead_time)
+        self.actuation.set_dead_time(dead_time)
         self._dead_time_ns = round(dead_time * NANOSECONDS)
 
     def _make_dead_time_estimator(self) -> DeadTimeEstimator:
@@ -606,17 +582,17 @@ class Controller:
         weights, body = snapshot
         if weights:
             self.law.set_weights(weights)
-        self._body.rollback(body)
+        self.body.rollback(body)
 
     def _take_snapshot(self) -> None:
         """Store a snapshot of the weights once per SNAPSHOT_PERIOD, except while disturbed."""
-        if self._disturbed:
+        if self.disturbed:
             return
         self._steps_since_snapshot += 1
         if self._steps_since_snapshot >= self._snapshot_steps:
             self._steps_since_snapshot = 0
             learnt = self.law.get_weights() if self.parameters.composition == 'paper' else {}
-            self._snapshots.append((learnt, self._body.snapshot()))
+            self._snapshots.append((learnt, self.body.snapshot()))
 
     def _announce_jumps(self, stamp_ns: int, effect_ns: int) -> None:
         """Announce jumps to the transition: in advance with preview, else when they occur."""
@@ -649,9 +625,9 @@ class Controller:
         self._announced.clear()
 
     def _stop(self) -> None:
-        if self._moving or np.any(self._actuation.command):
+        if self._moving or np.any(self.actuation.command):
             self._tracker.reset()
-            self._actuation.reset(np.zeros(2))
+            self.actuation.reset(np.zeros(2))
         self._moving = False
 
     def _make_status(
@@ -667,7 +643,7 @@ class Controller:
             np.zeros(2) if applied is None else applied,
             law.certificate,
             law.predictive.skill,
-            reason.moves and self._actuation.limited,
+            reason.moves and self.actuation.limited,
         )
 
 

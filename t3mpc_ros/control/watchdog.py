@@ -174,16 +174,6 @@ class ResponseMonitor:
         self.responsive = True
 
     @property
-    def last_command(self) -> tuple[float, float] | None:
-        """The last command, rad/s; None after a reset."""
-        return self._commands[-1] if self._commands else None
-
-    @property
-    def window(self) -> int:
-        """Maximum number of stored commands."""
-        return self._commands.maxlen or 0
-
-    @property
     def counts(self) -> tuple[int, int]:
         """Number of stored commands, and evidence against the present decision."""
         return len(self._commands), self._evidence

@@ -9,7 +9,6 @@ import numpy as np
 
 from t3mpc_ros.fuzzy.inference import (
     FuzzyParameters,
-    FuzzySets,
     FuzzyTables,
     build_sets,
     combine,
@@ -186,16 +185,17 @@ class FuzzyEstimator:
     ) -> None:
         if outputs < 1:
             raise ValueError(f'outputs must be at least 1: got {outputs}')
-        self._sets = build_sets(parameters, inputs)
-        self.tables = FuzzyTables.of(self._sets, outputs)
+        self.sets = build_sets(parameters, inputs)
+        self.tables = FuzzyTables.of(self.sets, outputs)
         """Sets, basis and coefficients, for kernels."""
         self._phi, self._coefficients = self.tables.phi, self.tables.coefficients
         self.configure(adaptation)
 
     def configure(self, adaptation: AdaptationParameters) -> None:
         """Replace the adaptation parameters from the next step on; keep the coefficients."""
-        self._adaptation = adaptation
-        self._radius = adaptation.radius * math.sqrt(self._sets.size)
+        self.adaptation = adaptation
+        self.radius = adaptation.radius * math.sqrt(self.sets.size)
+        """Radius of the ball of each output's coefficients, rad/s²."""
 
     def reset(self) -> None:
         """Set all coefficients to zero, and clear the basis until the next evaluation."""
@@ -205,7 +205,7 @@ class FuzzyEstimator:
     def warm_up(self) -> None:
         """Compile the kernels now instead of in the first step, without changing the state."""
         phi, coefficients = self._phi.copy(), self._coefficients.copy()
-        self.evaluate(np.zeros(self._sets.inputs))
+        self.evaluate(np.zeros(self.sets.inputs))
         self._adapt(np.zeros(coefficients.shape[0]), 0.0)
         self._phi[:], self._coefficients[:] = phi, coefficients
 
@@ -216,7 +216,7 @@ class FuzzyEstimator:
         Values that do not fit raise ValueError and change nothing.
         """
         values = np.ascontiguousarray(inputs, dtype=np.float64)
-        sets = self._sets
+        sets = self.sets
         outputs = np.empty(self._coefficients.shape[0])
         if values.shape != (sets.inputs,) or not estimate(values, self.tables, outputs):
             raise ValueError(f'inputs must be {sets.inputs} finite numbers: got {inputs}')
@@ -233,23 +233,8 @@ class FuzzyEstimator:
         """
         if not 0.0 <= dt < math.inf:
             raise ValueError(f'dt must be finite and not negative: got {dt} s')
-        if self._adaptation.enabled:
+        if self.adaptation.enabled:
             self._adapt(errors, dt)
-
-    @property
-    def radius(self) -> float:
-        """Radius of the ball of each output's coefficients, rad/s²."""
-        return self._radius
-
-    @property
-    def sets(self) -> FuzzySets:
-        """Tables of the fuzzy system."""
-        return self._sets
-
-    @property
-    def adaptation(self) -> AdaptationParameters:
-        """Present parameters of the adaptation."""
-        return self._adaptation
 
     @property
     def basis(self) -> Array:
@@ -280,14 +265,14 @@ class FuzzyEstimator:
 
     def _adapt(self, errors: Array, dt: float) -> None:
         values = np.ascontiguousarray(errors, dtype=np.float64)
-        parameters = self._adaptation
+        parameters = self.adaptation
         if values.shape != self._coefficients.shape[:1] or not adapt(
             self._coefficients,
             self._phi,
             values,
             dt,
             parameters.gamma,
-            self._radius,
+            self.radius,
             parameters.sigma_modification,
             parameters.dead_zone,
             parameters.step_limit,

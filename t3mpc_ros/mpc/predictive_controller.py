@@ -456,7 +456,8 @@ class PredictiveController:
         if not (period > 0.0 and outputs > 0):
             raise ValueError(f'period and outputs must be positive: got {period}, {outputs}')
         self._timing = SampleTiming(period, parameters.decimation, parameters.average)
-        span = self._timing.span
+        self.span = span = self._timing.span
+        """Predictive period T, s."""
         if parameters.move_lags * span < parameters.nominal.dead_time + span:
             raise ParameterError(
                 f'move_lags must cover the dead time of {parameters.nominal.dead_time} s and one '
@@ -464,7 +465,9 @@ class PredictiveController:
             )
         self.signals = Signals(*np.zeros((len(Signals._fields), outputs)))
         """The signals, for kernels."""
-        self._responses = Responses(*np.zeros((4, outputs, parameters.horizon)))
+        self.known_error = self.signals.jumps
+        """Residual of the known jumps, rad/s, shape (outputs,)."""
+        self.responses = Responses(*np.zeros((4, outputs, parameters.horizon)))
         self._zeros = np.zeros(outputs)
         self._no_change = np.zeros((parameters.horizon, outputs))
         moves = parameters.control_horizon
@@ -473,37 +476,13 @@ class PredictiveController:
             make_workspace(moves),
             np.zeros(outputs, dtype=np.int64),
         )
+        self.status = self._work.status
+        """Status of each last solution, see :mod:`t3mpc_ros.mpc.quadratic_program`."""
         self._accumulate_sample = TypedKernel(accumulate_sample)
         self._step_kernel = TypedKernel(predictive_step)
         self.parameters = parameters
         self.configure(parameters, feedback_gain)
         self.pretrain()
-
-    @property
-    def status(self) -> Indices:
-        """Status of each last solution, see :mod:`t3mpc_ros.mpc.quadratic_program`."""
-        return self._work.status
-
-    @property
-    def skill(self) -> Array:
-        """Skill against persistence in the middle of the horizon, shape (outputs,); read-only."""
-        skill: Array = self._skill
-        return skill
-
-    @property
-    def authority(self) -> Array:
-        """Fraction of the bound of v_p in use, in [0, 1], shape (outputs,)."""
-        return self.signals.authorities.copy()
-
-    @property
-    def prediction(self) -> Array:
-        """Predicted errors Psi (52) under the planned moves, rad/s, shape (outputs, n_p)."""
-        return self._responses.prediction.copy()
-
-    @property
-    def step_response(self) -> Array:
-        """Latest s_0 ... s_{n_p-1} (48), (rad/s)/(rad/s²), shape (outputs, n_p)."""
-        return self._responses.steps.copy()
 
     def configure(
         self, parameters: PredictiveParameters, feedback_gain: float | None = None
@@ -563,7 +542,7 @@ class PredictiveController:
 
     def reset(self) -> None:
         """Clear the history and set v_p to 0; keep weights and skill."""
-        for array in (*self.signals, *self._responses):
+        for array in (*self.signals, *self.responses):
             array[:] = 0.0
         self._generator = np.random.default_rng((self.parameters.seed, 1))
         self.status[:] = OPTIMAL
@@ -573,10 +552,11 @@ class PredictiveController:
         """Number of samples."""
         for predictor in self._predictors:
             reset_history(predictor.history, 0.0)
-        self._skill = np.array(
+        self.skill = np.array(
             [skill_score(predictor.history, 1) for predictor in self._predictors]
         )
-        self.signals.skills[:] = self._skill
+        """Skill against persistence in the middle of the horizon, shape (outputs,); read-only."""
+        self.signals.skills[:] = self.skill
 
     def warm_up(self) -> None:
         """Compile every kernel now instead of in the first step, then :meth:`reset`."""
@@ -668,16 +648,6 @@ class PredictiveController:
         self.phase = (phase + 1) % timing.decimation
 
     @property
-    def known_error(self) -> Array:
-        """Residual of the known jumps, rad/s, shape (outputs,)."""
-        return self.signals.jumps
-
-    @property
-    def span(self) -> float:
-        """Predictive period T, s."""
-        return self._timing.span
-
-    @property
     def due(self) -> bool:
         """Whether the next :meth:`step` solves the quadratic program, with ``known_change``."""
         return self.phase == 0
@@ -690,12 +660,12 @@ class PredictiveController:
         self._step_kernel(
             self._wheels,
             self.signals,
-            self._responses,
+            self.responses,
             change,
             self.samples,
             self._constants,
             self._learning,
             self._work,
         )
-        self._skill = self.signals.skills.copy()
+        self.skill = self.signals.skills.copy()
         self.samples += 1

@@ -329,16 +329,6 @@ class Predictor:
         self._trial = trial
 
     @property
-    def machine(self) -> BoltzmannMachine:
-        """The machine."""
-        return self.state.machine
-
-    @property
-    def rls(self) -> RlsState:
-        """State of the recursive least squares."""
-        return self.state.rls
-
-    @property
     def history(self) -> History:
         """History of errors and moves."""
         return self.state.history
@@ -352,13 +342,13 @@ class Predictor:
         learning: LearningConstants,
     ) -> None:
         """Pretrain on a run (*newest first*), and measure the skill on the trial run."""
-        pretrain(self.machine, self.rls, errors, moves, excitation, trust, learning.noise)
+        pretrain(*self.state[:2], errors, moves, excitation, trust, learning.noise)
         self.evaluate(learning)
 
     def evaluate(self, learning: LearningConstants) -> None:
         """Set the skill to that of the trial run, and clear the history."""
         reset_history(self.history, 0.0)
-        evaluate_offline(self.machine, self.rls, self.history, *self._trial, learning)
+        evaluate_offline(*self.state[:2], self.history, *self._trial, learning)
         reset_history(self.history, 0.0)
 
     def get_weights(self) -> dict[str, Array]:

@@ -156,9 +156,11 @@ class CommandLimiter:
         self.parameters = parameters
         self._geometry = geometry
         self._estop = ''
-        self._reason = NO_COMMAND
+        self.reason = NO_COMMAND
+        """Why the robot is stopped; empty while it follows a command."""
         self._command: RobotCommand | None = None
-        self._timed_out = False
+        self.timed_out = False
+        """Whether the last command expired."""
         self._ramp = _Ramp(ZERO_WHEEL_SPEEDS, ZERO_WHEEL_SPEEDS, 0.0, 0, 0.0)
         self._clock_ns: int | None = None
         ramp_towards(0.0, 0.0, 0.0, 0.0, 0.0)  # compile now, so that no stop waits for it
@@ -167,16 +169,6 @@ class CommandLimiter:
     def estop(self) -> bool:
         """Whether the emergency stop is latched."""
         return bool(self._estop)
-
-    @property
-    def timed_out(self) -> bool:
-        """Whether the last command expired."""
-        return self._timed_out
-
-    @property
-    def reason(self) -> str:
-        """Why the robot is stopped; empty while it follows a command."""
-        return self._reason
 
     def remaining_ns(self, now_ns: int) -> int:
         """Return the time until the current command expires, ns; 0 without one."""
@@ -201,7 +193,7 @@ class CommandLimiter:
         if not all(map(math.isfinite, (*wheels, *twist))):
             # The intended value is unknown, zero included.
             self._drop_command(f'command is not finite: got {wheels.right}, {wheels.left} rad/s')
-            return self._reason
+            return self.reason
         if self._estop:
             return self._estop
         if stale := self.staleness(command, now_ns):
@@ -210,8 +202,8 @@ class CommandLimiter:
         if self._command is not None and stamp_ns < self._command.stamp_ns:
             return 'command is older than the one before it'
         self._command = RobotCommand(wheels, stamp_ns)
-        self._timed_out = False
-        self._reason = ''
+        self.timed_out = False
+        self.reason = ''
         return ''
 
     def staleness(self, command: RobotCommand, now_ns: int) -> str:
@@ -244,13 +236,13 @@ class CommandLimiter:
             rate = max(rate, ESTOP_DECELERATION)
         self._ramp = _Ramp(wheels, target, rate, now_ns, hold)
         return LimitedCommand(
-            self._ramp.at(hold), target, self.estop, self._timed_out, limited, self._reason
+            self._ramp.at(hold), target, self.estop, self.timed_out, limited, self.reason
         )
 
     def expire(self) -> None:
         """Stop because the command has expired."""
         self._drop_command(f'no command for {self.parameters.command_timeout:g} s')
-        self._timed_out = True
+        self.timed_out = True
 
     def stop(self, reason: str, now_ns: int) -> None:
         """Drop the command; the next one is accepted again."""
@@ -277,8 +269,8 @@ class CommandLimiter:
 
     def _drop_command(self, reason: str) -> None:
         self._command = None
-        self._timed_out = False
-        self._reason = self._estop or reason
+        self.timed_out = False
+        self.reason = self._estop or reason
 
     def _check_clock(self, now_ns: int) -> None:
         """Stop when the clock has jumped back."""

@@ -126,5 +126,4 @@ def test_a_start_in_motion_is_no_step(speeds):
 def test_without_frequencies_nothing_changes():
     none = CommandShaperParameters(straight_frequency=0.0, turning_frequency=0.0)
     shaper = CommandShaper(none, PERIOD)
-    assert not shaper.active
     assert shaper.lead_ns == 0

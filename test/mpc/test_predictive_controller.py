@@ -156,9 +156,9 @@ def test_step_response_is_right_from_the_first_second():
         loop.step(np.ones(2), np.zeros(2), np.zeros(2))
         fine.append(loop.error[0])
     true = np.mean(np.reshape(fine, (10, 5)), axis=1)
-    assert np.all(controller.step_response > 0.0)
-    np.testing.assert_allclose(controller.step_response[:, 4], true[4], rtol=0.2)
-    np.testing.assert_allclose(controller.step_response[:, -1], true[9], rtol=0.25)
+    assert np.all(controller.responses.steps > 0.0)
+    np.testing.assert_allclose(controller.responses.steps[:, 4], true[4], rtol=0.2)
+    np.testing.assert_allclose(controller.responses.steps[:, -1], true[9], rtol=0.25)
 
 
 @pytest.mark.compiled
@@ -205,8 +205,8 @@ def test_a_wrong_sign_of_v_p_gets_no_authority():
         weights['output_weights'][z] = np.linalg.lstsq(passed.T, linear, rcond=None)[0]
     controller.set_weights(weights)
     _, moves = _run(controller, _levels(1000, 3))
-    assert np.all(controller.step_response[:, 4] < 0.0)
-    np.testing.assert_array_equal(controller.authority, 0.0)
+    assert np.all(controller.responses.steps[:, 4] < 0.0)
+    np.testing.assert_array_equal(controller.signals.authorities, 0.0)
     np.testing.assert_array_equal(moves, 0.0)
 
 
@@ -243,9 +243,9 @@ def test_v_p_changes_by_the_first_optimal_change_63():
         v_p = controller.step(loop.error)
         if due:
             assert np.all(controller.status == OPTIMAL)
-            np.testing.assert_allclose(controller.authority, 1.0)
+            np.testing.assert_allclose(controller.signals.authorities, 1.0)
             first = -parameters.error_weight * np.sum(
-                controller.step_response * controller.prediction, axis=1
+                controller.responses.steps * controller.responses.prediction, axis=1
             )
             np.testing.assert_allclose(v_p - before, first / parameters.move_weight, atol=1e-9)
             changes.append(v_p - before)
@@ -286,7 +286,7 @@ def test_disabled_it_returns_zero_and_still_learns():
     before = controller.get_weights()['output_weights']
     _, moves = _run(controller, _levels(1000, 6))
     np.testing.assert_array_equal(moves, 0.0)
-    np.testing.assert_array_equal(controller.authority, 0.0)
+    np.testing.assert_array_equal(controller.signals.authorities, 0.0)
     assert np.any(controller.get_weights()['output_weights'] != before)
 
 
@@ -336,14 +336,16 @@ def test_a_known_jump_decays_in_the_prediction_with_the_feedback():
     controller.notify_jump(np.array([100.0, -2.0]))
     controller.step(np.array([100.0, -2.0]))
     fall = np.exp(-GAIN * 0.05 * np.arange(1, 11))
-    np.testing.assert_allclose(controller.prediction, np.outer([100.0, -2.0], fall), atol=1e-9)
+    np.testing.assert_allclose(
+        controller.responses.prediction, np.outer([100.0, -2.0], fall), atol=1e-9
+    )
     controller.reset()
     coming = np.zeros((10, 2))
     coming[3] = (1.0, 0.0)
     controller.step(np.zeros(2), coming)
     expected = np.r_[np.zeros(3), np.exp(-GAIN * 0.05 * np.arange(7))]
-    np.testing.assert_allclose(controller.prediction[0], expected, atol=1e-9)
-    np.testing.assert_allclose(controller.prediction[1], 0.0, atol=1e-9)
+    np.testing.assert_allclose(controller.responses.prediction[0], expected, atol=1e-9)
+    np.testing.assert_allclose(controller.responses.prediction[1], 0.0, atol=1e-9)
 
 
 @pytest.mark.compiled
@@ -360,7 +362,7 @@ def test_it_learns_from_the_applied_v_p():
             if notify:
                 controller.notify_applied(applied)
             loop.step(applied, w, np.zeros(2))
-        return np.mean(controller.step_response[:, 4])
+        return np.mean(controller.responses.steps[:, 4])
 
     fresh = PredictiveController(DEFAULT, PERIOD, GAIN)
     fresh.step(np.zeros(2))

@@ -97,7 +97,7 @@ def test_a_pretrained_machine_predicts_an_unseen_run():
 @pytest.mark.compiled
 def test_an_untrained_machine_has_no_skill():
     predictor, _ = _predictor()
-    predictor.machine.output_weights[:] = np.random.default_rng(1).standard_normal(12)
+    predictor.state.machine.output_weights[:] = np.random.default_rng(1).standard_normal(12)
     predictor.evaluate(HOW)
     assert skill_score(predictor.history, 0) < 0.0
     assert skill_score(predictor.history, 1) < 0.3
@@ -108,9 +108,9 @@ def test_offline_evaluation_changes_no_weights():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
     weights = predictor.get_weights()
-    machine, history = predictor.machine, make_history(4, 4, 10)
+    machine, history = predictor.state.machine, make_history(4, 4, 10)
     errors, moves = run
-    evaluate_offline(machine, predictor.rls, history, errors, moves, HOW)
+    evaluate_offline(machine, predictor.state.rls, history, errors, moves, HOW)
     for name, before in weights.items():
         np.testing.assert_array_equal(before, predictor.get_weights()[name])
     count = errors.size - 1 - history.errors.size
@@ -133,7 +133,14 @@ def test_residuals_compare_predictions_with_measurements():
     missed, stayed = [], []
     for i in range(errors.size - 2, -1, -1):
         observe(
-            predictor.machine, predictor.rls, history, errors[i], moves[i + 1], True, False, HOW
+            predictor.state.machine,
+            predictor.state.rls,
+            history,
+            errors[i],
+            moves[i + 1],
+            True,
+            False,
+            HOW,
         )
         if i < errors.size - 20:
             missed.append(history.residuals[2])
@@ -152,7 +159,14 @@ def test_a_prediction_uses_the_offset_of_its_time():
     history, newest = predictor.history, []
     for i in range(30, -1, -1):
         observe(
-            predictor.machine, predictor.rls, history, errors[i], moves[i + 1], True, False, HOW
+            predictor.state.machine,
+            predictor.state.rls,
+            history,
+            errors[i],
+            moves[i + 1],
+            True,
+            False,
+            HOW,
         )
         newest.insert(0, history.offsets[0])
     count = history.offsets.size
@@ -165,7 +179,16 @@ def test_an_error_beyond_the_range_is_not_learned():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
     before = predictor.get_weights()
-    observe(predictor.machine, predictor.rls, predictor.history, 1e200, 0.0, True, True, HOW)
+    observe(
+        predictor.state.machine,
+        predictor.state.rls,
+        predictor.history,
+        1e200,
+        0.0,
+        True,
+        True,
+        HOW,
+    )
     for name, array in predictor.get_weights().items():
         np.testing.assert_array_equal(array, before[name])
     assert np.isfinite(

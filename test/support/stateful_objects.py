@@ -156,7 +156,7 @@ def drive_response(monitor, r):
             command = pair(r)
         monitor.add_command(*command.tolist())
         measured = command if follows else np.zeros(2)
-        found.append((monitor.update(*measured.tolist()), monitor.counts, monitor.last_command))
+        found.append((monitor.update(*measured.tolist()), monitor.counts))
     for _ in range(25):  # it ends with evidence against any decision
         monitor.add_command(9.0, 9.0)
         follows = monitor.responsive if _ < 19 else not monitor.responsive
@@ -219,7 +219,7 @@ def drive_shaper(shaper, r):
     found = []
     for _ in range(20):
         shaper.step(pair(r), gap(r))
-        found += properties(shaper, 'reference', 'rate', 'active', 'lead_ns')
+        found += properties(shaper, 'reference', 'rate', 'lead_ns')
     return found
 
 
@@ -240,7 +240,7 @@ def drive_law(law, r):
         else:
             law.set_applied(law.command, saturated=False)
         found += [law.terms.copy(), law.certificate, law.ultimate_bound, law.friction.copy()]
-        found += [law.predictive.skill, law.predictive.authority, law.predictive.prediction]
+        found += [law.predictive.skill, *map(np.copy, law.predictive.responses)]
     return found
 
 
@@ -782,7 +782,7 @@ MACHINE = tuple(
         *('machine.visible_weights', 'rls.information', 'rls.power'),
     )
 )
-SKILL = '.signals.skills', '._skill'
+SKILL = '.signals.skills', '.skill'
 RAMPS = '.plan.rate', '.plan.reachable', '.rate', '.reachable', '._transitions'
 BODY_SKILL = tuple(
     f'{memory}.{name}' for memory in ('._memory', '._state.memory') for name in SKILL_FIELDS
@@ -960,7 +960,7 @@ FRESH = {
                 lambda c: c.reset(),
                 kept=('._watchdog.enabled',),
                 scratch=(
-                    *('._ahead_ns', '._sampled', '._shaper', '._keep_out._nearest'),
+                    *('._ahead_ns', '._sampled', '._shaper', '.keep_out._nearest'),
                     *below('._tracker.transition', RAMPS),
                     *below('._tracker.law', (LAST[0], *LAST[2:5])),
                     *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
@@ -987,7 +987,7 @@ FRESH = {
                 kept=(
                     *all_of(
                         make_controller(ControllerParameters)(),
-                        *('_tracker', '_actuation', '_moving', 'status'),
+                        *('_tracker', 'actuation', '_moving', 'status'),
                     ),
                     *below('._tracker.law', (*ALPHA, *below('.predictive', MACHINE))),
                 ),
