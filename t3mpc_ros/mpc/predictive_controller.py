@@ -201,22 +201,13 @@ class MoveConstants(NamedTuple):
         """Return the constants of the parameters with the feedback of the nominal loop."""
         horizon, feedback = parameters.horizon, loop.feedback_gain
         steps = nominal_step_response(loop, timing, horizon)
+        same = {
+            name: getattr(parameters, name) for name in cls._fields if hasattr(parameters, name)
+        }
         return cls(
-            enabled=parameters.enabled,
-            learning=parameters.learning,
+            **same,
             dithered=parameters.enabled and parameters.dither > 0.0,
             quiet_threshold=0.1 * parameters.delta_scale,
-            probe=parameters.probe,
-            error_weight=parameters.error_weight,
-            move_weight=parameters.move_weight,
-            v_max=parameters.v_max,
-            dv_max=parameters.dv_max,
-            skill_low=parameters.skill_low,
-            skill_high=parameters.skill_high,
-            gain_low=parameters.gain_low,
-            gain_high=parameters.gain_high,
-            average=timing.average,
-            decimation=timing.decimation,
             nominal_response=float(steps[max(horizon // 2, 1) - 1]),
             decay=math.exp(-feedback * timing.period),
             decays=np.exp(-feedback * timing.span * np.arange(horizon + 1)),

@@ -149,22 +149,22 @@ class GyroMemory(Structure):
 
 
 class GyroConstants(Structure):
-    """Constants of :func:`update_filter`; names and units as in the parameters."""
+    """Constants of :func:`update_filter`: lengths in m, and values of the parameters by name."""
 
-    radius: float
-    half: float
-    per_metre: float
-    inflation: float
-    noise: float
-    tolerance: float
-    drift: float
-    delay: float
-    hold: float
+    wheel_radius: float
+    half_separation: float
+    variance_per_metre: float
+    slip_inflation: float
+    gyro_noise: float
+    gyro_scale_tolerance: float
+    gyro_bias_drift: float
+    gyro_delay: float
+    gyro_hold: float
     slip_threshold: float
     slip_time: float
     standstill_time: float
-    spread: float
-    bias_limit: float
+    standstill_spread: float
+    gyro_bias_limit: float
 
 
 class GyroOdometry:
@@ -201,21 +201,11 @@ class GyroOdometry:
     @parameters.setter
     def parameters(self, parameters: GyroOdometryParameters) -> None:
         self._parameters = parameters
+        fields = GyroConstants.__annotations__
         self._constants = GyroConstants.new(
-            radius=self._geometry.wheel_radius,
-            half=self._geometry.half_separation,
-            per_metre=parameters.variance_per_metre,
-            inflation=parameters.slip_inflation,
-            noise=parameters.gyro_noise,
-            tolerance=parameters.gyro_scale_tolerance,
-            drift=parameters.gyro_bias_drift,
-            delay=parameters.gyro_delay,
-            hold=parameters.gyro_hold,
-            slip_threshold=parameters.slip_threshold,
-            slip_time=parameters.slip_time,
-            standstill_time=parameters.standstill_time,
-            spread=parameters.standstill_spread,
-            bias_limit=parameters.gyro_bias_limit,
+            wheel_radius=self._geometry.wheel_radius,
+            half_separation=self._geometry.half_separation,
+            **{name: getattr(parameters, name) for name in fields if hasattr(parameters, name)},
         )
 
     @property
@@ -461,11 +451,15 @@ def update_filter(
         added since the last bias measurement
     right, left : rad; gyro : rad/s, NaN without one; dt : s; jitter : rad², of each angle
     """
-    radius, half, per_metre = constants.radius, constants.half, constants.per_metre
+    radius, half, per_metre = (
+        constants.wheel_radius,
+        constants.half_separation,
+        constants.variance_per_metre,
+    )
     has_gyro = not math.isnan(gyro)
     run_right, run_left, share = radius * right, radius * left, 0.5 / half
     steps_rate = share * (run_right - run_left) / dt
-    delayed = delayed_rate(memory, steps_rate, dt, constants.delay)
+    delayed = delayed_rate(memory, steps_rate, dt, constants.gyro_delay)
     still = right == 0.0 and left == 0.0 and abs(delayed) < STANDSTILL_RATE
     memory.standstill_for = memory.standstill_for + dt if still else 0.0
 
@@ -478,7 +472,7 @@ def update_filter(
         excess = rate - delayed
         if is_disturbed(memory, excess, rate, dt, still, constants):
             # Travel that the steps do not count.
-            rough *= constants.inflation
+            rough *= constants.slip_inflation
             path_right += half * abs(excess) * dt
             path_left += half * abs(excess) * dt
         elif right == 0.0 and left == 0.0 and not still:
@@ -489,12 +483,15 @@ def update_filter(
         if noise_steps > 0.0:
             # One sample represents all of dt, but its noise does not average over it.
             noise_turn = (
-                constants.noise * constants.noise * dt * max(1.0, 0.5 * dt / constants.delay)
+                constants.gyro_noise
+                * constants.gyro_noise
+                * dt
+                * max(1.0, 0.5 * dt / constants.gyro_delay)
             )
-            noise_turn += noise_steps * max(0.0, dt / constants.hold - 1.0)
+            noise_turn += noise_steps * max(0.0, dt / constants.gyro_hold - 1.0)
             gain_right = share * noise_right / (noise_steps + noise_turn)
             gain_left = -share * noise_left / (noise_steps + noise_turn)
-        gyro_excess, turn = excess * dt, constants.tolerance * rate * dt
+        gyro_excess, turn = excess * dt, constants.gyro_scale_tolerance * rate * dt
     else:
         memory.disagreement = memory.disagrees_for = memory.pushed_for = 0.0
         memory.slipping = False
@@ -514,7 +511,7 @@ def update_filter(
     add_noise(covariance, noise_right, right_x - part_x, right_y - part_y, bend - part_bend)
     add_noise(covariance, noise_left, left_x + part_x, left_y + part_y, part_bend - bend)
     add_noise(covariance, noise_turn, fused[0], fused[1], fused[2])
-    covariance[3, 3] += constants.drift * constants.drift * dt
+    covariance[3, 3] += constants.gyro_bias_drift * constants.gyro_bias_drift * dt
     drift[3, 3] += dt
 
     if still and has_gyro:
@@ -541,12 +538,14 @@ def is_disturbed(
 
     excess : gyro minus steps, rad/s; rate : of the gyro, without bias, rad/s
     """
-    limit = constants.slip_threshold + 3.0 * constants.tolerance * abs(rate)
-    disagrees = detect_slip(memory, excess, min(dt, constants.hold), limit, constants.slip_time)
+    limit = constants.slip_threshold + 3.0 * constants.gyro_scale_tolerance * abs(rate)
+    disagrees = detect_slip(
+        memory, excess, min(dt, constants.gyro_hold), limit, constants.slip_time
+    )
     # A hand that pushes back and forth passes through zero: the push lasts until the end.
     memory.pushed_for = max(memory.pushed_for - dt, 0.0)
     rests = memory.standstill_for > constants.slip_time
-    if rests and abs(memory.disagreement) > 3.0 * constants.spread:
+    if rests and abs(memory.disagreement) > 3.0 * constants.standstill_spread:
         memory.pushed_for = constants.standstill_time
     return disagrees or (still and memory.pushed_for > 0.0)
 
@@ -567,8 +566,14 @@ def average_standstill(
     memory.total += deviation
     memory.squares += deviation * deviation
     if memory.time >= constants.standstill_time and memory.count >= MIN_SAMPLES:
-        single = max(1.0 / memory.time, 0.5 / (constants.delay * memory.count))
-        variance = constants.noise * constants.noise * single
+        single = max(1.0 / memory.time, 0.5 / (constants.gyro_delay * memory.count))
+        variance = constants.gyro_noise * constants.gyro_noise * single
         estimate_bias(
-            pose, covariance, drift, memory, variance, constants.spread, constants.bias_limit
+            pose,
+            covariance,
+            drift,
+            memory,
+            variance,
+            constants.standstill_spread,
+            constants.gyro_bias_limit,
         )

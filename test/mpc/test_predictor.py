@@ -132,16 +132,7 @@ def test_residuals_compare_predictions_with_measurements():
     reset_history(history, 0.0)
     missed, stayed = [], []
     for i in range(errors.size - 2, -1, -1):
-        observe(
-            predictor.state.machine,
-            predictor.state.rls,
-            history,
-            errors[i],
-            moves[i + 1],
-            True,
-            False,
-            HOW,
-        )
+        observe(*predictor.state, errors[i], moves[i + 1], True, False, HOW)
         if i < errors.size - 20:
             missed.append(history.residuals[2])
             stayed.append(errors[i] - errors[i + 5])
@@ -158,16 +149,7 @@ def test_a_prediction_uses_the_offset_of_its_time():
     predictor, (errors, moves) = _predictor()
     history, newest = predictor.history, []
     for i in range(30, -1, -1):
-        observe(
-            predictor.state.machine,
-            predictor.state.rls,
-            history,
-            errors[i],
-            moves[i + 1],
-            True,
-            False,
-            HOW,
-        )
+        observe(*predictor.state, errors[i], moves[i + 1], True, False, HOW)
         newest.insert(0, history.offsets[0])
     count = history.offsets.size
     assert len(set(newest[:count])) == count
@@ -179,16 +161,7 @@ def test_an_error_beyond_the_range_is_not_learned():
     predictor, run = _predictor()
     predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
     before = predictor.get_weights()
-    observe(
-        predictor.state.machine,
-        predictor.state.rls,
-        predictor.history,
-        1e200,
-        0.0,
-        True,
-        True,
-        HOW,
-    )
+    observe(*predictor.state, 1e200, 0.0, True, True, HOW)
     for name, array in predictor.get_weights().items():
         np.testing.assert_array_equal(array, before[name])
     assert np.isfinite(
