@@ -11,7 +11,13 @@ import numpy as np
 
 from t3mpc_ros.control.jump_transition import JumpTransitionParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
-from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, adapt, estimate
+from t3mpc_ros.fuzzy.estimator import (
+    AdaptationGains,
+    AdaptationParameters,
+    FuzzyEstimator,
+    adapt,
+    estimate,
+)
 from t3mpc_ros.fuzzy.inference import FuzzyParameters, FuzzyTables
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
@@ -525,14 +531,11 @@ class Nt3fsMpcController:
             gain=law.gain,
             bound=self._bound(),
             smoothing=law.smoothing,
-            gamma=adaptation.gamma,
-            radius=self.fuzzy.radius,
-            leakage=adaptation.sigma_modification,
-            dead_zone=adaptation.dead_zone,
-            step_limit=adaptation.step_limit,
-            friction_gamma=parameters.friction.gamma,
+            fuzzy=self.fuzzy.gains,
+            friction=self.fuzzy.gains._replace(
+                gamma=parameters.friction.gamma, radius=math.sqrt(2.0) * adaptation.radius
+            ),
             friction_width=parameters.friction.width,
-            friction_radius=math.sqrt(2.0) * adaptation.radius,
         )
 
     def _bound(self) -> float:
@@ -549,14 +552,9 @@ class LawGains(NamedTuple):
     gain: float
     bound: float
     smoothing: float
-    gamma: float
-    radius: float
-    leakage: float
-    dead_zone: float
-    step_limit: float
-    friction_gamma: float
+    fuzzy: AdaptationGains
+    friction: AdaptationGains
     friction_width: float
-    friction_radius: float
 
 
 class LawOutput(NamedTuple):
@@ -600,7 +598,7 @@ def step_law(
     fuzzy_estimate[:] = 0.0
     if gains.use_fuzzy and not estimate(speeds, fuzzy, fuzzy_estimate):
         return False
-    has_friction = gains.use_fuzzy and gains.friction_gamma > 0.0
+    has_friction = gains.use_fuzzy and gains.friction.gamma > 0.0
     if has_friction:
         add_friction(reference, gains.friction_width, friction, fuzzy_estimate)
     law_terms(
@@ -621,29 +619,9 @@ def step_law(
             adaptation_error[i] = (
                 predictive.jump_free_errors[i] - gains.integral_transfer * predictive.v[i]
             )
-        adapt(
-            fuzzy.coefficients,
-            fuzzy.phi,
-            adaptation_error,
-            dt,
-            gains.gamma,
-            gains.radius,
-            gains.leakage,
-            gains.dead_zone,
-            gains.step_limit,
-        )
+        adapt(fuzzy.coefficients, fuzzy.phi, adaptation_error, dt, gains.fuzzy)
         if has_friction:
-            adapt(
-                friction.coefficients,
-                friction.basis,
-                adaptation_error,
-                dt,
-                gains.friction_gamma,
-                gains.friction_radius,
-                gains.leakage,
-                gains.dead_zone,
-                gains.step_limit,
-            )
+            adapt(friction.coefficients, friction.basis, adaptation_error, dt, gains.friction)
     return True
 
 

@@ -4,6 +4,7 @@
 
 from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -71,6 +72,21 @@ class AdaptationParameters(Parameters):
     )
 
 
+class AdaptationGains(NamedTuple):
+    """Gains and bounds of :func:`adapt`."""
+
+    gamma: float
+    """1/s²"""
+    radius: float
+    """rho, largest Euclidean norm of each output's coefficients, rad/s²."""
+    leakage: float
+    """sigma, 1/s"""
+    dead_zone: float
+    """Width, rad/s."""
+    step_limit: float
+    """Largest gamma |Phi|² dt, 1/s."""
+
+
 @kernel
 def beyond_dead_zone(error: float, width: float) -> float:
     """Return the part of ``error`` outside the dead zone, delta - sat(delta), rad/s.
@@ -82,15 +98,7 @@ def beyond_dead_zone(error: float, width: float) -> float:
 
 @kernel
 def adapt(
-    coefficients: Array,
-    phi: Array,
-    errors: Array,
-    dt: float,
-    gamma: float,
-    radius: float,
-    leakage: float,
-    dead_zone: float,
-    step_limit: float,
+    coefficients: Array, phi: Array, errors: Array, dt: float, gains: AdaptationGains
 ) -> bool:
     r"""Adapt the coefficients over ``dt``; return whether the errors are finite.
 
@@ -120,14 +128,10 @@ def adapt(
     phi : shape (p,), basis of the evaluation before the errors
     errors : shape (m,), delta, rad/s
     dt : s, not negative
-    gamma : 1/s²
-    radius : rho, largest Euclidean norm of each output's coefficients, rad/s²
-    leakage : sigma, 1/s
-    dead_zone : width, rad/s
-    step_limit : largest gamma |Phi|² dt, 1/s
 
     Returns False, and changes nothing, when an error is not finite.
     """
+    gamma, radius, leakage, dead_zone, step_limit = gains
     for z in range(errors.size):
         if not math.isfinite(errors[z]):
             return False
@@ -194,8 +198,13 @@ class FuzzyEstimator:
     def configure(self, adaptation: AdaptationParameters) -> None:
         """Replace the adaptation parameters from the next step on; keep the coefficients."""
         self.adaptation = adaptation
-        self.radius = adaptation.radius * math.sqrt(self.sets.size)
-        """Radius of the ball of each output's coefficients, rad/s²."""
+        self.gains = AdaptationGains(
+            adaptation.gamma,
+            adaptation.radius * math.sqrt(self.sets.size),
+            adaptation.sigma_modification,
+            adaptation.dead_zone,
+            adaptation.step_limit,
+        )
 
     def reset(self) -> None:
         """Set all coefficients to zero, and clear the basis until the next evaluation."""
@@ -265,17 +274,8 @@ class FuzzyEstimator:
 
     def _adapt(self, errors: Array, dt: float) -> None:
         values = np.ascontiguousarray(errors, dtype=np.float64)
-        parameters = self.adaptation
         if values.shape != self._coefficients.shape[:1] or not adapt(
-            self._coefficients,
-            self._phi,
-            values,
-            dt,
-            parameters.gamma,
-            self.radius,
-            parameters.sigma_modification,
-            parameters.dead_zone,
-            parameters.step_limit,
+            self._coefficients, self._phi, values, dt, self.gains
         ):
             raise ValueError(
                 f'errors must be {len(self._coefficients)} finite numbers: got {errors}'

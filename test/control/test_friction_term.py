@@ -13,7 +13,7 @@ from t3mpc_ros.control.control_law import (
     Nt3fsMpcParameters,
     add_friction,
 )
-from t3mpc_ros.fuzzy.estimator import adapt
+from t3mpc_ros.fuzzy.estimator import AdaptationGains, adapt
 
 DT = 0.01
 FRICTION = np.array([[9.0, 4.0], [4.0, 9.0]])
@@ -57,7 +57,7 @@ def test_v_rate_is_79_if_the_friction_coefficients_follow_e23():
         truth, known = rng.normal(size=(2, 2, 2))
         basis, delta, others = np.tanh(rng.normal(size=2)), rng.normal(size=2), rng.normal(size=2)
         adapted = known.copy()
-        assert adapt(adapted, basis, delta, dt, gamma, 100.0, 0.0, 0.0, 2.0)
+        assert adapt(adapted, basis, delta, dt, AdaptationGains(gamma, 100.0, 0.0, 0.0, 2.0))
         delta_rate = (truth - known) @ basis + others
         change = 2.0 * delta @ delta_rate * dt / 2.0
         change += (np.sum((truth - adapted) ** 2) - np.sum((truth - known) ** 2)) / (2.0 * gamma)

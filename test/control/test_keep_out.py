@@ -41,7 +41,7 @@ def _seen(obstacles=None):
 def _state(keep_out, x, y):
     """Return the state of the cell at a place (m)."""
     grid = keep_out.map.grid
-    low, size = grid.numbers
+    low, size = grid.low, grid.size
     return grid.cells[math.floor((y - low) / size), math.floor((x - low) / size)]
 
 

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, adapt, beyond_dead_zone
+from t3mpc_ros.fuzzy.estimator import (
+    AdaptationGains,
+    AdaptationParameters,
+    FuzzyEstimator,
+    adapt,
+    beyond_dead_zone,
+)
 from t3mpc_ros.fuzzy.inference import FuzzyParameters, build_sets, compute_basis
 
 Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
@@ -16,7 +22,7 @@ Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
 GAIN = 8.0
 """K, 1/s."""
 
-PLAIN = {'radius': 1e12, 'leakage': 0.0, 'dead_zone': 0.0, 'step_limit': 1e9}
+PLAIN = AdaptationGains(600.0, radius=1e12, leakage=0.0, dead_zone=0.0, step_limit=1e9)
 """Without modifications."""
 
 
@@ -58,7 +64,7 @@ def test_the_law_is_77_and_78():
     alpha = rng.normal(size=(2, phi.size))
     delta = np.array([0.3, -1.2])
     expected = alpha + 0.01 * 600.0 * np.outer(delta, phi)
-    assert adapt(alpha, phi, delta, 0.01, 600.0, **PLAIN)
+    assert adapt(alpha, phi, delta, 0.01, PLAIN)
     np.testing.assert_allclose(alpha, expected, rtol=1e-14)
 
 
@@ -119,7 +125,7 @@ def _drift(noise, dead_zone):
     alpha = np.zeros((noise.shape[1], phi.shape[1]))
     norms = []
     for k, values in enumerate(noise):
-        adapt(alpha, phi[k], values, 0.01, 600.0, **{**PLAIN, 'dead_zone': dead_zone})
+        adapt(alpha, phi[k], values, 0.01, PLAIN._replace(dead_zone=dead_zone))
         if k + 1 in (len(noise) // 4, len(noise)):
             norms.append(float(np.sqrt(np.mean(np.sum(alpha**2, axis=1)))))
     return norms
@@ -150,13 +156,13 @@ def test_leakage_bounds_the_coefficients_under_noise():
     rng = np.random.default_rng(24)
     phi = _bases(200, 24)
     alpha = np.zeros((1, phi.shape[1]))
-    limits = {**PLAIN, 'leakage': 0.5}
+    limits = PLAIN._replace(leakage=0.5)
     bound = 0.01 * 600.0 * np.linalg.norm(phi, axis=1).max() * 0.2 / -np.expm1(-0.5 * 0.01)
     largest = 0.0
     for k in range(20_000):
         # Errors of one sign are the worst case.
         error = np.array([rng.uniform(0.0, 0.2)])
-        adapt(alpha, phi[k % 200], error, 0.01, 600.0, **limits)
+        adapt(alpha, phi[k % 200], error, 0.01, limits)
         largest = max(largest, float(np.linalg.norm(alpha)))
     assert largest < bound
     unlimited = 0.01 * 600.0 * 20_000 * 0.1 * phi.mean(axis=0)
@@ -166,7 +172,7 @@ def test_leakage_bounds_the_coefficients_under_noise():
 @pytest.mark.parametrize('dt', [1e-3, 0.1, 10.0, 1e4])
 def test_leakage_decays_exactly_at_any_step(dt):
     alpha = np.full((2, 6), 3.0)
-    adapt(alpha, np.full(6, 1.0 / 6.0), np.zeros(2), dt, 600.0, **{**PLAIN, 'leakage': 2.0})
+    adapt(alpha, np.full(6, 1.0 / 6.0), np.zeros(2), dt, PLAIN._replace(leakage=2.0))
     np.testing.assert_allclose(alpha, 3.0 * np.exp(-2.0 * dt), rtol=1e-13)
 
 
@@ -178,8 +184,8 @@ def test_projection_keeps_the_ball_and_reduces_the_distance():
     for k in range(300):
         delta = rng.normal(scale=20.0, size=2)
         free = alpha.copy()
-        adapt(free, phi[k], delta, 0.01, 600.0, **PLAIN)
-        adapt(alpha, phi[k], delta, 0.01, 600.0, **{**PLAIN, 'radius': radius})
+        adapt(free, phi[k], delta, 0.01, PLAIN)
+        adapt(alpha, phi[k], delta, 0.01, PLAIN._replace(radius=radius))
         norms = np.linalg.norm(alpha, axis=1)
         assert np.all(norms <= radius * (1.0 + 1e-14))
         for z in range(2):
@@ -196,7 +202,7 @@ def test_step_limit_bounds_the_change_of_the_estimate():
     phi = _bases(1, 27)[0]
     for gamma, dt in ((600.0, 0.01), (600.0, 1.0), (1e6, 0.01), (1e6, 1e6), (1e6, 1e300)):
         alpha = np.zeros((1, phi.size))
-        adapt(alpha, phi, np.array([0.5]), dt, gamma, **{**PLAIN, 'step_limit': 2.0})
+        adapt(alpha, phi, np.array([0.5]), dt, PLAIN._replace(gamma=gamma, step_limit=2.0))
         wanted = min(gamma * (phi @ phi) * dt, 2.0) * 0.5
         assert alpha[0] @ phi == pytest.approx(wanted, rel=1e-12)
 
@@ -204,8 +210,8 @@ def test_step_limit_bounds_the_change_of_the_estimate():
 def test_huge_finite_errors_end_on_the_ball():
     phi = _bases(1, 28)[0]
     alpha = np.zeros((2, phi.size))
-    limits = {**PLAIN, 'radius': 5.0, 'step_limit': 1000.0}
-    assert adapt(alpha, phi, np.array([1.7e308, -1e300]), 1e300, 1e6, **limits)
+    limits = PLAIN._replace(gamma=1e6, radius=5.0, step_limit=1000.0)
+    assert adapt(alpha, phi, np.array([1.7e308, -1e300]), 1e300, limits)
     np.testing.assert_allclose(np.linalg.norm(alpha, axis=1), 5.0, rtol=1e-12)
     np.testing.assert_allclose(alpha[0] / 5.0, phi / np.linalg.norm(phi), rtol=1e-12)
 
@@ -214,5 +220,5 @@ def test_huge_finite_errors_end_on_the_ball():
 def test_an_error_that_is_not_finite_changes_no_output(wrong):
     phi = _bases(1, 29)[0]
     alpha = np.ones((2, phi.size))
-    assert not adapt(alpha, phi, np.array([0.5, wrong]), 0.01, 600.0, **PLAIN)
+    assert not adapt(alpha, phi, np.array([0.5, wrong]), 0.01, PLAIN)
     assert np.all(alpha == 1.0)

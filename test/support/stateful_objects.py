@@ -427,7 +427,7 @@ def drive_fuzzy(fuzzy, r):
     """Evaluate and adapt."""
     found = []
     for _ in range(20):
-        found += [fuzzy.evaluate(pair(r)), fuzzy.basis, fuzzy.coefficients, fuzzy.radius]
+        found += [fuzzy.evaluate(pair(r)), fuzzy.basis, fuzzy.coefficients, fuzzy.gains]
         fuzzy.adapt(pair(r, 1.0), gap(r))
     return found
 
