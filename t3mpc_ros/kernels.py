@@ -224,20 +224,21 @@ class TypedKernel(Generic[P, R]):
 class Structure:
     """Named numbers that kernels change in place: a class annotates and explains its fields.
 
-    The object is a NumPy record, which kernels take by reference: ``state.count += 1.0`` in a
-    kernel is seen by every owner of the structure.
+    The object is an element of a NumPy record array: ``state.count += 1.0`` in a kernel is seen
+    by every owner of the array. Kernels take the array, because a record by itself takes Python
+    several times longer to pass.
     """
 
     @classmethod
-    def new(cls, **values: float) -> Self:
-        """Return a structure whose fields are zero unless given."""
+    def new(cls, **values: float) -> Sequence[Self]:
+        """Return an array of one structure, whose fields are zero unless given."""
         fields = cls.__annotations__
         if taken := [name for name in fields if hasattr(np.record, name)]:
             raise ValueError(f'names of fields must not be those of NumPy: got {taken}')
-        structure = np.zeros(1, np.dtype(list(fields.items()))).view(np.recarray)[0]
+        one = np.zeros(1, np.dtype(list(fields.items()))).view(np.recarray)
         for name, value in values.items():
-            setattr(structure, name, value)
-        return cast('Self', structure)
+            one[name] = value
+        return cast('Sequence[Self]', one)
 
 
 def contiguous(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -29,6 +29,7 @@ What odometry and gyro cannot measure stays: a scale error common to both wheels
 distance only.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import NamedTuple
@@ -161,7 +162,8 @@ class BodyConstants(NamedTuple):
 class BodyState(NamedTuple):
     """State of :func:`correct_body`, changed in place."""
 
-    memory: BodyMemory
+    memory: Sequence[BodyMemory]
+    """Array of one."""
     history: Array
     """Commands, newest first, rad/s, shape (n, 2)."""
     point: Array
@@ -209,35 +211,35 @@ class BodyCorrection:
     @property
     def authority(self) -> float:
         """Fraction of the correction in use, in [0, 1]."""
-        return float(self._memory.authority)
+        return float(self._memory[0].authority)
 
     @property
     def yaw_error(self) -> float:
         """Yaw of the robot minus that of the reference since the start of the drive, rad."""
-        return float(self._memory.yaw_error * self._turn)
+        return float(self._memory[0].yaw_error * self._turn)
 
     def restart(self) -> None:
         """Start a drive: clear yaw error and history; map and skill are kept."""
         self._state.history[:] = 0.0
         for name in DRIVE:
-            setattr(self._memory, name, 0)
+            setattr(self._memory[0], name, 0)
 
     def reset(self) -> None:
         """Discard the map and its skill too."""
         for name in BodyMemory.__annotations__:
-            setattr(self._memory, name, 0)
+            setattr(self._memory[0], name, 0)
         self.fuzzy.reset()
         self.restart()
 
     def snapshot(self) -> tuple[Array, dict[str, float]]:
         """Return map and skill for :meth:`rollback`."""
-        return self.fuzzy.coefficients, {name: getattr(self._memory, name) for name in SKILL}
+        return self.fuzzy.coefficients, {name: getattr(self._memory[0], name) for name in SKILL}
 
     def rollback(self, snapshot: tuple[Array, dict[str, float]]) -> None:
         """Restore the map and its skill; the yaw error since is kept."""
         self.fuzzy.coefficients, skill = snapshot
         for name, value in skill.items():
-            setattr(self._memory, name, value)
+            setattr(self._memory[0], name, value)
 
     def step(
         self,
@@ -291,7 +293,7 @@ def correct_body(
     Arguments as in :meth:`BodyCorrection.step`.
     """
     turn, period = constants.turn, constants.period
-    memory, history, point, output = state
+    memory, history, point, output = state.memory[0], state.history, state.point, state.output
     # A gap of n periods repeats the last command n times: nothing else was sent.
     count = min(max(int(round(elapsed / period)), 1), history.shape[0])
     for j in range(history.shape[0] - 1, count - 1, -1):
@@ -333,7 +335,7 @@ def learn_turning(
     fuzzy: FuzzyTables,
 ) -> None:
     """Adapt the map to the turning ``achieved`` (rad/s) by the commands of a row (E20)."""
-    memory, history, point, output = state
+    memory, history, point, output = state.memory[0], state.history, state.point, state.output
     coefficients, phi = fuzzy.coefficients, fuzzy.phi
     row = int(position)
     part = position - row

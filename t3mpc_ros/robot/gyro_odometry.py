@@ -16,6 +16,7 @@ and a scale error. The filter over (x, y, yaw, bias, scale) combines both:
   drift that the bias caused; the scale is never estimated.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import ClassVar
@@ -221,7 +222,7 @@ class GyroOdometry:
     @property
     def bias(self) -> float:
         """Estimated gyro bias, rad/s."""
-        return float(self._memory.bias)
+        return float(self._memory[0].bias)
 
     @property
     def bias_std(self) -> float:
@@ -231,17 +232,17 @@ class GyroOdometry:
     @property
     def calibrated(self) -> bool:
         """Whether the bias has been measured at a standstill; the gyro is then in use."""
-        return bool(self._memory.calibrated)
+        return bool(self._memory[0].calibrated)
 
     @property
     def slipping(self) -> bool:
         """Whether gyro and steps have disagreed for ``slip_time``: a wheel slips or is blocked."""
-        return bool(self._memory.slipping)
+        return bool(self._memory[0].slipping)
 
     @property
     def slipping_for(self) -> float:
         """Time (s) for which gyro and steps have disagreed, zero unless :attr:`slipping`."""
-        return float(self._memory.disagrees_for) if self.slipping else 0.0
+        return float(self._memory[0].disagrees_for) if self.slipping else 0.0
 
     def reset(self, pose: Pose = ORIGIN) -> None:
         """Set a finite pose and clear its covariance; the bias estimate is kept."""
@@ -253,8 +254,8 @@ class GyroOdometry:
 
     def forget_bias(self) -> None:
         """Reset the bias estimate, as after a power loss of the sensor."""
-        self._memory.bias, self._memory.calibrated = 0.0, False
-        clear_window(self._memory)
+        for name in ('bias', 'calibrated', 'count', 'time', 'total', 'squares'):
+            setattr(self._memory[0], name, 0)
         for matrix in (self._covariance, self._drift):
             matrix[3, :] = 0.0
             matrix[:, 3] = 0.0
@@ -432,8 +433,8 @@ def update_filter(
     pose: Array,
     covariance: Array,
     drift: Array,
-    memory: GyroMemory,
-    constants: GyroConstants,
+    memories: Sequence[GyroMemory],
+    settings: Sequence[GyroConstants],
     right: float,
     left: float,
     gyro: float,
@@ -449,8 +450,10 @@ def update_filter(
     pose : shape (3,), m, m, rad; covariance : shape (5, 5); both changed in place
     drift : shape (5, 5), covariance that a random walk of the bias by 1 rad/s/√s would have
         added since the last bias measurement
+    memories, settings : arrays of one
     right, left : rad; gyro : rad/s, NaN without one; dt : s; jitter : rad², of each angle
     """
+    memory, constants = memories[0], settings[0]
     radius, half, per_metre = (
         constants.wheel_radius,
         constants.half_separation,

@@ -45,7 +45,7 @@ def leaves(thing: Any, path: str = '', above: tuple[int, ...] = ()) -> Iterator[
         yield path, thing
     elif isinstance(thing, float):
         yield path, struct.pack('<d', thing).hex() if thing != thing or thing == 0.0 else thing
-    elif isinstance(thing, np.ndarray):
+    elif isinstance(thing, np.ndarray) and not isinstance(thing, np.recarray):
         yield path, _Copy(thing)
     elif isinstance(thing, np.random.Generator):
         yield path, repr(thing.bit_generator.state)
@@ -106,7 +106,7 @@ def _parts(thing: Any) -> Iterator[tuple[str, Any]]:
         yield from ((f'.{name}', getattr(thing, name).item()) for name in thing.dtype.names)
     elif hasattr(thing, '_fields'):
         yield from ((f'.{name}', getattr(thing, name)) for name in thing._fields)
-    elif isinstance(thing, list | tuple | deque):
+    elif isinstance(thing, list | tuple | deque | np.recarray):
         yield from ((f'[{index}]', item) for index, item in enumerate(thing))
     elif isinstance(thing, types.GeneratorType):
         frame = thing.gi_frame
@@ -171,12 +171,13 @@ def carry(
 ) -> None:
     """Give a new object what an operation keeps of a used one."""
     memo = {} if memo is None else memo  # what two attributes share, they share afterwards
-    if isinstance(source, np.ndarray):
+    if isinstance(source, np.ndarray) and not isinstance(source, np.recarray):
         _carry_rows(source, target, paths, path)
         return
     for name, part in _parts(source):
         here = f'{path}{name}'
-        if isinstance(part, np.ndarray) and not matches(here, paths):
+        structures = isinstance(part, np.recarray)
+        if isinstance(part, np.ndarray) and not structures and not matches(here, paths):
             _carry_rows(part, dict(_parts(target))[name], paths, here)
         elif matches(here, paths):
             _put(target, name, copy.deepcopy(part, memo))

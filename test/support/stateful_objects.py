@@ -404,7 +404,7 @@ def drive_predictive(controller, r):
     found = []
     for k in range(130):
         found.append(controller.step(np.array([math.sin(0.05 * k), 1.0]) + 0.02 * pair(r, 1.0)))
-        found += properties(controller, 'skill', 'authority', 'prediction', 'step_response')
+        found += [controller.skill, *map(np.copy, (*controller.signals, *controller.responses))]
         found += properties(controller, 'known_error', 'due', 'status')
         if r.random() < 0.1:
             controller.notify_applied(0.5 * found[0])
@@ -785,11 +785,11 @@ MACHINE = tuple(
 SKILL = '.signals.skills', '.skill'
 RAMPS = '.plan.rate', '.plan.reachable', '.rate', '.reachable', '._transitions'
 BODY_SKILL = tuple(
-    f'{memory}.{name}' for memory in ('._memory', '._state.memory') for name in SKILL_FIELDS
+    f'{memory}.{name}' for memory in ('._memory[0]', '._state.memory[0]') for name in SKILL_FIELDS
 )
 BODY_OLD = tuple(
     f'{memory}.{name}'
-    for memory in ('._memory', '._state.memory')
+    for memory in ('._memory[0]', '._state.memory[0]')
     for name in ('yaw', 'last_reference')
 )
 GYRO_RESPONSE = 'first_pole', 'second_pole', 'last_rate', 'last_dt', 'standstill_for'
@@ -1116,7 +1116,7 @@ FRESH = {
                 lambda o: o.forget_bias(),
                 # The response of the gyro's filter to the steps, and for how long they rest.
                 kept=(
-                    *('._pose', *(f'._memory.{name}' for name in GYRO_RESPONSE)),
+                    *('._pose', *(f'._memory[0].{name}' for name in GYRO_RESPONSE)),
                     *(
                         f'._{matrix}[{row}][{column}]'
                         for matrix in ('covariance', 'drift')
@@ -1125,7 +1125,12 @@ FRESH = {
                     ),
                 ),
                 # Not read before the bias is known again.
-                scratch=('._memory.disagreement', '._memory.disagrees_for', '._memory.slipping'),
+                scratch=(
+                    *(
+                        f'._memory[0].{name}'
+                        for name in ('disagreement', 'disagrees_for', 'slipping')
+                    ),
+                ),
             ),
         },
     ),
@@ -1208,7 +1213,7 @@ FRESH = {
                     *(
                         '._odometry._pose',
                         *(
-                            f'._odometry._memory.{name}'
+                            f'._odometry._memory[0].{name}'
                             for name in GYRO_RESPONSE
                             if name != 'last_rate'
                         ),
