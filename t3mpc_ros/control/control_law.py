@@ -339,7 +339,7 @@ class Certificate:
         gain, bound, smoothing : as in :func:`law_terms`
         """
         last, value = self.reading, 0.5 * squared_norm(errors)
-        rate = (value - last.value) / dt if self._started else 0.0
+        rate = (value - last.value) / dt if self._started and dt > 0.0 else 0.0
         allowed = lyapunov_rate_bound(errors, gain, bound, smoothing)
         weight = min(1.0, dt / self.window)
         self._started = True
