@@ -85,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.cases import cases_for
     from t3mpc_ros.evaluation.experiment import ComparisonPlan, default_methods
     from t3mpc_ros.evaluation.methods import methods_for, require_libraries
-    from t3mpc_ros.evaluation.tuning.search_space import find_names
+    from t3mpc_ros.parameters.table import find_names
 
     if options.own or options.reference or options.robot not in ROBOTS:
         return _run_own(options)

@@ -122,7 +122,7 @@ def _tracking(options: argparse.Namespace, executor: Any) -> _Study:
         TrackingPlan,
         compare_trackers,
     )
-    from t3mpc_ros.evaluation.tuning.search_space import find_names
+    from t3mpc_ros.parameters.table import find_names
 
     names = tuple(TRACKED_PATHS)
     plan = TrackingPlan(
@@ -136,7 +136,7 @@ def _patrols(options: argparse.Namespace, executor: Any) -> _Study:
     from t3mpc_ros.evaluation.patrol import patrol_page
     from t3mpc_ros.evaluation.patrol.patrol_comparison import PATHS, PatrolPlan, compare_patrols
     from t3mpc_ros.evaluation.patrol.patrol_figures import Comparison
-    from t3mpc_ros.evaluation.tuning.search_space import find_names
+    from t3mpc_ros.parameters.table import find_names
 
     plan = PatrolPlan(
         paths=find_names('path', options.paths, PATHS) or PATHS,

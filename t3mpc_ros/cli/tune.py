@@ -88,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
         A method needs a library that is not installed.
     """
     from t3mpc_ros.evaluation.methods import require_libraries
-    from t3mpc_ros.evaluation.tuning.search_space import find_names
+    from t3mpc_ros.parameters.table import find_names
 
     if options.robot not in (None, TWIN, *DRIVES):
         return _identify(options)

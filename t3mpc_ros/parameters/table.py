@@ -8,11 +8,12 @@ the documentation and recorded bags all use that one table. Tables nest: a field
 nobody has a reason to set is a class variable beside them, a constant.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 import difflib
 from functools import partial
 import math
+import re
 from typing import Any, ClassVar, NamedTuple, Self, get_args, get_origin, get_type_hints
 
 Value = (
@@ -44,6 +45,24 @@ def number_hint(value: object) -> str:
     except ValueError:
         return ''
     return ', which YAML reads as text; write -0.9 or 1.0e-3' if number else ''
+
+
+def short_name(name: str) -> str:
+    """Return ``name`` in lower case with one hyphen for whatever is no letter or digit."""
+    return re.sub(r'[^a-z0-9]+', '-', name.lower()).strip('-')
+
+
+def find_names(kind: str, names: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
+    """Return the named entries of ``known`` in its order; case and punctuation are ignored."""
+    by_short_name = {short_name(name): name for name in known}
+    for name in names:
+        if short_name(name) not in by_short_name:
+            near = difflib.get_close_matches(short_name(name), by_short_name, n=1)
+            hint = f'; did you mean {by_short_name[near[0]]}?' if near else ''
+            all_names = ', '.join(by_short_name.values())
+            raise ValueError(f'{kind} must be one of {all_names}: got {name}{hint}')
+    wanted = {short_name(name) for name in names}
+    return tuple(name for short, name in by_short_name.items() if short in wanted)
 
 
 @dataclass(frozen=True, slots=True)

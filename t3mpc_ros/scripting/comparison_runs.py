@@ -17,9 +17,9 @@ from t3mpc_ros.evaluation.loop import Method
 from t3mpc_ros.evaluation.metrics import METRICS, Metric
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
-from t3mpc_ros.evaluation.tuning.search_space import find_names
 from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.parameters.provenance import provenance
+from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.scripting.controllers import OwnMethod, as_controllers
 from t3mpc_ros.scripting.executors import workers_for
 from t3mpc_ros.scripting.plants import NoiseLaw

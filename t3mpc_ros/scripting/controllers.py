@@ -27,8 +27,7 @@ from t3mpc_ros.evaluation.loop import Method
 from t3mpc_ros.evaluation.method import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.methods import methods_for, require_libraries
 from t3mpc_ros.evaluation.scenario import Scenario
-from t3mpc_ros.evaluation.tuning.search_space import find_names
-from t3mpc_ros.parameters.table import Parameters
+from t3mpc_ros.parameters.table import Parameters, find_names
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
 
 Array = NDArray[np.float64]

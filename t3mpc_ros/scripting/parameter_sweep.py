@@ -26,9 +26,9 @@ from t3mpc_ros.evaluation.paper.experiment_runs import source_digest
 from t3mpc_ros.evaluation.reporting import Table, finite, format_interval
 from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
-from t3mpc_ros.evaluation.tuning.search_space import find_names
 from t3mpc_ros.evaluation.workers import Job, JobError, WorkerPool, map_jobs
 from t3mpc_ros.parameters.provenance import provenance
+from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.scripting.comparison_runs import checked_seeds
 from t3mpc_ros.scripting.controllers import Controller, FileController, as_controllers
 from t3mpc_ros.scripting.executors import workers_for

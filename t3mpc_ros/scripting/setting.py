@@ -17,8 +17,8 @@ from t3mpc_ros.evaluation.scenario import (
     check_name,
 )
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
-from t3mpc_ros.evaluation.tuning.search_space import find_names
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.scripting.plants import (
     LawNoise,
     NoiseLaw,

@@ -10,7 +10,7 @@ from typing import ClassVar
 import pytest
 
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
-from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+from t3mpc_ros.parameters.table import ParameterError, Parameters, find_names, group, parameter
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 
 
@@ -207,3 +207,14 @@ def test_bounded_numbers_reject_values_out_of_range():
     for text in ('x', '1.5', ''):
         with pytest.raises(ValueError, match='invalid literal'):
             bounded_int(1, 5)(text)
+
+
+def test_names_that_are_not_known_are_refused_with_the_nearest():
+    known = ['PI + feed-forward', 'linear MPC preview', 'DMC']
+    words = r'must be one of PI \+ feed-forward, linear MPC preview, DMC: got linear mpc p; '
+    with pytest.raises(ValueError, match=words + 'did you mean linear MPC preview'):
+        find_names('method', ['linear mpc p'], known)
+    with pytest.raises(ValueError, match='got xyz$'):
+        find_names('method', ['xyz'], known)
+    assert find_names('method', [], known) == ()
+    assert find_names('method', ['dmc', 'pi-feed-forward'], known) == ('PI + feed-forward', 'DMC')
