@@ -74,7 +74,7 @@ def tuning(folder, begun, monkeypatch):
     path = folder / 'tuned.json'
     store = tune_methods(chosen, ['velocity'], 30, 1, path, evaluate=evaluate, resume=True)
     assert all(history_path(path, each, 'velocity').is_file() for each in chosen)
-    assert [*TunedParameters.load(path)] == [*store]
+    assert TunedParameters.load(path) == store
     return store.table()
 
 

@@ -279,7 +279,7 @@ def tune_methods(
 
 def history_path(path: Path, method: MethodDefinition, drive: str) -> Path:
     """Return where the history of one search is kept: in a folder beside ``path``."""
-    return path.with_suffix('.history') / f'{method.short}.{drive}.json'
+    return path.with_suffix('.history') / f'{method.short}.{drive}.jsonl'
 
 
 def _show_progress(bar: 'tqdm[int]', standing: SearchProgress) -> None:

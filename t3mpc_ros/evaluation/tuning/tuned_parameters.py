@@ -2,21 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tuned parameters of all methods in one JSON file of the package.
 
-The file holds all parameters of a method, not only the tuned ones: a later change of a default
-does not change what was compared. A file that does not fit the parameter tables is rejected.
+The file holds all parameters of a method, not only the tuned ones: it shows what was compared
+when a default changes later.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 import json
-import math
 from pathlib import Path
-from types import MappingProxyType, NoneType
-from typing import Any, Self, TypeVar, get_args, get_origin, get_type_hints
+from typing import Self, TypeVar
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.reporting import Table
-from t3mpc_ros.parameters.table import ParameterError, Parameters, nearest_hint
+from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 PACKAGED_FILE = Path(__file__).resolve().parent / 'tuned.json'
 """Bundled file of tuned parameters."""
@@ -29,22 +27,22 @@ class StoreError(ValueError):
     """A file of tuned parameters is invalid; the text gives position and reason."""
 
 
-@dataclass(frozen=True, slots=True)
-class TuningBudget:
+@dataclass(frozen=True)
+class TuningBudget(Parameters):
     """What a tuning was given: a comparison is fair when it is equal for all."""
 
-    evaluations: int
-    search_seed: int
-    training_seeds: tuple[int, ...]
-    """Runs of one evaluation; run i has noise level i, counted round."""
-    noise_levels: tuple[float, ...]
-    """Variances of the measured wheel speeds, (rad/s)²."""
-    duration: float
-    """Of each run, s."""
-    smoothness: float
-    """rho of the objective, s²."""
-    cases: tuple[str, ...] = ('nominal',)
-    """Run i has case i, counted round."""
+    evaluations: int = parameter(1, 'evaluations of the objective', bounds=(1, None))
+    search_seed: int = parameter(1, 'seed of the search')
+    training_seeds: tuple[int, ...] = parameter((), 'runs of one evaluation')
+    noise_levels: tuple[float, ...] = parameter(
+        (),
+        'noise of the wheel speeds, counted round the runs',
+        '(rad/s)²',
+        (0.0, None),
+    )
+    duration: float = parameter(0.0, 'length of each run', 's', (0.0, None))
+    smoothness: float = parameter(0.0, 'rho of the objective', 's²', (0.0, None))
+    cases: tuple[str, ...] = parameter(('nominal',), 'cases, counted round the runs')
 
     def __str__(self) -> str:
         seeds = ', '.join(map(str, self.training_seeds))
@@ -73,89 +71,47 @@ class TunedEntry:
     """Of this package, when it was found."""
 
 
-class TunedParameters:
+class TunedParameters(dict[tuple[str, str], TunedEntry]):
     """Tuned parameters by (method, drive); those for the digital twin have drive ``twin``."""
 
-    def __init__(self, entries: Mapping[tuple[str, str], TunedEntry] | None = None) -> None:
-        self._entries = dict(entries or {})
-
-    def __iter__(self) -> Iterator[tuple[str, str]]:
-        """Return every (method, drive), in order."""
-        return iter(sorted(self._entries))
-
-    def __len__(self) -> int:
-        return len(self._entries)
-
-    def __contains__(self, key: object) -> bool:
-        return key in self._entries
-
     @classmethod
-    def load(
-        cls, path: Path = PACKAGED_FILE, types: Mapping[str, type[Parameters]] | None = None
-    ) -> Self:
-        """Return the content of a file.
-
-        With ``types``, the table of each method, every value is checked, and a method that is not
-        in it is refused.
-
-        Raises
-        ------
-        StoreError
-            What it holds is not what :meth:`save` writes, or does not fit the tables.
-        """
+    def load(cls, path: Path = PACKAGED_FILE) -> Self:
+        """Return the content of a file; raise :class:`StoreError` if it is no such file."""
         try:
-            content = json.loads(
-                path.read_text(encoding='utf-8'),
-                parse_constant=_refuse_constant,
-                object_pairs_hook=_refuse_twice,
+            content = json.loads(path.read_text(encoding='utf-8'))
+            if content['format'] != _FORMAT:
+                raise StoreError(f'format must be {_FORMAT}: got {content["format"]!r}')
+            return cls(
+                {
+                    (method, drive): _entry(**found)
+                    for method, drives in content['methods'].items()
+                    for drive, found in drives.items()
+                }
             )
-            store = cls(_entries(content))
-            if types is not None:
-                store.check(types)
-        except (StoreError, ValueError) as error:
-            raise StoreError(f'{path}: {error}') from error
-        return store
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise StoreError(f'{path} holds no tuned parameters: {error}') from error
 
     def save(self, path: Path) -> None:
         """Write the file, whole or not at all."""
-        methods: dict[str, dict[str, Any]] = {}
-        for method, drive in self:
-            entry = self._entries[method, drive]
-            found = asdict(replace(entry, values=dict(entry.values)))
-            methods.setdefault(method, {})[drive] = found
+        methods: dict[str, dict[str, object]] = {}
+        for (method, drive), entry in sorted(self.items()):
+            methods.setdefault(method, {})[drive] = asdict(
+                replace(entry, values=dict(entry.values))
+            )
         content = {'format': _FORMAT, 'methods': methods}
         text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
         write_atomically(path, text + '\n')
 
     def put(self, method: str, drive: str, entry: TunedEntry) -> None:
         """Add or replace an entry."""
-        self._entries[method, drive] = entry
+        self[method, drive] = entry
 
     def entry(self, method: str, drive: str) -> TunedEntry:
         """Return what was found for a method in a drive."""
-        try:
-            return self._entries[method, drive]
-        except KeyError:
+        if (method, drive) not in self:
             known = ', '.join(' in '.join(key) for key in self) or 'nothing'
-            raise StoreError(
-                f'{method} was not tuned in drive {drive}; what was: {known}'
-            ) from None
-
-    def parameters(self, method: str, drive: str, table: type[T]) -> T:
-        """Return the tuned parameters of a method as its table."""
-        entry = self.entry(method, drive)
-        known = [row.name for row in table.specs()]
-        where = f'{method}, {drive}'
-        for name in [*entry.values, *entry.tuned]:
-            if name not in known:
-                raise StoreError(f'{where}: there is no setting {name}{nearest_hint(name, known)}')
-        missing = [name for name in known if name not in entry.values]
-        if missing:
-            raise StoreError(f'{where}: settings are missing: {", ".join(missing)}')
-        try:
-            return table.from_dict(entry.values)
-        except ParameterError as error:
-            raise StoreError(f'{where}: {error}') from error
+            raise StoreError(f'{method} was not tuned in drive {drive}; what was: {known}')
+        return self[method, drive]
 
     def applied(self, method: str, drive: str, start: T) -> T:
         """Return ``start`` with the parameters that were tuned; all others stay as they are."""
@@ -165,31 +121,22 @@ class TunedParameters:
         except ParameterError as error:
             raise StoreError(f'{method}, {drive}: {error}') from error
 
-    def check(self, types: Mapping[str, type[Parameters]]) -> None:
-        """Raise :class:`StoreError` unless every entry fits the table of its method."""
-        for method, drive in self:
-            if method not in types:
-                raise StoreError(f'there is no method {method}{nearest_hint(method, types)}')
-            self.parameters(method, drive, types[method])
-
     def check_equal(self) -> None:
         """Raise :class:`StoreError` unless all entries of a drive were given the same budget."""
         first: dict[str, tuple[str, str]] = {}
-        for key in self:
+        for key, entry in self.items():
             other = first.setdefault(key[1], key)
-            ours, others = self._entries[key].budget, self._entries[other].budget
-            if ours != others:
+            if entry.budget != self[other].budget:
                 raise StoreError(
-                    f'{key[0]}, {key[1]} was tuned with {ours}; '
-                    f'{other[0]}, {other[1]} with {others}'
+                    f'{key[0]}, {key[1]} was tuned with {entry.budget}; '
+                    f'{other[0]}, {other[1]} with {self[other].budget}'
                 )
 
     def table(self) -> str:
         """Return the improvement by tuning as a Markdown table."""
         head = 'method', 'drive', 'objective at start (rad/s)', 'tuned', 'tuned parameters'
         rows = []
-        for method, drive in self:
-            entry = self._entries[method, drive]
+        for (method, drive), entry in sorted(self.items()):
             start = entry.start_objective
             first = 'none' if start is None else f'{start:.4f}'
             numbers = f'{entry.objective:.4f}', str(len(entry.tuned))
@@ -197,78 +144,17 @@ class TunedParameters:
         return Table('', (*head, 'evaluations'), rows).markdown()
 
 
-def _entries(content: object) -> dict[tuple[str, str], TunedEntry]:
-    top = _object(content, 'the file', {'format', 'methods'})
-    if top['format'] != _FORMAT:
-        raise StoreError(f'format must be {_FORMAT}: got {top["format"]!r}')
-    return {
-        (method, drive): _entry(entry, f'{method}, {drive}')
-        for method, drives in _object(top['methods'], 'methods').items()
-        for drive, entry in _object(drives, method).items()
-    }
-
-
-def _entry(content: object, where: str) -> TunedEntry:
-    entry: TunedEntry = _decoded(TunedEntry, content, where)
-    for name in entry.tuned:
-        if name not in entry.values:
-            raise StoreError(f'{where}: {name} was tuned, but has no value')
-    if entry.budget.evaluations < 1:
-        raise StoreError(f'{where}: budget: evaluations must be at least 1: got 0')
-    return entry
-
-
-def _decoded(kind: Any, content: Any, where: str) -> Any:
-    """Return JSON content as an annotated type, or raise :class:`StoreError` with its place."""
-    if kind in (TunedEntry, TuningBudget):
-        hints = get_type_hints(kind)
-        read = _object(content, where, set(hints))
-        return kind(
-            **{name: _decoded(hints[name], read[name], f'{where}: {name}') for name in hints}
-        )
-    arguments = get_args(kind)
-    if NoneType in arguments:
-        return None if content is None else _decoded(arguments[0], content, where)
-    if get_origin(kind) is tuple:
-        if not isinstance(content, list) or not content:
-            raise StoreError(f'{where} must be a list that is not empty: got {content!r}')
-        return tuple(_decoded(arguments[0], each, where) for each in content)
-    if kind is str:
-        if not isinstance(content, str) or not content:
-            raise StoreError(f'{where} must be a text: got {content!r}')
-        return content
-    if kind in (int, float):
-        what, allowed = ('a whole number', int) if kind is int else ('a number', int | float)
-        if isinstance(content, bool) or not isinstance(content, allowed):
-            raise StoreError(f'{where} must be {what}: got {content!r}')
-        if not (math.isfinite(content) and content >= 0):
-            raise StoreError(f'{where} must be at least 0 and finite: got {content}')
-        return kind(content)
-    # JSON has no tuples, and a parameter of many values is one.
-    values = _object(content, where).items()
-    return MappingProxyType(
-        {name: tuple(value) if isinstance(value, list) else value for name, value in values}
-    )
-
-
-def _object(content: object, where: str, names: set[str] | None = None) -> dict[str, Any]:
-    if not isinstance(content, dict):
-        raise StoreError(f'{where} must be an object: got {type(content).__name__}')
-    if names is not None:
-        for problem, found in (('lacks', names - set(content)), ('has', set(content) - names)):
-            if found:
-                raise StoreError(f'{where} {problem} {", ".join(sorted(found))}')
-    return content
-
-
-def _refuse_constant(text: str) -> float:
-    raise StoreError(f'every number must be finite: got {text}')
-
-
-def _refuse_twice(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    result: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in result:
-            raise StoreError(f'{name} is given twice')
-        result[name] = value
-    return result
+def _entry(
+    values: Mapping[str, object],
+    tuned: list[str],
+    objective: float,
+    start_objective: float | None,
+    budget: Mapping[str, object],
+    version: str,
+) -> TunedEntry:
+    """Return an entry of the file; JSON has lists in place of tuples."""
+    made = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+    given = TuningBudget.from_dict(budget)
+    if missing := {*tuned} - {*made}:
+        raise StoreError(f'{", ".join(sorted(missing))} was tuned, but has no value')
+    return TunedEntry(made, tuple(tuned), objective, start_objective, given, version)
