@@ -5,6 +5,8 @@
 import argparse
 from pathlib import Path
 
+from t3mpc_ros.parameters.command_line import bounded_int
+
 DRIVES = {'servo': 'velocity', 'torque': 'torque'}
 OUTPUT = Path('model.npz')
 SEEDS = 5
@@ -26,7 +28,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     )
     parser.add_argument(
         '--seeds',
-        type=int,
+        type=bounded_int(1, 20),
         default=SEEDS,
         help=f'runs with and without the model after the training (default {SEEDS})',
     )
@@ -74,17 +76,15 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.training.simulated_runs import (
         assess,
         fit_simulated_runs,
-        held_out_seeds,
         origin,
     )
 
     if options.keep_predictor:
         raise ValueError('--keep-predictor is for bags')
-    seeds = held_out_seeds(options.seeds)
     drive = DRIVES[options.robot]
     pretrained, used = fit_simulated_runs(drive)
     save_model(options.output, pretrained, {**used.to_dict(), 'drive': drive}, origin(drive))
-    print(assess(drive, used, pretrained, seeds, progress=True))
+    print(assess(drive, options.seeds, progress=True))
     print(f'saved {options.output.resolve()}')
     return 0
 

@@ -157,7 +157,6 @@ CASES = [
     ('exponents', {EXPONENTS: ModuleNotFoundError('x', name='pyarrow')}, 1, 'pyarrow'),
     ('train bag --robot torque', {}, 1, 'robot must be servo for bags: got torque'),
     ('train --keep-predictor', {}, 1, '--keep-predictor is for bags'),
-    ('train --seeds 0', {}, 1, 'seeds must be from 1 to'),
     ('tune --robot none', {}, 1, 'robot must be twin, servo, torque or an existing bag: got none'),
     ('tune --robot key --resume', {}, 1, 'are for simulated robots: got a bag'),
     ('compare --methods nothing', {}, 1, 'method must be one of'),

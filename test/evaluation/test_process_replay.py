@@ -17,7 +17,6 @@ from rosbags.typesys import Stores, get_typestore
 from support.golden_bags import (
     GOLDEN_SCENARIOS,
     ControllerBag,
-    GoldenScenario,
     RecordedController,
     run_golden_scenario,
 )
@@ -50,7 +49,6 @@ from t3mpc_ros.evaluation.process_replay.controller_replay import replay_control
 from t3mpc_ros.evaluation.process_replay.divergence_figure import write_divergence_figure
 from t3mpc_ros.evaluation.process_replay.journal_alignment import commands_of, match
 from t3mpc_ros.evaluation.topic_roles import SCALARS
-from t3mpc_ros.evaluation.training.training_data import load_training_data
 from t3mpc_ros.geometry.types import BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.simulation.world import load_world
@@ -165,19 +163,6 @@ def test_scalars_after_a_lost_input_are_called_approximate(bag, tmp_path):
         run = load_run(recording)
     assert set(run.absent) >= SCALARS
     assert not any('journal' in note for note in run.notes)
-
-
-def test_training_data_without_scalars_are_those_of_the_journal(tmp_path):
-    changes = {'composition': 'paper', 'predictive.dither': 4.0}
-    scenario = GoldenScenario(2, ((8.0, 12.0),), parameters=changes)
-    path = run_golden_scenario(scenario, tmp_path / 'whole')
-    bare = without(path, tmp_path / 'bare', lambda topic, k: topic[1:] in SCALARS)
-    (whole, *_), (rest, *_) = load_training_data(path), load_training_data(bare)
-    published = np.isfinite(whole.moves)
-    np.testing.assert_allclose(rest.moves[published], whole.moves[published], atol=ELSEWHERE)
-    assert np.count_nonzero(np.isfinite(rest.moves)) >= 2 * np.count_nonzero(published) > 50
-    for name in ('errors', 'rest', 'speeds', 'unexplained'):
-        np.testing.assert_array_equal(getattr(rest, name), getattr(whole, name))
 
 
 def test_golden_bags_are_there_and_small():

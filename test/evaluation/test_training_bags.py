@@ -1,20 +1,21 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``bag train``: recorded bags teach what the lab teaches, and the file says where it is from."""
+"""``bag train``: recorded bags train as simulated runs do; the file says where it is from."""
 
 import argparse
 import hashlib
 
 import numpy as np
 import pytest
-from support.training_runs import START, STEP, ClosedLoopObjective
+from support.training_runs import START, STEP, TrainingRun
 
 from t3mpc_ros.bag.run.model_file import load_model, read_model_header
 from t3mpc_ros.cli.bag import add_train_parser
 from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.method import MethodSpec
-from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
+from t3mpc_ros.evaluation.methods import FULL, methods
+from t3mpc_ros.evaluation.proposed_method import ProposedController
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
 from t3mpc_ros.evaluation.training import recorded_runs
 from t3mpc_ros.evaluation.training.fit import (
@@ -25,8 +26,8 @@ from t3mpc_ros.evaluation.training.fit import (
     skills,
     stretches,
 )
-from t3mpc_ros.evaluation.training.recorded_runs import fit_bags, mean_and_spread, spread_in_words
-from t3mpc_ros.evaluation.training.simulated_runs import full_parameters, training_data_of
+from t3mpc_ros.evaluation.training.recorded_runs import fit_bags, mean_and_spread, spread_text
+from t3mpc_ros.evaluation.training.simulated_runs import training_data_of
 from t3mpc_ros.evaluation.training.training_data import TrainingData
 
 pytestmark = pytest.mark.slow
@@ -36,10 +37,10 @@ RECORDED = (21, 22, 23)
 
 
 def lossy(tape, seed):
-    """Return the messages as a busy machine records them: late by turns, and some not at all."""
+    """Return the messages as a busy machine records them: late by turns, some commands not."""
     rng = np.random.default_rng(seed)
-    kept = tape.where(lambda t, topic, i: t < 1.0 or rng.random() > 0.002)
-    late = rng.exponential(5e5, round(SECONDS * 1e9 / STEP) + 1).astype(int).tolist()
+    kept = tape.where(lambda t, topic, i: topic != '/cmd_vel' or rng.random() > 0.002)
+    late = rng.exponential(5e5, round(SECONDS * 1e9 / STEP) + 2).astype(int).tolist()
     kept.rows = [(row[0] + late[(row[0] - START) // STEP], *row[1:]) for row in kept.rows]
     return kept
 
@@ -48,8 +49,7 @@ def lossy(tape, seed):
 def bags(tmp_path_factory):
     folder = tmp_path_factory.mktemp('recorded')
     loops = {
-        seed: ClosedLoopObjective(seed, SECONDS, tape=True, **{'predictive.dither': DITHER})
-        for seed in RECORDED
+        seed: TrainingRun(seed, SECONDS, **{'predictive.dither': DITHER}) for seed in RECORDED
     }
     return [
         lossy(loop.tape, seed).write(folder / f'run{seed}' / 'bag') for seed, loop in loops.items()
@@ -61,9 +61,8 @@ def model(bags):
     return fit_bags(bags)
 
 
-def lab_run(seed):
-    changes = {**full_parameters('velocity').to_dict(), 'predictive.dither': DITHER}
-    parameters = ProposedParameters.from_dict(changes)
+def simulated_run(seed):
+    parameters = methods('velocity')[FULL].parameters.with_values({'predictive.dither': DITHER})
     scenario = Scenario('servo', 'nominal', seed, SECONDS)
     return training_data_of(
         run(scenario, MethodSpec('full', ProposedController, parameters)), parameters
@@ -73,11 +72,11 @@ def lab_run(seed):
 def test_three_recorded_bags_train_as_well_as_three_simulations(model):
     """The same training data, the runs once rebuilt from lossy bags and once known exactly.
 
-    Judged on runs of the lab that neither has seen: skill within 5 %, and as much explained.
+    Judged on simulated runs that neither has seen: skill within 5 %, and as much explained.
     """
     parameters = model.parameters
     predictive = parameters.predictive
-    lab = TrainingData.joined([lab_run(seed) for seed in PRETRAINING_SEEDS])
+    lab = TrainingData.joined([simulated_run(seed) for seed in PRETRAINING_SEEDS])
     exact = fit_predictor(parameters, *periods(lab, predictive, parameters.rate)).weights
     prefix = 'predictive.'
     recorded = {
@@ -89,7 +88,7 @@ def test_three_recorded_bags_train_as_well_as_three_simulations(model):
     coefficients = fit_coefficients(parameters, lab), model.learnt['fuzzy.coefficients']
     found, shares = [], []
     for seed in HELD_OUT_SEEDS[:3]:
-        judge = lab_run(seed)
+        judge = simulated_run(seed)
         parts = stretches(*periods(judge, predictive, parameters.rate))
         found.append([skills(predictive, 0.05, w, parts) for w in (exact, recorded, nominal)])
         shares.append([explained(parameters, each, judge) for each in coefficients])
@@ -166,4 +165,4 @@ def test_mean_and_spread_leave_out_what_is_not_known():
     np.testing.assert_allclose(mean, [2.0, 5.0])
     assert spread[0] == pytest.approx(1.0)
     assert np.isnan(spread[1])
-    assert spread_in_words(values, 1.0) == '2.00 ± 1.00 / 5.00'
+    assert spread_text(values) == '2.00 ± 1.00 / 5.00'

@@ -4,10 +4,11 @@
 
 import numpy as np
 
-from support.bag_messages import START, STORE, number, odometry_message, twist_message
+from support.bag_messages import START, STORE
+from support.golden_bags import ControllerBag, RecordedController
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.control.controller import Controller, ControllerParameters
+from t3mpc_ros.control.controller import ControllerParameters
+from t3mpc_ros.evaluation.process_replay.replay_bag import TYPES as RECORDED
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, State, WheelSpeeds
@@ -15,7 +16,6 @@ from t3mpc_ros.simulation.plant.paper_plant import PaperRobot
 
 STEP = 10_000_000
 LEAD = 40
-WHEELS = ('right', 'left')
 GEOMETRY = WheelGeometry()
 
 
@@ -55,64 +55,55 @@ class Tape:
         return folder
 
 
-class ClosedLoopObjective:
-    """Runs the controller on the simulated robot, as the nodes close the loop."""
+class TapeBag(ControllerBag):
+    """Keeps the messages of a controller in a tape."""
 
-    def __init__(self, seed, duration, learnt=None, tape=False, off=(), **changes):
+    def __init__(self, tape):
+        self.tape = tape
+
+    def _write(self, topic, now_ns, data):
+        self.tape.rows.append((now_ns, f'/{topic}', RECORDED[topic], data))
+
+
+class TrainingRun:
+    """A controller on the simulated robot of the paper, recorded as by the nodes.
+
+    It is disabled in the control periods ``off``; ``learnt`` are its weights at the start.
+    """
+
+    def __init__(self, seed, duration, learnt=None, off=(), **changes):
         scenario = Scenario('servo', 'nominal', seed, duration)
         robot = PaperRobot(scenario.true_robot())
-        self.controller = Controller(ControllerParameters.from_dict(changes))
+        parameters = ControllerParameters.from_dict(changes)
+        table = {name: str(value) for name, value in parameters.to_dict().items()}
+        self.tape = Tape({'controller': table})
+        recorded = RecordedController(parameters, TapeBag(self.tape), START - 1)
+        self.controller = recorded.controller
         if learnt is not None:
-            self.controller.law.set_weights(learnt)
-        parameters = {
-            name: str(value) for name, value in self.controller.parameters.to_dict().items()
-        }
-        self.tape = Tape(
-            {'controller': {**parameters, 'terms_rate': '20.0', 'use_sim_time': 'False'}}
-        )
-        self.taped = tape
+            self.controller.set_weights(learnt)
         self.wanted = scenario.reference().speeds
         self.statuses, self.speeds, self.estimates, self.unexplained = [], [], [], []
+
+        def add_reference(k, now_ns):
+            twist = twist_from_wheels(WheelSpeeds(*self.wanted[k].tolist()), GEOMETRY)
+            recorded.add_reference(now_ns, State(START + k * STEP, ORIGIN, twist))
+
         for k in range(LEAD):
-            self._tell(k, 0)
+            add_reference(k, START)
         state = robot.advance(START)
         for k in range(scenario.steps):
-            heard_ns = START + k * STEP + 1_000_000
-            self._tell(k + LEAD, heard_ns - 500_000)
-            if off:
-                self.controller.enable(not off[0] <= k < off[1])
-            twist, status = self.controller.step(state.odometry)
-            self.statuses.append(status)
+            now_ns = START + k * STEP + 1_000_000
+            add_reference(k + LEAD, now_ns - 500_000)
+            if k in off:
+                recorded.enable(now_ns - 1, k == off[-1])
+            twist = recorded.step(now_ns, state.odometry)
+            self.statuses.append(self.controller.status)
             self.speeds.append(state.true_wheels)
             self.estimates.append(self.controller.actuation.speeds.copy())
             self.unexplained.append(self.controller.actuation.disturbance.copy())
-            if tape:
-                self._record(k, heard_ns, state.odometry, twist, status)
             state = robot.step(wheels_from_twist(twist, GEOMETRY))
         self.terms = np.array([status.terms for status in self.statuses])
         self.errors = -self.terms[:, 1] / self.controller.parameters.law.gain
-
-    def _tell(self, k, heard_ns):
-        twist = twist_from_wheels(WheelSpeeds(*self.wanted[k].tolist()), GEOMETRY)
-        motion = State(START + k * STEP, ORIGIN, twist)
-        self.controller.add_reference(motion)
-        if self.taped:
-            self.tape.add(
-                '/reference', heard_ns or START, odometry_message(motion.stamp_ns, motion.twist)
-            )
-
-    def _record(self, k, heard_ns, odometry, twist, status):
-        self.tape.add('/odom', heard_ns, odometry_message(odometry.stamp_ns, odometry.twist))
-        self.tape.add('/cmd_vel', heard_ns + 1_000_000, twist_message(twist))
-        if (k + 1) % 5:
-            return
-        for row, term in enumerate(TERM_NAMES):
-            for z, wheel in enumerate(WHEELS):
-                self.tape.add(
-                    f'/controller/terms/{term}/{wheel}',
-                    heard_ns + 2_000_000,
-                    number(status.terms[row, z]),
-                )
 
     def rmse(self, seconds):
         n = round(100 * seconds)

@@ -81,18 +81,27 @@ def replay_controller(
     controllers = make_controllers(inputs, changes) if controllers is None else controllers
     outputs = np.full((inputs.events.size, len(FIELDS)), math.nan)
     reasons: list[Reason | None] = [None] * len(outputs)
-    odometry, references = [*motions(inputs.odometry)], [*motions(inputs.references)]
-    parameters = ControllerParameters()
-    for session, controller in zip(inputs.sessions, controllers, strict=True):
-        for row, twist, status in _session_steps(
-            controller, session, changes, odometry, references
-        ):
-            outputs[row] = output_row(twist, status)
-            reasons[row] = status.reason
-        parameters = controller.parameters
+    for row, _, twist, status in replay_steps(inputs, controllers, changes):
+        outputs[row] = output_row(twist, status)
+        reasons[row] = status.reason
+    parameters = controllers[-1].parameters if controllers else ControllerParameters()
     fields = dict(zip(FIELDS, np.ascontiguousarray(outputs.T), strict=True))
     steps = len(reasons) - reasons.count(None)
     return ReplayResult(fields, tuple(reasons), steps, parameters, dict(changes))
+
+
+def replay_steps(
+    inputs: ControllerInputs,
+    controllers: Sequence[Controller],
+    changes: Mapping[str, object] | None = None,
+) -> Iterator[tuple[int, Controller, BodyTwist, Status]]:
+    """Process all events in their order; yield row, controller, command and status of outputs."""
+    odometry, references = [*motions(inputs.odometry)], [*motions(inputs.references)]
+    for session, controller in zip(inputs.sessions, controllers, strict=True):
+        for row, twist, status in _session_steps(
+            controller, session, changes or {}, odometry, references
+        ):
+            yield row, controller, twist, status
 
 
 def make_controllers(

@@ -16,10 +16,6 @@ Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 
-ALIKE = 100
-"""Commands on each side that determine which message a command belongs to."""
-
-
 @dataclass(frozen=True)
 class ConsumedMessages:
     """Recorded messages by event, as row numbers."""
@@ -85,24 +81,6 @@ def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> Cons
         int(lost.sum()),
         int(gaps.sum()),
     )
-
-
-def match_commands(odometry: Array, commands: Array) -> NDArray[np.int64]:
-    """Return the odometry message of each command, -1 without one, shape (m,).
-
-    The controller responds to each message it processes, in order: command j belongs to message
-    j + s, where s is the number of earlier messages without a command, from before the first
-    command or lost. Receive times (ascending, s) alone mislead: on a busy processor the next
-    message arrives before the command, and of two publishers the second may even be received
-    first. Both are brief, so s is the median over two seconds.
-    """
-    numbers = np.arange(commands.size)
-    behind = np.searchsorted(odometry, commands, side='right') - 1 - numbers
-    padded = np.pad(behind, ALIKE, mode='symmetric')
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * ALIKE + 1)
-    found: NDArray[np.int64] = numbers + np.median(windows, axis=1).astype(np.int64)
-    found[(found < 0) | (found >= odometry.size)] = -1
-    return found
 
 
 def commands_of(rows: Integers, published: Integers, sent: Integers) -> Integers:

@@ -91,8 +91,6 @@ def _response(values: Array, delta_lags: int, ahead: int) -> float:
 
 MIN_EXCITATION = 10.0
 """Least amount of usable data, s."""
-MIN_PERIODS = 40
-"""Least predictive periods of a segment without a gap: shorter ones do not show their phase."""
 JUDGED = 20
 """Least predictive periods without a gap for an evaluation."""
 UNCERTAIN = 0.5
@@ -117,67 +115,34 @@ class PredictorFit:
 
 
 def periods(
-    replay: TrainingData, parameters: PredictiveParameters, rate: float
+    data: TrainingData, parameters: PredictiveParameters, rate: float
 ) -> tuple[Array, Array]:
     """Return errors (rad/s) and moves (rad/s²) of each predictive period, oldest first, (N, 2).
 
     They are sampled as by the predictive controller: an error is the mean of the newest
-    ``average`` ones at the step that takes the sample, and v_p holds from that step on. The delay
-    of a published v_p shows in u, which jumps with v_p: a recording may therefore begin
-    at any time.
+    ``average`` ones at the step that takes the sample, and v_p holds from that step on.
 
-    Messages may be missing. Unknown values are NaN: errors that were reconstructed wrongly or not
-    at all, v_p in periods in which limits mostly cut u, and a whole row wherever a period has no
-    message, or runs are not contiguous. Nothing is fitted across such a gap, nor to an
-    error whose lags reach into one; all other rows count.
+    A row of NaN stands wherever v_p is unknown or runs are not contiguous; v_p is NaN in periods
+    in which limits mostly cut u. Nothing is fitted across such a gap, nor to an error whose lags
+    reach into one; all other rows count.
     """
-    decimation, average, span = (
-        parameters.decimation,
-        parameters.average,
-        parameters.decimation / rate,
-    )
+    decimation, average = parameters.decimation, parameters.average
     gap = np.full((1, 2), math.nan)
     errors, moves = [gap], [gap]
-    jumps = np.abs(np.diff(replay.rest, axis=0, prepend=replay.rest[:1])).sum(axis=1)
-    edges = [*np.flatnonzero(replay.begins).tolist(), len(replay)]
-    for first, last in pairwise(edges):
-        published = first + np.flatnonzero(np.isfinite(replay.moves[first:last]).all(axis=1))
-        published = _one_each(replay, published, span)
-        published = published[published >= first + decimation + average]
-        if published.size < MIN_PERIODS:
+    known = np.isfinite(data.moves.sum(axis=1))
+    edges = data.begins | (known != np.roll(known, 1))
+    for first, last in pairwise([*np.flatnonzero(edges).tolist(), len(data)]):
+        new = 1 + np.flatnonzero(np.diff(data.moves[first:last], axis=0).any(axis=1))
+        if not known[first] or not new.size:
             continue
-        interval = float(np.median(np.diff(replay.time[published])))
-        if interval > 1.5 * span:
-            raise TrainingError(
-                f'v_p must be published in each predictive period of {span:g} s: it was every '
-                f"{interval:.2g} s; set the controller's terms_rate to {1.0 / span:g} Hz"
-            )
-        # The median: limits make u jump too, but rarely.
-        delays = [np.median(jumps[published - late]) for late in range(decimation)]
-        starts = published - np.argmax(delays)
-        seen = starts[:, None] - np.arange(average)
+        starts = np.arange(first + new[0] % decimation, last, decimation)
+        starts = starts[starts >= first + average - 1]
         applied = np.minimum(starts[:, None] + np.arange(decimation), last - 1)
-        error, move = replay.errors[seen].mean(axis=1), replay.moves[published]
-        whole = (average - 0.5) / rate > replay.time[starts] - replay.time[seen[:, -1]]
-        error[~whole] = math.nan
-        move[replay.limited[applied].mean(axis=1) > 0.5] = math.nan
-        torn = 1 + np.flatnonzero(np.abs(np.diff(replay.time[starts]) / span - 1.0) > 0.5)
-        errors += [np.insert(error, torn, math.nan, axis=0), gap]
-        moves += [np.insert(move, torn, math.nan, axis=0), gap]
+        move = data.moves[starts]
+        move[data.limited[applied].mean(axis=1) > 0.5] = math.nan
+        errors += [data.errors[starts[:, None] - np.arange(average)].mean(axis=1), gap]
+        moves += [move, gap]
     return np.concatenate(errors), np.concatenate(moves)
-
-
-def _one_each(replay: TrainingData, rows: NDArray[np.int64], span: float) -> NDArray[np.int64]:
-    """Return one row per predictive period: the first with the same v_p."""
-    kept: list[int] = []
-    for row in rows.tolist():
-        if (
-            not kept
-            or replay.time[row] - replay.time[kept[-1]] > 0.9 * span
-            or not np.array_equal(replay.moves[row], replay.moves[kept[-1]])
-        ):
-            kept.append(row)
-    return np.array(kept, dtype=np.int64)
 
 
 def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -> PredictorFit:
@@ -301,7 +266,7 @@ def skills(
         return 1.0 - missed / persistence_mse
 
 
-def fit_coefficients(parameters: Nt3fsMpcParameters, replay: TrainingData) -> Array:
+def fit_coefficients(parameters: Nt3fsMpcParameters, data: TrainingData) -> Array:
     r"""Return the coefficients with which g explains the estimator residual, (2, 2 r lambda).
 
     .. math:: \alpha \leftarrow P\left[\alpha + \gamma_n \Phi(\chi)
@@ -314,7 +279,7 @@ def fit_coefficients(parameters: Nt3fsMpcParameters, replay: TrainingData) -> Ar
     projection of the adaptation. d is the estimator residual, as seen by the control
     law; g is to cancel it.
     """
-    rows = _informative_rows(parameters, replay)
+    rows = _informative_rows(parameters, data)
     decimation = parameters.predictive.decimation
     if rows.size * decimation < MIN_EXCITATION * parameters.rate:
         raise TrainingError(
@@ -327,32 +292,31 @@ def fit_coefficients(parameters: Nt3fsMpcParameters, replay: TrainingData) -> Ar
     for number in range(PASSES):
         estimator.configure(replace(how, step_limit=SHARE / (1.0 + number)))
         for row in rows:
-            estimate = estimator.evaluate(replay.speeds[row])
-            estimator.adapt(replay.unexplained[row] - estimate, 1.0)
+            estimate = estimator.evaluate(data.speeds[row])
+            estimator.adapt(data.unexplained[row] - estimate, 1.0)
     return estimator.coefficients.copy()
 
 
-def explained(parameters: Nt3fsMpcParameters, coefficients: Array, replay: TrainingData) -> Array:
+def explained(parameters: Nt3fsMpcParameters, coefficients: Array, data: TrainingData) -> Array:
     """Return the share of the variance of the unexplained acceleration that g explains, (2,).
 
     Negative where g is worse than zero; NaN without usable rows.
     """
-    rows = _informative_rows(parameters, replay)
+    rows = _informative_rows(parameters, data)
     if rows.size < 2:
         return np.full(2, math.nan)
     estimator = FuzzyEstimator(parameters.fuzzy, parameters.adaptation)
     estimator.coefficients = coefficients
-    wanted = replay.unexplained[rows]
-    estimates = np.array([estimator.evaluate(replay.speeds[row]) for row in rows])
+    wanted = data.unexplained[rows]
+    estimates = np.array([estimator.evaluate(data.speeds[row]) for row in rows])
     missed = np.mean((wanted - estimates) ** 2, axis=0)
     share: Array = 1.0 - missed / np.maximum(wanted.var(axis=0), 1e-12)
     return share
 
 
-def _informative_rows(parameters: Nt3fsMpcParameters, replay: TrainingData) -> NDArray[np.int64]:
-    """Return the rows with a known unexplained acceleration, one in each predictive period."""
+def _informative_rows(parameters: Nt3fsMpcParameters, data: TrainingData) -> NDArray[np.int64]:
+    """Return the rows at which the estimate has settled, one in each predictive period."""
     settling = round(SETTLING * parameters.rate)
-    since = np.arange(len(replay))
-    since -= np.maximum.accumulate(np.where(replay.begins, since, 0))
-    known = np.isfinite(replay.errors).all(axis=1) & (since >= settling)
-    return np.flatnonzero(known)[:: parameters.predictive.decimation]
+    since = np.arange(len(data))
+    since -= np.maximum.accumulate(np.where(data.begins, since, 0))
+    return np.flatnonzero(since >= settling)[:: parameters.predictive.decimation]

@@ -3,10 +3,11 @@
 """Model fitted to recorded bags, of a simulated robot or a real one, and its cross-validation."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 import hashlib
 import math
 from pathlib import Path
+import warnings
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
 from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.evaluation.proposed_method import random_output_weights
+from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.topic_roles import bag_display_name
 from t3mpc_ros.evaluation.training.fit import (
     explained,
@@ -27,9 +29,9 @@ from t3mpc_ros.evaluation.training.fit import (
 from t3mpc_ros.evaluation.training.training_data import (
     TrainingData,
     TrainingError,
+    check_compatible,
     load_training_data,
 )
-from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.mpc.predictive_controller import PredictiveController
 from t3mpc_ros.parameters.provenance import provenance
 
@@ -54,19 +56,15 @@ class Fold:
     """Explained share of the variance of the unexplained acceleration, by g, (2,)."""
 
 
-def blocks(replay: TrainingData, count: int) -> list[TrainingData]:
+def blocks(data: TrainingData, count: int) -> list[TrainingData]:
     """Return a run in ``count`` parts of equal length, each a run of its own."""
     if count < 2:
         raise ValueError(f'folds must be at least 2: got {count}')
-    edges = np.linspace(0, len(replay), count + 1).round().astype(int).tolist()
-    parts = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
-        part = TrainingData(
-            *(getattr(replay, item.name)[low:high] for item in fields(TrainingData))
-        )
-        begins = part.begins.copy()
-        begins[:1] = True
-        parts.append(replace(part, begins=begins))
+    names = [item.name for item in fields(TrainingData)]
+    columns = zip(*(np.array_split(getattr(data, name), count) for name in names), strict=True)
+    parts = [TrainingData(*(column.copy() for column in each)) for each in columns]
+    for part in parts:
+        part.begins[:1] = True
     return parts
 
 
@@ -115,56 +113,43 @@ def cross_validate(
 
 def mean_and_spread(values: Sequence[Array]) -> tuple[Array, Array]:
     """Return mean and standard deviation over the folds with a value."""
-    table = np.stack(values)
-    known = np.isfinite(table)
-    count = known.sum(axis=0)
-    with np.errstate(invalid='ignore', divide='ignore'):
-        mean = np.where(known, table, 0.0).sum(axis=0) / count
-        squares = np.where(known, (table - mean) ** 2, 0.0).sum(axis=0)
-        return mean, np.sqrt(squares / (count - 1))
+    with warnings.catch_warnings():  # there may be one fold with a value, or none
+        warnings.simplefilter('ignore', RuntimeWarning)
+        return np.nanmean(values, axis=0), np.nanstd(values, axis=0, ddof=1)
 
 
 def fold_table(folds: Sequence[Fold]) -> str:
-    """Return the result as lines: rows are folds, each number is (right/left)."""
-    rows = [(f'{fold.name} ({fold.judged:.1f} s)', fold) for fold in folds]
-    width = max(len(f'skill, {MIDDLE}'), *(len(name) for name, _ in rows))
-    lines = []
-    titles = list(folds[0].skills)
-    for row, when in enumerate((NEXT_STEP, MIDDLE) if titles else ()):
-        lines.append(_line(f'skill, {when}', titles, width))
-        for name, fold in rows:
-            lines.append(_line(name, [pair(fold.skills[t][row], '.2f') for t in titles], width))
-        spreads = [spread_in_words([fold.skills[t][row] for fold in folds], 1.0) for t in titles]
-        lines.append(_line('mean ± spread', spreads, width))
-    lines.append(_line('g explains', [], width))
-    for name, fold in rows:
-        lines.append(_line(name, [f'{pair(100.0 * fold.explained, ".0f")} %'], width))
-    shares = spread_in_words([fold.explained for fold in folds], 100.0)
-    lines.append(_line('mean ± spread', [f'{shares} %'], width))
-    return '\n'.join(lines)
+    """Return the result in Markdown: rows are folds, each number is (right/left)."""
+    names = [f'{fold.name} ({fold.judged:.1f} s)' for fold in folds]
+    columns = {
+        f'skill, {when}': {
+            title: [fold.skills[title][row] for fold in folds] for title in folds[0].skills
+        }
+        for row, when in enumerate((NEXT_STEP, MIDDLE) if folds[0].skills else ())
+    }
+    columns['g explains'] = {'share': [fold.explained for fold in folds]}
+    tables = []
+    for what, measured in columns.items():
+        cells = [[pair(value) for value in values] for values in measured.values()]
+        spreads = [spread_text(values) for values in measured.values()]
+        rows = [*zip(names, *cells, strict=True), ('mean ± spread', *spreads)]
+        tables.append(Table('', (what, *measured), rows).markdown())
+    return '\n\n'.join(tables)
 
 
-def _line(title: str, cells: Sequence[str], width: int) -> str:
-    return f'  {title:<{width}}  {"".join(f"{cell:<31}" for cell in cells)}'.rstrip()
-
-
-def spread_in_words(values: Sequence[Array], scale: float) -> str:
+def spread_text(values: Sequence[Array]) -> str:
     """Return mean ± standard deviation of both wheels as text."""
-    mean, spread = mean_and_spread(values)
-    form = '.2f' if scale == 1.0 else '.0f'
     return ' / '.join(
-        f'{scale * m:{form}} ± {scale * s:{form}}' if math.isfinite(s) else f'{scale * m:{form}}'
-        for m, s in zip(mean, spread, strict=True)
+        f'{mean:.2f} ± {spread:.2f}' if math.isfinite(spread) else f'{mean:.2f}'
+        for mean, spread in zip(*mean_and_spread(values), strict=True)
     )
 
 
-def pair(values: Array, form: str) -> str:
+def pair(values: Array, form: str = '.2f') -> str:
     """Return the numbers of both wheels as text, a dash for an unknown one."""
     return '/'.join(f'{value:{form}}' if math.isfinite(value) else '–' for value in values)
 
 
-FREE = ('predictive.dither',)
-"""Parameters that may differ between the bags of one model, of all that affect the fit."""
 FOLDS = 5
 """Number of blocks of a single bag."""
 STORAGE = ('.mcap', '.db3')
@@ -205,30 +190,35 @@ def fit_bags(
     origins, lines = [], []
     parameters: ControllerParameters | None = None
     for folder in folders:
-        replay, found, notes = load_training_data(folder)
+        data, found, notes = load_training_data(folder)
         lines += [f'note: {note}' for note in notes]
         parameters = parameters or found
         check_compatible(parameters, found, folders[0], folder)
         name = bag_display_name(folder)
         while name in runs:
             name += "'"
-        runs[name] = replay
+        runs[name] = data
         origins.append({'name': name, **origin_of(folder)})
     if parameters is None:
         raise TrainingError('at least one bag must be given')
     if len({str(each['files']) for each in origins}) < len(origins):
         raise TrainingError('each bag must be given once: two have the same content')
-    replay = TrainingData.joined(list(runs.values()))
+    whole = TrainingData.joined(list(runs.values()))
     lines.append(
-        f'rebuilt {len(replay) / parameters.rate:.1f} s of control from {len(folders)} bag'
+        f'rebuilt {len(whole) / parameters.rate:.1f} s of control from {len(folders)} bag'
         f'{"s" if len(folders) > 1 else ""}'
     )
     # First fitted to all: errors that concern all bags are reported before the folds.
     learnt = Nt3fsMpcController(parameters).get_weights()
-    learnt['fuzzy.coefficients'] = fit_coefficients(parameters, replay)
+    learnt['fuzzy.coefficients'] = fit_coefficients(parameters, whole)
     status = 'predictor: pre-trained on the nominal loop, unchanged'
     if not keep_predictor:
-        fit = fit_predictor(parameters, *periods(replay, parameters.predictive, parameters.rate))
+        try:
+            fit = fit_predictor(
+                parameters, *periods(whole, parameters.predictive, parameters.rate)
+            )
+        except TrainingError as error:
+            raise TrainingError('\n'.join([str(error), *lines])) from error
         learnt |= {f'predictive.{name}': value for name, value in fit.weights.items()}
         status = (
             f'predictor: fitted to {fit.duration:.1f} s; the effect of v_p is known to '
@@ -236,7 +226,7 @@ def fit_bags(
         )
     parts = runs
     if len(runs) == 1:
-        parts = {f'block {i + 1}': part for i, part in enumerate(blocks(replay, count))}
+        parts = {f'block {i + 1}': part for i, part in enumerate(blocks(whole, count))}
     folds = cross_validate(parameters, parts, keep_predictor=keep_predictor)
     lines += [
         f'cross-validated in {len(folds)} folds: each {"bag" if len(runs) > 1 else "block"} is '
@@ -298,17 +288,3 @@ def origin_of(folder: Path) -> dict[str, object]:
         made_by = dict(recording.metadata_records.get('provenance', {}))
         start, duration = recording.start_ns, recording.duration
     return {'files': files, 'start_ns': start, 'duration_s': duration, 'made_by': made_by}
-
-
-def check_compatible(
-    first: ControllerParameters, other: ControllerParameters, path: Path, other_path: Path
-) -> None:
-    """Raise :class:`TrainingError` unless both models would be comparable."""
-    mine, its = first.to_dict(), other.to_dict()
-    names = [spec.name for spec in Nt3fsMpcParameters.specs() if spec.name not in FREE]
-    names += [spec.name for spec in WheelGeometry.specs()]
-    if differing := [name for name in names if mine[name] != its[name]]:
-        raise TrainingError(
-            f'{path} and {other_path} must have the same settings; they differ in '
-            + ', '.join(f'{name} ({mine[name]}, {its[name]})' for name in differing)
-        )
