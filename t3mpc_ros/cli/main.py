@@ -128,13 +128,14 @@ def _new_run(folder: Path) -> Path:
 
 
 def _estimation(options: argparse.Namespace) -> int:
-    from t3mpc_ros.evaluation.open_loop_estimation import compare, table
+    from t3mpc_ros.evaluation.open_loop_estimation import compare
+    from t3mpc_ros.evaluation.paper.results import estimation
     from t3mpc_ros.evaluation.reporting import strict_json
 
     results = compare(
         seeds=options.seeds, duration=options.duration, normalised_gain=options.gain, progress=True
     )
-    print(table(results))
+    print('\n\n'.join(table.markdown() for table in estimation(results)))
     if options.json:
         text = strict_json([result.record() for result in results])
         options.json.write_text(text, encoding='utf-8')

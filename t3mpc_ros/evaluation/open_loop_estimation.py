@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
-from t3mpc_ros.evaluation.reporting import Table, progress_bar
+from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
 from t3mpc_ros.fuzzy.inference import FuzzyParameters
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
@@ -190,86 +190,29 @@ def compare(
     if duration <= SETTLE:
         raise ValueError(f'duration must be more than {SETTLE:g} s: got {duration}')
     results = []
-    bar = progress_bar(len(variances) * seeds, show=progress)
-    for variance in variances:
-        figures: dict[str, list[tuple[float, float]]] = {
-            name: [] for name in (*KINDS, NO_FUZZY_SYSTEM)
-        }
-        for seed in range(1, seeds + 1):
-            run = simulate_open_loop(torque_robot(variance, seed), duration, seed)
-            first = round(SETTLE / run.period)
+    with progress_bar(len(variances) * seeds, show=progress) as bar:
+        for variance in variances:
+            figures: dict[str, list[tuple[float, float]]] = {
+                name: [] for name in (*KINDS, NO_FUZZY_SYSTEM)
+            }
+            for seed in range(1, seeds + 1):
+                run = simulate_open_loop(torque_robot(variance, seed), duration, seed)
+                for name, found in figures.items():
+                    found.append(_errors(run, name, variance, normalised_gain))
+                bar.update()
             for name, found in figures.items():
-                fuzzy = (
-                    None if name == NO_FUZZY_SYSTEM else estimator(name, variance, normalised_gain)
-                )
-                speeds, unknown = estimate(run, fuzzy)
-                found.append(
-                    (
-                        rms((speeds - run.speeds)[first:]),
-                        rms((unknown[:-1] - run.target)[first:]),
-                    )
-                )
-            bar.update()
-        for name, found in figures.items():
-            speed, unknown_part = zip(*found, strict=True)
-            results.append(EstimationResult(name, variance, speed, unknown_part))
-    bar.close()
+                results.append(EstimationResult(name, variance, *zip(*found, strict=True)))
     return results
 
 
-def table(results: Sequence[EstimationResult]) -> str:
-    """Return the comparison in Markdown: mean ± half the 95 % interval over seeds.
-
-    Three tables: RMSE of chi_hat, how much more that is than type 3's with the same seeds, and
-    RMSE of g. The last column is the growth of the mean from the first to the last noise.
-    """
-    variances = list(dict.fromkeys(result.noise_variance for result in results))
-    kinds = list(dict.fromkeys(result.kind for result in results))
-    by = {(result.kind, result.noise_variance): result for result in results}
-    noises = [f'noise {variance:g}' for variance in variances]
-
-    def measured(kind: str, name: str) -> list[str]:
-        row = [getattr(by[kind, variance], name) for variance in variances]
-        return [kind, *map(_spread, row), _growth(row)]
-
-    def excess(kind: str) -> list[str]:
-        pairs = [(by[kind, variance], by['type3', variance]) for variance in variances]
-        return [kind, *(_spread(difference(one, base), '+') for one, base in pairs)]
-
-    noise = [f'{math.sqrt(variance):.4f}' for variance in variances]
-    tables = [
-        Table(
-            '',
-            ('RMSE of chi_hat (rad/s)', *noises, 'growth'),
-            [
-                *(measured(kind, 'speed') for kind in kinds),
-                ['the measurement itself', *noise, ''],
-            ],
-        ),
-        Table(
-            '',
-            ('more than type3, same seeds (rad/s)', *noises),
-            [excess(kind) for kind in kinds if kind != 'type3'],
-        ),
-        Table(
-            '',
-            ("RMSE of g against chi' - u (rad/s²)", *noises, 'growth'),
-            [measured(kind, 'unknown') for kind in kinds],
-        ),
-    ]
-    return '\n\n'.join(table.markdown() for table in tables)
+def _errors(run: OpenLoopRun, name: str, variance: float, gain: float) -> tuple[float, float]:
+    """Return the RMSE of chi_hat (rad/s) and of g (rad/s²) of one estimator along a run."""
+    fuzzy = None if name == NO_FUZZY_SYSTEM else estimator(name, variance, gain)
+    speeds, unknown = estimate(run, fuzzy)
+    first = round(SETTLE / run.period)
+    return rms((speeds - run.speeds)[first:]), rms((unknown[:-1] - run.target)[first:])
 
 
 def difference(result: EstimationResult, base: EstimationResult) -> tuple[float, ...]:
     """Return how much more RMSE of chi_hat ``result`` has than ``base``, seed by seed, rad/s."""
     return tuple(a - b for a, b in zip(result.speed, base.speed, strict=True))
-
-
-def _spread(values: Sequence[float], sign: str = '') -> str:
-    half = interval(values)
-    # One seed has no interval.
-    return f'{mean(values):{sign}.4f}' + (f' ± {half:.4f}' if math.isfinite(half) else ' ± –')
-
-
-def _growth(row: Sequence[Sequence[float]]) -> str:
-    return f'{100.0 * (mean(row[-1]) / mean(row[0]) - 1.0):+.0f} %'

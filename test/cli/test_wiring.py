@@ -259,10 +259,7 @@ def link(path, *, key=True):
 
 TABLE = {
     'estimation': (
-        {
-            'evaluation.open_loop_estimation.compare': [],
-            'evaluation.open_loop_estimation.table': '',
-        },
+        {'evaluation.open_loop_estimation.compare': []},
         {
             '--seeds 7': {'compare.seeds': 7},
             '--duration 9': {'compare.duration': 9.0},

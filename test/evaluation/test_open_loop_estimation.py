@@ -14,7 +14,6 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
     KINDS,
     NO_FUZZY_SYSTEM,
     OUTPUT_ERROR_GAIN,
-    EstimationResult,
     OpenLoopRun,
     compare,
     difference,
@@ -22,7 +21,6 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
     estimator,
     excitation,
     simulate_open_loop,
-    table,
     torque_robot,
 )
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
@@ -67,7 +65,7 @@ def test_a_fuzzy_system_that_is_the_plant_estimates_it_exactly():
 
 
 def test_e18_without_u_the_exact_fuzzy_system_misses():
-    """(86) prints chi_hat' = g; the same estimator not told the push is off by the push."""
+    """(86) prints chi_hat' = g; the same estimator without u is off by u."""
     run = _matched_run(_fuzzy(1), 0.01)
     blind = OpenLoopRun(run.period, np.zeros_like(run.push), run.speeds, run.measured)
     exact = _fuzzy(1, gamma=0.0)
@@ -161,17 +159,11 @@ def test_kinds_at_equal_rates_differ_by_a_few_percent(results):
     assert max(growth) - min(growth) < 0.1
 
 
-def test_the_same_seed_gives_the_same_figures():
-    first, second = (compare(seeds=1, duration=11.0, variances=(0.04,)) for _ in range(2))
-    assert first == second
-
-
 def test_the_program_prints_the_table_and_writes_the_numbers(tmp_path, capsys):
     path = tmp_path / 'figures.json'
     assert main(['estimation', '--seeds', '2', '--duration', '11', '--json', str(path)]) == 0
     said = capsys.readouterr().out
     found = compare(seeds=2, duration=11.0)
-    assert said == table(found) + '\n'
     for result in found:
         assert f'{mean(result.speed):.4f} ± {interval(result.speed):.4f}' in said
     assert json.loads(path.read_text()) == [result.record() for result in found]
@@ -187,21 +179,14 @@ def test_what_cannot_be_driven_is_refused():
         simulate_open_loop(parameters.with_values({'drive.kind': 'velocity'}), 1.0, 1)
 
 
-def test_one_seed_has_no_interval():
-    """The table once contained an infinite one."""
-    results = [EstimationResult(kind, 0.04, (0.1,), (0.2,)) for kind in KINDS]
-    text = table(results)
-    assert 'inf' not in text
-    assert '0.1000 ± –' in text
-
-
-def test_the_json_of_one_seed_is_valid(tmp_path, capsys):
-    """It once held Infinity, which no other reader of JSON accepts."""
+def test_one_seed_has_no_interval(tmp_path, capsys):
+    """It once was infinite, which no reader of JSON accepts."""
     path = tmp_path / 'figures.json'
     assert main(['estimation', '--seeds', '1', '--duration', '11', '--json', str(path)]) == 0
 
     def refuse(word):
         raise AssertionError(word)
 
+    assert 'inf' not in capsys.readouterr().out
     records = json.loads(path.read_text(), parse_constant=refuse)
     assert {record['speed_ci95'] for record in records} == {None}

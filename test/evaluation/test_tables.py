@@ -16,9 +16,8 @@ from t3mpc_ros.evaluation.bag_report.run_data import BY_WHEEL
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.metrics import METRICS, START, measure
 from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
-from t3mpc_ros.evaluation.open_loop_estimation import table as estimation_table
 from t3mpc_ros.evaluation.paper.experiment_runs import Experiment, RunNumbers
-from t3mpc_ros.evaluation.paper.results import ResultRow, Results
+from t3mpc_ros.evaluation.paper.results import ResultRow, Results, estimation
 from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolResult
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES, PatrolMetrics
 from t3mpc_ros.evaluation.patrol.patrol_page import coverage_table, surprise_table
@@ -146,12 +145,11 @@ def test_tables_of_the_estimators():
         for noise, s in ((0.01, s), (0.04, 2 * s))
     ]
     half, wide = interval([0.0, 0.1]), interval([0.0, 2.0])
-    text = estimation_table(results)
-    assert f'| type3 | 0.2500 ± {half:.4f} | 0.4500 ± {half:.4f} | +80 % |' in text
-    assert f'| type1 | 0.5500 ± {half:.4f} | 1.0500 ± {half:.4f} | +91 % |' in text
-    assert '| the measurement itself | 0.1000 | 0.2000 |' in text
-    assert '| type1 | +0.3000 ± 0.0000 | +0.6000 ± 0.0000 |' in text
-    assert f'| type3 | 3.0000 ± {wide:.4f} | 5.0000 ± {wide:.4f} | +67 % |' in text
+    text = '\n'.join(table.markdown() for table in estimation(results))
+    assert f'| **type3** | 0.2500 ± {half:.4f} | 0.4500 ± {half:.4f} | +0.200 (+80 %) |' in text
+    assert f'| type1 | 0.5500 ± {half:.4f} | 1.0500 ± {half:.4f} | +0.500 (+91 %) |' in text
+    assert '| type1 | +0.3000 ± 0.0000 * | +0.6000 ± 0.0000 * |' in text
+    assert f'| **type3** | 3.0000 ± {wide:.4f} | 5.0000 ± {wide:.4f} | +2.000 (+67 %) |' in text
     assert '(rad/s²)' in text
 
 
