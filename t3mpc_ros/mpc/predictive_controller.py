@@ -33,7 +33,6 @@ from t3mpc_ros.mpc.pretraining import (
     SampleTiming,
     nominal_step_response,
     simulate_excitation,
-    split_runs,
 )
 from t3mpc_ros.mpc.quadratic_program import (
     OPTIMAL,
@@ -488,26 +487,16 @@ class PredictiveController:
         self._learning = learning_constants(parameters, self._timing.span)
         self._constants = MoveConstants.of(parameters, self._loop, self._timing)
 
-    def pretrain(self, errors: Array | None = None, moves: Array | None = None) -> None:
-        """Create new machines and pretrain them, then :meth:`reset`.
-
-        errors, moves : a recorded run, oldest first, one row per predictive period, shape (N,
-            outputs): errors (rad/s) and the v_p applied after each (rad/s²), NaN where unknown and
-            in a row between two runs. The longest stretch without a gap in the last quarter is the
-            trial run for the skill. Without a recorded run both are simulated with the nominal
-            loop.
-        """
+    def pretrain(self) -> None:
+        """Create new machines, pretrain them on the simulated nominal loop, then :meth:`reset`."""
         parameters, outputs = self.parameters, self.status.size
-        recorded = None
-        if errors is not None or moves is not None:
-            recorded = split_runs(np.asarray(errors), np.asarray(moves), outputs)
         generator = np.random.default_rng(parameters.seed)
         predictors: list[Predictor] = []
         sizes = LayerSizes(parameters.delta_lags, parameters.move_lags, parameters.hidden)
         trial = replace(
             parameters.excitation, duration=max(0.25 * parameters.excitation.duration, 10.0)
         )
-        for z in range(outputs):
+        for _ in range(outputs):
             machine = make_machine(
                 sizes, parameters.delta_scale, parameters.move_scale, parameters.spread, generator
             )
@@ -517,8 +506,6 @@ class PredictiveController:
                 )
                 for learning in (parameters.excitation, trial)
             ]
-            if recorded is not None:
-                runs = recorded[z]
             predictor = Predictor(machine, parameters.horizon, runs[1])
             predictor.fit(
                 *runs[0],

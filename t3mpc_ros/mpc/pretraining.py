@@ -296,31 +296,3 @@ def _simulate(
         errors,
     )
     return errors
-
-
-def split_runs(errors: Array, moves: Array, outputs: int) -> list[list[tuple[Array, Array]]]:
-    """Return the first three quarters and the rest of a run for each output, *newest first*.
-
-    The rest is reduced to its longest stretch without a gap, as a trial run needs.
-
-    errors, moves : a recorded run, oldest first, shape (N, outputs); NaN where unknown
-    """
-    if errors.shape != moves.shape or errors.shape[1:] != (outputs,):
-        raise ValueError(
-            f'errors and moves must be (N, {outputs}): got {errors.shape}, {moves.shape}'
-        )
-    cut = (3 * len(errors)) // 4
-    gaps = cut + np.flatnonzero(np.isnan(errors[cut:] + moves[cut:]).any(axis=1))
-    edges = [cut - 1, *gaps.tolist(), len(errors)]
-    longest = int(np.argmax(np.diff(edges)))
-    rest = slice(edges[longest] + 1, edges[longest + 1])
-    return [
-        [
-            (
-                np.ascontiguousarray(errors[part, z][::-1]),
-                np.ascontiguousarray(moves[part, z][::-1]),
-            )
-            for part in (slice(None, cut), rest)
-        ]
-        for z in range(outputs)
-    ]

@@ -51,7 +51,7 @@ from t3mpc_ros.mpc.boltzmann_machine import (
     set_visible,
 )
 from t3mpc_ros.mpc.predictive_controller import PredictiveController, PredictiveParameters
-from t3mpc_ros.mpc.pretraining import ExcitationParameters, pretrain, ridge_regression, split_runs
+from t3mpc_ros.mpc.pretraining import ExcitationParameters, pretrain, ridge_regression
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
@@ -466,16 +466,6 @@ def test_runs_with_a_gap_between_them_are_learnt_as_two_runs():
     np.testing.assert_allclose(pretrained.output_weights, expected, rtol=1e-9)
     with pytest.raises(ValueError, match='got inf'):
         pretrain(machine(), make_rls_state(12), joined[0], np.full(106, np.inf), how, 20.0, 0.05)
-
-
-def test_the_trial_is_the_longest_gapless_part_at_the_end():
-    errors = np.arange(80.0).reshape(40, 2)
-    errors[[3, 33, 38]] = math.nan
-    moves = -np.arange(80.0).reshape(40, 2)
-    known, trial = split_runs(errors, moves, 2)[0]
-    np.testing.assert_array_equal(trial[0], errors[34:38, 0][::-1])
-    np.testing.assert_array_equal(trial[1], moves[34:38, 0][::-1])
-    assert known[0].size == 30
 
 
 def _stepped(**changes):

@@ -419,35 +419,6 @@ def test_it_is_deterministic_and_weights_can_be_restored():
 
 
 @pytest.mark.compiled
-@pytest.mark.slow
-def test_a_recorded_run_improves_on_the_nominal_loop():
-    """The recorded run is that of a robot three times as slow as the nominal one."""
-    parameters = DEFAULT.with_values({'learning': False})
-    generator = np.random.default_rng(12)
-    plant = {'lag': 0.15, 'delay_steps': 5}
-    loop, moves, errors = Loop(**plant), np.zeros((2400, 2)), np.zeros((2400, 2))
-    pushes = _levels(2400 * 5, 15, size=3.0, hold=2.0)
-    for k in range(2400):
-        if k % 6 == 0:
-            level = generator.uniform(-8.0, 8.0, 2)
-        moves[k] = level
-        samples = []
-        for i in range(5):
-            loop.step(level, pushes[5 * k + i], np.zeros(2))
-            samples.append(loop.error)
-        if k + 1 < 2400:
-            errors[k + 1] = np.mean(samples, axis=0)
-    trained = PredictiveController(parameters, PERIOD, GAIN)
-    trained.pretrain(errors, moves)
-    assert np.all(trained.skill > 0.8)
-    disturbance = _levels(3000, 13)
-    nominal = _run(PredictiveController(parameters, PERIOD, GAIN), disturbance, **plant)[0]
-    assert _rms(_run(trained, disturbance, **plant)[0]) < _rms(nominal)
-    with pytest.raises(ValueError, match='must be'):
-        trained.pretrain(errors)
-
-
-@pytest.mark.compiled
 def test_invalid_input_is_rejected_without_effect():
     controller = PredictiveController(DEFAULT, PERIOD, GAIN)
     good = controller.get_weights()

@@ -30,7 +30,6 @@ from t3mpc_ros.mpc.pretraining import (
     random_levels,
     ridge_regression,
     simulate_excitation,
-    split_runs,
 )
 
 TIMING = SampleTiming(0.01, 5, 5)
@@ -361,15 +360,6 @@ def test_invalid_runs_are_rejected():
         pretrain(machine, rls, np.zeros(16), np.zeros(16), ExcitationParameters(), 1.0, 0.1)
     with pytest.raises(ValueError, match='finite'):
         pretrain(machine, rls, np.full(50, np.nan), np.zeros(50), ExcitationParameters(), 1.0, 0.1)
-    with pytest.raises(ValueError, match='must be'):
-        split_runs(np.zeros((50, 3)), np.zeros((50, 3)), 2)
-
-
-def test_a_recorded_run_is_split_in_time_and_reversed():
-    errors = np.arange(16.0).reshape(8, 2)
-    runs = split_runs(errors, -errors, 2)
-    np.testing.assert_array_equal(runs[1][0][0], [11.0, 9.0, 7.0, 5.0, 3.0, 1.0])
-    np.testing.assert_array_equal(runs[1][1][1], [-15.0, -13.0])
 
 
 @pytest.mark.compiled

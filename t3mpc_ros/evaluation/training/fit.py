@@ -160,9 +160,7 @@ def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -
     if duration < MIN_EXCITATION or not parts:
         raise TrainingError(
             f'the run must hold at least {MIN_EXCITATION:g} s with known errors and v_p, and of '
-            'these '
-            f'{JUDGED * timing.span:g} s without a gap: got {duration:.1f} s, the longest stretch '
-            f'{_longest(errors + moves) * timing.span:.1f} s'
+            f'these {JUDGED * timing.span:g} s without a gap: got {duration:.1f} s'
         )
     loop = replace(predictive.nominal, feedback_gain=min(feedback_slope(parameters), 100.0))
     middle = max(predictive.horizon // 2, 1)
@@ -225,12 +223,6 @@ def stretches(errors: Array, moves: Array) -> list[list[tuple[Array, Array]]]:
         for low, high in pairwise(edges)
         if high - low > JUDGED
     ]
-
-
-def _longest(table: Array) -> int:
-    """Return the length of the longest run of known rows."""
-    gaps = np.flatnonzero(np.isnan(table).any(axis=1))
-    return int(np.diff([-1, *gaps.tolist(), len(table)]).max()) - 1
 
 
 def feedback_slope(parameters: Nt3fsMpcParameters) -> float:

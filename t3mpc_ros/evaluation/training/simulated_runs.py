@@ -24,11 +24,10 @@ from t3mpc_ros.evaluation.scenario import (
     PRETRAINING_SEEDS,
     Scenario,
 )
-from t3mpc_ros.evaluation.training.fit import periods, skills
+from t3mpc_ros.evaluation.training.fit import periods, skills, stretches
 from t3mpc_ros.evaluation.training.recorded_runs import MIDDLE, NEXT_STEP, pair
 from t3mpc_ros.evaluation.training.training_data import TrainingData
 from t3mpc_ros.mpc.predictive_controller import PredictiveController
-from t3mpc_ros.mpc.pretraining import split_runs
 
 Array = NDArray[np.float64]
 
@@ -100,7 +99,8 @@ def _skill_table(drive: str, record: Record) -> Table:
     term = PredictiveController(predictive, 1.0 / RATE, parameters.law.gain)
     after = {key.removeprefix(prefix): each for key, each in weights.items() if prefix in key}
     errors, moves = periods(training_data_of(record, parameters), predictive, RATE)
-    last_quarter = [[trial for _, trial in split_runs(errors, moves, 2)]]
+    cut = 3 * len(errors) // 4
+    last_quarter = stretches(errors[cut:], moves[cut:])
     rows = [
         [name, *map(pair, skills(predictive, term.span, each, last_quarter))]
         for name, each in (('before', term.get_weights()), ('after', after))
