@@ -570,10 +570,13 @@ def run_compare(options: argparse.Namespace) -> int:
     """
     from t3mpc_ros.bag.run.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
-    from t3mpc_ros.evaluation.process_replay.comparison import compare, compare_bags
+    from t3mpc_ros.evaluation.process_replay.comparison import (
+        compare,
+        compare_bags,
+        write_divergence_figure,
+    )
     from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
     from t3mpc_ros.evaluation.process_replay.controller_replay import OPEN_LOOP, replay_controller
-    from t3mpc_ros.evaluation.process_replay.divergence_figure import write_divergence_figure
 
     tolerances = tolerances_from(options.abs, options.rel, options.fields)
     changes = parse_assignments(ControllerParameters, options.parameters)

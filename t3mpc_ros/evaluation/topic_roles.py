@@ -88,7 +88,7 @@ def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
     if wanted.odom and not wanted.namespace:
         chosen.pop(TRUTH, None)  # errors refer to the given topic
     notes = []
-    if not (wanted.odom or TRUTH in chosen):
+    if not wanted.odom:
         others = _candidates(ODOMETRY, filled.values(), chosen, wanted.namespace, namespaces[0])
         notes += _choose_by_type(ODOMETRY, 'Odometry', '--odom', chosen, others)
     if not wanted.cmd_vel:

@@ -179,7 +179,7 @@ REPLAY = {
     'evaluation.process_replay.comparison.compare': OUTCOME,
     'evaluation.process_replay.comparison.compare_bags': OUTCOME,
     'evaluation.process_replay.replay_bag.write_replay': 'there',
-    'evaluation.process_replay.divergence_figure.write_divergence_figure': None,
+    'evaluation.process_replay.comparison.write_divergence_figure': None,
 }
 REPORT = SimpleNamespace(verdict=SimpleNamespace(text=text), summary=text)
 BAG = {

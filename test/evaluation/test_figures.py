@@ -16,7 +16,7 @@ import pytest
 from support.records import PAIRS, record_of
 
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.evaluation import comparison_page, fault_page
+from t3mpc_ros.evaluation import comparison_page, fault_page, plotting
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ComparisonPlan
 from t3mpc_ros.evaluation.fault_study import Outcome
@@ -36,7 +36,7 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     PatrolResult,
     PatrolTrack,
 )
-from t3mpc_ros.evaluation.process_replay import divergence_figure
+from t3mpc_ros.evaluation.process_replay import comparison as replay_comparison
 from t3mpc_ros.evaluation.process_replay.comparison import Comparison, FieldComparison, Tolerances
 from t3mpc_ros.scripting.chaos_generator import ChaosSolution
 from t3mpc_ros.scripting.parameter_sweep import Sweep
@@ -386,7 +386,7 @@ def caught(monkeypatch):
         if (figure := draw(subject)) is not None:
             figures.append(figure)
 
-    for module in (comparison_page, fault_page, divergence_figure):
+    for module in (comparison_page, fault_page, plotting):
         monkeypatch.setattr(module, 'png_of', instead)
     return figures
 
@@ -453,7 +453,7 @@ def test_the_first_divergence_shows_both_runs_and_the_tolerance(caught, tmp_path
         (row,), Tolerances(0.01, 0.1), time, {'speed': was}, {'speed': now},
         np.ones(50, dtype=bool), (), (),
     )  # fmt: skip
-    divergence_figure.write_divergence_figure(outcome, tmp_path / 'x.png')
+    replay_comparison.write_divergence_figure(outcome, tmp_path / 'x.png')
     close, apart, _ = caught[0].axes
     shown = {name: y for name, (_, y) in (lines(close) | lines(apart)).items()}
     rows = (time >= 2.0) & (time <= 4.0)
@@ -639,7 +639,7 @@ def test_divergences_are_marked_at_their_time_and_field(caught, tmp_path):
     outcome = Comparison(
         rows, Tolerances(0.01, 0.1), time, was, now, np.ones(100, dtype=bool), (), ()
     )
-    divergence_figure.write_divergence_figure(outcome, tmp_path / 'x.png')
+    replay_comparison.write_divergence_figure(outcome, tmp_path / 'x.png')
     axis = caught[0].axes[-1]
     places = dict(
         zip([each.get_text() for each in axis.get_yticklabels()], axis.get_yticks(), strict=True)

@@ -38,16 +38,17 @@ from t3mpc_ros.evaluation.process_replay.comparison import (
     compare,
     compare_bags,
     compare_columns,
+    write_divergence_figure,
 )
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     FIELDS,
     SPEEDS,
     ReplayError,
+    commands_of,
     load_inputs,
+    match,
 )
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
-from t3mpc_ros.evaluation.process_replay.divergence_figure import write_divergence_figure
-from t3mpc_ros.evaluation.process_replay.journal_alignment import commands_of, match
 from t3mpc_ros.evaluation.topic_roles import SCALARS
 from t3mpc_ros.geometry.types import BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import ParameterError

@@ -1,24 +1,29 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Recorded and recomputed outputs, field by field, each with its tolerance."""
+"""Recorded and recomputed outputs, field by field, each with its tolerance; as text and figure."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 import math
+from pathlib import Path
+from typing import Any
 
+from matplotlib.colors import ListedColormap
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.controller import ControllerParameters
+from t3mpc_ros.evaluation import plotting
+from t3mpc_ros.evaluation.plotting import COLOURS
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     FIELDS,
     ControllerInputs,
     ReplayError,
 )
 from t3mpc_ros.evaluation.process_replay.controller_replay import ReplayResult
+from t3mpc_ros.geometry.types import Array
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 ABSOLUTE, RELATIVE = 1e-9, 1e-9
@@ -26,6 +31,10 @@ ABSOLUTE, RELATIVE = 1e-9, 1e-9
 ELSEWHERE = 1e-6
 """Both tolerances for other processors, compilers and linear-algebra libraries, whose rounding
 differs; adaptation accumulates the differences."""
+BEFORE, AFTER = 0.5, 1.5
+"""Half width of the figure's zoomed window, s."""
+BINS = 200
+"""Time bins of the figure's overview."""
 
 
 @dataclass(frozen=True)
@@ -293,3 +302,71 @@ def _plain(value: object) -> object:
 
 def _format_values(values: Sequence[object]) -> str:
     return ', then '.join(map(str, values))
+
+
+def write_divergence_figure(outcome: Comparison, path: Path) -> None:
+    """Write a PNG of the first divergence of the replay from the recording."""
+    content = plotting.png_of(_draw, outcome)
+    if content is not None:
+        path.write_bytes(content)
+
+
+def _draw(outcome: Comparison) -> Any:
+    first = outcome.first
+    fields = [row.field for row in outcome.rows]
+    figure = plotting.new_figure(2.0 + 0.16 * len(fields) + (3.6 if first else 0.0))
+    if first is None:
+        _overview(figure.subplots(), outcome, fields)
+        figure.suptitle(outcome.verdict(), fontsize=9)
+        return figure
+    close, apart, all_of_it = figure.subplots(
+        3, 1, height_ratios=[1.8, 1.4, 0.6 + 0.16 * len(fields)]
+    )
+    close.sharex(apart)
+    _close_up(close, apart, outcome, first.field, first.first)
+    _overview(all_of_it, outcome, fields)
+    return figure
+
+
+def _close_up(close: Any, apart: Any, outcome: Comparison, name: str, when: float) -> None:
+    """Draw both runs around the first divergence, and their difference on a logarithmic scale."""
+    time = outcome.time
+    shown = (time >= when - BEFORE) & (time <= when + AFTER) & ~np.isnan(outcome.recorded[name])
+    was, now = outcome.recorded[name][shown], outcome.computed[name][shown]
+    # The recorded line is wide, so that it stays visible below the other.
+    close.plot(time[shown], was, color=COLOURS['odom'], label='recorded', linewidth=4.0)
+    close.plot(time[shown], now, color=COLOURS['error'], label='recomputed', linewidth=1.0)
+    close.set_title(name)
+    absolute, relative = outcome.tolerances.of(name)
+    with np.errstate(invalid='ignore'):
+        far = np.abs(now - was)
+    allowed = np.maximum(absolute + relative * np.abs(was), 1e-18)
+    # Bit-equal values have no logarithm.
+    floor = 0.1 * float(allowed.min())
+    apart.plot(time[shown], np.maximum(far, floor), color=COLOURS['error'], label='difference')
+    apart.plot(time[shown], allowed, color=COLOURS['target'], label='tolerance')
+    apart.set_yscale('log')
+    apart.set_title(f'difference of {name}')
+    for axis in (close, apart):
+        axis.axvline(when, color=COLOURS['switch'], linewidth=0.8, linestyle=(0, (4, 3)))
+        plotting.add_legend(axis)
+    plotting.name_time([close, apart])
+    apart.set_xlim(max(when - BEFORE, time[0]), min(when + AFTER, time[-1]))
+    close.tick_params(labelbottom=False)
+
+
+def _overview(axis: Any, outcome: Comparison, fields: list[str]) -> None:
+    """Draw for each field where it is compared (pale) and where it exceeds its tolerance."""
+    span = float(outcome.time[0]), max(float(outcome.time[-1]), float(outcome.time[0]) + 1e-3)
+    level = np.full((len(fields), BINS), math.nan)
+    for row, name in zip(level, fields, strict=True):
+        compared = outcome.compared & ~np.isnan(outcome.recorded[name])
+        for value, mask in ((0.0, compared), (1.0, outcome.beyond(name))):
+            row[np.histogram(outcome.time[mask], BINS, span)[0] > 0] = value
+    colours = ListedColormap(['#d1fae5', COLOURS['error']])
+    extent = (*span, len(fields) - 0.5, -0.5)
+    axis.imshow(level, colours, aspect='auto', interpolation='none', extent=extent, vmin=0, vmax=1)
+    axis.set_yticks(range(len(fields)), fields, fontsize=6)
+    axis.set_title('compared (pale), beyond the tolerance (dark)')
+    axis.grid(visible=False)
+    plotting.name_time([axis])

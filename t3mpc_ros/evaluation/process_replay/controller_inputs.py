@@ -1,8 +1,8 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs and recorded outputs of a bag's controller, in the order of processing."""
+"""Inputs and recorded outputs of a bag's controller, in the order of its journal."""
 
-import ast
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -20,28 +20,12 @@ from t3mpc_ros.bag.recording.message_losses import message_loss_notes
 from t3mpc_ros.bag.run.journal import COMMAND_EVENTS, Event, parameters_from_json
 from t3mpc_ros.bag.run.model_file import load_model
 from t3mpc_ros.control.controller import SCALAR_NAMES, ControllerParameters
-from t3mpc_ros.evaluation.process_replay.journal_alignment import (
-    ConsumedMessages,
-    commands_of,
-    match,
-    rows_of,
-    with_initial_inputs,
-)
-from t3mpc_ros.evaluation.topic_roles import (
-    COMMAND,
-    INITIAL_INPUTS,
-    JOURNAL,
-    KINDS,
-    ODOMETRY,
-    REFERENCE,
-    SCALARS,
-    TRUTH,
-    find_topics,
-)
-from t3mpc_ros.geometry.types import NANOSECONDS, StateArray
-from t3mpc_ros.parameters.table import ParameterError, ParameterSpec
+from t3mpc_ros.evaluation import topic_roles
+from t3mpc_ros.evaluation.topic_roles import COMMAND, JOURNAL, ODOMETRY, REFERENCE
+from t3mpc_ros.geometry.types import NANOSECONDS, Array, StateArray
+from t3mpc_ros.parameters.command_line import parse_assignments
+from t3mpc_ros.parameters.table import ParameterError
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
@@ -53,6 +37,25 @@ FIELDS = (*SPEEDS, *SCALAR_NAMES)
 
 class ReplayError(RuntimeError):
     """The bag cannot be replayed or compared; the text gives the reason."""
+
+
+@dataclass(frozen=True)
+class ConsumedMessages:
+    """Recorded messages by event, as row numbers."""
+
+    odometry: Integers
+    """Message of each step; -1 at other events, and where it is missing in the bag, shape (n,)."""
+    begin: Integers
+    """First reference passed since the previous event, shape (n,)."""
+    end: Integers
+    """One past the last of them."""
+    broken: Flags
+    """Whether something is lost between the previous event and this one, shape (n,)."""
+    restarts: Flags
+    """Whether this is a reset that makes the past irrelevant, shape (n,)."""
+    lost_odometry: int
+    lost_references: int
+    lost_events: int
 
 
 @dataclass(frozen=True)
@@ -115,20 +118,7 @@ class ControllerInputs:
 def load_inputs(
     bag: Path, namespace: str | None = None, model: Mapping[str, Array] | None = None
 ) -> ControllerInputs:
-    """Return inputs and recorded outputs of the controller of a bag.
-
-    Parameters
-    ----------
-    namespace
-        Namespace of the robot; the one with most topics by default.
-    model
-        Initial model in place of the recorded one.
-
-    Raises
-    ------
-    ReplayError
-        Topics or parameters are missing, or cannot be used.
-    """
+    """Return inputs and outputs of a bag's controller; ``model`` replaces the recorded one."""
     with open_bag(bag) as recording:
         return inputs_of(recording, namespace, model)
 
@@ -139,25 +129,18 @@ def inputs_of(
     """Return inputs and recorded outputs of an open bag, see :func:`load_inputs`."""
     bag = recording.folder
     notes = message_loss_notes(recording.metadata_records)
-    recorded_topics = {name for name, topic in recording.topics.items() if topic.message_count}
-    known, namespaces = find_topics(recording.topics, namespace)
-    prefix = namespaces[0]
-    names = (REFERENCE, ODOMETRY, COMMAND, JOURNAL, *sorted(SCALARS))
-    wanted = {name: f'{prefix}/{name}' for name in names}
-    topics = {
-        name: full
-        for name, full in (wanted | known).items()
-        if name in wanted and full in recorded_topics
-    }
-    for name in (ODOMETRY, COMMAND):
-        if name not in topics and (full := _renamed_topic(recording, name, [*topics.values()])):
-            topics[name] = full
-            notes.append(f'{name} is taken from {full}')
+    choice = topic_roles.choose_topics(recording, topic_roles.ReportOptions(namespace=namespace))
+    notes += choice.notes
+    prefix = choice.namespaces[0]
+    names = {REFERENCE, ODOMETRY, COMMAND, *topic_roles.SCALARS}
+    topics = {name: full for name, full in choice.topics.items() if name in names}
     if missing := [name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics]:
         raise ReplayError(f'{bag}: these topics are not in the bag: {", ".join(missing)}')
-    if JOURNAL not in topics:
+    recorded_topics = {name for name, topic in recording.topics.items() if topic.message_count}
+    topics[JOURNAL] = f'{prefix}/{JOURNAL}'
+    if topics[JOURNAL] not in recorded_topics:
         raise ReplayError(
-            f'{bag}: there is no journal of the controller ({prefix}/{JOURNAL}), which defines '
+            f'{bag}: there is no journal of the controller ({topics[JOURNAL]}), which defines '
             'the order of its inputs: record it, as the recorder does by default; t3mpc bag '
             'report needs none'
         )
@@ -166,7 +149,7 @@ def inputs_of(
     initial = {
         name: full
         for name in (REFERENCE, ODOMETRY)
-        if (full := f'{prefix}/{INITIAL_INPUTS}{name}') in recorded_topics
+        if (full := f'{prefix}/{topic_roles.INITIAL_INPUTS}{name}') in recorded_topics
     }
     columns = read_columns(recording, [*topics.values(), *initial.values()])
     by_name = {name: columns[full] for name, full in topics.items()}
@@ -201,11 +184,9 @@ def recorded_parameters(
     table = controller_record(recording, namespace)
     if not table:
         raise ReplayError(f"{recording.folder}: the controller's settings are not in the bag")
-    values: dict[str, object] = {}
-    for row in ControllerParameters.specs():
-        if row.name in table:
-            values[row.name] = _value(row, table[row.name])
-    absent = [row.name for row in ControllerParameters.specs() if row.name not in values]
+    known = {name: text for name, text in table.items() if name in _names()}
+    values = parse_assignments(ControllerParameters, (f'{k}={v}' for k, v in known.items()))
+    absent = [row.name for row in ControllerParameters.specs() if row.name not in known]
     if absent:
         notes.append(f'not in the bag, taken at their defaults: {", ".join(absent)}')
     try:
@@ -214,34 +195,6 @@ def recorded_parameters(
         raise ReplayError(
             f'{recording.folder}: the recorded settings cannot be used: {error}'
         ) from error
-
-
-def _value(row: ParameterSpec, text: str) -> object:
-    """Return a value written by the recorder with ``str``; other text is rejected later."""
-    if row.kind is str:
-        return text
-    try:
-        return ast.literal_eval(text)
-    except (SyntaxError, ValueError):
-        return text
-
-
-def _renamed_topic(recording: BagReader, name: str, used: Sequence[str]) -> str:
-    """Return the only topic that can be the odometry or command of a robot with other names.
-
-    Empty if there is none, or several. Topics of another controller's namespace do not count.
-    """
-    others = [
-        full
-        for full, topic in recording.topics.items()
-        if topic.type_name in KINDS[name]
-        and topic.message_count
-        and full not in used
-        and f'/{INITIAL_INPUTS}' not in full
-        and not full.endswith((f'/{REFERENCE}', f'/{TRUTH}'))
-        and f'{full.removesuffix(f"/{name}")}/{JOURNAL}' not in recording.topics
-    ]
-    return others[0] if len(others) == 1 else ''
 
 
 def motions(column: TopicColumns) -> StateArray:
@@ -332,8 +285,10 @@ class _Reader:
             column = self.columns.get(f'{CONTROLLER}/{name}')
             if column is None or not len(column):
                 continue
-            rows = rows_of(self.published, column.published_ns, steps)
-            recorded[name][rows[rows >= 0]] = column.numbers[rows >= 0, 0]
+            # A step publishes its scalars after its row.
+            rows = np.searchsorted(self.published, column.published_ns, side='right') - 1
+            known = (rows >= 0) & steps[rows]
+            recorded[name][rows[known]] = column.numbers[known, 0]
         without = np.flatnonzero(np.isin(events, COMMAND_EVENTS) & ~there)
         if without.size:
             span = (self.published[without[[0, -1]]] - self.recording.start_ns) / NANOSECONDS
@@ -435,3 +390,131 @@ class _Reader:
             'give it by --model'
         )
         return None
+
+
+def with_initial_inputs(received: TopicColumns, initial: TopicColumns) -> TopicColumns:
+    """Return the messages of an input, completed by those that the recorder discovered too late.
+
+    The controller republishes its first inputs on a transient-local topic. A message with a stamp
+    that the plain topic lacks is inserted in front of the first message with a later stamp.
+    """
+    missing = np.flatnonzero(~np.isin(initial.stamps_ns, received.stamps_ns))
+    if not missing.size:
+        return received
+    # The controller may have been restarted: its history then begins anew, in order of stamps.
+    _, first = np.unique(initial.stamps_ns[missing], return_index=True)
+    missing = missing[first]
+    latest = np.maximum.accumulate(received.stamps_ns)
+    places = np.searchsorted(latest, initial.stamps_ns[missing], side='right')
+    merged = {
+        name: np.insert(getattr(received, name), places, getattr(initial, name)[missing], axis=0)
+        for name in ('received_ns', 'published_ns', 'stamps_ns', 'numbers')
+    }
+    return TopicColumns(**merged, integers=received.integers)
+
+
+def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> ConsumedMessages:
+    """Return the messages that the controller processed, by its journal.
+
+    ``rows`` is the journal of one session of the controller, shape (n, 5), see
+    :mod:`t3mpc_ros.bag.run.journal`; stamps of the messages are in order of receipt.
+    """
+    number, event, stamp, handed, value = rows.T
+    steps = event == Event.STEP
+    odometry = np.full(len(rows), -1, dtype=np.int64)
+    odometry[steps] = _in_turn(stamp[steps], odometry_ns)
+    gaps = np.diff(number, prepend=number[:1] - 1) - 1
+    begin, end, lost, late = _reference_ranges(handed, np.where(steps, value, 0), reference_ns)
+    missing = steps & (odometry < 0)
+    reset = event == Event.RESET
+    return ConsumedMessages(
+        odometry,
+        begin,
+        end,
+        # Without a reference the robot is at rest, and only the last odometry stamp is state.
+        (missing & (handed > 0)) | (gaps > 0) | (lost > 0) | (reset & late),
+        reset & ~late,
+        int(np.count_nonzero(missing)),
+        int(lost.sum()),
+        int(gaps.sum()),
+    )
+
+
+def commands_of(rows: Integers, published: Integers, sent: Integers) -> Integers:
+    """Return the recorded command of each row of the journal, -1 without one, shape (n,).
+
+    The controller publishes a command and then its journal row: ``published`` and ``sent`` are
+    these times by its clock, ns. A process that is killed in between leaves a command without a
+    row, which is none of the first row of the next process if that is more than a second later.
+    """
+    found = np.full(len(rows), -1, dtype=np.int64)
+    commanding = np.isin(rows[:, 1], COMMAND_EVENTS)
+    last = np.searchsorted(sent, published, side='right') - 1
+    before = np.concatenate([[np.iinfo(np.int64).min], published[:-1]])
+    begins = np.concatenate([[False], np.diff(rows[:, 0]) < 0])
+    before[begins] = np.maximum(before, published - NANOSECONDS)[begins]
+    fits = commanding & (last >= 0)
+    fits[fits] = sent[last[fits]] > before[fits]
+    found[fits] = last[fits]
+    if np.count_nonzero(fits) < np.count_nonzero(commanding) == sent.size and not begins.any():
+        # Publication times are unknown: without losses the order suffices.
+        found[commanding] = np.arange(sent.size)
+    return found
+
+
+def _in_turn(wanted: Integers, recorded: Integers) -> Integers:
+    """Return the row of each stamp in the recording, in order; -1 where it is missing."""
+    rows_of_stamp = _rows_by_stamp(recorded)
+    found = np.full(wanted.size, -1, dtype=np.int64)
+    end = 0
+    for k, stamp in enumerate(wanted.tolist()):
+        rows = rows_of_stamp.get(stamp, [])
+        place = bisect_left(rows, end)
+        if place < len(rows):
+            found[k], end = rows[place], rows[place] + 1
+    return found
+
+
+def _rows_by_stamp(recorded: Integers) -> dict[int, list[int]]:
+    rows: dict[int, list[int]] = {}
+    for row, stamp in enumerate(recorded.tolist()):
+        rows.setdefault(stamp, []).append(row)
+    return rows
+
+
+def _reference_ranges(
+    handed: Integers, newest: Integers, recorded: Integers
+) -> tuple[Integers, Integers, Integers, Flags]:
+    """Return begin and end of the references passed before each row, and how many are lost.
+
+    ``handed`` is their number since the start of the controller, ``newest`` the stamp of the last
+    one, 0 where the row does not hold it. By its stamp a row shows the lead of the recording over
+    this number; a row without one has that of the rows around it. Where theirs differ, references
+    were lost, or only the recorder received them, and it is unknown which of them the row passes:
+    they are passed later, as the last result marks.
+    """
+    rows_of_stamp = _rows_by_stamp(recorded)
+    stamped = np.flatnonzero((newest != 0) & (handed > 0))
+    leads, end = [0], 0
+    for count, stamp in zip(handed[stamped].tolist(), newest[stamped].tolist(), strict=True):
+        last = count + leads[-1] - 1
+        if not 0 <= last < recorded.size or recorded[last] != stamp:
+            rows = rows_of_stamp.get(stamp, [])
+            place = bisect_left(rows, end)
+            last = rows[place] if place < len(rows) else end - 1
+        end = last + 1
+        leads.append(end - count)
+    # Before the first stamp, nothing was lost if the recording was complete or began earlier.
+    lead = np.array([max(leads[1], 0), *leads[1:]] if stamped.size else leads)
+    counts, stamped = np.append(0, handed[stamped]), np.append(-1, stamped)
+    every = np.arange(len(handed))
+    before = np.searchsorted(stamped, every, side='right') - 1
+    after = np.minimum(np.searchsorted(stamped, every), lead.size - 1)
+    known = lead[before] == lead[after]
+    ends = np.where(known, handed, counts[before]) + lead[before]
+    ends = np.minimum(ends, recorded.size)
+    begins = np.append(lead[0], ends[:-1])
+    begins[stamped[1:]] = np.maximum(begins[stamped[1:]], counts[:-1] + lead[1:])
+    lost = np.zeros(len(handed), dtype=np.int64)
+    lost[stamped[1:]] = np.maximum(-np.diff(lead), 0)
+    return begins, ends, lost, ~known & (np.diff(handed, prepend=0) > 0)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import BagReader
 from t3mpc_ros.bag.run.journal import Event, reading_from_value
@@ -24,10 +23,8 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     motions,
 )
 from t3mpc_ros.geometry.arena import Obstacles
-from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, State
+from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, Array, BodyTwist, State
 from t3mpc_ros.simulation.world import WorldError, load_world
-
-Array = NDArray[np.float64]
 
 SCALAR_RATE = 20.0
 """Rate of the scalars if the controller published none, or if its parameters are unknown, Hz."""
@@ -69,13 +66,6 @@ def replay_controller(
 
     ``changes`` are parameters by name that replace the recorded ones throughout the run;
     ``controllers``, made by :func:`make_controllers`, are consumed by the call.
-
-    Raises
-    ------
-    ParameterError
-        A changed parameter is unknown or invalid.
-    ValueError
-        A model does not fit the parameters.
     """
     changes = changes or {}
     controllers = make_controllers(inputs, changes) if controllers is None else controllers
@@ -120,13 +110,7 @@ def make_controllers(
 
 
 def _obstacles(parameters: ControllerParameters) -> Obstacles:
-    """Return the known obstacles of a keep-out.
-
-    Raises
-    ------
-    ReplayError
-        The world is not here.
-    """
+    """Return the known obstacles of a keep-out; ReplayError if their world is not here."""
     if not parameters.keep_out.enabled:
         return Obstacles()
     try:
