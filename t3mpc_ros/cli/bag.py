@@ -28,7 +28,7 @@ from t3mpc_ros.cli.command import ArgumentParser, RemovedOption, run_command
 from t3mpc_ros.cli.run_options import add_topic_options, report_options
 from t3mpc_ros.cli.train import add_bag_options, run_bags
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.parameters.command_line import parse_assignments
+from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 
 if TYPE_CHECKING:
     from t3mpc_ros.evaluation.process_replay.comparison import Tolerances
@@ -370,25 +370,15 @@ def add_animate_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
     )
     parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its one file')
     parser.add_argument('--output', type=Path, required=True, metavar='FILE', help='a .gif')
-    parser.add_argument(
-        '--start', type=float, default=0.0, metavar='S', help='start, s (default 0)'
-    )
-    parser.add_argument(
-        '--duration', type=float, default=math.inf, metavar='S', help='s (default: to the end)'
-    )
-    parser.add_argument(
-        '--speed',
-        type=float,
-        default=1.0,
-        metavar='X',
-        help='seconds of the run in a second of the animation (default 1)',
-    )
-    parser.add_argument(
-        '--rate', type=float, default=10.0, metavar='HZ', help='frames per second (default 10)'
-    )
-    parser.add_argument(
-        '--width', type=int, default=760, metavar='PIXELS', help='of the picture (default 760)'
-    )
+    for name, default, metavar, kind, text in (
+        ('start', 0.0, 'S', bounded_float(0.0, 1e9, 's'), 'start, s (default 0)'),
+        ('duration', math.inf, 'S', bounded_float(0.0, math.inf, 's'), 's (default: to the end)'),
+        ('speed', 1.0, 'X', bounded_float(1e-3, 1e4), 'seconds of the run in a second of the '
+         'animation (default 1)'),
+        ('rate', 10.0, 'HZ', bounded_float(0.1, 50.0, 'Hz'), 'frames per second (default 10)'),
+        ('width', 760, 'PIXELS', bounded_int(200, 4000), 'of the picture (default 760)'),
+    ):  # fmt: skip
+        parser.add_argument(f'--{name}', type=kind, default=default, metavar=metavar, help=text)
     parser.add_argument('--namespace', help='of the robot, where the bag holds several')
     parser.set_defaults(run=run_animate)
 

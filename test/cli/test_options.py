@@ -89,7 +89,7 @@ IN_CODE = {
     'compare': {name: default_of(compare, name) for name in SIMULATED[:2]} | {'robot': 'twin'},
     'patrol': {'robot': PatrolPlan().robot, 'arena': list(PatrolPlan().arena)},
     'bag train': {'folds': default_of(fit_bags, 'count')},
-    'bag animate': asdict(AnimationOptions()),
+    'bag animate': AnimationOptions()._asdict(),
     'robot calibrate': {
         name: getattr(WizardOptions(), name)
         for name in ('steps', 'distance', 'turns', 'speed', 'distances')
