@@ -11,25 +11,25 @@ from t3mpc_ros.bag.reader import BagReader
 from t3mpc_ros.control.controller import SCALAR_NAMES
 
 TRUTH, ODOMETRY, REFERENCE, COMMAND = 'ground_truth/odom', 'odom', 'reference', 'cmd_vel'
-SIGNALS = ('reference/mode', 'reference/signal/right', 'reference/signal/left')
+SIGNALS = 'reference/signals'
 SCALARS = frozenset(f'controller/{name}' for name in SCALAR_NAMES)
 """Scalars of the controller, which follow from its journal."""
-NUMBERS = (*SIGNALS, *(f'controller/{name}' for name in SCALAR_NAMES))
 JOURNAL = 'controller/journal'
 INITIAL_INPUTS = 'controller/initial_inputs/'
 """Topics on which the controller republishes its first inputs; they are no topics of a robot."""
-NAMES = (REFERENCE, ODOMETRY, TRUTH, COMMAND, 'reference/signals', *NUMBERS)
+NAMES = (
+    REFERENCE, ODOMETRY, TRUTH, COMMAND, SIGNALS, *(f'controller/{name}' for name in SCALAR_NAMES)
+)  # fmt: skip
 
 _ODOMETRY, _TWIST = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist'
-_NUMBER = 'std_msgs/msg/Float64'
 _TWISTS = (_TWIST, f'{_TWIST}Stamped')
 KINDS: Mapping[str, tuple[str, ...]] = {
     TRUTH: (_ODOMETRY,),
     ODOMETRY: (_ODOMETRY,),
     REFERENCE: (_ODOMETRY, *_TWISTS),
     COMMAND: _TWISTS,
-    'reference/signals': ('std_msgs/msg/Int32MultiArray',),
-    **dict.fromkeys(NUMBERS, (_NUMBER,)),
+    SIGNALS: ('std_msgs/msg/Int32MultiArray',),
+    **dict.fromkeys(SCALARS, ('std_msgs/msg/Float64',)),
 }
 """Message types by role."""
 _ALIEN = ('truth', 'reference', 'goal', 'target', 'desired', 'gps', 'map', 'visual')
@@ -100,7 +100,7 @@ def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
             f'({_ODOMETRY}) and none of a command ({" or ".join(_TWISTS)}); found: '
             f'{_listing(recording)}'
         )
-    ours = bool({REFERENCE, *NUMBERS} & set(chosen)) and not wanted.reference
+    ours = bool({REFERENCE, SIGNALS, *SCALARS} & set(chosen)) and not wanted.reference
     return TopicChoice(chosen, namespaces, ours, tuple(notes))
 
 

@@ -46,7 +46,7 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 )
 from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
-from t3mpc_ros.evaluation.bag_report.run_data import Series, load_run
+from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Series, load_run
 from t3mpc_ros.evaluation.charts import MAX_POINTS, PageData, thinned
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
@@ -180,7 +180,7 @@ class Sheet:
         return folder
 
 
-def sheet_of(rows, namespace='', epoch_ns=START, announce='signals', terms=True, lead=LEAD):
+def sheet_of(rows, namespace='', epoch_ns=START, announce=True, terms=True, lead=LEAD):
     """Return a run as the nodes would publish it; stamps count from ``epoch_ns``."""
     sheet = Sheet(namespace, epoch_ns)
     generator = np.random.default_rng(1)
@@ -189,7 +189,7 @@ def sheet_of(rows, namespace='', epoch_ns=START, announce='signals', terms=True,
         t, stamp = row['t'] + 0.5, epoch_ns + round((row['t'] + 0.5) * 1e9)
         heard = t + 0.001
         sheet.add('reference', t - lead + 0.001, odometry(stamp, row['r']))
-        if announce == 'signals' and said != (said := (row['mode'], row['chosen'])):
+        if announce and said != (said := (row['mode'], row['chosen'])):
             sheet.add('reference/signals', t - lead, signals(*said))
         sheet.add('ground_truth/odom', heard, odometry(stamp, row['speeds'], row['pose']))
         sheet.add('odom', heard, odometry(stamp, row['measured'], row['pose']))
@@ -197,10 +197,6 @@ def sheet_of(rows, namespace='', epoch_ns=START, announce='signals', terms=True,
         sheet.add('cmd_vel', told, twist_of(row['command']))
         if i % 5 or not terms:
             continue
-        if announce == 'mode':
-            sheet.add('reference/mode', t - lead, number(row['mode']))
-            for wheel, one in zip(WHEELS, row['chosen'], strict=True):
-                sheet.add(f'reference/signal/{wheel}', t - lead, number(one))
         for k, wheel in enumerate(WHEELS):
             sheet.add(f'controller/error/{wheel}', told, number(row['error'][k]))
             sheet.add(f'controller/estimate/{wheel}', told, number(row['estimate'][k]))
@@ -366,20 +362,12 @@ def test_switches_are_found_where_the_reference_jumps(run):
     np.testing.assert_allclose(run.switches - start, SWITCHES, atol=1e-6)
 
 
-@pytest.mark.parametrize('announce', ['mode', 'signals'])
-def test_both_ways_to_announce_the_mode_give_the_same_switches(rows, tmp_path, announce):
-    """Numbers at 20 Hz come up to 50 ms late: the error statistics must not see that."""
-    bag = sheet_of(rows, announce=announce).write(tmp_path / 'bag')
-    with open_bag(bag) as recording:
-        run = load_run(recording)
-    assert (run.switches - run.motions[REFERENCE].time[0]).tolist() == pytest.approx(SWITCHES)
-    for name in ('reference/mode', 'reference/signal/right', 'reference/signal/left'):
-        value = run.numbers[name]['value']
-        assert np.count_nonzero(np.diff(value)) == 4
-    # Announced a lead time ahead, like the reference itself, and drawn where it applies.
-    mode = run.numbers['reference/mode']
-    changed = mode.time[1:][np.diff(mode['value']) != 0] - run.motions[REFERENCE].time[0]
-    np.testing.assert_allclose(changed, SWITCHES, atol=0.01)
+def test_signals_are_drawn_where_they_apply(run):
+    """They are announced a lead time ahead, like the reference itself."""
+    for name in SIGNAL_NAMES:
+        series = run.numbers[name]
+        changed = series.time[1:][np.diff(series['value']) != 0] - run.motions[REFERENCE].time[0]
+        np.testing.assert_allclose(changed, SWITCHES, atol=0.01)
     assert run.absent == ()
 
 
@@ -634,7 +622,7 @@ def test_without_commands_all_but_the_first_second_counts(rows, tmp_path):
 
 
 def test_a_foreign_bag_with_odometry_and_commands_has_a_report(rows, tmp_path):
-    sheet = sheet_of(rows[:200], terms=False, announce='')
+    sheet = sheet_of(rows[:200], terms=False, announce=False)
     sheet.rows = [row for row in sheet.rows if row[1] in ('/odom', '/cmd_vel')]
     sheet.topics = {name: sheet.topics[name] for name in ('/odom', '/cmd_vel')}
     figures = write_report(sheet.write(tmp_path / 'bag'))
@@ -642,7 +630,6 @@ def test_a_foreign_bag_with_odometry_and_commands_has_a_report(rows, tmp_path):
     assert 'RMSE right/left while driven not measured' in figures.summary()
     text = page_of(figures).text()
     assert 'The bag lacks a reference, or odometry to compare with it.' in text
-    assert 'Left out' not in text
 
 
 def test_a_long_line_keeps_its_extremes():
@@ -808,7 +795,7 @@ def test_the_summary_is_one_line_of_the_main_figures(report):
 def test_the_report_goes_beside_the_bag_unless_told_otherwise(tmp_path):
     sheet = Sheet()
     for i in range(5):
-        sheet.add('reference/mode', 0.1 * i, number(i))
+        sheet.add('reference/signals', 0.1 * i, signals(i, (1, 2)))
     bag = sheet.write(tmp_path / 'bag')
     figures = write_report(bag)
     assert figures.report == tmp_path / 'report.html'
@@ -822,14 +809,13 @@ def test_the_report_goes_beside_the_bag_unless_told_otherwise(tmp_path):
 
 
 def test_an_absent_topic_leaves_out_its_figures_and_is_named(rows, tmp_path):
-    figures = write_report(sheet_of(rows[:300], announce='', terms=False).write(tmp_path / 'bag'))
+    sheet = sheet_of(rows[:300], announce=False, terms=False)
+    figures = write_report(sheet.write(tmp_path / 'bag'))
     own = {'tracking', 'error', 'control', 'portrait', 'path', 'timing'}
     assert set(sections_of(figures)) == {*own, 'response', 'acceleration'}
     assert 'controller/estimate/right' in figures.absent
     text = page_of(figures).text()
     assert 'Not in the bag, or without a message: reference/signals, controller/' in text
-    assert 'Left out: the bag lacks reference/signals.' in text
-    assert 'Left out: the bag lacks controller/estimate/right, controller/estimate/left.' in text
 
 
 @pytest.mark.parametrize('gone', [REFERENCE, ODOMETRY, TRUTH, COMMAND, 'reference/signals'])

@@ -24,14 +24,20 @@ from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import link_table, response_table
 from t3mpc_ros.evaluation.bag_report.response import ResponseFit
 from t3mpc_ros.evaluation.bag_report.run_comparison import ErrorDifference
-from t3mpc_ros.evaluation.bag_report.run_data import BY_BODY, BY_WHEEL, Run, Series, Timing
+from t3mpc_ros.evaluation.bag_report.run_data import (
+    BY_BODY,
+    BY_WHEEL,
+    SIGNAL_NAMES,
+    Run,
+    Series,
+    Timing,
+)
 from t3mpc_ros.evaluation.bag_report.verdict import Stop, Verdict, judge
 from t3mpc_ros.evaluation.charts import Plane
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     ODOMETRY,
     REFERENCE,
-    SIGNALS,
     TRUTH,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry
@@ -45,7 +51,7 @@ NAMES = (
     *(f'controller/{name}/{wheel}' for name in ('estimate', 'skill') for wheel in WHEELS),
     'controller/lyapunov/value',
     'controller/lyapunov/margin',
-    *SIGNALS,
+    *SIGNAL_NAMES,
 )
 
 
@@ -135,7 +141,7 @@ def expected():
         'rad²/s³',
         {'margin': NUMBERS['controller/lyapunov/margin']['value']},
     )
-    signals = [NUMBERS[name]['value'] for name in SIGNALS]
+    signals = [NUMBERS[name]['value'] for name in SIGNAL_NAMES]
     labels = ('active mode', 'right wheel', 'left wheel')
     found['Active mode and chaotic signals'] = 'number', dict(zip(labels, signals, strict=True))
     found['radio: cycles answered since the report before'] = (

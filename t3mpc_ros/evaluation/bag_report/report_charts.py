@@ -24,13 +24,12 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     tracking_error,
 )
 from t3mpc_ros.evaluation.bag_report.response import ResponseFit, busiest, predicted, smooth
-from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
+from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.charts import Chart, Curve, Line, Plane, thinned
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     ODOMETRY,
     REFERENCE,
-    SIGNALS,
     TRUTH,
 )
 from t3mpc_ros.simulation.world import world_outline
@@ -136,18 +135,14 @@ def error(run: Run, metrics: ReportMetrics) -> Shown:
 
 def switching(run: Run, metrics: ReportMetrics) -> Shown:
     """Yield the active mode and the chaotic signals of the wheels, the paper's Fig. 10."""
-    titles = dict(zip(SIGNALS, ('active mode', 'right wheel', 'left wheel'), strict=True))
     lines = []
-    for (name, title), colour, dash in zip(
-        titles.items(), ('c4', 'right', 'left'), ((), (6, 3), (2, 3)), strict=True
-    ):
+    looks = (
+        ('active mode', 'c4', ()), ('right wheel', 'right', (6, 3)), ('left wheel', 'left', (2, 3))
+    )  # fmt: skip
+    for name, (title, colour, dash) in zip(SIGNAL_NAMES, looks, strict=True):
         if series := run.numbers.get(name):
-            end = max(run.duration, float(series.time[-1]))
-            held = Series(
-                np.append(series.time, end),
-                {'value': np.append(series['value'], series['value'][-1])},
-            )
-            time, value = held.time, held['value']
+            time = np.append(series.time, max(run.duration, float(series.time[-1])))
+            value = np.append(series['value'], series['value'][-1])  # to the end of the run
             lines.append(Line(title, colour, time, value, dash, 'steps'))
     if lines:
         count = run.switches.size
@@ -473,10 +468,6 @@ class Section:
     title: str
     caption: str
     draw: Callable[[Run, ReportMetrics], Shown]
-    needs: tuple[str, ...]
-    """Relative names of the topics it needs; empty: it is left out without a word."""
-    ours: bool = False
-    """Whether it needs topics of this package's nodes."""
 
 
 SECTIONS = (
@@ -484,16 +475,12 @@ SECTIONS = (
         'Speeds and their references (Fig. 11)',
         'Wheel speeds are computed from the body twists by (1). Dashed vertical lines: switches.',
         tracking,
-        (REFERENCE, ODOMETRY, TRUTH),
-        True,
     ),
     Section(
         'Tracking error over time',
         'Speed minus reference at the stamps of the measurement, over the whole recording; the '
         'metrics count only the time in which the robot was driven.',
         error,
-        (REFERENCE, ODOMETRY, TRUTH),
-        True,
     ),
     Section(
         'Path on the floor',
@@ -501,20 +488,16 @@ SECTIONS = (
         'positions, so the paths diverge. With ground truth, the frame of the odometry is laid on '
         'the first true pose: later, their distance is the drift.',
         path,
-        (ODOMETRY, TRUTH),
     ),
     Section(
         'Terms of the control law (Fig. 12)',
         'The terms of (66)-(67) with E12, and the applied acceleration.',
         terms,
-        tuple(f'controller/terms/{name}/{w}' for name in (*TERM_NAMES, 'applied') for w in WHEELS),
-        True,
     ),
     Section(
         'Commands (Fig. 12)',
         'The command is published as a body twist; u is the acceleration after all limits.',
         control,
-        (COMMAND, *(f'controller/terms/applied/{wheel}' for wheel in WHEELS)),
     ),
     Section(
         'Response of the robot to its commands',
@@ -522,14 +505,11 @@ SECTIONS = (
         'explain most of the measured speed. Commands are placed by receive time, odometry by '
         'its stamps, so the delay is the one observed at the recorder.',
         response,
-        (COMMAND, ODOMETRY),
     ),
     Section(
         'Switching modes and chaotic signals (Fig. 10)',
         'As published by the reference node, at the time for which it is valid.',
         switching,
-        ('reference/signals', *SIGNALS),
-        True,
     ),
     Section(
         'Estimates of the unknown dynamics and their targets (Fig. 13)',
@@ -537,15 +517,11 @@ SECTIONS = (
         f'smoothed over {WINDOW:g} s by a local straight line; it is undefined at switches, where '
         'the applied one jumps between two of its samples.',
         estimates,
-        tuple(f'controller/estimate/{wheel}' for wheel in WHEELS),
-        True,
     ),
     Section(
         'Phase portrait, one speed against the other (Figs. 9 and 14)',
         'Both curves have the same axes.',
         portrait,
-        (REFERENCE, ODOMETRY, TRUTH),
-        True,
     ),
     Section(
         'Run-time certificate and skill of the predictor',
@@ -553,18 +529,11 @@ SECTIONS = (
         'the disturbance is larger than assumed, or just after a jump of the reference. '
         'Skill is 1 for perfect prediction and 0 for no better than persistence.',
         certificate,
-        (
-            'controller/lyapunov/value',
-            'controller/lyapunov/margin',
-            *(f'controller/skill/{wheel}' for wheel in WHEELS),
-        ),
-        True,
     ),
     Section(
         'Acceleration and jerk over time',
         'Derivatives of the measured speeds, of parabolas fitted to short windows.',
         acceleration,
-        (ODOMETRY, TRUTH),
     ),
     Section(
         'The radio link',
@@ -572,13 +541,11 @@ SECTIONS = (
         'it is answered when a measurement is received. Round trips are over the last '
         '500 cycles.',
         link,
-        (),
     ),
     Section(
         'Punctuality of the loop',
         'By receive times at the recorder.',
         timing,
-        (ODOMETRY, COMMAND),
     ),
 )
 """In the order of the report."""

@@ -446,17 +446,10 @@ def _sections(run: Run, figures: ReportMetrics, *, first: bool) -> Iterator[Bloc
     for section in SECTIONS:
         if (section.draw.__name__ in FIRST) != first:
             continue
-        charts = list(section.draw(run, figures))
-        if not charts and (not section.needs or (section.ours and not run.ours)):
-            continue  # only bags of this package hold them
-        yield Heading(section.title)
-        if charts:
+        if charts := list(section.draw(run, figures)):
+            yield Heading(section.title)
             yield Group(charts, 'div', 'charts')
             yield Paragraph(section.caption, 'quiet')
-            continue
-        lacking = ', '.join(name for name in section.needs if name in run.absent)
-        why = f'the bag lacks {lacking}' if lacking else 'there are too few messages'
-        yield Paragraph(f'Left out: {why}.', 'quiet')
 
 
 def _timing(run: Run) -> list[Block]:

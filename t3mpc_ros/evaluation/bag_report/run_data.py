@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Data of a recorded run: motions, commands and control terms on one time axis."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
@@ -14,11 +14,7 @@ from t3mpc_ros.bag.columns import CDR_LAYOUTS, TopicColumns, read_columns
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
 from t3mpc_ros.bag.schema import DataError
 from t3mpc_ros.control.controller import WHEELS
-from t3mpc_ros.evaluation.bag_report.continuity import (
-    continuity_notes,
-    only_one_robot,
-    rate_notes,
-)
+from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, several_robots
 from t3mpc_ros.evaluation.bag_report.link_history import (
     DiagnosticEvent,
     LinkHistory,
@@ -30,7 +26,6 @@ from t3mpc_ros.evaluation.topic_roles import (
     JOURNAL,
     KINDS,
     NAMES,
-    NUMBERS,
     ODOMETRY,
     REFERENCE,
     SCALARS,
@@ -56,6 +51,8 @@ _ODOMETRY_FIELDS = {
 }
 
 
+SIGNAL_NAMES = ('mode', 'signal of the right wheel', 'signal of the left wheel')
+"""Numbers of the topic of signals."""
 _TWIST_FIELDS = {'linear': 'linear.x', 'angular': 'angular.z'}
 JUMP = 10.0
 """Jump (s) of the stamps against the receive times that indicates a changed clock."""
@@ -135,7 +132,7 @@ class Run:
     """``reference``, ``odom``, ``ground_truth/odom``, ``cmd_vel``: linear, angular (m/s, rad/s),
     right, left (rad/s) where the wheels are known, and of odometry x, y (m), yaw (rad)."""
     numbers: Mapping[str, Series]
-    """Scalar topics by relative name, as ``value``."""
+    """Scalar topics by relative name and the signals by :data:`SIGNAL_NAMES`, as ``value``."""
     receipts: Mapping[str, Array]
     """Receive times by relative name, by the recorder's clock."""
     timing: Mapping[str, Timing]
@@ -194,16 +191,14 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     raw = {name: table for name, table in raw.items() if table['stamp'].size}
     clock = _Clock(raw, oddities)
     scalars = _recomputed_scalars(recording, choice, notes)
-    motions, numbers = {}, {}
+    motions: dict[str, Series] = {}
+    numbers: dict[str, Series] = {}
     for name, table in {**raw, **scalars}.items():
-        if name == 'reference/signals':
-            for i, signal in enumerate(SIGNALS):
-                numbers[signal] = Series(
-                    clock.applies(table['received']), {'value': table[f'{i}']}
-                )
-        elif name in NUMBERS:
-            time = clock.applies if name in SIGNALS else clock.local
-            numbers[name] = Series(time(table['received']), {'value': table['value']})
+        if name == SIGNALS:
+            time = clock.applies(table['received'])
+            numbers |= {key: Series(time, {'value': table[key]}) for key in SIGNAL_NAMES}
+        elif name in SCALARS:
+            numbers[name] = Series(clock.local(table['received']), {'value': table['value']})
         elif name == COMMAND or 'x' not in table:
             motions[name] = _motion(clock.local(table['received']), table, geometry)
         else:
@@ -224,7 +219,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         timing={
             name: _timing(table)
             for name, table in raw.items()
-            if table['stamp'].size > 2 and name != 'reference/signals'  # sent on change only
+            if table['stamp'].size > 2 and name != SIGNALS  # sent on change only
         },
         switches=_switches(numbers, motions.get(REFERENCE)),
         lead=clock.lead,
@@ -288,7 +283,6 @@ def _oddities_of_motions(
                 f'Every speed of {topics[name]} is zero in all {count} messages: the robot stood, '
                 'or it is not connected.'
             )
-        found += rate_notes(topics[name], table['stamp'])
     return found
 
 
@@ -377,10 +371,10 @@ def _read(
     if kind.endswith(('/Twist', '/TwistStamped')):
         inner = 'twist.' if kind.endswith('Stamped') else ''
         fields = {key: inner + field for key, field in _TWIST_FIELDS.items()}
-    elif name == 'reference/signals':
-        fields = {f'{i}': f'data[{i}]' for i in range(3)}
+    elif name == SIGNALS:
+        fields = {signal: f'data[{i}]' for i, signal in enumerate(SIGNAL_NAMES)}
     else:
-        fields = {'value': 'data'} if name in NUMBERS else _ODOMETRY_FIELDS
+        fields = {'value': 'data'} if name in SCALARS else _ODOMETRY_FIELDS
     if column is None:
         table = recording.series(topic, fields)
     else:
@@ -398,14 +392,46 @@ def _read(
     table = {key: values[sound] for key, values in table.items()}
     mixed = False
     if fields is _ODOMETRY_FIELDS:
-        frames = () if column is None else column.frames
-        frame_of = np.empty(0, dtype=np.int64) if column is None else column.frame_of[sound]
-        table, mixed = only_one_robot(table, topic, frames, frame_of, notes)
-        places = np.stack([table['x'], table['y']], axis=1)
+        if column is not None and len(column.frames) > 1:
+            mixed = True
+            table = _of_one_frame(table, topic, column.frames, column.frame_of[sound], notes)
+        table = _each_once(table, topic, notes)
         times = table['received'], table['stamp']
+        places = np.stack([table['x'], table['y']], axis=1)
         notes += continuity_notes(topic, *times, places, table['linear'])
+        mixed |= several_robots(table['stamp'], places, table['linear'])
         _mend_stamps(table, topic, notes)
     return table, mixed
+
+
+def _of_one_frame(
+    table: Mapping[str, Array],
+    topic: str,
+    frames: Sequence[str],
+    frame_of: NDArray[np.int64],
+    notes: list[str],
+) -> dict[str, Array]:
+    """Return the messages of the most frequent base frame: a frame is a robot."""
+    counts = np.bincount(frame_of, minlength=len(frames))
+    kept = int(np.argmax(counts))
+    listed = ', '.join(f'{name} ({n})' for name, n in zip(frames, counts, strict=True))
+    notes.append(
+        f'Several robots: the messages of {topic} are of {len(frames)} frames: {listed}; '
+        f'those of {frames[kept]} are used.'
+    )
+    return {name: column[frame_of == kept] for name, column in table.items()}
+
+
+def _each_once(table: dict[str, Array], topic: str, notes: list[str]) -> dict[str, Array]:
+    """Return the rows without those that repeat the row before but for the receive time."""
+    columns = [column for name, column in table.items() if name != 'received']
+    same = np.all([column[1:] == column[:-1] for column in columns], axis=0)
+    again = np.concatenate([np.zeros(min(1, table['stamp'].size), dtype=np.bool_), same])
+    if np.unique(table['stamp']).size < 2 or not again.any():
+        return table  # without stamps, a robot at standstill repeats itself
+    notes.append(f'{np.count_nonzero(again)} messages of {topic} are repetitions; each counts '
+                 'once.')  # fmt: skip
+    return {name: column[~again] for name, column in table.items()}
 
 
 def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str]) -> None:
@@ -424,12 +450,6 @@ def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str]) -> None:
             f'The stamps of {topic} leap {len(leaps)} times, first by {steps[leaps[0]]:.1f} s at '
             f'{received[leaps[0]]:.1f} s: a clock was set; its messages were placed by receive '
             'time.'
-        )
-    elif leaps := np.flatnonzero(gaps > steps + JUMP).tolist():
-        notes.append(
-            f'From {received[leaps[0]]:.1f} s on nothing of {topic} was received for '
-            f'{gaps[leaps[0]]:.1f} s, but by its stamps that was {steps[leaps[0]]:.1f} s: the '
-            "recorder's clock was set, or the recording was paused."
         )
     if late := np.count_nonzero((steps < 0.0) & (steps >= -JUMP)):
         notes.append(f'{late} messages of {topic} were out of order; they were sorted.')
@@ -469,11 +489,8 @@ def _switches(numbers: Mapping[str, Series], reference: Series | None) -> Array:
     step of the reference within a quarter of a second is taken.
     """
     times: set[float] = set()
-    for name in SIGNALS:
-        if name in numbers:
-            series = numbers[name]
-            changed = np.flatnonzero(np.diff(series['value'])) + 1
-            times |= set(series.time[changed].tolist())
+    for series in (numbers[name] for name in SIGNAL_NAMES if name in numbers):
+        times |= set(series.time[1:][np.diff(series['value']) != 0.0].tolist())
     found = set()
     for time in times:
         if reference is not None and len(reference) > 1:
@@ -540,11 +557,4 @@ def _geometry(
 def _absent(topics: Collection[str], ours: bool) -> tuple[str, ...]:
     if not ours:
         return tuple(name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics)
-    names = set(NAMES) - set(topics)
-    # The signals are in one topic or in three; of the three the bag may hold a part.
-    names -= (
-        set(SIGNALS)
-        if names >= set(SIGNALS) or 'reference/signals' in topics
-        else {'reference/signals'}
-    )
-    return tuple(name for name in NAMES if name in names)
+    return tuple(name for name in NAMES if name not in topics)
