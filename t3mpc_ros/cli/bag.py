@@ -329,19 +329,7 @@ def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
 
 
 def run_report(options: argparse.Namespace) -> int:
-    """Write the report, print its summary and return 0.
-
-    Raises
-    ------
-    BagError
-        The bag is missing or cannot be read.
-    ReportError
-        The bag holds nothing to report, or a given topic cannot be used.
-    OSError
-        The output cannot be written.
-    ValueError
-        Wheel radius without separation or the reverse, or an invalid one.
-    """
+    """Write the report, print its summary and return 0."""
     from t3mpc_ros.evaluation.bag_report.report_page import write_report
 
     wanted = report_options(options)
@@ -384,17 +372,7 @@ def add_animate_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
 
 
 def run_animate(options: argparse.Namespace) -> int:
-    """Write the animation and return 0.
-
-    Raises
-    ------
-    BagError
-        The bag is missing or cannot be read.
-    ReportError
-        The bag holds no pose, or none in the part.
-    ValueError
-        An option is outside its bounds.
-    """
+    """Write the animation and return 0."""
     from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions, animate_bag
     from t3mpc_ros.evaluation.topic_roles import ReportOptions
 
@@ -450,17 +428,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run_replay(options: argparse.Namespace) -> int:
-    """Replay the run, print the comparison and the speed, and return 0.
-
-    Raises
-    ------
-    ReplayError
-        The bag cannot be replayed.
-    BagError
-        A bag cannot be read or written.
-    ParameterError
-        A parameter is unknown or invalid.
-    """
+    """Replay the run, print the comparison and the speed, and return 0."""
     from t3mpc_ros.bag.run.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
     from t3mpc_ros.evaluation.process_replay.comparison import compare
@@ -547,17 +515,7 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
 
 
 def run_compare(options: argparse.Namespace) -> int:
-    """Print the comparison; return 0 when all is within the tolerances, 3 otherwise.
-
-    Raises
-    ------
-    ReplayError
-        The bags hold nothing to compare.
-    BagError
-        A bag cannot be read.
-    ValueError
-        A tolerance or parameter is invalid.
-    """
+    """Print the comparison; return 0 when all is within the tolerances, 3 otherwise."""
     from t3mpc_ros.bag.run.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
     from t3mpc_ros.evaluation.process_replay.comparison import (
@@ -591,13 +549,7 @@ def run_compare(options: argparse.Namespace) -> int:
 def tolerances_from(
     absolute: float | None, relative: float | None, fields: Sequence[str]
 ) -> 'Tolerances':
-    """Return the tolerances given on the command line.
-
-    Raises
-    ------
-    ValueError
-        A text is not ``FIELD=NUMBER``, or a tolerance is invalid.
-    """
+    """Return the tolerances given on the command line."""
     from t3mpc_ros.evaluation.process_replay.comparison import ABSOLUTE, RELATIVE, Tolerances
 
     own = {}

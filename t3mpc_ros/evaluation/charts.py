@@ -11,7 +11,7 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import Array
 
 MAX_POINTS = 8000
 """Points of a line: a minute at 100 Hz is contained whole, of more the extremes."""

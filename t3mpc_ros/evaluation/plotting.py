@@ -14,8 +14,6 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import MaxNLocator
-import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
@@ -23,9 +21,9 @@ from t3mpc_ros.evaluation.topic_roles import (
     REFERENCE,
     TRUTH,
 )
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import World
 
-Array = NDArray[np.float64]
 Subject = TypeVar('Subject')
 Subject_contra = TypeVar('Subject_contra', contravariant=True)
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import BagReader
-
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import Array
 
 SHARES = ('lost_share', 'round_trip_median_ms', 'round_trip_p99_ms', 'telemetry_age_s')
 """Keys of gauges, see ``radio_bridge``."""

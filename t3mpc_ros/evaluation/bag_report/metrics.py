@@ -17,8 +17,7 @@ from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
-
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import Array
 
 SETTLING = 1.0
 """Settling time (s): excluded after the start of the drive and after each switch; also the longest

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
@@ -15,9 +14,8 @@ from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES, SHORTEST, patrol_metrics
 from t3mpc_ros.evaluation.reporting import Block, Heading, Paragraph, Table
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import recorded_world
-
-Array = NDArray[np.float64]
 
 LEAST_DISTANCE, LEAST_SIZE = 2.0, 0.5
 """Length of the path, and of a side of its bounding box, from which on there is a section, m."""

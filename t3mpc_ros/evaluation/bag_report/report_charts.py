@@ -32,9 +32,9 @@ from t3mpc_ros.evaluation.topic_roles import (
     REFERENCE,
     TRUTH,
 )
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import world_outline
 
-Array = NDArray[np.float64]
 Shown = Iterator[Chart | Plane]
 
 LABELS = {

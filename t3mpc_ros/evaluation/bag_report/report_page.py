@@ -153,22 +153,7 @@ def _whole(value: float) -> str:
 def write_report(
     folder: Path | str, output: Path | str | None = None, wanted: ReportOptions | None = None
 ) -> ReportMetrics:
-    """Write ``report.html``, and return the summary metrics of a bag.
-
-    Parameters
-    ----------
-    output
-        Folder of ``report.html``; beside the bag by default.
-    wanted
-        Namespace, topics and wheel geometry; by default found in the bag.
-
-    Raises
-    ------
-    BagError
-        The bag is missing or cannot be read.
-    ReportError
-        The bag holds nothing to report, or a given topic cannot be used.
-    """
+    """Write ``report.html`` beside the bag or to ``output``; return the summary metrics."""
     folder = Path(folder)
     output = folder.parent if output is None else Path(output)
     with open_bag(folder) as recording:

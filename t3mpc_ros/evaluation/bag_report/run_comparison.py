@@ -8,7 +8,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.evaluation.bag_report.metrics import (
@@ -47,8 +46,6 @@ from t3mpc_ros.evaluation.topic_roles import (
     ReportOptions,
     bag_display_name,
 )
-
-Array = NDArray[np.float64]
 
 PAGE = 'comparison.html'
 BLOCK = 5.0
@@ -195,24 +192,7 @@ def why_not_comparable(first: ComparedRun, other: ComparedRun) -> str:
 def write_comparison(
     folders: Sequence[Path], output: Path, wanted: ReportOptions | None = None
 ) -> tuple[Path, str]:
-    """Write ``comparison.html``, and return its path and the verdicts as text.
-
-    Parameters
-    ----------
-    folders
-        Bags, at least two; each is compared with the first.
-    output
-        Folder of the page.
-    wanted
-        Namespace, topics and wheel geometry of all bags.
-
-    Raises
-    ------
-    BagError
-        A bag is missing or cannot be read.
-    ReportError
-        A bag holds nothing to report, or there are too many.
-    """
+    """Compare each bag with the first in ``comparison.html``; return its path and the verdicts."""
     if not 2 <= len(folders) <= MAX_RUNS:
         raise ReportError(f'a comparison must have 2 to {MAX_RUNS} bags: got {len(folders)}')
     path = output / PAGE

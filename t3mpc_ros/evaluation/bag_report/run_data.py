@@ -36,10 +36,8 @@ from t3mpc_ros.evaluation.topic_roles import (
     choose_topics,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
+from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist
 from t3mpc_ros.parameters.table import ParameterError
-
-Array = NDArray[np.float64]
 
 _ODOMETRY_FIELDS = {
     'x': 'pose.pose.position.x',
@@ -169,13 +167,7 @@ class Run:
 
 
 def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
-    """Return the run in ``recording``; of the fullest namespace unless one is given.
-
-    Raises
-    ------
-    ReportError
-        The bag holds nothing to report, or an option does not fit it.
-    """
+    """Return the run in ``recording``; of the fullest namespace unless one is given."""
     wanted = wanted or ReportOptions()
     choice = choose_topics(recording, wanted)
     topics = choice.topics

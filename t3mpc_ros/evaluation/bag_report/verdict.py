@@ -159,29 +159,17 @@ def judge(
 ) -> Verdict:
     """Return the verdict on a run.
 
-    Parameters
-    ----------
-    drive
-        First and last command other than zero, s.
-    rmse
-        Largest settled RMSE of the wheels, in the unit of the reference; NaN if not measured.
-    counted
-        Time in which errors count, s.
-    missing, latency_99
-        Share of missing odometry, and 99th percentile of the time from odometry to command, s; NaN
-        if unknown.
+    ``drive`` are its first and last command other than zero, ``counted`` is the time in which
+    errors count, s; ``rmse`` the largest settled one of the channels, ``missing`` the share of
+    odometry, ``latency_99`` the 99th percentile from odometry to command, s; NaN if unknown.
     """
-    command, reference = run.motions.get(COMMAND), run.motions.get(REFERENCE)
-    lacking = [name for name in (REFERENCE, COMMAND) if name not in run.motions]
-    if not run.measured:
-        lacking.append(ODOMETRY)
     damage = run.damage
-    if command is None or reference is None or not run.measured or not run.ours:
-        judged_by = tuple(lacking) or ('the topics of the controller of this package',)
-        return Verdict(damage, judged=False, damage=damage, lacking=judged_by)
+    if lacking := _lacking(run):
+        return Verdict(damage, judged=False, damage=damage, lacking=lacking)
     if not drive[0] < drive[1]:
         return Verdict((*damage, 'the robot was never driven'), damage=damage)
-    stopped, length = stopped_time(command, *drive), drive[1] - drive[0]
+    command, length = run.motions[COMMAND], drive[1] - drive[0]
+    stopped = stopped_time(command, *drive)
     on_path = share_on_path(run, drive) if run.follows_path else None
     problems = []
     if on_path is None and stopped > MAX_STOPPED * length:
@@ -200,11 +188,19 @@ def judge(
     if slow and problems:
         # By itself it does not spoil the numbers.
         problems.insert(0, 'the machine was too slow')
-    stops = find_stops(run, command, *drive)
-    lost = missing > MAX_MISSING
-    return Verdict(
-        (*problems, *damage), stopped, stops, slow, lost, damage=damage, on_path=on_path
-    )
+    stops, lost = find_stops(run, command, *drive), missing > MAX_MISSING
+    found = (*problems, *damage)
+    return Verdict(found, stopped, stops, slow, lost, damage=damage, on_path=on_path)
+
+
+def _lacking(run: Run) -> tuple[str, ...]:
+    """Return what a closed loop of this package has, and the run has not."""
+    lacking = [name for name in (REFERENCE, COMMAND) if name not in run.motions]
+    if not run.measured:
+        lacking.append(ODOMETRY)
+    if not (lacking or run.ours):
+        lacking.append('the topics of the controller of this package')
+    return tuple(lacking)
 
 
 def share_on_path(run: Run, drive: tuple[float, float]) -> float:
