@@ -49,7 +49,6 @@ from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     ODOMETRY,
     REFERENCE,
-    ReportError,
     ReportOptions,
 )
 
@@ -337,19 +336,6 @@ def test_an_empty_bag_and_no_bag_are_errors(tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ['bag']
 
 
-@pytest.mark.parametrize('count', [1, 2, 3])
-@pytest.mark.parametrize('gone', ['', '/odom', '/cmd_vel'])
-def test_a_message_or_two_do_no_harm(rows, tmp_path, count, gone):
-    few, seen = [], {}
-    for row in rows:
-        seen[row[1]] = seen.get(row[1], 0) + 1
-        if seen[row[1]] <= count and row[1] != gone:
-            few.append(row)
-    figures = write_report(write(tmp_path / 'bag', few), tmp_path / 'out')
-    assert figures.messages == len(few)
-    assert '\n' not in figures.summary()
-
-
 # -- clocks -------------------------------------------------------------------------------------
 
 
@@ -566,10 +552,6 @@ def test_the_fit_of_a_long_run_is_made_on_its_liveliest_part():
     fit = fit_response(command, motion, 'linear')
     assert fit.dead_time + fit.lag == pytest.approx(DEAD_TIME + LAG, abs=0.1)
     assert fit.gain == pytest.approx(GAIN, rel=0.05)
-
-
-def test_nothing_to_report_is_an_error_of_its_own():
-    assert issubclass(ReportError, RuntimeError)
 
 
 # -- several runs -------------------------------------------------------------------------------
