@@ -15,12 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from t3mpc_ros.evaluation.topic_roles import (
-    COMMAND,
-    ODOMETRY,
-    REFERENCE,
-    TRUTH,
-)
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import World
 

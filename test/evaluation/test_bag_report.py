@@ -13,14 +13,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
-from support.bag_messages import (
-    START,
-    TYPES,
-    diagnostics,
-    header,
-    odometry_message,
-    twist_message,
-)
+from support.bag_messages import START, TYPES, diagnostics, header, odometry_message, twist_message
 from support.robot_bags import following_rows, write
 import yaml
 
@@ -39,18 +32,8 @@ from t3mpc_ros.evaluation.bag_report.response import (
     roughness,
     smooth,
 )
-from t3mpc_ros.evaluation.bag_report.run_data import (
-    BY_BODY,
-    BY_WHEEL,
-    Series,
-    load_run,
-)
-from t3mpc_ros.evaluation.topic_roles import (
-    COMMAND,
-    ODOMETRY,
-    REFERENCE,
-    ReportOptions,
-)
+from t3mpc_ros.evaluation.bag_report.run_data import BY_BODY, BY_WHEEL, Series, load_run
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, ReportOptions
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 ODOM, TWIST = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist'

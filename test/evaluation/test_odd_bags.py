@@ -13,14 +13,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.typesys import Stores, get_typestore
-from support.bag_messages import (
-    START,
-    STORE,
-    TYPES,
-    diagnostics,
-    odometry_message,
-    twist_message,
-)
+from support.bag_messages import START, STORE, TYPES, diagnostics, odometry_message, twist_message
 from support.robot_bags import following_rows, write
 
 from t3mpc_ros.cli.main import main as t3mpc

@@ -34,12 +34,7 @@ from t3mpc_ros.evaluation.bag_report.run_data import (
 )
 from t3mpc_ros.evaluation.bag_report.verdict import Stop, Verdict, judge
 from t3mpc_ros.evaluation.charts import Plane
-from t3mpc_ros.evaluation.topic_roles import (
-    COMMAND,
-    ODOMETRY,
-    REFERENCE,
-    TRUTH,
-)
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'

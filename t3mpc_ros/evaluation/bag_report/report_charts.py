@@ -26,12 +26,7 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 from t3mpc_ros.evaluation.bag_report.response import ResponseFit, busiest, predicted, smooth
 from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.charts import Chart, Curve, Line, Plane, thinned
-from t3mpc_ros.evaluation.topic_roles import (
-    COMMAND,
-    ODOMETRY,
-    REFERENCE,
-    TRUTH,
-)
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import world_outline
 

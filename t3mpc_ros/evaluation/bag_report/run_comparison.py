@@ -53,8 +53,10 @@ BLOCK = 5.0
 the error is correlated."""
 SAME_REFERENCE = 0.05
 """Largest difference of two equal references, as a share of their root mean square."""
-MAX_SHIFT = 2.0
-"""Largest difference of the places of the first commands in one reference, s."""
+MIN_SHIFT, MAX_SHIFT = 0.01, 2.0
+"""Resolution, and largest difference, of the places of the first commands in one reference, s."""
+MAX_SAMPLES = 2000
+"""Samples of a reference that are compared."""
 COLOURS = ('c1', 'c2', 'c3', 'c4', 'c5', 'ink')
 MAX_RUNS = len(COLOURS)
 """Runs that a page compares."""
@@ -136,35 +138,39 @@ def aligned(first: ComparedRun, other: ComparedRun) -> ComparedRun:
     Nodes discover each other sooner or later: the first command of two runs with one seed comes at
     different places of the reference. A run with another reference is unchanged.
     """
-    channels = first.run.channels
     one, two = (each.run.motions.get(REFERENCE) for each in (first, other))
-    if one is None or two is None or channels != other.run.channels or len(one) < 2:
+    same_channels = first.run.channels == other.run.channels
+    if one is None or two is None or not same_channels or len(one) < 2:
         return other
-    period = float(np.median(np.diff(one.time)))
-    # A clock that was set, or a sparse reference, would be a grid of any size.
-    if any(np.ptp(each.time) >= 10.0 * period * len(each) for each in (one, two)):
-        return other
-    a, b = (
-        np.column_stack([np.interp(grid, motion.time, motion[each.name]) for each in channels])
-        for motion in (one, two)
-        for grid in [np.arange(motion.time[0], motion.time[-1], period)]
-    )
-    least = 0.5 * min(len(a), len(b))
-    begin = first.start - one.time[0]
-    expected = round((other.start - two.time[0] - begin) / period)
-    reach = round(MAX_SHIFT / period)
-    best, miss = expected, math.inf
-    for lag in sorted(
-        range(expected - reach, expected + reach + 1), key=lambda k: abs(k - expected)
-    ):
-        low, high = max(0, -lag), min(len(a), len(b) - lag)
-        if high - low > least:
-            found = rms(a[low:high] - b[low + lag : high + lag])
-            if found < 0.99 * miss:  # among equal ones the nearest
-                best, miss = lag, found
-    if not miss <= SAME_REFERENCE * rms(a):
-        return other
-    return replace(other, start=float(two.time[0] + best * period + begin))
+    period = max(float(np.median(np.diff(one.time))), MIN_SHIFT)
+    # If nothing was lost, both recordings begin at the same place of the reference.
+    base = first.start + two.time[0] - one.time[0]
+    nearest = base + period * round((other.start - base) / period)
+    shifts = period * np.arange(round(MAX_SHIFT / period) + 1)
+    starts = nearest + np.column_stack([shifts, -shifts]).ravel()
+    moved = [replace(other, start=float(start)) for start in starts]
+    apart = [round(reference_difference(first, each)[0], 6) for each in moved]
+    best = int(np.argmin(apart))  # among equal ones the nearest
+    return moved[best] if apart[best] <= SAME_REFERENCE else other
+
+
+def reference_difference(first: ComparedRun, other: ComparedRun) -> tuple[float, str]:
+    """Return the largest RMS difference of two references of the same channels, and as text.
+
+    The number is a share of the RMS of the first reference; infinite if they do not overlap.
+    """
+    one, two = (each.run.motions[REFERENCE] for each in (first, other))
+    few = slice(None, None, max(1, len(one) // MAX_SAMPLES))
+    time = one.time[few] - first.start + other.start
+    common = time >= max(1.0 + other.start, two.time[0])
+    common &= time <= two.time[-1]
+    found = (0.0, '') if common.any() else (math.inf, 'they do not overlap')
+    for name, title, _, unit in first.run.channels if common.any() else ():
+        wanted = one[name][few][common]
+        apart, size = rms(wanted - np.interp(time[common], two.time, two[name])), rms(wanted)
+        share = apart / size if size > 0.0 else math.inf if apart > 0.0 else 0.0
+        found = max(found, (share, f'{title}: by {format_number(apart)} {unit} RMS'))
+    return found
 
 
 def why_not_comparable(first: ComparedRun, other: ComparedRun) -> str:
@@ -174,18 +180,9 @@ def why_not_comparable(first: ComparedRun, other: ComparedRun) -> str:
             return f'{each.label}: {each.metrics.verdict.headline.lower()}'
     if first.run.channels != other.run.channels:
         return 'the wheels of one robot are unknown'
-    one, two = (each.run.motions[REFERENCE] for each in (first, other))
-    span = min(one.time[-1] - first.start, two.time[-1] - other.start)
-    begin = max(1.0, one.time[0] - first.start, two.time[0] - other.start)
-    time = np.arange(begin, span, 0.05)
-    for channel in first.run.channels:
-        a = np.interp(time + first.start, one.time, one[channel.name])
-        b = np.interp(time + other.start, two.time, two[channel.name])
-        if time.size and rms(a - b) > SAME_REFERENCE * rms(a):
-            return (
-                'the references differ, so the runs had different tasks '
-                f'({channel.title}: by {format_number(rms(a - b))} {channel.unit} RMS)'
-            )
+    share, text = reference_difference(first, other)
+    if share > SAME_REFERENCE:
+        return f'the references differ, so the runs had different tasks ({text})'
     return ''
 
 
