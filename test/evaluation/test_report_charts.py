@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Charts, numbers and sentences of a bag report; no two quantities of the run are equal."""
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 import math
 from pathlib import Path
 import re
@@ -12,7 +12,7 @@ import pytest
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.bag_report import report_page
-from t3mpc_ros.evaluation.bag_report.link_history import LinkHistory, LinkMetrics
+from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkHistory, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     ChannelMetrics,
     ErrorStatistics,
@@ -294,14 +294,16 @@ def test_every_metric_has_its_quantity():
             assert part.seconds == pytest.approx(0.01 * some.size)
         for value, topic in ((found.chatter, COMMAND), (found.demand, REFERENCE)):
             assert value == pytest.approx(np.abs(np.diff(motion(topic, name))).sum() / 19.99)
-    assert asdict(METRICS.links['radio']) == pytest.approx(
+    found = METRICS.links['radio']
+    assert found.counts == pytest.approx(
         {
-            'cycles': 200.0, 'lost': 10.0, 'answered': 0.95, 'round_trip': 0.0065,
-            'round_trip_99': 0.011, 'oldest': math.nan, 'resets': 2.0, 'dongle_resets': 3.0,
-            'port_failures': 4.0, 'sessions': math.nan, 'damaged': 12.0,
+            'cycles': 200.0, 'cycles_lost': 10.0, 'robot_resets': 2.0, 'dongle_resets': 3.0,
+            'port_failures': 4.0, 'sessions': math.nan, 'crc_errors': 5.0, 'frame_errors': 7.0,
         },
         nan_ok=True,
     )  # fmt: skip
+    shares = found.answered, found.round_trip, found.round_trip_99, found.oldest
+    assert shares == pytest.approx((0.95, 0.0065, 0.011, math.nan), nan_ok=True)
 
 
 def statistics(rmse, seconds):
@@ -310,6 +312,7 @@ def statistics(rmse, seconds):
 
 FIT = ResponseFit(0.031, 0.012, 0.98, 0.994, 0.001)
 SOUND = Verdict((), stopped=0.3)
+COUNTS = dict(zip(COUNTED, (1000.0, 13.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0), strict=True))
 GIVEN = ReportMetrics(
     report=Path('r.html'), duration=61.26, messages=9, switches=4, measured=TRUTH,
     wheels={
@@ -317,7 +320,7 @@ GIVEN = ReportMetrics(
         'left': ChannelMetrics(statistics(0.12, 58.0), statistics(0.14, 50.0), 22.0, 1.0),
     },
     channels=BY_WHEEL, responses={'right': FIT, 'left': replace(FIT, lag=0.022)},
-    links={'radio': LinkMetrics(1000.0, 13.0, 0.987, 0.0065, 0.012, 0.4, 2.0, 3.0, 4.0, 5.0, 6.0)},
+    links={'radio': LinkMetrics(COUNTS, 0.987, 0.0065, 0.012, 0.4)},
     latency=0.0031, latency_99=0.0042, missing={ODOMETRY: 0.0234}, absent=(), verdict=SOUND,
 )  # fmt: skip
 
@@ -344,7 +347,7 @@ def test_tables_of_response_and_link_in_full():
         ['left wheel', *5 * [rows[1][1]]],
     ]
     assert [row[1] for row in link_table(GIVEN.links).rows] == [
-        '1000', '13', '98.7 %', '6.50 ms', '12.0 ms', '0.400 s', '2', '3', '4', '5', '6',
+        '98.7 %', '6.50 ms', '12.0 ms', '0.400 s', '1000', '13', '2', '3', '4', '5', '6', '7',
     ]  # fmt: skip
 
 

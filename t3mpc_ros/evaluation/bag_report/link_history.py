@@ -15,18 +15,18 @@ from t3mpc_ros.geometry.types import Array
 
 SHARES = ('lost_share', 'round_trip_median_ms', 'round_trip_p99_ms', 'telemetry_age_s')
 """Keys of gauges, see ``radio_bridge``."""
-COUNTERS = (
-    'cycles',
-    'cycles_lost',
-    'robot_resets',
-    'dongle_resets',
-    'sessions',
-    'port_failures',
-    'crc_errors',
-    'frame_errors',
-    'commands',
-    'commands_refused',
-)
+COUNTED = {
+    'cycles': 'cycles',
+    'cycles_lost': 'cycles lost',
+    'robot_resets': 'resets of the robot board',
+    'dongle_resets': 'resets of the dongle',
+    'port_failures': 'port failures',
+    'sessions': 'sessions begun after the first report',
+    'crc_errors': 'wrong checksums',
+    'frame_errors': 'malformed frames',
+}
+"""Counters that a report shows, with their names."""
+COUNTERS = (*COUNTED, 'commands', 'commands_refused')
 """Keys of counters, which only grow."""
 LINK_KEYS = ('cycles', 'cycles_lost', 'lost_share', 'round_trip_median_ms', 'round_trip_p99_ms')
 """A status with at least two of these keys describes a link."""
@@ -96,8 +96,8 @@ class LinkHistory:
 class LinkMetrics:
     """Quality of a link over a recording; NaN where it is unknown."""
 
-    cycles: float
-    lost: float
+    counts: Mapping[str, float]
+    """Increase of each of :data:`COUNTED` over the recording."""
     answered: float
     """Share of the cycles."""
     round_trip: float
@@ -106,35 +106,21 @@ class LinkMetrics:
     """Largest reported 99th percentile, s."""
     oldest: float
     """Largest reported age of the last measurement, s."""
-    resets: float
-    """Resets of the robot board."""
-    dongle_resets: float
-    port_failures: float
-    sessions: float
-    """Sessions that began after the first report."""
-    damaged: float
-    """Frames with a wrong checksum or format."""
 
 
 def link_metrics(link: LinkHistory) -> LinkMetrics:
     """Return the summary of a link."""
-    cycles, lost = link.grown('cycles'), link.grown('cycles_lost')
-    answered = 1.0 - lost / cycles if cycles > 0.0 else math.nan
-    if math.isnan(answered):
-        answered = _over(np.nanmean, link.answered())
+    counts = {key: link.grown(key) for key in COUNTED}
+    answered = _over(np.nanmean, link.answered())
+    if counts['cycles'] > 0.0 and math.isfinite(counts['cycles_lost']):
+        answered = 1.0 - counts['cycles_lost'] / counts['cycles']
     empty = np.full(1, math.nan)
     return LinkMetrics(
-        cycles,
-        lost,
+        counts,
         answered,
         1e-3 * _over(np.nanmedian, link.values.get('round_trip_median_ms', empty)),
         1e-3 * _over(np.nanmax, link.values.get('round_trip_p99_ms', empty)),
         _over(np.nanmax, link.values.get('telemetry_age_s', empty)),
-        link.grown('robot_resets'),
-        link.grown('dongle_resets'),
-        link.grown('port_failures'),
-        link.grown('sessions'),
-        link.grown('crc_errors') + link.grown('frame_errors'),
     )
 
 

@@ -249,18 +249,18 @@ class ReportMetrics:
         )
         chatter = format_channels(right.chatter, left.chatter, self.channels, '²')
         titles = '/'.join(each.short for each in self.channels)
-        answers = [
+        delays = [
             f'{each.short} {1e3 * (fit.dead_time + fit.lag):.0f} ms'
             for each in self.channels
             if (fit := self.responses.get(each.name)) and fit.clear
         ]
-        answer = f'responds after {", ".join(answers)}; ' if answers else ''
+        response = f'responds after {", ".join(delays)}; ' if delays else ''
         for name, link in self.links.items():
-            answer += f'{name}: {format_number(100.0 * link.answered)} % of cycles answered; '
+            response += f'{name}: {format_number(100.0 * link.answered)} % of cycles answered; '
         missing = format_number(100.0 * self.missing.get(ODOMETRY, math.nan))
         return (
             f'{self.duration:.1f} s, {self.switches} switches; RMSE {titles} while driven '
-            f'{overall}, settled {calm}; command varies by {chatter}; {answer}'
+            f'{overall}, settled {calm}; command varies by {chatter}; {response}'
             f'loop {format_number(1e3 * self.latency)} ms, 99 % below '
             f'{format_number(1e3 * self.latency_99)} ms; {missing} % of odom missing: '
             f'{self.report}'

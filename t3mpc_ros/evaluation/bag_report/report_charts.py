@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report.continuity import POSE_JUMP, gaps, pose_jumps
+from t3mpc_ros.evaluation.bag_report.link_history import COUNTED
 from t3mpc_ros.evaluation.bag_report.metrics import (
     UNMEASURED,
     WINDOW,
@@ -41,6 +42,7 @@ LABELS = {
 COLOURS = {TRUTH: 'truth', ODOMETRY: 'right', REFERENCE: 'reference', COMMAND: 'left'}
 """Variables of the style sheet by motion, the same in every chart."""
 DASHES = {REFERENCE: (6, 4), COMMAND: (2, 3)}
+TERM_COLOURS = ('c1', 'c2', 'c3', 'c4', 'c5', 'ink')
 TERM_DASHES = ((), (6, 3), (2, 3), (8, 3, 2, 3), (1, 4), (4, 2))
 DETAIL = 4.0
 """Time in which the fitted response is shown, s: where the command varies most."""
@@ -223,11 +225,12 @@ def acceleration(run: Run, metrics: ReportMetrics) -> Shown:
 def terms(run: Run, metrics: ReportMetrics) -> Shown:
     """Yield the terms of the control law, (66)-(67), by wheel."""
     names = (*TERM_NAMES, 'applied')
-    colours = ('c1', 'c2', 'c3', 'c4', 'c5', 'ink')
     symbols = ('−g', '−Kδ', 'ṙ', 'v_c', 'v_p', 'u')
     for wheel in WHEELS:
         lines, sizes = [], []
-        for name, symbol, colour, dash in zip(names, symbols, colours, TERM_DASHES, strict=True):
+        for name, symbol, colour, dash in zip(
+            names, symbols, TERM_COLOURS, TERM_DASHES, strict=True
+        ):
             if is_long(series := _term(run, name, wheel)):
                 lines.append(line(f'{name} {symbol}', colour, series, dash=dash))
                 size = float(np.sqrt(np.nanmean(series['value'] ** 2)))
@@ -373,15 +376,6 @@ def certificate(run: Run, metrics: ReportMetrics) -> Shown:
         yield Chart('Skill of the predictor', 'share', lines, f'Mean: {means}.')
 
 
-COUNTED = {
-    'robot_resets': 'resets of the robot board',
-    'dongle_resets': 'resets of the dongle',
-    'port_failures': 'port failures',
-    'crc_errors': 'wrong checksums',
-    'frame_errors': 'malformed frames',
-}
-
-
 def link(run: Run, metrics: ReportMetrics) -> Shown:
     """Yield answered cycles, round trips and counters of faults."""
     if not run.links or run.links[0].time.size < 2:
@@ -393,32 +387,22 @@ def link(run: Run, metrics: ReportMetrics) -> Shown:
         seen = f'Least share of a report: {100.0 * float(np.nanmin(answered)):.1f} %.'
         lines = [line('answered', 'c3', series, style='steps')]
         yield Chart(f'{shown.name}: cycles answered since the report before', '%', lines, seen)
-    trips = [key for key in ('round_trip_median_ms', 'round_trip_p99_ms') if key in values]
+    names = {'round_trip_median_ms': ('median', 'c1'), 'round_trip_p99_ms': ('99 % below', 'c2')}
+    trips = {key: look for key, look in names.items() if key in values}
     if trips:
-        lines = [
-            line(
-                'median' if 'median' in key else '99 % below',
-                colour,
-                Series(shown.time, values),
-                key,
-            )
-            for key, colour in zip(trips, ('c1', 'c2'), strict=False)
-        ]
-        seen = (
-            f'The round trip is {_extent(np.concatenate([values[key] for key in trips]), "ms")}.'
-        )
-        yield Chart('Round trip', 'ms', lines, seen)
-    counted = [key for key in COUNTED if np.isfinite(values.get(key, np.array([np.nan]))).any()]
-    if counted:
-        lines = []
-        grown = []
-        for key, dash, colour in zip(
-            counted, TERM_DASHES, ('c1', 'c2', 'c3', 'c4', 'c5'), strict=False
-        ):
-            since = values[key] - values[key][np.isfinite(values[key])][0]
-            series = Series(shown.time, {'value': since})
-            lines.append(line(COUNTED[key], colour, series, style='steps', dash=dash))
-            grown.append(f'{COUNTED[key]} {np.nanmax(since):.0f}')
+        series = Series(shown.time, values)
+        lines = [line(*look, series, key) for key, look in trips.items()]
+        extent = _extent(np.concatenate([values[key] for key in trips]), 'ms')
+        yield Chart('Round trip', 'ms', lines, f'The round trip is {extent}.')
+    counted = [key for key in COUNTED if key not in ('cycles', 'cycles_lost', 'sessions')]
+    counted = [key for key in counted if key in values and np.isfinite(values[key]).any()]
+    lines, grown = [], []
+    for key, dash, colour in zip(counted, TERM_DASHES, TERM_COLOURS, strict=False):
+        since = values[key] - values[key][np.isfinite(values[key])][0]
+        series = Series(shown.time, {'value': since})
+        lines.append(line(COUNTED[key], colour, series, style='steps', dash=dash))
+        grown.append(f'{COUNTED[key]} {np.nanmax(since):.0f}')
+    if lines:
         yield Chart('Faults since the first report', 'number', lines, f'{", ".join(grown)}.')
 
 

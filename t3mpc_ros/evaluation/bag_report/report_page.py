@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """HTML report of a recorded run."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 import math
@@ -11,7 +11,7 @@ from pathlib import Path
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.bag.recording.message_losses import LOSS_CAUSES, LOSSES
 from t3mpc_ros.evaluation.bag_report.continuity import gaps, parts
-from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics
+from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     SETTLING,
     UNMEASURED,
@@ -126,24 +126,16 @@ def motion_table(run: Run) -> Table:
 
 def link_table(links: Mapping[str, LinkMetrics]) -> Table:
     """Return the metrics of each link, one column each."""
-    each = list(links.values())
-    rows = [
-        ['cycles', *(_whole(one.cycles) for one in each)],
-        ['lost', *(_whole(one.lost) for one in each)],
-        ['answered', *(f'{format_number(100.0 * one.answered)} %' for one in each)],
-        ['round trip, median', *(f'{format_number(1e3 * one.round_trip)} ms' for one in each)],
-        [
-            'round trip, worst 99 %',
-            *(f'{format_number(1e3 * one.round_trip_99)} ms' for one in each),
-        ],
-        ['oldest measurement', *(f'{format_number(one.oldest)} s' for one in each)],
-        ["resets of the robot's board", *(_whole(one.resets) for one in each)],
-        ['resets of the dongle', *(_whole(one.dongle_resets) for one in each)],
-        ['failures of the port', *(_whole(one.port_failures) for one in each)],
-        ['sessions begun after the first report', *(_whole(one.sessions) for one in each)],
-        ['frames damaged between dongle and host', *(_whole(one.damaged) for one in each)],
+    quantities: list[tuple[str, Callable[[LinkMetrics], str]]] = [
+        ('cycles answered', lambda each: f'{format_number(100.0 * each.answered)} %'),
+        ('round trip, median', lambda each: f'{format_number(1e3 * each.round_trip)} ms'),
+        ('round trip, worst 99 %', lambda each: f'{format_number(1e3 * each.round_trip_99)} ms'),
+        ('oldest measurement', lambda each: f'{format_number(each.oldest)} s'),
     ]
-    return Table('', ['quantity', *links], rows if each else [])
+    rows = [[text, *map(show, links.values())] for text, show in quantities]
+    for key, text in COUNTED.items():
+        rows.append([text, *(_whole(each.counts[key]) for each in links.values())])
+    return Table('', ['quantity', *links], rows if links else [])
 
 
 def _whole(value: float) -> str:

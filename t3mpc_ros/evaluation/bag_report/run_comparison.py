@@ -21,7 +21,7 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     settled,
     tracking_error,
 )
-from t3mpc_ros.evaluation.bag_report.report_charts import TERM_DASHES, is_long, line
+from t3mpc_ros.evaluation.bag_report.report_charts import TERM_COLOURS, TERM_DASHES, is_long, line
 from t3mpc_ros.evaluation.bag_report.report_page import verdict_box
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, load_run
 from t3mpc_ros.evaluation.charts import Chart, Curve, Plane
@@ -57,8 +57,7 @@ MIN_SHIFT, MAX_SHIFT = 0.01, 2.0
 """Resolution, and largest difference, of the places of the first commands in one reference, s."""
 MAX_SAMPLES = 2000
 """Samples of a reference that are compared."""
-COLOURS = ('c1', 'c2', 'c3', 'c4', 'c5', 'ink')
-MAX_RUNS = len(COLOURS)
+MAX_RUNS = len(TERM_COLOURS)
 """Runs that a page compares."""
 BETTER, WORSE, INCONCLUSIVE = 'smaller error', 'larger error', 'inconclusive'
 
@@ -297,7 +296,7 @@ _Looks = list[tuple[ComparedRun, str, tuple[int, ...]]]
 def _charts(runs: Sequence[ComparedRun]) -> Iterator[Block]:
     """Yield the overlaid charts, with the time since the first command to move."""
     channels = [c for c in runs[0].run.channels if all(c in each.run.channels for each in runs)]
-    looks = list(zip(runs, COLOURS, TERM_DASHES, strict=False))
+    looks = list(zip(runs, TERM_COLOURS, TERM_DASHES, strict=False))
     for heading, charts in (
         ('Tracking errors', _error_charts(looks, channels)),
         ('Speeds', _motion_charts('Speeds', looks, channels, lambda each: each.run.measured)),
