@@ -44,7 +44,7 @@ class Chart:
     unit: str
     lines: Sequence[Line]
     summary: str
-    """What is seen, in words."""
+    """What is seen in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ class Plane:
     unit: str
     curves: Sequence[Curve]
     summary: str
-    """What is seen, in words."""
+    """What is seen in it."""
     world: Mapping[str, Any] | None = None
     """Walls, as of :func:`.world_outline`."""
     marks: Sequence[tuple[float, float, float, str]] = ()

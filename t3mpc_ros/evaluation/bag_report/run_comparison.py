@@ -93,7 +93,7 @@ class ErrorDifference:
         return BETTER if self.difference < 0.0 else WORSE
 
     def text(self) -> str:
-        """Return the difference and its verdict in words."""
+        """Return the difference and its verdict as text."""
         unit = f'({self.channel.unit})²'
         half = format_number(self.half) if math.isfinite(self.half) else 'unknown'
         difference = f'{self.difference:+.3g}' if math.isfinite(self.difference) else 'unknown'
