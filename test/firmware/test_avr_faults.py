@@ -221,17 +221,6 @@ def test_commands_resume_within_1_s_of_a_replugged_dongle(build, start):
     check_followed(bench)
 
 
-@pytest.mark.parametrize('name', ['dongle_reset', 'robot_reset'])
-def test_commands_resume_within_1_s_of_a_rebooted_board(build, name):
-    bench = driving(build, flat={'dongle_boot_time': 0.3})
-    bench.inject(name, 0.2)
-    took = time_to_resume(bench, 5.0)
-    print(f'\n{name}: commands resume after {took:.2f} s')
-    assert took <= 0.3 + 1.0
-    bench.run(0.3)
-    check_followed(bench)
-
-
 # -- host -----------------------------------------------------------------------------------------
 
 

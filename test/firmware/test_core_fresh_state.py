@@ -393,28 +393,3 @@ def test_each_state_is_the_same_when_it_is_entered_again(library):
     assert len(rests) >= 2
     assert all(powered for _, _, powered, _ in rests)
     assert not all(powered for _, _, powered, _ in first)
-
-
-def test_a_command_expires_in_the_first_pass_after_its_ttl(library, layout):
-    robot = Robot(library)
-    robot.run(1000)
-    robot.hello()
-    robot.send(robot.command(5000, 5000, ttl=20))
-    robot.run(199_800)
-    assert not any(memory(robot, layout)['robot.expired'])
-    robot.run(400)
-    assert any(memory(robot, layout)['robot.expired'])
-
-
-def test_the_button_counts_after_its_times(library, layout):
-    """As pressed after 5 ms, as released after 50 ms, and the pass of the main loop."""
-    robot = Robot(library)
-    robot.run(100_000)
-    for pressed, wait_us in ((True, 5_000), (False, 50_000)):
-        robot.call('press', ctypes.c_bool(pressed))
-        passed_us = 0
-        while bool(memory(robot, layout)['robot.pressed'][0]) != pressed:
-            robot.run(200)
-            passed_us += 200
-        assert wait_us <= passed_us <= wait_us + 400
-        robot.run(1000)

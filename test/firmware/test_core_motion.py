@@ -237,18 +237,6 @@ def test_clock_wrap_of_any_width_has_no_effect(robot, wrap, before):
     assert robot.status == ENABLED | MOVING
 
 
-@pytest.mark.long
-def test_driving_for_more_than_71_minutes(robot):
-    for _ in range(4400):
-        robot.drive(100, 100, 1_000_000, period=200_000, ttl=25)
-    assert robot.now < 200_000_000
-    assert robot.status == ENABLED | MOVING
-    counters = robot.counters()
-    assert (counters['stale'], counters['expired']) == (0, 0)
-    assert robot.steps == robot.pulses
-    assert robot.steps[0] * STEP == pytest.approx(440.0, abs=0.1)
-
-
 def test_counters_wrap_at_32_bits(robot):
     robot.call('poke_steps', 0, (1 << 31) - 3)
     robot.call('poke_steps', 1, -(1 << 31) + 3)

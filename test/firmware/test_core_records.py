@@ -7,9 +7,12 @@ import struct
 
 import pytest
 from support.firmware_core import (
+    ADDRESS,
     BUSY,
+    ENABLED,
     FAILED,
     INVERT,
+    LATCHED,
     NO_SESSION,
     OK,
     RANGE,
@@ -220,3 +223,53 @@ def test_the_robot_uses_its_settings_and_calibration(robot):
     assert struct.unpack_from('<H', aux, 4)[0] == pytest.approx(1.05 * nominal - 100, abs=9)
     (samples,) = robot.console(b'\x08\x09')
     assert struct.unpack_from('<9H', samples, 2) == (*8 * (200,), 800)
+
+
+DEFAULTS, OTHERS = (82, 16, ADDRESS), (100, 32, bytes.fromhex('c25a33a6e1'))
+"""Channel, microsteps and address."""
+
+
+def test_two_robots_without_settings_follow_no_command(library):
+    """Both once obeyed the first host on the default channel."""
+    for _ in range(2):
+        robot = Robot(library, erased=True)
+        robot.run(1000)
+        assert robot.hello()[1] == 0
+        robot.drive(5000, 5000, 1_000_000)
+        assert robot.status == NO_SESSION
+        assert robot.pulses == (0, 0)
+        assert not robot.call('powered')
+        assert robot.identity() == (SETTINGS_MISSING, *DEFAULTS)
+        assert robot.counters()['bad_session'] > 50
+        robot.send(robot.command(flags=2))  # ESTOP
+        assert robot.status & LATCHED
+
+
+def test_pong_and_info_hold_channel_address_and_build(library, robot):
+    (pong,) = robot.console(b'\x03\x01ping')
+    assert pong[21:] == bytes([SETTINGS_GOOD, 82]) + ADDRESS + bytes(4)
+    assert robot.request(b'\x25\0\0\2')[13:24] == bytes([SETTINGS_GOOD, 82]) + ADDRESS + bytes(4)
+    (pong,) = Robot(library, erased=True).console(b'\x03\x01ping')
+    assert pong[21] == SETTINGS_MISSING
+
+
+def test_settings_are_written_only_at_rest_with_drivers_off(robot):
+    for values in (
+        (82, 0, ADDRESS),
+        (82, 512, ADDRESS),
+        (82, 16, bytes(5)),
+        (82, 16, b'\xff' * 5),
+    ):
+        assert robot.settings(*values) == (RANGE, SETTINGS_GOOD, *DEFAULTS)
+    robot.drive(3000, 3000, 200_000)
+    assert robot.settings(*OTHERS, us=1000) == (BUSY, SETTINGS_GOOD, *DEFAULTS)
+    robot.drive(0, 0, 400_000)
+    assert robot.call('powered')
+    assert robot.settings(*OTHERS, us=1000) == (BUSY, SETTINGS_GOOD, *DEFAULTS)
+    assert robot.status == ENABLED
+    robot.send(robot.command(flags=0))
+    robot.run(2000)
+    steps = robot.steps
+    assert robot.settings(*OTHERS) == (OK, SETTINGS_GOOD, *OTHERS)
+    assert robot.status & NO_SESSION
+    assert robot.steps == steps

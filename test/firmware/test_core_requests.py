@@ -74,13 +74,6 @@ def test_the_direction_changes_only_at_rest(robot):
     assert robot.set(INVERT, 2) == (OK, 2)
 
 
-def test_boot_restores_the_parameter_defaults(robot):
-    assert robot.set(MAX_SPEED, 123) == (OK, 123)
-    robot.call('boot', 1, 0)
-    robot.hello()
-    assert robot.get(MAX_SPEED) == (OK, 10_000)
-
-
 def test_odometry_is_reset_only_at_rest(robot):
     robot.drive(1000, 1000, 500_000)
     assert robot.act(1, seq=1) == bytes([0x24, SESSION, 1, 1, BUSY])
@@ -101,13 +94,6 @@ def test_a_repeated_action_is_acknowledged_but_runs_once(robot):
     assert robot.steps == steps
     assert robot.act(1, seq=8)[4] == OK
     assert robot.steps == (0, 0)
-
-
-def test_counters_are_cleared_by_the_action(robot):
-    robot.send(robot.command(session=3))
-    assert robot.counters()['bad_session'] == 1
-    assert robot.act(2, seq=1)[4] == OK
-    assert set(robot.counters().values()) == {0, 1}
 
 
 def test_reply_to_each_kind_of_packet(robot):

@@ -177,12 +177,3 @@ def test_damaged_frames_never_pass_and_the_decoder_recovers():
     # The CRC passes one in 65 536; there are 12 000 damaged frames.
     assert wrong <= 2
     assert neighbours < 0.1 * damaged
-
-
-def test_a_partial_frame_does_not_survive_a_new_connection():
-    decoder = FrameDecoder()
-    wire = encode_frame(b'of this connection')
-    decoder.feed(wire[:5])
-    decoder.reset()
-    assert decoder.feed(wire) == [b'of this connection']
-    assert decoder.counts == (1, 0, 0)

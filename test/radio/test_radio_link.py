@@ -413,27 +413,6 @@ def test_the_robot_stops_when_its_command_expires(bench):
     assert moving(bench)
 
 
-def test_excessive_wheel_speeds_are_scaled_by_one_factor(bench):
-    bench.drive(30.0, -15.0)
-    bench.run(0.1)
-    assert bench.robot.speeds == (-5.0, 10.0)
-    assert bench.link.sent_wheels == (10.0, -5.0)
-    bench.drive(10.0, -20.0)
-    bench.run(0.1)
-    assert bench.robot.speeds == (-10.0, 5.0)
-
-
-def test_a_stop_lasts_until_the_next_command(bench):
-    bench.release_controls()
-    bench.link.stop('the reference is gone')
-    bench.run(0.05)
-    assert bench.robot.speeds == (0.0, 0.0)
-    assert bench.link.reason(bench.now_ns) == 'the reference is gone'
-    bench.drive(3.0, -2.0)
-    bench.run(0.05)
-    assert moving(bench)
-
-
 # -- emergency stop -------------------------------------------------------------------------------
 
 
@@ -456,23 +435,6 @@ def test_emergency_stop_and_release(bench):
     bench.drive(3.0, -2.0)
     bench.run(0.1)
     assert moving(bench)
-
-
-def test_release_is_sent_before_the_robot_reports_the_latch():
-    arbiter = SetpointArbiter(LinkParameters())
-    arbiter.latch('asked for')
-    assert arbiter.next_setpoint(False, 0).flags == CommandFlag.ESTOP
-    assert arbiter.release(False, 0) == ''
-    flags = [arbiter.next_setpoint(False, cycle * 20 * MS).flags for cycle in range(5)]
-    assert flags == 3 * [CommandFlag.ESTOP_CLEAR] + 2 * [CommandFlag.ENABLE]
-
-
-def test_nothing_is_commanded_while_the_robot_is_latched():
-    arbiter = SetpointArbiter(LinkParameters())
-    arbiter.command(WheelSpeeds(1.0, 2.0), 250 * MS)
-    assert arbiter.next_setpoint(True, MS)[:3] == (CommandFlag.ENABLE, 0, 0)
-    assert arbiter.sent_wheels == (0.0, 0.0)
-    assert arbiter.next_setpoint(False, MS) == (CommandFlag.ENABLE, 2000, 1000, 20)
 
 
 def test_a_setpoint_ends_with_its_command():
@@ -882,23 +844,6 @@ def test_the_link_does_not_poll_busily(bench):
     calls = 0
     bench.run(10.0)
     assert calls < 10 * 5 * 4
-
-
-@pytest.mark.slow
-def test_session_numbers_are_random_and_never_repeated():
-    numbers = []
-    bench = LinkBench(robot=FakeRobot(), seed=9)
-    bench.connect()
-    for _ in range(60):
-        bench.run(0.3)
-        numbers.append(bench.robot.verifier.session)
-        bench.robot.boot(bench.now_ns)
-        bench.run(0.05, lambda: not running(bench))
-        bench.connect()
-    assert all(a != b for a, b in zip(numbers, numbers[1:], strict=False))
-    assert len(set(numbers)) > 45
-    assert min(numbers) >= 1
-    assert bench.link.quality(bench.now_ns).robot_resets == 60
 
 
 def test_stamps_increase_strictly_with_a_stopped_clock():

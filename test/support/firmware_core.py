@@ -317,11 +317,8 @@ class Robot(Part):
 class CoreVerifier:
     """The rules of a session in the core, with the interface of ``CommandVerifier``."""
 
-    def __init__(self, key=b'', locked=False):
-        self._robot = Robot(load_core(), key or (KEY if locked else b''))
-        if locked:
-            self._robot.call('poke_eeprom', ctypes.c_uint8(8), ctypes.c_uint8(0x55))
-            self._robot.call('boot', 1, 0)
+    def __init__(self, key=b''):
+        self._robot = Robot(load_core(), key)
         self._robot.run(1000)
 
     @property
