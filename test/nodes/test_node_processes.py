@@ -11,7 +11,6 @@ import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from support import node_cost_bench
 from support.long_tests import few_of
 from support.ros_graph import speed, stamp
 from support.signals import attended
@@ -255,12 +254,3 @@ def test_a_restarted_recorder_continues_the_bag(run):
     assert len(list(run.last_bag.glob('*.mcap'))) == 2
     stamps, speeds = _speeds(run.last_bag)
     assert np.mean(_during(stamps, speeds, run.end_ns, -1.0, 0.0) > MOVING) > 0.8
-
-
-@pytest.mark.timed
-@pytest.mark.long
-def test_the_benchmark_of_the_nodes_measures_each_of_them(tmp_path):
-    found = node_cost_bench.run(tmp_path, 8.0)
-    assert found.keys() == {'echo', *node_cost_bench.NODES, 'command_ms', 'answer_ms'}
-    assert all(0.01 < found[name] < 1.0 for name in ('echo', *node_cost_bench.NODES))
-    assert 0.0 < found['command_ms'] < 100.0

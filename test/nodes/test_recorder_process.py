@@ -13,9 +13,9 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray
 from support.bag_files import kept_messages
 from support.long_tests import few_of
-from support.recorder_bench import run
 from support.waiting import wait_for_acknowledgement, wait_until
 
+from bench.recorder_load import run
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery import recover_bag
 from t3mpc_ros.cli.process_group import ProcessError
@@ -26,7 +26,7 @@ DEEP = QoSProfile(depth=5000)
 
 
 def test_two_thousand_messages_a_second_are_all_recorded(processes, tmp_path):
-    """``recorder_bench.py`` runs this for a minute and prints the processor load."""
+    """``bench/recorder_load.py`` runs this for a minute and prints the processor load."""
     found = run(tmp_path / 'bag', processes, seconds=4.0)
     assert found.sent == 8000
     assert found.recorded == found.sent

@@ -3,8 +3,9 @@
 """The table of docs/safety.md in its short form: one trial of each kind, with real processes."""
 
 import pytest
-from support import stopping_bench
 from support.long_tests import few_of
+
+from bench import stopping_times
 
 pytestmark = [pytest.mark.ros, pytest.mark.timed, pytest.mark.slow]
 
@@ -19,14 +20,14 @@ def test_the_robot_rests_in_time_whatever_fails(kind, processes, ros, tmp_path):
     """
     import rclpy
 
-    node = rclpy.create_node('stopping_bench')
+    node = rclpy.create_node('stopping_times')
     try:
-        for name, trials, _ in stopping_bench.rows(
+        for name, trials, _ in stopping_times.rows(
             node, processes, tmp_path, 1, durations=(0.2, 1.0), kinds=(kind,)
         ):
             (trial,) = trials
             print(f'\n{name}: {trial}')
-            assert trial.rest is None or trial.rest <= stopping_bench.LIMIT
-            assert trial.after <= stopping_bench.CREEP
+            assert trial.rest is None or trial.rest <= stopping_times.LIMIT
+            assert trial.after <= stopping_times.CREEP
     finally:
         node.destroy_node()

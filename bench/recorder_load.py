@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Benchmark of the recorder: lost messages and processor time at a high message rate.
 
-    PYTHONPATH=. .venv/bin/python test/support/recorder_bench.py [--seconds 60] [--topics 20]
+    PYTHONPATH=. .venv/bin/python bench/recorder_load.py [--seconds 60] [--topics 20]
         [--rate 100]
 
 A publisher and the recorder run as separate processes over DDS on loopback. Half of the topics

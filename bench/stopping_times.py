@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measures how fast the robot stops: real bridge processes, and emulated boards on a pty.
 
-``cd test && python -m support.stopping_bench --trials 20`` prints the table of docs/safety.md.
+    PYTHONPATH=.:test .venv/bin/python bench/stopping_times.py [--trials 20] [KIND ...]
+
+It prints the table of docs/safety.md; ``test/nodes/test_stopping_times.py`` is its short form.
 Times are those of the emulator, which knows when the motors pulse. It is in this process and may
 be interrupted on a busy machine: a trial in which its time has lagged is repeated.
 """
@@ -24,8 +26,8 @@ from typing import NamedTuple
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 import rclpy
-
 from support.waiting import Processes, WaitTimeoutError, wait_until
+
 from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.emulator.pty_port import PtyPort, serve
@@ -102,6 +104,7 @@ class DrivenRobot:
         self.start_bridge()
 
     def start_bridge(self):
+        """Start the bridge at the port of the emulator."""
         self._processes.start(
             self.name,
             '--ros-args',
@@ -113,9 +116,11 @@ class DrivenRobot:
 
     @property
     def pid(self):
+        """Return the process of the bridge."""
         return self._processes.pid(self.name)
 
     def kill_bridge(self):
+        """Kill the bridge."""
         self._processes.kill(self.name)
 
     def inject(self, *fault):
@@ -151,6 +156,7 @@ class DrivenRobot:
         del self._samples[:-2000], self._published[:-100]
 
     def close(self):
+        """End the bridge, the emulator and the publisher."""
         self._ended = True
         for thread in self._threads:
             thread.join()
@@ -252,6 +258,7 @@ def break_link(robot, fault, *values):
 
 
 def end_publisher(robot):
+    """Return the trial of a publisher that ends; the bridge goes on."""
     robot.drive()
     robot.speed = None
     time.sleep(_SETTLING)
@@ -350,7 +357,7 @@ def bench(folder: Path, environment: dict[str, str]) -> Iterator[tuple[object, P
     os.environ.update(environment)
     processes = Processes(folder / 'log', environment)
     rclpy.init(args=[])
-    node = rclpy.create_node('stopping_bench')
+    node = rclpy.create_node('stopping_times')
     try:
         yield node, processes
     finally:
@@ -419,6 +426,7 @@ def format_row(name, trials, disturbed):
 
 
 def main():
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--trials', type=int, default=20)
     parser.add_argument('kinds', nargs='*', default=['all'])

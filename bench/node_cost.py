@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Benchmark of the nodes: processor time and latency beside a bare echo node of rclpy.
 
-    PYTHONPATH=.:test .venv/bin/python test/support/node_cost_bench.py [--seconds 40] [--runs 3]
+    PYTHONPATH=.:test .venv/bin/python bench/node_cost.py [--seconds 40] [--runs 3]
 
 Generator, controller, simulated robot and recorder at 100 Hz, as the demo starts them, and in the
 same graph a node that answers each odometry message with a Twist and does nothing else. The first
@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 
-from support.recorder_bench import processor_time
+from bench.recorder_load import processor_time
 from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.cli.process_group import ProcessGroup
 
@@ -94,6 +94,7 @@ def run(folder: Path, seconds: float) -> dict[str, float]:
 
 
 def main() -> None:
+    """Print the medians of some runs."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
     parser.add_argument('--seconds', type=float, default=40.0)
     parser.add_argument('--runs', type=int, default=3)
