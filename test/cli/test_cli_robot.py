@@ -158,14 +158,6 @@ def test_jog_requires_a_confirmation(answer, capsys, monkeypatch):
     assert 'nothing was moved' in output.err
 
 
-def test_key_file_of_zeros_is_rejected(tmp_path, capsys):
-    path = tmp_path / 'key'
-    path.write_text(32 * '0')
-    path.chmod(0o600)
-    assert cli.main(['key', 'write', str(path), '--port', 'x']) == 2
-    assert 'zeros' in capsys.readouterr().err
-
-
 def test_calibrating_needs_a_person_at_a_terminal(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     with open(os.devnull) as empty:

@@ -3,7 +3,6 @@
 """``t3mpc demo``: signals end everything at every phase; private graphs never meet."""
 
 from contextlib import ExitStack, suppress
-import dataclasses
 from datetime import datetime
 import os
 from pathlib import Path
@@ -20,9 +19,7 @@ from support.robot_bags import following_rows, write
 from support.signals import attend
 from support.waiting import communicate, run, wait_until
 
-from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli import process_group
-from t3mpc_ros.cli.demo import DemoOptions, parse_settings
 from t3mpc_ros.cli.main import DEMO_EXIT_CODES, _new_run, main
 from t3mpc_ros.cli.private_graph import DOMAINS, NoDomainError, PrivateGraph, used_domains
 
@@ -385,41 +382,6 @@ def test_a_domain_with_a_participant_is_left_out():
         participant.bind(('127.0.0.1', 7400 + 250 * domain + 11))
         assert domain in used_domains(Path('/proc/net'))
     assert used_domains(Path('/nowhere')) == set()
-
-
-@pytest.mark.ros
-@pytest.mark.long
-def test_two_demos_at_once_do_not_meet(graph, tmp_path):
-    demos = []
-    for i in range(2):
-        (tmp_path / str(i)).mkdir()
-        demos.append(start_demo(tmp_path / str(i), os.environ, '--duration', '3'))
-    bags = []
-    for i, demo in enumerate(demos):
-        _, errors = communicate(demo, 240.0)
-        assert 'drawing the report' in errors, errors
-        bags.append(tmp_path / str(i) / 'run' / 'bag')
-    stamps = []
-    for bag in bags:
-        with open_bag(bag) as recording:
-            # A second generator would have published at the same stamps' distance, too.
-            times = recording.series('/reference', {'v': 'twist.twist.linear.x'})['stamp']
-            assert (times[1:] > times[:-1]).all()
-            stamps.append(set(times + recording.start_ns * 1e-9))
-    assert not stamps[0] & stamps[1]
-
-
-def test_parameters_of_each_node_are_set(tmp_path):
-    options = DemoOptions(robot='servo', seed=3)
-    texts = 'controller.law.gain=30', 'controller.adaptation.enabled=false', 'sim_robot.seed=4'
-    set_options = dataclasses.replace(options, settings=parse_settings(options, texts))
-    before, after = options.parameters(), set_options.parameters()
-    assert after['controller'] == before['controller'] | {
-        'law.gain': 30,
-        'adaptation.enabled': False,
-    }
-    assert after['sim_robot'] == before['sim_robot'] | {'seed': 4}
-    assert after['reference_generator'] == before['reference_generator']
 
 
 @pytest.mark.parametrize(

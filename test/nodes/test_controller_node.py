@@ -8,7 +8,6 @@ from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
-from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
@@ -23,26 +22,12 @@ from support.ros_graph import (
 )
 
 from t3mpc_ros.bag.run.model_file import ModelError, load_model
-from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import controller as controller_module
 from t3mpc_ros.nodes.common import qos
 from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.controller import ControllerNode
 
 pytestmark = pytest.mark.ros
-
-
-def test_without_odometry_the_controller_warns_and_stops(harness):
-    controller = harness.add(ControllerNode)
-    reference = harness.create_publisher(Odometry, 'reference')
-    commands = harness.subscribe(Twist, 'cmd_vel')
-    harness.wait_for_subscriber(reference)
-    reference.publish(odometry(NANOSECONDS, 0.2))
-    status = harness.next_status('controller')
-    assert status.level == WARN
-    assert status.message == 'stopped: no odometry'
-    assert not any(message.linear.x or message.angular.z for message in commands)
-    assert diagnostic(controller, 'steps') == 0
 
 
 def test_a_stale_reference_gives_a_zero_command_with_the_reason(harness):
@@ -258,24 +243,6 @@ def test_a_scalar_without_subscribers_is_not_published(harness):
     bench.publish_reference(seconds=0.9)
     bench.run(10)
     assert published == ['skill/left'] * 2
-
-
-def test_dynamic_controller_parameters_take_effect(harness):
-    bench = ControllerHarness(harness)
-
-    def follow():
-        for _ in range(4):  # a reference is stale 0.15 s after its arrival
-            bench.publish_reference(0.3)
-            bench.run(10)
-
-    bench.publish_odometry()
-    follow()
-    assert bench.last_command().linear.x > 0.1
-    lower = Parameter('linear.x.max_velocity', value=0.05)
-    assert bench.controller.set_parameters([lower])[0].successful
-    follow()
-    assert bench.last_command().linear.x == pytest.approx(0.05, abs=0.001)
-    assert diagnostic(bench.controller, 'limited')
 
 
 # -- initial inputs -------------------------------------------------------------------------------

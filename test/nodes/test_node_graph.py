@@ -10,7 +10,6 @@ from nav_msgs.msg import Odometry
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
-from std_srvs.srv import SetBool
 from support.ros_graph import NODE_CLASSES, diagnostic, is_ok, on_grid, reason, speed, stamp
 
 from t3mpc_ros.geometry.types import NANOSECONDS
@@ -166,25 +165,7 @@ def test_late_subscribers_receive_no_old_messages(topic, durability, harness):
         harness.spin_until(lambda: late, f'{node.get_name()} is not received')
 
 
-# -- namespaces -----------------------------------------------------------------------------------
-
-
-def test_namespaces_separate_two_robots(harness):
-    for name in ('a', 'b'):
-        harness.add(SimRobotNode, namespace=name)
-    harness.add(ControllerNode, namespace='a')
-    harness.add(ReferenceGeneratorNode, namespace='a')
-    odom = {name: harness.subscribe(Odometry, f'/{name}/odom') for name in ('a', 'b')}
-    foreign = harness.subscribe(Twist, '/b/cmd_vel')
-    harness.spin_until(lambda: odom['a'] and speed(odom['a'][-1]) > 0.05)
-    assert odom['b']
-    assert max(map(speed, odom['b'])) < 1e-3
-    assert not foreign
-    harness.spin_until(lambda: harness.statuses('a/sim_robot') and harness.statuses('b/sim_robot'))
-    assert harness.call(SetBool, '/b/e_stop', data=True).success
-    count = len(odom['a'])
-    harness.spin_until(lambda: len(odom['a']) > count + 20)
-    assert speed(odom['a'][-1]) > 0.0
+# -- remapping ------------------------------------------------------------------------------------
 
 
 def test_topics_can_be_remapped(harness):

@@ -72,21 +72,6 @@ def test_a_paused_reference_stands_still_and_resumes(harness):
     assert on_grid(received, 100)
 
 
-def _twists(received, count):
-    return [(m.twist.twist.linear.x, m.twist.twist.angular.z) for m in received[:count]]
-
-
-def test_one_seed_gives_one_reference(harness):
-    received = []
-    for name, seed in (('a', 3), ('b', 3), ('c', 4)):
-        received.append(harness.subscribe(Odometry, f'{name}/reference'))
-        harness.add(ReferenceGeneratorNode, namespace=name, seed=seed, ramp=0.0)
-    harness.spin_until(lambda: min(map(len, received)) >= 50)
-    first, same, other = (_twists(messages, 50) for messages in received)
-    assert first == same
-    assert first != other
-
-
 def test_reseed_changes_the_reference_and_hides_the_seed(harness):
     """The seed determines the path of the robot."""
     seed = 918_273_645

@@ -17,7 +17,6 @@ from support.ros_graph import (
     diagnostic,
     diagnostic_level,
     driving_robot,
-    is_ok,
     on_grid,
     reason,
     speed,
@@ -64,17 +63,6 @@ def test_a_non_finite_command_never_moves_the_robot(harness):
     )
 
 
-def test_a_non_finite_command_stops_a_moving_robot(harness):
-    robot, odom, source = driving_robot(harness, 0.3)
-    harness.spin_until(lambda: is_ok(robot, 'following commands'))
-    source.message = twist(0.3, math.nan)
-    harness.spin_until(lambda: speed(odom[-1]) < 1e-3, 'the robot stops')
-    assert 'not finite' in reason(robot)
-    source.message = twist(0.3)
-    harness.spin_until(lambda: speed(odom[-1]) > 0.28, 'the robot moves again')
-    harness.spin_until(lambda: is_ok(robot, 'following commands'))
-
-
 def test_lateral_and_vertical_commands_are_ignored(harness):
     harness.add(SimRobotNode, disturbance__bound=0.0)
     odom = harness.subscribe(Odometry, 'odom')
@@ -88,16 +76,6 @@ def test_lateral_and_vertical_commands_are_ignored(harness):
     harness.spin_until(lambda: odom[-1].pose.pose.position.x > 0.05)
     assert abs(odom[-1].pose.pose.position.y) < 1e-9
     assert odom[-1].twist.twist.linear.y == 0.0
-
-
-def test_a_command_timeout_stops_the_robot_with_the_reason(harness):
-    _, odom, source = driving_robot(harness, 0.3)
-    source.message = None
-    harness.spin_until(lambda: speed(odom[-1]) < 1e-3, 'the robot stops')
-    status = harness.next_status('sim_robot')
-    assert status.level == WARN
-    assert status.message == 'no command for 0.25 s'
-    assert {entry.key: entry.value for entry in status.values}['timed_out'] == 'True'
 
 
 def test_e_stop_latches_and_release_needs_a_new_command(harness):
@@ -220,25 +198,3 @@ def test_stamped_commands_are_accepted_and_stale_ones_rejected(harness):
     harness.spin_until(lambda: speed(odom[-1]) < 1e-3)
     say(0)
     harness.spin_until(lambda: speed(odom[-1]) > 0.1, 'a stamp of zero means now')
-
-
-def test_huge_commands_stay_within_the_limits(harness):
-    robot = harness.add(SimRobotNode)
-    odom = harness.subscribe(Odometry, 'odom')
-    source = CommandSource(harness)
-    for value in (1e3, 1e160, 1.7e308):
-        source.message = twist(value, value)
-        count = len(odom)
-        harness.spin_until(lambda start=count: len(odom) > start + 30)
-    harness.spin_until(lambda: len(odom) > 100)
-    limits = robot.parameters.limiter
-    assert max(abs(message.twist.twist.linear.x) for message in odom) <= 1.05 * limits.linear_speed
-    turning = max(abs(message.twist.twist.angular.z) for message in odom)
-    assert turning <= 1.05 * limits.angular_speed
-
-
-def test_dynamic_limits_of_the_robot_take_effect(harness):
-    robot, odom, source = driving_robot(harness, 0.3)
-    assert robot.set_parameters([Parameter('linear.x.max_velocity', value=0.1)])[0].successful
-    harness.spin_until(lambda: abs(speed(odom[-1]) - 0.1) < 0.01)
-    assert diagnostic(robot, 'limited')

@@ -28,13 +28,10 @@ from support.ros_graph import (
     twist,
 )
 
-from t3mpc_ros.cli.demo import DemoOptions
-from t3mpc_ros.cli.main import _parser
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.common import conversions
 from t3mpc_ros.nodes.common.base_node import OK, WARN
 from t3mpc_ros.nodes.recorder.node import RecorderNode
-from t3mpc_ros.nodes.registry import parameter_class
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.interface import RANGE_SENSORS
@@ -486,21 +483,3 @@ def test_two_robots_launch_file_separates_the_robots(harness):
     for part in ('odom', 'cmd_vel', 'battery_state', 'range/front_left', 'joint_states'):
         assert {f'/robot_1/{part}', f'/robot_2/{part}'} <= topics
         assert f'/{part}' not in topics
-
-
-# -- demo -----------------------------------------------------------------------------------------
-
-
-def test_the_demo_uses_the_selected_robot():
-    asked = {
-        words: _parser().parse_args(['demo', *words.split()]).robot
-        for words in ('', '--robot twin', '--robot servo')
-    }
-    assert list(asked.values()) == ['twin', 'twin', 'servo']
-    for robot, kind, lag in (('twin', 'stepper', 0.003), ('servo', 'velocity', 0.02)):
-        given = DemoOptions(robot=robot, seed=7).parameters()
-        tables = {name: parameter_class(name).from_dict(values) for name, values in given.items()}
-        assert tables['sim_robot'].drive.kind == kind
-        assert tables['sim_robot'].noise.variance == 0.04
-        assert tables['controller'].speed_filter.lag == lag
-        assert tables['sim_robot'].seed == tables['reference_generator'].seed == 7
