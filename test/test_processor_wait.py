@@ -128,15 +128,6 @@ def run_pytest(folder, text, *words, shares=''):
     return done, {name.rpartition('::')[2]: outcome for outcome, name in found}
 
 
-def test_certain_faults_fail_on_a_busy_machine(busy, tmp_path):
-    """They were three skips, and no failure."""
-    done, outcomes = run_pytest(tmp_path, CERTAIN.format(busy=0.4), '-n', 1, shares=None)
-    assert done.returncode == 1
-    assert '3 failed' in done.stdout
-    assert set(outcomes.values()) == {'failed'}
-    assert len(outcomes) == 3
-
-
 @pytest.mark.parametrize('workers', [0, 1])
 def test_only_a_timeout_of_a_wait_is_inconclusive(workers, tmp_path):
     """With worker processes nothing was listed at the end: the failure was a mere skip."""
@@ -173,14 +164,6 @@ def test_inconclusive_tests_alone_have_an_exit_code_of_their_own(tmp_path):
     assert (done.returncode, len(outcomes)) == (6, 5)
     done, outcomes = run_pytest(tmp_path, text, '-k', 'test_sound')
     assert (done.returncode, outcomes) == (0, {'test_sound': 'passed'})
-
-
-def test_a_shared_fixture_is_inconclusive_for_each_test(tmp_path):
-    """The second test gets the same error at once, and its processes have not waited."""
-    text = CERTAIN.format(busy=0.0) + WAITS
-    words = ['-k', 'wait_in_a_shared']
-    done, outcomes = run_pytest(tmp_path, text, *words, shares='0.9' + ', 0.0' * 9)
-    assert (done.returncode, [*outcomes.values()]) == (6, ['inconclusive'] * 2)
 
 
 def test_a_timeout_on_a_quiet_machine_is_a_failure(tmp_path):
