@@ -29,12 +29,13 @@ discarded with it:
 """
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
-from t3mpc_ros.kernels import kernel
+from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
 
 Array = NDArray[np.float64]
 
@@ -110,41 +111,71 @@ MIN_NOISE_VARIANCE = 1e-4
 NOISE_MAX_COUNT = 4000.0
 """Number of measured speeds in the estimate of the variance of the innovation."""
 
-SCALARS = 0
-"""Row of the state: :data:`DEAD_TIME` to :data:`RESPONSE`."""
-AGE, UNDELAYED = 1, 2
-"""Rows of the history, newest first: age (s), and response without dead time (rad/s), two rows."""
-OFFSET, ERROR = 4, 6
-"""Two rows each: offsets and errors (rad/s) of each dead time of the grid."""
-WINDOW, BLOCK, PENDING, ACCEPTED, RECENT, REJECTED = range(8, 14)
-"""Rows of data: the sum of squared errors of each dead time of the grid, then the columns
-:data:`DURATION` to :data:`NIS`."""
-COEFFICIENTS = 14
-"""Four rows: shares of the friction of right and left wheel in the error of the right wheel, and
-in that of the left one, of each dead time of the grid, rad/s."""
-FRICTION = 18
-"""Row of the regressor of friction, columns :data:`FILTERED` to :data:`COVARIANCE`."""
-ROWS = 19
-FILTERED, MEAN, COVARIANCE = 0, 2, 4
-"""Columns: filtered speeds (rad/s) and means of their signs, two each, and the covariance of the
-coefficients: right, mixed, left ((rad/s)²)."""
-DURATION, COUNT, INFORMATION, NIS = range(GRID_SIZE, GRID_SIZE + 4)
-"""Columns: s, number of speeds, Fisher information (1/s²), normalised innovation squared."""
-COLUMNS = GRID_SIZE + 4
-(
-    DEAD_TIME,
-    DEVIATION,
-    NOISE_RATIO,
-    NOISE_COUNT,
-    RATE,
-    DISTURBED,
-    QUIET_TIME,
-    BLOCK_DISTURBED,
-    SUPPORT,
-    RESPONSE,
-) = range(10)
-"""Columns of the scalars: s, s, variance ratio, its weight, rad/s², flag, s, flag, ratio, and
-filtered command (rad/s), two columns."""
+EVIDENCE = np.dtype(
+    (
+        np.record,
+        [
+            ('costs', 'f8', GRID_SIZE),  # of each dead time of the grid: errors² / their variance
+            ('duration', 'f8'),  # s
+            ('count', 'f8'),  # number of speeds
+            ('information', 'f8'),  # Fisher information, 1/s²
+            ('nis', 'f8'),  # normalised innovation squared
+        ],
+    )
+)
+"""Sums over some data."""
+ESTIMATE = np.dtype(
+    (
+        np.record,
+        [
+            ('dead_time', 'f8'),  # s
+            ('deviation', 'f8'),  # s
+            ('noise_ratio', 'f8'),  # variance of the innovation / noise variance
+            ('noise_count', 'f8'),  # weight of that ratio, in measured speeds
+            ('rate', 'f8'),  # change of the speeds, held for a while, rad/s²
+            ('disturbed', '?'),
+            ('quiet_time', 'f8'),  # without evidence of a disturbance, s
+            ('block_disturbed', '?'),
+            ('support', 'f8'),  # likelihood ratio of the recent data
+            ('response', 'f8', 2),  # filtered command, rad/s
+            ('offset', 'f8', (2, GRID_SIZE)),  # of wheel and dead time of the grid, rad/s
+            ('error', 'f8', (2, GRID_SIZE)),  # rad/s
+            ('filtered', 'f8', 2),  # measured speeds behind the lag, rad/s
+            ('mean_sign', 'f8', 2),  # mean of tanh(filtered / FRICTION_WIDTH)
+            ('friction', 'f8', (2, 2, GRID_SIZE)),  # share of the wheel j in the error of i, rad/s
+            ('covariance', 'f8', 3),  # of these shares: right, mixed, left, (rad/s)²
+            ('window', EVIDENCE),  # newest data, forgotten exponentially
+            ('block', EVIDENCE),  # data that is not assessed yet
+            ('pending', EVIDENCE),  # the last block that fits
+            ('accepted', EVIDENCE),  # what the estimate follows from
+            ('recent', EVIDENCE),  # the last blocks, whether they fit or not
+            ('rejected', EVIDENCE),  # blocks since the last one that fits
+        ],
+    )
+)
+"""State of the estimator, but for the history of the response."""
+
+
+class Drive(NamedTuple):
+    """Constants of :func:`update_dead_time`."""
+
+    lag: float
+    """s"""
+    period: float
+    """s"""
+    noise_variance: float
+    """(rad/s)²"""
+    mean_speeds: bool
+    friction: bool
+
+
+class ResponseHistory(NamedTuple):
+    """Response without dead time, newest first, changed in place."""
+
+    age: Array
+    """s, shape (n,)"""
+    undelayed: Array
+    """rad/s, shape (2, n)"""
 
 
 class DeadTimeEstimator:
@@ -181,73 +212,59 @@ class DeadTimeEstimator:
     ) -> None:
         if not period > 0.0:
             raise ValueError(f'period must be positive: got {period} s')
-        self._period = period
-        self._mean_speeds, self._friction = mean_speeds, friction
-        self._lag = parameters.lag
         self._configured = parameters.dead_time
         least = SERVO_VARIANCE if friction else MIN_NOISE_VARIANCE
-        self._noise_variance = max(parameters.noise_variance, least)
-        history = math.ceil(1.25 * MAX_DEAD_TIME / period) + 2
-        self.state: Array = np.zeros((ROWS, max(COLUMNS, history)))
-        """All that changes: a copy, written back, continues bit-equal."""
-        prior = min(parameters.dead_time, MAX_DEAD_TIME)
-        self.state[SCALARS, DEAD_TIME] = prior
-        self.state[SCALARS, DEVIATION] = PRIOR_DEVIATION
-        self.state[SCALARS, NOISE_RATIO] = NOISE_PRIOR_RATIO
-        self.state[SCALARS, NOISE_COUNT] = NOISE_PRIOR_COUNT
+        variance = max(parameters.noise_variance, least)
+        self._drive = Drive(parameters.lag, period, variance, mean_speeds, friction)
+        size = math.ceil(1.25 * MAX_DEAD_TIME / period) + 2
+        self._history = ResponseHistory(np.zeros(size), np.zeros((2, size)))
+        self._state = np.zeros(1, ESTIMATE).view(np.recarray)
+        estimate, prior = self.estimate, min(parameters.dead_time, MAX_DEAD_TIME)
+        estimate.dead_time, estimate.deviation = prior, PRIOR_DEVIATION
+        estimate.noise_ratio, estimate.noise_count = NOISE_PRIOR_RATIO, NOISE_PRIOR_COUNT
         grid = GRID_STEP * np.arange(GRID_SIZE)
-        costs = NOISE_PRIOR_RATIO * ((grid - prior) / PRIOR_DEVIATION) ** 2
-        self.state[ACCEPTED, :GRID_SIZE] = costs
-        self.state[FRICTION, [COVARIANCE, COVARIANCE + 2]] = FRICTION_DEVIATION**2
+        estimate.accepted.costs = NOISE_PRIOR_RATIO * ((grid - prior) / PRIOR_DEVIATION) ** 2
+        estimate.covariance = FRICTION_DEVIATION**2, 0.0, FRICTION_DEVIATION**2
+        self._update = TypedKernel(update_dead_time)
         self.reset(np.zeros(2))
+
+    @property
+    def estimate(self) -> Any:
+        """State, a record of :data:`ESTIMATE`."""
+        return self._state[0]
 
     @property
     def dead_time(self) -> float:
         """Estimate, from 0 to :data:`MAX_DEAD_TIME`, s."""
-        return float(self.state[SCALARS, DEAD_TIME])
+        return float(self.estimate.dead_time)
 
     @property
     def dead_time_in_use(self) -> float:
         """The configured dead time, or the estimate where it clearly differs, s."""
-        dead_time, deviation = self.state[SCALARS, : DEVIATION + 1].tolist()
+        dead_time, deviation = self.dead_time, self.standard_deviation
         clear = max(USED_DIFFERENCE, USED_DEVIATIONS * deviation)
         return dead_time if abs(dead_time - self._configured) > clear else self._configured
 
     @property
     def standard_deviation(self) -> float:
         """Standard deviation of the estimate from the noise, s."""
-        return float(self.state[SCALARS, DEVIATION])
-
-    @property
-    def identified(self) -> bool:
-        """Whether the data determines the dead time, within the bounds of the grid."""
-        inside = self.dead_time < MAX_DEAD_TIME - 0.5 * GRID_STEP
-        return inside and self.standard_deviation <= IDENTIFIED_DEVIATION
-
-    @property
-    def disturbed(self) -> bool:
-        """Whether the measured speeds do not fit the commands; nothing is learned from them."""
-        return bool(self.state[SCALARS, DISTURBED])
-
-    @property
-    def noise_ratio(self) -> float:
-        """Variance of the innovation as a multiple of the noise variance, at least 1."""
-        return float(self.state[SCALARS, NOISE_RATIO])
+        return float(self.estimate.deviation)
 
     def reset(self, speeds: Array) -> None:
         """Restart at measured wheel speeds (rad/s) with equal commands; the estimate is kept.
 
         Data that is not accepted yet is discarded, and a disturbance has ended.
         """
-        state = self.state
-        state[OFFSET : ERROR + 2] = 0.0
-        state[WINDOW : PENDING + 1] = 0.0
-        state[SCALARS, RATE : BLOCK_DISTURBED + 1] = 0.0
-        state[AGE] = self._period * np.arange(state.shape[1])
-        state[UNDELAYED : UNDELAYED + 2] = speeds[:, np.newaxis]
-        state[SCALARS, RESPONSE : RESPONSE + 2] = speeds
-        state[FRICTION, FILTERED : FILTERED + 2] = speeds
-        state[FRICTION, MEAN : MEAN + 2] = np.tanh(speeds / FRICTION_WIDTH)
+        for name in (
+            *('offset', 'error', 'window', 'block', 'pending'),
+            *('rate', 'disturbed', 'quiet_time', 'block_disturbed'),
+        ):
+            self._state[name] = 0
+        estimate, history = self.estimate, self._history
+        history.age[:] = self._drive.period * np.arange(history.age.size)
+        history.undelayed[:] = speeds[:, np.newaxis]
+        estimate.response = estimate.filtered = speeds
+        estimate.mean_sign = np.tanh(speeds / FRICTION_WIDTH)
 
     def step(self, measured: Array, command: Array, dt: float) -> bool:
         """Update the estimate with one measurement; return whether the response is disturbed.
@@ -263,239 +280,291 @@ class DeadTimeEstimator:
             Time since the previous measurement, s, positive. After a gap that stops the robot,
             call :meth:`reset` instead.
         """
-        return update_dead_time(
-            self.state,
-            self._lag,
-            self._period,
-            self._noise_variance,
-            self._mean_speeds,
-            self._friction,
-            measured,
-            command,
+        return self._update(
+            self._state,
+            self._history,
+            self._drive,
+            contiguous(measured),
+            contiguous(command),
             dt,
         )
 
 
 @kernel
 def update_dead_time(
-    state: Array,
-    lag: float,
-    period: float,
-    noise_variance: float,
-    mean_speeds: bool,
-    friction: bool,
-    measured: Array,
-    command: Array,
-    dt: float,
+    state: Any, history: ResponseHistory, drive: Drive, measured: Array, command: Array, dt: float
 ) -> bool:
     """Update the estimate with one measurement; return whether the response is disturbed.
 
-    state : shape (ROWS, at least COLUMNS), rows from SCALARS to REJECTED
-    dt    : time since the last measurement, s
-    other arguments as in :class:`DeadTimeEstimator`
+    state : shape (1,), of the type ESTIMATE; other arguments as in :class:`DeadTimeEstimator`
     """
-    # Response without dead time; a gap in the measurements is divided into periods.
-    scalars = state[SCALARS]
-    size = state.shape[1]
-    parts = max(1, round(dt / period))
-    decay = math.exp(-dt / parts / lag)
-    mean_decay = lag * parts / dt * (1.0 - decay) if mean_speeds else decay
-    for _ in range(parts):
-        for j in range(size - 1, 0, -1):
-            state[AGE, j] = state[AGE, j - 1] + dt / parts
-            for i in range(2):
-                state[UNDELAYED + i, j] = state[UNDELAYED + i, j - 1]
-        state[AGE, 0] = 0.0
-        for i in range(2):
-            difference = scalars[RESPONSE + i] - command[i]
-            state[UNDELAYED + i, 0] = command[i] + mean_decay * difference
-            scalars[RESPONSE + i] = command[i] + decay * difference
-
-    # Errors of each dead time of the grid. Each has its own offset, so that a constant load counts
-    # as no delay.
-    j = 0
-    share = min(1.0, dt / OFFSET_TIME)
-    for g in range(GRID_SIZE):
-        age = g * GRID_STEP
-        while j < size - 2 and state[AGE, j + 1] < age:
-            j += 1
-        weight = min(1.0, (age - state[AGE, j]) / (state[AGE, j + 1] - state[AGE, j]))
-        for i in range(2):
-            newer, older = state[UNDELAYED + i, j], state[UNDELAYED + i, j + 1]
-            error = measured[i] - newer - weight * (older - newer) - state[OFFSET + i, g]
-            state[ERROR + i, g] = error
-            state[OFFSET + i, g] += share * error
-    spread = remove_friction(state, lag, noise_variance, measured, dt) if friction else 0.0
-
-    # Variances. After an acceleration the drive oscillates: the rate is held.
-    g = min(int(scalars[DEAD_TIME] / GRID_STEP), GRID_SIZE - 2)
-    weight = scalars[DEAD_TIME] / GRID_STEP - g
-    rate = scalars[RATE] * math.exp(-dt / RATE_HOLD_TIME)
-    squared_slope = 0.0
-    for i in range(2):
-        slope = (state[ERROR + i, g + 1] - state[ERROR + i, g]) / GRID_STEP
-        squared_slope += slope**2
-        rate = max(rate, abs(slope))
-    scalars[RATE] = rate
-    variance = noise_variance + spread + (RATE_TOLERANCE * rate) ** 2
-    uncertainty = estimate_uncertainty(scalars)
-    innovation_variance = noise_variance + spread + uncertainty * rate**2
-    clip = CLIP * scalars[NOISE_RATIO]
-    nis = 0.0
-    for i in range(2):
-        newer, older = state[ERROR + i, g], state[ERROR + i, g + 1]
-        nis += min((newer + weight * (older - newer)) ** 2 / innovation_variance, clip)
-
-    forget = math.exp(-dt / WINDOW_TIME)
-    for j in range(COLUMNS):
-        state[WINDOW, j] *= forget
-    for g in range(GRID_SIZE):
-        cost = 0.0
-        for i in range(2):
-            cost += min(state[ERROR + i, g] ** 2 / variance, clip)
-        state[WINDOW, g] += cost
-        state[BLOCK, g] += cost
-    for row in (WINDOW, BLOCK):
-        state[row, DURATION] += dt
-        state[row, COUNT] += 2.0
-        state[row, INFORMATION] += squared_slope / variance
-        state[row, NIS] += nis
-
-    # Disturbance test. The mean of an exponential window has the variance of a mean of
-    # (1 + forget)/(1 - forget) equal weights; bound of Wilson and Hilferty.
-    spread = (1.0 - forget) / (1.0 + forget) / 9.0
-    bound = (1.0 - spread + NOISE_QUANTILE * math.sqrt(spread)) ** 3
-    mean = state[WINDOW, NIS] / state[WINDOW, COUNT] / scalars[NOISE_RATIO]
-    ratio = max(scalars[SUPPORT], likelihood_ratio(state, WINDOW))
-    evidence = max(mean / bound, ratio / RATIO_BOUND)
-    if state[WINDOW, DURATION] > 0.6 * WINDOW_TIME and evidence > 1.0:
-        scalars[DISTURBED] = 1.0
-    if scalars[DISTURBED] > 0.0:
-        scalars[BLOCK_DISTURBED] = 1.0
-        scalars[QUIET_TIME] = 0.0 if evidence > QUIET_EVIDENCE else scalars[QUIET_TIME] + dt
-        if scalars[QUIET_TIME] >= CLEAR_TIME:
-            scalars[DISTURBED] = scalars[QUIET_TIME] = 0.0
-    duration = state[BLOCK, DURATION] + 0.5 * period
-    enough = state[BLOCK, INFORMATION] * BLOCK_DEVIATION**2 >= scalars[NOISE_RATIO]
-    enough |= scalars[BLOCK_DISTURBED] > 0.0 or duration >= BLOCK_MAX_TIME
-    enough |= scalars[DEVIATION] > IDENTIFIED_DEVIATION
+    estimate = state[0]
+    follow_command(estimate, history, drive, command, dt)
+    measure_errors(estimate, history, measured, dt)
+    spread = remove_friction(estimate, drive, measured, dt) if drive.friction else 0.0
+    add_evidence(estimate, drive.noise_variance + spread, dt)
+    detect_disturbance(estimate, dt)
+    block = estimate.block
+    duration = block.duration + 0.5 * drive.period
+    enough = block.information * BLOCK_DEVIATION**2 >= estimate.noise_ratio
+    enough |= estimate.block_disturbed or duration >= BLOCK_MAX_TIME
+    enough |= estimate.deviation > IDENTIFIED_DEVIATION
     if enough and duration >= BLOCK_TIME:
-        assess_block(state)
-    return bool(scalars[DISTURBED] > 0.0)
+        assess_block(estimate)
+    return bool(estimate.disturbed)
 
 
 @kernel
-def remove_friction(
-    state: Array, lag: float, noise_variance: float, measured: Array, dt: float
-) -> float:
+def follow_command(
+    estimate: Any, history: ResponseHistory, drive: Drive, command: Array, dt: float
+) -> None:
+    """Add the response without dead time to the history; a gap is divided into periods."""
+    age, undelayed = history
+    parts = max(1, round(dt / drive.period))
+    decay = math.exp(-dt / parts / drive.lag)
+    mean_decay = drive.lag * parts / dt * (1.0 - decay) if drive.mean_speeds else decay
+    for _ in range(parts):
+        for j in range(age.size - 1, 0, -1):
+            age[j] = age[j - 1] + dt / parts
+            for i in range(2):
+                undelayed[i, j] = undelayed[i, j - 1]
+        age[0] = 0.0
+        for i in range(2):
+            difference = estimate.response[i] - command[i]
+            undelayed[i, 0] = command[i] + mean_decay * difference
+            estimate.response[i] = command[i] + decay * difference
+
+
+@kernel
+def measure_errors(estimate: Any, history: ResponseHistory, measured: Array, dt: float) -> None:
+    """Set the error of each dead time of the grid.
+
+    Each has its own offset, so that a constant load counts as no delay.
+    """
+    age, undelayed = history
+    errors, offsets = estimate.error, estimate.offset
+    j = 0
+    share = min(1.0, dt / OFFSET_TIME)
+    for g in range(GRID_SIZE):
+        late = g * GRID_STEP
+        while j < age.size - 2 and age[j + 1] < late:
+            j += 1
+        weight = min(1.0, (late - age[j]) / (age[j + 1] - age[j]))
+        for i in range(2):
+            newer, older = undelayed[i, j], undelayed[i, j + 1]
+            error = measured[i] - newer - weight * (older - newer) - offsets[i, g]
+            errors[i, g] = error
+            offsets[i, g] += share * error
+
+
+@kernel
+def remove_friction(estimate: Any, drive: Drive, measured: Array, dt: float) -> float:
     """Remove the friction from the errors; return the variance ((rad/s)²) that this adds.
 
     Coulomb friction of the two wheels, which the body couples, takes a speed of
     A tanh(chi/width) from them, with the offset's mean removed. Each dead time of the grid has
     its own A, by recursive least squares: dead times are compared by what friction cannot
     explain. The regressor and hence the covariance are the same for all.
-
-    state : see :func:`update_dead_time`
     """
-    row = state[FRICTION]
+    filtered, mean, covariance = estimate.filtered, estimate.mean_sign, estimate.covariance
+    shares, errors = estimate.friction, estimate.error
     share = min(1.0, dt / OFFSET_TIME)
-    right = math.tanh(row[FILTERED] / FRICTION_WIDTH) - row[MEAN]
-    left = math.tanh(row[FILTERED + 1] / FRICTION_WIDTH) - row[MEAN + 1]
-    row[MEAN] += share * right
-    row[MEAN + 1] += share * left
+    right = math.tanh(filtered[0] / FRICTION_WIDTH) - mean[0]
+    left = math.tanh(filtered[1] / FRICTION_WIDTH) - mean[1]
+    mean[0] += share * right
+    mean[1] += share * left
     # Friction acts through the lag of the drive, so the speed is filtered alike. It is that
     # before this measurement, whose noise is in the errors.
     for i in range(2):
-        row[FILTERED + i] += (1.0 - math.exp(-dt / lag)) * (measured[i] - row[FILTERED + i])
-    own, mixed, other = row[COVARIANCE], row[COVARIANCE + 1], row[COVARIANCE + 2]
+        filtered[i] += (1.0 - math.exp(-dt / drive.lag)) * (measured[i] - filtered[i])
+    own, mixed, other = covariance
     gain_right = own * right + mixed * left
     gain_left = mixed * right + other * left
     spread = right * gain_right + left * gain_left
-    total = noise_variance + spread
+    total = drive.noise_variance + spread
     for g in range(GRID_SIZE):
         for i in range(2):
-            first, second = COEFFICIENTS + 2 * i, COEFFICIENTS + 2 * i + 1
-            state[ERROR + i, g] -= state[first, g] * right + state[second, g] * left
-            state[first, g] += gain_right / total * state[ERROR + i, g]
-            state[second, g] += gain_left / total * state[ERROR + i, g]
+            errors[i, g] -= shares[i, 0, g] * right + shares[i, 1, g] * left
+            shares[i, 0, g] += gain_right / total * errors[i, g]
+            shares[i, 1, g] += gain_left / total * errors[i, g]
     walk, limit = FRICTION_WALK**2 * dt, FRICTION_DEVIATION**2
-    row[COVARIANCE] = min(own - gain_right * gain_right / total + walk, limit)
-    row[COVARIANCE + 1] = mixed - gain_right * gain_left / total
-    row[COVARIANCE + 2] = min(other - gain_left * gain_left / total + walk, limit)
+    covariance[0] = min(own - gain_right * gain_right / total + walk, limit)
+    covariance[1] = mixed - gain_right * gain_left / total
+    covariance[2] = min(other - gain_left * gain_left / total + walk, limit)
     return float(spread)
 
 
 @kernel
-def estimate_uncertainty(scalars: Array) -> float:
+def add_evidence(estimate: Any, noise_variance: float, dt: float) -> None:
+    """Add the errors, divided by their variance ((rad/s)²), to the window and the block.
+
+    After an acceleration the drive oscillates: the rate is held.
+    """
+    errors = estimate.error
+    g = min(int(estimate.dead_time / GRID_STEP), GRID_SIZE - 2)
+    weight = estimate.dead_time / GRID_STEP - g
+    rate = estimate.rate * math.exp(-dt / RATE_HOLD_TIME)
+    squared_slope = 0.0
+    for i in range(2):
+        slope = (errors[i, g + 1] - errors[i, g]) / GRID_STEP
+        squared_slope += slope**2
+        rate = max(rate, abs(slope))
+    estimate.rate = rate
+    variance = noise_variance + (RATE_TOLERANCE * rate) ** 2
+    innovation_variance = noise_variance + estimate_uncertainty(estimate) * rate**2
+    clip = CLIP * estimate.noise_ratio
+    nis = 0.0
+    for i in range(2):
+        newer, older = errors[i, g], errors[i, g + 1]
+        nis += min((newer + weight * (older - newer)) ** 2 / innovation_variance, clip)
+    scale(estimate.window, math.exp(-dt / WINDOW_TIME))
+    in_window, in_block = estimate.window.costs, estimate.block.costs
+    for g in range(GRID_SIZE):
+        cost = 0.0
+        for i in range(2):
+            cost += min(errors[i, g] ** 2 / variance, clip)
+        in_window[g] += cost
+        in_block[g] += cost
+    for data in (estimate.window, estimate.block):
+        data.duration += dt
+        data.count += 2.0
+        data.information += squared_slope / variance
+        data.nis += nis
+
+
+@kernel
+def detect_disturbance(estimate: Any, dt: float) -> None:
+    """Set whether the response is disturbed, by the data of the window.
+
+    The mean of an exponential window has the variance of a mean of (1 + forget)/(1 - forget)
+    equal weights; bound of Wilson and Hilferty.
+    """
+    window = estimate.window
+    forget = math.exp(-dt / WINDOW_TIME)
+    spread = (1.0 - forget) / (1.0 + forget) / 9.0
+    bound = (1.0 - spread + NOISE_QUANTILE * math.sqrt(spread)) ** 3
+    mean = window.nis / window.count / estimate.noise_ratio
+    ratio = max(estimate.support, likelihood_ratio(estimate, window))
+    evidence = max(mean / bound, ratio / RATIO_BOUND)
+    if window.duration > 0.6 * WINDOW_TIME and evidence > 1.0:
+        estimate.disturbed = True
+    if estimate.disturbed:
+        estimate.block_disturbed = True
+        estimate.quiet_time = 0.0 if evidence > QUIET_EVIDENCE else estimate.quiet_time + dt
+        if estimate.quiet_time >= CLEAR_TIME:
+            estimate.disturbed, estimate.quiet_time = False, 0.0
+
+
+@kernel
+def estimate_uncertainty(estimate: Any) -> float:
     """Return the variance (s²) of the dead time that contradicts no estimate.
 
     Before the dead time is identified, every dead time is possible.
     """
-    deviation = UNCERTAINTY_FACTOR * scalars[DEVIATION]
-    if scalars[DEVIATION] > IDENTIFIED_DEVIATION:
+    deviation = UNCERTAINTY_FACTOR * estimate.deviation
+    if estimate.deviation > IDENTIFIED_DEVIATION:
         deviation = 0.5 * MAX_DEAD_TIME
     return float(deviation**2 + TOLERANCE**2)
 
 
 @kernel
-def assess_block(state: Array) -> None:
-    """Accept or reject the data of a block; adopt rejected data that persists.
-
-    state : see :func:`update_dead_time`
-    """
-    scalars = state[SCALARS]
-    information = state[BLOCK, INFORMATION] / scalars[NOISE_RATIO]
+def assess_block(estimate: Any) -> None:
+    """Accept or reject the data of the block, and begin another one."""
+    block, recent = estimate.block, estimate.recent
+    information = block.information / estimate.noise_ratio
     # Recent data is forgotten as new information arrives, not while the robot stands.
-    keep = math.exp(-information * RECENT_DEVIATION**2)
-    for j in range(COLUMNS):
-        state[RECENT, j] = keep * state[RECENT, j] + state[BLOCK, j]
-    scalars[SUPPORT] = likelihood_ratio(state, RECENT)
-    fits = scalars[BLOCK_DISTURBED] == 0.0 and scalars[SUPPORT] < BLOCK_BOUND
-    if fits and likelihood_ratio(state, BLOCK) < BLOCK_BOUND:
-        if scalars[DEVIATION] <= IDENTIFIED_DEVIATION:
-            count = scalars[NOISE_COUNT] + state[PENDING, COUNT]
-            total = scalars[NOISE_RATIO] * scalars[NOISE_COUNT] + state[PENDING, NIS]
-            scalars[NOISE_RATIO] = max(total / count, 1.0)
-            scalars[NOISE_COUNT] = min(count, NOISE_MAX_COUNT)
-        for j in range(COLUMNS):
-            state[ACCEPTED, j] += state[PENDING, j]
-            state[PENDING, j] = state[BLOCK, j]
-            state[REJECTED, j] = 0.0
-        set_estimate(state)
+    scale(recent, math.exp(-information * RECENT_DEVIATION**2))
+    add(recent, block)
+    estimate.support = likelihood_ratio(estimate, recent)
+    fits = not estimate.block_disturbed and estimate.support < BLOCK_BOUND
+    if fits and likelihood_ratio(estimate, block) < BLOCK_BOUND:
+        accept_pending(estimate)
     else:
-        driving = information >= DRIVING_INFORMATION * state[BLOCK, DURATION]
-        for j in range(COLUMNS):
-            state[PENDING, j] = 0.0
-            if j < GRID_SIZE or driving:
-                state[REJECTED, j] += state[BLOCK, j]
-        if state[REJECTED, DURATION] >= ADOPTION_TIME:
-            _, least, _ = minimum(state[REJECTED])
-            scalars[NOISE_RATIO] = max(least / state[REJECTED, COUNT], 1.0)
-            scalars[NOISE_COUNT] = NOISE_PRIOR_COUNT
-            for j in range(COLUMNS):
-                state[ACCEPTED, j] = state[REJECTED, j]
-                state[WINDOW, j] = state[RECENT, j] = state[REJECTED, j] = 0.0
-            scalars[SUPPORT] = 0.0
-            set_estimate(state)
-    for j in range(COLUMNS):
-        state[BLOCK, j] = 0.0
-    scalars[BLOCK_DISTURBED] = scalars[DISTURBED]
+        reject_block(estimate, information >= DRIVING_INFORMATION * block.duration)
+    clear(block)
+    estimate.block_disturbed = estimate.disturbed
 
 
 @kernel
-def set_estimate(state: Array) -> None:
-    """Set the estimate from the accepted data, of which the oldest is forgotten.
+def accept_pending(estimate: Any) -> None:
+    """Accept the block before this one, which is pending in its place."""
+    pending = estimate.pending
+    if estimate.deviation <= IDENTIFIED_DEVIATION:
+        count = estimate.noise_count + pending.count
+        total = estimate.noise_ratio * estimate.noise_count + pending.nis
+        estimate.noise_ratio = max(total / count, 1.0)
+        estimate.noise_count = min(count, NOISE_MAX_COUNT)
+    add(estimate.accepted, pending)
+    clear(pending)
+    add(pending, estimate.block)
+    clear(estimate.rejected)
+    set_estimate(estimate)
 
-    state : see :func:`update_dead_time`
-    """
-    scalars, accepted = state[SCALARS], state[ACCEPTED]
-    ratio = scalars[NOISE_RATIO]
-    dead_time, least, curvature = minimum(accepted)
+
+@kernel
+def reject_block(estimate: Any, driving: bool) -> None:
+    """Keep the block apart; adopt what is rejected if it persists while the robot is driving."""
+    rejected, block = estimate.rejected, estimate.block
+    clear(estimate.pending)
+    if driving:
+        add(rejected, block)
+    else:
+        for g in range(GRID_SIZE):
+            rejected.costs[g] += block.costs[g]
+    if rejected.duration >= ADOPTION_TIME:
+        _, least, _ = minimum(rejected.costs)
+        estimate.noise_ratio = max(least / rejected.count, 1.0)
+        estimate.noise_count = NOISE_PRIOR_COUNT
+        clear(estimate.accepted)
+        add(estimate.accepted, rejected)
+        for data in (estimate.window, estimate.recent, rejected):
+            clear(data)
+        estimate.support = 0.0
+        set_estimate(estimate)
+
+
+@kernel
+def scale(data: Any, factor: float) -> None:
+    """Weight all sums by a factor."""
+    costs = data.costs
+    for g in range(GRID_SIZE):
+        costs[g] *= factor
+    data.duration *= factor
+    data.count *= factor
+    data.information *= factor
+    data.nis *= factor
+
+
+@kernel
+def add(data: Any, other: Any) -> None:
+    """Add the sums over other data."""
+    for g in range(GRID_SIZE):
+        data.costs[g] += other.costs[g]
+    data.duration += other.duration
+    data.count += other.count
+    data.information += other.information
+    data.nis += other.nis
+
+
+@kernel
+def clear(data: Any) -> None:
+    """Set all sums to zero, even those that are not finite."""
+    for g in range(GRID_SIZE):
+        data.costs[g] = 0.0
+    data.duration = data.count = data.information = data.nis = 0.0
+
+
+@kernel
+def set_estimate(estimate: Any) -> None:
+    """Set the estimate from the accepted data, of which the oldest is forgotten."""
+    accepted, ratio = estimate.accepted, estimate.noise_ratio
+    costs = accepted.costs
+    dead_time, least, curvature = minimum(costs)
     # While the likelihood is wider than the grid step, its variance is that over the grid.
     total = first = second = 0.0
     for g in range(GRID_SIZE):
-        accepted[g] -= least
-        weight = math.exp(-0.5 * accepted[g] / ratio)
+        costs[g] -= least
+        weight = math.exp(-0.5 * costs[g] / ratio)
         total += weight
         first += weight * g * GRID_STEP
         second += weight * (g * GRID_STEP) ** 2
@@ -503,11 +572,10 @@ def set_estimate(state: Array) -> None:
     if variance < GRID_STEP**2:
         variance = 2.0 * ratio / curvature
     if variance < MIN_DEVIATION**2:
-        for j in range(COLUMNS):
-            accepted[j] *= variance / MIN_DEVIATION**2
+        scale(accepted, variance / MIN_DEVIATION**2)
         variance = MIN_DEVIATION**2
-    scalars[DEAD_TIME] = dead_time
-    scalars[DEVIATION] = min(math.sqrt(variance), PRIOR_DEVIATION)
+    estimate.dead_time = dead_time
+    estimate.deviation = min(math.sqrt(variance), PRIOR_DEVIATION)
 
 
 @kernel
@@ -529,21 +597,18 @@ def minimum(costs: Array) -> tuple[float, float, float]:
 
 
 @kernel
-def likelihood_ratio(state: Array, row: int) -> float:
-    """Return 2 log of the likelihood ratio of the best dead time and the estimate.
+def likelihood_ratio(estimate: Any, data: Any) -> float:
+    """Return 2 log of the likelihood ratio of the best dead time of some data and the estimate.
 
     The uncertainty of the estimate, which is no contradiction, reduces it.
-
-    state : see :func:`update_dead_time`
-    row   : row of the data
     """
-    scalars, costs = state[SCALARS], state[row]
+    costs = data.costs
     _, least, _ = minimum(costs)
-    position = scalars[DEAD_TIME] / GRID_STEP
+    position = estimate.dead_time / GRID_STEP
     g = min(max(int(position + 0.5), 1), GRID_SIZE - 2)
     offset = position - g
     slope = 0.5 * (costs[g + 1] - costs[g - 1])
     curvature = costs[g + 1] - 2.0 * costs[g] + costs[g - 1]
     cost = costs[g] + offset * (slope + 0.5 * curvature * offset)
-    uncertainty = estimate_uncertainty(scalars)
-    return float((cost - least) / (scalars[NOISE_RATIO] + costs[INFORMATION] * uncertainty))
+    uncertainty = estimate_uncertainty(estimate)
+    return float((cost - least) / (estimate.noise_ratio + data.information * uncertainty))

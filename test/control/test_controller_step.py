@@ -13,7 +13,6 @@ from support.control_loops import GEOMETRY, LEAD, PERIOD, Loop, ServoLoop, make_
 
 from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
 from t3mpc_ros.control.controller import Controller, ControllerParameters, SwitchingTracker
-from t3mpc_ros.control.dead_time_estimator import DISTURBED, SCALARS
 from t3mpc_ros.control.jump_transition import JumpTransitionParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
@@ -263,7 +262,7 @@ def test_a_dead_time_that_nobody_configured_is_found():
     assert loop.controller.actuation.dead_time == pytest.approx(0.0425, abs=0.004)
     assert abs(estimate.dead_time - 0.0425) < 4.0 * estimate.standard_deviation + 0.003
     # Without the estimate, the configured dead time is back and nothing is disturbed.
-    estimate.state[SCALARS, DISTURBED] = 1.0
+    estimate.estimate.disturbed = True
     loop.step(State(loop.now, ORIGIN, loop.twist))
     assert loop.controller.disturbed
     parameters = loop.controller.parameters

@@ -45,7 +45,7 @@ def leaves(thing: Any, path: str = '', above: tuple[int, ...] = ()) -> Iterator[
         yield path, thing
     elif isinstance(thing, float):
         yield path, struct.pack('<d', thing).hex() if thing != thing or thing == 0.0 else thing
-    elif isinstance(thing, np.ndarray) and not isinstance(thing, np.recarray):
+    elif isinstance(thing, np.ndarray) and not thing.dtype.names:
         yield path, _Copy(thing)
     elif isinstance(thing, np.random.Generator):
         yield path, repr(thing.bit_generator.state)
@@ -97,7 +97,9 @@ class _Copy:
 
 
 def _parts(thing: Any) -> Iterator[tuple[str, Any]]:
-    if isinstance(thing, Mapping):
+    if isinstance(thing, np.ndarray):
+        yield from ((f'.{name}', thing[name]) for name in thing.dtype.names)
+    elif isinstance(thing, Mapping):
         for key in sorted(thing, key=repr):
             yield f'[{key!r}]', thing[key]
     elif isinstance(thing, set | frozenset):
@@ -171,13 +173,13 @@ def carry(
 ) -> None:
     """Give a new object what an operation keeps of a used one."""
     memo = {} if memo is None else memo  # what two attributes share, they share afterwards
-    if isinstance(source, np.ndarray) and not isinstance(source, np.recarray):
+    if isinstance(source, np.ndarray) and not source.dtype.names:
         _carry_rows(source, target, paths, path)
         return
     for name, part in _parts(source):
         here = f'{path}{name}'
-        structures = isinstance(part, np.recarray)
-        if isinstance(part, np.ndarray) and not structures and not matches(here, paths):
+        is_array = isinstance(part, np.ndarray) and not part.dtype.names
+        if is_array and not matches(here, paths):
             _carry_rows(part, dict(_parts(target))[name], paths, here)
         elif matches(here, paths):
             _put(target, name, copy.deepcopy(part, memo))

@@ -288,9 +288,8 @@ def drive_estimator(estimator, r):
         measured = speeds + (pair(r, 3.0) if 200 < k < 230 else 0.05 * pair(r, 1.0))
         sent.append(command)
         found.append(estimator.step(measured, command, gap(r) if r.random() < 0.05 else PERIOD))
-        found += properties(
-            estimator, 'dead_time', 'dead_time_in_use', 'standard_deviation', 'noise_ratio'
-        )
+        found += properties(estimator, 'dead_time', 'dead_time_in_use', 'standard_deviation')
+        found.append(float(estimator.estimate.noise_ratio))
     return found
 
 
@@ -886,10 +885,12 @@ FRESH = {
         {
             'reset': Operation(
                 lambda e: e.reset(SPEEDS),
-                kept=(
-                    *(f'.state[{row}]' for row in range(11, 18)),
-                    *(f'.state[0][{column}]' for column in (0, 1, 2, 3, 8)),
-                    *(f'.state[18][{column}]' for column in (4, 5, 6)),
+                kept=below(
+                    '._state',
+                    (
+                        *('.dead_time', '.deviation', '.noise_ratio', '.noise_count', '.support'),
+                        *('.friction', '.covariance', '.accepted', '.recent', '.rejected'),
+                    ),
                 ),
             )
         },
