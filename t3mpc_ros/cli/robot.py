@@ -136,7 +136,7 @@ def _setup(options: argparse.Namespace, stop: StopSignal) -> int:
     if options.save is not None:
         if not stored.valid:
             raise ProcedureError('there are no settings to save: give the microsteps, or --load')
-        options.save.write_text(robot_settings.parameter_file(stored.settings))
+        options.save.write_text(robot_settings.settings_file(stored.settings))
         print(
             f'{options.save}: radio_bridge --ros-args --params-file {options.save}, '
             f't3mpc robot ping --params-file {options.save}'

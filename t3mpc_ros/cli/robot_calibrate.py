@@ -11,13 +11,11 @@ from pathlib import Path
 import sys
 from typing import Any, TypeVar
 
-import yaml
-
 from t3mpc_ros.cli.command import ask_line, check_writable
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml
+from t3mpc_ros.parameters.yaml_files import YamlError, parameter_file, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.radio_robot import RadioRobotParameters
 from t3mpc_ros.radio.tool import procedure, robot_records, robot_settings
@@ -138,7 +136,7 @@ def _report(text: str) -> None:
 # -- parameter file -------------------------------------------------------------------------------
 
 
-def parameter_file(found: Calibration, date: str, link: Mapping[str, object]) -> str:
+def calibration_file(found: Calibration, date: str, link: Mapping[str, object]) -> str:
     """Return the ROS parameter file of a calibration.
 
     It holds the parameters of the link (by name, without ``link.``) as well: the launch file takes
@@ -168,30 +166,11 @@ def parameter_file(found: Calibration, date: str, link: Mapping[str, object]) ->
         for name in SharpCurve._fields:
             values = [_rounded(getattr(curve or none, name)) for curve in found.curves]
             bridge[f'calibration.range_{name}'] = values
-    content = {
-        # A copy: the parser of ROS knows no YAML aliases.
-        f'/**/{node}': {'ros__parameters': dict(values)}
-        for node, values in (
-            ('radio_bridge', geometry | bridge),
-            ('controller', geometry),
-            ('reference_generator', geometry),
-        )
-        if values
-    }
-    text = yaml.dump(content, Dumper=_Dumper, sort_keys=False)
-    return f'# Calibration of the robot, written by t3mpc robot calibrate.\n{text}'
-
-
-class _Dumper(yaml.SafeDumper):
-    """Quotes every text that is a value: ROS takes 12345e6789, an address, for a number."""
-
-
-def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
-    style = "'" if text[:1].isdigit() else None
-    return dumper.represent_scalar('tag:yaml.org,2002:str', text, style)
-
-
-_Dumper.add_representer(str, _represent_text)
+    nodes = {'radio_bridge': geometry | bridge}
+    if geometry:
+        nodes |= {'controller': geometry, 'reference_generator': geometry}
+    title = 'Calibration of the robot, written by t3mpc robot calibrate.'
+    return parameter_file(title, {f'/**/{node}': values for node, values in nodes.items()})
 
 
 def _rounded(value: float) -> float:
@@ -200,7 +179,7 @@ def _rounded(value: float) -> float:
 
 
 def read_parameter_file(path: Path) -> tuple[Calibration, dict[str, object]]:
-    """Return the calibration and the parameters of the link in a file of :func:`parameter_file`.
+    """Return the calibration and the parameters of the link in a file of :func:`calibration_file`.
 
     Raises
     ------
@@ -285,7 +264,7 @@ def calibrate(
         _report('interrupted')
         code = _EXIT_INTERRUPTED
     if wizard.calibration != start:
-        path.write_text(parameter_file(wizard.calibration, _today(), link))
+        path.write_text(calibration_file(wizard.calibration, _today(), link))
         _show(f'{path}: saved; ros2 launch t3mpc_ros robot.launch.py params_file:={path}')
     return code
 

@@ -135,7 +135,7 @@ def _tuned(
 def _identify(options: argparse.Namespace) -> int:
     """Print the parameter file for the robot in the bag ``options.robot`` and return 0."""
     from t3mpc_ros.evaluation.topic_roles import bag_display_name
-    from t3mpc_ros.evaluation.tuning.drive_identification import identify_bag, parameter_file
+    from t3mpc_ros.evaluation.tuning.drive_identification import drive_file, identify_bag
 
     bag = Path(options.robot)
     if not bag.exists():
@@ -145,11 +145,11 @@ def _identify(options: argparse.Namespace) -> int:
     if options.methods or options.evaluations or options.resume:
         raise ValueError('methods, --evaluations and --resume are for simulated robots: got a bag')
     found = identify_bag(bag, report_options(options))
-    text = parameter_file(*found, bag_display_name(bag))
-    print(text)
+    text = drive_file(*found, bag_display_name(bag))
+    print(text, end='')
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
-        options.output.write_text(text + '\n', encoding='utf-8')
+        options.output.write_text(text, encoding='utf-8')
     return 0
 
 

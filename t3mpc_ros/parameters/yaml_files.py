@@ -2,11 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """YAML files that users write: worlds, fault schedules, paths, profiles, settings of a robot."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 import os
 from pathlib import Path
 import reprlib
+from types import MappingProxyType
 from typing import Any
 
 import yaml
@@ -76,6 +77,40 @@ def parse_yaml(text: str) -> object:
         raise YamlError(f'is not YAML: {line}{error.problem}') from error
     except _ERRORS as error:
         raise YamlError(f'is not YAML: {" ".join(str(error).split())}') from error
+
+
+def parameter_file(
+    title: str,
+    nodes: Mapping[str, Mapping[str, object]],
+    comments: Mapping[str, str] = MappingProxyType({}),
+) -> str:
+    """Return a ROS parameter file: values by node and name, and comments by name."""
+    content = {node: {'ros__parameters': dict(values)} for node, values in nodes.items()}
+    lines = [f'# {title}']
+    for line in yaml.dump(content, Dumper=_Dumper, sort_keys=False, width=1000).splitlines():
+        comment = comments.get(line.partition(':')[0].strip())
+        lines.append(f'{line}  # {comment}' if comment else line)
+    return '\n'.join([*lines, ''])
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes what the parser of ROS reads: it knows no aliases, and 12345e6789 is a number."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
+def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    style = "'" if text[:1].isdigit() else None
+    return dumper.represent_scalar('tag:yaml.org,2002:str', text, style)
+
+
+def _represent_list(dumper: yaml.SafeDumper, values: list[object]) -> yaml.SequenceNode:
+    return dumper.represent_sequence('tag:yaml.org,2002:seq', values, flow_style=True)
+
+
+_Dumper.add_representer(str, _represent_text)
+_Dumper.add_representer(list, _represent_list)
 
 
 def shortened(value: object) -> str:

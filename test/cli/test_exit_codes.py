@@ -23,7 +23,7 @@ from t3mpc_ros.radio.tool.bench_checklist import FAIL, PASS, SKIPPED, Check
 from t3mpc_ros.radio.tool.link_test import BAD, GOOD, POOR, ReportRow
 from t3mpc_ros.radio.tool.procedure import ProcedureError
 from t3mpc_ros.radio.tool.robot_records import RobotSettings
-from t3mpc_ros.radio.tool.robot_settings import StoredSettings, parameter_file
+from t3mpc_ros.radio.tool.robot_settings import StoredSettings, settings_file
 from t3mpc_ros.robot.calibration import Calibration
 
 RUN = 'radio.tool.procedure.run_script'
@@ -216,7 +216,7 @@ def test_the_exit_code_says_how_it_ended(
 ):
     (tmp_path / 'key').write_text('01' * 16)
     (tmp_path / 'key').chmod(0o600)
-    (tmp_path / 'robot.yaml').write_text(parameter_file(RobotSettings()))
+    (tmp_path / 'robot.yaml').write_text(settings_file(RobotSettings()))
     monkeypatch.chdir(tmp_path)
     for name, result in instead.items():
         replace(monkeypatch, f't3mpc_ros.{name}', result)

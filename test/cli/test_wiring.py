@@ -29,7 +29,7 @@ from t3mpc_ros.nodes.registry import NODES, parameter_class
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import key_check
 from t3mpc_ros.radio.tool.robot_records import RobotSettings
-from t3mpc_ros.radio.tool.robot_settings import StoredSettings, parameter_file
+from t3mpc_ros.radio.tool.robot_settings import StoredSettings, settings_file
 from t3mpc_ros.robot.calibration import Calibration
 
 pytestmark = pytest.mark.slow
@@ -102,7 +102,7 @@ FILES = {
     'speeds.csv': CSV,
     'mine.py': 'import numpy as np\ndef step(observation):\n    return np.zeros(2)\n',
     'key': KEY.hex() + '\n',
-    'robot.yaml': parameter_file(OTHER_ROBOT),
+    'robot.yaml': settings_file(OTHER_ROBOT),
     'bag/x.mcap': '',
     'page.md': '',
 }
@@ -152,7 +152,7 @@ TUNE = {
     'evaluation.tuning.tune_methods.tune_methods': SimpleNamespace(table=text),
     'evaluation.tuning.twin_tuning.tune_twin': SimpleNamespace(table=text),
     'evaluation.tuning.drive_identification.identify_bag': ('drive', 'paper'),
-    'evaluation.tuning.drive_identification.parameter_file': 'a: 1',
+    'evaluation.tuning.drive_identification.drive_file': 'a: 1\n',
 }
 MODEL = SimpleNamespace(
     text='', learnt={}, parameters=SimpleNamespace(to_dict=dict), origin={}, to_dict=dict

@@ -20,9 +20,9 @@ from t3mpc_ros.evaluation.topic_roles import ReportOptions
 from t3mpc_ros.evaluation.tuning.drive_identification import (
     MAX_RELATIVE_DEVIATION,
     IdentificationError,
+    drive_file,
     fitting_parameters,
     identify_bag,
-    parameter_file,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State, WheelSpeeds
@@ -156,11 +156,11 @@ def test_a_robot_of_another_make_is_identified(tmp_path, lag, dead_time):
         identify_bag(folder, ReportOptions())
 
 
-def test_the_parameter_file_has_the_gain_by_the_rule(tmp_path):
+def test_the_drive_file_has_the_gain_by_the_rule(tmp_path):
     tape = recorded(ramps(1, 4000), drive__lag=0.03, noise__variance=0.04)
     drive, _ = identified(tape, tmp_path / 'bag')
     for composition in ('paper', 'body'):
-        text = parameter_file(drive, composition, 'bag')
+        text = drive_file(drive, composition, 'bag')
         values = yaml.safe_load(text)['/**/controller']['ros__parameters']
         parameters = StepperControllerParameters.from_dict(values)
         fitting = fitting_parameters(drive, composition).to_dict()

@@ -7,7 +7,7 @@ import yaml
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli import bag as bag_cli
-from t3mpc_ros.cli.robot_calibrate import parameter_file
+from t3mpc_ros.cli.robot_calibrate import calibration_file
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode
@@ -24,7 +24,7 @@ FOUND = Calibration(
 
 
 def test_the_calibration_is_in_the_bag(harness, tmp_path, capsys):
-    files = yaml.safe_load(parameter_file(FOUND, '2026-11-22', {}))
+    files = yaml.safe_load(calibration_file(FOUND, '2026-11-22', {}))
     values = {
         node: {
             name.replace('.', '__'): value

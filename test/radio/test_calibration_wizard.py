@@ -214,7 +214,7 @@ WHOLE = Calibration(
 def test_the_parameter_file_holds_the_calibration(found, tmp_path):
     path = tmp_path / 'calibration.yaml'
     link = {'channel': 100, 'address': '12345e6789'}
-    path.write_text(cli.parameter_file(found, '2026-11-22', link))
+    path.write_text(cli.calibration_file(found, '2026-11-22', link))
     assert cli.read_parameter_file(path) == (found, link)
     assert "link.address: '12345e6789'" in path.read_text()
     assert '&' not in path.read_text()  # the parser of ROS knows no aliases

@@ -145,7 +145,7 @@ def write(bench, seed=1, **changes):
 
 def host_of(settings):
     """Return link parameters from the parameter file of a robot."""
-    content = yaml.safe_load(robot_settings.parameter_file(settings))
+    content = yaml.safe_load(robot_settings.settings_file(settings))
     # A node rejects what it does not know: settings of the board once ended radio_bridge.
     assert set(content['/**']['ros__parameters']) == {'link'}
     return LinkParameters.from_dict(content['/**']['ros__parameters']['link'])
@@ -218,7 +218,7 @@ def test_a_settings_file_holds_every_setting():
             source.randint(1000, 13_000) / 1000,
             tuple(source.choices(SENSORS, k=8)),
         )
-        text = robot_settings.parameter_file(settings)
+        text = robot_settings.settings_file(settings)
         assert robot_settings.settings_of_file(yaml.safe_load(text)) == settings
         assert host_of(settings).rate == settings.rate
         other = settings._replace(divider=settings.divider + 1, channel=settings.channel + 1)
@@ -234,13 +234,13 @@ def test_a_settings_file_holds_every_setting():
         ('microsteps: 16', 'microsteps: true', 'microsteps must be of type int'),
         ('microsteps: 16', '', 'lacks the settings: microsteps'),
         ('microsteps: 16', 'microstep: 16', 'unknown settings: microstep'),
-        ("'GP2Y0A21', ", '', 'sensors must be 8'),
+        ('GP2Y0A21, ', '', 'sensors must be 8'),
         ('/**', 'robot', 'must be a file of t3mpc robot setup --save'),
         ('link:', 'other:', 'must be a file of t3mpc robot setup --save'),
     ],
 )
 def test_a_wrong_settings_file_is_rejected_by_name(old, new, words):
-    text = robot_settings.parameter_file(RobotSettings(bytes.fromhex('c25a33a6e1')))
+    text = robot_settings.settings_file(RobotSettings(bytes.fromhex('c25a33a6e1')))
     assert old in text
     with pytest.raises(robot_settings.SettingsFileError, match=words):
         robot_settings.settings_of_file(yaml.safe_load(text.replace(old, new, 1)))

@@ -38,6 +38,7 @@ from t3mpc_ros.evaluation.topic_roles import (
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.kernels import kernel
+from t3mpc_ros.parameters.yaml_files import parameter_file
 
 Array = NDArray[np.float64]
 
@@ -412,44 +413,36 @@ def _resolved(drive: IdentifiedDrive, composition: str, lag: float) -> Controlle
     return parameters.resolved()
 
 
-def parameter_file(drive: IdentifiedDrive, composition: str, source: str) -> str:
+def drive_file(drive: IdentifiedDrive, composition: str, source: str) -> str:
     """Return the parameter file (YAML) of the controller for a drive; ``source`` names the bag."""
     values = fitting_parameters(drive, composition).to_dict()
     slower = _resolved(drive, composition, drive.lag.value + drive.lag.deviation).to_dict()
 
-    def change(name: str) -> str:
-        difference = float(str(slower[name])) - float(str(values[name]))
-        return f'standard deviation {abs(difference):.2g}'
-
-    def spread(estimate: Estimate, unit: str) -> str:
-        return f'standard deviation {estimate.deviation:.2g} {unit}'
+    def by_lag(name: str, unit: str) -> str:
+        change = abs(float(str(slower[name])) - float(str(values[name])))
+        return f'by the lag; standard deviation {change:.2g} {unit}'
 
     kind = 'means over the period before the stamp' if drive.mean_speeds else 'at the stamp'
-    rows: list[tuple[str, object, str]] = [
-        ('rate', drive.rate, 'of the odometry'),
-        ('wheel_radius', drive.geometry.wheel_radius, ''),
-        ('wheel_separation', drive.geometry.wheel_separation, ''),
-        ('composition', composition, ''),
-        ('mean_speeds', str(drive.mean_speeds).lower(), f'measured speeds are {kind}'),
-        ('speed_filter.lag', drive.lag.value, spread(drive.lag, 's')),
-        ('speed_filter.dead_time', drive.dead_time.value, spread(drive.dead_time, 's')),
-        (
-            'speed_filter.noise_variance',
-            drive.noise_variance.value,
-            spread(drive.noise_variance, '(rad/s)²'),
-        ),
-        ('law.gain', values['law.gain'], f'by the lag; {change("law.gain")} 1/s'),
-        ('law.smoothing', values['law.smoothing'], f'by the lag; {change("law.smoothing")} rad/s'),
-    ]
-    lines = [
-        f'# Drive identified from {source}: {drive.duration:.1f} s, '
-        f'{100 * drive.explained:.1f} % of the wheel speeds explained.',
-        '/**/controller:',
-        '  ros__parameters:',
-    ]
-    for name, value, comment in rows:
-        text = f'{value:.5g}' if isinstance(value, float) else str(value)
-        if isinstance(value, float) and not set(text) & set('.en'):
-            text += '.0'
-        lines.append(f'    {name}: {text}' + (f'  # {comment}' if comment else ''))
-    return '\n'.join(lines)
+    comments = {
+        'rate': 'of the odometry',
+        'wheel_radius': '',
+        'wheel_separation': '',
+        'composition': '',
+        'mean_speeds': f'measured speeds are {kind}',
+        'speed_filter.lag': f'standard deviation {drive.lag.deviation:.2g} s',
+        'speed_filter.dead_time': f'standard deviation {drive.dead_time.deviation:.2g} s',
+        'speed_filter.noise_variance': 'standard deviation '
+        f'{drive.noise_variance.deviation:.2g} (rad/s)²',
+        'law.gain': by_lag('law.gain', '1/s'),
+        'law.smoothing': by_lag('law.smoothing', 'rad/s'),
+    }
+    chosen = {name: values[name] for name in comments}
+    rounded = {
+        name: float(f'{value:.5g}') if isinstance(value, float) else value
+        for name, value in chosen.items()
+    }
+    title = (
+        f'Drive identified from {source}: {drive.duration:.1f} s, '
+        f'{100 * drive.explained:.1f} % of the wheel speeds explained.'
+    )
+    return parameter_file(title, {'/**/controller': rounded}, comments)

@@ -5,6 +5,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+from t3mpc_ros.parameters.yaml_files import parameter_file
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD
 from t3mpc_ros.radio.tool.procedure import Script
@@ -133,28 +134,17 @@ def format_settings(stored: StoredSettings) -> str:
     return '\n'.join(lines)
 
 
-def parameter_file(settings: RobotSettings) -> str:
+def settings_file(settings: RobotSettings) -> str:
     """Return a ROS parameter file: the link parameters of the host, and all other settings."""
-    link = [f'{name}: {_yaml(getattr(settings, name))}' for name in _LINK]
-    other = [
-        f'{name}: {_yaml(getattr(settings, name))}'
-        for name in settings._fields
-        if name not in _LINK
-    ]
-    return '\n'.join(
-        (
-            '# Settings of the robot, written by t3mpc robot setup.',
-            '/**:',
-            *_indent(['ros__parameters:', *_indent(['link:', *_indent(link)])]),
-            f'{_BOARD}:',
-            *_indent(['ros__parameters:', *_indent(other)]),
-            '',
-        )
-    )
+    values: dict[str, object] = settings._asdict()
+    values |= {'address': settings.address.hex(), 'sensors': list(settings.sensors)}
+    link = {name: values.pop(name) for name in _LINK}
+    title = 'Settings of the robot, written by t3mpc robot setup.'
+    return parameter_file(title, {'/**': {'link': link}, _BOARD: values})
 
 
 def settings_of_file(content: object) -> RobotSettings:
-    """Return the settings of a file of :func:`parameter_file`, parsed as YAML.
+    """Return the settings of a file of :func:`settings_file`, parsed as YAML.
 
     Raises
     ------
@@ -204,16 +194,3 @@ def _text(value: object) -> str:
     if isinstance(value, bool):
         return 'yes' if value else 'no'
     return str(value)
-
-
-def _indent(lines: list[str]) -> list[str]:
-    return [f'  {line}' for line in lines]
-
-
-def _yaml(value: object) -> str:
-    if isinstance(value, tuple):
-        return f'[{", ".join(map(_yaml, value))}]'
-    if isinstance(value, bool):
-        return str(value).lower()
-    # Quoted: 1234567890 and 12e4567890 would be numbers.
-    return str(value) if isinstance(value, (int, float)) else f"'{_text(value)}'"
