@@ -26,13 +26,12 @@ from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
 from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.response import (
-    fit_response,
     motion_summary,
-    predicted,
     roughness,
     smooth,
 )
 from t3mpc_ros.evaluation.bag_report.run_data import BY_BODY, BY_WHEEL, Series, load_run
+from t3mpc_ros.evaluation.drive_response import fit_response, predicted
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, ReportOptions
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)

@@ -87,7 +87,7 @@ def identified(tape, folder, **options):
 
 
 def assert_within(estimate, truth):
-    assert abs(estimate.value - truth) <= 3.0 * estimate.deviation, (estimate, truth)
+    assert abs(estimate.value - truth) <= 3.0 * estimate.uncertainty, (estimate, truth)
 
 
 @pytest.mark.parametrize(
@@ -113,8 +113,8 @@ def test_a_known_drive_is_recovered(tmp_path, lag, dead_time, noise, seed):
     assert_within(drive.lag, lag)
     assert_within(drive.dead_time, dead_time)
     assert_within(drive.noise_variance, noise)
-    assert drive.dead_time.deviation <= IDENTIFIED_DEVIATION
-    assert drive.lag.deviation <= max(IDENTIFIED_DEVIATION, MAX_RELATIVE_DEVIATION * lag)
+    assert drive.dead_time.uncertainty <= IDENTIFIED_DEVIATION
+    assert drive.lag.uncertainty <= max(IDENTIFIED_DEVIATION, MAX_RELATIVE_DEVIATION * lag)
     assert drive.rate == RATE
     assert composition == 'paper'
     assert drive.duration == pytest.approx(40.0, abs=0.1)
@@ -125,7 +125,7 @@ def test_more_noise_gives_a_larger_deviation(tmp_path):
     for noise in (0.002, 0.1):
         tape = recorded(ramps(1, 4000), drive__lag=0.1, noise__variance=noise)
         found.append(identified(tape, tmp_path / f'{noise}')[0])
-    assert found[1].lag.deviation > 1.1 * found[0].lag.deviation
+    assert found[1].lag.uncertainty > 1.1 * found[0].lag.uncertainty
     assert found[1].noise_variance.value > 40.0 * found[0].noise_variance.value
 
 
@@ -175,7 +175,7 @@ def test_the_drive_file_has_the_gain_by_the_rule(tmp_path):
             slope = parameters.compensated_bound / parameters.law.smoothing
         assert parameters.law.gain + slope == pytest.approx(total, rel=1e-3)
         assert parameters.law.compensator == (composition == 'paper')
-        assert f'{drive.lag.value:.5g}  # standard deviation {drive.lag.deviation:.2g} s' in text
+        assert f'{drive.lag.value:.5g}  # standard deviation {drive.lag.uncertainty:.2g} s' in text
         assert text.count('standard deviation') == 5
 
 

@@ -22,7 +22,6 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 )
 from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import link_table, response_table
-from t3mpc_ros.evaluation.bag_report.response import ResponseFit
 from t3mpc_ros.evaluation.bag_report.run_comparison import ErrorDifference
 from t3mpc_ros.evaluation.bag_report.run_data import (
     BY_BODY,
@@ -34,6 +33,7 @@ from t3mpc_ros.evaluation.bag_report.run_data import (
 )
 from t3mpc_ros.evaluation.bag_report.verdict import Stop, Verdict, judge
 from t3mpc_ros.evaluation.charts import Plane
+from t3mpc_ros.evaluation.drive_response import ResponseFit
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 

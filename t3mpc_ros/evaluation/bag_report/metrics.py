@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report.continuity import within_gaps
 from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics, link_metrics
-from t3mpc_ros.evaluation.bag_report.response import ResponseFit, responses
+from t3mpc_ros.evaluation.bag_report.response import responses
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.drive_response import ResponseFit
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
 

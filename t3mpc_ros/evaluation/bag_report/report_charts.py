@@ -24,9 +24,10 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     path_of,
     tracking_error,
 )
-from t3mpc_ros.evaluation.bag_report.response import ResponseFit, busiest, predicted, smooth
+from t3mpc_ros.evaluation.bag_report.response import smooth
 from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.charts import Chart, Curve, Line, Plane, thinned
+from t3mpc_ros.evaluation.drive_response import ResponseFit, busiest, predicted
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import world_outline

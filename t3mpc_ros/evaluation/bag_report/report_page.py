@@ -27,7 +27,6 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 from t3mpc_ros.evaluation.bag_report.patrol_section import patrol_blocks
 from t3mpc_ros.evaluation.bag_report.report_charts import LABELS, SECTIONS
 from t3mpc_ros.evaluation.bag_report.response import (
-    ResponseFit,
     motion_summary,
     responses,
     roughness,
@@ -35,6 +34,7 @@ from t3mpc_ros.evaluation.bag_report.response import (
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, load_run
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
+from t3mpc_ros.evaluation.drive_response import ResponseFit
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
     Block,

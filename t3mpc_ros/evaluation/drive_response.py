@@ -1,0 +1,289 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+r"""Response of a robot to its commands, a first-order lag behind a dead time, and its fit.
+
+The model is that of the speed filter and of the estimator of the dead time:
+
+.. math:: y(t) = k\,\chi(t - \tau) + o + \nu, \qquad \chi' = (c - \chi)/\lambda
+
+with the command c, which holds until the next one, the dead time tau and the lag lambda. Commands
+count from their receipt by the recorder, measured speeds at the stamps of the odometry.
+:func:`fit_response` searches one speed over a wide grid; :func:`fit_wheels` starts there and
+fits both wheels by least squares, with covariance. Errors that last for some time, such as
+friction, are no white noise: the covariance is that of Newey and West (1987, doi 10.2307/1913610).
+"""
+
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.bag_report.continuity import parts
+from t3mpc_ros.evaluation.bag_report.run_data import Series
+from t3mpc_ros.kernels import kernel
+
+Array = NDArray[np.float64]
+
+LONGEST_DEAD_TIME, LONGEST_LAG = 1.0, 3.0
+"""Largest dead time and lag that are searched, s."""
+MOST = 20_000
+"""Number of samples of a fit: of a longer run, the window in which the command varies most."""
+FEWEST = 50
+MIN_EXPLAINED = 0.3
+"""Explained share below which the fit is rejected."""
+MIN_LAG = 1e-3
+"""Lag below which a drive responds at once, s."""
+CORRELATION_TIME = 0.5
+"""Time over which the errors of the model are correlated at most, s."""
+ITERATIONS = 60
+DEAD_TIME, LAG = 0, 1
+"""Parameters of the fit of both wheels."""
+
+
+@dataclass(frozen=True)
+class ResponseFit:
+    """First-order response with dead time: the measured speed is k u(t - d) behind a lag."""
+
+    dead_time: float
+    """d, s; between receive times of commands and stamps of odometry."""
+    lag: float
+    """Time constant of the first-order lag, s."""
+    gain: float
+    """k, ratio of speed to command."""
+    explained: float
+    """Explained share of the variance of the measured speed."""
+    step: float
+    """Resolution of the dead time, s."""
+
+    @property
+    def clear(self) -> bool:
+        """Whether the fit explains enough of the response."""
+        return self.explained >= MIN_EXPLAINED and self.gain > 0.0
+
+
+@kernel
+def lag_behind(u: Array, keep: Array, out: Array) -> None:
+    """Write ``u`` filtered by a first-order lag: each step keeps a share of the last output.
+
+    u, keep, out : shape (n,)
+    """
+    out[0] = u[0]
+    for k in range(1, u.size):
+        out[k] = keep[k] * out[k - 1] + (1.0 - keep[k]) * u[k - 1]
+
+
+def fit_response(command: Series, motion: Series, name: str) -> ResponseFit | None:
+    """Return the dead time, lag and gain that fit the measured speed best.
+
+    Least squares of the output error over a grid of lags and dead times, refined twice. The sum of
+    dead time and lag is better determined than either. In a closed loop, noise fed back through
+    the command biases the delay slightly upwards. None when the two series overlap too briefly
+    or the command does not vary.
+    """
+    if min(len(command), len(motion)) < 3:
+        return None
+    gap = float(np.median(np.diff(motion.time)))
+    step = min(max(0.25 * gap, 0.002), 0.01)
+    start, end = busiest(command, motion, name, MOST * step)
+    if not end > start:
+        return None
+    count = int((end - start) / step) + 1
+    shifts = int(LONGEST_DEAD_TIME / step) + 1
+    if count < shifts + FEWEST:
+        return None
+    grid = start + step * np.arange(count)
+    u = command[name][np.maximum(np.searchsorted(command.time, grid, 'right') - 1, 0)]
+    y = np.interp(grid, motion.time, motion[name])
+    u, y = u - u.mean(), y - y[shifts:].mean()
+    if not (np.ptp(u) > 1e-6 and np.ptp(y) > 1e-9):
+        return None
+    lags = np.geomspace(0.5 * step, LONGEST_LAG, 30)
+    best = _best(u, y, step, shifts, [0.0, *lags.tolist()])
+    near = int(np.searchsorted(lags, best.lag))
+    low = 0.0 if best.lag == 0.0 else float(lags[max(near - 1, 0)])
+    high = float(lags[min(near + 1, lags.size - 1)])
+    return _best(u, y, step, shifts, [best.lag, *np.linspace(low, high, 16).tolist()])
+
+
+def busiest(command: Series, motion: Series, name: str, most: float) -> tuple[float, float]:
+    """Return the time span without a gap, at most ``most`` s, in which the command varies most.
+
+    Start and end are equal where both series overlap nowhere.
+    """
+    moved = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(command[name])))])
+    best, span = -1.0, (0.0, 0.0)
+    for start, end in parts(command.time, motion.time):
+        starts = np.array([start])
+        if end - start > most:
+            starts = np.append(np.arange(start, end - most, 0.25 * most), end - most)
+        ends = np.minimum(starts + most, end)
+        varied = np.interp(ends, command.time, moved) - np.interp(starts, command.time, moved)
+        k = int(np.argmax(varied))
+        if varied[k] > best:
+            best, span = float(varied[k]), (float(starts[k]), float(ends[k]))
+    return span
+
+
+def _best(u: Array, y: Array, step: float, shifts: int, lags: list[float]) -> ResponseFit:
+    # All shifts at once by the Fourier transform. A product for each of them would wait, on a busy
+    # machine, thousands of times for the threads of the linear algebra library.
+    wanted = y[shifts:]
+    power = float(wanted @ wanted)
+    spectrum = np.conj(np.fft.rfft(wanted, u.size))
+    found = ResponseFit(0.0, 0.0, 0.0, -math.inf, step)
+    x = np.empty(u.size)
+    for lag in lags:
+        lag_behind(u, np.full(u.size, math.exp(-step / lag) if lag > 0.0 else 0.0), x)
+        seen = x if lag > 0.0 else u
+        squares = np.concatenate([[0.0], np.cumsum(seen**2)])
+        energy = (squares[-shifts:] - squares[1 : shifts + 1])[::-1]
+        product = np.fft.irfft(np.fft.rfft(seen) * spectrum, u.size)[shifts:0:-1]
+        sound = (energy > 0.0) & (product > 0.0)
+        explained = np.full(shifts, -math.inf)
+        explained[sound] = product[sound] ** 2 / (energy[sound] * power)
+        shift = int(np.argmax(explained))
+        if explained[shift] > found.explained:
+            gain = float(product[shift] / energy[shift])
+            found = ResponseFit(shift * step, lag, gain, float(explained[shift]), step)
+    return found
+
+
+def predicted(fit: ResponseFit, command: Series, name: str, time: Array) -> Array:
+    """Return the speed that the fit predicts at evenly spaced ``time``, in its unit."""
+    late = time - fit.dead_time
+    u = command[name][np.maximum(np.searchsorted(command.time, late, 'right') - 1, 0)]
+    out = np.empty(u.size)
+    step = float(time[1] - time[0])
+    lag_behind(u, np.full(u.size, math.exp(-step / fit.lag) if fit.lag > 0.0 else 0.0), out)
+    return fit.gain * out
+
+
+class WheelData(NamedTuple):
+    """Commands and measured speeds of both wheels."""
+
+    switches: Array
+    """Receipt of the commands, s, shape (n,)"""
+    commands: Array
+    """rad/s, shape (2, n)"""
+    time: Array
+    """Stamps of the measured speeds, s, shape (m,)"""
+    measured: Array
+    """rad/s, shape (2, m)"""
+    window: float
+    """Time before a stamp over which the measured speed is the mean, s; 0: the speed at it."""
+
+
+class WheelFit(NamedTuple):
+    """Fit of the model to both wheels, with a gain and an offset of each."""
+
+    times: Array
+    """tau and lambda, s"""
+    covariance: Array
+    """s², shape (2, 2)"""
+    residuals: Array
+    """rad/s, shape (2, m)"""
+    data: WheelData
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared errors, (rad/s)²."""
+        return float((self.residuals**2).sum())
+
+
+def respond(data: WheelData, dead_time: float, lag: float) -> Array:
+    """Return chi(t - tau) at the stamps, or its mean over the window, rad/s, shape (2, m)."""
+    switches, commands, time, _, window = data
+    steps = np.diff(switches, prepend=switches[0])
+    at_switches = np.empty_like(commands)
+    for each, speeds in zip(commands, at_switches, strict=True):
+        lag_behind(each, np.exp(-steps / lag), speeds)
+    integral = np.cumsum(np.roll(commands, 1, axis=1) * steps, axis=1)
+
+    def at(moments: Array) -> tuple[Array, Array]:
+        """Return chi and the integral of the command (rad)."""
+        rows = np.clip(np.searchsorted(switches, moments, 'right') - 1, 0, None)
+        elapsed = np.maximum(moments - switches[rows], 0.0)
+        now = commands[:, rows]
+        speeds = now + (at_switches[:, rows] - now) * np.exp(-elapsed / lag)
+        return speeds, integral[:, rows] + now * elapsed
+
+    speeds, covered = at(time - dead_time)
+    if window == 0.0:
+        return speeds
+    before, covered_before = at(time - dead_time - window)
+    # Of chi' = (c - chi)/lag: the integral of chi is that of c less the change of chi.
+    mean: Array = (covered - covered_before - lag * (speeds - before)) / window
+    return mean
+
+
+def fit_wheels(data: WheelData, delay: float) -> WheelFit:
+    """Return the least-squares fit; ``delay`` is roughly the sum of dead time and lag, s.
+
+    Gauss-Newton with halved steps, from the best of several shares of the lag in the delay.
+    """
+
+    def errors(times: Array) -> Array:
+        """Return the errors (rad/s) with the best gains and offsets."""
+        found = respond(data, float(times[DEAD_TIME]), float(times[LAG]))
+        centred = found - found.mean(axis=1, keepdims=True)
+        measured = data.measured - data.measured.mean(axis=1, keepdims=True)
+        energy = np.maximum((centred**2).sum(axis=1), 1e-12)
+        gains = (centred * measured).sum(axis=1) / energy
+        missed: Array = measured - gains[:, np.newaxis] * centred
+        return missed
+
+    def slopes(times: Array) -> Array:
+        """Return the derivatives of the errors by tau and lambda, shape (2, 2, m)."""
+        found = np.empty((2, *data.measured.shape))
+        for i in (DEAD_TIME, LAG):
+            high, low = times.copy(), times.copy()
+            change = max(1e-4, 0.02 * times[i])
+            high[i] += change
+            low[i] = max(low[i] - change, 0.1 * MIN_LAG) if i == LAG else low[i] - change
+            found[i] = (errors(high) - errors(low)) / (high[i] - low[i])
+        return found
+
+    def cost(times: Array) -> float:
+        return float((errors(times) ** 2).sum())
+
+    total = max(delay - 0.5 * data.window, 2.0 * MIN_LAG)
+    least = np.array([-data.window, 0.25 * MIN_LAG])
+    shares = (0.05, 0.25, 0.5, 0.75, 0.95)
+    starts = [np.array([total - share * total, max(share * total, MIN_LAG)]) for share in shares]
+    times = min(starts, key=cost)
+    for _ in range(ITERATIONS):
+        design, missed = slopes(times).reshape(2, -1), errors(times).ravel()
+        step = np.linalg.lstsq(design.T, -missed, rcond=None)[0]
+        outward = (times <= least) & (step < 0.0)
+        if outward.any():  # at a bound, along it
+            step = np.zeros(2)
+            step[~outward] = np.linalg.lstsq(design[~outward].T, -missed, rcond=None)[0]
+        now, tried = cost(times), np.maximum(times + step, least)
+        while cost(tried) >= now and np.abs(tried - times).max() >= 1e-7:
+            step = 0.5 * step
+            tried = np.maximum(times + step, least)
+        if np.abs(tried - times).max() < 1e-7:
+            break
+        times = tried
+    found = errors(times)
+    return WheelFit(times, _covariance(slopes(times), found, data.time), found, data)
+
+
+def _covariance(slopes: Array, errors: Array, time: Array) -> Array:
+    """Return the covariance of tau and lambda for errors correlated over CORRELATION_TIME."""
+    flat = slopes.reshape(2, -1)
+    inverse = np.linalg.pinv(flat @ flat.T)
+    scores = (slopes * errors).sum(axis=1)  # both wheels together: their errors are correlated
+    spread = scores @ scores.T
+    lags = max(1, round(CORRELATION_TIME / float(np.median(np.diff(time)))))
+    for k in range(1, lags + 1):
+        product = scores[:, k:] @ scores[:, :-k].T
+        spread += (1.0 - k / (lags + 1.0)) * (product + product.T)
+    white = float((errors**2).sum()) / (errors.size - 6)
+    robust: Array = inverse @ spread @ inverse
+    for i in (DEAD_TIME, LAG):
+        # By chance the correlation may appear negative: never less than with white noise.
+        robust[i, i] = max(robust[i, i], white * inverse[i, i])
+    return robust
