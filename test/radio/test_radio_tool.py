@@ -265,29 +265,33 @@ def test_each_of_two_robots_follows_its_own_host_only():
 # -- ping -----------------------------------------------------------------------------------------
 
 
+def ping(bench, count):
+    """Return the measurements of a link test, and the rows of its report by name."""
+    seen = bench.at_dongle(link_test.run_link_test(LinkParameters(), count))
+    return seen, {row.name: row for row in link_test.evaluate(seen, LinkParameters())}
+
+
 def test_a_good_link_is_good_in_every_row():
     bench = ToolBench()
-    seen = bench.at_dongle(link_test.run_link_test(LinkParameters(), 100))
-    rows = link_test.evaluate(seen, LinkParameters())
-    assert [row.verdict for row in rows] == [link_test.GOOD] * 6
+    seen, rows = ping(bench, 100)
+    assert [row.verdict for row in rows.values()] == [link_test.GOOD] * 6
     assert len(seen.pings) == len(seen.cycles) == 100
     assert seen.retransmissions[0] == 200
     assert max(seen.cycles) < 0.01
     assert not bench.board.session
     assert not bench.board.powered
-    assert link_test.is_usable(rows)
+    assert link_test.is_usable([*rows.values()])
 
 
 def test_losses_cause_retransmissions_and_a_bad_verdict():
     bench = ToolBench()
     bench.emulator.inject('loss', math.inf, 0.4)
-    seen = bench.at_dongle(link_test.run_link_test(LinkParameters(), 300))
+    seen, rows = ping(bench, 300)
     assert len(seen.cycles) / 300 == pytest.approx(1 - (1 - 0.6**2) ** 4, abs=0.07)
     assert seen.retransmissions[1] > 40
-    rows = {row.name: row for row in link_test.evaluate(seen, LinkParameters())}
     assert rows['robot answers by radio'].verdict == link_test.BAD
     assert rows['retransmissions per packet'].verdict == link_test.POOR
-    text = link_test.format_report(list(rows.values()))
+    text = link_test.format_report([*rows.values()])
     assert '10 uF' in text
     assert text.count('try: ') == 2
 
@@ -295,26 +299,21 @@ def test_losses_cause_retransmissions_and_a_bad_verdict():
 def test_an_absent_robot_leads_to_the_channel_scan():
     bench = ToolBench()
     bench.emulator.inject('robot_reset', 1000.0)
-    rows = link_test.evaluate(
-        bench.at_dongle(link_test.run_link_test(LinkParameters(), 10)), LinkParameters()
-    )
-    text = link_test.format_report(rows)
-    assert 't3mpc robot scan' in text
-    assert not link_test.is_usable(rows)
+    _, rows = ping(bench, 10)
+    assert 't3mpc robot scan' in link_test.format_report([*rows.values()])
+    assert not link_test.is_usable([*rows.values()])
 
 
 @pytest.mark.slow
 def test_slow_and_damaged_cables_are_detected():
     bench = ToolBench()
     bench.emulator.inject('delay', math.inf, 0.016)
-    seen = bench.at_dongle(link_test.run_link_test(LinkParameters(), 20))
-    rows = {row.name: row for row in link_test.evaluate(seen, LinkParameters())}
+    _, rows = ping(bench, 20)
     assert rows['dongle answers over USB'].verdict == link_test.POOR
     assert rows['round trip to the robot'].verdict != link_test.GOOD
     bench = ToolBench()
     bench.emulator.inject('flip_bits', math.inf, 0.004)
-    seen = bench.at_dongle(link_test.run_link_test(LinkParameters(), 200))
-    rows = {row.name: row for row in link_test.evaluate(seen, LinkParameters())}
+    seen, rows = ping(bench, 200)
     assert seen.line_errors > 0
     assert rows['frames damaged on the cable'].verdict == link_test.POOR
 

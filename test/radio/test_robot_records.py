@@ -119,7 +119,7 @@ def test_uncertainties_are_never_stored_as_smaller_or_as_none():
         ({'wheel_radius': Estimate(float('nan'), 1e-5)}, 'wheel_radius must be'),
         ({'track': Estimate(0.2, 0.0)}, r'track\.uncertainty must be above 0'),
         ({'track': Estimate(0.2, 0.1)}, r'track\.uncertainty must be above 0'),
-        ({'gyro_scale': Estimate(1.3, 1e-3)}, 'gyro_scale - 1 must be'),
+        ({'gyro_scale': Estimate(1.3, 1e-3)}, 'gyro_scale must be from 0.8 to 1.2'),
         ({'gyro_bias': Estimate(1.0, 1e-3)}, 'gyro_bias must be'),
         ({'divider': DividerCorrection(0.0, 40.0, 0.1)}, r'divider\.offset must be'),
         ({'curves': ()}, 'curves must be 8'),

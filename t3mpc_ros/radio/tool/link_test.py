@@ -38,6 +38,12 @@ _MAX_USB_ROUND_TRIP = 5e-3
 """s; PING and PONG take 0.7 ms on the line"""
 _MAX_MEAN_RETRIES = 0.5
 """Mean retransmissions per packet above which the radio has no margin."""
+_SEARCH = '{} t3mpc robot scan searches all channels; '
+_PROBLEMS = {
+    StatusFlag.ESTOP: 'its emergency stop is latched',
+    StatusFlag.IMU_FAULT: 'its inertial sensor does not answer: SDA at 20, SCL at 21, 5 V',
+    StatusFlag.LOW_BATTERY: 'its battery is low, or its divider differs from docs/robot.md',
+}
 
 
 class LinkTestResult(NamedTuple):
@@ -123,21 +129,63 @@ def _line_errors(pong: Pong) -> int:
 
 def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[ReportRow]:
     """Return the report: each measurement with a verdict and a remedy."""
+    requests, pings, cycles = result.requests, result.pings, result.cycles
+    lost = 1.0 - len(cycles) / requests
     rows = [
-        _evaluate_usb(result),
+        ReportRow(
+            'dongle answers over USB',
+            f'{len(pings)} of {requests}{", " if pings else ""}{_format_trips(pings)}',
+            _verdict(
+                len(pings) == requests and _slow_trip(pings) <= _MAX_USB_ROUND_TRIP,
+                len(pings) >= requests * (1.0 - LOSS_LIMIT),
+            ),
+            'the latency timer of an FTDI chip at 1 ms (docs/radio.md), another cable, no hub, '
+            'less load on the computer',
+        ),
         ReportRow(
             'frames damaged on the cable',
             str(result.line_errors),
-            GOOD if not result.line_errors else POOR,
+            _verdict(not result.line_errors),
             'another cable, another USB port, no hub',
         ),
-        _evaluate_losses(result, parameters),
+        ReportRow(
+            'robot answers by radio',
+            f'{len(cycles)} of {requests}',
+            _verdict(lost <= LOSS_LIMIT / 5, lost <= LOSS_LIMIT),
+            ('' if cycles else _SEARCH.format(reasons.robot_absent(parameters.channel)))
+            + 'more than 0.2 m between the radios, antennas upright and free; 10 uF and 100 nF at '
+            'both radio chips; another channel (t3mpc robot scan lists them); --set power=…; '
+            '--set rate=250k with nRF24L01+ chips at both ends',
+        ),
     ]
-    if result.cycles:
-        rows += [_evaluate_retries(result), _evaluate_round_trips(result, parameters)]
-    if result.state is not None:
-        rows.append(_evaluate_robot(result.state))
+    if cycles:
+        retries = result.retransmissions
+        mean = sum(k * count for k, count in enumerate(retries)) / max(sum(retries), 1)
+        slow, period = _slow_trip(cycles), 1.0 / parameters.cycle_rate
+        rows += [
+            ReportRow(
+                'retransmissions per packet',
+                ', '.join(f'{number}: {count}' for number, count in enumerate(retries) if count),
+                _verdict(mean <= _MAX_MEAN_RETRIES),
+                'as for the answers by radio: most packets are retransmitted',
+            ),
+            ReportRow(
+                'round trip to the robot',
+                _format_trips(cycles),
+                _verdict(slow <= ROUND_TRIP_LIMIT * period, slow <= period),
+                f'half a period is {500.0 * period:g} ms: a lower --set cycle_rate, or the '
+                'latency timer of the serial port at 1 ms (docs/radio.md)',
+            ),
+        ]
+    if (state := result.state) is not None:
+        found = [text for bit, text in _PROBLEMS.items() if StatusFlag(state.status) & bit]
+        session = f'in session {state.session}' if state.session else 'in no session'
+        rows.append(ReportRow('robot', session, _verdict(not found), '; '.join(found)))
     return rows
+
+
+def _verdict(good: bool, usable: bool = True) -> str:
+    return BAD if not usable else GOOD if good else POOR
 
 
 def is_usable(rows: list[ReportRow]) -> bool:
@@ -160,75 +208,8 @@ def _format_trips(trips: tuple[float, ...]) -> str:
     if not trips:
         return ''
     median, slow = 1e3 * np.quantile(trips, [0.5, 0.99])
-    return f', {median:.1f} ms (median), {slow:.1f} ms (99 of 100)'
+    return f'{median:.1f} ms (median), {slow:.1f} ms (99 of 100)'
 
 
 def _slow_trip(trips: tuple[float, ...]) -> float:
     return float(np.quantile(trips, 0.99))
-
-
-def _evaluate_usb(result: LinkTestResult) -> ReportRow:
-    answered = len(result.pings)
-    verdict = GOOD
-    if answered < result.requests or _slow_trip(result.pings) > _MAX_USB_ROUND_TRIP:
-        verdict = POOR
-    if answered < result.requests * (1.0 - LOSS_LIMIT):
-        verdict = BAD
-    return ReportRow(
-        'dongle answers over USB',
-        f'{answered} of {result.requests}{_format_trips(result.pings)}',
-        verdict,
-        'the latency timer of an FTDI chip at 1 ms (docs/radio.md), another cable, no hub, less '
-        'load on the computer',
-    )
-
-
-def _evaluate_losses(result: LinkTestResult, parameters: LinkParameters) -> ReportRow:
-    share = 1.0 - len(result.cycles) / result.requests
-    verdict = GOOD if share <= LOSS_LIMIT / 5 else POOR if share <= LOSS_LIMIT else BAD
-    remedy = (
-        'more than 0.2 m between the radios, antennas upright and free; 10 uF and 100 nF at both '
-        'radio chips; another channel (t3mpc robot scan lists them); --set power=…; '
-        '--set rate=250k with nRF24L01+ chips at both ends'
-    )
-    if not result.cycles:
-        absent = reasons.robot_absent(parameters.channel)
-        remedy = f'{absent} t3mpc robot scan searches all channels; {remedy}'
-    return ReportRow(
-        'robot answers by radio', f'{len(result.cycles)} of {result.requests}', verdict, remedy
-    )
-
-
-def _evaluate_retries(result: LinkTestResult) -> ReportRow:
-    retries = result.retransmissions
-    mean = sum(number * count for number, count in enumerate(retries)) / max(sum(retries), 1)
-    counts = ', '.join(f'{number}: {count}' for number, count in enumerate(retries) if count)
-    remedy = 'as for the answers by radio: most packets are retransmitted'
-    return ReportRow(
-        'retransmissions per packet', counts, GOOD if mean <= _MAX_MEAN_RETRIES else POOR, remedy
-    )
-
-
-def _evaluate_round_trips(result: LinkTestResult, parameters: LinkParameters) -> ReportRow:
-    slow = _slow_trip(result.cycles)
-    period = 1.0 / parameters.cycle_rate
-    verdict = GOOD if slow <= ROUND_TRIP_LIMIT * period else POOR if slow <= period else BAD
-    return ReportRow(
-        'round trip to the robot',
-        _format_trips(result.cycles)[2:],
-        verdict,
-        f'half a period is {500.0 * period:g} ms: a lower --set cycle_rate, or the latency timer '
-        'of the serial port at 1 ms (docs/radio.md)',
-    )
-
-
-def _evaluate_robot(state: State) -> ReportRow:
-    status = StatusFlag(state.status)
-    problems = {
-        StatusFlag.ESTOP: 'its emergency stop is latched',
-        StatusFlag.IMU_FAULT: 'its inertial sensor does not answer: SDA at 20, SCL at 21, 5 V',
-        StatusFlag.LOW_BATTERY: 'its battery is low, or its divider differs from docs/robot.md',
-    }
-    found = [text for bit, text in problems.items() if status & bit]
-    session = f'in session {state.session}' if state.session else 'in no session'
-    return ReportRow('robot', session, POOR if found else GOOD, '; '.join(found))

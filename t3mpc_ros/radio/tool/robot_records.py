@@ -106,13 +106,7 @@ class Stored(NamedTuple):
 
 
 def encode_settings(settings: RobotSettings) -> bytes:
-    """Return the record of the settings.
-
-    Raises
-    ------
-    ValueError
-        A value is impossible; the text names field, bound and value.
-    """
+    """Return the record of the settings."""
     check_settings(settings)
     return _SETTINGS.pack(
         _SETTINGS_FORMAT,
@@ -134,7 +128,7 @@ def check_settings(settings: RobotSettings) -> None:
         (
             'address',
             len(settings.address) == 5 and len(set(settings.address)) > 1,
-            '5 bytes that are not all equal',
+            '10 hexadecimal digits, not of equal bytes',
         ),
         ('channel', 0 <= settings.channel <= 125, 'from 0 to 125'),
         ('rate', settings.rate in RATES, f'one of {", ".join(RATES)}'),
@@ -154,7 +148,8 @@ def check_settings(settings: RobotSettings) -> None:
     )
     for name, good, bound in bounds:
         if not good:
-            raise ValueError(f'{name} must be {bound}: got {getattr(settings, name)!r}')
+            value = settings.address.hex() if name == 'address' else getattr(settings, name)
+            raise ValueError(f'{name} must be {bound}: got {value!r}')
 
 
 def decode_settings(body: bytes) -> RobotSettings:
@@ -178,35 +173,39 @@ def decode_settings(body: bytes) -> RobotSettings:
     return settings
 
 
+_ESTIMATES = {
+    'wheel_radius': (0.0, 1e-7, 10_000, 100_000_000),
+    'track': (0.0, 1e-7, 10_000, 100_000_000),
+    'gyro_scale': (1.0, 1e-5, -20_000, 20_000),
+    'gyro_bias': (0.0, _MILLIDEGREE, -0x8000, 0x7FFF),
+}
+"""Value that is stored as 0, unit, least and largest number of units of each estimate."""
+
+
 def encode_calibration(calibration: Calibration) -> bytes:
-    """Return the record of a calibration.
+    """Return the record of a calibration; ValueError names a value that does not fit.
 
     Lengths are 1 mm to 10 m with an uncertainty of at most 6.5 mm, the scale of the gyro 0.8 to
     1.2, its bias at most 0.57 rad/s, the gain of the divider at most 0.2.
-
-    Raises
-    ------
-    ValueError
-        A value does not fit; the text names field, bound and value.
     """
     if len(calibration.curves) != SENSOR_COUNT:
         raise ValueError(f'curves must be {SENSOR_COUNT}: got {len(calibration.curves)}')
-    scale = calibration.gyro_scale
-    if scale is not None:
-        scale = scale._replace(value=scale.value - 1.0)
-    divider = calibration.divider or DividerCorrection(0.0, 0.0, 0.0)
-    head = _CALIBRATION.pack(
-        _CALIBRATION_FORMAT,
-        *_estimate('wheel_radius', calibration.wheel_radius, 1e-7, 10_000, 100_000_000),
-        *_estimate('track', calibration.track, 1e-7, 10_000, 100_000_000),
-        *_estimate('gyro_scale - 1', scale, 1e-5, -20_000, 20_000),
-        *_estimate('gyro_bias', calibration.gyro_bias, _MILLIDEGREE, -0x8000, 0x7FFF),
-        _steps('divider.gain', divider.gain, 1e-5, -20_000, 20_000),
-        _steps('divider.offset', divider.offset, 1e-3, -0x8000, 0x7FFF),
-        0
-        if calibration.divider is None
-        else _ceil('divider.uncertainty', divider.uncertainty, 1e-3, 0xFFFF),
-    )
+    values: list[int] = []
+    for name, (zero, unit, low, high) in _ESTIMATES.items():
+        estimate: Estimate | None = getattr(calibration, name)
+        if estimate is None:
+            values += 0, 0
+        else:
+            values.append(_steps(name, estimate.value, unit, low, high, zero))
+            values.append(_ceil(f'{name}.uncertainty', estimate.uncertainty, unit, 0xFFFF))
+    if calibration.divider is None:
+        values += 0, 0, 0
+    else:
+        gain, offset, uncertainty = calibration.divider
+        values.append(_steps('divider.gain', gain, 1e-5, -20_000, 20_000))
+        values.append(_steps('divider.offset', offset, 1e-3, -0x8000, 0x7FFF))
+        values.append(_ceil('divider.uncertainty', uncertainty, 1e-3, 0xFFFF))
+    head = _CALIBRATION.pack(_CALIBRATION_FORMAT, *values)
     return head + b''.join(
         _encode_curve(f'curves[{number}]', curve)
         for number, curve in enumerate(calibration.curves)
@@ -218,20 +217,21 @@ def decode_calibration(body: bytes) -> Calibration:
     head = body[: _CALIBRATION.size]
     if len(body) != _CALIBRATION.size + SENSOR_COUNT * _CURVE.size:
         raise ValueError(f'calibration must be a known format: got {len(body)} bytes')
-    _, radius, d_radius, track, d_track, scale, d_scale, bias, d_bias, gain, offset, d_battery = (
-        _unpack('calibration', _CALIBRATION, _CALIBRATION_FORMAT, head)
-    )
-    curves = tuple(
-        SharpCurve(1e-4 * scale, 1e-4 * shift, 1e-4 * level, 1e-3 * error) if error else None
-        for scale, shift, level, error in _CURVE.iter_unpack(body[_CALIBRATION.size :])
-    )
+    _, *values = _unpack('calibration', _CALIBRATION, _CALIBRATION_FORMAT, head)
+    *pairs, gain, offset, battery = values
+    estimates = {
+        name: Estimate(zero + unit * steps, unit * uncertainty) if uncertainty else None
+        for (name, (zero, unit, *_)), steps, uncertainty in zip(
+            _ESTIMATES.items(), pairs[::2], pairs[1::2], strict=True
+        )
+    }
     return Calibration(
-        Estimate(1e-7 * radius, 1e-7 * d_radius) if d_radius else None,
-        Estimate(1e-7 * track, 1e-7 * d_track) if d_track else None,
-        Estimate(1.0 + 1e-5 * scale, 1e-5 * d_scale) if d_scale else None,
-        Estimate(_MILLIDEGREE * bias, _MILLIDEGREE * d_bias) if d_bias else None,
-        DividerCorrection(1e-5 * gain, 1e-3 * offset, 1e-3 * d_battery) if d_battery else None,
-        curves,
+        **estimates,
+        divider=DividerCorrection(1e-5 * gain, 1e-3 * offset, 1e-3 * battery) if battery else None,
+        curves=tuple(
+            SharpCurve(1e-4 * scale, 1e-4 * shift, 1e-4 * level, 1e-3 * error) if error else None
+            for scale, shift, level, error in _CURVE.iter_unpack(body[_CALIBRATION.size :])
+        ),
     )
 
 
@@ -254,10 +254,11 @@ def _choice(names: tuple[str, ...], number: int) -> str:
     return names[number] if number < len(names) else f'number {number}'
 
 
-def _steps(name: str, value: float, unit: float, low: int, high: int) -> int:
-    steps = round(value / unit) if math.isfinite(value) else high + 1
+def _steps(name: str, value: float, unit: float, low: int, high: int, zero: float = 0.0) -> int:
+    steps = round((value - zero) / unit) if math.isfinite(value) else high + 1
     if not low <= steps <= high:
-        raise ValueError(f'{name} must be from {low * unit:.6g} to {high * unit:.6g}: got {value}')
+        least, most = zero + low * unit, zero + high * unit
+        raise ValueError(f'{name} must be from {least:.6g} to {most:.6g}: got {value}')
     return steps
 
 
@@ -268,15 +269,6 @@ def _ceil(name: str, value: float, unit: float, high: int) -> int:
     if max(steps, 1) > high:
         raise ValueError(f'{name} must be above 0, up to {high * unit:.6g}: got {value}')
     return max(steps, 1)
-
-
-def _estimate(
-    name: str, estimate: Estimate | None, unit: float, low: int, high: int
-) -> tuple[int, int]:
-    if estimate is None:
-        return 0, 0
-    value = _steps(name, estimate.value, unit, low, high)
-    return value, _ceil(f'{name}.uncertainty', estimate.uncertainty, unit, 0xFFFF)
 
 
 def _encode_curve(name: str, curve: SharpCurve | None) -> bytes:
@@ -294,13 +286,7 @@ def _encode_curve(name: str, curve: SharpCurve | None) -> bytes:
 
 
 def read_calibration() -> Script[Calibration]:
-    """Return the calibration of the robot, all None if it was never calibrated.
-
-    Raises
-    ------
-    ProcedureError
-        The calibration is damaged or of a newer firmware, or the port is not that of a robot.
-    """
+    """Return the calibration of the robot, all None if it was never calibrated."""
     stored = yield from read_record(CALIBRATION_RECORD)
     if stored.state == frames.SETTINGS_DAMAGED:
         raise ProcedureError(
@@ -318,13 +304,6 @@ def write_calibration(calibration: Calibration) -> Script[Calibration]:
     It replaces the old one completely: to change a value, write ``read_calibration()`` with it
     replaced. The session of the robot ends, and the values are in effect at once. The robot must
     stand still, with its drivers off.
-
-    Raises
-    ------
-    ValueError
-        A value does not fit; raised before anything is sent.
-    ProcedureError
-        The robot moves, its EEPROM failed, or the port is not that of a robot.
     """
     body = encode_calibration(calibration)
     return decode_calibration((yield from write_record(CALIBRATION_RECORD, body)))
