@@ -9,7 +9,7 @@ import math
 import os
 from pathlib import Path
 import sys
-from typing import Any, TypeVar
+from typing import Any
 
 from t3mpc_ros.cli.command import ask_line, check_writable
 from t3mpc_ros.geometry.kinematics import WheelGeometry
@@ -18,115 +18,24 @@ from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.parameters.yaml_files import YamlError, parameter_file, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.radio_robot import RadioRobotParameters
-from t3mpc_ros.radio.tool import procedure, robot_records, robot_settings
 from t3mpc_ros.radio.tool.calibration_wizard import (
     STEPS,
     CalibrationRobot,
     CalibrationWizard,
+    Interrupted,
     WizardOptions,
 )
-from t3mpc_ros.radio.tool.manoeuvre import HandTurn, Manoeuvre, Rest
-from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, ProcedureError, Script
+from t3mpc_ros.radio.tool.procedure import ProcedureError
 from t3mpc_ros.robot.calibration import (
     MARKS,
     Calibration,
     DividerCorrection,
     Estimate,
     MarkUncertainty,
-    Recording,
     SharpCurve,
 )
-from t3mpc_ros.robot.interface import WheelAngles
 
-Value = TypeVar('Value')
 _EXIT_OK, _EXIT_INTERRUPTED = 0, 130
-
-
-class Interrupted(Exception):
-    """The user ends the wizard: Ctrl-C, or the end of the input."""
-
-
-class LinkedRobot(CalibrationRobot):
-    """The robot behind a dongle and, for raw counts, behind its own USB port.
-
-    Parameters
-    ----------
-    port, robot_port
-        Of the dongle, and of the robot board; the second may be empty.
-    parameters, key
-        Of the link.
-    interrupted
-        Whether the user has ended the wizard; polled during every measurement.
-    """
-
-    def __init__(
-        self,
-        port: str,
-        robot_port: str,
-        parameters: LinkParameters,
-        key: bytes,
-        interrupted: Callable[[], bool],
-    ) -> None:
-        self.has_usb = bool(robot_port)
-        self._port = port
-        self._robot_port = robot_port
-        self._parameters = parameters
-        self._key = key
-        self._interrupted = interrupted
-
-    def rest(self, seconds: float) -> Recording:
-        """Return a recording of the robot at rest."""
-        return self._record(Rest(self._parameters, self._key, os.urandom, seconds, _report))
-
-    def drive(self, angles: WheelAngles, speed: float, rests: tuple[float, float]) -> Recording:
-        """Turn the wheels by angles (rad); return the recording with the rests around it."""
-        return self._record(
-            Manoeuvre(self._parameters, self._key, os.urandom, angles, speed, _report, rests)
-        )
-
-    def turn_by_hand(self, timeout: float, rests: tuple[float, float]) -> Recording:
-        """Return the recording of a turn by hand between two rests."""
-        return self._record(
-            HandTurn(self._parameters, self._key, os.urandom, timeout, _report, rests)
-        )
-
-    def counts(self, samples: int) -> Sequence[tuple[int, ...]]:
-        """Return raw counts: of the eight distance sensors and, last, of the battery."""
-        return self._at_board(robot_records.read_counts(samples))
-
-    def divider(self) -> float:
-        """Return the nominal divider of the battery, as in the settings of the robot."""
-        stored = self._at_board(robot_settings.read_settings())
-        if not stored.valid:
-            raise ProcedureError('the robot has no valid settings: t3mpc robot setup')
-        return stored.settings.divider
-
-    def store(self, found: Calibration) -> None:
-        """Store a calibration in the robot, in place of the one that it has."""
-        try:
-            self._at_board(robot_records.write_calibration(found))
-        except ValueError as error:
-            raise ProcedureError(f'the robot cannot hold this calibration: {error}') from error
-
-    def stored(self) -> Calibration:
-        """Return the calibration in the robot."""
-        return self._at_board(robot_records.read_calibration())
-
-    def _at_board(self, script: Script[Value]) -> Value:
-        try:
-            return procedure.run_script(script, self._robot_port, self._interrupted, ROBOT_BOARD)
-        except ProcedureError as error:
-            if self._interrupted():
-                raise Interrupted from error
-            raise
-
-    def _record(self, task: Manoeuvre) -> Recording:
-        procedure.run_at_port(task, self._port, self._interrupted)
-        if self._interrupted():
-            raise Interrupted
-        if task.error:
-            raise ProcedureError(task.error)
-        return task.recording
 
 
 def _report(text: str) -> None:
@@ -136,28 +45,29 @@ def _report(text: str) -> None:
 # -- parameter file -------------------------------------------------------------------------------
 
 
+_ESTIMATES = {
+    'wheel_radius': ('wheel_radius', 'calibration.wheel_radius_uncertainty'),
+    'track': ('wheel_separation', 'calibration.wheel_separation_uncertainty'),
+    'gyro_scale': ('odometry.gyro_scale', 'odometry.gyro_scale_tolerance'),
+    'gyro_bias': ('calibration.gyro_bias', 'calibration.gyro_bias_uncertainty'),
+}
+"""Parameters of value and uncertainty of each estimate of a calibration."""
+_GEOMETRY = 'wheel_radius', 'wheel_separation'
+"""Parameters that the controller and the generator have, too."""
+
+
 def calibration_file(found: Calibration, date: str, link: Mapping[str, object]) -> str:
     """Return the ROS parameter file of a calibration.
 
     It holds the parameters of the link (by name, without ``link.``) as well: the launch file takes
     one file.
     """
-    geometry: dict[str, object] = {}
     bridge: dict[str, object] = {f'link.{name}': value for name, value in link.items()}
     bridge['calibration.date'] = date
-    for name, estimate in (
-        ('wheel_radius', found.wheel_radius),
-        ('wheel_separation', found.track),
-    ):
-        if estimate is not None:
-            geometry[name] = _rounded(estimate.value)
-            bridge[f'calibration.{name}_uncertainty'] = _rounded(estimate.uncertainty)
-    if found.gyro_scale is not None:
-        bridge['odometry.gyro_scale'] = _rounded(found.gyro_scale.value)
-        bridge['odometry.gyro_scale_tolerance'] = _rounded(found.gyro_scale.uncertainty)
-    if found.gyro_bias is not None:
-        bridge['calibration.gyro_bias'] = _rounded(found.gyro_bias.value)
-        bridge['calibration.gyro_bias_uncertainty'] = _rounded(found.gyro_bias.uncertainty)
+    for field, names in _ESTIMATES.items():
+        if (estimate := getattr(found, field)) is not None:
+            bridge |= zip(names, map(_rounded, estimate), strict=True)
+    geometry = {name: bridge[name] for name in _GEOMETRY if name in bridge}
     if found.divider is not None:
         for name, value in found.divider._asdict().items():
             bridge[f'calibration.battery_{name}'] = _rounded(value)
@@ -166,7 +76,7 @@ def calibration_file(found: Calibration, date: str, link: Mapping[str, object]) 
         for name in SharpCurve._fields:
             values = [_rounded(getattr(curve or none, name)) for curve in found.curves]
             bridge[f'calibration.range_{name}'] = values
-    nodes = {'radio_bridge': geometry | bridge}
+    nodes = {'radio_bridge': bridge}
     if geometry:
         nodes |= {'controller': geometry, 'reference_generator': geometry}
     title = 'Calibration of the robot, written by t3mpc robot calibrate.'
@@ -179,13 +89,7 @@ def _rounded(value: float) -> float:
 
 
 def read_parameter_file(path: Path) -> tuple[Calibration, dict[str, object]]:
-    """Return the calibration and the parameters of the link in a file of :func:`calibration_file`.
-
-    Raises
-    ------
-    ParameterError
-        The file cannot be read, or is another one.
-    """
+    """Return the calibration and the link parameters of a file of :func:`calibration_file`."""
     try:
         content: Any = read_yaml(path)
         values = content['/**/radio_bridge']['ros__parameters']
@@ -197,26 +101,20 @@ def read_parameter_file(path: Path) -> tuple[Calibration, dict[str, object]]:
             f'{path} must be a parameter file of t3mpc robot calibrate, with calibration below '
             '/**/radio_bridge'
         ) from error
-    known, odometry = parameters.calibration, parameters.odometry
-    curves = zip(
-        known.range_scale,
-        known.range_shift,
-        known.range_offset,
-        known.range_uncertainty,
-        strict=True,
-    )
-    geometry = parameters.geometry
-    has_scale = 'odometry.gyro_scale' in values
-    has_divider = known.battery_uncertainty > 0.0
+    known: dict[str, Any] = parameters.to_dict()
+    estimates = {
+        field: Estimate(known[value], known[uncertainty])
+        for field, (value, uncertainty) in _ESTIMATES.items()
+        if value in values and known[uncertainty] > 0.0
+    }
+    battery = [known[f'calibration.battery_{name}'] for name in DividerCorrection._fields]
+    ranges = [known[f'calibration.range_{name}'] for name in SharpCurve._fields]
     found = Calibration(
-        _estimate(geometry.wheel_radius, known.wheel_radius_uncertainty),
-        _estimate(geometry.wheel_separation, known.wheel_separation_uncertainty),
-        Estimate(odometry.gyro_scale, odometry.gyro_scale_tolerance) if has_scale else None,
-        _estimate(known.gyro_bias, known.gyro_bias_uncertainty),
-        DividerCorrection(known.battery_gain, known.battery_offset, known.battery_uncertainty)
-        if has_divider
-        else None,
-        tuple(SharpCurve(*each) if each[3] > 0.0 else None for each in curves),
+        **estimates,
+        divider=DividerCorrection(*battery) if battery[-1] > 0.0 else None,
+        curves=tuple(
+            SharpCurve(*each) if each[-1] > 0.0 else None for each in zip(*ranges, strict=True)
+        ),
     )
     return found, _changed(parameters.link)
 
@@ -225,10 +123,6 @@ def _changed(link: LinkParameters) -> dict[str, object]:
     """Return the parameters of a link that differ from their defaults, by name."""
     defaults = LinkParameters().to_dict()
     return {name: value for name, value in link.to_dict().items() if value != defaults[name]}
-
-
-def _estimate(value: float, uncertainty: float) -> Estimate | None:
-    return Estimate(value, uncertainty) if uncertainty > 0.0 else None
 
 
 # -- command --------------------------------------------------------------------------------------
@@ -245,7 +139,9 @@ def calibrate(
     if not sys.stdin.isatty():
         raise ProcedureError('calibrating a robot needs a person: run it at a terminal')
     path: Path = options.save
-    robot = LinkedRobot(options.port, options.robot_port, parameters, key, stop)
+    robot = CalibrationRobot(
+        options.port, options.robot_port, parameters, key, os.urandom, stop, _report
+    )
     start, link = Calibration(), _changed(parameters)
     if path.exists():
         start, known = read_parameter_file(path)
@@ -322,7 +218,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add(
         '--steps',
         type=_steps,
-        default=STEPS,
+        default=tuple(STEPS),
         metavar='STEP,…',
         help=f'some of {", ".join(STEPS)}; default: all',
     )

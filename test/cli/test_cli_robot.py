@@ -187,7 +187,7 @@ def test_an_interrupted_calibration_keeps_what_it_found(capsys, monkeypatch, tmp
     rates = 0.01 + 5e-4 * np.random.default_rng(1).standard_normal(500)
     still = np.zeros(500)
     recording = Recording(0.02 * np.arange(500), still, still, rates, 500, 500)
-    monkeypatch.setattr(robot_calibrate.LinkedRobot, 'rest', lambda robot, seconds: recording)
+    monkeypatch.setattr(robot_calibrate.CalibrationRobot, 'rest', lambda robot, seconds: recording)
     read, write = os.pipe()
     path = tmp_path / 'found.yaml'
     with os.fdopen(read) as terminal:

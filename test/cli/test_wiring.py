@@ -242,7 +242,7 @@ ROBOT = {
         run=lambda: None, calibration=start
     ),
     'cli.robot_calibrate.read_parameter_file': (Calibration(), {}),
-    'cli.robot_calibrate.LinkedRobot': SimpleNamespace(has_usb=False),
+    'cli.robot_calibrate.CalibrationRobot': SimpleNamespace(has_usb=False),
     'cli.robot_doctor.run_doctor': [],
 }
 
@@ -596,8 +596,8 @@ TABLE = {
     'robot calibrate --port p': (
         ROBOT,
         {
-            '--port q': {'LinkedRobot.port': 'q'},
-            '--robot-port r': {'LinkedRobot.robot_port': 'r'},
+            '--port q': {'CalibrationRobot.port': 'q'},
+            '--robot-port r': {'CalibrationRobot.robot_port': 'r'},
             '--save robot.yaml': {'read_parameter_file.path': 'robot.yaml'},
             '--steps rest,radius': {'CalibrationWizard.options.steps': ('rest', 'radius')},
             '--wheel-radius 0.05': {'CalibrationWizard.options.geometry.wheel_radius': 0.05},
@@ -612,7 +612,7 @@ TABLE = {
             '--mark-angle 90': {'CalibrationWizard.options.marks.angle': np.pi / 2},
             '--mark-range 7': {'CalibrationWizard.options.marks.range': 0.007},
             '--mark-voltage 0.5': {'CalibrationWizard.options.marks.voltage': 0.5},
-            **link('LinkedRobot'),
+            **link('CalibrationRobot'),
         },
     ),
     'robot doctor --port p --robot-port r --no-questions': (

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The calibration wizard against the emulated boards, in virtual time."""
 
-import math
+import os
 from pathlib import Path
 import re
 import shlex
@@ -14,12 +14,15 @@ import yaml
 
 from t3mpc_ros.cli import robot as robot_cli
 from t3mpc_ros.cli import robot_calibrate as cli
-from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes.registry import parameter_class
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool import procedure, robot_records
-from t3mpc_ros.radio.tool.calibration_wizard import CalibrationWizard, WizardOptions
+from t3mpc_ros.radio.tool.calibration_wizard import (
+    CalibrationRobot,
+    CalibrationWizard,
+    WizardOptions,
+)
 from t3mpc_ros.robot import calibration
 from t3mpc_ros.robot.calibration import (
     COVERAGE,
@@ -29,7 +32,6 @@ from t3mpc_ros.robot.calibration import (
     Estimate,
     SharpCurve,
 )
-from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
 from t3mpc_ros.simulation.sensors.range_sensor import output_voltage
 
 RADIUS, TRACK = 1.02 * 0.035, 1.03 * 0.147
@@ -55,7 +57,9 @@ def person(monkeypatch):
 
 
 def wizard(person, *steps, start=None, robot_port='', **options):
-    robot = cli.LinkedRobot('dongle', robot_port, LinkParameters(), b'', lambda: False)
+    robot = CalibrationRobot(
+        *('dongle', robot_port, LinkParameters(), b''), os.urandom, lambda: False, person.show
+    )
     options = WizardOptions(steps=steps, **options)
     return CalibrationWizard(robot, person.ask, person.show, options, start or Calibration())
 
@@ -241,20 +245,3 @@ def test_another_file_is_refused(text, words, tmp_path):
     path.write_text(text)
     with pytest.raises(ParameterError, match=words):
         cli.read_parameter_file(path)
-
-
-def test_the_bridge_corrects_the_gyro_by_its_scale():
-    """Ten turns of a gyro that reports 3 % too much end where the robot is."""
-    odometry = GyroOdometry(
-        GyroOdometryParameters(gyro_scale=1.0 / 1.03, gyro_scale_tolerance=3e-4), WheelGeometry()
-    )
-    for _ in range(150):
-        odometry.update(0.0, 0.0, 0.1, 0.02)  # the bias
-    turn = 2.0 * math.pi / 300.0
-    angle = turn * 0.147 / 2.0 / 0.035
-    for _ in range(3000):
-        odometry.update(angle, -angle, 1.03 * turn / 0.02 + 0.1, 0.02)
-    for _ in range(150):
-        odometry.update(0.0, 0.0, 0.1, 0.02)
-    assert odometry.pose.yaw == pytest.approx(0.0, abs=0.01)
-    assert not odometry.slipping

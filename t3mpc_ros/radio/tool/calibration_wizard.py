@@ -11,12 +11,15 @@ the robot without a yes to the question before it.
 from collections.abc import Callable, Sequence
 from functools import partial
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.radio.tool.procedure import ProcedureError
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.tool import procedure, robot_records, robot_settings
+from t3mpc_ros.radio.tool.manoeuvre import HandTurn, Manoeuvre, Rest
+from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, ProcedureError, Script
 from t3mpc_ros.robot import calibration
 from t3mpc_ros.robot.calibration import (
     COVERAGE,
@@ -34,8 +37,9 @@ from t3mpc_ros.robot.calibration import (
 )
 from t3mpc_ros.robot.interface import RANGE_SENSORS, WheelAngles
 
-STEPS = ('rest', 'radius', 'track', 'hand', 'ranges', 'battery')
-_TITLES = {
+Value = TypeVar('Value')
+
+STEPS = {
     'rest': 'bias of the gyro, at rest',
     'radius': 'wheel radius, on a straight line',
     'track': 'track and scale of the gyro, turning on the spot',
@@ -43,6 +47,8 @@ _TITLES = {
     'ranges': 'distance sensors',
     'battery': 'divider of the battery',
 }
+"""Title of each step, which the method ``measure_`` and its name runs, in their order."""
+_USB_STEPS = 'ranges', 'battery'
 _REST_TIME = 10.0
 _RESTS = (4.0, 4.0)
 """Before and after a turn, s."""
@@ -54,29 +60,85 @@ _SIDES = (('front', 0), ('left', 2), ('rear', 4), ('right', 6))
 """Side, and the number of the first of its two sensors."""
 
 
-class CalibrationRobot(Protocol):
-    """Measurements on a robot; each raises ProcedureError with a reason and a remedy."""
+class Interrupted(Exception):
+    """The user ends the wizard: Ctrl-C, or the end of the input."""
 
-    has_usb: bool
-    """Whether the USB port of the robot board is connected: raw counts."""
+
+class CalibrationRobot:
+    """The robot behind a dongle and, for raw counts, behind its own USB port, which may be empty.
+
+    A measurement raises ProcedureError with a reason and a remedy, or :class:`Interrupted`:
+    ``interrupted``, whether the user has ended the wizard, is polled. ``report`` receives the
+    reasons for waiting.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        robot_port: str,
+        parameters: LinkParameters,
+        key: bytes,
+        entropy: Callable[[int], bytes],
+        interrupted: Callable[[], bool],
+        report: Callable[[str], None],
+    ) -> None:
+        self.has_usb = bool(robot_port)
+        """Whether the USB port of the robot board is connected: raw counts."""
+        self._port = port
+        self._robot_port = robot_port
+        self._link = parameters, key, entropy
+        self._interrupted = interrupted
+        self._report = report
 
     def rest(self, seconds: float) -> Recording:
         """Return a recording of the robot at rest."""
+        return self._record(Rest(*self._link, seconds, self._report))
 
     def drive(self, angles: WheelAngles, speed: float, rests: tuple[float, float]) -> Recording:
         """Turn the wheels by angles (rad); return the recording with the rests around it."""
+        return self._record(Manoeuvre(*self._link, angles, speed, self._report, rests))
 
     def turn_by_hand(self, timeout: float, rests: tuple[float, float]) -> Recording:
         """Return the recording of a turn by hand between two rests."""
+        return self._record(HandTurn(*self._link, timeout, self._report, rests))
 
     def counts(self, samples: int) -> Sequence[tuple[int, ...]]:
         """Return raw counts: of the eight distance sensors and, last, of the battery."""
+        return self._at_board(robot_records.read_counts(samples))
 
     def divider(self) -> float:
         """Return the nominal divider of the battery, as in the settings of the robot."""
+        stored = self._at_board(robot_settings.read_settings())
+        if not stored.valid:
+            raise ProcedureError('the robot has no valid settings: t3mpc robot setup')
+        return stored.settings.divider
 
     def store(self, found: Calibration) -> None:
         """Store a calibration in the robot, in place of the one that it has."""
+        try:
+            self._at_board(robot_records.write_calibration(found))
+        except ValueError as error:
+            raise ProcedureError(f'the robot cannot hold this calibration: {error}') from error
+
+    def stored(self) -> Calibration:
+        """Return the calibration in the robot."""
+        return self._at_board(robot_records.read_calibration())
+
+    def _at_board(self, script: Script[Value]) -> Value:
+        try:
+            return procedure.run_script(script, self._robot_port, self._interrupted, ROBOT_BOARD)
+        except ProcedureError as error:
+            if self._interrupted():
+                raise Interrupted from error
+            raise
+
+    def _record(self, task: Manoeuvre) -> Recording:
+        procedure.run_at_port(task, self._port, self._interrupted)
+        if self._interrupted():
+            raise Interrupted
+        if task.error:
+            raise ProcedureError(task.error)
+        return task.recording
 
 
 class WizardOptions(NamedTuple):
@@ -85,7 +147,7 @@ class WizardOptions(NamedTuple):
     marks: MarkUncertainty = MARKS
     geometry: WheelGeometry = WheelGeometry()
     """Nominal wheels, which decide how far the robot drives."""
-    steps: tuple[str, ...] = STEPS
+    steps: tuple[str, ...] = tuple(STEPS)
     distance: float = 2.0
     """Length of a straight run, m."""
     turns: int = 10
@@ -103,18 +165,8 @@ class Skipped(Exception):
 class CalibrationWizard:
     """Runs the steps and collects their results.
 
-    Parameters
-    ----------
-    robot
-        Measures.
-    ask
-        Shows a question; returns the answer.
-    show
-        Shows a line.
-    options
-        Steps, ways and uncertainties.
-    start
-        Calibration whose values are kept where a step is left out.
+    ``ask`` shows a question and returns the answer, ``show`` shows a line. Where a step is left
+    out, the values of the calibration ``start`` are kept.
     """
 
     def __init__(
@@ -137,18 +189,10 @@ class CalibrationWizard:
         """Run the steps; return the calibration."""
         steps = [step for step in STEPS if step in self._options.steps]
         if not self._robot.has_usb:
-            steps = [step for step in steps if step not in ('ranges', 'battery')]
-        actions = {
-            'rest': self._measure_rest,
-            'radius': self._measure_radius,
-            'track': self._measure_track,
-            'hand': self._measure_hand,
-            'ranges': self._measure_ranges,
-            'battery': self._measure_battery,
-        }
+            steps = [step for step in steps if step not in _USB_STEPS]
         for number, step in enumerate(steps):
-            self._show(f'Step {number + 1} of {len(steps)}: {_TITLES[step]}')
-            self._repeat(actions[step])
+            self._show(f'Step {number + 1} of {len(steps)}: {STEPS[step]}')
+            self._repeat(getattr(self, f'measure_{step}'))
             self._show('')
         for line in summary(self.calibration):
             self._show(line)
@@ -181,7 +225,8 @@ class CalibrationWizard:
 
     # -- steps ------------------------------------------------------------------------------------
 
-    def _measure_rest(self) -> None:
+    def measure_rest(self) -> None:
+        """Measure the bias of the gyro."""
         self._do(f'Put the robot on the floor, and do not touch it for {_REST_TIME:g} s.')
         self._wait_for_enter()
         recording = self._robot.rest(_REST_TIME)
@@ -194,7 +239,8 @@ class CalibrationWizard:
         self._keep(gyro_bias=bias)
         self._result(f'bias of the gyro {_degrees(bias)} deg/s')
 
-    def _measure_radius(self) -> None:
+    def measure_radius(self) -> None:
+        """Measure the wheel radius."""
         options, radius = self._options, self._options.geometry.wheel_radius
         angle = options.distance / radius
         self._do(
@@ -218,12 +264,12 @@ class CalibrationWizard:
             )
             runs.append(StraightRun(distance, right, left))
             # Refused now, not after the way back.
-            calibration.estimate_wheel_radius(runs, options.marks)
-        found = calibration.estimate_wheel_radius(runs, options.marks)
+            found = calibration.estimate_wheel_radius(runs, options.marks)
         self._keep(wheel_radius=found)
         self._result(f'wheel radius {_millimetres(found)} mm, nominal {1e3 * radius:.2f}')
 
-    def _measure_track(self) -> None:
+    def measure_track(self) -> None:
+        """Measure the track and the scale of the gyro."""
         options, geometry = self._options, self._options.geometry
         radius = self.calibration.wheel_radius
         if radius is None:
@@ -253,7 +299,8 @@ class CalibrationWizard:
         )
         self._result(f'scale of the gyro {_value(scale, 1.0, 5)}')
 
-    def _measure_hand(self) -> None:
+    def measure_hand(self) -> None:
+        """Measure the scale of the gyro again."""
         options = self._options
         self._do(
             'The motors are off in this step. Mark the direction of the robot on the floor. After '
@@ -269,7 +316,8 @@ class CalibrationWizard:
         self._keep(gyro_scale=scale)
         self._result(f'scale of the gyro {_value(scale, 1.0, 5)}, of {len(self._turns)} turns')
 
-    def _measure_ranges(self) -> None:
+    def measure_ranges(self) -> None:
+        """Measure the curves of the distance sensors."""
         self._do(
             'Use a white board, wider than the robot, parallel to one side after the other. '
             'Distances are from the faces of the sensors.'
@@ -303,7 +351,8 @@ class CalibrationWizard:
             self._result(f'{name} {_curve(curve)}')
         self._keep(curves=tuple(curves))
 
-    def _measure_battery(self) -> None:
+    def measure_battery(self) -> None:
+        """Measure the divider of the battery."""
         marks, divider = self._options.marks, self._robot.divider()
         self._do(
             'Connect a meter to the battery, or a bench supply in its place. Measure a full and '

@@ -53,22 +53,10 @@ _IDLE_OFF = 0.1
 class Manoeuvre:
     """Turns both wheels over the link: handshake, rest, motion, rest, drives disabled.
 
-    Parameters
-    ----------
-    parameters
-        Parameters of the link; acceleration and deceleration are replaced by 8 rad/s².
-    key
-        Key of the robot; empty for an open link.
-    entropy
-        Source of session numbers and nonces.
-    angles
-        By which the wheels turn, rad; their speeds have the same relation.
-    speed
-        Maximum speed of the faster wheel, rad/s, positive.
-    report
-        Receives the reason for waiting when it changes.
-    rests
-        Rest before and after the motion, s.
+    The wheels turn by ``angles`` (rad), the faster one with at most ``speed`` (rad/s), and both
+    speeds have the relation of the angles. ``rests`` are those before and after the motion, s;
+    ``report`` receives the reason for waiting when it changes. The acceleration of the link is
+    replaced by 8 rad/s²; an empty key is an open link.
     """
 
     def __init__(
@@ -282,13 +270,8 @@ class Rest(Manoeuvre):
 class HandTurn(Manoeuvre):
     """Records a turn by hand between two rests, with the drivers off.
 
-    The turn begins when the gyro reports it, and ends with a rest. Other parameters as of
-    :class:`Manoeuvre`.
-
-    Parameters
-    ----------
-    timeout
-        Longest time from the first rest to the end of the second, s.
+    The turn begins when the gyro reports it, and ends with a rest, at most ``timeout`` s after the
+    first rest.
     """
 
     _late_reason = 'no turn between two rests was seen within the time'
@@ -308,20 +291,12 @@ class HandTurn(Manoeuvre):
         self._timeout = rests[0] + timeout
         self._turning = False
         self._resting_ns: int | None = None
-        self._bias = 0.0
-        """Mean rate of the rest before the turn, rad/s."""
-        self._rested = 0
-        """Number of its samples."""
 
     def _move(self, telemetry: Telemetry, now_ns: int) -> None:
         if telemetry.imu is None or not self._samples:
             self._fail('the inertial sensor does not answer')
             return
-        if not self._turning:
-            for *_, rested in self._samples[self._rested : self._motion[0]]:
-                self._rested += 1
-                self._bias += (rested - self._bias) / self._rested
-        rate = abs(telemetry.imu.angular - self._bias)
+        rate = abs(telemetry.imu.angular - self._bias())
         if not self._turning:
             self._turning = rate > _TURNING_RATE
             if not self._turning:
@@ -331,7 +306,7 @@ class HandTurn(Manoeuvre):
             begin_ns = telemetry.stamp_ns - round(_TURN_MARGIN * NANOSECONDS)
             while self._motion[0] > 1 and self._samples[self._motion[0] - 1][0] > begin_ns:
                 self._motion[0] -= 1
-            self._bias = float(np.mean([each[3] for each in self._samples[: self._motion[0]]]))
+            rate = abs(telemetry.imu.angular - self._bias())
         if rate > _RESTING_RATE or self._resting_ns is None:
             self._resting_ns = now_ns
         resting = (now_ns - self._resting_ns) / NANOSECONDS
@@ -339,3 +314,7 @@ class HandTurn(Manoeuvre):
             self._motion[1] = len(self._samples)
         elif resting > self._rests[1] + _TURN_MARGIN:
             self._end()
+
+    def _bias(self) -> float:
+        """Return the mean rate of the rest before the turn, rad/s."""
+        return float(np.mean([rate for *_, rate in self._samples[: self._motion[0] or 1]]))
