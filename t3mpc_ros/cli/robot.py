@@ -3,7 +3,7 @@
 """``t3mpc robot``: settings, key, link test, scan, jog and calibration of the real robot."""
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 import math
 import os
 from pathlib import Path
@@ -35,6 +35,7 @@ from t3mpc_ros.radio.tool.robot_records import (
     SENSOR_COUNT,
     SENSORS,
     RobotSettings,
+    check_settings,
 )
 from t3mpc_ros.radio.tool.robot_settings import SettingsFileError, StoredSettings
 from t3mpc_ros.stop_signal import StopSignal
@@ -217,7 +218,12 @@ def _show_parameters(options: argparse.Namespace, stop: StopSignal) -> int:
 
 def _jog(options: argparse.Namespace, stop: StopSignal) -> int:
     parameters = _link_parameters(options)
-    if not options.yes and not _confirmed(options, stop):
+    motion = (
+        f'The {options.wheel} wheel will make {options.revolutions:g} turns at '
+        f'{options.speed:g} rad/s. Both wheels must be in the air, hands and cables away; Ctrl-C '
+        'stops.\nContinue?'
+    )
+    if not options.yes and not _ask(motion, stop):
         print('t3mpc robot: nothing was moved', file=sys.stderr)
         return EXIT_INTERRUPTED if stop() else EXIT_FAILED
     task = jog.Jog(
@@ -258,18 +264,6 @@ def _doctor(options: argparse.Namespace, stop: StopSignal) -> int:
     parameters, key = _link_parameters(options), _key_option(options)
     checks = robot_doctor.run_doctor(options, parameters, key, answer, stop)
     return EXIT_POOR if any(check.verdict == FAIL for check in checks) else EXIT_OK
-
-
-def _confirmed(options: argparse.Namespace, stop: StopSignal) -> bool:
-    """Return whether the user confirms at a terminal that the wheels are off the ground."""
-    if not sys.stdin.isatty():
-        raise ProcedureError('jogging a wheel needs a confirmation at a terminal, or --yes')
-    print(
-        f'The {options.wheel} wheel will make {options.revolutions:g} turns at '
-        f'{options.speed:g} rad/s. Both wheels must be in the air, hands and cables away; Ctrl-C '
-        'stops.'
-    )
-    return _ask('Continue?', stop)
 
 
 def _ask(question: str, stop: StopSignal) -> bool:
@@ -329,30 +323,23 @@ def _flat_items(group: dict[str, object]) -> Iterator[tuple[str, object]]:
             yield name, value
 
 
-def _address(text: str) -> bytes:
-    address = bytes.fromhex(text)
-    if len(text) != 2 * robot_settings.ADDRESS_SIZE or len(set(address)) < 2:
-        raise argparse.ArgumentTypeError(
-            f'must be 10 hexadecimal digits, not of equal bytes: got {text}'
-        )
-    return address
+def _setting(name: str, convert: Callable[[str], object]) -> Callable[[str], object]:
+    """Return the parser of an option for a setting, with the bounds of the setting."""
 
+    def parse(text: str) -> object:
+        try:
+            value = convert(text)
+            check_settings(RobotSettings()._replace(**{name: value}))  # type: ignore[arg-type]
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+        return value
 
-def _microsteps(text: str) -> int:
-    value = int(text)
-    if value not in [1 << power for power in range(9)]:
-        raise argparse.ArgumentTypeError(f'must be a power of two from 1 to 256: got {text}')
-    return value
+    return parse
 
 
 def _sensors(text: str) -> tuple[str, ...]:
     names = tuple(text.split(','))
-    names = SENSOR_COUNT * names if len(names) == 1 else names
-    if len(names) != SENSOR_COUNT or not set(names) <= set(SENSORS):
-        raise argparse.ArgumentTypeError(
-            f'must be one or {SENSOR_COUNT} of {", ".join(SENSORS)}: got {text}'
-        )
-    return names
+    return SENSOR_COUNT * names if len(names) == 1 else names
 
 
 def _revolutions(text: str) -> float:
@@ -372,82 +359,51 @@ def _parser() -> argparse.ArgumentParser:
     _add_settings_commands(commands)
     _add_key_commands(commands)
 
-    ping = commands.add_parser('ping', help='test the link to dongle and robot')
-    ping.add_argument(
-        '--count',
-        type=bounded_int(1, 100_000),
-        default=200,
-        help='number of requests to each (default 200)',
-    )
-    scan = commands.add_parser('scan', help='list the channels on which the robot answers')
-    scan.add_argument('--all-rates', action='store_true', help='at 250k, 1M and 2M')
-    jogging = commands.add_parser('jog', help='turn one wheel, with both wheels in the air')
-    jogging.add_argument('wheel', choices=(jog.LEFT, jog.RIGHT))
-    jogging.add_argument(
-        'revolutions', type=_revolutions, metavar='REVOLUTIONS', help='negative: backward'
-    )
-    jogging.add_argument(
-        '--speed',
-        type=bounded_float(0.2, 10.0),
-        default=2.0,
-        help='wheel speed, rad/s (default 2)',
-    )
-    jogging.add_argument(
-        '--yes', action='store_true', help='do not ask whether the wheels are in the air'
-    )
-    table = commands.add_parser('parameters', help='list the board parameters')
-    calibrating = commands.add_parser(
-        'calibrate', help='measure wheels, track, gyro, distance sensors and battery, step by step'
-    )
-    robot_calibrate.add_arguments(calibrating)
-    examining = commands.add_parser(
-        'doctor', help='go through the bench checklist: measure, ask, write a report'
-    )
-    examining.add_argument('--robot-port', required=True, help='USB port of the robot board')
-    examining.add_argument(
-        '--count',
-        type=bounded_int(10, 100_000),
-        default=200,
-        help='requests of the link test (default 200)',
-    )
-    examining.add_argument(
-        '--drive', action='store_true', help='turn each wheel once, after a confirmation'
-    )
-    examining.add_argument(
-        '--no-questions', action='store_true', help='skip what only a person can judge'
-    )
-    examining.add_argument(
-        '--report',
-        type=Path,
-        default=Path('doctor.html'),
-        metavar='FILE',
-        help='HTML file (default doctor.html); the same as JSON beside it',
-    )
-    for command, run in (
-        (ping, _ping),
-        (scan, _scan),
-        (jogging, _jog),
-        (table, _show_parameters),
-        (calibrating, _calibrate),
-        (examining, _doctor),
-    ):
+    def link_command(
+        name: str, run: Callable[[argparse.Namespace, StopSignal], int], text: str, key: bool
+    ) -> argparse.ArgumentParser:
+        command: argparse.ArgumentParser = commands.add_parser(name, help=text)
         command.set_defaults(run=run)
-        command.add_argument('--port', required=True, help='port of the dongle, /dev/…')
-        command.add_argument(
-            '--params-file',
-            type=Path,
-            metavar='FILE',
-            help='link parameters: a ROS parameter file',
-        )
-        command.add_argument(
-            '--set',
-            action='append',
-            default=[],
-            metavar='NAME=VALUE',
-            help='link parameter, e.g. channel=100 or robot.invert_left=true',
-        )
-    for command in (jogging, table, calibrating, examining):
-        command.add_argument('--key', type=Path, help='file with the key of the robot')
+        add = command.add_argument
+        add('--port', required=True, help='port of the dongle, /dev/…')
+        text = 'link parameters: a ROS parameter file'
+        add('--params-file', type=Path, metavar='FILE', help=text)
+        text = 'link parameter, e.g. channel=100 or robot.invert_left=true'
+        add('--set', action='append', default=[], metavar='NAME=VALUE', help=text)
+        if key:
+            add('--key', type=Path, help='file with the key of the robot')
+        return command
+
+    add = link_command('ping', _ping, 'test the link to dongle and robot', False).add_argument
+    text = 'number of requests to each (default 200)'
+    add('--count', type=bounded_int(1, 100_000), default=200, help=text)
+
+    text = 'list the channels on which the robot answers'
+    add = link_command('scan', _scan, text, False).add_argument
+    add('--all-rates', action='store_true', help='at 250k, 1M and 2M')
+
+    text = 'turn one wheel, with both wheels in the air'
+    add = link_command('jog', _jog, text, True).add_argument
+    add('wheel', choices=(jog.LEFT, jog.RIGHT))
+    add('revolutions', type=_revolutions, metavar='REVOLUTIONS', help='negative: backward')
+    text = 'wheel speed, rad/s (default 2)'
+    add('--speed', type=bounded_float(0.2, 10.0), default=2.0, help=text)
+    add('--yes', action='store_true', help='do not ask whether the wheels are in the air')
+
+    link_command('parameters', _show_parameters, 'list the board parameters', True)
+
+    text = 'measure wheels, track, gyro, distance sensors and battery, step by step'
+    robot_calibrate.add_arguments(link_command('calibrate', _calibrate, text, True))
+
+    text = 'go through the bench checklist: measure, ask, write a report'
+    add = link_command('doctor', _doctor, text, True).add_argument
+    add('--robot-port', required=True, help='USB port of the robot board')
+    text = 'requests of the link test (default 200)'
+    add('--count', type=bounded_int(10, 100_000), default=200, help=text)
+    add('--drive', action='store_true', help='turn each wheel once, after a confirmation')
+    add('--no-questions', action='store_true', help='skip what only a person can judge')
+    text = 'HTML file (default doctor.html); the same as JSON beside it'
+    add('--report', type=Path, default=Path('doctor.html'), metavar='FILE', help=text)
     return parser
 
 
@@ -462,20 +418,23 @@ def _add_settings_commands(
     add('--port', required=True, help='USB port of the robot board')
     add(
         '--address',
-        type=_address,
+        type=_setting('address', bytes.fromhex),
         metavar='HEX',
         help='10 hexadecimal digits; default: as stored, on a new board random',
     )
-    add('--channel', type=bounded_int(0, 125), help='2400 MHz plus this')
+    add('--channel', type=_setting('channel', int), help='2400 MHz plus this')
     add('--rate', choices=RATES, help='bit/s; 250k only with nRF24L01+ chips')
     add('--power', choices=POWERS, help='of the transmitter of the robot, dBm')
-    add('--microsteps', type=_microsteps, help='as set by the jumpers of the drivers')
-    add('--steps-per-turn', type=bounded_int(20, 10_000), help='full steps of a turn of the wheel')
+    for name, convert, text in (
+        ('microsteps', int, 'as set by the jumpers of the drivers'),
+        ('steps_per_turn', int, 'full steps of a turn of the wheel'),
+    ):
+        add(f'--{name.replace("_", "-")}', type=_setting(name, convert), help=text)
     add('--invert', choices=('none', 'left', 'right', 'both'), help='wheels that turn backward')
-    add('--divider', type=bounded_float(1.0, 13.0), help='of the battery voltage, 4: 1/4 of it')
+    add('--divider', type=_setting('divider', float), help='of the battery voltage, 4: 1/4 of it')
     add(
         '--sensors',
-        type=_sensors,
+        type=_setting('sensors', _sensors),
         metavar='TYPE[,…]',
         help=f'distance sensors, one type or {SENSOR_COUNT}: {", ".join(SENSORS)}',
     )

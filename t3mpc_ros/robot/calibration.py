@@ -193,11 +193,6 @@ def estimate_wheel_radius(runs: Sequence[StraightRun], marks: MarkUncertainty = 
 
     with the mean angle theta of both wheels. u_d holds both marks of a run and the angles at its
     ends; u_t, the tape (class II: at most 0.3 mm and 0.2 mm/m), is common to all runs.
-
-    Raises
-    ------
-    CalibrationError
-        No run, one that is too short, or one that is not straight.
     """
     if not runs:
         raise CalibrationError('runs must be at least 1: got 0; drive between two marks')
@@ -243,11 +238,6 @@ def estimate_track(
     Each turn is given with its true yaw psi, rad, from whole turns and the floor mark; u_psi holds
     both readings of the mark and the step angles. The relation R/2b, which decides on the yaw of
     the odometry, does not depend on R.
-
-    Raises
-    ------
-    CalibrationError
-        No turn, or one of too few turns.
     """
     _check_turns(turns)
     yaws = np.array([yaw for yaw, _ in turns])
@@ -275,11 +265,6 @@ def estimate_gyro_bias(recording: Recording) -> Estimate:
     .. math:: \hat b = \bar\omega, \qquad u^2(b) = \frac{N^2}{T} + \frac{q^2 T}{3}
 
     with noise density N and random walk q: the value holds for the end of the rest.
-
-    Raises
-    ------
-    CalibrationError
-        The rest is too short, or the robot was moved during it.
     """
     mean, duration = _rest(recording, slice(0, recording.begin), 'before')
     return Estimate(mean, math.sqrt(GYRO_NOISE**2 / duration + GYRO_DRIFT**2 * duration / 3.0))
@@ -294,11 +279,6 @@ def measure_turn(recording: Recording) -> GyroTurn:
 
     .. math:: N^2 \left(T + \frac{T^2}{4 T_0} + \frac{T^2}{4 T_1}\right)
               + q^2 \left(\frac{T^3}{12} + \frac{T^2 (T_0 + T_1)}{12}\right).
-
-    Raises
-    ------
-    CalibrationError
-        The robot did not turn or was moved during a rest; samples are saturated or missing.
     """
     times, rates = recording.times, recording.rates
     if recording.begin >= recording.end:
@@ -343,11 +323,6 @@ def estimate_gyro_scale(
               w_i = \frac{1}{u_\psi^2 + k^2 u^2(G_i)}
 
     with the rotations G of the gyro and the true yaws psi, from whole turns and a mark.
-
-    Raises
-    ------
-    CalibrationError
-        No turn, or one of too few turns; the result is beyond what the sensor can have.
     """
     _check_turns(turns)
     yaws = np.array([yaw for yaw, _ in turns])
@@ -435,11 +410,6 @@ def estimate_divider(
     by linear least squares; each reading has the variance of the meter and that of one step of
     the converter behind the divider, :math:`(q \Delta)^2 / 12`. The uncertainty is the largest of
     a corrected voltage within ``span`` (V): three Li-ion cells.
-
-    Raises
-    ------
-    CalibrationError
-        Fewer than two readings, or voltages that are too close.
     """
     if len(readings) < _MIN_VOLTAGES:
         raise CalibrationError(
@@ -480,12 +450,6 @@ def estimate_sharp_curve(
 
     from the scatter of its samples, one step of the converter, and the distance that was set. The
     uncertainty of a distance is that of the curve there, divided by its slope.
-
-    Raises
-    ------
-    CalibrationError
-        Too few or too similar distances, readings that are saturated or that do not fall with the
-        distance, or readings that no such curve fits.
     """
     readings = sorted(readings)
     _check_ranges(readings)

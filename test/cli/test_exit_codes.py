@@ -184,7 +184,7 @@ CASES = [
             'view --port 70000': 'must be from 0 to 65535',
             'robot setup --port p --address 11': 'must be 10 hexadecimal digits',
             'robot setup --port p --microsteps 3': 'must be a power of two',
-            'robot setup --port p --sensors x': 'must be one or 8 of none',
+            'robot setup --port p --sensors x': 'sensors must be 8 of none',
             'robot jog left 0 --port p': 'must be from 0.01 to 100, or negative',
             'robot jog middle 1 --port p': 'invalid choice',
             'robot jog left 1 --speed 11 --port p': 'must be from 0.2 to 10: got 11',

@@ -24,17 +24,7 @@ class JogResult(NamedTuple):
 
 
 class Jog(Manoeuvre):
-    """Turns one wheel over the link: handshake, commands, stop, drives disabled.
-
-    Parameters as of :class:`Manoeuvre`, and:
-
-    Parameters
-    ----------
-    wheel
-        LEFT or RIGHT.
-    revolutions
-        Negative: backward.
-    """
+    """Turns one wheel, LEFT or RIGHT, over the link; negative revolutions are backward."""
 
     _ends_when_silent = False
     _late_reason = 'the wheel does not reach its target: does the board count its steps?'

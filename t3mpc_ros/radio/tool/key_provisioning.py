@@ -25,13 +25,7 @@ _MAX_ATTEMPTS = 5
 
 
 def create_key_file(path: Path, entropy: Callable[[int], bytes]) -> int:
-    """Generate a key into a new file with mode 600; return its check value.
-
-    Raises
-    ------
-    KeyFileError
-        The file exists or cannot be created.
-    """
+    """Generate a key into a new file with mode 600; return its check value."""
     key = ERASE_KEY
     while key == ERASE_KEY:  # reserved
         key = entropy(KEY_SIZE)

@@ -138,12 +138,7 @@ class PortTask(Protocol):
 class Procedure(Generic[Value]):
     """Runs a script as a function of time and bytes.
 
-    Parameters
-    ----------
-    script
-        Its return value becomes :attr:`result`, a ProcedureError becomes :attr:`error`.
-    decode
-        Decodes the frames of the board on the port.
+    The return value of the script becomes :attr:`result`, a ProcedureError :attr:`error`.
     """
 
     def __init__(self, script: Script[Value], decode: Callable[[bytes], ReplyFrame]) -> None:
@@ -258,13 +253,7 @@ def wait_for_board(absent: str = NO_BOARD) -> Script[Pong]:
 
 
 def request_reply(frame: RequestFrame, kind: type[Reply]) -> Script[Reply]:
-    """Return the reply of the robot board to a frame, which is sent again after a timeout.
-
-    Raises
-    ------
-    ProcedureError
-        The board is another one, its firmware does not know the frame, or it stopped answering.
-    """
+    """Return the reply of the robot board to a frame, which is sent again after a timeout."""
     for _ in range(_MAX_ATTEMPTS):
         response = yield Request(frame, _REPLY_TIMEOUT)
         if isinstance(response.reply, kind):
@@ -312,13 +301,7 @@ def read_radio_setup() -> Script[Configure]:
 def run_script(
     script: Script[Value], path: str, interrupted: Callable[[], bool], board: Board
 ) -> Value:
-    """Return the result of a script at the port ``path`` of a board.
-
-    Raises
-    ------
-    ProcedureError
-        The script failed or was interrupted, or the port cannot be used.
-    """
+    """Return the result of a script at a port; an interruption is a ProcedureError, too."""
     procedure = Procedure(script, board.decode)
     run_at_port(procedure, path, interrupted, board.name)
     if procedure.error or procedure.result is None:

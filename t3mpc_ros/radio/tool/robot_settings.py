@@ -86,11 +86,6 @@ def change_settings(
 
     A robot without settings gets a random address, so that two robots never obey one host by
     accident.
-
-    Raises
-    ------
-    ValueError
-        A value is impossible.
     """
     settings = stored.settings._replace(**changes)  # type: ignore[arg-type]
     if not stored.valid and 'address' not in changes:
@@ -144,13 +139,7 @@ def settings_file(settings: RobotSettings) -> str:
 
 
 def settings_of_file(content: object) -> RobotSettings:
-    """Return the settings of a file of :func:`settings_file`, parsed as YAML.
-
-    Raises
-    ------
-    SettingsFileError
-        It is no such file, a name is unknown or missing, or a value is impossible.
-    """
+    """Return the settings of a file of :func:`settings_file`, parsed as YAML."""
     values: dict[str, Any] = {}
     try:
         link = content['/**']['ros__parameters']['link']  # type: ignore[index]
