@@ -82,17 +82,24 @@ def run(
     lag: float = LAG,
     noise_variance: float = NOISE_VARIANCE,
     rows: np.ndarray | None = None,
+    **kind: bool,
 ) -> tuple[DeadTimeEstimator, np.ndarray]:
-    """Return the estimator after a run, and dead time, deviation and disturbance of each row."""
-    estimator = DeadTimeEstimator(
-        SpeedFilterParameters(lag=lag, dead_time=configured, noise_variance=noise_variance), PERIOD
+    """Return the estimator after a run, and rows of estimate, deviation, disturbance, use."""
+    parameters = SpeedFilterParameters(
+        lag=lag, dead_time=configured, noise_variance=noise_variance
     )
+    estimator = DeadTimeEstimator(parameters, PERIOD, **kind)
     rows = np.arange(len(drive.command)) if rows is None else rows
-    record = np.zeros((len(rows), 3))
+    record = np.zeros((len(rows), 4))
+    record[0, [0, 3]] = configured
     for k in range(1, len(rows)):
         dt = PERIOD * (rows[k] - rows[k - 1])
-        estimator.step(drive.measured[rows[k]], drive.command[rows[k - 1]], dt)
-        record[k] = estimator.dead_time, estimator.standard_deviation, estimator.estimate.disturbed
+        disturbed = estimator.step(drive.measured[rows[k]], drive.command[rows[k - 1]], dt)
+        record[k] = (
+            *(estimator.dead_time, estimator.standard_deviation),
+            *(disturbed, estimator.dead_time_in_use),
+        )
+    assert np.all((record[:, 0] >= 0.0) & (record[:, 0] <= MAX_DEAD_TIME))
     return estimator, record
 
 
@@ -219,14 +226,11 @@ def test_speeds_at_the_stamp_need_the_other_model():
     response = lfilter([0.0, 1.0 - decay], [1.0, -decay], command, axis=0)
     response = np.vstack([np.zeros((3, 2)), response[:-3]])  # three periods of dead time
     noise = np.random.default_rng(97).normal(scale=0.2, size=response.shape)
-    errors = []
-    for mean_speeds in (False, True):
-        estimator = DeadTimeEstimator(
-            SpeedFilterParameters(lag=0.02), PERIOD, mean_speeds=mean_speeds
-        )
-        for k in range(1, len(command)):
-            estimator.step(response[k] + noise[k], command[k - 1], PERIOD)
-        errors.append(estimator.dead_time - 0.03)
+    drive = Drive(command, response + noise)
+    errors = [
+        run(drive, lag=0.02, mean_speeds=mean_speeds)[0].dead_time - 0.03
+        for mean_speeds in (False, True)
+    ]
     np.testing.assert_allclose(errors, [0.0, -0.5 * PERIOD], atol=0.002)
 
 
@@ -277,18 +281,8 @@ def run_servo(
     drive: Drive, *, friction: bool = True, noise_variance: float = NOISE_VARIANCE
 ) -> np.ndarray:
     """Return estimate and dead time in use (s) of each row; 10 ms are configured."""
-    estimator = DeadTimeEstimator(
-        SpeedFilterParameters(lag=SERVO_LAG, dead_time=0.01, noise_variance=noise_variance),
-        PERIOD,
-        mean_speeds=False,
-        friction=friction,
-    )
-    record = np.full((len(drive.command), 2), 0.01)
-    for k in range(1, len(record)):
-        estimator.step(drive.measured[k], drive.command[k - 1], PERIOD)
-        record[k] = estimator.dead_time, estimator.dead_time_in_use
-        assert 0.0 <= estimator.dead_time <= MAX_DEAD_TIME
-    return record
+    model = {'lag': SERVO_LAG, 'mean_speeds': False, 'friction': friction}
+    return run(drive, noise_variance=noise_variance, **model)[1][:, [0, 3]]
 
 
 @pytest.mark.compiled
