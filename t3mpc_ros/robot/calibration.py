@@ -203,10 +203,9 @@ def estimate_wheel_radius(runs: Sequence[StraightRun], marks: MarkUncertainty = 
     radius = float(angles @ distances / (angles @ angles))
     # Two marks; two wheels, each at both ends of the run.
     variance = 2.0 * marks.distance**2 + (radius * STEP_ANGLE) ** 2
-    chi_squared = float(np.sum((distances - radius * angles) ** 2)) / variance
     tape = np.max((3e-4 + 2e-4 * distances) / distances) / math.sqrt(3.0)
-    spread = variance / (angles @ angles) * _birge_squared(chi_squared, len(runs) - 1)
-    return Estimate(radius, math.sqrt(spread + (radius * tape) ** 2))
+    spread = _slope(angles, distances, variance).uncertainty
+    return Estimate(radius, math.hypot(spread, radius * tape))
 
 
 def _check_straight_run(run: StraightRun) -> None:
@@ -249,11 +248,10 @@ def estimate_track(
             f'{angles[0]:.1f} rad of the wheels for a yaw of {yaws[0]:.1f}; '
             'left is positive, check invert_left and invert_right'
         )
-    variance = 2.0 * marks.angle**2 + 4.0 * (STEP_ANGLE / ratio) ** 2
-    chi_squared = float(np.sum((angles / ratio - yaws) ** 2)) / variance
-    relative = variance / (yaws @ yaws) * _birge_squared(chi_squared, len(turns) - 1)
+    variance = 2.0 * (ratio * marks.angle) ** 2 + 4.0 * STEP_ANGLE**2
+    relative = _slope(yaws, angles, variance).uncertainty / ratio
     track = radius.value * ratio
-    return Estimate(track, track * math.sqrt(relative + (radius.uncertainty / radius.value) ** 2))
+    return Estimate(track, track * math.hypot(relative, radius.uncertainty / radius.value))
 
 
 # -- gyro -----------------------------------------------------------------------------------------
@@ -328,15 +326,13 @@ def estimate_gyro_scale(
     yaws = np.array([yaw for yaw, _ in turns])
     rotations = np.array([turn.rotation for _, turn in turns])
     variances = 2.0 * marks.angle**2 + np.array([turn.uncertainty**2 for _, turn in turns])
-    total = float(np.sum(rotations**2 / variances))
-    scale = float(np.sum(yaws * rotations / variances)) / total
-    if not 0.8 <= scale <= 1.2:
+    scale = _slope(rotations, yaws, variances)
+    if not 0.8 <= scale.value <= 1.2:
         raise CalibrationError(
-            f'the scale of the gyro must be from 0.8 to 1.2: got {scale:.3f}; '
+            f'the scale of the gyro must be from 0.8 to 1.2: got {scale.value:.3f}; '
             'count the turns, left is positive'
         )
-    chi_squared = float(np.sum((yaws - scale * rotations) ** 2 / variances))
-    return Estimate(scale, math.sqrt(_birge_squared(chi_squared, len(turns) - 1) / total))
+    return scale
 
 
 def whole_turns(turn: GyroTurn, beyond: float) -> int:
@@ -427,10 +423,8 @@ def estimate_divider(
     step = REFERENCE_VOLTAGE / CONVERTER_COUNTS * divider
     variance = marks.voltage**2 + step**2 / 12.0
     design = np.column_stack((nominal, np.ones_like(nominal)))
-    covariance = variance * np.linalg.inv(design.T @ design)
-    slope, offset = (np.linalg.lstsq(design, meter, rcond=None)[0]).tolist()
-    chi_squared = float(np.sum((meter - slope * nominal - offset) ** 2)) / variance
-    covariance *= _birge_squared(chi_squared, len(readings) - 2)
+    solution, covariance = _least_squares(design, meter, variance)
+    slope, offset = solution.tolist()
     ends = np.array([[voltage, 1.0] for voltage in span])
     worst = max(float(end @ covariance @ end) for end in ends)
     return DividerCorrection(slope - 1.0, offset, math.sqrt(worst))
@@ -476,11 +470,8 @@ def range_uncertainties(
     values = np.array(curve[:3])
     gradients = _curve_gradients(values, distances)
     variances = noise + (gradients[:, 1] * marks.range) ** 2
-    weighted = gradients / np.sqrt(variances)[:, None]
     residuals = volts - curve.scale / (distances + curve.shift) - curve.offset
-    chi_squared = float(np.sum(residuals**2 / variances))
-    covariance = np.linalg.inv(weighted.T @ weighted)
-    covariance *= _birge_squared(chi_squared, len(distances) - 3)
+    _, covariance = _least_squares(gradients, residuals, variances)
     there = _curve_gradients(values, np.array(at))
     found: list[float] = (
         np.sqrt(np.einsum('ij,jk,ik->i', there, covariance, there)) / np.abs(there[:, 1])
@@ -537,9 +528,9 @@ def _fit_curve(
     curve = np.array([0.282, 0.0257, 0.061])
     for _ in range(100):
         gradients = _curve_gradients(curve, distances)
-        root = 1.0 / np.sqrt(noise + (gradients[:, 1] * mark) ** 2)
+        variances = noise + (gradients[:, 1] * mark) ** 2
         residuals = volts - curve[0] / (distances + curve[1]) - curve[2]
-        change = np.linalg.lstsq(gradients * root[:, None], residuals * root, rcond=None)[0]
+        change, _ = _least_squares(gradients, residuals, variances)
         # A step that would bring the pole of the curve near the distances is shortened.
         while distances[0] + curve[1] + change[1] < 0.5 * (distances[0] + curve[1]):
             change = 0.5 * change
@@ -551,6 +542,23 @@ def _fit_curve(
         'the readings must follow scale / (d + shift) + offset: got no solution after 100 steps; '
         'check the distances'
     )
+
+
+def _slope(x: Array, y: Array, variances: float | Array) -> Estimate:
+    """Return k of y = k x, with the variances of y."""
+    solution, covariance = _least_squares(x[:, np.newaxis], y, variances)
+    return Estimate(float(solution[0]), math.sqrt(covariance[0, 0]))
+
+
+def _least_squares(design: Array, y: Array, variances: float | Array) -> tuple[Array, Array]:
+    """Return x of design (n, p) x = y and its covariance, enlarged by the Birge ratio."""
+    root: Array = 1.0 / np.sqrt(variances + np.zeros(y.shape))
+    weighted = design * root[:, np.newaxis]
+    x = np.linalg.lstsq(weighted, y * root, rcond=None)[0]
+    chi_squared = float(np.sum(((y - design @ x) * root) ** 2))
+    covariance = np.linalg.inv(weighted.T @ weighted)
+    covariance *= _birge_squared(chi_squared, len(y) - design.shape[1])
+    return x.astype(np.float64), covariance.astype(np.float64)
 
 
 def _birge_squared(chi_squared: float, freedom: int) -> float:
