@@ -109,30 +109,6 @@ def test_port_errors_contain_a_remedy(tmp_path, capsys):
     os.close(slave)
 
 
-@pytest.mark.parametrize(
-    'arguments, words',
-    [
-        (['ping', '--port', 'x', '--set', 'channel=126'], 'channel'),
-        (['ping', '--port', 'x', '--set', 'chanel=12'], 'chanel'),
-        (['scan', '--port', 'x', '--set', 'rate'], 'NAME=VALUE'),
-        (['jog', 'left', '1', '--port', 'x', '--key', 'no/such/file', '--yes'], 'no/such/file'),
-        (['jog', 'left', '1', '--port', 'x'], '--yes'),
-        (['key', 'check', 'no/such/file'], 'no/such/file'),
-        (['setup', '--port', 'x', '--save', 'no/such/file'], 'no/such/file cannot be written'),
-        (['calibrate', '--port', 'x', '--save', '/'], '/ cannot be written'),
-        (
-            ['doctor', '--port', 'x', '--robot-port', 'x', '--report', 'no/such/file'],
-            'no/such/file cannot be written',
-        ),
-    ],
-)
-def test_invalid_input_is_reported_before_the_port_opens(arguments, words, capsys, monkeypatch):
-    with open(os.devnull) as empty:
-        monkeypatch.setattr(sys, 'stdin', empty)
-        assert cli.main(arguments) == 2
-    assert words in capsys.readouterr().err
-
-
 @pytest.mark.parametrize('answer', ['no', '', 'yeah', 'ctrl-c'])
 @pytest.mark.slow
 def test_jog_requires_a_confirmation(answer, capsys, monkeypatch):
@@ -156,30 +132,6 @@ def test_jog_requires_a_confirmation(answer, capsys, monkeypatch):
     output = capsys.readouterr()
     assert 'in the air' in output.out
     assert 'nothing was moved' in output.err
-
-
-def test_calibrating_needs_a_person_at_a_terminal(capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    with open(os.devnull) as empty:
-        monkeypatch.setattr(sys, 'stdin', empty)
-        assert cli.main(['calibrate', '--port', 'x']) == 2
-    assert 'run it at a terminal' in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    'arguments, words',
-    [
-        (['--steps', 'rest,raduis'], 'must be of rest, radius'),
-        (['--distances', '0.1,0.2,0.3'], 'at least 4, from 0.05 to 1 m'),
-        (['--turns', '1'], 'from 2 to 15: got 1'),
-        (['--mark-distance', '0'], 'from 0.001 to 100: got 0'),
-    ],
-)
-def test_arguments_of_a_calibration_are_checked(arguments, words, capsys):
-    with pytest.raises(SystemExit):
-        cli.main(['calibrate', '--port', 'x', *arguments])
-    assert words in capsys.readouterr().err
 
 
 def test_an_interrupted_calibration_keeps_what_it_found(capsys, monkeypatch, tmp_path):
@@ -247,10 +199,3 @@ def test_setup_shows_asks_and_restores(ports, tmp_path, capsys, monkeypatch):
     saved.write_text(saved.read_text().replace('channel: 82', 'channel: 126'))
     code, output = run('--load', str(saved))
     assert (code, 'channel must be from 0 to 125: got 126' in output) == (2, True)
-
-
-def test_the_doctor_asks_only_at_a_terminal(capsys, monkeypatch):
-    with open(os.devnull) as empty:
-        monkeypatch.setattr(sys, 'stdin', empty)
-        assert cli.main(['doctor', '--port', 'x', '--robot-port', 'y']) == 2
-    assert '--no-questions' in capsys.readouterr().err

@@ -14,7 +14,7 @@ import pytest
 
 from t3mpc_ros.bag.recovery import Damage, FileResult, RecoveryOutputError, RecoveryResult
 from t3mpc_ros.bag.schema import BagError
-from t3mpc_ros.cli import process_group, robot_calibrate
+from t3mpc_ros.cli import process_group
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup
 from t3mpc_ros.emulator.fault_injection import FaultError
@@ -24,7 +24,6 @@ from t3mpc_ros.radio.tool.link_test import BAD, GOOD, POOR, ReportRow
 from t3mpc_ros.radio.tool.procedure import ProcedureError
 from t3mpc_ros.radio.tool.robot_records import RobotSettings
 from t3mpc_ros.radio.tool.robot_settings import StoredSettings, settings_file
-from t3mpc_ros.robot.calibration import Calibration
 
 RUN = 'radio.tool.procedure.run_script'
 
@@ -194,6 +193,22 @@ CASES = [
             'bag compare --update-golden test/golden': 'removed: PYTHONPATH=. .venv/bin/python',
             'robot ping': 'required: --port',
             'robot key': 'required: ACTION',
+            'robot ping --port x --set channel=126': 'channel must be',
+            'robot ping --port x --set chanel=12': 'chanel',
+            'robot scan --port x --set rate': 'NAME=VALUE',
+            'robot jog left 1 --port x --key no/such/file --yes': 'no/such/file',
+            'robot jog left 1 --port x': 'or --yes',
+            'robot key check no/such/file': 'no/such/file',
+            'robot setup --port x --save no/such/file': 'no/such/file cannot be written',
+            'robot setup --port x --load none': 'none cannot be read',
+            'robot doctor --port x --robot-port y': 'or use --no-questions',
+            'robot doctor --port x --robot-port x --report no/such': 'no/such cannot be written',
+            'robot calibrate --port x --save /': '/ cannot be written',
+            'robot calibrate --port x': 'run it at a terminal',
+            'robot calibrate --port x --steps rest,raduis': 'must be of rest, radius',
+            'robot calibrate --port x --distances 0.1,0.2,0.3': 'at least 4, from 0.05 to 1 m',
+            'robot calibrate --port x --turns 1': 'from 2 to 15: got 1',
+            'robot calibrate --port x --mark-distance 0': 'from 0.001 to 100: got 0',
             'robot': 'required: COMMAND',
             'emulator': 'required: --link',
             'emulator --link l --loss 2': 'must be from 0 to 1: got 2',
@@ -239,19 +254,6 @@ def replace(monkeypatch, target, result):
         return result(*arguments) if isinstance(result, Interruption) else result
 
     monkeypatch.setattr(target, instead)
-
-
-def test_an_interrupted_calibration_ends_with_130(monkeypatch, tmp_path, capsys):
-    def run(wizard):
-        raise robot_calibrate.Interrupted
-
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, 'stdin', SimpleNamespace(isatty=lambda: True))
-    monkeypatch.setattr(robot_calibrate.CalibrationWizard, 'run', run)
-    assert main(['robot', 'calibrate', '--port', 'p']) == 130
-    monkeypatch.setattr(robot_calibrate.CalibrationWizard, 'run', lambda wizard: Calibration())
-    assert main(['robot', 'calibrate', '--port', 'p']) == 0
-    assert not list(tmp_path.iterdir())
 
 
 # -- processes of others --------------------------------------------------------------------------
