@@ -166,7 +166,11 @@ class Drive(NamedTuple):
     noise_variance: float
     """(rad/s)²"""
     mean_speeds: bool
+    """Whether the measured speeds are means over a period, as those from counters of steps or
+    encoder pulses, or the speeds at the stamp."""
     friction: bool
+    """Whether friction and disturbances move the wheels, as with a servo; a stepper motor follows
+    exactly."""
 
 
 class ResponseHistory(NamedTuple):
@@ -181,25 +185,9 @@ class ResponseHistory(NamedTuple):
 class DeadTimeEstimator:
     """Estimates the dead time of a velocity drive from sent and measured wheel speeds.
 
-    The estimate is a function of the calls in their order.
-
-    Parameters
-    ----------
-    parameters
-        Lag of the drive, variance of the measured speeds, and dead time: the prior.
-    period
-        Nominal time between steps, s.
-    mean_speeds
-        Whether the measured speeds are means over a period, as those from counters of steps or
-        encoder pulses, or the speeds at the stamp.
-    friction
-        Whether friction and disturbances move the wheels, as with a servo; a stepper motor follows
-        exactly.
-
-    Raises
-    ------
-    ValueError
-        The period is not positive.
+    The estimate is a function of the calls in their order. ``period`` is the nominal time between
+    steps, s; the lag, the variance of the measured speeds, and the dead time, which is the prior,
+    are ``parameters``. Other arguments as of :class:`Drive`.
     """
 
     def __init__(
@@ -218,7 +206,7 @@ class DeadTimeEstimator:
         self._drive = Drive(parameters.lag, period, variance, mean_speeds, friction)
         size = math.ceil(1.25 * MAX_DEAD_TIME / period) + 2
         self._history = ResponseHistory(np.zeros(size), np.zeros((2, size)))
-        self._state = np.zeros(1, ESTIMATE).view(np.recarray)
+        self._state = np.zeros(1, ESTIMATE)
         estimate, prior = self.estimate, min(parameters.dead_time, MAX_DEAD_TIME)
         estimate.dead_time, estimate.deviation = prior, PRIOR_DEVIATION
         estimate.noise_ratio, estimate.noise_count = NOISE_PRIOR_RATIO, NOISE_PRIOR_COUNT
@@ -236,19 +224,19 @@ class DeadTimeEstimator:
     @property
     def dead_time(self) -> float:
         """Estimate, from 0 to :data:`MAX_DEAD_TIME`, s."""
-        return float(self.estimate.dead_time)
+        return float(self._state['dead_time'][0])
 
     @property
     def dead_time_in_use(self) -> float:
         """The configured dead time, or the estimate where it clearly differs, s."""
-        dead_time, deviation = self.dead_time, self.standard_deviation
-        clear = max(USED_DIFFERENCE, USED_DEVIATIONS * deviation)
+        dead_time: float = self._state['dead_time'].item()
+        clear = max(USED_DIFFERENCE, USED_DEVIATIONS * self._state['deviation'].item())
         return dead_time if abs(dead_time - self._configured) > clear else self._configured
 
     @property
     def standard_deviation(self) -> float:
         """Standard deviation of the estimate from the noise, s."""
-        return float(self.estimate.deviation)
+        return float(self._state['deviation'][0])
 
     def reset(self, speeds: Array) -> None:
         """Restart at measured wheel speeds (rad/s) with equal commands; the estimate is kept.
@@ -269,16 +257,11 @@ class DeadTimeEstimator:
     def step(self, measured: Array, command: Array, dt: float) -> bool:
         """Update the estimate with one measurement; return whether the response is disturbed.
 
-        Parameters
-        ----------
-        measured
-            Measured wheel speeds, rad/s, shape (2,), with white noise.
-        command
-            Wheel speeds (rad/s) sent at the previous step, after the limits, shape (2,); the
-            robot keeps them until the next ones arrive.
-        dt
-            Time since the previous measurement, s, positive. After a gap that stops the robot,
-            call :meth:`reset` instead.
+        measured, command : wheel speeds, rad/s, shape (2,); the command was sent at the previous
+        step, after the limits, and the robot keeps it until the next one arrives
+
+        dt : time since the previous measurement, s, positive; after a gap that stops the robot,
+        call :meth:`reset` instead
         """
         return self._update(
             self._state,
