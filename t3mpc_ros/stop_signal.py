@@ -1,13 +1,23 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Stop signal: SIGINT, SIGTERM and SIGHUP as a flag that a program polls."""
+"""What ends a process: SIGINT, SIGTERM and SIGHUP as a flag that it polls, or its parent."""
 
+import ctypes
 import os
 import signal
 from types import FrameType
 from typing import Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_LIBC = ctypes.CDLL(None)
+_PR_SET_PDEATHSIG = 1
+
+
+def end_with_parent(parent: int) -> None:
+    """Let the kernel send SIGTERM to this process when its parent ends, whatever ends it."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM))
+    if os.getppid() != parent:  # it has ended already
+        os._exit(1)
 
 
 class StopSignal:

@@ -1,14 +1,16 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Signals as a flag."""
+"""Signals as a flag; processes that end with their parent."""
 
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
 
 import pytest
 from support.signals import attended
+from support.waiting import wait_until
 
 from t3mpc_ros.stop_signal import SIGNALS, StopSignal
 
@@ -44,3 +46,33 @@ def test_a_signal_during_the_start_ends_the_process_with_code_0():
         'os.kill(os.getpid(), signal.SIGTERM); raise SystemExit(3)'
     )
     assert subprocess.run([sys.executable, '-c', program], check=False).returncode == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
+def test_the_workers_of_a_killed_process_end_with_it(number, tmp_path):
+    """``t3mpc compare`` that was terminated left its workers computing, for minutes."""
+    program = tmp_path / 'study.py'
+    program.write_text(
+        'import os, time\n'
+        'from t3mpc_ros.evaluation.workers import WorkerPool\n'
+        'def task(job):\n'
+        '    print(os.getpid(), flush=True)\n'
+        '    time.sleep(600.0)\n'
+        'if __name__ == "__main__":\n'
+        '    with WorkerPool(2) as pool:\n'
+        '        list(pool.map(task, [1, 2]))\n'
+    )
+    with subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE, text=True) as study:
+        workers = [int(study.stdout.readline()) for _ in range(2)]
+        study.send_signal(number)
+        study.wait()
+        wait_until(lambda: not any(map(runs, workers)))
+
+
+def runs(pid):
+    """Return whether a process computes: a zombie does not."""
+    try:
+        return Path('/proc', str(pid), 'stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except FileNotFoundError:
+        return False

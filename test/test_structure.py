@@ -41,7 +41,7 @@ PACKAGES = {
     'simulation': BASE | {'robot'},
     'radio': BASE | {'robot'},
     'emulator': BASE | {'robot', 'simulation', 'radio'},
-    'evaluation': CORE | {'page', 'atomic_file'},
+    'evaluation': CORE | {'page', 'atomic_file', 'stop_signal'},
     'scripting': CORE | {'evaluation', 'missing_library'},
     'nodes': CORE | {'radio', 'stop_signal', 'missing_library'},
     'cli': CORE

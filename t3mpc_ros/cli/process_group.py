@@ -3,7 +3,6 @@
 """Starts, monitors and stops the package's executables as processes."""
 
 from collections.abc import Callable, Mapping, Sequence
-import ctypes
 from functools import partial
 import os
 from pathlib import Path
@@ -12,6 +11,8 @@ import subprocess
 import sys
 import sysconfig
 import time
+
+from t3mpc_ros.stop_signal import end_with_parent
 
 READY_TIMEOUT = 1200.0
 """Maximum start of a node, s: a busy machine compiles the kernels for minutes."""
@@ -69,17 +70,6 @@ def installed_file(path: Path) -> Path:
         f'{path} is not installed below any of {", ".join(map(str, _prefixes()))}; run the '
         'command through scripts/run, or build the workspace and source its setup file'
     )
-
-
-_LIBC = ctypes.CDLL(None)
-_PR_SET_PDEATHSIG = 1
-
-
-def _end_with_parent(parent: int) -> None:
-    """Let the kernel send SIGTERM to this process when its parent ends, whatever ends it."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM))
-    if os.getppid() != parent:  # it has ended already
-        os._exit(1)
 
 
 class ProcessGroup:
@@ -144,7 +134,7 @@ class ProcessGroup:
                 # Ctrl-C in a terminal reaches the whole group: here the processes are stopped
                 # in order instead, the recorder last.
                 start_new_session=True,
-                preexec_fn=partial(_end_with_parent, os.getpid()),
+                preexec_fn=partial(end_with_parent, os.getpid()),
             )
 
     def log(self, name: str) -> Path:

@@ -11,6 +11,7 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_complet
 from contextlib import nullcontext
 from functools import partial
 import multiprocessing
+import os
 from typing import Any, Protocol, Self, TypeVar
 
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
@@ -20,6 +21,7 @@ from t3mpc_ros.evaluation.method import MethodSpec
 from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import Scenario
+from t3mpc_ros.stop_signal import end_with_parent
 
 T = TypeVar('T')
 
@@ -65,7 +67,7 @@ class WorkerPool:
         elif self._workers > 1:
             # Spawned, not forked: a fork would copy whatever threads and locks this process has.
             self._pool = ProcessPoolExecutor(
-                self._workers, multiprocessing.get_context('spawn'), initializer=warm_up
+                self._workers, multiprocessing.get_context('spawn'), _start_worker, (os.getpid(),)
             )
         return self
 
@@ -149,6 +151,12 @@ def full_record(record: Record) -> Record:
 def _job_error(job: tuple[Any, Named], error: BaseException) -> JobError:
     scenario, method = job
     return JobError(f'{method.name} on {scenario} failed: {error!r}')
+
+
+def _start_worker(parent: int) -> None:
+    """Prepare a worker process, which ends with its parent, also if that is killed."""
+    end_with_parent(parent)
+    warm_up()
 
 
 def warm_up() -> None:
