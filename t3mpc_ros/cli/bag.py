@@ -403,8 +403,6 @@ def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
         '--method',
         action=RemovedOption,
         nargs='?',
-        const='examples/recorded_reference.py compares methods in closed loop on the reference of '
-        'a bag, with t3.compare',
         help=argparse.SUPPRESS,
     )
     add_input_options(parser)
@@ -506,8 +504,6 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
         '--update-golden',
         action=RemovedOption,
         nargs='?',
-        const='PYTHONPATH=. .venv/bin/python test/support/golden_bags.py records the golden bags '
-        'anew, in a checkout',
         help=argparse.SUPPRESS,
     )
     add_input_options(parser)

@@ -26,8 +26,24 @@ class ArgumentParser(argparse.ArgumentParser):
             )
 
 
+REMOVED = {
+    't3mpc twin': 'examples/digital_twin.py draws the twin, test/simulation checks it',
+    't3mpc bag replay --method': 'examples/recorded_reference.py compares methods in closed loop '
+    'on the reference of a bag, with t3.compare',
+    't3mpc bag compare --update-golden': 'PYTHONPATH=. .venv/bin/python '
+    'test/support/golden_bags.py records the golden bags anew, in a checkout',
+}
+"""Successors of the commands and options that were removed."""
+
+
+def reject_removed(parser: argparse.ArgumentParser, typed: str) -> None:
+    """End with an error if ``typed`` is a key of :data:`REMOVED`."""
+    if typed in REMOVED:
+        parser.error(f'{typed} was removed: {REMOVED[typed]}')
+
+
 class RemovedOption(argparse.Action):
-    """An option that is no longer there: an error, whose end is its ``const``."""
+    """An option of :data:`REMOVED`."""
 
     def __call__(
         self,
@@ -37,7 +53,7 @@ class RemovedOption(argparse.Action):
         option_string: str | None = None,
     ) -> None:
         """End with the error."""
-        parser.error(f'{option_string} was removed: {self.const}')
+        reject_removed(parser, f'{parser.prog} {option_string}')
 
 
 def run_command(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""``t3mpc``: the command-line program for everything that needs no ROS graph."""
+"""``t3mpc``: the command-line program; each subcommand has a module of its name."""
 
 import argparse
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ import sys
 from typing import TYPE_CHECKING
 import webbrowser
 
-from t3mpc_ros.cli.command import ArgumentParser, run_command
+from t3mpc_ros.cli.command import ArgumentParser, reject_removed, run_command
 from t3mpc_ros.cli.compare import add_parser as add_compare
 from t3mpc_ros.cli.faults import add_outcomes_parser
 from t3mpc_ros.cli.graph import add_parsers as add_graph_parsers
@@ -47,9 +47,6 @@ PROGRAMS = {
 }
 """Subcommands with their own parser, in the module of the same name."""
 
-REMOVED = {'twin': 'examples/digital_twin.py draws the twin, test/simulation checks it'}
-"""Successors of the commands that were removed."""
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Return the exit code: 0 done, 1 failed with a reason, 2 wrong command line."""
@@ -64,14 +61,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: Sequence[str]) -> int:
-    if words and words[0] in REMOVED:
-        print(f'error: t3mpc {words[0]} was removed: {REMOVED[words[0]]}', file=sys.stderr)
-        return 2
     if words and words[0] in PROGRAMS:
         # Imported only when it is used: `t3mpc --help` stays fast.
         code: int = import_module(f't3mpc_ros.cli.{words[0]}').main(words[1:])
         return code
-    return run_command(_parser(), words)
+    parser = _parser()
+    reject_removed(parser, ' '.join(['t3mpc', *words[:1]]))
+    return run_command(parser, words)
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -208,7 +204,8 @@ def _method_definitions() -> 'Sequence[MethodDefinition]':
 
 def _parser() -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = ArgumentParser(
-        prog='t3mpc', description='Everything of t3mpc_ros that needs no ROS graph.'
+        prog='t3mpc',
+        description='Tools of t3mpc_ros; topic, param, call, stop, view and demo use a ROS graph.',
     )
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
 
