@@ -5,8 +5,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-from t3mpc_ros.nodes.common.base_node import BaseNode
-from t3mpc_ros.nodes.common.graph_introspection import RCLError
+from t3mpc_ros.nodes.base_node import BaseNode
+from t3mpc_ros.nodes.qos import RCLError
 from t3mpc_ros.nodes.registry import node_module
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 

@@ -28,8 +28,8 @@ from t3mpc_ros.control.controller import (
 from t3mpc_ros.control.watchdog import InputMonitor, Reason
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
-from t3mpc_ros.nodes.common import conversions, graph_introspection, qos
-from t3mpc_ros.nodes.common.base_node import (
+from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes.base_node import (
     ADAPT_PERIOD,
     ERROR,
     OK,
@@ -37,8 +37,7 @@ from t3mpc_ros.nodes.common.base_node import (
     BaseNode,
     publish_and_wait_for_acked,
 )
-from t3mpc_ros.nodes.common.command_subscription import age_problem, message_age_ns
-from t3mpc_ros.nodes.common.conversions import FrameParameters
+from t3mpc_ros.nodes.conversions import FrameParameters, age_problem, message_age_ns
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 
@@ -241,20 +240,20 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         """Publish the other type if it is the only one that a subscriber expects."""
         other = Twist if self._command_type is TwistStamped else TwistStamped
         topic = self.resolve_topic_name('cmd_vel')
-        expected = graph_introspection.command_types(self, topic)
-        if expected != {graph_introspection.type_name(other)}:
+        expected = qos.command_types(self, topic)
+        if expected != {conversions.type_name(other)}:
             return
         # A participant has one type for a topic: the old publisher goes first.
         self.destroy_publisher(self._command_publisher)
         try:
             self._command_publisher = self.create_publisher(other, 'cmd_vel', qos.COMMAND)
-        except graph_introspection.RCLError:  # this process uses the topic with the old type
+        except qos.RCLError:  # this process uses the topic with the old type
             self._command_publisher = self.create_publisher(
                 self._command_type, 'cmd_vel', qos.COMMAND
             )
             return
         self._command_type = other
-        self.get_logger().info(f'the robot expects {graph_introspection.type_name(other)}')
+        self.get_logger().info(f'the robot expects {conversions.type_name(other)}')
 
     def _on_watchdog(self) -> None:
         self._take_references()
@@ -354,9 +353,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         stopped = f'stopped: {status.reason.value}'
         if not status.reason.moves and not waiting:
             return ERROR, stopped, values
-        if problem := graph_introspection.command_type_problem(
-            self, self._command_type, publish=True
-        ):
+        if problem := qos.command_type_problem(self, self._command_type, publish=True):
             return WARN, problem, values
         if waiting:
             return WARN, stopped, values

@@ -22,10 +22,10 @@ from rclpy.node import Node
 from std_srvs.srv import SetBool
 import yaml
 
-from t3mpc_ros.nodes.common import qos
-from t3mpc_ros.nodes.common.graph_introspection import message_class
-from t3mpc_ros.nodes.common.remote_parameters import RemoteParameters, plain_value
-from t3mpc_ros.nodes.common.ros_context import init_ros
+from t3mpc_ros.nodes import qos
+from t3mpc_ros.nodes.conversions import message_class
+from t3mpc_ros.nodes.entry_point import init_ros
+from t3mpc_ros.nodes.remote_parameters import RemoteParameters, plain_value
 
 LISTING = 1.5
 """Time in which nodes are discovered before they are listed, s."""

@@ -17,16 +17,17 @@ import threading
 from typing import Any, ClassVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
-from t3mpc_ros.nodes.common import diagnostics, graph_introspection
-from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode
-from t3mpc_ros.nodes.common.command_subscription import CommandSubscription
-from t3mpc_ros.nodes.common.robot_publishers import (
+from t3mpc_ros.nodes import qos
+from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
+from t3mpc_ros.nodes.robot_commands import CommandSubscription, RobotServices
+from t3mpc_ros.nodes.robot_topics import (
     RobotDescription,
     RobotPublishers,
     RobotTopicParameters,
+    count_variance,
+    state_values,
+    state_warnings,
 )
-from t3mpc_ros.nodes.common.robot_services import RobotServices
-from t3mpc_ros.nodes.common.sensor_messages import count_variance
 from t3mpc_ros.parameters.table import group, parameter
 from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, Wait, Write
 from t3mpc_ros.radio.link.standstill_reasons import ROBOT_USB
@@ -226,17 +227,15 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             'commands': self._commands.received,
             'commands_rejected': self._commands.rejected,
             **_link_values(quality),
-            **diagnostics.values(state),
+            **state_values(state),
         }
         if link_state is not LinkState.RUN or state.status.estop:
             return ERROR, state.reason or link_state.value, values
         if quality.level is DiagnosticLevel.ERROR:
             return ERROR, quality.text, values
-        if problem := graph_introspection.command_type_problem(
-            self, self._commands.message_type, publish=False
-        ):
+        if problem := qos.command_type_problem(self, self._commands.message_type, publish=False):
             return WARN, problem, values
-        found = [*diagnostics.warnings(state, command_problem=self._commands.problem)]
+        found = [*state_warnings(state, command_problem=self._commands.problem)]
         if quality.text:
             found.append(quality.text)
         if found:

@@ -28,9 +28,9 @@ from t3mpc_ros.geometry.path_file import load_path
 from t3mpc_ros.geometry.path_timing import PathError, check_points
 from t3mpc_ros.geometry.timing import SampleScheduler
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, Pose, State
-from t3mpc_ros.nodes.common import conversions, qos
-from t3mpc_ros.nodes.common.base_node import ACK_TIMEOUT, NO_CLOCK, OK, WARN, BaseNode
-from t3mpc_ros.nodes.common.conversions import FrameParameters
+from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes.base_node import ACK_TIMEOUT, NO_CLOCK, OK, WARN, BaseNode
+from t3mpc_ros.nodes.conversions import FrameParameters
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
 CONFIGURATION_ERRORS: tuple[type[Exception], ...] = (PathError,)

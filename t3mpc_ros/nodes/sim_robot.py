@@ -11,16 +11,17 @@ from std_srvs.srv import Trigger
 
 from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, SimulatedTime
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose
-from t3mpc_ros.nodes.common import conversions, diagnostics, graph_introspection, qos
-from t3mpc_ros.nodes.common.base_node import ERROR, NO_CLOCK, OK, WARN, BaseNode
-from t3mpc_ros.nodes.common.command_subscription import CommandSubscription
-from t3mpc_ros.nodes.common.robot_publishers import (
+from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN, BaseNode
+from t3mpc_ros.nodes.robot_commands import CommandSubscription, RobotServices
+from t3mpc_ros.nodes.robot_topics import (
     RobotDescription,
     RobotPublishers,
     RobotTopicParameters,
+    count_variance,
+    state_values,
+    state_warnings,
 )
-from t3mpc_ros.nodes.common.robot_services import RobotServices
-from t3mpc_ros.nodes.common.sensor_messages import count_variance
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
 from t3mpc_ros.simulation.digital_twin import (
@@ -266,16 +267,14 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
             values['real_time_factor'] = self._real_time_factor.value
         if state is None:
             return ERROR, NO_CLOCK, values
-        values |= diagnostics.values(state, twin)
+        values |= state_values(state, twin)
         if state.status.estop:
             return ERROR, state.reason, values
-        if problem := graph_introspection.command_type_problem(
-            self, self._commands.message_type, publish=False
-        ):
+        if problem := qos.command_type_problem(self, self._commands.message_type, publish=False):
             return WARN, problem, values
         if overload := self._overload():
             return WARN, f'processor overloaded: {overload}', values
-        if found := diagnostics.warnings(state, twin, self._commands.problem):
+        if found := state_warnings(state, twin, self._commands.problem):
             return WARN, '; '.join(found), values
         return OK, 'following commands', values
 

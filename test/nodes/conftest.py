@@ -20,7 +20,7 @@ def harness(ros):
 @pytest.fixture
 def execute(graph, capfd):
     """Return a function that runs an executable in this process until its nodes have started."""
-    from t3mpc_ros.nodes.common.entry_point import run
+    from t3mpc_ros.nodes.entry_point import run
 
     class Stop:
         exit_at_once = False

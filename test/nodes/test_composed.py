@@ -10,7 +10,7 @@ from support.waiting import wait_until
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.nodes import composed
-from t3mpc_ros.nodes.common.entry_point import make_executor
+from t3mpc_ros.nodes.entry_point import make_executor
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.parameters.table import ParameterError
 

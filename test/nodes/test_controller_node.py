@@ -23,8 +23,8 @@ from support.ros_graph import (
 
 from t3mpc_ros.bag.run.model_file import ModelError, load_model
 from t3mpc_ros.nodes import controller as controller_module
-from t3mpc_ros.nodes.common import qos
-from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN
+from t3mpc_ros.nodes import qos
+from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.controller import ControllerNode
 
 pytestmark = pytest.mark.ros

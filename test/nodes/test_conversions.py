@@ -16,7 +16,8 @@ from sensor_msgs.msg import Range
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State, WheelSpeeds, wrap_angle
-from t3mpc_ros.nodes.common import conversions, diagnostics, sensor_messages
+from t3mpc_ros.nodes import conversions, robot_topics
+from t3mpc_ros.nodes.robot_topics import state_values, state_warnings
 from t3mpc_ros.robot.interface import (
     ZERO_WHEEL_SPEEDS,
     BatteryReading,
@@ -241,7 +242,7 @@ def test_imu_covariance_is_the_variance_of_its_samples():
     sensor = SimulatedImu(parameters, np.random.default_rng(3))
     still = np.zeros((3, 2))
     samples = np.array([sensor.measure(still, 0.01) for _ in range(20_000)])
-    message = sensor_messages.imu_message(parameters, 'imu_link')
+    message = robot_topics.imu_message(parameters, 'imu_link')
     turn, push = message.angular_velocity_covariance, message.linear_acceleration_covariance
     claimed = (turn[8], push[0], push[4])
     np.testing.assert_allclose(samples.var(axis=0), claimed, rtol=0.1)
@@ -250,13 +251,13 @@ def test_imu_covariance_is_the_variance_of_its_samples():
         matrix = np.array(covariance).reshape(3, 3)
         np.testing.assert_array_equal(matrix, np.diag(np.diag(matrix)))
         assert all(covariance[place] == 1e6 for place in unknown)
-    noisier = sensor_messages.imu_message(ImuParameters(gyro_noise=0.05), 'imu_link')
+    noisier = robot_topics.imu_message(ImuParameters(gyro_noise=0.05), 'imu_link')
     assert noisier.angular_velocity_covariance[8] > 50.0 * turn[8]
 
 
 def test_an_imu_sample_sets_its_axes_only():
-    message = sensor_messages.imu_message(ImuParameters(), 'a/imu')
-    sensor_messages.fill_imu(message, ImuSample(0.5, 1.0, -2.0), 7)
+    message = robot_topics.imu_message(ImuParameters(), 'a/imu')
+    robot_topics.fill_imu(message, ImuSample(0.5, 1.0, -2.0), 7)
     assert conversions.ns_from_time(message.header.stamp) == 7
     assert message.header.frame_id == 'a/imu'
     turn, push = message.angular_velocity, message.linear_acceleration
@@ -281,8 +282,8 @@ FLOATS = np.float32
 )
 def test_a_distance_follows_rep_117_after_serialization(distance, infinity, expected):
     """Ranges are serialized in single precision; a value at a limit must stay within it."""
-    message = sensor_messages.range_message(RangeSensorParameters(), 'left_front_range_link')
-    sensor_messages.fill_range(message, distance, 7, infinity=infinity)
+    message = robot_topics.range_message(RangeSensorParameters(), 'left_front_range_link')
+    robot_topics.fill_range(message, distance, 7, infinity=infinity)
     received = deserialize_message(serialize_message(message), Range)
     assert received.range == expected
     assert received.radiation_type == Range.INFRARED
@@ -294,14 +295,14 @@ def test_a_distance_follows_rep_117_after_serialization(distance, infinity, expe
 
 def test_a_discharging_battery_has_a_negative_current():
     parameters = BatteryParameters(cells=4, capacity=2.0)
-    message = sensor_messages.battery_message(parameters)
-    sensor_messages.fill_battery(message, BatteryReading(15.0, 0.5, 0.75), 7)
+    message = robot_topics.battery_message(parameters)
+    robot_topics.fill_battery(message, BatteryReading(15.0, 0.5, 0.75), 7)
     assert (message.voltage, message.current, message.percentage) == (15.0, -0.5, 0.75)
     assert message.charge == 1.5
     assert message.design_capacity == 2.0
     assert len(message.cell_voltage) == 4
     assert np.isnan([*message.cell_voltage, message.temperature, message.capacity]).all()
-    sensor_messages.fill_battery(message, BatteryReading(15.0, math.nan, math.nan), 8)
+    robot_topics.fill_battery(message, BatteryReading(15.0, math.nan, math.nan), 8)
     assert np.isnan([message.current, message.charge, message.percentage]).all()
 
 
@@ -311,10 +312,10 @@ def test_the_covariance_of_a_twist_is_that_of_its_wheels():
     rng = np.random.default_rng(9)
     wheels = rng.normal(scale=math.sqrt(variance), size=(20_000, 2))
     twists = np.array([twist_from_wheels(WheelSpeeds(*pair), geometry) for pair in wheels])
-    covariance = np.array(sensor_messages.twist_covariance(geometry, variance)).reshape(6, 6)
+    covariance = np.array(robot_topics.twist_covariance(geometry, variance)).reshape(6, 6)
     np.testing.assert_allclose([covariance[0, 0], covariance[5, 5]], twists.var(axis=0), rtol=0.05)
     assert covariance[1, 1] == 1e6
-    misled = np.array(sensor_messages.twist_covariance(geometry, math.inf)).reshape(6, 6)
+    misled = np.array(robot_topics.twist_covariance(geometry, math.inf)).reshape(6, 6)
     np.testing.assert_array_equal(misled, 1e6 * np.eye(6))
 
 
@@ -324,7 +325,7 @@ def test_count_variance_is_that_of_quantisation():
     angles = np.cumsum(rng.uniform(0.01, 0.05, 20_000))
     counted = np.diff(np.floor(angles / step) * step) / period
     error = counted - np.diff(angles) / period
-    assert sensor_messages.count_variance(step, period) == pytest.approx(error.var(), rel=0.05)
+    assert robot_topics.count_variance(step, period) == pytest.approx(error.var(), rel=0.05)
 
 
 # -- diagnostics ----------------------------------------------------------------------------------
@@ -364,7 +365,7 @@ INSIDE = TwinDiagnostics((), (0.1, 0.2), (0.0, 0.0), 0.05, 0.04, 0.0)
     ],
 )
 def test_warnings_name_each_problem_once(state, inside, words):
-    found = diagnostics.warnings(state, inside)
+    found = state_warnings(state, inside)
     assert len(found) == len(words)
     for text, word in zip(found, words, strict=True):
         assert word in text
@@ -372,10 +373,10 @@ def test_warnings_name_each_problem_once(state, inside, words):
 
 def test_active_faults_are_named():
     inside = replace(INSIDE, faults=('gyro_dead', 'command_delay 0.1 s'))
-    (text,) = diagnostics.warnings(_state(), inside)
+    (text,) = state_warnings(_state(), inside)
     assert text == 'faults: gyro_dead, command_delay 0.1 s'
-    assert diagnostics.values(_state(), inside)['faults'] == 'gyro_dead, command_delay 0.1 s'
-    values = diagnostics.values(_state(), INSIDE)
+    assert state_values(_state(), inside)['faults'] == 'gyro_dead, command_delay 0.1 s'
+    values = state_values(_state(), INSIDE)
     assert values['faults'] == 'none'
     assert (values['gyro_bias_rad_s'], values['gyro_bias_estimate_rad_s']) == (0.05, 0.04)
     assert (values['slid_right_m'], values['slid_left_m']) == (0.1, 0.2)

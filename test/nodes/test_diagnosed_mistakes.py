@@ -8,7 +8,7 @@ import pytest
 from support.ros_graph import odometry
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common.base_node import ERROR, WARN
+from t3mpc_ros.nodes.base_node import ERROR, WARN
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 

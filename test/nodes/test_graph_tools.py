@@ -11,7 +11,7 @@ from std_srvs.srv import SetBool
 import yaml
 
 from t3mpc_ros.nodes import graph_tools
-from t3mpc_ros.nodes.common.conversions import quaternion_from_yaw
+from t3mpc_ros.nodes.conversions import quaternion_from_yaw
 from t3mpc_ros.nodes.graph_tools import Graph, GraphError, RateMeter, message_text
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode

@@ -37,7 +37,7 @@ def test_nodes_without_bags_need_no_bag_library(without, graph):
     """The parameters of other nodes, which a file may hold, were looked up in their modules."""
     without(*BAG_LIBRARIES)
     start = (
-        'import sys; from t3mpc_ros.nodes.common.entry_point import run\n'
+        'import sys; from t3mpc_ros.nodes.entry_point import run\n'
         'class Stop:\n'
         '    def __call__(self): return True\n'
         "for name in ('reference_generator', 'controller', 'sim_robot', 'radio_bridge'):\n"

@@ -13,8 +13,8 @@ from rosgraph_msgs.msg import Clock
 from support.ros_graph import NODE_CLASSES, diagnostic, is_ok, on_grid, reason, speed, stamp
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import conversions
-from t3mpc_ros.nodes.common.base_node import OK, WARN
+from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes.base_node import OK, WARN
 from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode

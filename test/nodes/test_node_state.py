@@ -22,7 +22,7 @@ from t3mpc_ros.chaos.reference import ChaoticReference
 from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist
-from t3mpc_ros.nodes.common.base_node import ERROR, NO_CLOCK, OK, WARN
+from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN
 from t3mpc_ros.nodes.player.node import PlayerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.recorder.metadata import ParameterCollector

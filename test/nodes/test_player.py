@@ -32,8 +32,8 @@ from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.nodes.common import conversions, graph_introspection
-from t3mpc_ros.nodes.common.base_node import OK, WARN
+from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes.base_node import OK, WARN
 from t3mpc_ros.nodes.player.node import PlayerNode
 from t3mpc_ros.nodes.player.terminal import parse_keys
 from t3mpc_ros.nodes.recorder.node import RecorderNode
@@ -53,7 +53,7 @@ def write(folder, messages, profiles=None, **more):
     with BagWriter(folder, metadata_records={}, **more) as bag:
         for topic, seconds, message in messages:
             offered = (profiles or {}).get(topic, QosProfile())
-            bag.add_topic(topic, graph_introspection.type_name(type(message)), [offered])
+            bag.add_topic(topic, conversions.type_name(type(message)), [offered])
             stamp_ns = START + round(seconds * SECOND)
             bag.write(topic, stamp_ns, stamp_ns, serialize_message(message))
     return str(folder)
@@ -394,7 +394,7 @@ def test_unusable_parameters_are_rejected_at_start(given, error, words, harness,
 
 # -- in a terminal --------------------------------------------------------------------------------
 
-PROGRAM = 'import sys; from t3mpc_ros.nodes.common.entry_point import player; sys.exit(player())'
+PROGRAM = 'import sys; from t3mpc_ros.nodes.entry_point import player; sys.exit(player())'
 
 
 class Terminal:

@@ -13,8 +13,8 @@ from sensor_msgs.msg import Imu, Range
 from std_srvs.srv import Trigger
 from support.ros_graph import LATCHED
 
-from t3mpc_ros.nodes.common.conversions import FrameParameters
 from t3mpc_ros.nodes.controller import ControllerNode
+from t3mpc_ros.nodes.conversions import FrameParameters
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode

@@ -23,7 +23,7 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.run.model_file import find_model, load_model, save_model
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
-from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN
+from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.recorder.metadata import SEED_RECORD, RecordingMetadata
 from t3mpc_ros.nodes.recorder.node import RecorderNode

@@ -20,7 +20,7 @@ from support.waiting import Processes, wait_until
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery import recover_bag
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import qos
+from t3mpc_ros.nodes import qos
 
 pytestmark = [pytest.mark.ros, pytest.mark.timed, pytest.mark.slow]
 

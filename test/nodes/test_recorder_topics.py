@@ -26,7 +26,7 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.bag.writer import BagWriter, DiskError
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common.base_node import ERROR, OK
+from t3mpc_ros.nodes.base_node import ERROR, OK
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode
 from t3mpc_ros.nodes.recorder.subscriptions import FULL_DISCOVERY, TopicDiscovery

@@ -25,8 +25,8 @@ from support.ros_graph import (
 )
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import conversions
-from t3mpc_ros.nodes.common.base_node import ERROR, WARN
+from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes.base_node import ERROR, WARN
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
 pytestmark = pytest.mark.ros

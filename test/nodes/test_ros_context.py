@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from t3mpc_ros.nodes.common.ros_context import provide_log_directory
+from t3mpc_ros.nodes.entry_point import provide_log_directory
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_a_folder_that_cannot_be_written_is_replaced(given, replaced, tmp_path):
 @pytest.mark.slow
 def test_ros_starts_without_a_home_folder(tmp_path):
     """Every node said that its command line was invalid."""
-    code = 'from t3mpc_ros.nodes.common.ros_context import init_ros; init_ros([])'
+    code = 'from t3mpc_ros.nodes.entry_point import init_ros; init_ros([])'
     environment = {k: v for k, v in os.environ.items() if k != 'ROS_LOG_DIR'}
     for home in (str(tmp_path), os.devnull):
         words = [sys.executable, '-c', code]

@@ -29,8 +29,8 @@ from support.ros_graph import (
 )
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import conversions
-from t3mpc_ros.nodes.common.base_node import OK, WARN
+from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes.base_node import OK, WARN
 from t3mpc_ros.nodes.recorder.node import RecorderNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
 from t3mpc_ros.parameters.table import ParameterError

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from support.ros_graph import CommandSource, twist
 
-from t3mpc_ros.nodes.common.remote_parameters import parameter_row
+from t3mpc_ros.nodes.remote_parameters import parameter_row
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
 from t3mpc_ros.nodes.viewer import CommandFailedError, ViewNode
 from t3mpc_ros.view.live_run import LiveRun

@@ -14,11 +14,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from support.waiting import wait_until
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import conversions
-from t3mpc_ros.nodes.common.base_node import OK
-from t3mpc_ros.nodes.common.entry_point import make_executor
+from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes.base_node import OK
 from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
+from t3mpc_ros.nodes.entry_point import make_executor
 from t3mpc_ros.nodes.player.node import PlayerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode

@@ -18,8 +18,8 @@ from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline, ReadAhead
 from t3mpc_ros.bag.qos import read_qos_overrides
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import qos
-from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode
+from t3mpc_ros.nodes import qos
+from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
 from t3mpc_ros.nodes.player.player_thread import PlayerThread
 from t3mpc_ros.nodes.player.publishers import CLOCK, PublishingRules, TopicPublishers
 from t3mpc_ros.nodes.player.terminal import KeyboardHandler, ProgressLine

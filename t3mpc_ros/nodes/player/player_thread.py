@@ -17,7 +17,7 @@ from rosgraph_msgs.msg import Clock
 
 from t3mpc_ros.bag.player import DueMessage, PlaybackTimeline
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import conversions
+from t3mpc_ros.nodes import conversions
 
 
 @dataclass(frozen=True)

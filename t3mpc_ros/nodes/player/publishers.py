@@ -24,7 +24,8 @@ from t3mpc_ros.bag.player import VELOCITY_TYPES, velocity_command_risk
 from t3mpc_ros.bag.qos import UNLIMITED, QosProfile, adapt_offer_to_recorded_offers
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import graph_introspection
+from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes.qos import RCLError
 
 CLOCK = '/clock'
 ROBOT_NODES = ('radio_bridge', 'sim_robot')
@@ -69,7 +70,7 @@ class TopicPublishers:
                 BagError,
                 ImportError,
                 NameValidationException,
-                graph_introspection.RCLError,
+                RCLError,
             ) as error:
                 self.unusable[topic] = str(error)
             except ValueError as error:
@@ -96,7 +97,7 @@ class TopicPublishers:
         overrides = rules.qos_overrides
         override = next((overrides[name] for name in names if name in overrides), None)
         offer = override or adapt_offer_to_recorded_offers(track.offered_qos_profiles)
-        message = graph_introspection.message_class(track.type_name)
+        message = conversions.message_class(track.type_name)
         return self._node.create_publisher(message, topic, qos_profile(offer))
 
     def all_subscribed(self) -> bool:
@@ -109,7 +110,7 @@ class TopicPublishers:
         for topic, publisher in self.by_topic.items():
             if (
                 self._allow_commands
-                or graph_introspection.type_name(publisher.msg_type) not in VELOCITY_TYPES
+                or conversions.type_name(publisher.msg_type) not in VELOCITY_TYPES
             ):
                 continue
             for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name):

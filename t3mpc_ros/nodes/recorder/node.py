@@ -31,8 +31,8 @@ from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.bag.writer import BagWriter, FolderError
 from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes.common import qos
-from t3mpc_ros.nodes.common.base_node import ERROR, OK, WARN, BaseNode
+from t3mpc_ros.nodes import qos
+from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
 from t3mpc_ros.nodes.recorder.metadata import SEED_RECORD, ParameterCollector, RecordingMetadata
 from t3mpc_ros.nodes.recorder.subscriptions import RawSubscriptions, TopicDiscovery, offered_qos
 

@@ -36,8 +36,8 @@ from t3mpc_ros.bag.mcap_file import SerializedMessage
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.topic_filter import TopicFilter
-from t3mpc_ros.nodes.common import graph_introspection, qos
-from t3mpc_ros.nodes.common.endpoints import PolledCallbackGroup, unused_callback
+from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes.qos import PolledCallbackGroup, unused_callback
 
 EXPECTED_TOPICS = {
     'reference': 'nav_msgs/msg/Odometry',
@@ -110,7 +110,7 @@ class RawSubscriptions:
 
         Raises ImportError without the message type, RCLError if this process uses another one.
         """
-        message = graph_introspection.message_class(type_name)
+        message = conversions.message_class(type_name)
         replaced = self._subscriptions.get(topic)
         self.unsubscribe(topic)
         subscription = self._node.create_subscription(
@@ -239,7 +239,7 @@ class TopicDiscovery:
             profile = qos.RECORDER_LATCHED if name in LATCHED_TOPICS else qos.RECORDER
             try:
                 self._subscriptions.subscribe(topic, type_name, profile)
-            except graph_introspection.RCLError:
+            except qos.RCLError:
                 # A node of this process uses another type; discovery finds its publisher.
                 continue
 
@@ -291,7 +291,7 @@ class TopicDiscovery:
         self._take_messages()
         try:
             self._subscriptions.subscribe(topic, type_name, request)
-        except (ImportError, graph_introspection.RCLError) as error:
+        except (ImportError, qos.RCLError) as error:
             self.exclude(topic, str(error))
 
 

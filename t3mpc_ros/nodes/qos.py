@@ -1,22 +1,102 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""QoS of publishers and subscriptions: overrides of the user, adaptation to offers, mismatches."""
+"""What publishers and subscriptions match by: QoS profiles, overrides, types, mismatches."""
 
-from collections.abc import Callable, Iterable
-import copy
+from collections.abc import Callable, Iterable, Sequence
+from copy import copy
 import inspect
 from typing import Any, Literal
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, QoSPolicyKind, QoSProfile, qos_check_compatible
+from rclpy.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSCompatibility,
+    QoSPolicyKind,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from t3mpc_ros.nodes.common import qos
+from t3mpc_ros.nodes import conversions
 from t3mpc_ros.parameters.table import ParameterError
+
+RCLError: type[Exception] = rclpy_implementation.RCLError
+"""Error of rclpy, among others for a topic that this process uses with another type."""
+
+
+def _profile(depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=durability,
+    )
+
+
+STREAM = _profile(100)
+"""Odometry, reference and sensors: every sample counts; one second of them is queued."""
+
+INITIAL_INPUTS = _profile(1000, DurabilityPolicy.TRANSIENT_LOCAL)
+"""First inputs of the controller, 10 s at 100 Hz, for a recorder that discovers it late."""
+
+COMMAND = _profile(50)
+"""Published commands, queued until a recorder has received each of them."""
+
+LATEST = _profile(1)
+"""Commands received by a robot, and /clock: only the latest message counts."""
+
+SCALARS = _profile(20)
+"""Scalars for plot tools, joint states and slow sensors."""
+
+LATCHED = _profile(1, DurabilityPolicy.TRANSIENT_LOCAL)
+"""Topics whose last message late subscribers receive."""
+
+JOURNAL = _profile(1000, DurabilityPolicy.TRANSIENT_LOCAL)
+"""Journal of the controller, with the last 10 s for a recorder that discovers it late."""
+
+PARAMETER_REVISIONS = _profile(20, DurabilityPolicy.TRANSIENT_LOCAL)
+"""Revisions of the controller's parameters, to which the journal refers."""
+
+DIAGNOSTICS = _profile(10)
+"""Diagnostics."""
+
+RECORDER = _profile(1000)
+"""Subscriptions of the recorder, with a queue for times when the disk is busy."""
+
+RECORDER_LATCHED = _profile(RECORDER.depth, DurabilityPolicy.TRANSIENT_LOCAL)
+"""Subscriptions of the recorder to topics with transient-local publishers."""
+
+
+def is_transient_local(profile: QoSProfile) -> bool:
+    """Return whether late subscribers receive earlier messages."""
+    return bool(profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def compatible_with_all(subscription: QoSProfile, publishers: Sequence[QoSProfile]) -> bool:
+    """Return whether the offers of all publishers satisfy the request of a subscription."""
+    return all(
+        qos_check_compatible(offered, subscription)[0] != QoSCompatibility.ERROR
+        for offered in publishers
+    )
+
+
+def adapt_request_to_offers(publishers: Sequence[QoSProfile]) -> QoSProfile:
+    """Return the strictest request for the recorder that all offers satisfy."""
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in publishers)
+    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers)
+    return QoSProfile(
+        depth=RECORDER.depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
 
 Kind = Literal['publisher', 'subscription']
 
@@ -30,11 +110,7 @@ def overriding_options(node: Node, topic: str, kind: Kind) -> QoSOverridingOptio
     """Return the policies of an endpoint that the user overrides, None without any.
 
     Parameters are declared for these policies only, as ``qos_overrides.<topic>.<kind>.<policy>``.
-
-    Raises
-    ------
-    ParameterError
-        An override names no policy or a value that the policy does not have.
+    ParameterError for an override with an unknown policy or value.
     """
     prefix = f'{PREFIX}{node.resolve_topic_name(topic)}.{kind}.'
     overrides = node._parameter_overrides  # rclpy has no public access to them
@@ -50,9 +126,9 @@ def _policy_kind(parameter: str, policy: str, value: object) -> QoSPolicyKind:
     if policy not in known:
         raise ParameterError(f'{parameter} must end with one of {", ".join(known)}: got {policy}')
     choices = {
-        'reliability': qos.ReliabilityPolicy,
-        'durability': qos.DurabilityPolicy,
-        'history': qos.HistoryPolicy,
+        'reliability': ReliabilityPolicy,
+        'durability': DurabilityPolicy,
+        'history': HistoryPolicy,
     }
     if policy in choices:
         names = [choice.lower() for choice in choices[policy].__members__ if choice != 'UNKNOWN']
@@ -114,24 +190,11 @@ class MatchingSubscription:
 
     Robots on micro-ROS and TurtleBot 4 publish best effort, which a reliable subscription does
     not receive. The request is weakened when such a publisher appears. A QoS that the user
-    overrides is kept.
+    overrides is kept. ``raw`` messages stay serialized.
 
-    Parameters
-    ----------
-    node
-        Node that subscribes.
-    message
-        Message class.
-    topic
-        Topic name.
-    callback
-        Called with each message and its information; None: no executor waits for them, and the
-        node takes them with :meth:`take_waiting`. To be woken costs more than a step of the
-        controller, so a node with two streams waits for one of them.
-    profile
-        Request while all publishers offer it.
-    raw
-        Whether the messages stay serialized.
+    The callback gets each message and its information. Without one no executor waits for them,
+    and the node takes them with :meth:`take_waiting`: to be woken costs more than a step of the
+    controller, so a node with two streams waits for one of them.
     """
 
     def __init__(
@@ -164,10 +227,10 @@ class MatchingSubscription:
             return
         held, name = self.held, self.held.topic_name
         offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(name)]
-        if qos.compatible_with_all(held.qos_profile, offers):
+        if compatible_with_all(held.qos_profile, offers):
             return
-        profile = copy.copy(held.qos_profile)
-        profile.reliability = qos.adapt_request_to_offers(offers).reliability
+        profile = copy(held.qos_profile)
+        profile.reliability = adapt_request_to_offers(offers).reliability
         if profile.reliability == held.qos_profile.reliability:
             return  # the mismatch is another one, which the diagnostics name
         self._node.destroy_subscription(held)
@@ -201,17 +264,7 @@ def command_publishers_problem(node: Node) -> str:
 
 
 def qos_problem(node: Node, endpoints: Iterable[Any], kind: Kind) -> str:
-    """Return the first QoS mismatch between endpoints of a node and their peers, or nothing.
-
-    Parameters
-    ----------
-    node
-        The node.
-    endpoints
-        Its publishers, or its subscriptions.
-    kind
-        Which of both they are.
-    """
+    """Return the first QoS mismatch between endpoints of a node and their peers, or nothing."""
     for endpoint in endpoints:
         name, own = endpoint.topic_name, endpoint.qos_profile
         if kind == 'publisher':
@@ -229,7 +282,7 @@ def qos_problem(node: Node, endpoints: Iterable[Any], kind: Kind) -> str:
 
 def _comparable(profile: QoSProfile) -> QoSProfile:
     """Return a profile with 0, as in a default profile, for the infinite times of the graph."""
-    result = copy.copy(profile)
+    result = copy(profile)
     for name in ('deadline', 'lifespan', 'liveliness_lease_duration'):
         if getattr(profile, name).nanoseconds == UNLIMITED:
             setattr(result, name, Duration())
@@ -243,3 +296,32 @@ def _mismatch(topic: str, peer: TopicEndpointInfo, reason: str) -> str:
 
 def _full_name(info: TopicEndpointInfo) -> str:
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+
+
+RECORDERS = ('recorder', 'rosbag2_recorder')
+"""Nodes that subscribe to a topic with the type that they find or expect."""
+
+
+def command_types(node: Node, topic: str) -> set[str]:
+    """Return the message types that the robots on a command topic expect."""
+    peers: list[TopicEndpointInfo] = node.get_subscriptions_info_by_topic(topic)
+    return {peer.topic_type for peer in peers if peer.node_name not in RECORDERS}
+
+
+def command_type_problem(node: Node, message: type, *, publish: bool) -> str:
+    """Return why a node and its peers use ``cmd_vel`` with different types; empty if equal.
+
+    ROS 2 connects endpoints of equal type only and reports nothing when the types differ.
+    """
+    name = node.resolve_topic_name('cmd_vel')
+    peers: list[TopicEndpointInfo] = (
+        node.get_subscriptions_info_by_topic(name)
+        if publish
+        else node.get_publishers_info_by_topic(name)
+    )
+    expected = conversions.type_name(message)
+    other = next((peer.topic_type for peer in peers if peer.topic_type != expected), '')
+    if not other:
+        return ''
+    action = 'expects' if publish else 'publishes'
+    return f'another node {action} {other} on cmd_vel: set enable_stamped_cmd_vel'

@@ -1,52 +1,19 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Subscription of a robot to ``cmd_vel``, and the age of received messages.
-
-The age of a message counts from its publication, by the source timestamp of the middleware. An
-executor that was suspended takes messages that have waited: counted from the moment at which it
-takes them, an unstamped command would be new, however long ago its publisher ended.
-"""
+"""How a robot is commanded: ``cmd_vel``, and the services ``reset_odometry`` and ``e_stop``."""
 
 from collections.abc import Callable
-import time
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.node import Node
+from std_srvs.srv import SetBool, Trigger
 
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
-from t3mpc_ros.nodes.common import conversions, qos
-from t3mpc_ros.nodes.common.base_node import BaseNode
-
-MAX_CLOCK_LEAD_NS = NANOSECONDS // 20
-"""Lead of the publisher's clock beyond which the age of a message is unknown."""
-
-
-def message_age_ns(info: dict[str, Any]) -> int:
-    """Return the time since the publication of a message, ns; 0 if the middleware has no stamp.
-
-    Both times are of the system clock, also with ``use_sim_time``. The age is negative if the
-    clock of the publisher leads.
-    """
-    published_ns = int(info['source_timestamp'])
-    return time.time_ns() - published_ns if published_ns > 0 else 0
-
-
-def age_problem(age_ns: int, timeout: float) -> str:
-    """Return why a message of this age must not move a robot; empty if it may.
-
-    Parameters
-    ----------
-    age_ns
-        Age from :func:`message_age_ns`.
-    timeout
-        Time for which the message is valid, s.
-    """
-    age = age_ns / NANOSECONDS
-    if age_ns < -MAX_CLOCK_LEAD_NS:
-        return f'is from the future: {-age:.3f} s, the clocks of the computers differ'
-    if age >= timeout:
-        return f'is too old: {age:.3f} s, it has waited or the clocks of the computers differ'
-    return ''
+from t3mpc_ros.geometry.types import BodyTwist
+from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes.base_node import BaseNode
+from t3mpc_ros.robot.interface import RobotInterface
 
 
 class CommandSubscription:
@@ -96,9 +63,9 @@ class CommandSubscription:
     def _on_message(self, message: Twist | TwistStamped, info: dict[str, Any]) -> None:
         # First of all: if the process is suspended from here on, the command ages.
         robot_ns = self._robot_ns()
-        age_ns = message_age_ns(info)
+        age_ns = conversions.message_age_ns(info)
         self.received += 1
-        problem = age_problem(age_ns, self._timeout())
+        problem = conversions.age_problem(age_ns, self._timeout())
         if problem:
             problem = f'command {problem}'
         else:
@@ -114,3 +81,52 @@ class CommandSubscription:
                     f'cmd_vel rejected: {problem}', throttle_duration_sec=1.0
                 )
         self.problem = problem
+
+
+class RobotServices:
+    """Offers ``reset_odometry`` and ``e_stop``, which latches until released.
+
+    Parameters
+    ----------
+    node
+        Node that offers the services.
+    robot
+        Robot that they act on.
+    now_ns
+        Returns the time of the robot, ns.
+    lock
+        Held during calls of the robot where several threads use it; None: not needed.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        robot: RobotInterface,
+        now_ns: Callable[[], int],
+        lock: AbstractContextManager[Any] | None = None,
+    ) -> None:
+        self._robot = robot
+        self._now_ns = now_ns
+        self._lock = nullcontext() if lock is None else lock
+        node.create_service(Trigger, 'reset_odometry', self._on_reset_odometry)
+        node.create_service(SetBool, 'e_stop', self._on_e_stop)
+
+    def _on_reset_odometry(
+        self, request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        with self._lock:
+            problem = self._robot.reset_odometry(self._now_ns())
+        response.success = not problem
+        response.message = problem or 'odometry reset to the origin'
+        return response
+
+    def _on_e_stop(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        problem = ''
+        with self._lock:
+            if request.data:
+                self._robot.latch_estop('requested by service e_stop', self._now_ns())
+            else:
+                problem = self._robot.release_estop(self._now_ns())
+        response.success = not problem
+        response.message = problem or ('latched' if request.data else 'released')
+        return response

@@ -1,15 +1,17 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Entry points of the executables: signal handling, start, spin, shutdown, exit code.
+"""Entry points of the executables: signals, start of ROS, spin, shutdown, exit code.
 
 Importing rclpy and numba takes one to two seconds. SIGINT in that time has to end the process
 without a traceback, so the signal handlers are installed first and slow imports follow in the
 functions.
 """
 
-from collections.abc import Sequence
+from collections.abc import MutableMapping, Sequence
 import os
+from pathlib import Path
 import sys
+import tempfile
 from typing import TYPE_CHECKING, NoReturn
 
 from t3mpc_ros.missing_library import remedy
@@ -19,14 +21,13 @@ from t3mpc_ros.nodes.arguments import (
     unknown_arguments,
     unmatched_files,
 )
-from t3mpc_ros.nodes.common.ros_context import init_ros
 from t3mpc_ros.nodes.registry import node_module
 from t3mpc_ros.stop_signal import StopSignal
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
 
-    from t3mpc_ros.nodes.common.base_node import BaseNode
+    from t3mpc_ros.nodes.base_node import BaseNode
 
 USAGE_ERROR = 2
 """Exit code for an unusable parameter, parameter file or command line."""
@@ -176,3 +177,30 @@ def _spin(nodes: Sequence['BaseNode'], stop: StopSignal) -> None:
 def _usage_error(name: str, problem: str) -> int:
     print(f'{name}: {problem}', file=sys.stderr, flush=True)
     return USAGE_ERROR
+
+
+def init_ros(arguments: Sequence[str]) -> None:
+    """Initialise rclpy with the arguments of a command line, without its signal handlers."""
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    provide_log_directory(os.environ)
+    rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+
+
+def provide_log_directory(environment: MutableMapping[str, str]) -> None:
+    """Set ``ROS_LOG_DIR`` to a temporary folder where ROS could not write its logs.
+
+    ROS writes them below ``ROS_HOME`` or ``~/.ros``; in a read-only home folder, as of a service
+    or a container, no node would start. A folder that the user has chosen is not replaced.
+    """
+    if environment.get('ROS_LOG_DIR'):
+        return
+    base = environment.get('ROS_HOME') or str(Path(environment.get('HOME', os.devnull), '.ros'))
+    try:
+        Path(base, 'log').mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=Path(base, 'log')):
+            pass
+    except OSError:
+        folder = Path(tempfile.gettempdir(), f't3mpc_ros-{os.getuid()}', 'log')
+        environment['ROS_LOG_DIR'] = str(folder)

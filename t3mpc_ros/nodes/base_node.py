@@ -25,7 +25,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
-from t3mpc_ros.nodes.common import endpoints, qos
+from t3mpc_ros.nodes import qos
 from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec, nearest_hint
 
 P = TypeVar('P', bound=Parameters)
@@ -83,7 +83,7 @@ class BaseNode(Node, Generic[P]):
         # Steady time: diagnostics continue while the simulated clock is paused.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_steady_timer(1.0, self._publish_diagnostics)
-        self._matching: list[endpoints.MatchingSubscription] = []
+        self._matching: list[qos.MatchingSubscription] = []
         self.create_steady_timer(ADAPT_PERIOD, self._adapt_subscriptions)
         self._unused_overrides: list[str] | None = None
 
@@ -133,7 +133,7 @@ class BaseNode(Node, Generic[P]):
     def subscriptions(self) -> Iterator[Subscription]:
         """The subscriptions that an executor waits for."""
         for each in super().subscriptions:
-            if not isinstance(each.callback_group, endpoints.PolledCallbackGroup):
+            if not isinstance(each.callback_group, qos.PolledCallbackGroup):
                 yield each
 
     def create_matching_subscription(
@@ -144,20 +144,20 @@ class BaseNode(Node, Generic[P]):
         profile: QoSProfile,
         *,
         raw: bool = False,
-    ) -> endpoints.MatchingSubscription:
+    ) -> qos.MatchingSubscription:
         """Return a subscription whose request follows the offers of the publishers.
 
         Without a callback the node takes the messages itself.
         """
-        made = endpoints.MatchingSubscription(self, msg_type, topic, callback, profile, raw=raw)
+        made = qos.MatchingSubscription(self, msg_type, topic, callback, profile, raw=raw)
         self._matching.append(made)
         return made
 
     def _with_overrides(
-        self, topic: str, kind: endpoints.Kind, args: tuple[Any, ...], options: dict[str, Any]
+        self, topic: str, kind: qos.Kind, args: tuple[Any, ...], options: dict[str, Any]
     ) -> tuple[Any, ...]:
         """Return the positional arguments, with a copy of the profile that rclpy may change."""
-        overriding = endpoints.overriding_options(self, topic, kind)
+        overriding = qos.overriding_options(self, topic, kind)
         if overriding is None or 'qos_overriding_options' in options:
             return args
         options['qos_overriding_options'] = overriding
@@ -210,15 +210,15 @@ class BaseNode(Node, Generic[P]):
     def _graph_warnings(self) -> list[str]:
         """Return what prevents this node and the others from working together."""
         if self._unused_overrides is None:  # all endpoints exist by now
-            self._unused_overrides = endpoints.unused_overrides(self)
+            self._unused_overrides = qos.unused_overrides(self)
             for name in self._unused_overrides:
                 self.get_logger().warning(f'{name} has no effect: this node has no such endpoint')
         found = [
             *self.start_warnings,
             *self.warnings(),
-            endpoints.command_publishers_problem(self),
-            endpoints.qos_problem(self, (each.held for each in self._matching), 'subscription'),
-            endpoints.qos_problem(self, islice(self._public_publishers(), 20), 'publisher'),
+            qos.command_publishers_problem(self),
+            qos.qos_problem(self, (each.held for each in self._matching), 'subscription'),
+            qos.qos_problem(self, islice(self._public_publishers(), 20), 'publisher'),
         ]
         if self.get_clock().ros_time_is_active and not self.clock_started():
             found.append(f'use_sim_time is set: {NO_CLOCK}')

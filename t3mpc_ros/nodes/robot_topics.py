@@ -1,7 +1,8 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers of the robot state, common to the simulated and the real robot."""
+"""Topics and diagnostics of the robot state, common to the simulated and the real robot."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
@@ -12,16 +13,19 @@ from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Range
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.nodes.common import conversions, qos, sensor_messages
-from t3mpc_ros.nodes.common.conversions import FrameParameters
+from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes.conversions import UNKNOWN_VARIANCE, FrameParameters
 from t3mpc_ros.parameters.table import parameter
 from t3mpc_ros.robot.description import FixedFrame, FrameNames, fixed_frames
-from t3mpc_ros.robot.interface import RANGE_SENSORS, RobotState
+from t3mpc_ros.robot.interface import RANGE_SENSORS, BatteryReading, ImuSample, RobotState
 from t3mpc_ros.robot.sensor_conversions import (
+    GRAVITY,
     BatteryParameters,
     ImuParameters,
     RangeSensorParameters,
 )
+from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
+from t3mpc_ros.simulation.digital_twin import TwinDiagnostics
 
 BATTERY_RATE = 1.0
 """Rate of ``battery_state``, Hz."""
@@ -120,11 +124,11 @@ class RobotPublishers:
             self._battery_publisher = node.create_publisher(
                 BatteryState, 'battery_state', qos.SCALARS
             )
-            self._battery_message = sensor_messages.battery_message(battery)
+            self._battery_message = battery_message(battery)
             self._ranges = [
                 (
                     node.create_publisher(Range, f'range/{name}', qos.SCALARS),
-                    sensor_messages.range_message(
+                    range_message(
                         range_sensor,
                         self._frame(parameters.frame_names.range_sensor(name)),
                     ),
@@ -140,13 +144,9 @@ class RobotPublishers:
         self._topic_parameters, self._rate = parameters, robot.rate
         if robot.sensors is not None:
             imu = robot.sensors[0]
-            self._imu_message = sensor_messages.imu_message(
-                imu, self._frame(parameters.imu_frame_id)
-            )
+            self._imu_message = imu_message(imu, self._frame(parameters.imu_frame_id))
         self._twist_covariances = {
-            slipping: sensor_messages.twist_covariance(
-                robot.geometry, math.inf if slipping else robot.variance
-            )
+            slipping: twist_covariance(robot.geometry, math.inf if slipping else robot.variance)
             for slipping in (False, True)
         }
         self._slipping: bool | None = None
@@ -183,21 +183,17 @@ class RobotPublishers:
     def _publish_sensors(self, state: RobotState) -> None:
         parameters = self._topic_parameters
         if state.imu is not None:
-            self._imu_publisher.publish(
-                sensor_messages.fill_imu(self._imu_message, state.imu, state.stamp_ns)
-            )
+            self._imu_publisher.publish(fill_imu(self._imu_message, state.imu, state.stamp_ns))
         if self._is_due(parameters.range_rate):
             infinity = parameters.range_infinity
             for (publisher, message), distance in zip(self._ranges, state.ranges, strict=False):
                 if not math.isnan(distance):
                     publisher.publish(
-                        sensor_messages.fill_range(
-                            message, distance, state.stamp_ns, infinity=infinity
-                        )
+                        fill_range(message, distance, state.stamp_ns, infinity=infinity)
                     )
         if state.battery is not None and self._is_due(BATTERY_RATE):
             self._battery_publisher.publish(
-                sensor_messages.fill_battery(self._battery_message, state.battery, state.stamp_ns)
+                fill_battery(self._battery_message, state.battery, state.stamp_ns)
             )
 
     def _is_due(self, rate: float) -> bool:
@@ -248,3 +244,161 @@ def _fixed_transform(fixed: FixedFrame, frame: str, child: str, stamp_ns: int) -
     message.transform.translation.z = fixed.z
     message.transform.rotation = conversions.quaternion_from_yaw(fixed.yaw)
     return message
+
+
+def imu_message(parameters: ImuParameters, frame: str) -> Imu:
+    """Return an Imu message with frame and covariances, without a sample.
+
+    Orientation is not measured (its covariance begins with -1, REP 145), nor are quantities out
+    of the plane. The acceleration contains gravity (REP 145): its z is that of a level robot, with
+    the variance of an unknown. The other variances are those of noise and quantisation, without
+    bias and scale error.
+    """
+    message = Imu()
+    message.header.frame_id = frame
+    message.orientation_covariance[0] = -1.0
+    message.linear_acceleration.z = GRAVITY
+    rate = _noise_variance(math.radians(parameters.gyro_noise), parameters.rate_step, parameters)
+    acceleration = _noise_variance(
+        1e-6 * GRAVITY * parameters.accel_noise, parameters.acceleration_step, parameters
+    )
+    message.angular_velocity_covariance = _diagonal(UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, rate)
+    message.linear_acceleration_covariance = _diagonal(
+        acceleration, acceleration, UNKNOWN_VARIANCE
+    )
+    return message
+
+
+def fill_imu(message: Imu, sample: ImuSample, stamp_ns: int) -> Imu:
+    """Write a sample into ``message``."""
+    message.header.stamp = conversions.time_from_ns(stamp_ns)
+    message.angular_velocity.z = sample.angular
+    message.linear_acceleration.x = sample.forward
+    message.linear_acceleration.y = sample.sideways
+    return message
+
+
+def range_message(parameters: RangeSensorParameters, frame: str) -> Range:
+    """Return a Range message with the limits of the sensor, without a distance."""
+    message = Range(
+        radiation_type=Range.INFRARED,
+        field_of_view=parameters.field_of_view,
+        min_range=parameters.minimum,
+        max_range=parameters.maximum,
+        range=math.nan,
+    )
+    message.header.frame_id = frame
+    return message
+
+
+def fill_range(message: Range, distance: float, stamp_ns: int, *, infinity: bool) -> Range:
+    """Write a distance (m) into ``message``.
+
+    REP 117: -inf is closer than the minimum range, inf beyond the maximum range. Without
+    ``infinity`` the latter becomes ``max_range``, which some consumers take for free space.
+    """
+    message.header.stamp = conversions.time_from_ns(stamp_ns)
+    message.range = message.max_range if distance == math.inf and not infinity else distance
+    return message
+
+
+def battery_message(parameters: BatteryParameters) -> BatteryState:
+    """Return a BatteryState message with the type of the battery, without a reading."""
+    return BatteryState(
+        temperature=math.nan,
+        capacity=math.nan,
+        design_capacity=parameters.capacity,
+        power_supply_status=BatteryState.POWER_SUPPLY_STATUS_DISCHARGING,
+        power_supply_technology=BatteryState.POWER_SUPPLY_TECHNOLOGY_LION,
+        present=True,
+        cell_voltage=[math.nan] * parameters.cells,
+        cell_temperature=[math.nan] * parameters.cells,
+    )
+
+
+def fill_battery(message: BatteryState, reading: BatteryReading, stamp_ns: int) -> BatteryState:
+    """Write a reading into ``message``; the current of a discharging battery is negative there."""
+    message.header.stamp = conversions.time_from_ns(stamp_ns)
+    message.voltage = reading.voltage
+    message.current = -reading.current
+    message.percentage = reading.charge
+    message.charge = reading.charge * message.design_capacity
+    return message
+
+
+def twist_covariance(geometry: WheelGeometry, variance: float) -> list[float]:
+    """Return the 36 numbers for a twist from wheel speeds of variance ``variance`` ((rad/s)²).
+
+    By (1), v and omega are the mean and the difference of the wheel speeds. Lateral speed is not
+    measured. With infinite variance (slipping wheels) all variances are that of an unknown.
+    """
+    linear = 0.5 * variance * geometry.wheel_radius**2
+    angular = linear / geometry.half_separation**2
+    return conversions.planar_covariance(
+        (
+            (min(linear, UNKNOWN_VARIANCE), 0.0, 0.0),
+            (0.0, UNKNOWN_VARIANCE, 0.0),
+            (0.0, 0.0, min(angular, UNKNOWN_VARIANCE)),
+        )
+    )
+
+
+def count_variance(step: float, period: float) -> float:
+    """Return the variance ((rad/s)²) of a speed from a counter read every ``period`` seconds.
+
+    The quantisation error of both readings is uniform over one ``step`` (rad).
+    """
+    return (step / period) ** 2 / 6.0
+
+
+def _noise_variance(density: float, step: float, parameters: ImuParameters) -> float:
+    """Return the variance of a noise density behind the low-pass filter, with quantisation."""
+    return density**2 * parameters.noise_bandwidth + step**2 / 12.0
+
+
+def _diagonal(x: float, y: float, z: float) -> list[float]:
+    return [x, 0.0, 0.0, 0.0, y, 0.0, 0.0, 0.0, z]
+
+
+def state_warnings(
+    state: RobotState, twin: TwinDiagnostics | None = None, command_problem: str = ''
+) -> tuple[str, ...]:
+    """Return the warnings about a robot state, most important first.
+
+    ``command_problem`` says why the last command was rejected, '' if it was accepted.
+    """
+    status = state.status
+    found = [state.reason] if state.reason else []
+    if command_problem and command_problem != state.reason:
+        found.append(f'cmd_vel rejected: {command_problem}')
+    if status.slipping and state.reason != SLIP_STOP_REASON:
+        found.append('a wheel slips, is blocked, or has lost steps')
+    if status.imu_fault:
+        found.append('the inertial sensor does not answer')
+    if status.low_battery:
+        volts = f': {state.battery.voltage:.1f} V' if state.battery else ''
+        found.append(f'the battery is low{volts}')
+    if twin is not None and twin.faults:
+        found.append(f'faults: {", ".join(twin.faults)}')
+    if state.lost_steps is not None and any(state.lost_steps):
+        right, left = state.lost_steps
+        found.append(f'steps lost: {right} right, {left} left')
+    return tuple(found)
+
+
+def state_values(state: RobotState, twin: TwinDiagnostics | None = None) -> Mapping[str, object]:
+    """Return the status and the measured quantities of a robot state by diagnostic key."""
+    found: dict[str, object] = {**state.status._asdict()}
+    if state.battery is not None:
+        found['battery_v'] = state.battery.voltage
+    if state.lost_steps is not None:
+        found['lost_steps_right'], found['lost_steps_left'] = state.lost_steps
+    if twin is not None:
+        found |= {
+            'slid_right_m': twin.slid[0],
+            'slid_left_m': twin.slid[1],
+            'gyro_bias_rad_s': twin.gyro_bias,
+            'gyro_bias_estimate_rad_s': twin.estimated_bias,
+            'faults': ', '.join(twin.faults) or 'none',
+        }
+    return found

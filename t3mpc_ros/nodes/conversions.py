@@ -1,11 +1,14 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Conversions between ROS messages and the types of the package, and prefixes of frames."""
+"""ROS messages: conversion to the types of the package, classes by name, frames, and age."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+import importlib
 import math
 import struct
+import time
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, Quaternion, TransformStamped, Twist, TwistStamped
@@ -16,10 +19,10 @@ from sensor_msgs.msg import JointState
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import Parameters, parameter
 
+MAX_CLOCK_LEAD_NS = NANOSECONDS // 20
+"""Lead of the publisher's clock beyond which the age of a message is unknown."""
 UNKNOWN_VARIANCE = 1e6
 """Variance of a quantity that is not measured, in any unit."""
-
-
 MIN_POSE_VARIANCE = 1e-6
 """Least published variance of a pose: 1 mm and 1 mrad."""
 
@@ -234,3 +237,41 @@ def joint_state(
     )
     message.header.stamp = time_from_ns(stamp_ns)
     return message
+
+
+def message_age_ns(info: dict[str, Any]) -> int:
+    """Return the time since the publication of a message, ns; 0 if the middleware has no stamp.
+
+    An executor that was suspended takes messages that have waited: counted from the moment at
+    which it takes them, an unstamped command would be new, however long ago its publisher ended.
+    Both times are of the system clock, also with ``use_sim_time``. The age is negative if the
+    clock of the publisher leads.
+    """
+    published_ns = int(info['source_timestamp'])
+    return time.time_ns() - published_ns if published_ns > 0 else 0
+
+
+def age_problem(age_ns: int, timeout: float) -> str:
+    """Return why a message must not move a robot for which it is valid ``timeout`` s; or ''."""
+    age = age_ns / NANOSECONDS
+    if age_ns < -MAX_CLOCK_LEAD_NS:
+        return f'is from the future: {-age:.3f} s, the clocks of the computers differ'
+    if age >= timeout:
+        return f'is too old: {age:.3f} s, it has waited or the clocks of the computers differ'
+    return ''
+
+
+def type_name(message: type) -> str:
+    """Return ``package/msg/Type`` of a message class."""
+    package = message.__module__.split('.', maxsplit=1)[0]
+    return f'{package}/msg/{message.__name__}'
+
+
+def message_class(name: str) -> type:
+    """Return the class of ``package/msg/Type`` or ``package/srv/Type``, or raise ImportError."""
+    package, folder, word = name.split('/')
+    try:
+        found: type = getattr(importlib.import_module(f'{package}.{folder}'), word)
+    except AttributeError as error:
+        raise ImportError(f'{package} has no {name}') from error
+    return found
