@@ -3,6 +3,7 @@
 """``t3mpc topic``, ``param``, ``call`` and ``stop``: for a graph without a ROS installation."""
 
 import argparse
+from collections import deque
 from collections.abc import Callable
 import sys
 import time
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 REPORT_PERIOD = 1.0
 """Time between two lines of a rate, s."""
+WINDOW = 10_000
+"""Number of messages over which a rate is averaged."""
 
 
 def add_parsers(commands: Any) -> None:
@@ -88,16 +91,17 @@ def _echo(graph: 'Graph', options: argparse.Namespace) -> int:
 
 
 def _rate(graph: 'Graph', options: argparse.Namespace) -> int:
-    from t3mpc_ros.nodes.graph_tools import RateMeter
+    from t3mpc_ros.nodes.graph_tools import rate_text
 
-    meter, due = RateMeter(), time.monotonic() + REPORT_PERIOD
+    arrivals: deque[float] = deque(maxlen=WINDOW)
+    due = time.monotonic() + REPORT_PERIOD
     for message in graph.messages(options.topic):
         now = time.monotonic()
         if message is not None:
-            meter.arrived(now)
+            arrivals.append(now)
         elif now >= due:
             due += REPORT_PERIOD
-            if text := meter.text():
+            if text := rate_text(arrivals):
                 print(text, flush=True)
     return 0
 

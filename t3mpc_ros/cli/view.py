@@ -3,7 +3,6 @@
 """``t3mpc view``: a robot, or a recorded run, on a page in a browser of this machine."""
 
 import argparse
-from collections.abc import Mapping
 from pathlib import Path
 import sys
 import time
@@ -14,7 +13,7 @@ from t3mpc_ros.parameters.command_line import bounded_int
 from t3mpc_ros.stop_signal import StopSignal
 
 if TYPE_CHECKING:
-    from t3mpc_ros.view.server import Command, PageServer
+    from t3mpc_ros.view.server import PageServer
 
 DEFAULT_PORT = 8765
 """TCP port of the page."""
@@ -46,7 +45,7 @@ def add_parser(commands: Any) -> None:
 def _view(options: argparse.Namespace) -> int:
     # Imported only when it is used: `t3mpc --help` stays fast.
     from t3mpc_ros.view.live_run import LiveRun
-    from t3mpc_ros.view.server import CommandError, PageServer
+    from t3mpc_ros.view.server import PageServer
 
     with StopSignal() as stop:
         if options.bag is not None:
@@ -58,19 +57,11 @@ def _view(options: argparse.Namespace) -> int:
                 while not stop():
                     time.sleep(0.1)
             return 0
-        from t3mpc_ros.nodes.viewer import CommandFailedError, view_node  # takes a second
+        from t3mpc_ros.nodes.viewer import view_node  # takes a second
 
         run = LiveRun()
         with view_node(run, options.namespace) as node:
-
-            def execute(name: str, arguments: Mapping[str, Any]) -> str:
-                try:
-                    done: str = node.command(name, arguments)
-                except CommandFailedError as error:
-                    raise CommandError(str(error)) from None
-                return done
-
-            command: Command | None = None if options.read_only else execute
+            command = None if options.read_only else node.command
             with PageServer(run, command, options.port) as server:
                 _announce(server, options)
                 node.spin(stop)

@@ -8,14 +8,13 @@ Words and output are those of ``ros2 topic``, ``ros2 param`` and ``ros2 service 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-import importlib
 import math
-import statistics
 import time
 from typing import Any
 
-from rcl_interfaces.msg import ParameterType
-from rcl_interfaces.srv import GetParameters, ListParameters
+import numpy as np
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -25,7 +24,7 @@ import yaml
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.conversions import message_class
 from t3mpc_ros.nodes.entry_point import init_ros
-from t3mpc_ros.nodes.remote_parameters import RemoteParameters, plain_value
+from t3mpc_ros.nodes.remote_parameters import parameter_message, plain_value, refusal, type_text
 
 LISTING = 1.5
 """Time in which nodes are discovered before they are listed, s."""
@@ -34,19 +33,9 @@ DISCOVERY = 6.0
 REPLY = 5.0
 """Longest wait for the answer of a service, s."""
 E_STOP = 'e_stop'
-WINDOW = 10_000
-"""Number of messages over which a rate is averaged."""
 
-_VALUE_TEXTS = {
-    ParameterType.PARAMETER_BOOL: 'Boolean value is',
-    ParameterType.PARAMETER_INTEGER: 'Integer value is',
-    ParameterType.PARAMETER_DOUBLE: 'Double value is',
-    ParameterType.PARAMETER_STRING: 'String value is',
-    ParameterType.PARAMETER_BOOL_ARRAY: 'Boolean values are',
-    ParameterType.PARAMETER_INTEGER_ARRAY: 'Integer values are',
-    ParameterType.PARAMETER_DOUBLE_ARRAY: 'Double values are',
-    ParameterType.PARAMETER_STRING_ARRAY: 'String values are',
-}
+_WORDS = {'bool': 'Boolean', 'int': 'Integer', 'float': 'Double', 'str': 'String'}
+"""Words of ``ros2 param`` for the types of parameters."""
 
 
 class GraphError(RuntimeError):
@@ -54,15 +43,7 @@ class GraphError(RuntimeError):
 
 
 class Graph:
-    """A node that looks at the graph and asks other nodes.
-
-    Parameters
-    ----------
-    node
-        The node; not spun by anything else.
-    stop
-        Returns whether to end a wait.
-    """
+    """A node, spun by nothing else, that examines the graph; ``stop`` ends every wait."""
 
     def __init__(self, node: Node, stop: Callable[[], bool] = lambda: False) -> None:
         self._node = node
@@ -106,12 +87,8 @@ class Graph:
     def messages(self, topic: str) -> Iterator[Any]:
         """Yield the messages of a topic from now on, and None about twenty times a second.
 
-        The request matches the offers of the publishers.
-
-        Raises
-        ------
-        GraphError
-            Nothing publishes the topic, or its type is not installed or not unique.
+        The request matches the offers of the publishers. GraphError if nothing publishes the
+        topic, or its type is not installed or not unique.
         """
         name = self._node.resolve_topic_name(topic)
         self.discover(lambda: self._node.count_publishers(name) > 0)
@@ -155,43 +132,26 @@ class Graph:
         return sorted(answer.result.names)
 
     def parameter_text(self, node: str, name: str) -> str:
-        """Return a value with its type in words.
-
-        Raises
-        ------
-        GraphError
-            The node has no such parameter, or does not answer.
-        """
-        request = GetParameters.Request(names=[name])
-        values = self.call(f'{node}/get_parameters', GetParameters, request).values
-        value = values[0] if values else None
-        if value is None or value.type not in _VALUE_TEXTS:
-            raise GraphError(f'{node} has no parameter {name} (t3mpc param list {node})')
-        return f'{_VALUE_TEXTS[value.type]}: {plain_value(value)}'
+        """Return a value with its type in words; errors as of :meth:`call`."""
+        value = self._parameter(node, name)
+        *many, kind = type_text(value.type).split(' of ')
+        return f'{_WORDS[kind]} {"values are" if many else "value is"}: {plain_value(value)}'
 
     def set_parameter(self, node: str, name: str, value: object) -> str:
         """Set a parameter; return the reason of a refusal, or nothing.
 
-        Raises
-        ------
-        GraphError
-            The node has no such parameter, or does not answer.
-        ValueError
-            The value cannot be one of its type.
+        ValueError if the value cannot be one of its type; errors as of :meth:`call`.
         """
-        remote = RemoteParameters(self._node, node)
-        answers: list[Any] = []
-        try:
-            if not self._spin_until(remote.ready, DISCOVERY):
-                raise GraphError(f'{node} is no node with parameters (t3mpc param list)')
-            remote.read(answers.append)
-            if self._spin_until(lambda: len(answers) > 0, REPLY):
-                remote.set(name, value, answers.append)
-            if not self._spin_until(lambda: len(answers) > 1, REPLY):
-                raise GraphError(f'no answer of {node} within {REPLY:g} s: is it alive?')
-        finally:
-            remote.destroy()
-        return str(answers[1])
+        message = parameter_message(name, self._parameter(node, name).type, value)
+        request = SetParameters.Request(parameters=[message])
+        return refusal(self.call(f'{node}/set_parameters', SetParameters, request))
+
+    def _parameter(self, node: str, name: str) -> ParameterValue:
+        request = GetParameters.Request(names=[name])
+        values = self.call(f'{node}/get_parameters', GetParameters, request).values
+        if not values or type_text(values[0].type) == 'unset':
+            raise GraphError(f'{node} has no parameter {name} (t3mpc param list {node})')
+        return values[0]
 
     # -- services ---------------------------------------------------------------------------------
 
@@ -200,13 +160,7 @@ class Graph:
         return dict(sorted(self._node.get_service_names_and_types()))
 
     def call(self, name: str, kind: type, request: Any) -> Any:
-        """Return the answer of a service.
-
-        Raises
-        ------
-        GraphError
-            No node offers it, or the answer does not come.
-        """
+        """Return the answer of a service; GraphError if no node offers it, or none comes."""
         client = self._node.create_client(kind, name)
         try:
             if not self._spin_until(client.service_is_ready, DISCOVERY):
@@ -221,20 +175,16 @@ class Graph:
     def call_by_name(self, name: str, values: Mapping[str, object]) -> Any:
         """Return the answer of a service whose type the graph knows; fields by name.
 
-        Raises
-        ------
-        GraphError
-            No node offers it, its type is not installed, or a field does not fit.
+        GraphError also if its type is not installed, or a field does not fit.
         """
         full = self._node.resolve_service_name(name)
         self.discover(lambda: full in self.services())
         kinds = self.services().get(full)
         if not kinds:
             raise GraphError(f'no node offers the service {full}')
-        package, _, word = kinds[0].split('/')
         try:
-            kind = getattr(importlib.import_module(f'{package}.srv'), word)
-        except (ImportError, AttributeError):
+            kind: Any = message_class(kinds[0])
+        except ImportError:
             raise GraphError(f'the type of {full} is not installed: {kinds[0]}') from None
         request = kind.Request(check_fields=True)
         for field, value in values.items():
@@ -309,13 +259,7 @@ def plain(message: Any) -> Any:
 
 
 def message_text(message: Any, field: str = '') -> str:
-    """Return a message, or one of its fields (``pose.pose.position``), as YAML.
-
-    Raises
-    ------
-    GraphError
-        It has no such field.
-    """
+    """Return a message, or one of its fields (``pose.pose.position``), as YAML."""
     for name in field.split('.') if field else ():
         known = getattr(message, 'get_fields_and_field_types', dict)()
         if name not in known:
@@ -328,27 +272,15 @@ def message_text(message: Any, field: str = '') -> str:
     return text
 
 
-class RateMeter:
-    """Rate of the messages of a topic, by the times of their arrival."""
-
-    def __init__(self) -> None:
-        self._last: float | None = None
-        self._periods: deque[float] = deque(maxlen=WINDOW)
-
-    def arrived(self, now: float) -> None:
-        """Count a message at time ``now``, s."""
-        if self._last is not None:
-            self._periods.append(now - self._last)
-        self._last = now
-
-    def text(self) -> str:
-        """Return rate, least and largest period and their deviation; '' before two messages."""
-        if not self._periods:
-            return ''
-        mean = statistics.fmean(self._periods)
-        rate = 1.0 / mean if mean > 0.0 else math.inf
-        return (
-            f'average rate: {rate:.3f}\n'
-            f'\tmin: {min(self._periods):.3f}s max: {max(self._periods):.3f}s '
-            f'std dev: {statistics.pstdev(self._periods):.5f}s window: {len(self._periods) + 1}'
-        )
+def rate_text(times: Sequence[float]) -> str:
+    """Return rate, least and largest period and their deviation of arrivals, s; '' of one."""
+    if len(times) < 2:
+        return ''
+    periods = np.diff(times)
+    mean = float(periods.mean())
+    rate = 1.0 / mean if mean > 0.0 else math.inf
+    return (
+        f'average rate: {rate:.3f}\n'
+        f'\tmin: {periods.min():.3f}s max: {periods.max():.3f}s '
+        f'std dev: {periods.std():.5f}s window: {len(times)}'
+    )

@@ -238,19 +238,24 @@ class MatchingSubscription:
         self._node.get_logger().info(f'{name} is published best effort')
 
     def take_waiting(self) -> list[Any]:
-        """Return the messages that wait in the queue.
+        """Return the messages that wait in the queue."""
+        return take_waiting(self.held, raw=self._raw)
 
-        The executor takes one message of a subscription per cycle: a queue that has filled while
-        it was busy would otherwise stay full, and every message would wait as long.
-        """
-        held = self.held
-        messages: list[Any] = []
-        with held.handle:
-            while len(messages) < held.qos_profile.depth:
-                if (item := held.handle.take_message(held.msg_type, self._raw)) is None:
-                    break
-                messages.append(item[0])
-        return messages
+
+def take_waiting(subscription: Subscription, *, raw: bool = False) -> list[Any]:
+    """Return the messages that wait in the queue of a subscription.
+
+    The executor takes one message of a subscription per cycle: a queue that has filled while it
+    was busy would otherwise stay full, and every message would wait as long.
+    """
+    messages: list[Any] = []
+    handle = subscription.handle
+    with handle:
+        while len(messages) < subscription.qos_profile.depth:
+            if (item := handle.take_message(subscription.msg_type, raw)) is None:
+                break
+            messages.append(item[0])
+    return messages
 
 
 def command_publishers_problem(node: Node) -> str:

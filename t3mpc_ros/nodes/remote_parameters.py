@@ -6,67 +6,37 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 import re
 import sys
-from typing import Any, TypeVar
+from typing import Any
 
-from rcl_interfaces.msg import Parameter, ParameterDescriptor, ParameterType, ParameterValue
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterDescriptor, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.client import Client
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.task import Future
 
-T = TypeVar('T')
-
+SERVICES = {
+    'list_parameters': ListParameters,
+    'describe_parameters': DescribeParameters,
+    'get_parameters': GetParameters,
+    'set_parameters': SetParameters,
+}
 _UNIT = re.compile(r' \[([^\]]+)\](?=$| \()')
 """Unit at the end of a description; a source may follow in parentheses."""
-_RANGE_KINDS = {
-    ParameterType.PARAMETER_INTEGER: 'integer_range',
-    ParameterType.PARAMETER_DOUBLE: 'floating_point_range',
-}
-_FIELDS = {
-    ParameterType.PARAMETER_BOOL: 'bool_value',
-    ParameterType.PARAMETER_INTEGER: 'integer_value',
-    ParameterType.PARAMETER_DOUBLE: 'double_value',
-    ParameterType.PARAMETER_STRING: 'string_value',
-    ParameterType.PARAMETER_BOOL_ARRAY: 'bool_array_value',
-    ParameterType.PARAMETER_INTEGER_ARRAY: 'integer_array_value',
-    ParameterType.PARAMETER_DOUBLE_ARRAY: 'double_array_value',
-    ParameterType.PARAMETER_STRING_ARRAY: 'string_array_value',
-}
-TYPE_NAMES = {
-    ParameterType.PARAMETER_BOOL: 'bool',
-    ParameterType.PARAMETER_INTEGER: 'int',
-    ParameterType.PARAMETER_DOUBLE: 'float',
-    ParameterType.PARAMETER_STRING: 'str',
-    ParameterType.PARAMETER_BOOL_ARRAY: 'list of bool',
-    ParameterType.PARAMETER_INTEGER_ARRAY: 'list of int',
-    ParameterType.PARAMETER_DOUBLE_ARRAY: 'list of float',
-    ParameterType.PARAMETER_STRING_ARRAY: 'list of str',
-}
+_TYPES = {'BOOL': 'bool', 'INTEGER': 'int', 'DOUBLE': 'float', 'STRING': 'str'}
+_UNBOUNDED = {'INTEGER': 2**63 - 1, 'DOUBLE': sys.float_info.max}
+"""Magnitude of a bound of a range that has none."""
 
 
 class RemoteParameters:
-    """Parameters of one other node; every answer arrives through a callback.
-
-    Parameters
-    ----------
-    node
-        Node that asks; an executor spins it.
-    name
-        Full name of the other node.
-    """
+    """Parameters of the node ``name``; every answer arrives through a callback."""
 
     def __init__(self, node: Node, name: str) -> None:
         self.name = name
         self._node = node
         self._clients: dict[str, Client] = {
-            word: node.create_client(kind, f'{name}/{word}')
-            for word, kind in (
-                ('list_parameters', ListParameters),
-                ('describe_parameters', DescribeParameters),
-                ('get_parameters', GetParameters),
-                ('set_parameters', SetParameters),
-            )
+            word: node.create_client(kind, f'{name}/{word}') for word, kind in SERVICES.items()
         }
         self._types: dict[str, int] = {}
 
@@ -80,54 +50,44 @@ class RemoteParameters:
         return all(client.service_is_ready() for client in self._clients.values())
 
     def read(self, found: Callable[[Sequence[Mapping[str, Any]]], None]) -> None:
-        """Ask for all parameters; ``found`` gets one row each, see :func:`parameter_row`."""
+        """Request all parameters; ``found`` gets one row each, see :func:`parameter_row`."""
+
+        def listed(answer: Any) -> None:
+            names = sorted(answer.result.names)
+            self._call('describe_parameters', partial(described, names), names=names)
 
         def described(names: list[str], answer: Any) -> None:
-            descriptors = answer.descriptors
-            self._types = {each.name: each.type for each in descriptors}
-            request = GetParameters.Request(names=names)
-            self._call('get_parameters', request, partial(valued, descriptors))
+            self._types = {each.name: each.type for each in answer.descriptors}
+            self._call('get_parameters', partial(valued, answer.descriptors), names=names)
 
         def valued(descriptors: list[ParameterDescriptor], answer: Any) -> None:
             found([parameter_row(*pair) for pair in zip(descriptors, answer.values, strict=False)])
 
-        def listed(answer: Any) -> None:
-            names = sorted(answer.result.names)
-            request = DescribeParameters.Request(names=names)
-            self._call('describe_parameters', request, partial(described, names))
-
-        self._call('list_parameters', ListParameters.Request(), listed)
+        self._call('list_parameters', listed)
 
     def set(self, name: str, value: Any, done: Callable[[str], None]) -> None:
-        """Ask the node to set a parameter; ``done`` gets the reason of a refusal, or nothing.
+        """Request a new value; ``done`` gets the reason of a refusal, or nothing.
 
-        Raises
-        ------
-        ValueError
-            The node has no such parameter, or the value cannot be one of its type.
+        ValueError if the node has no such parameter, or the value cannot be one of its type.
         """
         if name not in self._types:
             raise ValueError(f'{self.name} has no parameter {name}')
-        kind = self._types[name]
-        message = ParameterValue(type=kind, check_fields=True)
-        try:
-            setattr(message, _FIELDS[kind], _converted(kind, value))
-        except (AssertionError, TypeError, ValueError):
-            raise ValueError(f'{name} must be {TYPE_NAMES[kind]}: got {value!r}') from None
-        request = SetParameters.Request(parameters=[Parameter(name=name, value=message)])
+        message = parameter_message(name, self._types[name], value)
+        self._call('set_parameters', lambda answer: done(refusal(answer)), parameters=[message])
 
-        def answered(answer: Any) -> None:
-            (result,) = answer.results
-            done('' if result.successful else result.reason or 'refused without a reason')
-
-        self._call('set_parameters', request, answered)
-
-    def _call(self, word: str, request: Any, done: Callable[[Any], None]) -> None:
+    def _call(self, word: str, done: Callable[[Any], None], **fields: Any) -> None:
         def finish(future: Future) -> None:
             if (answer := future.result()) is not None:
                 done(answer)
 
+        request = SERVICES[word].Request(**fields)
         self._clients[word].call_async(request).add_done_callback(finish)
+
+
+def refusal(answer: SetParameters.Response) -> str:
+    """Return why a parameter was not set, or nothing."""
+    (result,) = answer.results
+    return '' if result.successful else result.reason or 'refused without a reason'
 
 
 def parameter_row(descriptor: ParameterDescriptor, value: ParameterValue) -> Mapping[str, Any]:
@@ -139,38 +99,30 @@ def parameter_row(descriptor: ParameterDescriptor, value: ParameterValue) -> Map
     text, unit = descriptor.description, ''
     if match := _UNIT.search(text):
         text, unit = text[: match.start()] + text[match.end() :], match[1]
-    low = high = None
-    for bound in getattr(descriptor, _RANGE_KINDS.get(descriptor.type, ''), ()):
-        low, high = (
-            None if abs(each) >= limit else each
-            for each, limit in (
-                (bound.from_value, _LIMITS[descriptor.type]),
-                (bound.to_value, _LIMITS[descriptor.type]),
-            )
-        )
+    bounds: tuple[float | None, ...] = (None, None)
+    for bound in (*descriptor.integer_range, *descriptor.floating_point_range):
+        limit = _UNBOUNDED[Parameter.Type(descriptor.type).name]
+        both = bound.from_value, bound.to_value
+        bounds = tuple(None if abs(each) >= limit else each for each in both)
+    values, prefix = descriptor.additional_constraints, 'one of '
     return {
         'name': descriptor.name,
-        'type': TYPE_NAMES.get(descriptor.type, 'unset'),
+        'type': type_text(descriptor.type),
         'value': plain_value(value),
         'unit': unit,
-        'low': low,
-        'high': high,
+        'low': bounds[0],
+        'high': bounds[1],
         'text': text,
-        'choices': _choices(descriptor.additional_constraints),
+        'choices': values.removeprefix(prefix).split(', ') if values.startswith(prefix) else [],
         'dynamic': not descriptor.read_only,
     }
 
 
-_LIMITS = {
-    ParameterType.PARAMETER_INTEGER: 2**63 - 1,
-    ParameterType.PARAMETER_DOUBLE: sys.float_info.max,
-}
-"""Bounds from which on a range has no bound."""
-
-
-def _choices(constraints: str) -> list[str]:
-    prefix = 'one of '
-    return constraints.removeprefix(prefix).split(', ') if constraints.startswith(prefix) else []
+def type_text(kind: int) -> str:
+    """Return the name of a type of parameters: ``float``, ``list of int``."""
+    word, is_list = _kind(kind)
+    text = _TYPES.get(word, 'unset')
+    return f'list of {text}' if is_list else text
 
 
 def plain_value(message: ParameterValue) -> Any:
@@ -179,25 +131,25 @@ def plain_value(message: ParameterValue) -> Any:
     return value if value is None or isinstance(value, bool | int | float | str) else list(value)
 
 
-def _converted(kind: int, value: Any) -> Any:
-    """Return a value of JSON or a command line as a parameter of the type takes it."""
-    expected = _EXPECTED.get(kind)
-    if expected is not None and (not isinstance(value, expected) or _is_flag(value, kind)):
-        raise TypeError
-    if kind == ParameterType.PARAMETER_DOUBLE:
-        return float(value)
-    if kind == ParameterType.PARAMETER_DOUBLE_ARRAY:
-        return [float(each) for each in value]
-    return value
+def parameter_message(name: str, kind: int, value: Any) -> ParameterMessage:
+    """Return a parameter with a value of JSON or YAML; ValueError if its type has no such one."""
+    word, is_list = _kind(kind)
+    message = ParameterValue(type=kind, check_fields=True)
+    try:
+        # The message accepts True as a number, and no whole number as a float.
+        numbers = value if is_list else [value]
+        if word != 'BOOL' and any(isinstance(each, bool) for each in numbers):
+            raise TypeError
+        if word == 'DOUBLE':
+            numbers = [float(each) if isinstance(each, int) else each for each in numbers]
+            value = numbers if is_list else numbers[0]
+        setattr(message, f'{Parameter.Type(kind).name.lower()}_value', value)
+    except (AssertionError, TypeError, ValueError, OverflowError):
+        raise ValueError(f'{name} must be {type_text(kind)}: got {value!r}') from None
+    return ParameterMessage(name=name, value=message)
 
 
-_EXPECTED: Mapping[int, Any] = {
-    ParameterType.PARAMETER_BOOL: bool,
-    ParameterType.PARAMETER_INTEGER: int,
-    ParameterType.PARAMETER_DOUBLE: int | float,
-    ParameterType.PARAMETER_STRING: str,
-}
-
-
-def _is_flag(value: Any, kind: int) -> bool:
-    return isinstance(value, bool) and kind != ParameterType.PARAMETER_BOOL
+def _kind(kind: int) -> tuple[str, bool]:
+    """Return the name of the element type of parameters, and whether they are lists."""
+    word, _, array = Parameter.Type(kind).name.partition('_A')
+    return word, bool(array)

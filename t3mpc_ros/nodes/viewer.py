@@ -15,7 +15,7 @@ import math
 from queue import Empty, SimpleQueue
 import struct
 import time
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
@@ -39,14 +39,12 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, State
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.entry_point import init_ros
-from t3mpc_ros.nodes.qos import PolledCallbackGroup
+from t3mpc_ros.nodes.qos import PolledCallbackGroup, take_waiting
 from t3mpc_ros.nodes.remote_parameters import RemoteParameters, plain_value
 from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 from t3mpc_ros.simulation.world import world_outline
-
-Condition = Literal['normal', 'warning', 'stopped']
 
 PERIOD = 0.05
 """Time between two polls, s."""
@@ -76,34 +74,6 @@ class CommandFailedError(RuntimeError):
     """A command that was not executed; the text says why and what to do."""
 
 
-class Sink(Protocol):
-    """Receives what the node collects."""
-
-    def add(self, stream: str, time: float, values: Sequence[float]) -> None:
-        """Add a sample."""
-        ...
-
-    def set(self, fact: str, value: Any) -> None:
-        """Set a fact."""
-        ...
-
-    def report(self, time: float, kind: str, text: str) -> None:
-        """Add an event."""
-        ...
-
-    def node_report(self, name: str, text: str, condition: Condition) -> None:
-        """Replace the newest report of a node."""
-        ...
-
-    def node_gone(self, name: str) -> None:
-        """Discard the report of a node."""
-        ...
-
-    def tick(self, now: float) -> None:
-        """Update what depends on the time since the last message."""
-        ...
-
-
 class _Source(NamedTuple):
     """A subscription and the method that takes its messages."""
 
@@ -113,17 +83,12 @@ class _Source(NamedTuple):
 
 
 class ViewNode(Node):
-    """Shows a robot: hands samples, facts and reports to a sink, and executes commands.
+    """Collects samples, facts and reports of the robot in a namespace, and executes commands.
 
-    Parameters
-    ----------
-    sink
-        Receives everything, in the thread of :meth:`spin`.
-    namespace
-        Namespace of the robot.
+    ``sink``, a :class:`t3mpc_ros.view.live_run.LiveRun`, gets them in the thread of :meth:`spin`.
     """
 
-    def __init__(self, sink: Sink, namespace: str = '') -> None:
+    def __init__(self, sink: Any, namespace: str = '') -> None:
         super().__init__(
             'view', namespace=namespace, start_parameter_services=False, enable_rosout=False
         )
@@ -172,12 +137,8 @@ class ViewNode(Node):
     def poll(self) -> None:
         """Take the messages that wait, and start the commands that wait."""
         for source in list(self._sources.values()):
-            held = source.subscription
-            with held.handle:
-                for _ in range(held.qos_profile.depth):
-                    if (item := held.handle.take_message(held.msg_type, source.raw)) is None:
-                        break
-                    source.take(item[0])
+            for message in take_waiting(source.subscription, raw=source.raw):
+                source.take(message)
         self._add_collected('ranges', self._ranges)
         self._add_collected('terms', self._terms)
         with suppress(Empty):
@@ -339,11 +300,9 @@ class ViewNode(Node):
         rows = self._rows[name]
         self._sink.set(f'parameters/{name}', [dict(row) for row in rows.values()])
         if 'wheel_radius' in rows and 'wheel_separation' in rows:
-            radius, separation = (
-                rows[each]['value'] for each in ('wheel_radius', 'wheel_separation')
-            )
-            self._geometry = WheelGeometry(radius, separation)
-            self._sink.set('robot', {'wheel_radius': radius, 'wheel_separation': separation})
+            size = {each: rows[each]['value'] for each in ('wheel_radius', 'wheel_separation')}
+            self._geometry = WheelGeometry(*size.values())
+            self._sink.set('robot', size)
         if name == 'sim_robot' and (world := rows.get('world')):
             self._sink.set('world', world_outline(world['value']))
 
@@ -364,12 +323,7 @@ class ViewNode(Node):
         """Execute a command from another thread while :meth:`spin` runs; return what was done.
 
         ``set`` takes node, name and value of a parameter; the services in :data:`SERVICES` with
-        a SetBool take ``on``.
-
-        Raises
-        ------
-        CommandFailedError
-            It was refused, there is no answer, or nothing offers the service.
+        a SetBool take ``on``. CommandFailedError if it was refused, or without an answer.
         """
         reply: Future[str] = Future()
         self._pending.put(partial(self._start, name, arguments, reply))
@@ -431,13 +385,10 @@ class ViewNode(Node):
 
 
 @contextmanager
-def view_node(sink: Sink, namespace: str = '') -> Iterator[ViewNode]:
+def view_node(sink: Any, namespace: str = '') -> Iterator[ViewNode]:
     """Return a node in a context of its own, and end both after the ``with`` block.
 
-    Raises
-    ------
-    ValueError
-        The namespace is not valid in ROS.
+    ValueError for a namespace that is not valid in ROS.
     """
     init_ros([])
     try:
@@ -455,8 +406,8 @@ def view_node(sink: Sink, namespace: str = '') -> Iterator[ViewNode]:
         rclpy.try_shutdown()
 
 
-_CONDITIONS: Sequence[Condition] = ('normal', 'warning', 'stopped')
-_CONTROLLER_CONDITIONS: Mapping[str, Condition] = {
+_CONDITIONS = ('normal', 'warning', 'stopped')
+_CONTROLLER_CONDITIONS = {
     reason.value: 'normal'
     if reason is Reason.TRACKING
     else 'warning'
@@ -466,7 +417,7 @@ _CONTROLLER_CONDITIONS: Mapping[str, Condition] = {
 }
 
 
-def _stop_condition(name: str, text: str) -> Condition | None:
+def _stop_condition(name: str, text: str) -> str | None:
     """Return whether a text of a node is a reason to stand; None if it is about something else."""
     if name == 'controller':
         return _CONTROLLER_CONDITIONS.get(text.removeprefix('stopped: '))

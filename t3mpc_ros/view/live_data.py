@@ -33,14 +33,8 @@ class LiveData:
     """Collects what happens in a run; each reader asks for what is new to it.
 
     Every change has a number, ascending from 1. A reader remembers the number up to which it has
-    read, its *cursor*; a new reader begins with 0 and gets all that is kept.
-
-    Parameters
-    ----------
-    span
-        Time for which samples are kept, s.
-    step
-        Least time between two samples of a stream, s; those between are left out.
+    read, its *cursor*; a new reader begins with 0 and gets all that is kept. Samples are kept for
+    ``span`` s; those less than ``step`` s after the one before are left out.
     """
 
     def __init__(self, span: float = SPAN, step: float = 0.0) -> None:
@@ -74,17 +68,7 @@ class LiveData:
                 self._facts[fact] = self._next(), value
 
     def report(self, time: float, kind: str, text: str) -> None:
-        """Add an event.
-
-        Parameters
-        ----------
-        time
-            s
-        kind
-            ``switch``, ``fault``, ``stop``, ``command`` or ``note``.
-        text
-            One line.
-        """
+        """Add an event: ``switch``, ``fault``, ``stop``, ``command`` or ``note``, in one line."""
         with self._changed:
             self._events.append((self._next(), {'time': time, 'kind': kind, 'text': text}))
 

@@ -1,11 +1,64 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""State of a run that goes on: its data, what its nodes report, and the banner from both."""
+"""A run in real time: its data, what its nodes report, and the banner that says what it does."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
 
-from t3mpc_ros.view.banner import Banner, Condition, NodeReport, banner
 from t3mpc_ros.view.live_data import STEP, LiveData
+
+Condition = Literal['normal', 'warning', 'stopped']
+
+LOST = 1.5
+"""Time without odometry after which the connection counts as lost, s."""
+ESTOP = 'emergency stop'
+"""Begin of the reason of a robot whose e-stop is latched."""
+
+
+class NodeReport(NamedTuple):
+    """Newest report of a node about itself, from its log or its diagnostics."""
+
+    text: str
+    condition: Condition = 'normal'
+
+
+PAUSED = NodeReport('paused')
+"""Report of a reference generator that was paused."""
+
+
+class Banner(NamedTuple):
+    """One line in large letters, and the reason for it."""
+
+    kind: Literal['good', 'warning', 'stopped', 'lost']
+    headline: str
+    detail: str
+
+
+def banner(reports: Mapping[str, NodeReport], odometry_age: float | None) -> Banner:
+    """Return what a person has to know first.
+
+    ``reports`` are the newest ones of the nodes; ``odometry_age`` is the time since the last
+    odometry, s, None before the first one.
+    """
+    worse = {name: each for name, each in reports.items() if each.condition != 'normal'}
+    stops = {name: each for name, each in worse.items() if each.condition == 'stopped'}
+    detail = '; '.join(f'{name}: {each.text}' for name, each in (stops or worse).items())
+    if odometry_age is None:
+        return Banner('lost', 'Waiting for a robot', detail or 'no odometry on the graph yet')
+    if odometry_age > LOST:
+        return Banner('lost', 'Connection lost', f'no odometry for {odometry_age:.0f} s')
+    if any(each.text.startswith(ESTOP) for each in stops.values()):
+        return Banner('stopped', 'E-STOP', detail)
+    if reports.get('reference_generator') == PAUSED:
+        return Banner('warning', 'Reference paused', detail)
+    if stops:
+        return Banner('stopped', 'Stopped', detail)
+    if worse:
+        return Banner('warning', 'Driving, with a warning', detail)
+    if 'controller' in reports:
+        return Banner('good', 'Tracking the reference', '')
+    return Banner('good', 'Following commands' if reports else 'Receiving odometry', '')
+
 
 ODOMETRY = 'odometry'
 """Stream whose samples show that a robot is connected."""
@@ -41,13 +94,7 @@ class LiveRun(LiveData):
         self._reports.pop(name, None)
 
     def tick(self, now: float) -> None:
-        """Update the banner; call it several times a second.
-
-        Parameters
-        ----------
-        now
-            Time that passes steadily, s.
-        """
+        """Update the banner at steady time ``now`` (s); call it several times a second."""
         if self._odometry_pending:
             self._odometry_pending, self._last_odometry = False, now
         age = None if self._last_odometry is None else now - self._last_odometry

@@ -47,23 +47,11 @@ _HEADERS = {
 }
 
 Command = Callable[[str, Mapping[str, Json]], str]
-"""Executes a command: name and arguments; returns what was done."""
-
-
-class CommandError(RuntimeError):
-    """A command that was not executed; the text says why and what to do."""
+"""Executes a command: name and arguments; returns what was done, or raises RuntimeError."""
 
 
 class RefusedError(Exception):
-    """A request that is refused.
-
-    Parameters
-    ----------
-    status
-        HTTP status.
-    text
-        Reason, for the sender.
-    """
+    """A request that is refused: HTTP status, and the reason for the sender."""
 
     def __init__(self, status: HTTPStatus, text: str) -> None:
         super().__init__(text)
@@ -73,20 +61,8 @@ class RefusedError(Exception):
 class PageServer:
     """Serves the live page of one run, in threads of its own; a context manager.
 
-    Parameters
-    ----------
-    data
-        What the page shows.
-    command
-        Executes a command of the page, in a thread of the server; raises :class:`CommandError`.
-        None: the page shows, and commands are refused.
-    port
-        TCP port on :data:`ADDRESS`; 0: a free one.
-
-    Raises
-    ------
-    OSError
-        The port is in use.
+    ``command`` runs in a thread of the server; None: the page shows only. ``port`` is a TCP port
+    on :data:`ADDRESS`, 0 a free one; OSError if it is in use.
     """
 
     def __init__(self, data: LiveData, command: Command | None, port: int) -> None:
@@ -214,7 +190,7 @@ class _Handler(BaseHTTPRequestHandler):
         name, arguments = self._read_command(page)
         try:
             done = page.command(name, arguments)
-        except CommandError as error:
+        except RuntimeError as error:
             self._send(json.dumps({'error': str(error)}), 'application/json', HTTPStatus.CONFLICT)
         else:
             self._send(json.dumps({'done': done}), 'application/json')

@@ -189,7 +189,7 @@ BAG = {
     'cli.bag.recover_bag': lambda output, **_: RecoveryResult(output, ()),
 }
 VIEW = {
-    'nodes.viewer.view_node': context(SimpleNamespace(spin=lambda stop: None)),
+    'nodes.viewer.view_node': context(SimpleNamespace(spin=lambda stop: None, command=print)),
     'view.server.PageServer': context(SimpleNamespace(url='http://page')),
     'cli.recorded_run.recorded_run': 'run',
 }

@@ -9,9 +9,8 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from t3mpc_ros.view.banner import LOST, NodeReport, banner
 from t3mpc_ros.view.live_data import MAX_EVENTS, SPAN, LiveData
-from t3mpc_ros.view.live_run import LiveRun
+from t3mpc_ros.view.live_run import LOST, LiveRun, NodeReport, banner
 
 
 def test_readers_of_any_pace_get_every_sample_once_and_in_order():

@@ -10,7 +10,7 @@ import re
 import pytest
 
 from t3mpc_ros.view.live_data import LiveData
-from t3mpc_ros.view.server import ADDRESS, MAX_BODY, MAX_READERS, CommandError, PageServer
+from t3mpc_ros.view.server import ADDRESS, MAX_BODY, MAX_READERS, PageServer
 
 
 class Page:
@@ -54,7 +54,7 @@ def page():
 
     def command(name, arguments):
         if name == 'fail':
-            raise CommandError('no node offers it')
+            raise RuntimeError('no node offers it')
         done.append((name, arguments))
         return 'latched'
 
