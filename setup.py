@@ -23,6 +23,15 @@ with open(f'{NAME}/version.py', encoding='utf-8') as source:
     VERSION = re.search(r"^VERSION = '([^']+)'", source.read(), re.MULTILINE).group(1)
 
 ROS = 'ros-jazzy-'
+NODES = (
+    'reference_generator',
+    'controller',
+    'sim_robot',
+    'radio_bridge',
+    'recorder',
+    'player',
+    'composed',
+)
 
 
 def requirements(file):
@@ -133,13 +142,7 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': [
-            f'reference_generator = {NAME}.nodes.entry_point:reference_generator',
-            f'controller = {NAME}.nodes.entry_point:controller',
-            f'sim_robot = {NAME}.nodes.entry_point:sim_robot',
-            f'radio_bridge = {NAME}.nodes.entry_point:radio_bridge',
-            f'recorder = {NAME}.nodes.entry_point:recorder',
-            f'player = {NAME}.nodes.entry_point:player',
-            f'composed = {NAME}.nodes.entry_point:composed',
+            *(f'{node} = {NAME}.nodes.entry_point:{node}' for node in NODES),
             f't3mpc = {NAME}.cli.main:main',
         ],
     },

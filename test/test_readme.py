@@ -8,6 +8,7 @@ in the text and in blocks marked ``sh``: these need tools of ROS or apt, hardwar
 """
 
 from contextlib import contextmanager, suppress
+from itertools import takewhile
 from pathlib import Path
 import re
 import shlex
@@ -208,7 +209,7 @@ def _parse(arguments, capsys, complete):
 
 def _check_node(name, arguments):
     assert name in NODES
-    assert unknown_arguments(name, [name, *arguments]) == ''
+    assert unknown_arguments(name, [*takewhile('--ros-args'.__ne__, arguments)]) == ''
     given = [word.partition(':=') for word in arguments if ':=' in word and '__' not in word]
     values = {key: yaml.safe_load(value) for key, _, value in given}
     values = {key: [one] if isinstance(one, dict) else one for key, one in values.items()}

@@ -59,14 +59,8 @@ class RemovedOption(argparse.Action):
 def run_command(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
     """Return the exit code of the chosen subcommand: its own, or 1 after an error.
 
-    A wrong command line ends the program with 2, Ctrl-C gives 130.
-
-    Parameters
-    ----------
-    parser
-        Each subcommand sets ``run``, which takes the options and returns the exit code.
-    arguments
-        Command-line words; None for those of the process.
+    A wrong command line ends the program with 2, Ctrl-C gives 130. Each subcommand sets ``run``,
+    which takes the options and returns the exit code.
     """
     options = parser.parse_args(arguments)
     try:

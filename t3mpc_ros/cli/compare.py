@@ -73,15 +73,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the tables and return 0.
-
-    Raises
-    ------
-    ValueError
-        An unknown case or method.
-    ModuleNotFoundError
-        A method needs a library that is not installed.
-    """
+    """Print the tables and return 0."""
     from t3mpc_ros.evaluation.cases import cases_for
     from t3mpc_ros.evaluation.experiment import ComparisonPlan, default_methods
     from t3mpc_ros.evaluation.methods import methods_for, require_libraries

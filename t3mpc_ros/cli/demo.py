@@ -124,13 +124,7 @@ class DemoOptions:
 def parse_settings(
     options: DemoOptions, texts: Iterable[str]
 ) -> Mapping[str, Mapping[str, object]]:
-    """Return parameters by node and name from texts like ``controller.law.gain=30``.
-
-    Raises
-    ------
-    ParameterError
-        The demo has no such node, the node no such parameter, or the parameter not that value.
-    """
+    """Return parameters by node and name from texts like ``controller.law.gain=30``."""
     from t3mpc_ros.nodes.registry import parameter_class  # takes a second
 
     found: dict[str, Mapping[str, object]] = {}
@@ -147,15 +141,7 @@ def parse_settings(
 
 
 class DemoInterruptedError(RuntimeError):
-    """A signal has ended the demo; the text says what was recorded.
-
-    Parameters
-    ----------
-    number
-        The signal.
-    bag
-        Folder of the recording; need not exist.
-    """
+    """Signal ``number`` has ended the demo; the text says what ``bag`` holds, if it exists."""
 
     def __init__(self, number: int, bag: Path) -> None:
         self.number = number
@@ -173,17 +159,8 @@ def run_demo(options: DemoOptions) -> 'ReportMetrics':
     """Run reference generator, controller, robot and recorder; return the report metrics.
 
     The bag is in ``output/bag``, the nodes' logs in ``output/log``, the report beside them.
-
-    Raises
-    ------
-    ProcessError
-        A node did not start, ended during the run, or did not end cleanly; all are stopped.
-    DemoInterruptedError
-        SIGINT, SIGTERM or SIGHUP has ended the run; all nodes are stopped.
-    NoDomainError
-        Every ROS domain of this machine is in use.
-    OSError
-        The output folder cannot be made.
+    Whatever ends the run (a ProcessError, or a signal with DemoInterruptedError), all nodes are
+    stopped.
     """
     options.output.mkdir(parents=True, exist_ok=True)
     bag = options.output / 'bag'

@@ -4,7 +4,7 @@
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
@@ -81,15 +81,8 @@ def _demo(options: argparse.Namespace) -> int:
     if options.patrol and options.robot != 'twin':
         print(f'error: --patrol needs --robot twin: got {options.robot}', file=sys.stderr)
         return 2
-    wanted = DemoOptions(
-        duration=options.duration,
-        headless=options.headless,
-        seed=options.seed,
-        robot=options.robot,
-        loss=options.loss,
-        view=options.view,
-        patrol=options.patrol,
-    )
+    names = {each.name for each in fields(DemoOptions)} - {'output'}
+    wanted = DemoOptions(**{name: getattr(options, name) for name in names & {*vars(options)}})
     if options.set:
         wanted = replace(wanted, settings=parse_settings(wanted, options.set))
     wanted = replace(wanted, output=options.output or _new_run(Path('runs')))

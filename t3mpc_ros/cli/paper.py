@@ -41,13 +41,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write everything and return 0.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        A compared method needs a library that is not installed.
-    """
+    """Write everything and return 0."""
     from t3mpc_ros.evaluation.methods import NMPC, require_libraries
     from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, default_setup, reproduce
 

@@ -67,15 +67,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print the tables, write page, pictures and numbers, and return 0.
-
-    Raises
-    ------
-    ValueError
-        An unknown path, or an arena without the start.
-    ModuleNotFoundError
-        ``--scheduler`` without dask.distributed.
-    """
+    """Print the tables, write page, pictures and numbers, and return 0."""
     from t3mpc_ros.evaluation.plotting import write_pictures
     from t3mpc_ros.evaluation.reporting import strict_json
 

@@ -32,12 +32,8 @@ class PrivateGraph:
     """A reserved domain and the environment of its processes; a context manager.
 
     The reservation is a socket with an abstract name, which exists once per network of the
-    machine, for all users and checkouts. It ends with the process at the latest.
-
-    Raises
-    ------
-    NoDomainError
-        Every domain is reserved or in use.
+    machine, for all users and checkouts. It ends with the process at the latest. NoDomainError if
+    every domain is reserved or in use.
     """
 
     def __init__(self) -> None:
@@ -88,10 +84,7 @@ class PrivateGraph:
 def used_domains(tables: Path) -> set[int]:
     """Return the domains in which a participant runs: its UDP ports are bound on this machine.
 
-    Parameters
-    ----------
-    tables
-        Folder of the kernel's tables ``udp`` and ``udp6``; a missing table counts as empty.
+    ``tables`` is the folder of the kernel's tables ``udp`` and ``udp6``, either of which may lack.
     """
     found = set()
     for table in (tables / 'udp', tables / 'udp6'):

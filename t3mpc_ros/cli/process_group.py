@@ -33,13 +33,7 @@ class StopRequestedError(ProcessError):
 
 
 def executable(name: str) -> Path:
-    """Return the file that ``ros2 run t3mpc_ros NAME`` would start, or that pip has installed.
-
-    Raises
-    ------
-    ProcessError
-        It is not installed; the text gives the remedy.
-    """
+    """Return the file that ``ros2 run t3mpc_ros NAME`` would start, or that pip has installed."""
     by_pip = Path(sysconfig.get_path('scripts')) / name
     try:
         return installed_file(Path('lib') / 't3mpc_ros' / name)
@@ -56,13 +50,7 @@ def _prefixes() -> list[Path]:
 
 
 def installed_file(path: Path) -> Path:
-    """Return the installed file of a path relative to the prefix.
-
-    Raises
-    ------
-    ProcessError
-        It is not installed; the text gives the remedy.
-    """
+    """Return the installed file of a path relative to the prefix; ProcessError without one."""
     for prefix in _prefixes():
         if (prefix / path).exists():
             return prefix / path
@@ -73,19 +61,10 @@ def installed_file(path: Path) -> Path:
 
 
 class ProcessGroup:
-    """Executables of one run, each a process with a log file.
+    """Executables of one run, each a process with a log file in the folder ``logs``.
 
-    Parameters
-    ----------
-    logs
-        Folder for the log files, made if missing.
-    environment
-        Environment of the processes.
-    stop_requested
-        Returns whether everything is to end; every wait then raises
-        :class:`StopRequestedError`.
-    progress
-        Called with a line of text about every 5 s of a wait.
+    When ``stop_requested`` returns True, every wait raises :class:`StopRequestedError`;
+    ``progress`` gets a line of text about every 5 s of a wait.
     """
 
     def __init__(
@@ -148,12 +127,7 @@ class ProcessGroup:
     def wait_for(self, name: str, words: str, seconds: float = 30.0) -> None:
         """Wait until the output since the start of the executable holds ``words``.
 
-        Raises
-        ------
-        ProcessError
-            It ended; the text ends with its last lines.
-        ProcessTimeoutError
-            It did not print them within ``seconds``.
+        ProcessError, with its last lines, if it ends, ProcessTimeoutError after ``seconds``.
         """
         begin = time.monotonic()
         deadline, shown = begin + seconds, begin
@@ -202,10 +176,7 @@ class ProcessGroup:
     def stop(self, name: str, number: int = signal.SIGINT, seconds: float = 10.0) -> int:
         """Send a stop signal to one executable and return its exit code.
 
-        Raises
-        ------
-        ProcessTimeoutError
-            It did not end in time and was killed.
+        ProcessTimeoutError if it did not end in time and was killed.
         """
         process = self._processes[name]
         process.send_signal(number)
@@ -231,12 +202,7 @@ class ProcessGroup:
     def end_all(self, last: Sequence[str] = (), seconds: float = 10.0) -> None:
         """End all running executables, at once except for the ``last``; kill those that remain.
 
-        Parameters
-        ----------
-        last
-            Executables that end after the others, in this order.
-        seconds
-            Time that the first ones together, and each of the last ones, are given.
+        The last ones end in their order; each has ``seconds``, as the others together.
         """
         first = tuple(name for name in self._processes if name not in last)
         for names in (first, *((name,) for name in last if name in self._processes)):

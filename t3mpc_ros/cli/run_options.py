@@ -93,13 +93,7 @@ def add_topic_options(parser: argparse._ActionsContainer) -> None:
 
 
 def report_options(options: argparse.Namespace) -> 'ReportOptions':
-    """Return what :func:`add_topic_options` added, and the ``--reference`` of a report.
-
-    Raises
-    ------
-    ValueError
-        Wheel radius without separation or the reverse.
-    """
+    """Return what :func:`add_topic_options` added, and the ``--reference`` of a report."""
     from t3mpc_ros.evaluation.topic_roles import ReportOptions
 
     if (options.wheel_radius is None) != (options.track is None):
@@ -110,15 +104,7 @@ def report_options(options: argparse.Namespace) -> 'ReportOptions':
 
 @contextmanager
 def executor_of(options: argparse.Namespace) -> Iterator[Any]:
-    """Enter who computes: the workers of ``--scheduler``, or the number of ``--workers``.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        dask.distributed is not installed.
-    ValueError
-        No scheduler answers at the address.
-    """
+    """Enter who computes: the workers of ``--scheduler``, or the number of ``--workers``."""
     if not options.scheduler:
         yield options.workers
         return

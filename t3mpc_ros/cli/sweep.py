@@ -58,13 +58,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the sweep, print its table and return 0.
-
-    Raises
-    ------
-    ScriptError
-        Wrong use, or every run failed.
-    """
+    """Run the sweep, print its table and return 0."""
     from t3mpc_ros.scripting.controllers import loaded
     from t3mpc_ros.scripting.parameter_sweep import sweep
 

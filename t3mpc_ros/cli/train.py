@@ -56,17 +56,7 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the model, print its skill and return 0.
-
-    Raises
-    ------
-    TrainingError
-        The bags cannot be used for training.
-    ModelError
-        The file cannot be written.
-    ValueError
-        Options that contradict.
-    """
+    """Write the model, print its skill and return 0."""
     from t3mpc_ros.bag.run.model_file import save_model
 
     if options.bags:

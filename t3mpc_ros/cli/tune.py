@@ -72,21 +72,7 @@ def add_parser(
 
 
 def run(options: argparse.Namespace) -> int:
-    """Tune every method, or identify the drive in a bag; print the result and return 0.
-
-    Raises
-    ------
-    ValueError
-        An unknown method or robot, or options that contradict.
-    IdentificationError
-        The bag does not determine the drive.
-    ReportError
-        The bag holds no topic of a robot, or a given topic cannot be used.
-    BagError
-        The bag cannot be read.
-    ModuleNotFoundError
-        A method needs a library that is not installed.
-    """
+    """Tune every method, or identify the drive in a bag; print the result and return 0."""
     from t3mpc_ros.evaluation.methods import require_libraries
     from t3mpc_ros.parameters.table import find_names
 

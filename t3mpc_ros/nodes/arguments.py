@@ -1,13 +1,9 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Command line of the node executables: ``--help``, ``--version``, rejection of anything else.
-
-rcl parses what stands between ``--ros-args`` and ``--`` and ignores the rest.
-"""
+"""Command line of the node executables: help, version, parameter files, rejection of the rest."""
 
 from collections.abc import Iterator, Sequence
 import difflib
-from pathlib import Path
 import re
 import textwrap
 
@@ -25,31 +21,15 @@ ROS_ARGUMENTS = (
 _WIDTH = 99
 
 
-def user_arguments(argv: Sequence[str]) -> list[str]:
-    """Return the arguments that are not ROS arguments, without the name of the executable."""
-    words: list[str] = []
-    ros = False
-    for word in argv[1:]:
-        if word == '--ros-args':
-            ros = True
-        elif ros and word == '--':
-            ros = False
-        elif not ros:
-            words.append(word)
-    return words
-
-
-def information(node: str, argv: Sequence[str]) -> str:
+def information(node: str, words: Sequence[str]) -> str:
     """Return the text that ``--help`` or ``--version`` asks for; empty without them."""
-    words = user_arguments(argv)
     if {'-h', '--help'} & set(words):
         return help_text(node)
     return f't3mpc_ros {VERSION}' if '--version' in words else ''
 
 
-def unknown_arguments(node: str, argv: Sequence[str]) -> str:
-    """Return why the command line is rejected; empty if it holds ROS arguments only."""
-    words = user_arguments(argv)
+def unknown_arguments(node: str, words: Sequence[str]) -> str:
+    """Return why words outside ``--ros-args`` are rejected, or nothing."""
     if not words:
         return ''
     plural = 's' if len(words) > 1 else ''
@@ -103,16 +83,13 @@ def _wrapped(head: str, text: str) -> list[str]:
 
 def parameter_file_problem(argv: Sequence[str]) -> str:
     """Return why a ``--params-file`` of the command line is unusable; empty if usable."""
-    import yaml
+    from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml
 
     for name in _parameter_files(argv):
         try:
-            content = yaml.safe_load(Path(name).read_text(encoding='utf-8'))
-        except OSError as error:
-            return f'cannot read the parameter file {name}: {error.strerror}'
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            place = ' '.join(str(error).split())
-            return f'the parameter file {name} is not valid YAML: {place}'
+            content = read_yaml(name)
+        except YamlError as error:
+            return f'the parameter file {name} {error}'
         if not isinstance(content, dict):
             return (
                 f'the parameter file {name} must hold "<node>: ros__parameters: ...": got nothing'
@@ -157,7 +134,7 @@ def file_values(file: str, node: str) -> dict[str, object]:
 
 def _entries(file: str) -> Iterator[tuple[str, str, object]]:
     """Yield node, parameter and value; namespaces may be nested keys, as groups are."""
-    import yaml
+    from t3mpc_ros.parameters.yaml_files import read_yaml  # a missing library has a remedy
 
     def leaves(tree: object, path: tuple[str, ...]) -> Iterator[tuple[str, str, object]]:
         if isinstance(tree, dict) and tree:
@@ -168,7 +145,7 @@ def _entries(file: str) -> Iterator[tuple[str, str, object]]:
             node = ''.join(f'/{part.strip("/")}' for part in path[:at])
             yield node, '.'.join(path[at + 1 :]), tree
 
-    yield from leaves(yaml.safe_load(Path(file).read_text(encoding='utf-8')), ())
+    yield from leaves(read_yaml(file), ())
 
 
 def _key_pattern(key: str) -> 're.Pattern[str]':

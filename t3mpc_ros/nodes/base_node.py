@@ -244,13 +244,8 @@ def declare_parameters(node: Node, parameter_class: type[P], changed: Callable[[
 
     Every specification becomes a ROS parameter with description, unit and range. Parameters that
     are not dynamic are read-only. ``changed`` is called with the new values after an accepted set
-    request.
-
-    Raises
-    ------
-    ParameterError
-        An override is unknown to this node (the text has the nearest known name), of the wrong
-        type or out of range; the text has the name, the bound and the value.
+    request. ParameterError for an override that is unknown to this node (the text has the nearest
+    known name), of the wrong type or out of range (the text has the bound and the value).
     """
     overrides = _overrides(node)
     specs = {spec.name: spec for spec in parameter_class.specs()}

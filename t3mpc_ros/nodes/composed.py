@@ -35,11 +35,8 @@ class ComposedNode(BaseNode[ComposedParameters]):
 def make() -> list[BaseNode]:
     """Return the chosen nodes and the node of the process.
 
-    Raises
-    ------
-    ParameterError
-        A node cannot be made with its parameters, or two nodes use one topic with different
-        types, which ROS does not allow within a process.
+    ParameterError also if two nodes use one topic with different types, which ROS does not allow
+    within a process.
     """
     process = ComposedNode()
     nodes: list[BaseNode] = []

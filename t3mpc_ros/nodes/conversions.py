@@ -77,12 +77,8 @@ def state_from_odometry(data: bytes) -> State:
     """Return the planar state in a serialized odometry message.
 
     To construct the message, with its 72 covariances, would take ten times as long. The layout
-    is that of CDR: four bytes of header, then each value at a multiple of its size.
-
-    Raises
-    ------
-    struct.error
-        The data ends before the message does.
+    is that of CDR: four bytes of header, then each value at a multiple of its size. struct.error
+    if the data ends before the message does.
     """
     order, start = _layout(data)
     seconds, nanoseconds = struct.unpack_from(f'{order}iI', data, 4)

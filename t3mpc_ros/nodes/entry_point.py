@@ -8,6 +8,7 @@ functions.
 """
 
 from collections.abc import MutableMapping, Sequence
+from functools import partial
 import os
 from pathlib import Path
 import sys
@@ -33,43 +34,8 @@ USAGE_ERROR = 2
 """Exit code for an unusable parameter, parameter file or command line."""
 
 
-def reference_generator() -> NoReturn:
-    """Run the fractional-order chaotic reference generator."""
-    _main('reference_generator')
-
-
-def controller() -> NoReturn:
-    """Run the NT3FS-BM-MPC controller."""
-    _main('controller')
-
-
-def sim_robot() -> NoReturn:
-    """Run the simulated robot."""
-    _main('sim_robot')
-
-
-def radio_bridge() -> NoReturn:
-    """Run the bridge to the real robot."""
-    _main('radio_bridge')
-
-
-def recorder() -> NoReturn:
-    """Run the MCAP recorder."""
-    _main('recorder')
-
-
-def player() -> NoReturn:
-    """Run the bag player."""
-    _main('player')
-
-
-def composed() -> NoReturn:
-    """Run several nodes in one process."""
-    _main('composed')
-
-
 def _main(name: str) -> NoReturn:
-    """Run an executable and end the process at once.
+    """Run the executable of a node and end the process at once.
 
     The robot is stopped and the files are closed when :func:`run` returns. The teardown of the
     interpreter would take half a second more, in which launch sends SIGTERM on a busy machine.
@@ -88,6 +54,15 @@ def _main(name: str) -> NoReturn:
     os._exit(code)
 
 
+reference_generator = partial(_main, 'reference_generator')
+controller = partial(_main, 'controller')
+sim_robot = partial(_main, 'sim_robot')
+radio_bridge = partial(_main, 'radio_bridge')
+recorder = partial(_main, 'recorder')
+player = partial(_main, 'player')
+composed = partial(_main, 'composed')
+
+
 def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
     """Spin the nodes of an executable until a signal; return the exit code of the process.
 
@@ -95,24 +70,26 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
     exit, and for ``--help`` and ``--version``; 2 for an unusable parameter, parameter file or
     command line, with one line on standard error that names it and the reason.
     """
-    if text := information(name, argv):
-        print(text)
-        return 0
-    if problem := unknown_arguments(name, argv):
-        return _usage_error(name, problem)
     import rclpy
     from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
     from rclpy.executors import ExternalShutdownException
+    from rclpy.utilities import remove_ros_args
 
     from t3mpc_ros.parameters.table import ParameterError
 
-    module = node_module(name)
-    if problem := parameter_file_problem(argv):
+    if problem := parameter_file_problem(argv):  # rcl would read them, too
         return _usage_error(name, problem)
     try:
+        words = remove_ros_args(list(argv))[1:]
+        if text := information(name, words):
+            print(text)
+            return 0
+        if problem := unknown_arguments(name, words):
+            return _usage_error(name, problem)
         init_ros(argv)
     except (RuntimeError, ValueError) as error:
         return _usage_error(name, f'invalid command line: {error}')
+    module = node_module(name)
     configuration_errors = (
         ParameterError,
         InvalidParameterTypeException,

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
-from t3mpc_ros.nodes.robot_commands import CommandSubscription, RobotServices
+from t3mpc_ros.nodes.robot_commands import CommandSubscription, offer_services
 from t3mpc_ros.nodes.robot_topics import (
     RobotDescription,
     RobotPublishers,
@@ -98,7 +98,7 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             self._apply_command,
             (self.now_ns, self.steady_ns),
         )
-        RobotServices(self, self._robot, self.steady_ns, self._lock)
+        offer_services(self, self._robot, self.steady_ns, self._lock)
         self._wake_read, self._wake_write = os.pipe()
         self._port_thread = threading.Thread(target=self._serve_port, name='radio', daemon=True)
         self._port_thread.start()

@@ -19,20 +19,10 @@ from t3mpc_ros.robot.interface import RobotInterface
 class CommandSubscription:
     """Receives ``cmd_vel``, rejects commands by age, and counts rejections.
 
-    Parameters
-    ----------
-    node
-        Node of the robot.
-    stamped
-        Whether commands are TwistStamped.
-    timeout
-        Returns the time for which a command is valid, s.
-    apply
-        Applies a twist with its stamp in robot time (ns); returns the reason for a rejection.
-    clocks
-        Clock of the stamps in messages, and clock of the robot; both return ns.
-    simulated
-        Returns whether robot time is simulated: then it does not measure the age of a message.
+    ``timeout`` returns the time for which a command is valid, s; ``apply`` takes a twist with its
+    stamp in robot time (ns) and returns the reason for a rejection; ``clocks`` are that of the
+    stamps in messages and that of the robot, ns. ``simulated`` returns whether robot time is
+    simulated: then it does not measure the age of a message.
     """
 
     def __init__(
@@ -83,50 +73,35 @@ class CommandSubscription:
         self.problem = problem
 
 
-class RobotServices:
-    """Offers ``reset_odometry`` and ``e_stop``, which latches until released.
+def offer_services(
+    node: Node,
+    robot: RobotInterface,
+    now_ns: Callable[[], int],
+    lock: AbstractContextManager[Any] | None = None,
+) -> None:
+    """Offer ``reset_odometry`` and ``e_stop``, which latches until released.
 
-    Parameters
-    ----------
-    node
-        Node that offers the services.
-    robot
-        Robot that they act on.
-    now_ns
-        Returns the time of the robot, ns.
-    lock
-        Held during calls of the robot where several threads use it; None: not needed.
+    ``now_ns`` returns the time of the robot; ``lock`` guards a robot that several threads use.
     """
+    guard = nullcontext() if lock is None else lock
 
-    def __init__(
-        self,
-        node: Node,
-        robot: RobotInterface,
-        now_ns: Callable[[], int],
-        lock: AbstractContextManager[Any] | None = None,
-    ) -> None:
-        self._robot = robot
-        self._now_ns = now_ns
-        self._lock = nullcontext() if lock is None else lock
-        node.create_service(Trigger, 'reset_odometry', self._on_reset_odometry)
-        node.create_service(SetBool, 'e_stop', self._on_e_stop)
-
-    def _on_reset_odometry(
-        self, request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        with self._lock:
-            problem = self._robot.reset_odometry(self._now_ns())
+    def reset_odometry(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        with guard:
+            problem = robot.reset_odometry(now_ns())
         response.success = not problem
         response.message = problem or 'odometry reset to the origin'
         return response
 
-    def _on_e_stop(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+    def e_stop(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         problem = ''
-        with self._lock:
+        with guard:
             if request.data:
-                self._robot.latch_estop('requested by service e_stop', self._now_ns())
+                robot.latch_estop('requested by service e_stop', now_ns())
             else:
-                problem = self._robot.release_estop(self._now_ns())
+                problem = robot.release_estop(now_ns())
         response.success = not problem
         response.message = problem or ('latched' if request.data else 'released')
         return response
+
+    node.create_service(Trigger, 'reset_odometry', reset_odometry)
+    node.create_service(SetBool, 'e_stop', e_stop)

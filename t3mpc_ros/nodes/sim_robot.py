@@ -13,7 +13,7 @@ from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, Simulated
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN, BaseNode
-from t3mpc_ros.nodes.robot_commands import CommandSubscription, RobotServices
+from t3mpc_ros.nodes.robot_commands import CommandSubscription, offer_services
 from t3mpc_ros.nodes.robot_topics import (
     RobotDescription,
     RobotPublishers,
@@ -153,7 +153,7 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
             (self._robot_now_ns, self._robot_now_ns),
             lambda: self._simulated_time is not None or self.get_clock().ros_time_is_active,
         )
-        RobotServices(self, self._robot, self._robot_now_ns)
+        offer_services(self, self._robot, self._robot_now_ns)
         self.create_service(Trigger, '~/set_pose', self._on_set_pose)
         self.create_service(Trigger, '~/step', self._on_step)
         self._timer = self.create_steady_timer(self._timer_period(), self._on_timer)
