@@ -40,7 +40,7 @@ ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
     },
     'emulator': {
         'radio_bridge': {},
-        # Fifty measurements a second; a command goes with the cycle after the one it answers,
+        # Fifty measurements a second; a command goes with the cycle after that of its sample,
         # 19 ms after the sample: test_radio_delay.py.
         'controller': {'rate': 50.0, 'speed_filter.dead_time': 0.02},
     },

@@ -217,7 +217,7 @@ class BaseNode(Node, Generic[P]):
             *self.start_warnings,
             *self.warnings(),
             qos.command_publishers_problem(self),
-            qos.qos_problem(self, (each.held for each in self._matching), 'subscription'),
+            qos.qos_problem(self, (each.subscription for each in self._matching), 'subscription'),
             qos.qos_problem(self, islice(self._public_publishers(), 20), 'publisher'),
         ]
         if self.get_clock().ros_time_is_active and not self.clock_started():

@@ -212,15 +212,17 @@ def pose_stamped(state: State, frame: str) -> PoseStamped:
     return message
 
 
-def transform(state: State, frame: str, child: str) -> TransformStamped:
-    """Return the pose of a state as a transform from ``frame`` to ``child``."""
-    message = TransformStamped()
-    message.header.stamp = time_from_ns(state.stamp_ns)
+def transform(
+    stamp_ns: int, pose: Pose, frame: str, child: str, z: float = 0.0
+) -> TransformStamped:
+    """Return a pose at height ``z`` (m) as a transform from ``frame`` to ``child``."""
+    message = TransformStamped(child_frame_id=child)
+    message.header.stamp = time_from_ns(stamp_ns)
     message.header.frame_id = frame
-    message.child_frame_id = child
-    message.transform.translation.x = state.pose.x
-    message.transform.translation.y = state.pose.y
-    message.transform.rotation = quaternion_from_yaw(state.pose.yaw)
+    message.transform.translation.x = pose.x
+    message.transform.translation.y = pose.y
+    message.transform.translation.z = z
+    message.transform.rotation = quaternion_from_yaw(pose.yaw)
     return message
 
 

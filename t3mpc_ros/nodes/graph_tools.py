@@ -132,7 +132,7 @@ class Graph:
         return sorted(answer.result.names)
 
     def parameter_text(self, node: str, name: str) -> str:
-        """Return a value with its type in words; errors as of :meth:`call`."""
+        """Return a value with its type, as ros2 param does; errors as of :meth:`call`."""
         value = self._parameter(node, name)
         *many, kind = type_text(value.type).split(' of ')
         return f'{_WORDS[kind]} {"values are" if many else "value is"}: {plain_value(value)}'

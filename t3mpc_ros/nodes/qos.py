@@ -213,7 +213,7 @@ class MatchingSubscription:
         self._group = None if callback else PolledCallbackGroup()
         self._raw = raw
         self._overridden = overriding_options(node, topic, 'subscription') is not None
-        self.held: Subscription = self._subscribe(profile)
+        self.subscription: Subscription = self._subscribe(profile)
         """The present subscription."""
 
     def _subscribe(self, profile: QoSProfile) -> Subscription:
@@ -225,21 +225,22 @@ class MatchingSubscription:
         """Subscribe again if a publisher does not offer what is requested."""
         if self._overridden:
             return
-        held, name = self.held, self.held.topic_name
+        present = self.subscription
+        name = present.topic_name
         offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(name)]
-        if compatible_with_all(held.qos_profile, offers):
+        if compatible_with_all(present.qos_profile, offers):
             return
-        profile = copy(held.qos_profile)
+        profile = copy(present.qos_profile)
         profile.reliability = adapt_request_to_offers(offers).reliability
-        if profile.reliability == held.qos_profile.reliability:
+        if profile.reliability == present.qos_profile.reliability:
             return  # the mismatch is another one, which the diagnostics name
-        self._node.destroy_subscription(held)
-        self.held = self._subscribe(profile)
+        self._node.destroy_subscription(present)
+        self.subscription = self._subscribe(profile)
         self._node.get_logger().info(f'{name} is published best effort')
 
     def take_waiting(self) -> list[Any]:
         """Return the messages that wait in the queue."""
-        return take_waiting(self.held, raw=self._raw)
+        return take_waiting(self.subscription, raw=self._raw)
 
 
 def take_waiting(subscription: Subscription, *, raw: bool = False) -> list[Any]:

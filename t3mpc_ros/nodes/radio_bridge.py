@@ -16,6 +16,7 @@ import select
 import threading
 from typing import Any, ClassVar
 
+from t3mpc_ros.geometry.kinematics import wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
@@ -114,7 +115,7 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
         self._robot_publishers.configure(parameters, _robot_description(parameters))
 
     def _apply_command(self, twist: BodyTwist, stamp_ns: int) -> str:
-        command = RobotCommand.from_twist(twist, self.parameters.geometry, stamp_ns)
+        command = RobotCommand(wheels_from_twist(twist, self.parameters.geometry), stamp_ns)
         with self._lock:
             return self._robot.apply(command, self.steady_ns())
 

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
 
-from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Range
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import Pose
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.conversions import UNKNOWN_VARIANCE, FrameParameters
 from t3mpc_ros.parameters.table import parameter
-from t3mpc_ros.robot.description import FixedFrame, FrameNames, fixed_frames
+from t3mpc_ros.robot.description import FrameNames, fixed_frames
 from t3mpc_ros.robot.interface import RANGE_SENSORS, BatteryReading, ImuSample, RobotState
 from t3mpc_ros.robot.sensor_conversions import (
     GRAVITY,
@@ -173,7 +173,10 @@ class RobotPublishers:
         if self._broadcaster is not None:
             message = self._odom_message
             frames = message.header.frame_id, message.child_frame_id
-            self._broadcaster.sendTransform(conversions.transform(state.odometry, *frames))
+            odometry = state.odometry
+            self._broadcaster.sendTransform(
+                conversions.transform(odometry.stamp_ns, odometry.pose, *frames)
+            )
         if self._is_due(parameters.joint_rate):
             names = parameters.right_wheel_name, parameters.left_wheel_name
             self._joint_publisher.publish(
@@ -212,7 +215,13 @@ class RobotPublishers:
         stamp_ns = self._node.get_clock().now().nanoseconds
         self._static_broadcaster.sendTransform(
             [
-                _fixed_transform(frame, base, self._frame(frame.name), stamp_ns)
+                conversions.transform(
+                    stamp_ns,
+                    Pose(frame.x, frame.y, frame.yaw),
+                    base,
+                    self._frame(frame.name),
+                    frame.z,
+                )
                 for frame in fixed_frames(names, geometry, range_sensor)
             ]
         )
@@ -231,18 +240,6 @@ class RobotPublishers:
 def _odometry_message(frame: str, child: str) -> Odometry:
     message = Odometry(child_frame_id=child)
     message.header.frame_id = frame
-    return message
-
-
-def _fixed_transform(fixed: FixedFrame, frame: str, child: str, stamp_ns: int) -> TransformStamped:
-    message = TransformStamped()
-    message.header.stamp = conversions.time_from_ns(stamp_ns)
-    message.header.frame_id = frame
-    message.child_frame_id = child
-    message.transform.translation.x = fixed.x
-    message.transform.translation.y = fixed.y
-    message.transform.translation.z = fixed.z
-    message.transform.rotation = conversions.quaternion_from_yaw(fixed.yaw)
     return message
 
 

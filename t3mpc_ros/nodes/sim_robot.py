@@ -9,6 +9,7 @@ from typing import Any
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
+from t3mpc_ros.geometry.kinematics import wheels_from_twist
 from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, SimulatedTime
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose
 from t3mpc_ros.nodes import conversions, qos
@@ -176,7 +177,7 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
         )
 
     def _apply_command(self, twist: BodyTwist, stamp_ns: int) -> str:
-        command = RobotCommand.from_twist(twist, self.parameters.geometry, stamp_ns)
+        command = RobotCommand(wheels_from_twist(twist, self.parameters.geometry), stamp_ns)
         return self._robot.apply(command, self._robot_now_ns())
 
     def _on_timer(self) -> None:

@@ -156,7 +156,7 @@ def test_poses_in_all_their_messages_agree():
     for motion in motions(20):
         odometry = conversions.fill_odometry(Odometry(), motion)
         posed = conversions.pose_stamped(motion, 'odom')
-        moved = conversions.transform(motion, 'odom', 'base_link')
+        moved = conversions.transform(motion.stamp_ns, motion.pose, 'odom', 'base_link')
         assert posed.pose == odometry.pose.pose
         assert posed.header.stamp == moved.header.stamp == odometry.header.stamp
         assert (posed.header.frame_id, moved.header.frame_id) == ('odom', 'odom')

@@ -145,7 +145,9 @@ def test_each_executor_calls_back_and_leaves_polled_messages(events, harness, mo
         assert message.linear.x == 0.25
         assert info['source_timestamp'] > 0
         assert [each.linear.x for each in polled.take_waiting()] == [0.25]
-        assert polled.held.topic_name not in {each.topic_name for each in node.subscriptions}
+        assert polled.subscription.topic_name not in {
+            each.topic_name for each in node.subscriptions
+        }
     finally:
         executor.remove_node(node)
         executor.shutdown()

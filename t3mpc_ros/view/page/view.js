@@ -19,7 +19,7 @@ let lastEvent = performance.now();
 let source = null;
 let connected = false;
 let changed = true;
-let selection = null; // [from, to] while the picture is held
+let selection = null; // [from, to] while the charts do not follow the run
 let base = null; // pose of the odometry frame on the map
 let cursorTime = null;
 
