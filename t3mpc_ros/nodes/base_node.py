@@ -45,16 +45,7 @@ ADAPT_PERIOD = 0.5
 ACK_TIMEOUT = Duration(nanoseconds=200_000_000)
 """Maximum wait of :func:`publish_and_wait_for_acked`."""
 
-_PARAMETER_TYPES = {
-    (bool, False): Parameter.Type.BOOL,
-    (int, False): Parameter.Type.INTEGER,
-    (float, False): Parameter.Type.DOUBLE,
-    (str, False): Parameter.Type.STRING,
-    (bool, True): Parameter.Type.BOOL_ARRAY,
-    (int, True): Parameter.Type.INTEGER_ARRAY,
-    (float, True): Parameter.Type.DOUBLE_ARRAY,
-    (str, True): Parameter.Type.STRING_ARRAY,
-}
+_TYPES = {bool: 'BOOL', int: 'INTEGER', float: 'DOUBLE', str: 'STRING'}
 
 _NO_PUBLISHER_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 _NO_SUBSCRIPTION_EVENTS = SubscriptionEventCallbacks(use_default_callbacks=False)
@@ -78,7 +69,9 @@ class BaseNode(Node, Generic[P]):
         """Warnings about the start of the process, repeated in the diagnostics."""
         self.exit_requested = False
         """Set to True to end the process with :attr:`exit_code`."""
-        self.parameters: P = declare_parameters(self, parameter_class, self._on_change)
+        self.parameters: P = declare_parameters(self, parameter_class)
+        self.add_on_set_parameters_callback(self._validate)
+        self.add_post_set_parameters_callback(self._apply)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.DIAGNOSTICS)
         # Steady time: diagnostics continue while the simulated clock is paused.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -183,9 +176,24 @@ class BaseNode(Node, Generic[P]):
     def on_shutdown(self) -> None:
         """Stop the robot, publish final messages, close files."""
 
-    def _on_change(self, parameters: P) -> None:
-        self.parameters = parameters
-        self.on_parameters_changed(parameters)
+    def _validate(self, requested: list[Parameter]) -> SetParametersResult:
+        try:
+            self._with_changes(requested)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _apply(self, accepted: list[Parameter]) -> None:
+        if (new := self._with_changes(accepted)) != self.parameters:
+            self.parameters = new
+            self.on_parameters_changed(new)
+
+    def _with_changes(self, changes: list[Parameter]) -> P:
+        """Return the parameters with changes; those that rclpy declares are left out."""
+        known = self.parameters.to_dict()
+        return self.parameters.with_values(
+            {each.name: each.value for each in changes if each.name in known}
+        )
 
     def _publish_diagnostics(self) -> None:
         level, message, values = self.produce_diagnostics()
@@ -239,13 +247,12 @@ def publish_and_wait_for_acked(publisher: Publisher, message: Any) -> None:
     publisher.wait_for_all_acked(ACK_TIMEOUT)
 
 
-def declare_parameters(node: Node, parameter_class: type[P], changed: Callable[[P], None]) -> P:
+def declare_parameters(node: Node, parameter_class: type[P]) -> P:
     """Return the node's parameters: the overrides of the user on the defaults of the class.
 
-    Every specification becomes a ROS parameter with description, unit and range. Parameters that
-    are not dynamic are read-only. ``changed`` is called with the new values after an accepted set
-    request. ParameterError for an override that is unknown to this node (the text has the nearest
-    known name), of the wrong type or out of range (the text has the bound and the value).
+    Every specification becomes a ROS parameter with description, unit and range; those that are
+    not dynamic are read-only. ParameterError for an override that is unknown to this node (the
+    text has the nearest known name), of the wrong type or out of range (with bound and value).
     """
     overrides = _overrides(node)
     specs = {spec.name: spec for spec in parameter_class.specs()}
@@ -255,26 +262,12 @@ def declare_parameters(node: Node, parameter_class: type[P], changed: Callable[[
     values = parameters.to_dict()
     for name, spec in specs.items():
         node.declare_parameter(
-            name, _ros_value(spec, values[name]), parameter_descriptor(spec), ignore_override=True
+            name,
+            list(values[name]) if spec.many else values[name],
+            parameter_descriptor(spec),
+            ignore_override=True,
         )
 
-    current = [parameters]
-
-    def validate(requested: list[Parameter]) -> SetParametersResult:
-        try:
-            _with_changes(current[0], specs, requested)
-        except ParameterError as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
-
-    def apply(accepted: list[Parameter]) -> None:
-        new = _with_changes(current[0], specs, accepted)
-        if new != current[0]:
-            current[0] = new
-            changed(new)
-
-    node.add_on_set_parameters_callback(validate)
-    node.add_post_set_parameters_callback(apply)
     return parameters
 
 
@@ -284,7 +277,7 @@ def parameter_descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     source = '' if spec.source == 'assumed' else f' ({spec.source})'
     descriptor = ParameterDescriptor(
         name=spec.name,
-        type=_PARAMETER_TYPES[spec.kind, spec.many].value,
+        type=Parameter.Type[_TYPES[spec.kind] + ('_ARRAY' if spec.many else '')].value,
         description=f'{spec.text}{unit}{source}',
         additional_constraints=spec.bounds_text(),
         read_only=not spec.dynamic,
@@ -335,16 +328,6 @@ def _names_of_nodes() -> frozenset[str]:
             table = parameter_class(node)
             names |= {spec.name for spec in table.specs()} | table.class_constants().keys()
     return frozenset(names)
-
-
-def _ros_value(spec: ParameterSpec, value: object) -> object:
-    return list(value) if spec.many and isinstance(value, tuple) else value
-
-
-def _with_changes(parameters: P, specs: dict[str, ParameterSpec], changes: list[Parameter]) -> P:
-    return parameters.with_values(
-        {parameter.name: parameter.value for parameter in changes if parameter.name in specs}
-    )
 
 
 def _text(value: object) -> str:
