@@ -14,6 +14,7 @@ from support.parsers import commands, options
 
 from t3mpc_ros.cli import tune
 from t3mpc_ros.cli.demo import DemoOptions
+from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions
 from t3mpc_ros.evaluation.open_loop_estimation import compare as compare_estimators
 from t3mpc_ros.evaluation.paper.experiment_runs import make_grid
@@ -26,6 +27,7 @@ from t3mpc_ros.radio.tool.calibration_wizard import WizardOptions
 from t3mpc_ros.robot.calibration import MARKS
 from t3mpc_ros.scripting.comparison_runs import compare
 from t3mpc_ros.scripting.parameter_sweep import sweep
+from t3mpc_ros.version import VERSION
 
 UNIT = re.compile(
     r'\b(s|seconds?|m|M|mm|rad/s|1/s²|Hz|V|degrees|minutes|frames per second|share|SI units)\b'
@@ -70,6 +72,25 @@ def test_the_help_gives_defaults_and_units(command):
         elif name not in UNSTATED:
             stated = re.split(r'; |, ', given[1])[0] or given[0]
             assert stated == shown(value), f'{name} is {shown(value)} by default: {text}'
+
+
+COMMANDS = ('', 'bag', 'robot', *commands())
+
+
+@pytest.mark.parametrize('words', COMMANDS)
+def test_every_subcommand_prints_the_version(words, capsys):
+    """Only ``t3mpc --version`` did."""
+    with pytest.raises(SystemExit) as end:
+        main([*words.split(), '--version'])
+    assert end.value.code == 0
+    assert capsys.readouterr().out == f't3mpc_ros {VERSION}\n'
+
+
+@pytest.mark.parametrize('words', COMMANDS)
+def test_unknown_options_of_subcommands_give_code_2(words):
+    with pytest.raises(SystemExit) as end:
+        main([*words.split(), '--no-such-option'])
+    assert end.value.code == 2
 
 
 def default_of(function, name):
