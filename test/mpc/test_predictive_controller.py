@@ -321,8 +321,8 @@ def test_a_known_jump_is_not_learned_and_preview_helps():
     assert np.all(aware.skill > unaware.skill + 0.2)
     true = PredictiveController(DEFAULT, PERIOD, GAIN)
     true.step(np.zeros(2))
-    ratio = aware.step_response[:, 4] / true.step_response[:, 4]
-    wrong = unaware.step_response[:, 4] / true.step_response[:, 4]
+    ratio = aware.responses.steps[:, 4] / true.responses.steps[:, 4]
+    wrong = unaware.responses.steps[:, 4] / true.responses.steps[:, 4]
     assert np.all(np.abs(ratio - 1.0) < 0.25)
     assert np.max(np.abs(wrong - 1.0)) > np.max(np.abs(ratio - 1.0))
     assert _rms(known) < _rms(unknown)
@@ -366,7 +366,7 @@ def test_it_learns_from_the_applied_v_p():
 
     fresh = PredictiveController(DEFAULT, PERIOD, GAIN)
     fresh.step(np.zeros(2))
-    true = np.mean(fresh.step_response[:, 4])
+    true = np.mean(fresh.responses.steps[:, 4])
     assert abs(gain(notify=True) / true - 1.0) < 0.35
     assert abs(gain(notify=True) - true) < abs(gain(notify=False) - true)
 

@@ -97,7 +97,7 @@ class _Copy:
 
 
 def _parts(thing: Any) -> Iterator[tuple[str, Any]]:
-    if isinstance(thing, np.ndarray):
+    if isinstance(thing, np.ndarray) and not isinstance(thing, np.recarray):
         yield from ((f'.{name}', thing[name]) for name in thing.dtype.names)
     elif isinstance(thing, Mapping):
         for key in sorted(thing, key=repr):
