@@ -165,7 +165,7 @@ CASES = [
     ('patrol --arena 1 1 2 2', {}, 1, 'arena must contain the start'),
     ('bag report bag --track 1', {}, 1, '--wheel-radius and --track must be given together'),
     ('bag animate bag --output x.mp4', {}, 1, 'output must end in .gif'),
-    ('bag animate bag --output x.gif --rate 99', {}, 1, 'rate must be above 0 and at most 50'),
+    ('bag animate bag --output x.gif --rate 99', {}, 2, 'rate: must be from 0.1 to 50 Hz'),
     *(
         (words, {}, 2, text)
         for words, text in {

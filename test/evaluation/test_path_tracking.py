@@ -166,7 +166,7 @@ def test_a_drive_is_repeatable_and_the_pose_loop_pays():
     closed, again, open_loop = (
         drive((job, METHODS[name])) for name in (OURS, OURS, 'without the pose loop')
     )
-    assert np.array_equal(closed.truth, again.truth)
+    assert np.array_equal(closed['truth'], again['truth'])
     errors = [errors_of(each, job.points, timed=True) for each in (closed, open_loop)]
     assert errors[0].cross_track < 0.5 * errors[1].cross_track
     assert errors[0].within_limits

@@ -388,16 +388,16 @@ def test_torn_lines_and_those_of_another_search_are_not_used(tmp_path):
 @dataclass
 class Measured:
     error: float
-    variation: float
+    varied: float
 
     def rmse(self):
         return self.error
 
-    def chatter(self):
-        return self.variation
+    def variation(self):
+        return self.varied
 
 
-def test_a_thousand_of_chatter_costs_a_hundredth():
+def test_a_thousand_of_variation_costs_a_hundredth():
     assert objective(Measured(0.2, 0.0)) == 0.2
     assert objective(Measured(0.2, 1000.0)) == pytest.approx(0.21)
     for broken in (Measured(math.nan, 1.0), Measured(1.0, math.nan), Measured(math.inf, 1.0)):

@@ -9,7 +9,12 @@ import re
 import shutil
 
 ROOT = Path(__file__).resolve().parents[2]
-EXECUTABLES = set(re.findall(r"f'(\w+) = \{NAME\}", (ROOT / 'setup.py').read_text()))
+SETUP = (ROOT / 'setup.py').read_text()
+EXECUTABLES = {
+    't3mpc',
+    *re.findall(r"    '(\w+)',", re.search(r'^NODES = \(.*?^\)', SETUP, re.M | re.S)[0]),
+}
+"""What ``setup.py`` installs."""
 # Variables of the user's ROS, workspace and pip, removed for the tests.
 FOREIGN = ('PYTHONPATH', 'AMENT_PREFIX_PATH', 'COLCON_', 'PIP_', 'UV_', 'T3MPC_')
 
