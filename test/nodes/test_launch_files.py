@@ -396,7 +396,7 @@ def test_a_robot_of_another_make_follows_the_reference(start, tmp_path, capsys):
     assert reference > 0.5
     assert error < 0.25 * reference
     assert bag_main(['replay', str(bag)]) == 0
-    assert 'odom is taken from /base/odom' in capsys.readouterr().out
+    assert 'Odometry is taken from /base/odom' in capsys.readouterr().out
 
 
 @pytest.mark.ros
