@@ -11,7 +11,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.control.actuation import VelocityActuation
 from t3mpc_ros.control.control_law import TERM_NAMES
@@ -26,12 +25,10 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
 from t3mpc_ros.evaluation.record import RATE, stamp_of
 from t3mpc_ros.evaluation.scenario import LEAD, SampledReference, Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
-from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, State, WheelSpeeds, wrap_angle
+from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, Array, State, WheelSpeeds, wrap_angle
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand, RobotState
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant_robot import Signals
-
-Array = NDArray[np.float64]
 
 
 class NodeDriver:

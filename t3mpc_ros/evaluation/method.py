@@ -7,9 +7,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController, NominalModel
 from t3mpc_ros.evaluation.cases import NOMINAL
@@ -22,9 +19,8 @@ from t3mpc_ros.evaluation.scenario import (
     PRETRAINING_SEEDS,
     Scenario,
 )
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,8 @@ from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.kinematics import twist_from_wheels
-from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.geometry.types import Array, WheelSpeeds
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 START = 3.0

@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheel_speeds
-from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.robot.interface import RobotStatus
-
-Array = NDArray[np.float64]
 
 RATE = 100.0
 """Control periods a second in every run."""

@@ -20,6 +20,7 @@ from t3mpc_ros.evaluation.cases import CASES, ROBOTS, Case, cases_for
 from t3mpc_ros.evaluation.record import RATE, stamp_of
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, nearest_hint
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule, load_schedule
@@ -32,8 +33,6 @@ from t3mpc_ros.simulation.plant_robot import (
     PlantRobot,
     SimulatedRobot,
 )
-
-Array = NDArray[np.float64]
 
 TUNING_SEEDS = tuple(range(1, 10))
 """Seeds for tuning."""
@@ -99,6 +98,9 @@ class OwnParts:
     """Times at which a person disables and re-enables the driver, s."""
 
 
+NO_PARTS = OwnParts()
+
+
 @dataclass(frozen=True)
 class Scenario:
     """One run without its driver.
@@ -126,7 +128,7 @@ class Scenario:
     duration: float = 60.0
     noise: float = 0.04
     gyro: bool = False
-    own: OwnParts = field(default_factory=OwnParts, compare=False)
+    own: OwnParts = NO_PARTS
 
     def __post_init__(self) -> None:
         check_name('robot', self.robot, ROBOTS)
