@@ -1,117 +1,255 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Comparison of methods: a plan of cases, methods and seeds, and the metrics of all its runs."""
+"""Experiment: runs of scenarios and methods, measured and kept, one row a run.
 
-from collections.abc import Mapping, Sequence
-from concurrent.futures import Executor
-from dataclasses import dataclass
+A study is a list of :class:`Run`; :func:`run_experiment` makes those that its file lacks, here or
+on other machines, and returns a :class:`ResultTable`, from which means, paired differences, claims
+and pages are made.
+"""
 
-from t3mpc_ros.evaluation.cases import cases_for
-from t3mpc_ros.evaluation.loop import Method, run
-from t3mpc_ros.evaluation.methods import (
-    FEED_FORWARD,
-    FULL,
-    STAGES,
-    TWIN_PARTS,
-    WITHOUT,
-    methods_for,
-)
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
+import hashlib
+import inspect
+import os
+from pathlib import Path
+import pickle
+import sys
+from typing import Any
+
+import numpy as np
+
+from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
+from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.metrics import Numbers, measure
-from t3mpc_ros.evaluation.scenario import KINDS, Scenario, check_name
-from t3mpc_ros.evaluation.workers import Job, map_jobs
+from t3mpc_ros.evaluation.result_file import ResultFile, Row
+from t3mpc_ros.evaluation.workers import Job, JobError, WorkerPool, map_jobs
+from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
+from t3mpc_ros.version import VERSION
 
-QUICK_SEEDS = tuple(range(201, 207))
-"""Default seeds: none of them was used for tuning, or is in a table of the paper's results."""
-
-
-def default_methods(robot: str) -> tuple[str, ...]:
-    """Return the full controller and every baseline, without stages and ablations."""
-    parts = {*STAGES, *WITHOUT, *TWIN_PARTS} - {FULL}
-    return tuple(name for name in methods_for(robot) if name not in parts)
+RESTARTS = 3
+"""How often a pool of processes that lost one is started anew."""
+Report = Callable[[str], None]
+"""Receives messages about the progress of long work."""
 
 
-@dataclass(frozen=True)
-class ComparisonPlan:
-    """What is compared."""
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One run of an experiment."""
 
-    robot: str
-    cases: tuple[str, ...]
-    methods: tuple[str, ...]
-    seeds: tuple[int, ...] = QUICK_SEEDS
-    duration: float = 60.0
-    noise: float = 0.04
-    gyro: bool = False
+    job: tuple[Any, Any]
+    """Scenario and method, or what else the task of the experiment measures."""
+    fields: Row
+    """Columns that tell the run from the others: ``controller``, ``case``, ``seed`` and so on."""
+    key: str = ''
+    """Digest of all that determines its numbers, see :func:`digest`; needed to keep them."""
 
-    @property
-    def against(self) -> str:
-        """The method with which every other is compared."""
-        return FEED_FORWARD
 
-    @property
-    def robot_text(self) -> str:
-        """What the robot is, in words."""
-        return KINDS[self.robot].text
+class ResultTable(Sequence[Row]):
+    """Measured runs, one row each: what tells the run from others, and its numbers by name."""
 
-    @property
-    def additional_knowledge(self) -> Mapping[str, str]:
-        """What methods know that are no method of the robot, for the table of the page."""
-        return {}
+    def __init__(self, rows: Sequence[Row]) -> None:
+        self.rows = list(rows)
+        self._groups: dict[tuple[str, ...], dict[tuple[Hashable, ...], list[Row]]] = {}
 
-    def known_methods(self) -> Mapping[str, Method]:
-        """Return every method that can be compared, by name."""
-        return methods_for(self.robot)
+    def __len__(self) -> int:
+        return len(self.rows)
 
-    def __post_init__(self) -> None:
-        check_name('robot', self.robot, KINDS)
-        known = self.known_methods()
-        for case in self.cases:
-            check_name('case', case, cases_for(self.robot))
-        for method in self.methods:
-            check_name('method', method, known)
-        if self.gyro and not KINDS[self.robot].has_gyro:
-            raise ValueError(f'gyro is for the twin alone: got robot {self.robot}')
-        for what, chosen in (
-            ('case', self.cases),
-            ('method', self.methods),
-            ('seed', self.seeds),
-        ):
-            if not chosen:
-                raise ValueError(f'at least one {what} must be given')
+    def __getitem__(self, index: Any) -> Any:
+        return self.rows[index]
 
-    def jobs(self) -> list[tuple[str, str, int]]:
-        """Return (case, method, seed) of every run, methods of one seed next to each other."""
-        return [
-            (case, method, seed)
-            for case in self.cases
-            for seed in self.seeds
-            for method in self.methods
+    def where(self, **wanted: Hashable) -> list[Row]:
+        """Return the rows with these values, in their order."""
+        names = tuple(sorted(wanted))
+        if names not in self._groups:
+            groups = self._groups[names] = {}
+            for row in self.rows:
+                groups.setdefault(tuple(row.get(name) for name in names), []).append(row)
+        return self._groups[names].get(tuple(wanted[name] for name in names), [])
+
+    def values(self, column: str, **wanted: Hashable) -> list[Any]:
+        """Return a column of those rows that have it."""
+        return [row[column] for row in self.where(**wanted) if column in row]
+
+    def unique(self, column: str, **wanted: Hashable) -> tuple[Any, ...]:
+        """Return the values of a column, each once, in the order of the rows."""
+        return tuple(dict.fromkeys(self.values(column, **wanted)))
+
+    def difference(
+        self, metric: str, first: Row, second: Row, *, pair: str = 'seed'
+    ) -> Difference | None:
+        """Return how much larger a metric is in the rows of ``first`` than in those of ``second``.
+
+        Rows are paired by their seed; None where one of both was not measured.
+        """
+        sides = [
+            {row[pair]: row[metric] for row in self.where(**wanted) if metric in row}
+            for wanted in (first, second)
         ]
-
-    def job(self, case: str, method: str, seed: int) -> Job:
-        """Return scenario and method of a run."""
-        scenario = Scenario(self.robot, case, seed, self.duration, self.noise, self.gyro)
-        return scenario, self.known_methods()[method]
-
-
-Results = Mapping[tuple[str, str], Sequence[Numbers]]
-"""Metrics by case and method, one entry for each seed in the order of the plan."""
-
-
-def compare(
-    plan: ComparisonPlan, workers: int | Executor = 1, *, progress: bool = False
-) -> Results:
-    """Return the metrics of every run of a plan; ``workers`` as for :class:`WorkerPool`."""
-    keys = plan.jobs()
-    found = map_jobs(measured_run, [plan.job(*key) for key in keys], workers, progress=progress)
-    numbers = dict(zip(keys, found, strict=True))
-    return {
-        (case, method): [numbers[case, method, seed] for seed in plan.seeds]
-        for case in plan.cases
-        for method in plan.methods
-    }
+        if not all(sides):
+            return None
+        keys = list(sides[0])
+        return paired(
+            [sides[0][key] for key in keys],
+            [sides[1][key] for key in keys] if sides[1].keys() == {*keys} else [],
+        )
 
 
 def measured_run(job: Job) -> Numbers:
     """Return the metrics of one run."""
     scenario, method = job
     return measure(scenario, run(scenario, method))
+
+
+def run_experiment(
+    runs: Sequence[Run],
+    task: Callable[[Any], Mapping[str, Any]] = measured_run,
+    workers: int | Executor = 1,
+    *,
+    store: Path | None = None,
+    fresh: bool = False,
+    report: Report | None = None,
+) -> ResultTable:
+    """Return one row for each run, in their order.
+
+    Numbers depend neither on who works nor on what the file holds: a run that it holds is not
+    made again, and each that is made is added to it at once, so that an experiment that was
+    interrupted goes on where it was.
+
+    Parameters
+    ----------
+    task
+        Makes the numbers of a job, plain data by name; a function of a module.
+    workers
+        As for :class:`WorkerPool`.
+    store, fresh
+        File of the runs, and whether those that it holds are thrown away.
+    report
+        Receives messages; with None there is no progress line either.
+
+    Raises
+    ------
+    JobError
+        A run raised an exception.
+    RuntimeError
+        Another process writes to the file.
+    """
+    jobs = [run.job for run in runs]
+    if store is None:
+        found = map_jobs(task, jobs, workers, progress=report is not None)
+        return ResultTable(
+            [{**run.fields, **numbers} for run, numbers in zip(runs, found, strict=True)]
+        )
+    by_key = {run.key: run for run in runs}
+    if len(by_key) < len(runs) or '' in by_key:
+        raise ValueError('runs must have different keys')
+    file = ResultFile(store, fresh=fresh)
+    for left in reversed(range(RESTARTS + 1)):
+        try:
+            kept = file.complete(
+                {run.key: run.job for run in runs}, lambda jobs: _made(task, jobs, workers), report
+            )
+            break
+        except JobError as error:
+            if not (left and isinstance(error.__cause__, BrokenExecutor)):
+                raise
+            if report is not None:
+                report('a worker process was lost; its runs are begun again')
+    return ResultTable([{**run.fields, **kept[run.key]} for run in runs])
+
+
+def _made(
+    task: Callable[[Any], Mapping[str, Any]], jobs: Sequence[Any], workers: int | Executor
+) -> Iterator[tuple[int, Row]]:
+    with WorkerPool(workers) as pool:
+        for index, numbers in pool.map(task, jobs):
+            yield index, dict(numbers)
+
+
+def print_report(line: str) -> None:
+    """Print a message about the progress on standard error."""
+    print(line, file=sys.stderr, flush=True)
+
+
+# -- what determines the numbers of a run ---------------------------------------------------------
+
+
+def digest(*parts: Any) -> str:
+    """Return a digest of version, sources of this package, and the content of ``parts``.
+
+    Functions and classes of a script count with their source, files with their content.
+    """
+    content = VERSION, source_digest(), [content_of(part) for part in parts]
+    return hashlib.sha256(repr(content).encode()).hexdigest()[:16]
+
+
+# Sources that only display, record or select, or whose values are part of a method. All others
+# make stored runs invalid: a needless repetition is better than an outdated result.
+_IRRELEVANT_SOURCES = (
+    'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'evaluation/bag_report/',
+    'evaluation/process_replay/', 'evaluation/tuning/', 'evaluation/comparison',
+    'evaluation/fault_page.py', 'evaluation/plotting.py', 'evaluation/reporting.py',
+    'evaluation/result_file.py', 'evaluation/paper/', 'evaluation/patrol/patrol_page.py',
+    'evaluation/patrol/patrol_figures.py', 'evaluation/patrol/tracking_page.py',
+)  # fmt: skip
+
+
+@cache
+def source_digest(package: Path = PACKAGE_DIRECTORY) -> str:
+    """Return a digest of every source and data file that can change the numbers of a run."""
+    suffixes = ('.py', '.npy', '.npz', '.yaml', '.json', '.csv')
+    found = hashlib.sha256()
+    for path in sorted(package.rglob('*')):
+        name = path.relative_to(package).as_posix()
+        if path.suffix in suffixes and not name.startswith(_IRRELEVANT_SOURCES):
+            found.update(name.encode() + b'\0' + hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()[:16]
+
+
+def content_of(value: Any) -> object:
+    """Return what a value is, as text and numbers; equal ones have equal content.
+
+    An object with a method ``content()`` says itself what it is.
+    """
+    if callable(own := getattr(value, 'content', None)) and not isinstance(value, type):
+        return own()
+    if isinstance(value, str | os.PathLike):
+        return os.fspath(value), _file_digest(Path(value).expanduser())
+    if value is None or isinstance(value, bool | int | float):
+        return value
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+        return str(value.dtype), value.shape, content
+    if isinstance(value, Mapping):
+        return [(str(key), content_of(item)) for key, item in value.items()]
+    if isinstance(value, list | tuple):
+        return [content_of(item) for item in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        items = [content_of(getattr(value, item.name)) for item in fields(value)]
+        return type(value).__name__, items
+    return _code(value)
+
+
+def _file_digest(path: Path) -> str:
+    """Return a digest of a file, a schedule of faults or a world say; '' if there is none."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ''
+    except OSError:
+        return ''
+
+
+def _code(value: Any) -> object:
+    """Return the source of a function or class, or of the class of an object and its state."""
+    name = getattr(value, '__qualname__', type(value).__qualname__)
+    try:
+        source = inspect.getsource(value if hasattr(value, '__qualname__') else type(value))
+    except (OSError, TypeError):
+        source = ''  # made in an interactive session: its name is all that is known
+    if hasattr(value, '__qualname__'):
+        return name, source
+    try:
+        return name, source, hashlib.sha256(pickle.dumps(value)).hexdigest()
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return name, source

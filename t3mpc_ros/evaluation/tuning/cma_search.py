@@ -114,7 +114,7 @@ def search_best(
     origin = space.point(start)
     search = [dict(about or {}), repr(space.ranges), start.to_dict()]
     digest = hashlib.sha256(json.dumps(search).encode()).hexdigest()
-    file = None if path is None else ResultFile(path, _encode, _decode, fresh=not resume)
+    file = None if path is None else ResultFile(path, fresh=not resume)
     with file or nullcontext():
         evaluator = _Evaluator(objective, evaluations, digest, file, report)
         evaluator.evaluate([space.of(start)])
@@ -132,10 +132,6 @@ def search_best(
     return SearchResult(best.values, best.value, tuple(evaluator.done))
 
 
-_Key = tuple[str, str]
-"""Digest of the search, and the tried parameters as JSON."""
-
-
 class _Evaluator:
     """The evaluations of one search: made once, or found in its file, and counted."""
 
@@ -144,12 +140,13 @@ class _Evaluator:
         objective: Objective,
         total: int,
         digest: str,
-        file: ResultFile[_Key, float] | None,
+        file: ResultFile | None,
         report: Callable[[SearchProgress], None] | None,
     ) -> None:
         self._objective, self._total, self._digest = objective, total, digest
         self._file, self._report = file, report
         self._known = {} if file is None else file.read()
+        """Objective by digest of the search and tried parameters as JSON."""
         self.done: list[Evaluation] = []
 
     @property
@@ -162,7 +159,7 @@ class _Evaluator:
 
     def evaluate(self, asked: Sequence[Values]) -> list[float]:
         """Return the objective of each, infinite where it is not a finite number."""
-        keys = [(self._digest, json.dumps(each)) for each in asked]
+        keys = [f'{self._digest} {json.dumps(each)}' for each in asked]
         missing = [i for i, key in enumerate(keys) if key not in self._known]
         returned = self._objective([dict(asked[i]) for i in missing]) if missing else []
         if len(returned) != len(missing):
@@ -170,26 +167,15 @@ class _Evaluator:
                 f'objective must return one value a point, {len(missing)}: got {len(returned)}'
             )
         for i, value in zip(missing, returned, strict=True):
-            self._known[keys[i]] = float(value) if math.isfinite(value) else math.inf
+            number = float(value) if math.isfinite(value) else math.inf
+            self._known[keys[i]] = {'objective': number}
             if self._file is not None:
                 self._file.add(keys[i], self._known[keys[i]])
-        values = [self._known[key] for key in keys]
+        values = [float(self._known[key]['objective']) for key in keys]
         self.done += map(Evaluation, asked, values)
         if self._report is not None:
             self._report(SearchProgress(len(self.done), self._total, self.best.value))
         return values
-
-
-def _encode(key: _Key, value: float) -> str:
-    """Return a line of the file; JSON has no infinity."""
-    number = value if math.isfinite(value) else None
-    return json.dumps({'search': key[0], 'values': json.loads(key[1]), 'objective': number})
-
-
-def _decode(line: str) -> tuple[_Key, float]:
-    row = json.loads(line)
-    number = math.inf if row['objective'] is None else float(row['objective'])
-    return (row['search'], json.dumps(row['values'])), number
 
 
 class _Generations:
