@@ -17,7 +17,7 @@ from t3mpc_ros.cli.run_options import (
 )
 
 if TYPE_CHECKING:
-    from t3mpc_ros.evaluation.experiment import ComparisonPlan
+    from t3mpc_ros.evaluation.comparison import ComparisonPlan
 
 DEFAULT_SEEDS = '201-206'
 
@@ -75,7 +75,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 def run(options: argparse.Namespace) -> int:
     """Print the tables and return 0."""
     from t3mpc_ros.evaluation.cases import cases_for
-    from t3mpc_ros.evaluation.experiment import ComparisonPlan, default_methods
+    from t3mpc_ros.evaluation.comparison import ComparisonPlan, default_methods
     from t3mpc_ros.evaluation.methods import methods_for, require_libraries
     from t3mpc_ros.parameters.table import find_names
 
@@ -120,16 +120,16 @@ def _compare_own(options: argparse.Namespace) -> int:
 
 def _compare_and_write(options: argparse.Namespace, plan: 'ComparisonPlan') -> int:
     from t3mpc_ros.evaluation import comparison_page
-    from t3mpc_ros.evaluation.experiment import compare
+    from t3mpc_ros.evaluation.comparison import compare
+    from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.reporting import strict_json
     from t3mpc_ros.scripting.executors import workers_for
 
     for path in (options.json, options.html):
         if path:  # a folder that cannot be made is an error before the runs, not after them
             path.parent.mkdir(parents=True, exist_ok=True)
-    jobs = [plan.job(*key) for key in plan.jobs()]
     with executor_of(options) as executor:
-        results = compare(plan, workers_for(executor, jobs), progress=True)
+        results = compare(plan, workers_for(executor, plan.runs()), print_report)
     print(comparison_page.markdown(plan, results))
     if options.json:
         content = comparison_page.record(plan, results)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
-from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean, paired
-from t3mpc_ros.evaluation.experiment import ComparisonPlan, Results
+from t3mpc_ros.evaluation.comparison import ComparisonPlan
+from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean
+from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.method import NodeMethod
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, TWIN_ADVANCE
 from t3mpc_ros.evaluation.metrics import (
@@ -49,21 +50,12 @@ BETTER, WORSE, INCONCLUSIVE = 'better', 'worse', 'inconclusive'
 """Verdicts on a paired difference: its 95 % interval lies below zero, above it, or contains it."""
 
 
-def values(results: Results, case: str, method: str, metric: Metric) -> list[float]:
-    """Return a metric of all seeds; empty where the case does not have it."""
-    runs = results[case, method]
-    return [run[metric.name] for run in runs] if metric.name in runs[0] else []
-
-
 def difference(
-    results: Results, case: str, method: str, metric: Metric, against: str = FEED_FORWARD
+    plan: ComparisonPlan, results: ResultTable, case: str, method: str, metric: Metric
 ) -> Difference | None:
-    """Return the paired difference from another method; None for itself or without it."""
-    if method == against or (case, against) not in results:
-        return None
-    mine = values(results, case, method, metric)
-    other = values(results, case, against, metric)
-    return paired(mine, other) if mine and other else None
+    """Return the paired difference from the method of reference; None for itself or without it."""
+    first, second = ({'controller': name, 'case': case} for name in (method, plan.against))
+    return None if first == second else results.difference(metric.name, first, second)
 
 
 def verdict(found: Difference) -> str:
@@ -82,15 +74,15 @@ def judged_metrics(case: str) -> tuple[Metric, ...]:
     return SETTLED, OVERALL
 
 
-def summary_table(plan: ComparisonPlan, results: Results) -> Table:
+def summary_table(plan: ComparisonPlan, results: ResultTable) -> Table:
     """Return the first judged metric of every method and case, with its verdict."""
     rows = []
     for method in plan.methods:
         cells = [method]
         for case in plan.cases:
             metric = judged_metrics(case)[0]
-            found = difference(results, case, method, metric, plan.against)
-            average = mean(values(results, case, method, metric))
+            found = difference(plan, results, case, method, metric)
+            average = mean(results.values(metric.name, case=case, controller=method))
             text = 'diverged' if math.isnan(average) else f'{average:.{metric.digits}f}'
             cells.append(text if found is None else f'{text} {verdict(found)}')
         rows.append(tuple(cells))
@@ -102,14 +94,17 @@ def summary_table(plan: ComparisonPlan, results: Results) -> Table:
     return Table(title, ('method', *plan.cases), rows, (FULL,), wrap=True)
 
 
-def case_table(plan: ComparisonPlan, results: Results, case: str) -> Table:
+def case_table(plan: ComparisonPlan, results: ResultTable, case: str) -> Table:
     """Return every metric of a case, and the paired differences of those that decide it."""
-    first = results[case, plan.methods[0]][0]
+    first = results.where(case=case, controller=plan.methods[0])[0]
     metrics = [
         metric
         for metric in METRICS
         if metric.name in first
-        and (metric is not STOPPED or any(_stopped(results, case, m) for m in plan.methods))
+        and (
+            metric is not STOPPED
+            or any(each > 0.0 for each in results.values(STOPPED.name, case=case))
+        )
     ]
     judged = judged_metrics(case)
     head = ['method', *(f'{metric.heading}, {metric.unit}' for metric in metrics)]
@@ -121,10 +116,10 @@ def case_table(plan: ComparisonPlan, results: Results, case: str) -> Table:
     for method in plan.methods:
         cells = [method]
         for metric in metrics:
-            numbers = values(results, case, method, metric)
+            numbers = results.values(metric.name, case=case, controller=method)
             cells.append(format_interval(mean(numbers), interval(numbers), '', metric.digits))
         for metric in judged if compared else ():
-            found = difference(results, case, method, metric, plan.against)
+            found = difference(plan, results, case, method, metric)
             if found is None:
                 cells += [EMPTY_CELL, EMPTY_CELL]
             else:
@@ -210,7 +205,7 @@ def _are_outside(seeds: Sequence[int]) -> bool:
     return not {*seeds} & {*TUNING_SEEDS, *PRETRAINING_SEEDS, *HELD_OUT_SEEDS}
 
 
-def markdown(plan: ComparisonPlan, results: Results) -> str:
+def markdown(plan: ComparisonPlan, results: ResultTable) -> str:
     """Return all tables in Markdown."""
     tables = [
         summary_table(plan, results),
@@ -220,7 +215,7 @@ def markdown(plan: ComparisonPlan, results: Results) -> str:
     return '\n\n'.join([description(plan), *(table.markdown() for table in tables)])
 
 
-def page(plan: ComparisonPlan, results: Results) -> str:
+def page(plan: ComparisonPlan, results: ResultTable) -> str:
     """Return the page as self-contained HTML."""
     blocks: list[Block] = []
     caption = f'Difference from {plan.against}, with 95 % interval'
@@ -235,7 +230,7 @@ def page(plan: ComparisonPlan, results: Results) -> str:
     return html_page(f'Comparison of methods: {plan.robot}', blocks)
 
 
-def record(plan: ComparisonPlan, results: Results) -> dict[str, Any]:
+def record(plan: ComparisonPlan, results: ResultTable) -> dict[str, Any]:
     """Return plan, runs and differences for a JSON file; NaN where a run broke off."""
     cases: dict[str, Any] = {}
     for case in CASES:
@@ -265,12 +260,13 @@ def _parameters(plan: ComparisonPlan, name: str) -> Mapping[str, object]:
 
 
 def _method_record(
-    plan: ComparisonPlan, results: Results, case: str, method: str
+    plan: ComparisonPlan, results: ResultTable, case: str, method: str
 ) -> dict[str, Any]:
-    runs = results[case, method]
+    runs = results.where(case=case, controller=method)
+    names = [metric.name for metric in METRICS if metric.name in runs[0]]
     differences = {}
     for metric in METRICS:
-        found = difference(results, case, method, metric, plan.against)
+        found = difference(plan, results, case, method, metric)
         if found is not None:
             differences[metric.name] = {
                 'mean': found.mean,
@@ -278,24 +274,19 @@ def _method_record(
                 'verdict': verdict(found),
             }
     return {
-        'mean': {name: mean([run[name] for run in runs]) for name in runs[0]},
-        'runs': [dict(run) for run in runs],
+        'mean': {name: mean([run[name] for run in runs]) for name in names},
+        'runs': [{name: run[name] for name in names} for run in runs],
         f'difference_from_{plan.against.replace("-", "_")}': differences,
     }
 
 
-def _stopped(results: Results, case: str, method: str) -> bool:
-    return any(number > 0.0 for number in values(results, case, method, STOPPED))
-
-
-def _draw_differences(plan: ComparisonPlan, results: Results, case: str) -> Any:
+def _draw_differences(plan: ComparisonPlan, results: ResultTable, case: str) -> Any:
     """Return a figure of the paired differences of the first judged metric, or None."""
     metric = judged_metrics(case)[0]
     rows: Sequence[tuple[str, Difference]] = [
         (method, found)
         for method in plan.methods
-        if (found := difference(results, case, method, metric, plan.against))
-        and math.isfinite(found.mean)
+        if (found := difference(plan, results, case, method, metric)) and math.isfinite(found.mean)
     ]
     if not rows:
         return None

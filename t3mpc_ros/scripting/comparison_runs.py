@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from t3mpc_ros.evaluation.cases import NOMINAL
+from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan
+from t3mpc_ros.evaluation.comparison import compare as run_plan
 from t3mpc_ros.evaluation.confidence_intervals import Difference
-from t3mpc_ros.evaluation.experiment import QUICK_SEEDS, ComparisonPlan, Results
-from t3mpc_ros.evaluation.experiment import compare as run_plan
+from t3mpc_ros.evaluation.experiment import ResultTable, print_report
 from t3mpc_ros.evaluation.loop import Method
 from t3mpc_ros.evaluation.metrics import METRICS, Metric
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
-from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.scripting.controllers import OwnMethod, as_controllers
@@ -67,18 +67,14 @@ class ScriptedPlan(ComparisonPlan):
         """Return one run without its method."""
         return self.setting.scenario(case, seed)
 
-    def job(self, case: str, method: str, seed: int) -> Job:
-        """Return scenario and method of a run."""
-        return self.scenario(case, seed), self.controllers[method]
-
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Result of a comparison: the metrics of every run, and what is made of them."""
 
     plan: ScriptedPlan
-    results: Results
-    """Metrics by (case, controller), one entry for each seed."""
+    results: ResultTable
+    """One row for each run: controller, case, seed and metrics by name."""
 
     def table(self, case: str | None = None) -> str:
         """Return the metrics of a case in Markdown: means over the seeds with 95 % intervals.
@@ -98,9 +94,8 @@ class Comparison:
     @one_sentence
     def values(self, controller: str, metric: str = 'overall', case: str = '') -> list[float]:
         """Return a metric of a controller, one number for each seed."""
-        from t3mpc_ros.evaluation.comparison_page import values
-
-        return values(self.results, *self._chosen(controller, case), _metric(metric))
+        chosen = self._chosen(controller, case)
+        return self.results.values(_metric(metric).name, **chosen)
 
     @one_sentence
     def difference(
@@ -110,34 +105,24 @@ class Comparison:
 
         None for the first controller itself.
         """
-        from t3mpc_ros.evaluation.comparison_page import difference
+        first = self._chosen(controller, case)
+        second = {**first, 'controller': self.plan.against}
+        return (
+            None
+            if first == second
+            else self.results.difference(_metric(metric).name, first, second)
+        )
 
-        run = self._chosen(controller, case)
-        return difference(self.results, *run, _metric(metric), self.plan.against)
-
-    def _chosen(self, controller: str, case: str) -> tuple[str, str]:
-        """Return case and controller by their names, or parts of them."""
+    def _chosen(self, controller: str, case: str) -> dict[str, str]:
+        """Return controller and case by their names, or parts of them."""
         (name,) = find_names('controller', [controller], self.plan.methods)
         (chosen,) = find_names('case', [case or self.plan.cases[0]], self.plan.cases)
-        return chosen, name
+        return {'controller': name, 'case': chosen}
 
     def rows(self) -> list[dict[str, Any]]:
         """Return one row for each run: controller, case, seed, setting, metrics, provenance."""
-        plan, origin = self.plan, provenance()
-        return [
-            {
-                'controller': method,
-                'robot': plan.robot,
-                'case': case,
-                'seed': seed,
-                'noise': plan.noise,
-                'duration': plan.duration,
-                **numbers,
-                **origin,
-            }
-            for (case, method), runs in self.results.items()
-            for seed, numbers in zip(plan.seeds, runs, strict=True)
-        ]
+        origin = provenance()
+        return [row | origin for row in self.results]
 
     @one_sentence
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
@@ -200,8 +185,8 @@ def compare(
         As for :func:`simulate`.
     """
     plan = make_plan(controllers, seeds, cases, Setting(plant, reference, noise, faults, duration))
-    jobs = [plan.job(*key) for key in plan.jobs()]
-    return Comparison(plan, run_plan(plan, workers_for(executor, jobs), progress=progress))
+    workers = workers_for(executor, plan.runs())
+    return Comparison(plan, run_plan(plan, workers, print_report if progress else None))
 
 
 def make_plan(

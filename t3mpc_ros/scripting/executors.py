@@ -11,19 +11,20 @@ import pickle
 import sys
 from typing import Any
 
+from t3mpc_ros.evaluation.experiment import Run
 from t3mpc_ros.scripting.script_error import LOST_PROCESS, ScriptError
 
 
-def workers_for(executor: Any, jobs: Sequence[Any]) -> int | Executor:
-    """Return who computes jobs: a number of processes, or an executor.
+def workers_for(executor: Any, runs: Sequence[Run]) -> int | Executor:
+    """Return who makes runs: a number of processes, or an executor.
 
-    One job, and jobs of an interactive session, which other processes cannot import, are computed
+    One run, and runs of an interactive session, which other processes cannot import, are made
     in this process unless an executor is given.
 
     Raises
     ------
     ScriptError
-        It is no executor, or the jobs cannot be sent to other processes.
+        It is no executor, or the runs cannot be sent to other processes.
     """
     if isinstance(executor, Executor):
         return executor
@@ -41,14 +42,14 @@ def workers_for(executor: Any, jobs: Sequence[Any]) -> int | Executor:
     if getattr(multiprocessing.process.current_process(), '_inheriting', False):
         # The program of a worker process runs this script again: it would start workers for ever.
         raise SystemExit(f'error: {LOST_PROCESS}')
-    if executor == 1 or len(jobs) < 2:
+    if executor == 1 or len(runs) < 2:
         return 1
     count = executor or len(os.sched_getaffinity(0))
     if executor is None and not hasattr(sys.modules['__main__'], '__file__'):
         return 1
     if count > 1:
-        _check_picklable(jobs[0])
-    return min(count, len(jobs))
+        _check_picklable(runs[0].job)
+    return min(count, len(runs))
 
 
 @contextmanager

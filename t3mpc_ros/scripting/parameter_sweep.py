@@ -2,35 +2,37 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs over parameters × seeds × cases × controllers: ``sweep`` and its result."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-import hashlib
-import inspect
 import itertools
-import json
 import math
 import os
 from pathlib import Path
-import pickle
-import sys
 from typing import Any
 
 import numpy as np
 
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
-from t3mpc_ros.evaluation.experiment import measured_run
+from t3mpc_ros.evaluation.experiment import (
+    Report,
+    Run,
+    content_of,
+    digest,
+    measured_run,
+    print_report,
+    run_experiment,
+)
 from t3mpc_ros.evaluation.metrics import METRICS
-from t3mpc_ros.evaluation.paper.experiment_runs import source_digest
-from t3mpc_ros.evaluation.reporting import Table, finite, format_interval
-from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
+from t3mpc_ros.evaluation.reporting import Table, format_interval
+from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
-from t3mpc_ros.evaluation.workers import Job, JobError, WorkerPool, map_jobs
+from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.scripting.comparison_runs import checked_seeds
-from t3mpc_ros.scripting.controllers import Controller, FileController, as_controllers
+from t3mpc_ros.scripting.controllers import as_controllers
 from t3mpc_ros.scripting.executors import workers_for
 from t3mpc_ros.scripting.plants import NoiseLaw
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence, sentence
@@ -44,9 +46,6 @@ OF_SETTING = ('noise', 'duration')
 RUN, ERROR = 'run', 'error'
 """Columns: digest of all that determines a run, and why it has no numbers; '' with them."""
 SUFFIX = '.parquet'
-RESTARTS = 3
-"""How often a pool of processes that lost one is started anew."""
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,43 +167,33 @@ def sweep(
         As for :func:`simulate`, or because every run failed.
     """
     setting = Setting(plant, reference, noise, faults, duration)
-    cells = make_cells(controllers, parameters, checked_seeds(seeds), cases, setting)
+    runs = make_runs(controllers, parameters, checked_seeds(seeds), cases, setting)
     path = _checked_path(output)
-    workers = workers_for(executor, [cell.job for cell in cells.values()])
-    names = tuple(parameters)
-    report = _print if progress else None
+    workers = workers_for(executor, runs)
+    report = print_report if progress else None
     if path is None:
-        jobs = [cell.job for cell in cells.values()]
-        found = map_jobs(cell_numbers, jobs, workers, progress=progress)
-        numbers = dict(zip(cells, found, strict=True))
-        return _checked(Sweep(_rows(cells, numbers), names))
-    result = _to_file(path, cells, workers, report, names)
-    return _checked(result)
+        rows = list(run_experiment(runs, numbers_or_error, workers, report=report))
+    else:
+        rows = _run_to_file(path, runs, workers, report)
+    if all(errors := [row[ERROR] for row in rows]):
+        raise ScriptError(f'every run failed: {errors[0]}')
+    return Sweep(rows, tuple(parameters), path)
 
 
-@dataclass(frozen=True, eq=False)
-class Cell:
-    """One run of a sweep."""
-
-    job: Job
-    values: Row
-    """The row without metrics."""
-
-
-def make_cells(
+def make_runs(
     controllers: Any,
     parameters: Mapping[str, Sequence[Any]],
     seeds: Sequence[int],
     cases: Sequence[str],
     setting: Setting,
-) -> dict[str, Cell]:
-    """Return the runs of a sweep by the digest of all that determines them.
+) -> list[Run]:
+    """Return the runs of a sweep, each with the digest of all that determines it.
 
     Seed by seed, so that an estimate of the time left holds.
     """
     chosen = setting.chosen_cases(cases)
     combinations = _combinations(parameters)
-    origin, sources = provenance(), source_digest(every=True)
+    origin = provenance()
     prepared = []
     for controller in as_controllers(controllers):
         for values in combinations:
@@ -215,14 +204,14 @@ def make_cells(
                 robot_parameters=_robot_values(setting, values),
             )
             source = replace(controller, settings={**controller.settings, **own})
-            digest = _digest((sources, origin['python'], _content(source), _content(changed)))
+            content = content_of([origin['python'], source, changed])
             prepared.append(
-                (controller.name, values, source.method(setting.robot), changed, digest)
+                (controller.name, values, source.method(setting.robot), changed, content)
             )
-    cells: dict[str, Cell] = {}
+    runs = []
     for seed in seeds:
         for case in chosen:
-            for name, values, method, changed, digest in prepared:
+            for name, values, method, changed, content in prepared:
                 row = {
                     'controller': name,
                     **values,
@@ -233,11 +222,12 @@ def make_cells(
                     'noise': changed.variance,
                     'duration': float(changed.duration),
                 }
-                cell = Cell((changed.scenario(case, seed), method), row | origin)
-                cells[_digest((digest, name, case, seed))] = cell
-    if len(cells) != len(seeds) * len(chosen) * len(prepared):
+                key = digest(content, name, case, seed)
+                job = changed.scenario(case, seed), method
+                runs.append(Run(job, {**row, **origin, RUN: key}, key))
+    if len({run.key for run in runs}) < len(runs):
         raise ScriptError('controllers and values must differ: got two runs that are the same')
-    return cells
+    return runs
 
 
 def _combinations(parameters: Mapping[str, Sequence[Any]]) -> list[Row]:
@@ -262,7 +252,7 @@ def _robot_values(setting: Setting, values: Row) -> Row:
     return {**setting.robot_parameters, **own}
 
 
-def cell_numbers(job: Job) -> Row:
+def numbers_or_error(job: Job) -> Row:
     """Return the metrics of one run, or its error.
 
     Errors that say nothing about the run itself, such as a missing library, are raised.
@@ -271,17 +261,6 @@ def cell_numbers(job: Job) -> Row:
         return {**measured_run(job), ERROR: ''}
     except (ValueError, ArithmeticError) as error:
         return {ERROR: sentence(error)}
-
-
-def _rows(cells: Mapping[str, Cell], numbers: Mapping[str, Row]) -> list[Row]:
-    return [{**cell.values, **numbers[key], RUN: key} for key, cell in cells.items()]
-
-
-def _checked(result: Sweep) -> Sweep:
-    errors = [row[ERROR] for row in result.rows]
-    if all(errors):
-        raise ScriptError(f'every run failed: {errors[0]}')
-    return result
 
 
 # -- file -----------------------------------------------------------------------------------------
@@ -299,43 +278,24 @@ def _checked_path(output: str | os.PathLike[str] | None) -> Path | None:
     return path
 
 
-def _to_file(
-    path: Path,
-    cells: Mapping[str, Cell],
-    workers: int | Executor,
-    report: Callable[[str], None] | None,
-    names: tuple[str, ...],
-) -> Sweep:
+def _run_to_file(
+    path: Path, runs: Sequence[Run], workers: int | Executor, report: Report | None
+) -> list[Row]:
     """Run what the file and its journal lack, write the file, and remove the journal."""
     stored = _read(path)
-    wanted = {key: cell for key, cell in cells.items() if key not in stored}
+    wanted = [run for run in runs if run.key not in stored]
     if stored and report is not None:
-        report(f'{path} holds {len(cells) - len(wanted)} of {len(cells)} runs')
-    journal: ResultFile[str, Row] = ResultFile(
-        path.with_name(f'{path.name}.runs.jsonl'), _encoded, _decoded
+        report(f'{path} holds {len(runs) - len(wanted)} of {len(runs)} runs')
+    journal = path.with_name(f'{path.name}.runs.jsonl')
+    made = run_experiment(wanted, numbers_or_error, workers, store=journal, report=report)
+    fresh = {row[RUN]: row for row in made}
+    rows = [fresh.get(run.key) or stored[run.key] for run in runs]
+    keys = {run.key for run in runs}
+    write_parquet(
+        path, columns_of([*rows, *(row for key, row in stored.items() if key not in keys)])
     )
-    jobs = {key: cell.job for key, cell in wanted.items()}
-
-    def run(missing: Sequence[Job]) -> Iterator[tuple[int, Row]]:
-        with WorkerPool(workers) as pool:
-            yield from pool.map(cell_numbers, missing)
-
-    for left in reversed(range(RESTARTS + 1)):
-        try:
-            numbers = run_missing_jobs(journal, jobs, run, report)
-        except JobError as error:
-            if not (left and isinstance(error.__cause__, BrokenExecutor)):
-                raise
-            if report is not None:
-                report('a worker process was lost; its runs are begun again')
-        else:
-            break
-    fresh = {row[RUN]: row for row in _rows(wanted, numbers)}
-    rows = [fresh.get(key) or stored[key] for key in cells]
-    others = [row for key, row in stored.items() if key not in cells]
-    write_parquet(path, columns_of([*rows, *others]))
-    journal.path.unlink(missing_ok=True)
-    return Sweep(rows, names, path)
+    journal.unlink(missing_ok=True)
+    return rows
 
 
 def _read(path: Path) -> dict[str, Row]:
@@ -352,75 +312,3 @@ def _read(path: Path) -> dict[str, Row]:
     if any(RUN not in row for row in rows):
         raise ScriptError(f'{path} is no file of a sweep: its rows have no column {RUN}')
     return {row[RUN]: row for row in rows}
-
-
-def _encoded(key: str, value: Row) -> str:
-    return json.dumps({RUN: key, **dict(finite(value).items())}, ensure_ascii=False)  # type: ignore[attr-defined]
-
-
-def _decoded(line: str) -> tuple[str, Row]:
-    row = json.loads(line)
-    key = row.pop(RUN)
-    return key, {name: math.nan if value is None else value for name, value in row.items()}
-
-
-def _print(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
-
-
-# -- what determines a run ------------------------------------------------------------------------
-
-
-def _digest(content: object) -> str:
-    return hashlib.sha256(repr(content).encode()).hexdigest()[:16]
-
-
-def _content(value: Any) -> object:
-    """Return what a value is, as text and numbers: functions and files by their content."""
-    if isinstance(value, str | os.PathLike):
-        return os.fspath(value), _file(Path(value).expanduser())
-    if value is None or isinstance(value, bool | int | float):
-        return value
-    if isinstance(value, Controller):
-        source = value.source
-        if isinstance(source, str) and '.py:' in source:
-            source = FileController.load(source)
-        return value.name, _content(source), _content(value.settings)
-    if isinstance(value, Setting):
-        reference = value.own_reference
-        speeds = None if reference is None else reference.speeds
-        parts = value.plant, value.noise, value.faults, value.duration, value.robot_parameters
-        return *(_content(part) for part in parts), _content(speeds)
-    if isinstance(value, np.ndarray):
-        return value.shape, hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
-    if isinstance(value, Mapping):
-        return [(str(key), _content(item)) for key, item in value.items()]
-    if isinstance(value, list | tuple):
-        return [_content(item) for item in value]
-    if hasattr(value, '__dataclass_fields__'):
-        names = value.__dataclass_fields__
-        return type(value).__name__, [_content(getattr(value, name)) for name in names]
-    return _code(value)
-
-
-def _file(path: Path) -> str:
-    """Return a digest of a file, a schedule of faults or a world say; '' if there is none."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ''
-    except OSError:
-        return ''
-
-
-def _code(value: Any) -> object:
-    """Return the source of a function or class, or of the class of an object and its state."""
-    name = getattr(value, '__qualname__', type(value).__qualname__)
-    try:
-        source = inspect.getsource(value if hasattr(value, '__qualname__') else type(value))
-    except (OSError, TypeError):
-        source = ''  # made in an interactive session: its name is all that is known
-    if hasattr(value, '__qualname__'):
-        return name, source
-    try:
-        return name, source, hashlib.sha256(pickle.dumps(value)).hexdigest()
-    except (pickle.PicklingError, AttributeError, TypeError):
-        return name, source

@@ -9,6 +9,7 @@ import os
 from typing import Any
 
 from t3mpc_ros.evaluation.cases import NOMINAL, ROBOTS, cases_for
+from t3mpc_ros.evaluation.experiment import content_of
 from t3mpc_ros.evaluation.scenario import (
     KINDS,
     OwnParts,
@@ -168,6 +169,13 @@ class Setting:
         if self.faults is None or isinstance(self.faults, LinkFaults):
             return FaultSchedule()
         return load_schedule(os.fspath(self.faults))
+
+    def content(self) -> object:
+        """Return what determines its runs: the reference counts with its speeds."""
+        reference = self.own_reference
+        speeds = None if reference is None else reference.speeds
+        parts = self.plant, self.noise, self.faults, self.duration, self.robot_parameters, speeds
+        return content_of(parts)
 
     def scenario(self, case: str = NOMINAL, seed: int = 1) -> Scenario:
         """Return one run without its method.

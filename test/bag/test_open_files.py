@@ -277,10 +277,10 @@ def a_page(folder):
 
 
 def results(folder):
-    file = ResultFile(folder / 'a.jsonl', lambda key, value: key, lambda line: (line, line))
-    other = ResultFile(folder / 'a.jsonl', lambda key, value: key, lambda line: (line, line))
+    file = ResultFile(folder / 'a.jsonl')
+    other = ResultFile(folder / 'a.jsonl')
     with file:
-        file.add('a', 'b')
+        file.add('a', {'b': 1})
         with suppress(RuntimeError), other:
             pass
     with suppress(OSError):

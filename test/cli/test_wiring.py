@@ -130,7 +130,7 @@ def topics(path):
 
 PAPER = 'evaluation.paper.reproduce.reproduce'
 COMPARE = {
-    'evaluation.experiment.compare': {},
+    'evaluation.comparison.compare': {},
     'evaluation.comparison_page.markdown': '',
     'evaluation.comparison_page.record': {},
     'evaluation.comparison_page.page': '',

@@ -17,8 +17,9 @@ from support.records import PAIRS, record_of
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation import comparison_page, fault_page, plotting
+from t3mpc_ros.evaluation.comparison import ComparisonPlan
 from t3mpc_ros.evaluation.confidence_intervals import interval
-from t3mpc_ros.evaluation.experiment import ComparisonPlan
+from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.fault_study import Outcome
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.metrics import METRICS
@@ -397,11 +398,12 @@ def test_differences_of_methods_are_coloured_by_their_verdict(caught):
     noise = np.array([-0.01, 0.0, 0.02])
     plan = ComparisonPlan('servo', ('nominal',), ('feed-forward', *apart), (1, 2, 3), 60.0)
 
-    def runs(shift, spread=1.0):
-        return [{'settled': 1.0 + shift + spread * n, 'overall': 2.0} for n in noise]
-
-    results = {('nominal', 'feed-forward'): runs(0.0, 0.0)}
-    results |= {('nominal', name): runs(shift) for name, shift in apart.items()}
+    rows = [
+        {'controller': name, 'case': 'nominal', 'seed': seed, 'settled': 1.0 + n, 'overall': 2.0}
+        for name, shift in {'feed-forward': None, **apart}.items()
+        for seed, n in enumerate(0.0 * noise if shift is None else shift + noise)
+    ]
+    results = ResultTable(rows)
     page = comparison_page.page(plan, results)
     (axis,) = caught[0].axes
     assert [tick.get_text() for tick in axis.get_yticklabels()] == [*apart]

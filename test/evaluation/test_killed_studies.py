@@ -108,4 +108,4 @@ def test_every_study_with_a_file_of_its_runs_is_tried():
         if re.search(r'import .*\b(ResultFile|write_atomically)\b', path.read_text())
     }
     users -= {'metadata', 'tuned_parameters'}  # a bag; a file that nothing resumes
-    assert users == {'parameter_sweep', 'experiment_runs', 'patrol_comparison', 'cma_search'}
+    assert users == {'parameter_sweep', 'experiment', 'cma_search'}

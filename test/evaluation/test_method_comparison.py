@@ -19,6 +19,12 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
     ProportionalIntegralParameters,
 )
 from t3mpc_ros.evaluation.cases import NOMINAL, cases_for
+from t3mpc_ros.evaluation.comparison import (
+    QUICK_SEEDS,
+    ComparisonPlan,
+    compare,
+    default_methods,
+)
 from t3mpc_ros.evaluation.comparison_page import (
     BETTER,
     INCONCLUSIVE,
@@ -28,13 +34,7 @@ from t3mpc_ros.evaluation.comparison_page import (
     verdict,
 )
 from t3mpc_ros.evaluation.drivers import MethodDriver, NodeDriver
-from t3mpc_ros.evaluation.experiment import (
-    QUICK_SEEDS,
-    ComparisonPlan,
-    compare,
-    default_methods,
-    measured_run,
-)
+from t3mpc_ros.evaluation.experiment import ResultTable, measured_run
 from t3mpc_ros.evaluation.loop import run, run_loop
 from t3mpc_ros.evaluation.method import MethodSpec
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, methods_for, twin_start
@@ -318,21 +318,27 @@ def test_the_gain_that_tuning_starts_with_cancels_the_noise():
 
 
 def test_differences_are_paired_with_their_verdict():
-    def results(mine, other):
-        return {
-            ('nominal', 'mine'): [{SETTLED.name: value} for value in mine],
-            ('nominal', FEED_FORWARD): [{SETTLED.name: value} for value in other],
-        }
+    plan = ComparisonPlan('servo', (NOMINAL,), (PI,))
+
+    def found(mine, other, method=PI):
+        rows = [
+            {'controller': name, 'case': NOMINAL, 'seed': seed, SETTLED.name: value}
+            for name, values in ((PI, mine), (FEED_FORWARD, reversed(other)))
+            for seed, value in enumerate(values)
+        ]
+        for row in rows[len(mine) :]:
+            row['seed'] = len(other) - 1 - row['seed']  # paired by seed, not by place
+        return difference(plan, ResultTable(rows), NOMINAL, method, SETTLED)
 
     def judged(mine, other):
-        return verdict(difference(results(mine, other), 'nominal', 'mine', SETTLED))
+        return verdict(found(mine, other))
 
     assert judged([1.1, 2.1, 3.1], [1.0, 2.0, 3.0]) == WORSE
     assert judged([0.9, 1.91, 2.9], [1.0, 2.0, 3.0]) == BETTER
     assert judged([0.9, 2.1, 3.0], [1.0, 2.0, 3.0]) == INCONCLUSIVE
     assert judged([math.nan, 2.0, 3.0], [1.0, 2.0, 3.0]) == WORSE
     assert judged([0.5], [1.0]) == INCONCLUSIVE
-    assert difference(results([1.0], [1.0]), 'nominal', FEED_FORWARD, SETTLED) is None
+    assert found([1.0], [1.0], FEED_FORWARD) is None
 
 
 def test_the_body_decides_where_it_is_not_known():
@@ -344,9 +350,11 @@ def test_the_body_decides_where_it_is_not_known():
 def test_the_plant_of_the_paper_is_compared_too(robot):
     plan = ComparisonPlan(robot, ('nominal',), (FEED_FORWARD, PI), (201,), 2.0)
     results = compare(plan)
-    assert set(results) == {('nominal', FEED_FORWARD), ('nominal', PI)}
-    assert results['nominal', PI][0] == measured_run(plan.job('nominal', PI, 201))
-    assert all(math.isfinite(value) for value in results['nominal', PI][0].values())
+    assert results.values('controller') == [FEED_FORWARD, PI]
+    (row,) = results.where(controller=PI, case='nominal')
+    numbers = measured_run((Scenario(robot, 'nominal', 201, 2.0), methods_for(robot)[PI]))
+    assert numbers.items() <= row.items()
+    assert all(math.isfinite(value) for value in numbers.values())
 
 
 @pytest.mark.slow

@@ -77,7 +77,7 @@ def seen(value):
     if isinstance(value, t3.RunResult):
         return value.controller, [seen(column) for column in value.columns.values()]
     if isinstance(value, t3.Comparison):
-        return [seen(run) for runs in value.results.values() for run in runs]
+        return [seen(row) for row in value.results]
     if isinstance(value, t3.Sweep):
         return [
             {name: row[name] for name in ('settled', 'overall', 'variation')} for row in value.rows

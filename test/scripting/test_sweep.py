@@ -13,9 +13,10 @@ import pytest
 
 import t3mpc_ros as t3
 from t3mpc_ros.cli.main import main
+from t3mpc_ros.evaluation import experiment
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.scripting import parameter_sweep
-from t3mpc_ros.scripting.parameter_sweep import make_cells
+from t3mpc_ros.scripting.parameter_sweep import make_runs
 from t3mpc_ros.scripting.setting import Setting
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 
@@ -205,7 +206,7 @@ CHANGES = [
 
 
 def keys(setting=SERVO, controllers='ADRC', parameters=None, seeds=(1,), cases=('nominal',)):
-    return [*make_cells(controllers, parameters or {}, seeds, cases, setting)]
+    return [run.key for run in make_runs(controllers, parameters or {}, seeds, cases, setting)]
 
 
 @pytest.mark.parametrize(
@@ -232,8 +233,13 @@ def test_the_key_of_a_run_changes_with_its_place_in_the_sweep(monkeypatch, tmp_p
     again = keys(parameters={'gain': [20.0]}, seeds=(2,), cases=('disturbance',))
     assert {*again} < {*found}
     # What the package is made of, and the Python that runs it.
-    for name, other in (('source_digest', 'x'), ('provenance', {'python': '4'})):
-        monkeypatch.setattr(parameter_sweep, name, lambda *_, value=other, **__: value)
+    for module, name, other in (
+        (experiment, 'source_digest', 'x'),
+        (experiment, 'VERSION', '0'),
+        (parameter_sweep, 'provenance', {'python': '4'}),
+    ):
+        new = other if name == 'VERSION' else lambda value=other: value
+        monkeypatch.setattr(module, name, new)
         changed = keys(parameters={'gain': [20.0]}, seeds=(2,), cases=('disturbance',))
         assert not {*changed} & {*found, *again}
         again += changed
