@@ -21,61 +21,35 @@ from t3mpc_ros.chaos.pose_reference import (
     WaitParameters,
 )
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
-from t3mpc_ros.chaos.solver import FractionalSolver
-from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
-from t3mpc_ros.chaos.system import hyperchaotic_system
-from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.body_correction import SKILL as SKILL_FIELDS
 from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
-from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParameters
-from t3mpc_ros.control.control_law import (
-    Certificate,
-    Nt3fsMpcController,
-    Nt3fsMpcParameters,
-)
 from t3mpc_ros.control.controller import (
     Controller,
     ControllerParameters,
     StepperControllerParameters,
-    SwitchingTracker,
 )
 from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
-from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
 from t3mpc_ros.control.pose_controller import (
     PoseController,
     PoseLoopParameters,
-    PoseReference,
 )
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters, SpeedKalmanFilter
-from t3mpc_ros.control.watchdog import InputWatchdog, ResponseMonitor, WatchdogParameters
+from t3mpc_ros.control.watchdog import ResponseMonitor, WatchdogParameters
 from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultInjection
 from t3mpc_ros.emulator.link.serial_line import SerialLine
 from t3mpc_ros.emulator.plant import Plant
-from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
-from t3mpc_ros.fuzzy.inference import FuzzyParameters
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, SimulatedTime
-from t3mpc_ros.geometry.trajectory import ReferenceTrajectory
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, WheelSpeeds
-from t3mpc_ros.mpc.predictive_controller import PredictiveController, PredictiveParameters
 from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
 from t3mpc_ros.robot.interface import RobotCommand
-from t3mpc_ros.robot.slip_monitor import SlipMonitor
-from t3mpc_ros.robot.wheel_odometry import WheelOdometry, WheelOdometryParameters
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultParameters, FaultSchedule
-from t3mpc_ros.simulation.plant.disturbances import (
-    Disturbance,
-    DisturbanceParameters,
-    NoiseParameters,
-    SpeedNoise,
-)
 from t3mpc_ros.simulation.plant.paper_plant import (
-    DisturbedPlant,
     PaperRobot,
     PaperRobotParameters,
 )
@@ -118,32 +92,13 @@ def properties(thing: object, *names: str) -> list[object]:
 # -- control --------------------------------------------------------------------------------------
 
 
-def drive_watchdog(watchdog, r, start=None):
-    """Give stamps with gaps, stale references, and states that diverge."""
-    stamp, found = r.randrange(10**9) if start is None else start, []
-    for _ in range(60):
-        stamp += round(1e9 * gap(r))
-        if r.random() < 0.7:
-            watchdog.reference_received()
-        found.append(watchdog.elapsed(stamp))
-        speed = r.choice((1.0, 1.0, 1.0, 1.0, 1.0, 100.0))
-        found.append(
-            watchdog.decide(
-                stamp, finite=r.random() < 0.9, known=r.random() < 0.9, speed=speed, error=0.0
-            )
-        )
-    # Two endings: within the stop of a diverging state, and with a reference of now.
-    watchdog.reference_received()
-    found.append(
-        watchdog.decide(stamp, finite=True, known=True, speed=r.choice((1.0, 99.0)), error=0.0)
-    )
+def drive_filter(kalman, r):
+    """Send commands and measure speeds."""
+    found = []
+    for _ in range(20):
+        kalman.update(pair(r), pair(r), gap(r), sent=r.random() < 0.9)
+        found += [*(array.copy() for array in kalman.state), kalman.dead_time]
     return found
-
-
-def jump_back(watchdog):
-    """Give a stamp of before the start."""
-    watchdog.elapsed(-(10**9))
-    watchdog.elapsed(-2 * 10**9)
 
 
 def drive_response(monitor, r):
@@ -162,120 +117,6 @@ def drive_response(monitor, r):
         follows = monitor.responsive if _ < 19 else not monitor.responsive
         measured = (9.0, 9.0) if follows else (0.0, 0.0)
         found.append((monitor.update(*measured), monitor.counts))
-    return found
-
-
-def drive_filter(kalman, r):
-    """Send commands and measure speeds."""
-    found = []
-    for _ in range(20):
-        kalman.update(pair(r), pair(r), gap(r), sent=r.random() < 0.9)
-        found += [*(array.copy() for array in kalman.state), kalman.dead_time]
-    return found
-
-
-def drive_actuation(actuation, r):
-    """Measure, and command speeds, accelerations and the commands of a replay."""
-    found = []
-    for _ in range(20):
-        actuation.observe(pair(r), gap(r))
-        r.choice((actuation.send_acceleration, actuation.send_speeds, actuation.set_command))(
-            pair(r, 8.0)
-        )
-        found += properties(
-            actuation,
-            'speeds',
-            'predicted',
-            'disturbance',
-            'twist',
-            'command',
-            'applied',
-            'limited',
-        )
-    return found
-
-
-def drive_body(body, r):
-    """Turn with wheels other than the nominal ones, with gaps."""
-    found, yaw, sent = [], r.uniform(-3.0, 3.0), np.zeros(2)
-    for k in range(120):
-        elapsed = gap(r) if r.random() < 0.1 else PERIOD
-        wanted = np.array([6.0 + 3.0 * math.sin(0.1 * k), 2.0]) + 0.1 * pair(r, 0.1)
-        yaw += elapsed * 1.1 * (sent[0] - sent[1]) * 0.5 * 0.035 / 0.0735 + r.gauss(0.0, 1e-4)
-        learn = r.random() < 0.9
-        found.append(body.step(yaw, elapsed, wanted, wanted, sent, 0.02, learn=learn))
-        found += [body.authority, body.yaw_error]
-        sent = wanted
-    return found
-
-
-def make_body(parameters=BODY_PARAMETERS):
-    """Return the correction of the default robot."""
-    return BodyCorrection(parameters, 0.035, 0.0735, PERIOD)
-
-
-def drive_shaper(shaper, r):
-    """Give a reference with gaps."""
-    found = []
-    for _ in range(20):
-        shaper.step(pair(r), gap(r))
-        found += properties(shaper, 'reference', 'rate', 'lead_ns')
-    return found
-
-
-def drive_certificate(certificate, r):
-    """Give errors."""
-    return [certificate.update(pair(r).tolist(), 15.0, 9.0, 0.6, gap(r)) for _ in range(20)]
-
-
-def drive_law(law, r):
-    """Track, with limits now and then."""
-    found, speeds = [], pair(r, 3.0)
-    for k in range(160):
-        reference = np.array([4.0 * math.sin(0.03 * k), 3.0])
-        speeds = 0.9 * speeds + 0.1 * reference + 0.02 * pair(r, 1.0)
-        found.append(law.step(speeds, reference, np.zeros(2), PERIOD).copy())
-        if r.random() < 0.2:
-            law.set_applied(0.5 * law.command, saturated=True)
-        else:
-            law.set_applied(law.command, saturated=False)
-        found += [law.terms.copy(), law.certificate, law.ultimate_bound, law.friction.copy()]
-        found += [law.predictive.skill, *map(np.copy, law.predictive.responses)]
-    return found
-
-
-def drive_tracker(tracker, r):
-    """Track a reference with jumps, known and unknown."""
-    found, now = [], r.randrange(10**9)
-    for k in range(150):
-        now += PERIOD_NS
-        reference = np.array([4.0 if k % 50 < 25 else -4.0, 3.0])
-        if k % 25 == 10:
-            tracker.transition.announce(now + 15 * PERIOD_NS, np.array([8.0, 0.0]), np.zeros(2))
-        if r.random() < 0.02:
-            tracker.transition.withdraw(now)
-        speeds = reference + 0.1 * pair(r, 1.0)
-        found.append(tracker.step(now, speeds, reference, reference, PERIOD).copy())
-        tracker.set_applied(found[-1], saturated=r.random() < 0.1)
-    return found
-
-
-def drive_jumps(transition, r):
-    """Announce, withdraw and pass jumps; it ends within one."""
-    found, now, level = [], r.randrange(10**9), 0.0
-    for k in range(60):
-        now += PERIOD_NS
-        reference = np.array([level + 0.1 * k, -level])
-        transition.step(now, reference, reference + 0.1)
-        found += [array.copy() for array in transition.plan]
-        found.append(transition.count)
-        found.append(transition.future_jumps(now, 0.05, 4))
-        if r.random() < 0.15 or k == 57:
-            transition.announce(now + r.choice((-1, 1, 5)) * PERIOD_NS, pair(r, 3.0), pair(r, 1.0))
-        if r.random() < 0.03:
-            found.append(transition.pop_passed(now))
-        if r.random() < 0.03:
-            transition.withdraw(now)
     return found
 
 
@@ -317,23 +158,23 @@ def make_keep_out():
     return KeepOut(parameters, BodyTwist(0.3, 3.0), wall)
 
 
-def drive_map(free_map, r):
-    """Add readings of every kind."""
-    for _ in range(60):
-        free_map.add_reading(
-            r.randrange(8), r.choice((0.2, 0.5, math.inf, -math.inf)), pose(r, 0.2)
-        )
-    free_map.mark_free(*pair(r, 0.3).tolist(), 0.2)
-
-
-def drive_pose_reference(reference, r):
-    """Add poses, some of them again, more than are kept."""
-    stamp, found = r.randrange(100), []
-    for _ in range(40):
-        stamp += r.choice((10, 10, 10, -30))
-        reference.add(State(stamp, pose(r), BodyTwist(0.0, 0.0)))
-        found.append(reference.at(stamp - r.randrange(100)))
+def drive_body(body, r):
+    """Turn with wheels other than the nominal ones, with gaps."""
+    found, yaw, sent = [], r.uniform(-3.0, 3.0), np.zeros(2)
+    for k in range(120):
+        elapsed = gap(r) if r.random() < 0.1 else PERIOD
+        wanted = np.array([6.0 + 3.0 * math.sin(0.1 * k), 2.0]) + 0.1 * pair(r, 0.1)
+        yaw += elapsed * 1.1 * (sent[0] - sent[1]) * 0.5 * 0.035 / 0.0735 + r.gauss(0.0, 1e-4)
+        learn = r.random() < 0.9
+        found.append(body.step(yaw, elapsed, wanted, wanted, sent, 0.02, learn=learn))
+        found += [body.authority, body.yaw_error]
+        sent = wanted
     return found
+
+
+def make_body(parameters=BODY_PARAMETERS):
+    """Return the correction of the default robot."""
+    return BodyCorrection(parameters, 0.035, 0.0735, PERIOD)
 
 
 def drive_pose_controller(controller, r):
@@ -395,41 +236,6 @@ def make_controller(
 
 # -- mpc, fuzzy -----------------------------------------------------------------------------------
 
-QUICK = PredictiveParameters.from_dict({'excitation.duration': 20.0, 'dither': 0.5})
-
-
-def drive_predictive(controller, r):
-    """Give errors with known jumps, and apply less than v_p."""
-    found = []
-    for k in range(130):
-        found.append(controller.step(np.array([math.sin(0.05 * k), 1.0]) + 0.02 * pair(r, 1.0)))
-        found += [controller.skill, *map(np.copy, (*controller.signals, *controller.responses))]
-        found += properties(controller, 'known_error', 'due', 'status')
-        if r.random() < 0.1:
-            controller.notify_applied(0.5 * found[0])
-        if r.random() < 0.03:
-            controller.notify_jump(pair(r, 3.0))
-    return found
-
-
-def other_weights(controller):
-    """Return weights of another seed."""
-    return PredictiveController(
-        PredictiveParameters.from_dict({'excitation.duration': 20.0, 'seed': 5}), PERIOD, 15.0
-    ).get_weights()
-
-
-WEIGHTS = other_weights(None)
-
-
-def drive_fuzzy(fuzzy, r):
-    """Evaluate and adapt."""
-    found = []
-    for _ in range(20):
-        found += [fuzzy.evaluate(pair(r)), fuzzy.basis, fuzzy.coefficients, fuzzy.gains]
-        fuzzy.adapt(pair(r, 1.0), gap(r))
-    return found
-
 
 # -- chaos ----------------------------------------------------------------------------------------
 
@@ -474,17 +280,6 @@ def drive_twist(source, r):
 def drive_reference(reference, r):
     """Take samples."""
     return [reference.advance() for _ in range(r.randrange(120, 150))]
-
-
-def drive_solver(solver, r):
-    """Advance."""
-    return [(solver.advance(r.randrange(1, 9)), solver.rate, solver.time) for _ in range(9)]
-
-
-def drive_schedule(schedule, r):
-    """Ask for modes in any order."""
-    times = [r.choice((r.uniform(0.0, 60.0), 12.0, 24.0)) for _ in range(20)]
-    return [(schedule.at(time), schedule.switches_until(time)) for time in times]
 
 
 # -- robot, geometry ------------------------------------------------------------------------------
@@ -545,27 +340,6 @@ def drive_gyro(odometry, r):
     return found
 
 
-def drive_slip(monitor, r):
-    """Slip, and command motion."""
-    found = []
-    for k in range(60):
-        command = RobotCommand(WheelSpeeds(*pair(r).tolist()), 0)
-        found.append(monitor.update(r.choice((0.0, 2.0)), r.choice((1.0, 1.0, 1.0, 0.0)), 0.1 * k))
-        found.append(monitor.rejects(command, 0.1 * k))
-    monitor.update(2.0, 1.0, 7.0)
-    return found
-
-
-def drive_wheels(odometry, r):
-    """Turn the wheels."""
-    found = []
-    for _ in range(20):
-        odometry.update(*pair(r, 0.3).tolist(), r.choice((0.0, 1e-6)))
-        odometry.update_from_speeds(WheelSpeeds(*pair(r).tolist()), gap(r), 0.04)
-        found += properties(odometry, 'pose', 'covariance')
-    return found
-
-
 def drive_scheduler(scheduler, r):
     """Call late and early."""
     found, now = [], 10**9 + r.randrange(10**9)
@@ -598,18 +372,6 @@ def drive_factor(factor, r):
         steady += r.randrange(10**9)
         factor.update(2 * steady, steady)
         found.append(factor.value)
-    return found
-
-
-def drive_trajectory(trajectory, r):
-    """Add samples with jumps and restarts, more than are kept."""
-    stamp, found = r.randrange(10**9), []
-    for _ in range(80):
-        stamp += r.choice((PERIOD_NS,) * 9 + (-5 * PERIOD_NS,))
-        trajectory.add(State(stamp, ORIGIN, BodyTwist(*pair(r, 0.05).tolist())))
-        found += [trajectory.at(stamp - r.randrange(10**8)), trajectory.newest_ns]
-        if r.random() < 0.1:
-            found.append(trajectory.pop_jumps())
     return found
 
 
@@ -658,15 +420,6 @@ def drive_faults(schedule, r):
     return [schedule.at(time, r.choice(tables)) for time in times]
 
 
-def drive_disturbance(disturbance, r):
-    """Draw and evaluate."""
-    found = []
-    for k in range(30):
-        disturbance.draw(gap(r))
-        found += [disturbance.torque(0.1 * k), disturbance.walk.copy()]
-    return found
-
-
 def drive_imu(imu, r):
     """Measure, most often at one period."""
     found = []
@@ -697,15 +450,6 @@ def drive_battery(battery, r):
         )
         for _ in range(60)
     ]
-
-
-def drive_disturbed(plant, r):
-    """Command wheel speeds."""
-    found = []
-    for _ in range(20):
-        plant.run(tuple(pair(r, 3.0).tolist()), 10, braking=r.random() < 0.1)
-        found += [plant.measure(PERIOD), plant.wheels, plant.plant.pose]
-    return found
 
 
 def drive_plant(plant, r):
@@ -833,16 +577,6 @@ OTHER_WEIGHTS = used_weights()
 SPEEDS = np.array([2.0, 1.0])
 FRESH = {
     # control
-    VelocityActuation: Stateful(
-        lambda: VelocityActuation(
-            SpeedFilterParameters(), LimitParameters(), GEOMETRY, 'velocity', PERIOD
-        ),
-        drive_actuation,
-        {
-            'reset': Operation(lambda a: a.reset(SPEEDS)),
-            'reset with a command': Operation(lambda a: a.reset(SPEEDS, np.ones(2))),
-        },
-    ),
     SpeedKalmanFilter: Stateful(
         lambda: SpeedKalmanFilter(SpeedFilterParameters(), 'velocity', PERIOD),
         drive_filter,
@@ -871,13 +605,10 @@ FRESH = {
             ),
         },
     ),
-    CommandShaper: Stateful(
-        lambda: CommandShaper(CommandShaperParameters(), PERIOD),
-        drive_shaper,
-        {'reset': Operation(lambda s: s.reset(SPEEDS), scratch=('.reference', '.rate'))},
-    ),
-    Certificate: Stateful(
-        Certificate, drive_certificate, {'reset': Operation(lambda c: c.reset())}
+    ResponseMonitor: Stateful(
+        lambda: ResponseMonitor(WatchdogParameters(), PERIOD),
+        drive_response,
+        {'reset': Operation(lambda m: m.reset())},
     ),
     DeadTimeEstimator: Stateful(
         lambda: DeadTimeEstimator(SpeedFilterParameters(), PERIOD, friction=True),
@@ -895,63 +626,10 @@ FRESH = {
             )
         },
     ),
-    JumpTransition: Stateful(
-        lambda: JumpTransition(JumpTransitionParameters(), 0.02, PERIOD),
-        drive_jumps,
-        {'reset': Operation(lambda t: t.reset(), scratch=RAMPS)},
-    ),
     KeepOut: Stateful(
         make_keep_out,
         drive_keep_out,
         {'reset': Operation(lambda k: k.reset(), scratch=('._nearest', '._rows'))},
-    ),
-    PoseReference: Stateful(
-        lambda: PoseReference(16), drive_pose_reference, {'clear': Operation(lambda p: p.clear())}
-    ),
-    PoseController: Stateful(
-        lambda: PoseController(PoseLoopParameters()),
-        drive_pose_controller,
-        {'reset': Operation(lambda p: p.reset())},
-    ),
-    InputWatchdog: Stateful(
-        lambda: InputWatchdog(WatchdogParameters()),
-        drive_watchdog,
-        {'reset': Operation(lambda w: w.reset()), 'jump back': Operation(jump_back)},
-    ),
-    ResponseMonitor: Stateful(
-        lambda: ResponseMonitor(WatchdogParameters(), PERIOD),
-        drive_response,
-        {'reset': Operation(lambda m: m.reset())},
-    ),
-    Nt3fsMpcController: Stateful(
-        lambda: Nt3fsMpcController(Nt3fsMpcParameters(predictive=QUICK)),
-        drive_law,
-        {
-            'reset': Operation(
-                lambda c: c.reset(),
-                kept=(*ALPHA, *below('.predictive', MACHINE)),
-                continued=below('.predictive', SKILL),
-                scratch=LAST,
-            ),
-            'reset_estimate': Operation(
-                lambda c: (c.reset(), c.reset_estimate()),
-                kept=below('.predictive', MACHINE),
-                continued=below('.predictive', SKILL),
-                scratch=LAST[:5],
-            ),
-        },
-    ),
-    SwitchingTracker: Stateful(
-        lambda: SwitchingTracker(Nt3fsMpcParameters(predictive=QUICK), 'velocity'),
-        drive_tracker,
-        {
-            'reset': Operation(
-                lambda t: t.reset(),
-                kept=below('.law', (*ALPHA, *below('.predictive', MACHINE))),
-                continued=below('.law.predictive', SKILL),
-                scratch=(*below('.law', LAST), *below('.transition', RAMPS)),
-            )
-        },
     ),
     Controller: Stateful(
         make_controller(pose__enabled=True, keep_out__enabled=True),
@@ -1012,20 +690,6 @@ FRESH = {
         },
     ),
     # mpc, fuzzy
-    PredictiveController: Stateful(
-        lambda: PredictiveController(QUICK, PERIOD, 15.0),
-        drive_predictive,
-        {
-            'reset': Operation(lambda c: c.reset(), kept=MACHINE, continued=SKILL),
-            'pretrain': Operation(lambda c: c.pretrain()),
-            'set_weights': Operation(lambda c: c.set_weights(WEIGHTS)),
-        },
-    ),
-    FuzzyEstimator: Stateful(
-        lambda: FuzzyEstimator(FuzzyParameters(), AdaptationParameters()),
-        drive_fuzzy,
-        {'reset': Operation(lambda f: f.reset())},
-    ),
     # chaos
     PathClock: Stateful(
         lambda: PathClock(WaitParameters()),
@@ -1074,24 +738,6 @@ FRESH = {
             ),
         },
     ),
-    FractionalSolver: Stateful(
-        lambda: FractionalSolver(hyperchaotic_system(), 1e-3, np.ones(4)),
-        drive_solver,
-        {
-            'reset': Operation(lambda s: s.reset()),
-            'reset to a state': Operation(
-                lambda s: s.reset(np.array([1.0, 2.0, 3.0, 4.0])),
-                built=lambda: FractionalSolver(
-                    hyperchaotic_system(), 1e-3, np.array([1.0, 2.0, 3.0, 4.0])
-                ),
-            ),
-        },
-    ),
-    SwitchingSchedule: Stateful(
-        lambda: SwitchingSchedule(SwitchingParameters(kind='random', blend=1.0), 3),
-        drive_schedule,
-        {'at the start': Operation(lambda s: s.at(0.0))},
-    ),
     # robot, geometry
     CommandLimiter: Stateful(
         lambda: CommandLimiter(CommandLimiterParameters(), GEOMETRY),
@@ -1135,16 +781,6 @@ FRESH = {
             ),
         },
     ),
-    SlipMonitor: Stateful(
-        SlipMonitor,
-        drive_slip,
-        {'reset': Operation(lambda m: m.reset(), scratch=('._last_motion_command',))},
-    ),
-    WheelOdometry: Stateful(
-        lambda: WheelOdometry(WheelOdometryParameters(), GEOMETRY),
-        drive_wheels,
-        {'reset': Operation(lambda o: o.reset(Pose(1.0, 2.0, 3.0)))},
-    ),
     SampleScheduler: Stateful(
         lambda: SampleScheduler(100.0, slack=0.002),
         drive_scheduler,
@@ -1167,11 +803,6 @@ FRESH = {
     RealTimeFactor: Stateful(
         RealTimeFactor, drive_factor, {'restart': Operation(lambda f: f.restart())}
     ),
-    ReferenceTrajectory: Stateful(
-        lambda: ReferenceTrajectory(BodyTwist(2.0, 20.0), 16),
-        drive_trajectory,
-        {'clear': Operation(lambda t: t.clear(), scratch=('.buffer.samples', '.buffer.stamps'))},
-    ),
     # simulation, emulator
     PaperRobot: Stateful(
         lambda: PaperRobot(PAPER),
@@ -1187,11 +818,6 @@ FRESH = {
         lambda: DigitalTwin(TWIN),
         drive_robot,
         {
-            'reset_odometry': Operation(
-                lambda x: x._reset_odometry(),
-                kept=(*all_of(DigitalTwin(TWIN), '_odometry'), '._odometry._memory'),
-                continued=('._odometry._covariance[3]', '._odometry._drift[3]'),
-            ),
             'a loss of power': Operation(
                 lambda x: x._lose_power(),
                 kept=all_of(
@@ -1294,29 +920,17 @@ FRESH = {
 }
 
 NEVER_RESET = {
-    # Made anew for each run or path.
-    **dict.fromkeys(('InputMonitor', 'PathTiming', '_CurveBuilder', 'GivenPathSource'), 'one run'),
-    # Their state is that of an entry of the table, which contains them.
-    'Predictor': 'part of PredictiveController',
-    'PortraitPath': 'part of PortraitSource',
-    'FreeSpaceMap': 'part of KeepOut',
-    'Drivetrain': 'part of DigitalTwin and Plant',
-    'PaperPlant': 'part of PaperRobot',
-    'FixedStepRobot': 'base of PaperRobot and DigitalTwin',
-    # Only their parameters change: see CONFIGURED.
-    **dict.fromkeys(
-        ('Disturbance', 'SpeedNoise', 'SimulatedBattery', 'SimulatedRangeSensors'), 'no reset'
-    ),
-    **dict.fromkeys(('DisturbedPlant', 'NoisyPlant', 'PlantRobot'), 'one run, no reset'),
     # The state is in the memory of the C core: see test_core_fresh_state.py.
     **dict.fromkeys(('Board', 'Motion', 'RobotBoard', 'Dongle', 'Emulator'), 'C core'),
     **dict.fromkeys(('c_short_Array_7', 'c_ushort_Array_9'), 'C core'),
-    **dict.fromkeys(('EventQueue', 'RadioChannel', '_Exchange'), 'one emulator, never reset'),
+    **dict.fromkeys(('RadioChannel', '_Exchange'), 'one emulator, never reset'),
     **dict.fromkeys(('PtyPort', '_ConsolePort', 'StopTimeMonitor'), 'one process, never reset'),
-    # No state that changes.
-    **dict.fromkeys(('Arena', 'StateArray'), 'constant'),
+    **dict.fromkeys(('InputMonitor', 'GivenPathSource'), 'made anew for each run or path'),
+    **dict.fromkeys(('NoisyPlant', 'PlantRobot'), 'one run, no reset'),
+    'FixedStepRobot': 'base of PaperRobot and DigitalTwin',
+    'StateArray': 'constant',
 }
-"""Classes without an entry in FRESH, and why."""
+"""Classes of which no object in FRESH holds one, and why."""
 
 
 # -- parameters -----------------------------------------------------------------------------------
@@ -1349,31 +963,6 @@ def drive_with(drive, *seeds):
 
 
 CONFIGURED = {
-    VelocityActuation: Configured(
-        LimitParameters(),
-        lambda p: VelocityActuation(SpeedFilterParameters(), p, GEOMETRY, 'velocity', PERIOD),
-        configure,
-        drive_actuation,
-    ),
-    BodyCorrection: Configured(
-        BodyCorrectionParameters(), make_body, configure, drive_body, elsewhere=('enabled',)
-    ),
-    JumpTransition: Configured(
-        JumpTransitionParameters(),
-        lambda p: JumpTransition(p, 0.02, PERIOD),
-        assign,
-        drive_jumps,
-        elsewhere=('preview',),
-    ),
-    FuzzyEstimator: Configured(
-        AdaptationParameters(),
-        lambda p: FuzzyEstimator(FuzzyParameters(), p),
-        configure,
-        drive_fuzzy,
-    ),
-    PredictiveController: Configured(
-        QUICK, lambda p: PredictiveController(p, PERIOD, 15.0), configure, drive_predictive
-    ),
     PoseController: Configured(
         PoseLoopParameters(), PoseController, assign, drive_with(drive_pose_controller, 1, 2, 3)
     ),
@@ -1391,7 +980,7 @@ CONFIGURED = {
         configure,
         drive_controller,
         elsewhere=tuple(
-            spec.name for spec in ControllerParameters.specs() if spec.name != 'body.enabled'
+            spec.name for spec in ControllerParameters.specs() if not spec.name.startswith('body.')
         ),
         triggers=('estimate_dead_time',),
         late=('.status',),
@@ -1404,36 +993,14 @@ CONFIGURED = {
         Controller,
         configure,
         drive_controller,
-        elsewhere=(*COMMANDS, 'adaptation.', 'predictive.', 'pose.', 'body.'),
+        elsewhere=('pose.', 'body.'),
         triggers=('estimate_dead_time',),
         late=('.status',),
         # Pretrained weights are those of the gain before.
         settle=lambda controller: controller.law.predictive.pretrain(),
     ),
-    CommandLimiter: Configured(
-        CommandLimiterParameters(max_stopping_time=5.0),
-        lambda p: CommandLimiter(p, GEOMETRY),
-        assign,
-        drive_with(drive_limiter, 1, 2, 3),
-    ),
-    WheelOdometry: Configured(
-        WheelOdometryParameters(), lambda p: WheelOdometry(p, GEOMETRY), assign, drive_wheels
-    ),
     GyroOdometry: Configured(
         GyroOdometryParameters(), lambda p: GyroOdometry(p, GEOMETRY), assign, drive_gyro
-    ),
-    Disturbance: Configured(
-        DisturbanceParameters(),
-        lambda p: Disturbance(p, np.random.default_rng(1)),
-        assign,
-        drive_disturbance,
-        late=LATE,
-    ),
-    SpeedNoise: Configured(
-        NoiseParameters(),
-        lambda p: SpeedNoise(p, np.random.default_rng(1)),
-        assign,
-        lambda noise, r: [noise.measure(WheelSpeeds(1.0, 2.0)) for _ in range(9)],
     ),
     SimulatedImu: Configured(
         SimulatedImuParameters(),
@@ -1450,14 +1017,6 @@ CONFIGURED = {
     ),
     SimulatedBattery: Configured(
         SimulatedBatteryParameters(), SimulatedBattery, assign, drive_battery, late=LATE
-    ),
-    DisturbedPlant: Configured(
-        PAPER,
-        DisturbedPlant,
-        configure,
-        drive_disturbed,
-        elsewhere=COMMANDS,
-        late=LATE,
     ),
     PaperRobot: Configured(
         PAPER, PaperRobot, configure, drive_robot, ('drive.speed_ceiling',), late=LATE
