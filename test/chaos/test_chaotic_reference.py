@@ -181,23 +181,6 @@ def test_switch_times_do_not_reveal_the_perturbation():
     assert left.var() > 0.8 * centred.var()
 
 
-@pytest.mark.compiled
-@pytest.mark.slow
-def test_reset_repeats_a_run_and_another_seed_gives_another_one():
-    reference = ChaoticReference(
-        ReferenceParameters.from_dict({'seed': 7, 'switching.kind': 'random'}), GEOMETRY
-    )
-    first = [reference.advance() for _ in range(2500)]
-    reference.reset()
-    assert [reference.advance() for _ in range(2500)] == first
-    reference.reset(2**127 + 5)
-    other = [reference.advance() for _ in range(2500)]
-    assert abs(np.corrcoef(wheels_of(first)[:, 0], wheels_of(other)[:, 0])[0, 1]) < 0.8
-    assert [s.switched for s in first] != [s.switched for s in other]
-    reference.reset(7)
-    assert [reference.advance() for _ in range(2500)] == first
-
-
 def test_lists_need_one_value_per_state():
     for name in ('orders', 'amplitude', 'offset', 'initial'):
         with pytest.raises(ParameterError, match=name):

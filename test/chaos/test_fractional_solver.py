@@ -251,18 +251,6 @@ def test_many_steps_at_once_equal_single_steps():
     assert single.time == many.time == pytest.approx(0.06)
 
 
-def test_reset_repeats_the_run():
-    solver = FractionalSolver(hyperchaotic_system(), 1e-3, START)
-    first = run(solver, 50)
-    solver.reset()
-    assert solver.time == 0.0
-    assert run(solver, 50).tolist() == first.tolist()
-    solver.reset(2.0 * START)
-    assert solver.state.tolist() == (2.0 * START).tolist()
-    fresh = FractionalSolver(hyperchaotic_system(), 1e-3, 2.0 * START)
-    assert run(solver, 50).tolist() == run(fresh, 50).tolist()
-
-
 def test_returned_states_are_copies():
     solver = FractionalSolver(hyperchaotic_system(), 1e-3, START)
     solver.advance(5)

@@ -49,13 +49,6 @@ def test_a_clock_that_jumps_back_starts_a_new_grid():
     assert scheduler.due(1_013 * MS) == [1_013 * MS]
 
 
-def test_repeated_calls_return_no_sample_twice():
-    scheduler = SampleScheduler(100.0)
-    assert scheduler.due(25 * MS) == [25 * MS]
-    assert [scheduler.due(25 * MS) for _ in range(5)] == [[]] * 5
-    assert scheduler.due(36 * MS) == [35 * MS]
-
-
 def test_lateness_counts_from_the_newest_sample():
     scheduler = SampleScheduler(100.0)
     assert scheduler.lateness(0) == 0.0

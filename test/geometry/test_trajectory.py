@@ -160,20 +160,6 @@ def test_a_non_finite_sample_is_rejected_without_effect(bad):
     assert trajectory.at(5 * MS) == before
 
 
-def test_only_the_newest_samples_are_kept():
-    trajectory = filled(*(sample(10.0 * n, 0.1) for n in range(100)), capacity=8)
-    assert trajectory.at(919 * MS) is None
-    assert trajectory.at(920 * MS) is not None
-    assert trajectory.newest_ns == 990 * MS
-
-
-def test_a_cleared_trajectory_is_empty():
-    trajectory = filled(sample(0.0, 0.1), sample(10.0, 0.1))
-    trajectory.clear()
-    assert trajectory.at(5 * MS) is None
-    assert trajectory.newest_ns is None
-
-
 def test_numbers_near_the_largest_one_make_a_jump_and_never_nan():
     trajectory = filled(sample(0.0, -1.7e308), sample(10.0, 1.7e308))
     point = trajectory.at(5 * MS)

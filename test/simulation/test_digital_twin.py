@@ -105,17 +105,6 @@ def test_request_rate_does_not_change_the_state():
     assert repr(last) == repr(asked)
 
 
-def test_parameters_do_not_shift_other_random_numbers():
-    speeds = course(3, 100)
-    before = drive(DigitalTwin(parameters(world='corridor')), speeds)
-    after = drive(
-        DigitalTwin(parameters(world='corridor', range_sensor__voltage_noise=0.1)), speeds
-    )
-    assert [state.imu for state in before] == [state.imu for state in after]
-    assert before[-1].truth == after[-1].truth
-    assert [repr(s.ranges) for s in before] != [repr(s.ranges) for s in after]
-
-
 @pytest.mark.compiled
 @pytest.mark.slow
 def test_halving_the_step_changes_a_minute_by_less_than_10_um():
@@ -214,11 +203,6 @@ def test_battery_collapse_causes_a_brown_out():
     assert drive(full, [WheelSpeeds(3.0, 3.0)] * 20)[-1].reason == ''
     states = drive(weak, [WheelSpeeds(3.0, 3.0)] * 20)
     assert BROWN_OUT_REASON in {state.reason for state in states}
-
-
-def test_active_faults_are_reported_immediately():
-    robot = DigitalTwin(parameters(faults__slippery=0.5, faults__load_change=1.0))
-    assert robot.diagnostics.faults == ('load_change 1 kg', 'slippery 0.5')
 
 
 # -- world and sensors ----------------------------------------------------------------------------

@@ -78,24 +78,6 @@ def test_reflection_is_bounded_and_continuous():
     assert reflect(-1.2) == pytest.approx(-0.8)
 
 
-def test_disturbance_parameters_do_not_shift_random_numbers():
-    calm = Disturbance(DisturbanceParameters(walk_rate=0.0), np.random.default_rng(5))
-    wild = Disturbance(DisturbanceParameters(walk_rate=3.0), np.random.default_rng(5))
-    other = Disturbance(DisturbanceParameters(walk_rate=3.0), np.random.default_rng(5))
-    for _ in range(10):
-        calm.draw(0.01)
-        wild.draw(0.01)
-        other.draw(0.01)
-    assert np.array_equal(wild.walk, other.walk)
-    assert np.array_equal(calm.signals.phases, wild.signals.phases)
-    assert not calm.walk.any()
-    calm.parameters = wild.parameters
-    step = wild.walk.copy()
-    calm.draw(0.01)
-    wild.draw(0.01)
-    assert calm.walk == pytest.approx(wild.walk - step, abs=1e-12)
-
-
 def test_noise_has_the_set_variance_and_zero_mean():
     noise = SpeedNoise(NoiseParameters(variance=0.04), np.random.default_rng(6))
     drawn = np.array([noise.measure(WheelSpeeds(5.0, -3.0)) for _ in range(20000)])

@@ -308,15 +308,5 @@ def test_wheel_energy_equals_the_energy_of_the_parts(seed):
     assert kinetic_energy(wheels, body, geometry) == pytest.approx(parts, rel=1e-12)
 
 
-def test_torque_power_equals_the_energy_rate():
-    body, geometry = BodyParameters(), WheelGeometry()
-    generator = np.random.default_rng(7)
-    inertia, dynamics = wheel_inertia(body, geometry), dynamics_vector(body, geometry)
-    for _ in range(20):
-        speeds, torque = generator.uniform(-20.0, 20.0, 2), generator.uniform(-0.4, 0.4, 2)
-        rates = np.array(wheel_acceleration(*speeds, *torque, dynamics))
-        assert speeds @ inertia @ rates == pytest.approx(speeds @ torque, abs=1e-12)
-
-
 def test_torques_act_only_on_the_wheel_angles():
     assert input_matrix().T @ np.arange(5.0) == pytest.approx([3.0, 4.0])

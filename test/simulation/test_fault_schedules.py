@@ -89,61 +89,6 @@ def test_active_faults_report_value_and_unit():
 # --- a schedule ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('name', NAMES)
-def test_every_fault_can_be_scheduled_and_ends(name):
-    value = a_fault(name)
-    schedule = FaultSchedule([FaultEvent(1.0, name, value, 2.0)])
-    for elapsed in (-1.0, 0.0, 0.999, 3.0, 1e5):
-        assert schedule.at(elapsed, NO_FAULT) == NO_FAULT
-    for elapsed in (1.0, 2.0, 2.999):
-        assert schedule.at(elapsed, NO_FAULT) == replace(NO_FAULT, **{name: value})
-
-
-def test_fault_without_duration_persists():
-    schedule = FaultSchedule([FaultEvent(1.0, 'supply_sag', 2.0)])
-    assert schedule.at(1e6, NO_FAULT).supply_sag == 2.0
-
-
-def test_latest_start_takes_precedence_in_any_list_order():
-    outer = FaultEvent(1.0, 'command_delay', 0.1, 9.0)
-    inner = FaultEvent(3.0, 'command_delay', 0.3, 2.0)
-    beyond = FaultEvent(8.0, 'command_delay', 0.8, 4.0)
-    for events in ([outer, inner, beyond], [beyond, inner, outer]):
-        schedule = FaultSchedule(events)
-        delays = [schedule.at(second + 0.5, NO_FAULT).command_delay for second in range(13)]
-        assert delays == [0, 0.1, 0.1, 0.3, 0.3, 0.1, 0.1, 0.1, 0.8, 0.8, 0.8, 0.8, 0]
-
-
-def test_simultaneous_events_use_the_later_in_the_list():
-    first = FaultEvent(1.0, 'command_delay', 0.1, 4.0)
-    second = FaultEvent(1.0, 'command_delay', 0.2, 2.0)
-    assert FaultSchedule([first, second]).at(2.0, NO_FAULT).command_delay == 0.2
-    assert FaultSchedule([first, second]).at(4.0, NO_FAULT).command_delay == 0.1
-    assert FaultSchedule([second, first]).at(2.0, NO_FAULT).command_delay == 0.1
-
-
-def test_events_of_different_faults_are_independent():
-    schedule = FaultSchedule(
-        [FaultEvent(0.0, 'gyro_dead', True, 5.0), FaultEvent(1.0, 'command_loss', 0.5, 1.0)]
-    )
-    assert active_faults(schedule.at(1.5, NO_FAULT)) == ('command_loss 0.5', 'gyro_dead')
-
-
-def test_schedule_overrides_dynamic_values_while_it_lasts():
-    schedule = FaultSchedule([FaultEvent(1.0, 'command_delay', 0.3, 1.0)])
-    before = FaultParameters(command_delay=0.1, gyro_dead=True)
-    after = FaultParameters(command_delay=0.2)
-    assert schedule.at(0.5, before) == before
-    assert schedule.at(1.5, before) == replace(before, command_delay=0.3)
-    assert schedule.at(1.6, after) == replace(after, command_delay=0.3)
-    assert schedule.at(2.0, after) == after
-
-
-def test_scheduled_default_hides_a_dynamic_value():
-    schedule = FaultSchedule([FaultEvent(1.0, 'wheel_blocked', 'none', 1.0)])
-    assert schedule.at(1.5, FaultParameters(wheel_blocked='both')) == NO_FAULT
-
-
 def test_empty_schedule_changes_nothing():
     dynamic = FaultParameters(command_loss=0.5)
     assert load_schedule('').at(3.0, dynamic) == dynamic

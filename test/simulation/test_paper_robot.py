@@ -95,56 +95,6 @@ def test_wheels_stop_within_half_a_second_from_10_rad_s(end):
         assert after.commanded == (0.0, 0.0)
 
 
-def test_command_timeout_stops_the_robot_with_a_reason():
-    simulated = robot()
-    simulated.apply(command(10.0, 10.0, 0), 0)
-    before = simulated.advance(250 * MS)
-    assert before.true_wheels.right > 5.0
-    assert before.reason == ''
-    after = simulated.advance(260 * MS)
-    assert after.status.timed_out
-    assert 'no command for 0.25 s' in after.reason
-    assert simulated.advance(300 * MS).true_wheels.right < before.true_wheels.right
-
-
-def test_emergency_stop_overrides_commands_until_release():
-    simulated = robot()
-    now = 0
-    for _ in range(40):
-        simulated.apply(command(10.0, 10.0, now), now)
-        now += PERIOD
-        simulated.advance(now)
-    simulated.latch_estop('button', now)
-    for _ in range(100):
-        assert 'button' in simulated.apply(command(10.0, 10.0, now), now)
-        now += PERIOD
-        state = simulated.advance(now)
-    assert state.status.estop
-    assert not state.status.enabled
-    assert not state.status.moving
-    assert 'button' in state.reason
-    assert simulated.release_estop(now) == ''
-    assert simulated.release_estop(now) != ''
-    for _ in range(30):
-        now += PERIOD
-        state = simulated.advance(now)
-    assert not state.status.moving
-    assert simulated.apply(command(10.0, 10.0, now), now) == ''
-    assert simulated.advance(now + 200 * MS).status.moving
-
-
-@pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
-def test_non_finite_command_never_moves_the_robot(bad):
-    simulated = robot(disturbance__bound=0.0)
-    for now in range(0, 500 * MS, PERIOD):
-        assert 'not finite' in simulated.apply(command(bad, 5.0, now), now)
-        assert 'not finite' in simulated.apply(command(5.0, bad, now), now)
-        state = simulated.advance(now + PERIOD)
-    assert state.truth.pose == (0.0, 0.0, 0.0)
-    assert state.true_wheels == (0.0, 0.0)
-    assert 'not finite' in state.reason
-
-
 @pytest.mark.parametrize('bad', [math.nan, math.inf])
 def test_non_finite_torque_brakes(bad):
     simulated = robot(drive__kind='torque')
@@ -251,15 +201,6 @@ def test_command_acts_from_its_arrival_step():
     assert moved[0] > moved[2] > moved[3] > 0.0
 
 
-def test_intermediate_requests_change_nothing():
-    busy, quiet = robot(), robot()
-    for simulated in (busy, quiet):
-        simulated.apply(command(5.0, 3.0, 0), 0)
-    for now in range(0, 200 * MS, 1_300_000):
-        busy.advance(now)
-    assert numbers(busy.advance(200 * MS)) == numbers(quiet.advance(200 * MS))
-
-
 def test_step_equals_apply_and_advance():
     stepped, timed = robot(), robot()
     for tick in range(100):
@@ -316,17 +257,6 @@ def test_noise_affects_the_measurement_only():
         assert exact.wheels == exact.true_wheels
         deviations.append(np.array(blurred.wheels) - blurred.true_wheels)
     assert np.var(deviations) == pytest.approx(0.04, rel=0.06)
-
-
-def test_disturbance_parameters_do_not_shift_the_noise():
-    calm, rough = robot(noise__variance=0.04), robot(noise__variance=0.04)
-    rough.configure(rough.parameters.with_values({'disturbance.bound': 0.01}))
-    for tick in range(50):
-        a, b = calm.step(wander(tick)), rough.step(wander(tick))
-        noise_a = np.array(a.wheels) - a.true_wheels
-        noise_b = np.array(b.wheels) - b.true_wheels
-        assert noise_a == pytest.approx(noise_b, abs=1e-12)
-        assert a.true_wheels != b.true_wheels
 
 
 def trajectory(substep: float, **changes: object) -> np.ndarray:

@@ -232,22 +232,6 @@ def test_each_sensor_has_its_own_offset():
     assert all(low - 0.0025 <= value <= high + 0.0025 for value in sensors.readings)
 
 
-def test_range_parameters_do_not_shift_random_numbers():
-    first, second = finders(seed=5), finders(seed=5)
-    changed = finders(seed=5, voltage_noise=0.0, voltage_offset=0.1)
-    for index in (0, 1, 2, 0, 0):
-        for sensors in (first, second, changed):
-            sensors.measure(index, 0.4)
-    assert first.readings[:3] == second.readings[:3]
-    assert first.periods == second.periods
-    assert changed.periods == first.periods
-    changed.parameters = first.parameters
-    for _ in range(10):
-        first.measure(4, 0.7)
-        changed.measure(4, 0.7)
-        assert first.readings[4] == changed.readings[4]
-
-
 @pytest.mark.parametrize(
     ('changes', 'name'),
     [

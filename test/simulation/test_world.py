@@ -19,7 +19,6 @@ from t3mpc_ros.simulation.world import (
     MAX_SEGMENTS,
     MIN_SIZE,
     WORLDS_FOLDER,
-    World,
     WorldError,
     bundled_worlds,
     cast_ray,
@@ -162,13 +161,6 @@ def test_inside_of_a_wall_is_free_and_non_finite_is_not():
         assert not world.is_free(*numbers)
     with pytest.raises(ValueError, match='radius must be at least 0 m: got -0.1'):
         world.is_free(0.0, 0.0, -0.1)
-
-
-def test_world_is_frozen_and_self_contained():
-    world = World('mine', np.zeros((0, 4)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros((0, 5)))
-    assert world.is_free(0.0, 0.0, 1.0)
-    with pytest.raises(AttributeError):
-        world.name = 'yours'
 
 
 # --- joints ------------------------------------------------------------------------------------
