@@ -31,7 +31,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 
 if TYPE_CHECKING:
-    from t3mpc_ros.evaluation.process_replay.comparison import Tolerances
+    from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances
 
 
 def columns(rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
@@ -429,13 +429,13 @@ def run_replay(options: argparse.Namespace) -> int:
     """Replay the run, print the comparison and the speed, and return 0."""
     from t3mpc_ros.bag.run.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
-    from t3mpc_ros.evaluation.process_replay.comparison import compare
     from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
     from t3mpc_ros.evaluation.process_replay.controller_replay import (
         OPEN_LOOP,
         make_controllers,
         replay_controller,
     )
+    from t3mpc_ros.evaluation.process_replay.replay_comparison import compare
 
     changes = parse_assignments(ControllerParameters, options.parameters)
     model = load_model(options.model) if options.model else None
@@ -514,13 +514,13 @@ def run_compare(options: argparse.Namespace) -> int:
     """Print the comparison; return 0 when all is within the tolerances, 3 otherwise."""
     from t3mpc_ros.bag.run.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
-    from t3mpc_ros.evaluation.process_replay.comparison import (
+    from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
+    from t3mpc_ros.evaluation.process_replay.controller_replay import OPEN_LOOP, replay_controller
+    from t3mpc_ros.evaluation.process_replay.replay_comparison import (
         compare,
         compare_bags,
         write_divergence_figure,
     )
-    from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
-    from t3mpc_ros.evaluation.process_replay.controller_replay import OPEN_LOOP, replay_controller
 
     tolerances = tolerances_from(options.abs, options.rel, options.fields)
     changes = parse_assignments(ControllerParameters, options.parameters)
@@ -546,7 +546,11 @@ def tolerances_from(
     absolute: float | None, relative: float | None, fields: Sequence[str]
 ) -> 'Tolerances':
     """Return the tolerances given on the command line."""
-    from t3mpc_ros.evaluation.process_replay.comparison import ABSOLUTE, RELATIVE, Tolerances
+    from t3mpc_ros.evaluation.process_replay.replay_comparison import (
+        ABSOLUTE,
+        RELATIVE,
+        Tolerances,
+    )
 
     own = {}
     for text in fields:

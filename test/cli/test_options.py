@@ -20,8 +20,8 @@ from t3mpc_ros.evaluation.open_loop_estimation import compare as compare_estimat
 from t3mpc_ros.evaluation.paper.experiment_runs import make_grid
 from t3mpc_ros.evaluation.paper.reproduce import default_setup
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan
-from t3mpc_ros.evaluation.process_replay import comparison
-from t3mpc_ros.evaluation.process_replay.comparison import Tolerances
+from t3mpc_ros.evaluation.process_replay import replay_comparison
+from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances
 from t3mpc_ros.evaluation.training.recorded_runs import fit_bags
 from t3mpc_ros.radio.tool.calibration_wizard import WizardOptions
 from t3mpc_ros.robot.calibration import MARKS
@@ -36,7 +36,7 @@ UNIT = re.compile(
 UNSTATED = ('workers', 'steps')
 """As many as there are: the help says so."""
 ELSEWHERE = {
-    ('bag compare', 'abs'): [Tolerances().absolute, comparison.ELSEWHERE],
+    ('bag compare', 'abs'): [Tolerances().absolute, replay_comparison.ELSEWHERE],
     ('bag compare', 'rel'): [Tolerances().relative],
     ('paper', 'seeds'): [len(make_grid(default_setup(), quick=True).seeds)],
     ('tune', 'evaluations'): [tune.EVALUATIONS, tune.TWIN_EVALUATIONS],

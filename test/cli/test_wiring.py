@@ -176,10 +176,10 @@ REPLAY = {
     'evaluation.process_replay.controller_inputs.load_inputs': 'inputs',
     'evaluation.process_replay.controller_replay.make_controllers': [],
     'evaluation.process_replay.controller_replay.replay_controller': REPLAYED,
-    'evaluation.process_replay.comparison.compare': OUTCOME,
-    'evaluation.process_replay.comparison.compare_bags': OUTCOME,
+    'evaluation.process_replay.replay_comparison.compare': OUTCOME,
+    'evaluation.process_replay.replay_comparison.compare_bags': OUTCOME,
     'evaluation.process_replay.replay_bag.write_replay': 'there',
-    'evaluation.process_replay.comparison.write_divergence_figure': None,
+    'evaluation.process_replay.replay_comparison.write_divergence_figure': None,
 }
 REPORT = SimpleNamespace(verdict=SimpleNamespace(text=text), summary=text)
 BAG = {

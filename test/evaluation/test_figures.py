@@ -37,8 +37,12 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     PatrolResult,
     PatrolTrack,
 )
-from t3mpc_ros.evaluation.process_replay import comparison as replay_comparison
-from t3mpc_ros.evaluation.process_replay.comparison import Comparison, FieldComparison, Tolerances
+from t3mpc_ros.evaluation.process_replay import replay_comparison
+from t3mpc_ros.evaluation.process_replay.replay_comparison import (
+    Comparison,
+    FieldComparison,
+    Tolerances,
+)
 from t3mpc_ros.scripting.chaos_generator import ChaosSolution
 from t3mpc_ros.scripting.parameter_sweep import Sweep
 from t3mpc_ros.scripting.single_run import RunResult

@@ -10,9 +10,9 @@ import pytest
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.evaluation.process_replay.comparison import ELSEWHERE, Tolerances, compare
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
+from t3mpc_ros.evaluation.process_replay.replay_comparison import ELSEWHERE, Tolerances, compare
 from t3mpc_ros.evaluation.topic_roles import ReportOptions, choose_topics, find_topics
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'

@@ -31,14 +31,6 @@ from t3mpc_ros.cli.bag import add_compare_parser, add_replay_parser
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
-from t3mpc_ros.evaluation.process_replay.comparison import (
-    ELSEWHERE,
-    Tolerances,
-    compare,
-    compare_bags,
-    compare_columns,
-    write_divergence_figure,
-)
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     FIELDS,
     SPEEDS,
@@ -48,6 +40,14 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     match,
 )
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
+from t3mpc_ros.evaluation.process_replay.replay_comparison import (
+    ELSEWHERE,
+    Tolerances,
+    compare,
+    compare_bags,
+    compare_columns,
+    write_divergence_figure,
+)
 from t3mpc_ros.evaluation.topic_roles import SCALARS
 from t3mpc_ros.geometry.types import BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import ParameterError

@@ -22,7 +22,11 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, Patr
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES, PatrolMetrics
 from t3mpc_ros.evaluation.patrol.patrol_page import coverage_table, surprise_table
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, Skill
-from t3mpc_ros.evaluation.process_replay.comparison import Comparison, FieldComparison, Tolerances
+from t3mpc_ros.evaluation.process_replay.replay_comparison import (
+    Comparison,
+    FieldComparison,
+    Tolerances,
+)
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY

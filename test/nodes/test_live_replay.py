@@ -14,12 +14,12 @@ from t3mpc_ros.bag.run.journal import Event
 from t3mpc_ros.bag.run.model_file import save_model
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.evaluation.process_replay.comparison import Tolerances, compare
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
 from t3mpc_ros.evaluation.process_replay.controller_replay import (
     recompute_scalars,
     replay_controller,
 )
+from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances, compare
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode
