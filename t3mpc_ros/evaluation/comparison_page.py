@@ -59,7 +59,7 @@ def difference(
 
 
 def verdict(found: Difference) -> str:
-    """Return the verdict on a paired difference; a run that broke off is worse."""
+    """Return the verdict on a paired difference; a run that diverged is worse."""
     if math.isnan(found.mean):
         return WORSE
     if not found.certain:
@@ -162,11 +162,11 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
         }
     else:
         rows |= {
-            FULL: 'the tuned parameters of this drive, and the weights of three practice runs on '
-            'the nominal robot; its stages and ablations likewise',
+            FULL: 'the tuned parameters of this drive, and the weights of three pretraining runs '
+            'on the nominal robot; its stages and ablations likewise',
             FEED_FORWARD: 'no measurement',
             'baselines': 'the tuned parameters of this drive, with equal effort; adaptive ones '
-            'start with the weights of the same practice runs',
+            'start with the weights of the same pretraining runs',
         }
     rows |= plan.additional_knowledge
     return Table(
@@ -231,7 +231,7 @@ def page(plan: ComparisonPlan, results: ResultTable) -> str:
 
 
 def record(plan: ComparisonPlan, results: ResultTable) -> dict[str, Any]:
-    """Return plan, runs and differences for a JSON file; NaN where a run broke off."""
+    """Return plan, runs and differences for a JSON file; NaN where a run diverged."""
     cases: dict[str, Any] = {}
     for case in CASES:
         if case in plan.cases:

@@ -193,7 +193,7 @@ class MethodDriver:
         Raises
         ------
         ValueError
-            The method answers with something else than two accelerations.
+            The method returns something other than two accelerations.
         """
         if not self._enabled:
             return RobotCommand(ZERO_WHEEL_SPEEDS, state.stamp_ns)
@@ -261,7 +261,7 @@ class MethodDriver:
     def _answer(
         self, controller: BaselineController, k: int, measured: Array, elapsed: int
     ) -> Array:
-        """Return what the method answers to the speeds (rad/s) measured in period ``k``."""
+        """Return what the method makes of the speeds (rad/s) measured in period ``k``."""
         seam = self._actuation
         seam.observe(measured, elapsed * self._model.period)
         now, following, future = self._reference.at(k, self._late)

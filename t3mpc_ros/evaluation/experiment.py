@@ -83,6 +83,11 @@ class ResultTable(Sequence[Row]):
         """Return how much larger a metric is in the rows of ``first`` than in those of ``second``.
 
         Rows are paired by their seed; None where one of both was not measured.
+
+        Raises
+        ------
+        ValueError
+            They do not have the same seeds.
         """
         sides = [
             {row[pair]: row[metric] for row in self.where(**wanted) if metric in row}
@@ -90,11 +95,9 @@ class ResultTable(Sequence[Row]):
         ]
         if not all(sides):
             return None
-        keys = list(sides[0])
-        return paired(
-            [sides[0][key] for key in keys],
-            [sides[1][key] for key in keys] if sides[1].keys() == {*keys} else [],
-        )
+        if sides[0].keys() != sides[1].keys():
+            raise ValueError(f'{metric} must be paired by {pair}: got {first} and {second}')
+        return paired(*([side[key] for key in sides[0]] for side in sides))
 
 
 def measured_run(job: Job) -> Numbers:

@@ -119,7 +119,7 @@ METRICS = (
 )
 """All metrics; a run without one leaves it out."""
 Numbers = Mapping[str, float]
-"""Metrics of a run by name; NaN where the run broke off."""
+"""Metrics of a run by name; NaN where the run diverged."""
 
 
 def measure(scenario: Scenario, record: Record) -> Numbers:

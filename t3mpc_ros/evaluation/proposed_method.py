@@ -35,8 +35,8 @@ class ProposedParameters(Nt3fsMpcParameters):
     )
     random_predictor: bool = parameter(
         False,
-        'replace what the predictor was taught by random output weights, and let it not learn: '
-        'to show what the teaching is worth',
+        'replace the trained output weights of the predictor by random ones, without learning: '
+        'to show what the training is worth',
     )
 
 

@@ -144,7 +144,7 @@ class Record:
         return counted_rows(self.time, self.switches, self.start + after, margins)
 
     def rmse(self, after: float = 3.0, *, margins: tuple[float, float] = (0.0, 0.0)) -> float:
-        """Return the tracking RMSE over both wheels, rad/s; NaN when the run broke off."""
+        """Return the tracking RMSE over both wheels, rad/s; NaN when the run diverged."""
         return rms(self.error[self.counted(after, margins)])
 
     def largest_error(self, after: float = 3.0) -> float:
