@@ -44,6 +44,7 @@ from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, SimulatedTime
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, WheelSpeeds
+from t3mpc_ros.mpc.predictive_controller import PredictiveController, PredictiveParameters
 from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
 from t3mpc_ros.robot.interface import RobotCommand
@@ -234,7 +235,34 @@ def make_controller(
     return lambda: Controller(parameters)
 
 
-# -- mpc, fuzzy -----------------------------------------------------------------------------------
+QUICK = PredictiveParameters.from_dict({'excitation.duration': 20.0, 'dither': 0.5})
+
+
+def drive_predictive(controller, r):
+    """Give errors with known jumps, and apply less than v_p."""
+    found = []
+    for k in range(130):
+        found.append(controller.step(np.array([math.sin(0.05 * k), 1.0]) + 0.02 * pair(r, 1.0)))
+        found += [controller.skill, *map(np.copy, (*controller.signals, *controller.responses))]
+        found += properties(controller, 'known_error', 'due', 'status')
+        if r.random() < 0.1:
+            controller.notify_applied(0.5 * found[0])
+        if r.random() < 0.03:
+            controller.notify_jump(pair(r, 3.0))
+    return found
+
+
+def other_weights(controller):
+    """Return weights of another seed."""
+    return PredictiveController(
+        PredictiveParameters.from_dict({'excitation.duration': 20.0, 'seed': 5}), PERIOD, 15.0
+    ).get_weights()
+
+
+WEIGHTS = other_weights(None)
+
+
+# -- mpc ------------------------------------------------------------------------------------------
 
 
 # -- chaos ----------------------------------------------------------------------------------------
@@ -689,7 +717,16 @@ FRESH = {
             ),
         },
     ),
-    # mpc, fuzzy
+    # mpc
+    PredictiveController: Stateful(
+        lambda: PredictiveController(QUICK, PERIOD, 15.0),
+        drive_predictive,
+        {
+            'reset': Operation(lambda c: c.reset(), kept=MACHINE, continued=SKILL),
+            'pretrain': Operation(lambda c: c.pretrain()),
+            'set_weights': Operation(lambda c: c.set_weights(WEIGHTS)),
+        },
+    ),
     # chaos
     PathClock: Stateful(
         lambda: PathClock(WaitParameters()),
