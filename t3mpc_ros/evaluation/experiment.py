@@ -245,14 +245,19 @@ def _file_digest(path: Path) -> str:
 
 def _code(value: Any) -> object:
     """Return the source of a function or class, or of the class of an object and its state."""
-    name = getattr(value, '__qualname__', type(value).__qualname__)
-    try:
-        source = inspect.getsource(value if hasattr(value, '__qualname__') else type(value))
-    except (OSError, TypeError):
-        source = ''  # made in an interactive session: its name is all that is known
     if hasattr(value, '__qualname__'):
-        return name, source
+        return _source(value)
+    kind: Any = type(value)
     try:
-        return name, source, hashlib.sha256(pickle.dumps(value)).hexdigest()
+        return *_source(kind), hashlib.sha256(pickle.dumps(value)).hexdigest()
     except (pickle.PicklingError, AttributeError, TypeError):
-        return name, source
+        return _source(kind)
+
+
+@cache  # reading takes milliseconds, and an experiment has thousands of runs
+def _source(code: Any) -> tuple[str, str]:
+    """Return name and source of a function or class."""
+    try:
+        return code.__qualname__, inspect.getsource(code)
+    except (OSError, TypeError):  # made in an interactive session: its name is all that is known
+        return code.__qualname__, ''
