@@ -5,7 +5,6 @@
 import argparse
 from dataclasses import replace
 from pathlib import Path
-import sys
 from typing import Any
 
 from t3mpc_ros.cli.run_options import add_workers, executor_of
@@ -42,8 +41,9 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 
 def run(options: argparse.Namespace) -> int:
     """Write everything and return 0."""
+    from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.methods import NMPC, require_libraries
-    from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, default_setup, reproduce
+    from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, reproduce
 
     require_libraries([NMPC])
     output = options.output or Path('runs') / ('paper-quick' if options.quick else 'paper')
@@ -56,9 +56,5 @@ def run(options: argparse.Namespace) -> int:
         fresh=options.fresh,
     )
     with executor_of(options) as executor:
-        print(reproduce(default_setup(), replace(chosen, workers=executor), _report))
+        print(reproduce(replace(chosen, workers=executor), print_report))
     return 0
-
-
-def _report(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

@@ -8,7 +8,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+
+Values = Sequence[float] | NDArray[np.float64]
 
 
 class Difference(NamedTuple):
@@ -24,7 +26,7 @@ class Difference(NamedTuple):
         return abs(self.mean) > self.half
 
 
-def mean(values: Sequence[float]) -> float:
+def mean(values: Values) -> float:
     """Return the mean."""
     if len(values) == 0:
         raise ValueError('values must not be empty')
@@ -36,7 +38,7 @@ def rms(values: ArrayLike) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def interval(values: Sequence[float], confidence: float = 0.95) -> float:
+def interval(values: Values, confidence: float = 0.95) -> float:
     """Return half the width of the confidence interval of the mean, by Student's t.
 
     It is infinite for fewer than two values: one value has no standard deviation.
@@ -47,7 +49,7 @@ def interval(values: Sequence[float], confidence: float = 0.95) -> float:
     return float(student_quantile(n - 1, confidence) * np.std(values, ddof=1) / math.sqrt(n))
 
 
-def paired(a: Sequence[float], b: Sequence[float], confidence: float = 0.95) -> Difference:
+def paired(a: Values, b: Values, confidence: float = 0.95) -> Difference:
     """Return how much larger ``a`` is than ``b``, value by value.
 
     What both have from a seed, an easy reference say, drops out of the difference.

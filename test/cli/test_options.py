@@ -17,8 +17,7 @@ from t3mpc_ros.cli.demo import DemoOptions
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions
 from t3mpc_ros.evaluation.open_loop_estimation import compare as compare_estimators
-from t3mpc_ros.evaluation.paper.experiment_runs import make_grid
-from t3mpc_ros.evaluation.paper.reproduce import default_setup
+from t3mpc_ros.evaluation.paper.study import chosen_extent
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan
 from t3mpc_ros.evaluation.process_replay import replay_comparison
 from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances
@@ -38,7 +37,7 @@ UNSTATED = ('workers', 'steps')
 ELSEWHERE = {
     ('bag compare', 'abs'): [Tolerances().absolute, replay_comparison.ELSEWHERE],
     ('bag compare', 'rel'): [Tolerances().relative],
-    ('paper', 'seeds'): [len(make_grid(default_setup(), quick=True).seeds)],
+    ('paper', 'seeds'): [len(chosen_extent(quick=True).seeds)],
     ('tune', 'evaluations'): [tune.EVALUATIONS, tune.TWIN_EVALUATIONS],
 }
 """Defaults that are numbers of the code behind a command, not of its parser."""

@@ -6,6 +6,7 @@ Every quantity of the runs has a value of its own, so that any two that are exch
 """
 
 from dataclasses import replace
+from itertools import product
 import math
 from types import SimpleNamespace
 
@@ -24,9 +25,9 @@ from t3mpc_ros.evaluation.fault_study import Outcome
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.metrics import METRICS
 from t3mpc_ros.evaluation.paper import paper_figures
-from t3mpc_ros.evaluation.paper.experiment_runs import STAGES, WITHOUT, Experiment, RunNumbers
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.results import Results
+from t3mpc_ros.evaluation.paper.study import STAGES, WITHOUT
 from t3mpc_ros.evaluation.patrol import patrol_figures, tracking_page
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid
 from t3mpc_ros.evaluation.patrol.path_tracking import OURS as TRACKER
@@ -292,21 +293,24 @@ METHODS = {'PI': (True, False), 'MPC': (True, True)} | METHODS
 
 def results_of():
     """Return results in which each method, drive, noise and case has numbers of its own."""
-    numbers = {}
     generator = np.random.default_rng(1)
-    for name in METHODS:
-        for drive in ('torque', 'velocity'):
-            for noise in (0.0, 0.04):
-                for case in ('nominal', 'mass +30 %'):
-                    runs = 0.5 + generator.random(4)
-                    numbers[Experiment(name, drive, noise, case)] = [
-                        RunNumbers(each, 0.5 * each, 9.0, 2.0, True) for each in runs
-                    ]
-    return Results(METHODS, numbers, 59.5)
+    names = 'drive', 'noise', 'case'
+    situations = product(('torque', 'velocity'), (0.0, 0.04), ('nominal', 'mass +30 %'))
+    rows = [
+        {
+            'controller': name, 'baseline': baseline, 'preview': preview, 'rmse': rmse,
+            'settled': 0.5 * rmse, 'chatter': 9.0, 'largest_error': 2.0, 'finite': True,
+            'seed': seed, 'duration': 59.5, **dict(zip(names, situation, strict=True)),
+        }
+        for situation in situations
+        for name, (baseline, preview) in METHODS.items()
+        for seed, rmse in enumerate(0.5 + generator.random(4))
+    ]  # fmt: skip
+    return Results(ResultTable(rows))
 
 
-def rmse_of(results, *experiment):
-    return [run.rmse for run in results.runs(Experiment(*experiment))]
+def rmse_of(results, name, drive, noise, case):
+    return results.runs.values('rmse', controller=name, drive=drive, noise=noise, case=case)
 
 
 def test_bars_of_the_methods_have_means_intervals_and_names():

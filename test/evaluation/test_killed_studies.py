@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a study has finished is on the disk at once: one that is killed goes on from there."""
 
-from dataclasses import replace
 from functools import cache
+import math
 from pathlib import Path
 import re
 import shutil
@@ -11,15 +11,10 @@ import shutil
 import pytest
 
 import t3mpc_ros as t3
-from t3mpc_ros.evaluation.methods import method_definitions
-from t3mpc_ros.evaluation.paper.experiment_runs import (
-    ExperimentGrid,
-    RunFile,
-    RunNumbers,
-    needed_experiments,
-    run_missing,
-)
-from t3mpc_ros.evaluation.paper.reproduce import default_setup
+from t3mpc_ros.evaluation.methods import FULL, method_definitions, methods
+from t3mpc_ros.evaluation.paper import reproduce, study
+from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, run_study
+from t3mpc_ros.evaluation.paper.study import Extent
 from t3mpc_ros.evaluation.patrol import patrol_comparison
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
 from t3mpc_ros.evaluation.tuning.tune_methods import history_path, tune_methods
@@ -43,15 +38,15 @@ def sweep(folder, begun, monkeypatch):
 
 
 def paper(folder, begun, monkeypatch):
-    def measure_many(jobs, made_of, team):
-        for index, (scenario, method) in enumerate(jobs):
-            begun()
-            yield index, RunNumbers(scenario.seed / 3.0, len(method.name), 0.3, 0.4, True)
+    def measured(job):
+        begun()
+        scenario, method = job
+        return {'rmse': scenario.seed / 3.0, 'settled': math.nan, 'chatter': len(method.name)}
 
-    setup = replace(default_setup(), measure_many=measure_many)
-    grid = ExperimentGrid((101, 102), 6.0, ('nominal',), (0.04,))
-    needed = needed_experiments(setup, grid)[:3]
-    return run_missing(setup, grid, needed, RunFile(folder / 'runs.jsonl'), 'sources')
+    monkeypatch.setattr(reproduce, 'measured_run', measured)
+    monkeypatch.setattr(study, 'methods', lambda drive: {FULL: methods(drive)[FULL]})
+    extent = Extent((101, 102), 6.0, ('nominal',), (0.04,))
+    return list(map(str, run_study(extent, PaperOptions(folder), None)))
 
 
 def patrols(folder, begun, monkeypatch):
@@ -108,4 +103,4 @@ def test_every_study_with_a_file_of_its_runs_is_tried():
         if re.search(r'import .*\b(ResultFile|write_atomically)\b', path.read_text())
     }
     users -= {'metadata', 'tuned_parameters'}  # a bag; a file that nothing resumes
-    assert users == {'parameter_sweep', 'experiment', 'cma_search'}
+    assert users == {'experiment', 'cma_search'}

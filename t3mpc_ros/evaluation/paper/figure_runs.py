@@ -3,17 +3,18 @@
 """The single runs that the figures show, and the claims decided from them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-import math
+from concurrent.futures import Executor
+from dataclasses import dataclass
 import re
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.cases import NOMINAL
+from t3mpc_ros.evaluation.claim import Claim
+from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.metrics import START
 from t3mpc_ros.evaluation.open_loop_estimation import (
     KINDS,
@@ -24,20 +25,18 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
     simulate_open_loop,
     torque_robot,
 )
-from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD, Claim
-from t3mpc_ros.evaluation.paper.experiment_runs import (
-    NOMINAL,
+from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD
+from t3mpc_ros.evaluation.paper.results import Results, rank
+from t3mpc_ros.evaluation.paper.study import (
     PAPER_NOISE,
     SETTLING,
     WITHOUT,
-    ExperimentGrid,
-    ExperimentSetup,
+    Extent,
+    study_scenario,
 )
-from t3mpc_ros.evaluation.paper.results import Results
 from t3mpc_ros.evaluation.record import Record, switch_times
-from t3mpc_ros.evaluation.workers import full_record
-
-Array = NDArray[np.float64]
+from t3mpc_ros.evaluation.workers import Job, map_jobs
+from t3mpc_ros.geometry.types import Array
 
 NO_PREVIEW = WITHOUT['preview']
 PORTRAITS = 6
@@ -59,7 +58,7 @@ class FigureRuns:
     """The full controller in the paper's parameter."""
     velocity: Record
     """The full controller as the nodes close the loop."""
-    blind: Record | None
+    blind: Record
     """The same without preview."""
     portraits: Mapping[str, Record]
     """Of several methods in the paper's parameter, the full controller first."""
@@ -73,40 +72,27 @@ class FigureRuns:
 
     def claims(self) -> list[Claim]:
         """Return the paper's claims on single runs, decided for these."""
-        return [switches_claim(self.torque), follows_claim(self.torque), estimate_claim(self)]
+        return [decide(self.torque) for decide in (switches_claim, follows_claim, estimate_claim)]
 
 
-def simulate_figure_runs(
-    setup: ExperimentSetup, grid: ExperimentGrid, results: Results, team: Any
-) -> FigureRuns:
+def simulate_figure_runs(extent: Extent, results: Results, workers: int | Executor) -> FigureRuns:
     """Return the runs that are drawn, with the first held-out seed."""
-    seed = grid.seeds[0]
+    seed = extent.seeds[0]
     shown = portrait_methods(results)
-    requested = [('torque', name) for name in shown] + [('velocity', FULL)]
-    if NO_PREVIEW in setup.methods('velocity'):
-        requested.append(('velocity', NO_PREVIEW))
-    methods = {kind: setup.methods(kind) for kind in ('torque', 'velocity')}
+    wanted = [('torque', name) for name in shown]
+    wanted += [('velocity', FULL), ('velocity', NO_PREVIEW)]
     jobs = [
-        (
-            setup.scenario(
-                drive=kind, noise=PAPER_NOISE, case=NOMINAL, seed=seed, duration=grid.duration
-            ),
-            methods[kind][name],
-        )
-        for kind, name in requested
+        (study_scenario(drive, PAPER_NOISE, NOMINAL, seed, extent.duration), methods(drive)[name])
+        for drive, name in wanted
     ]
-    found: dict[tuple[str, str], Record] = {}
-    for index, run in setup.measure_many(jobs, full_record, team):
-        found[requested[index]] = run
-    if len(found) != len(requested):
-        raise RuntimeError(f'{len(requested) - len(found)} runs never came back')
-    alone = simulate_open_loop(torque_robot(PAPER_NOISE, seed), SETTLE + grid.duration, seed)
+    found = dict(zip(wanted, map_jobs(whole_run, jobs, workers), strict=True))
+    alone = simulate_open_loop(torque_robot(PAPER_NOISE, seed), SETTLE + extent.duration, seed)
     first = round(SETTLE / alone.period)
     return FigureRuns(
         seed=seed,
         torque=found['torque', FULL],
         velocity=found['velocity', FULL],
-        blind=found.get(('velocity', NO_PREVIEW)),
+        blind=found['velocity', NO_PREVIEW],
         portraits={name: found['torque', name] for name in shown},
         pairs=ReferenceParameters().switching.pairs,
         driven=alone.speeds[first:],
@@ -117,15 +103,18 @@ def simulate_figure_runs(
     )
 
 
+def whole_run(job: Job) -> Record:
+    """Return the record of a run."""
+    return run(*job)
+
+
 def portrait_methods(results: Results) -> list[str]:
     """Return the methods of the phase portraits: proposed, other fuzzy kinds, best baselines."""
-    rows = results.rows_of('torque', PAPER_NOISE, baseline=True)
-    rows.sort(key=lambda row: math.inf if math.isnan(row.rmse_mean) else row.rmse_mean)
-    names = [row.controller for row in rows]
+    rows = results.methods('torque')
     kinds = re.compile(r'fuzzy|type.?[12]\b|\bi?t[12]\b', re.IGNORECASE)
-    fuzzy = [name for name in results.kinds if kinds.search(name)]
-    measured = [name for name in fuzzy if results.row(name, 'torque', PAPER_NOISE)]
-    return list(dict.fromkeys([FULL, *measured, *names]))[:PORTRAITS]
+    fuzzy = [row['controller'] for row in rows if kinds.search(row['controller'])]
+    best = sorted((row for row in rows if row['baseline']), key=lambda row: rank(row['rmse_mean']))
+    return list(dict.fromkeys([FULL, *fuzzy, *(row['controller'] for row in best)]))[:PORTRAITS]
 
 
 def switches_of(run: Record) -> Array:
@@ -177,48 +166,52 @@ def explained(run: Record) -> tuple[float, float]:
 def switches_claim(run: Record) -> Claim:
     """Decide whether the reference changes its signals as often as in the paper's run."""
     count = switches_of(run).size
-    text = 'The reference changes its signals four times in a run, suddenly (60 s here)'
-    long_enough = run.time[-1] > LONG_ENOUGH
     return Claim(
         'four switches',
         'paper',
-        text,
+        'The reference changes its signals four times in a run, suddenly (60 s here)',
         f'{count} switches in {run.time[-1]:.0f} s',
-        count == 4 if long_enough else None,
+        count == 4 if run.time[-1] > LONG_ENOUGH else None,
         {'switches': count},
     )
 
 
 def follows_claim(run: Record) -> Claim:
     """Decide whether the outputs follow between switches, in the run that is drawn."""
-    text = (
-        'The outputs track the switching references very well (here: settled RMSE at most '
-        f'{100 * FOLLOWS:.0f} % of the reference, torque drive, noise {PAPER_NOISE:g}, run shown)'
-    )
     settled = run.rmse(START, margins=SETTLING)
-    found = f'settled RMSE {settled:.3f} rad/s, {100 * settled / REFERENCE_SPREAD:.1f} %'
-    held = bool(settled <= FOLLOWS * REFERENCE_SPREAD)
-    return _of_run(run, Claim('outputs follow', 'paper', text, found, held, {'settled': settled}))
-
-
-def estimate_claim(showcase: FigureRuns) -> Claim:
-    """Decide whether the fuzzy systems' estimates follow the true unknown acceleration."""
-    text = (
-        'The estimated signals follow their targets (here: they explain at least '
-        f'{100 * EXPLAINS:.0f} % of the variance on both wheels, run shown)'
+    return _of_run(
+        run,
+        'outputs follow',
+        'The outputs track the switching references very well (here: settled RMSE at most '
+        f'{100 * FOLLOWS:.0f} % of the reference, torque drive, noise {PAPER_NOISE:g}, run shown)',
+        f'settled RMSE {settled:.3f} rad/s, {100 * settled / REFERENCE_SPREAD:.1f} %',
+        settled <= FOLLOWS * REFERENCE_SPREAD,
+        {'settled': settled},
     )
-    right, left = explained(showcase.torque)
-    found = f'{100 * right:.0f} % of the variance explained on the right, {100 * left:.0f} % left'
-    held = bool(min(right, left) >= EXPLAINS)
-    numbers: dict[str, object] = {'right': right, 'left': left}
-    claim = Claim('estimates follow', 'paper', text, found, held, numbers)
-    return _of_run(showcase.torque, claim)
 
 
-def _of_run(run: Record, claim: Claim) -> Claim:
-    if claim.held or run.time[-1] > LONG_ENOUGH:
-        return claim
-    return replace(claim, held=None, inconclusive=True)
+def estimate_claim(run: Record) -> Claim:
+    """Decide whether the fuzzy systems' estimates follow the true unknown acceleration."""
+    right, left = explained(run)
+    return _of_run(
+        run,
+        'estimates follow',
+        'The estimated signals follow their targets (here: they explain at least '
+        f'{100 * EXPLAINS:.0f} % of the variance on both wheels, run shown)',
+        f'{100 * right:.0f} % of the variance explained on the right, {100 * left:.0f} % left',
+        min(right, left) >= EXPLAINS,
+        {'right': right, 'left': left},
+    )
+
+
+def _of_run(
+    run: Record, name: str, text: str, found: str, held: bool, numbers: dict[str, object]
+) -> Claim:
+    """Return the claim with its verdict; a short run refutes nothing."""
+    sure = held or bool(run.time[-1] > LONG_ENOUGH)
+    return Claim(
+        name, 'paper', text, found, bool(held) if sure else None, numbers, inconclusive=not sure
+    )
 
 
 def broken_at_switches(run: Record, values: Sequence[Array] | Array) -> Array:

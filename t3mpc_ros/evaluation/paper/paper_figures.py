@@ -16,14 +16,6 @@ from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.metrics import START
-from t3mpc_ros.evaluation.paper.experiment_runs import (
-    NOMINAL,
-    PAPER_NOISE,
-    PARTS,
-    SETTLING,
-    STAGES,
-    WITHOUT,
-)
 from t3mpc_ros.evaluation.paper.figure_runs import (
     FigureRuns,
     broken_at_switches,
@@ -33,7 +25,8 @@ from t3mpc_ros.evaluation.paper.figure_runs import (
     switches_of,
     true_unknown,
 )
-from t3mpc_ros.evaluation.paper.results import PairedDifference, ResultRow, Results
+from t3mpc_ros.evaluation.paper.results import Results, label
+from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, PARTS, SETTLING, STAGES, WITHOUT
 from t3mpc_ros.evaluation.plotting import (
     COLOURS,
     legend_above,
@@ -42,15 +35,10 @@ from t3mpc_ros.evaluation.plotting import (
     new_panels,
 )
 from t3mpc_ros.evaluation.record import Record
-from t3mpc_ros.evaluation.topic_roles import (
-    ODOMETRY,
-    REFERENCE,
-    TRUTH,
-)
+from t3mpc_ros.evaluation.result_file import Row
+from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
-from t3mpc_ros.geometry.types import ORIGIN, WheelSpeeds
-
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import ORIGIN, Array, WheelSpeeds
 
 REFERENCE_COLOUR, DRIVEN = COLOURS[REFERENCE], COLOURS[TRUTH]
 COMMAND, MEASURED = COLOURS['applied'], COLOURS[ODOMETRY]
@@ -220,7 +208,7 @@ def preview(showcase: FigureRuns) -> Any:
     """Return both wheels about a switch, with preview and without."""
     run, blind = showcase.velocity, showcase.blind
     middle = largest_switch(run)
-    if blind is None or middle is None:
+    if middle is None:
         return None
     before, after = 0.3, 0.8
     rows = rows_between(run, run.time[middle] - before, run.time[middle] + after)
@@ -299,32 +287,27 @@ KIND_NAMES = {'type3': 'type 3', 'interval_type2': 'interval type 2', 'type1': '
 
 def colours_of(results: Results) -> dict[str, str]:
     """Return one colour per method, the same in every figure."""
-    baselines = [name for name, (baseline, _) in results.kinds.items() if baseline]
-    found = {
-        name: _BASELINE_COLOURS[i % len(_BASELINE_COLOURS)] for i, name in enumerate(baselines)
-    }
-    return dict.fromkeys(results.kinds, '#9ca3af') | found | {FULL: OURS}
+    found = dict.fromkeys(results.means.unique('controller'), '#9ca3af')
+    for i, name in enumerate(results.means.unique('controller', baseline=True)):
+        found[name] = _BASELINE_COLOURS[i % len(_BASELINE_COLOURS)]
+    return found | {FULL: OURS}
 
 
 def rmse_bars(results: Results) -> Any:
     """Return the RMSE with intervals of all methods at the paper's noise."""
     shown = {drive: _ranked(results, drive) for drive in results.drives}
-    shown = {drive: rows for drive, rows in shown.items() if rows}
-    if not shown:
-        return None
     colours = colours_of(results)
     longest = max(map(len, shown.values()))
     figure = new_figure(0.9 + len(shown) * (0.5 + 0.23 * longest))
     axes = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
     for axis, (drive, rows) in zip(axes, shown.items(), strict=True):
         places = np.arange(len(rows))
-        means = [row.rmse_mean for row in rows]
-        bounds = [_whisker(row.rmse_ci95) for row in rows]
-        bar_colours = [colours[row.controller] for row in rows]
+        means, bounds = _bars(rows)
+        bar_colours = [colours[row['controller']] for row in rows]
         axis.barh(places, means, xerr=bounds, color=bar_colours, height=0.7, ecolor='#1f2937')
         for place, mean, bound in zip(places, means, bounds, strict=True):
             axis.text(mean + bound, place, f'  {mean:.3f}', va='center', fontsize=8)
-        axis.set_yticks(places, [_label(row) for row in rows])
+        axis.set_yticks(places, [label(row) for row in rows])
         axis.invert_yaxis()
         axis.grid(axis='y', visible=False)
         axis.margins(x=0.12)
@@ -341,20 +324,19 @@ def noise_growth(results: Results) -> Any:
     if len(noises) < 2:
         return None
     colours = colours_of(results)
-    baselines = [name for name, (baseline, _) in results.kinds.items() if baseline]
+    baselines = results.means.unique('controller', baseline=True)
     figure = new_figure(5.6 + 0.16 * len(baselines) / 3)
     drives = results.drives
     axes = figure.subplots(2, len(drives), sharex=True, sharey='row', squeeze=False)
     for column, drive in zip(axes.T, drives, strict=True):
         for i, name in enumerate([*baselines, FULL]):
-            rows = [results.row(name, drive, noise) for noise in noises]
-            points = [(row.noise, row.rmse_mean, row.rmse_ci95) for row in rows if row is not None]
-            if not points:
+            rows = [row for noise in noises if (row := results.row(name, drive, noise))]
+            if not rows:
                 continue
-            x, y, bound = np.array(points).T
+            x = np.array([row['noise'] for row in rows])
+            y, bound = map(np.array, _bars(rows))
             # Beside each other, or the intervals of equal methods hide one another.
             beside = x + 0.006 * noises[-1] * (i - 0.5 * len(baselines))
-            bound = np.where(np.isfinite(bound), bound, 0.0)
             own = name == FULL
             style = {
                 'color': colours[name],
@@ -363,9 +345,7 @@ def noise_growth(results: Results) -> Any:
                 'markersize': 6 if own else 4.5,
                 'zorder': 5 if own else 2,
             }
-            column[0].errorbar(
-                beside, y, bound, label=_name(results, name), elinewidth=0.8, **style
-            )
+            column[0].errorbar(beside, y, bound, label=label(rows[0]), elinewidth=0.8, **style)
             if x[0] == noises[0]:
                 column[1].plot(beside, y - y[0], **style)
         column[0].set_title(f'{drive} drive')
@@ -379,24 +359,16 @@ def noise_growth(results: Results) -> Any:
 
 def ablation_bars(results: Results) -> Any:
     """Return the RMSE of the controller's stages in every case at the paper's noise."""
-    drives = [
-        drive
-        for drive in results.drives
-        if any(results.row(stage, drive, PAPER_NOISE) for stage in STAGES)
-    ]
-    if not drives:
-        return None
+    drives = results.drives
     figure = new_figure(0.6 + 2.3 * len(drives))
     panels = figure.subplots(len(drives), 1, squeeze=False)[:, 0]
     width = 0.85 / len(STAGES)
     for axis, drive in zip(panels, drives, strict=True):
         cases = results.cases(drive)
         for i, (stage, colour) in enumerate(zip(STAGES, _STAGE_COLOURS, strict=True)):
-            rows = [results.row(stage, drive, PAPER_NOISE, case) for case in cases]
-            found = [(k, row) for k, row in enumerate(rows) if row is not None]
-            places = [k + (i - 2) * width for k, _ in found]
-            means = [row.rmse_mean for _, row in found]
-            bounds = [_whisker(row.rmse_ci95) for _, row in found]
+            rows = [row for case in cases if (row := results.row(stage, drive, PAPER_NOISE, case))]
+            places = [cases.index(row['case']) + (i - 2) * width for row in rows]
+            means, bounds = _bars(rows)
             axis.bar(
                 places, means, width, yerr=bounds, color=colour, ecolor='#1f2937',
                 error_kw={'elinewidth': 0.8}, label=f'{stage} (+preview)' if i == 4 else stage,
@@ -412,27 +384,30 @@ def ablation_bars(results: Results) -> Any:
 
 def parts(results: Results) -> Any:
     """Return the effect of adding and of leaving out each part, with 95 % intervals."""
-    by_name = {name: part for part, name in WITHOUT.items()}
-    added = [(PARTS[STAGES.index(p.first) - 1], p, 1.0) for p in results.stage_differences()]
-    left_out = [(by_name[p.first], p, -1.0) for p in results.losses()]
-    drives = [d for d in results.drives if any(p.drive == d for _, p, _ in added)]
-    if not drives:
-        return None
+    drives = results.drives
     most = max(len(results.cases(drive)) for drive in drives)
     figure = new_figure(1.0 + len(drives) * (0.5 + 0.3 * most))
     axes = figure.subplots(len(drives), len(PARTS), squeeze=False, sharey='row')
-    ways = (
-        ('added to the stage before', added, -0.13),
-        ('kept, against left out', left_out, 0.13),
-    )
     for row, drive in zip(axes, drives, strict=True):
         cases = results.cases(drive)
-        for axis, part in zip(row, PARTS, strict=True):
+        for axis, part, stage in zip(row, PARTS, STAGES[1:], strict=True):
+            colour = _PART_COLOURS[part]
+            here = {'drive': drive, 'noise': PAPER_NOISE}
+            added = results.added.where(first=stage, **here)
+            kept = results.lost.where(first=WITHOUT[part], **here)
             axis.axvline(0.0, color='#6b7280', linewidth=0.8)
-            for (label, pairs, beside), face in zip(
-                ways, (_PART_COLOURS[part], 'white'), strict=True
+            for pairs, sign, beside, face, words in (
+                (added, 1.0, -0.13, colour, 'added to the stage before'),
+                (kept, -1.0, 0.13, 'white', 'kept, against left out'),
             ):
-                _differences(axis, pairs, part, drive, cases, label, beside, face)
+                if pairs:
+                    axis.errorbar(
+                        [sign * pair['difference'] for pair in pairs],
+                        [cases.index(pair['case']) + beside for pair in pairs],
+                        xerr=[_whisker(pair['ci95']) for pair in pairs],
+                        fmt='o', markersize=4, elinewidth=1.4, label=words, color=colour,
+                        markerfacecolor=face,
+                    )  # fmt: skip
             axis.xaxis.set_major_locator(MaxNLocator(nbins=2))
             axis.grid(axis='y', visible=False)
             axis.set_title(part)
@@ -442,30 +417,6 @@ def parts(results: Results) -> Any:
     figure.supxlabel('paired difference of RMSE / rad/s; left of zero: better with it', fontsize=9)
     legend_above(figure, axes[0, 0])
     return figure
-
-
-def _differences(
-    axis: Any,
-    pairs: Sequence[tuple[str, PairedDifference, float]],
-    part: str,
-    drive: str,
-    cases: Sequence[str],
-    label: str,
-    beside: float,
-    face: str,
-) -> None:
-    """Draw the paired differences of one part by case, each with its interval."""
-    shown = [
-        (sign * pair.difference, cases.index(pair.case) + beside, _whisker(pair.ci95))
-        for name, pair, sign in pairs
-        if (name, pair.drive, pair.noise) == (part, drive, PAPER_NOISE)
-    ]
-    if shown:
-        means, places, bounds = zip(*shown, strict=True)
-        axis.errorbar(
-            means, places, xerr=bounds, fmt='o', markersize=4, elinewidth=1.4, label=label,
-            color=_PART_COLOURS[part], markerfacecolor=face,
-        )  # fmt: skip
 
 
 def portraits(showcase: FigureRuns, results: Results) -> Any:
@@ -513,22 +464,15 @@ def _name_wheels(axes: Any) -> None:
         axis.set_ylabel('right wheel / rad/s')
 
 
-def _ranked(results: Results, drive: str) -> list[ResultRow]:
-    rows = results.rows_of(drive, PAPER_NOISE, NOMINAL)
-    rows = [row for row in rows if row.baseline or row.controller == FULL]
-    return sorted((r for r in rows if math.isfinite(r.rmse_mean)), key=lambda r: r.rmse_mean)
+def _ranked(results: Results, drive: str) -> list[Row]:
+    rows = [results.row(name, drive, PAPER_NOISE) for name in results.compared(drive)]
+    known = [row for row in rows if row is not None and math.isfinite(row['rmse_mean'])]
+    return sorted(known, key=lambda row: float(row['rmse_mean']))
 
 
-def _label(row: ResultRow) -> str:
-    return _with_mark(row.controller, row.baseline, row.preview)
-
-
-def _name(results: Results, name: str) -> str:
-    return _with_mark(name, *results.kinds[name])
-
-
-def _with_mark(name: str, baseline: bool, preview: bool) -> str:
-    return f'{name} (preview)' if baseline and preview and 'preview' not in name else name
+def _bars(rows: Sequence[Row]) -> tuple[list[float], list[float]]:
+    """Return the RMSE of rows and the lengths of their whiskers."""
+    return [row['rmse_mean'] for row in rows], [_whisker(row['rmse_ci95']) for row in rows]
 
 
 def _whisker(ci95: float) -> float:

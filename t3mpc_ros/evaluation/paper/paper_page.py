@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from t3mpc_ros.evaluation.claim import Claim
 from t3mpc_ros.evaluation.paper import paper_figures
-from t3mpc_ros.evaluation.paper.claims import Claim
-from t3mpc_ros.evaluation.paper.experiment_runs import WITHOUT
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.results import Results
+from t3mpc_ros.evaluation.paper.study import WITHOUT
 from t3mpc_ros.evaluation.reporting import (
     Block,
     Contents,
@@ -34,7 +34,6 @@ class ExhibitData:
 
     results: Results
     showcase: FigureRuns
-    claims: tuple[Claim, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +50,7 @@ class Exhibit:
     """Name of the picture's file; empty for tables."""
     draw: Callable[[ExhibitData], Any] | None = None
     tables: str = ''
-    """Heading of its tables, as in :func:`.result_tables.all_tables`."""
+    """Heading of its tables, as in :func:`.all_tables`."""
     comparable: bool = True
     finding: Callable[[ExhibitData], str] | None = None
     """What was found where there is no claim to decide."""

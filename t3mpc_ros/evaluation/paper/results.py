@@ -1,256 +1,126 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Results by method and experiment: means with intervals, JSON, CSV, and their tables."""
+"""Results of the paper's study: means with intervals, paired differences, and their tables."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 import csv
-from dataclasses import asdict, dataclass, fields
 import math
 from pathlib import Path
 
+from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
+from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult, difference
-from t3mpc_ros.evaluation.paper.experiment_runs import (
-    DURATION,
-    NOMINAL,
-    PAPER_NOISE,
-    PARTS,
-    STAGES,
-    WITHOUT,
-    Experiment,
-    ExperimentGrid,
-    ExperimentSetup,
-    RunNumbers,
-)
+from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, STAGES, WITHOUT
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, format_interval
+from t3mpc_ros.evaluation.result_file import Row
 
-
-@dataclass(frozen=True, slots=True)
-class ResultRow:
-    """Result of one method in one situation; NaN where a run diverged."""
-
-    controller: str
-    baseline: bool
-    preview: bool
-    drive: str
-    noise: float
-    """Variance of the measured wheel speeds, (rad/s)²."""
-    case: str
-    rmse_mean: float
-    """Tracking RMSE, mean over the seeds, rad/s."""
-    rmse_ci95: float
-    """Half the 95 % interval of that mean; infinite for a single seed."""
-    settled_mean: float
-    """The same without the second about each switch."""
-    settled_ci95: float
-    chatter_mean: float
-    """Total variation of the effort per second and wheel, rad/s³."""
-    largest_error: float
-    """rad/s, over all seeds."""
-    finite: bool
-    """Whether every number of every run is finite."""
-    seeds: int
-    """How many."""
-    duration: float
-    """s of each run."""
-
-    @property
-    def experiment(self) -> Experiment:
-        """Method and situation."""
-        return Experiment(self.controller, self.drive, self.noise, self.case)
-
-    def record(self) -> dict[str, object]:
-        """Return the row as plain data."""
-        return asdict(self)
-
-
-@dataclass(frozen=True, slots=True)
-class PairedDifference:
-    """How much more RMSE one method has than another with the same seeds, rad/s."""
-
-    first: str
-    second: str
-    drive: str
-    noise: float
-    case: str
-    difference: float
-    """Mean of first minus second; negative if the first is better."""
-    ci95: float
-    """Half the 95 % interval of that mean (Student's t); infinite for a single seed."""
-    seeds: int
-
-    @property
-    def below(self) -> bool:
-        """Whether the whole interval is below zero: the first is better."""
-        return self.difference + self.ci95 < 0.0
-
-    def record(self) -> dict[str, object]:
-        """Return the comparison as plain data."""
-        return asdict(self)
+SITUATION = ('drive', 'noise', 'case')
+_GROUP = ('controller', 'baseline', 'preview', *SITUATION)
 
 
 class Results:
-    """Every number of a set of runs, by experiment.
+    """Means and paired differences of the runs of a study.
 
-    Parameters
+    Attributes
     ----------
-    kinds
-        Of each method: whether it is a baseline, and whether it has preview; in the tables' order.
-    numbers
-        One entry per seed, in the same order of seeds in all cells.
-    duration, complete
-        s of each run, and whether these are all seeds with the whole duration.
+    runs
+        One row a run: what it is, see :func:`.study_runs`, and its :data:`.NUMBERS`.
+    means
+        One row for each method and situation: means over the seeds with half their 95 % intervals,
+        the largest error of all seeds, and whether every number is finite; NaN where a run
+        diverged.
+    added, lost
+        What RMSE each stage adds to the one before, and each part left out to the full controller:
+        mean with half its 95 % interval of ``first`` less ``second`` on the same seeds.
     """
 
-    def __init__(
-        self,
-        kinds: Mapping[str, tuple[bool, bool]],
-        numbers: Mapping[Experiment, Sequence[RunNumbers]],
-        duration: float,
-        *,
-        complete: bool = True,
-    ) -> None:
-        self.kinds = dict(kinds)
-        self.duration = duration
-        self.complete = complete
-        self._numbers = {experiment: tuple(runs) for experiment, runs in numbers.items()}
-        self._rows = {
-            experiment: self._row(experiment, runs) for experiment, runs in self._numbers.items()
-        }
+    def __init__(self, runs: ResultTable) -> None:
+        groups: dict[tuple[object, ...], list[Row]] = {}
+        for row in runs:
+            groups.setdefault(tuple(row[name] for name in _GROUP), []).append(row)
+        self.runs = runs
+        self.means = ResultTable([_mean_row(rows) for rows in groups.values()])
+        self.added = self._differences(list(zip(STAGES[1:], STAGES[:-1], strict=True)))
+        self.lost = self._differences([(each, STAGES[-1]) for each in WITHOUT.values()])
 
-    @property
-    def rows(self) -> tuple[ResultRow, ...]:
-        """Every row, in the order of the plan."""
-        return tuple(self._rows.values())
-
-    def row(
-        self, controller: str, drive: str, noise: float, case: str = NOMINAL
-    ) -> ResultRow | None:
-        """Return a row, None when it was not measured."""
-        return self._rows.get(Experiment(controller, drive, noise, case))
-
-    def runs(self, experiment: Experiment) -> tuple[RunNumbers, ...]:
-        """Return the runs of an experiment, one per seed, in the same order in all of them."""
-        return self._numbers[experiment]
-
-    def rows_of(
-        self,
-        drive: str,
-        noise: float,
-        case: str = NOMINAL,
-        *,
-        baseline: bool | None = None,
-        preview: bool | None = None,
-    ) -> list[ResultRow]:
-        """Return the rows of all methods in one situation, those of a kind if one is given."""
-        return [
-            row
-            for name in self.kinds
-            if (row := self.row(name, drive, noise, case)) is not None
-            and baseline in (None, row.baseline)
-            and preview in (None, row.preview)
-        ]
-
-    def paired(
-        self, first: str, second: str, drive: str, noise: float, case: str = NOMINAL
-    ) -> PairedDifference | None:
-        """Return how much more RMSE ``first`` has than ``second``, None when not measured."""
-        one = self._numbers.get(Experiment(first, drive, noise, case))
-        other = self._numbers.get(Experiment(second, drive, noise, case))
-        if one is None or other is None:
-            return None
-        more = [a.rmse - b.rmse for a, b in zip(one, other, strict=True)]
-        return PairedDifference(
-            first, second, drive, noise, case, mean(more), interval(more), len(more)
-        )
+    def row(self, controller: str, drive: str, noise: float, case: str = NOMINAL) -> Row | None:
+        """Return a row of the means, None when it was not measured."""
+        rows = self.means.where(controller=controller, drive=drive, noise=noise, case=case)
+        return rows[0] if rows else None
 
     @property
     def drives(self) -> tuple[str, ...]:
-        """The drives there are rows of."""
-        return tuple(dict.fromkeys(experiment.drive for experiment in self._rows))
+        """The drives of the runs."""
+        return self.means.unique('drive')
 
     @property
     def noises(self) -> tuple[float, ...]:
-        """The noises there are rows of, ascending."""
-        return tuple(sorted({experiment.noise for experiment in self._rows}))
+        """The noises of the runs, ascending."""
+        return tuple(sorted(self.means.unique('noise')))
 
     def cases(self, drive: str) -> tuple[str, ...]:
-        """The cases there are rows of."""
-        return tuple(dict.fromkeys(c.case for c in self._rows if c.drive == drive))
+        """The cases of the runs with a drive."""
+        return self.means.unique('case', drive=drive)
 
-    def stage_differences(self) -> list[PairedDifference]:
-        """Return the effect of adding each part, stage by stage, where measured."""
-        pairs = zip(STAGES[1:], STAGES[:-1], strict=True)
-        return self._everywhere(list(pairs))
+    def methods(self, drive: str) -> list[Row]:
+        """Return the nominal rows at the paper's noise, where every method runs."""
+        return self.means.where(drive=drive, noise=PAPER_NOISE, case=NOMINAL)
 
-    def losses(self) -> list[PairedDifference]:
-        """Return the cost of leaving each part out of the full controller, where measured."""
-        return self._everywhere([(without, STAGES[-1]) for without in WITHOUT.values()])
+    def compared(self, drive: str) -> list[str]:
+        """Return the names of the baselines and of the full controller."""
+        rows = self.methods(drive)
+        return [row['controller'] for row in rows if row['baseline'] or row['controller'] == FULL]
 
-    def _everywhere(self, pairs: Sequence[tuple[str, str]]) -> list[PairedDifference]:
-        situations = dict.fromkeys((c.drive, c.noise, c.case) for c in self._rows)
-        found = (
-            self.paired(first, second, drive, noise, case)
-            for drive, noise, case in situations
-            for first, second in pairs
-        )
-        return [paired for paired in found if paired is not None]
-
-    def _row(self, experiment: Experiment, runs: Sequence[RunNumbers]) -> ResultRow:
-        baseline, preview = self.kinds[experiment.method]
-        rmse, settled = [run.rmse for run in runs], [run.settled for run in runs]
-        finite = all(run.finite for run in runs)
-        return ResultRow(
-            controller=experiment.method,
-            baseline=baseline,
-            preview=preview,
-            drive=experiment.drive,
-            noise=experiment.noise,
-            case=experiment.case,
-            rmse_mean=mean(rmse),
-            rmse_ci95=interval(rmse),
-            settled_mean=mean(settled),
-            settled_ci95=interval(settled),
-            chatter_mean=mean([run.chatter for run in runs]),
-            largest_error=max(run.largest_error for run in runs) if finite else math.nan,
-            finite=finite,
-            seeds=len(runs),
-            duration=self.duration,
-        )
+    def _differences(self, pairs: Sequence[tuple[str, str]]) -> ResultTable:
+        situations = dict.fromkeys(tuple(row[name] for name in SITUATION) for row in self.means)
+        found = []
+        for values in situations:
+            situation = dict(zip(SITUATION, values, strict=True))
+            for first, second in pairs:
+                sides = ({'controller': name, **situation} for name in (first, second))
+                apart = self.runs.difference('rmse', *sides)
+                if apart is not None:
+                    row = {'first': first, 'second': second, **situation}
+                    row |= {'difference': apart.mean, 'ci95': apart.half}
+                    seeds = len(self.runs.where(controller=first, **situation))
+                    found.append(row | {'seeds': seeds})
+        return ResultTable(found)
 
 
-def results_of(
-    setup: ExperimentSetup,
-    grid: ExperimentGrid,
-    numbers: Mapping[Experiment, Sequence[RunNumbers]],
-) -> Results:
-    """Return the table of results of a set of runs, the methods in the order of the setup."""
-    kinds: dict[str, tuple[bool, bool]] = {}
-    for drive in grid.drives:
-        for name, method in setup.methods(drive).items():
-            kind = (bool(method.baseline), bool(method.preview))
-            if kinds.setdefault(name, kind) != kind:
-                raise ValueError(f'{name} must be of the same kind with every drive')
-    complete = grid.seeds == tuple(setup.seeds) and grid.duration >= DURATION
-    return Results(kinds, numbers, grid.duration, complete=complete)
+def _mean_row(runs: Sequence[Row]) -> Row:
+    rmse, settled, chatter, largest, finite = (
+        [run[name] for run in runs]
+        for name in ('rmse', 'settled', 'chatter', 'largest_error', 'finite')
+    )
+    return {name: runs[0][name] for name in _GROUP} | {
+        'rmse_mean': mean(rmse),
+        'rmse_ci95': interval(rmse),
+        'settled_mean': mean(settled),
+        'settled_ci95': interval(settled),
+        'chatter_mean': mean(chatter),
+        'largest_error': max(largest) if all(finite) else math.nan,
+        'finite': all(finite),
+        'seeds': len(runs),
+        'duration': runs[0]['duration'],
+    }
 
 
-def step_to(part: str) -> tuple[str, str]:
-    """Return the stages (with, without) a part that :data:`PARTS` names."""
-    index = PARTS.index(part)
-    return STAGES[index + 1], STAGES[index]
+def label(row: Row) -> str:
+    """Return the name of a method, with a mark if it is a baseline with preview."""
+    name = str(row['controller'])
+    marked = row['baseline'] and row['preview'] and 'preview' not in name
+    return f'{name} (preview)' if marked else name
 
 
-def write_csv(path: Path, rows: Iterable[ResultRow]) -> None:
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Write the rows with the names of the JSON's keys on top; empty for what is not finite."""
     with path.open('w', newline='', encoding='utf-8') as stream:
-        writer = csv.DictWriter(
-            stream, [item.name for item in fields(ResultRow)], lineterminator='\n'
-        )
+        writer = csv.DictWriter(stream, list(rows[0]), lineterminator='\n')
         writer.writeheader()
         for row in rows:
-            writer.writerow({name: _csv_cell(value) for name, value in row.record().items()})
+            writer.writerow({name: _csv_cell(value) for name, value in row.items()})
 
 
 def _csv_cell(value: object) -> object:
@@ -265,44 +135,29 @@ def comparison(results: Results, drive: str, *, settled: bool = False) -> Table:
     ``settled`` leaves out the second about each switch.
     """
     noises = results.noises
-    known = [n for n in results.kinds if any(results.row(n, drive, v) for v in noises)]
+    name = 'settled' if settled else 'rmse'
     what = 'RMSE settled, without 1 s about each switch' if settled else 'RMSE'
-    head = ['method', *(f'noise {noise:g}' for noise in noises)]
-    head.append(f'growth from {noises[0]:g} to {noises[-1]:g}')
-
-    def value(row: ResultRow) -> tuple[float, float]:
-        return (row.settled_mean, row.settled_ci95) if settled else (row.rmse_mean, row.rmse_ci95)
-
-    def rank(name: str) -> float:
-        row = results.row(name, drive, PAPER_NOISE)
-        found = math.inf if row is None else value(row)[0]
-        return math.inf if math.isnan(found) else found
-
+    head = ('method', *_heads(noises), f'growth from {noises[0]:g} to {noises[-1]:g}')
     lines = []
-    for name in sorted(known, key=rank):
-        rows = [results.row(name, drive, noise) for noise in noises]
-        cells = [EMPTY_CELL if row is None else format_interval(*value(row)) for row in rows]
+    for method in sorted(results.methods(drive), key=lambda row: rank(row[f'{name}_mean'])):
+        rows = [results.row(method['controller'], drive, noise) for noise in noises]
         first, last = rows[0], rows[-1]
         growth = EMPTY_CELL
         if first is not None and last is not None:
-            growth = _growth(value(first)[0], value(last)[0])
-        labelled = all(results.kinds[name]) and 'preview' not in name
-        mark = ' (preview)' if labelled else ''
-        lines.append((name + mark, *cells, growth))
+            growth = _growth(first[f'{name}_mean'], last[f'{name}_mean'])
+        lines.append((label(method), *(_cell(row, name) for row in rows), growth))
     title = f'{what} (rad/s), {drive} drive, nominal robot'
-    return Table(title, tuple(head), tuple(lines), (FULL,))
+    return Table(title, head, lines, (FULL,))
 
 
 def chatter(results: Results, drive: str) -> Table:
     """Return every method's total variation of the effort against noise."""
-    rows = []
-    for name in results.kinds:
-        found = [results.row(name, drive, noise) for noise in results.noises]
-        if any(found):
-            rows.append((name, *(_number(row, lambda r: r.chatter_mean, 0) for row in found)))
-    head = ('method', *(f'noise {noise:g}' for noise in results.noises))
+    rows = [
+        (name, *(_chatter(results.row(name, drive, noise)) for noise in results.noises))
+        for name in (method['controller'] for method in results.methods(drive))
+    ]
     title = f'Total variation of what is asked per second (rad/s³), {drive} drive, nominal robot'
-    return Table(title, head, tuple(rows), (FULL,))
+    return Table(title, ('method', *_heads(results.noises)), rows, (FULL,))
 
 
 def cases(results: Results, drive: str, noise: float, *, baselines: bool) -> Table | None:
@@ -310,44 +165,42 @@ def cases(results: Results, drive: str, noise: float, *, baselines: bool) -> Tab
 
     None when nothing beside the nominal case was measured at this noise.
     """
+    what, column = 'The controller as it grows, and less one part', 'stage'
+    names = [*STAGES, *WITHOUT.values()]
     if baselines:
-        names = [n for n, (baseline, _) in results.kinds.items() if baseline or n == FULL]
-    else:
-        names = [*STAGES, *WITHOUT.values()]
-    shown = [
-        case
-        for case in results.cases(drive)
-        if any(results.row(name, drive, noise, case) for name in names)
-    ]
+        what, column = 'Methods in every case', 'method'
+        names = results.compared(drive)
+    found: dict[str, dict[str, Row]] = {name: {} for name in names}
+    for row in results.means.where(drive=drive, noise=noise):
+        if row['controller'] in found:
+            found[row['controller']][row['case']] = row
+    shown = [case for case in results.cases(drive) if any(case in rows for rows in found.values())]
     if set(shown) <= {NOMINAL}:
         return None
-    rows = []
-    for name in names:
-        found = [results.row(name, drive, noise, case) for case in shown]
-        if any(found):
-            rows.append((name, *(_rmse(row) for row in found)))
-    what = (
-        'Methods in every case' if baselines else 'The controller as it grows, and less one part'
-    )
+    lines = [
+        (name, *(_cell(rows.get(case)) for case in shown)) for name, rows in found.items() if rows
+    ]
     title = f'{what}: RMSE (rad/s), {drive} drive, noise {noise:g}'
-    return Table(title, (('method' if baselines else 'stage'), *shown), tuple(rows), (FULL,))
+    return Table(title, (column, *shown), lines, (FULL,))
 
 
 def differences(
-    results: Results, pairs: Sequence[PairedDifference], drive: str, noise: float, title: str
+    results: Results, pairs: ResultTable, drive: str, noise: float, title: str
 ) -> Table | None:
     """Return paired differences by case; with an asterisk where the interval excludes zero."""
-    here = [pair for pair in pairs if (pair.drive, pair.noise) == (drive, noise)]
-    by = {(pair.first, pair.second, pair.case): pair for pair in here}
+    by = {
+        (pair['first'], pair['second'], pair['case']): _starred(pair['difference'], pair['ci95'])
+        for pair in pairs.where(drive=drive, noise=noise)
+    }
     shown = [case for case in results.cases(drive) if any(key[2] == case for key in by)]
     rows = [
-        (f'{first} less {second}', *(_paired(by.get((first, second, case))) for case in shown))
-        for first, second in dict.fromkeys((pair.first, pair.second) for pair in here)
+        (f'{first} less {second}', *(by.get((first, second, case), EMPTY_CELL) for case in shown))
+        for first, second in dict.fromkeys(key[:2] for key in by)
     ]
     if not rows:
         return None
     text = f'{title}: paired difference of RMSE (rad/s), {drive} drive, noise {noise:g}'
-    return Table(text, ('', *shown), tuple(rows))
+    return Table(text, ('', *shown), rows)
 
 
 def estimation(results: Sequence[EstimationResult]) -> list[Table]:
@@ -357,76 +210,78 @@ def estimation(results: Sequence[EstimationResult]) -> list[Table]:
     noises = list(dict.fromkeys(result.noise_variance for result in results))
     if not kinds:
         return []
-    head = tuple(f'noise {noise:g}' for noise in noises)
 
-    def by_noise(title: str, key: str) -> Table:
+    def by_noise(title: str, values: Callable[[EstimationResult], Sequence[float]]) -> Table:
         rows = []
         for kind in kinds:
-            records = [by[kind, noise].record() for noise in noises]
-            means = [float(str(record[f'{key}_mean'])) for record in records]
-            cis = [float(str(record[f'{key}_ci95'])) for record in records]
-            cells = [format_interval(m, c, digits=4) for m, c in zip(means, cis, strict=True)]
-            rows.append((kind, *cells, _growth(means[0], means[-1])))
-        return Table(title, ('kind', *head, 'growth'), tuple(rows), ('type3',))
+            samples = [values(by[kind, noise]) for noise in noises]
+            cells = [format_interval(mean(each), interval(each), digits=4) for each in samples]
+            rows.append((kind, *cells, _growth(mean(samples[0]), mean(samples[-1]))))
+        return Table(title, ('kind', *_heads(noises), 'growth'), rows, ('type3',))
 
     more = []
     for kind in kinds:
         if kind != 'type3':
-            pairs = [(by[kind, noise], by['type3', noise]) for noise in noises]
-            found = [_of_sample(difference(*pair)) for pair in pairs]
-            more.append((kind, *(_starred(*item) for item in found)))
+            samples = [difference(by[kind, noise], by['type3', noise]) for noise in noises]
+            more.append((kind, *(_starred(mean(each), interval(each)) for each in samples)))
+    title = 'The same, more than type3 with the same seeds (rad/s)'
     return [
-        by_noise('Estimation without a controller (86): RMSE of the speed (rad/s)', 'speed'),
-        Table('The same, more than type3 with the same seeds (rad/s)', ('kind', *head), (*more,)),
-        by_noise('RMSE of g against what it should be (rad/s²)', 'unknown'),
+        by_noise(
+            'Estimation without a controller (86): RMSE of the speed (rad/s)',
+            lambda result: result.speed,
+        ),
+        Table(title, ('kind', *_heads(noises)), more),
+        by_noise('RMSE of g against what it should be (rad/s²)', lambda result: result.unknown),
     ]
 
 
 def all_tables(results: Results, estimated: Sequence[EstimationResult]) -> dict[str, list[Table]]:
     """Return all tables by their heading."""
-    stages, losses = results.stage_differences(), results.losses()
-    found: dict[str, list[Table | None]] = {
-        'Methods against noise (Table 3)': [],
-        'Methods in every case': [],
-        'What each part is worth': [],
-        'Total variation of the control': [],
-        'Estimation without a controller': [*estimation(estimated)],
-    }
-    methods, perturbed, parts, varied, _ = found.values()
+    methods: list[Table | None] = []
+    perturbed: list[Table | None] = []
+    parts: list[Table | None] = []
     for drive in results.drives:
         methods += [comparison(results, drive), comparison(results, drive, settled=True)]
-        varied.append(chatter(results, drive))
-        perturbed += [cases(results, drive, noise, baselines=True) for noise in (PAPER_NOISE,)]
+        perturbed.append(cases(results, drive, PAPER_NOISE, baselines=True))
         for noise in results.noises:
             parts += [
                 cases(results, drive, noise, baselines=False),
-                differences(results, stages, drive, noise, 'Adding a part'),
-                differences(results, losses, drive, noise, 'Leaving a part out'),
+                differences(results, results.added, drive, noise, 'Adding a part'),
+                differences(results, results.lost, drive, noise, 'Leaving a part out'),
             ]
+    found: dict[str, Sequence[Table | None]] = {
+        'Methods against noise (Table 3)': methods,
+        'Methods in every case': perturbed,
+        'What each part is worth': parts,
+        'Total variation of the control': [chatter(results, drive) for drive in results.drives],
+        'Estimation without a controller': estimation(estimated),
+    }
     return {heading: [t for t in tables if t is not None] for heading, tables in found.items()}
 
 
-def _number(row: ResultRow | None, value: Callable[[ResultRow], float], digits: int) -> str:
+def _heads(noises: Iterable[float]) -> list[str]:
+    return [f'noise {noise:g}' for noise in noises]
+
+
+def rank(value: float) -> float:
+    """Return what puts a mean that diverged last."""
+    return math.inf if math.isnan(value) else value
+
+
+def _cell(row: Row | None, name: str = 'rmse') -> str:
     if row is None:
         return EMPTY_CELL
-    number = value(row)
-    return f'{number:.{digits}f}' if math.isfinite(number) else 'diverged'
+    return format_interval(row[f'{name}_mean'], row[f'{name}_ci95'])
 
 
-def _rmse(row: ResultRow | None) -> str:
-    return EMPTY_CELL if row is None else format_interval(row.rmse_mean, row.rmse_ci95)
-
-
-def _paired(pair: PairedDifference | None) -> str:
-    return EMPTY_CELL if pair is None else _starred(pair.difference, pair.ci95)
+def _chatter(row: Row | None) -> str:
+    if row is None:
+        return EMPTY_CELL
+    return f'{row["chatter_mean"]:.0f}' if math.isfinite(row['chatter_mean']) else 'diverged'
 
 
 def _starred(mean: float, ci95: float) -> str:
     return format_interval(mean, ci95, '+', 4) + (' *' if abs(mean) > ci95 else '')
-
-
-def _of_sample(values: Sequence[float]) -> tuple[float, float]:
-    return mean(values), interval(values)
 
 
 def _growth(first: float, last: float) -> str:
