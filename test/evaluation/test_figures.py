@@ -160,20 +160,16 @@ def test_the_variation_of_u_is_that_of_its_wheel():
         assert f'varies by {rate} rad/s² a second' in title(axis)
 
 
-@pytest.mark.parametrize(
-    ('draw', 'drawn'),
-    [
-        (paper_figures.portrait, (RUN.reference, RUN.speeds)),
-        (paper_figures.robot_portrait, (SERVO.reference, SERVO.speeds)),
-    ],
-)
-def test_portraits_have_the_left_wheel_to_the_right(draw, drawn):
-    for axis, values, name in zip(draw(SHOWCASE).axes, drawn, ('reference', 'robot'), strict=True):
+@pytest.mark.parametrize('run', [RUN, SERVO])
+def test_portraits_have_the_left_wheel_to_the_right(run):
+    figure = paper_figures.portrait(run)
+    for axis, name in zip(figure.axes, ('reference', 'robot'), strict=True):
+        values = run.reference if name == 'reference' else run.speeds
         x, y = axis.lines[0].get_xydata()[0]
         assert (x, y) == (values[0, 1], values[0, 0])
         assert axis.get_xlabel() == 'left wheel / rad/s'
         assert title(axis) == name
-    assert draw(SHOWCASE).axes[0].get_ylabel() == 'right wheel / rad/s'
+    assert figure.axes[0].get_ylabel() == 'right wheel / rad/s'
 
 
 def test_portraits_of_methods_name_the_run_and_its_rmse():

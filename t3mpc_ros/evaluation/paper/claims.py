@@ -12,6 +12,7 @@ from functools import partial
 import math
 import re
 from statistics import median
+from typing import NamedTuple
 
 import numpy as np
 
@@ -252,19 +253,18 @@ def no_larger_than_pi(runs: ResultTable, drive: str) -> Finding | None:
 
 def smallest_growth(runs: ResultTable, drive: str) -> Finding | None:
     """Compare what the noise adds to RMSE with what it adds to that of any baseline, in rad/s."""
-    grown = growths(runs, drive)
-    if FULL not in grown or len(grown) < 2:
+    others = growths(runs, drive)
+    full = others.pop(FULL, None)
+    if full is None or not others:
         return None
-    added = {name: ends[1] - ends[0] for name, (ends, _) in grown.items()}
-    own = added.pop(FULL)
+    added = {name: each.last - each.first for name, each in others.items()}
     least = min(added, key=lambda name: added[name])
-    text = f'{own:+.3f} rad/s against {added[least]:+.3f} of {least}, the least of {len(added)}'
-    by_seed = {name: beyond(runs, 0.0) for name, (_, runs) in grown.items()}
+    own = full.last - full.first
     return Finding(
         math.isfinite(own) and own <= added[least],
-        text,
+        f'{own:+.3f} rad/s against {added[least]:+.3f} of {least}, the least of {len(added)}',
         {'full': own, 'least_rival': least, 'least': added[least]},
-        [paired(by_seed[name], by_seed[FULL]) for name in added],
+        [paired(each.beyond(0.0), full.beyond(0.0)) for each in others.values()],
     )
 
 
@@ -281,34 +281,26 @@ def settled_share(runs: ResultTable, drive: str, limit: float) -> Finding | None
 
 def grows_slightly(runs: ResultTable, drive: str) -> Finding | None:
     """Compare the growth of RMSE with noise with :data:`SLIGHTLY`."""
-    grown = growths(runs, drive)
-    if FULL not in grown:
+    full = growths(runs, drive).get(FULL)
+    if full is None:
         return None
-    (first, last), ends = grown[FULL]
-    share = last / first - 1.0
-    margin = beyond(ends, SLIGHTLY)
-    return Finding(
-        share <= SLIGHTLY,
-        f'{100 * share:+.0f} %',
-        {'growth': share},
-        [paired(np.zeros(margin.shape), margin)],
-    )
+    growth, margin = full.share, paired(np.zeros(full.seeds), full.beyond(SLIGHTLY))
+    return Finding(growth <= SLIGHTLY, f'{100 * growth:+.0f} %', {'growth': growth}, [margin])
 
 
 def others_grow(runs: ResultTable, drive: str) -> Finding | None:
     """Compare the growth of every baseline's RMSE with noise with half of it."""
-    grown = growths(runs, drive)
-    grown.pop(FULL, None)
-    if not grown:
+    others = growths(runs, drive)
+    others.pop(FULL, None)
+    if not others:
         return None
-    shares = {name: last / first - 1.0 for name, ((first, last), _) in grown.items()}
+    shares = {name: each.share for name, each in others.items()}
     low, high = (pick(shares, key=lambda name: shares[name]) for pick in (min, max))
-    margins = [beyond(ends, 0.5) for _, ends in grown.values()]
     return Finding(
         shares[low] > 0.5,
         f'from {100 * shares[low]:+.0f} % ({low}) to {100 * shares[high]:+.0f} % ({high})',
         shares,
-        [paired(margin, np.zeros(margin.shape)) for margin in margins],
+        [paired(each.beyond(0.5), np.zeros(each.seeds)) for each in others.values()],
     )
 
 
@@ -368,34 +360,45 @@ def best_of(candidates: Mapping[str, Array]) -> str | None:
     return min(known, key=lambda name: means[name], default=None)
 
 
-Ends = tuple[Array, Array]
-"""RMSE of each seed without noise and with the most."""
+class Growth(NamedTuple):
+    """RMSE of a method in the nominal case without noise and with the most."""
+
+    first: float
+    last: float
+    """Infinite for what diverges under noise."""
+    ends: tuple[Array, Array]
+    """Both of each seed."""
+
+    @property
+    def share(self) -> float:
+        """Growth relative to the RMSE without noise."""
+        return self.last / self.first - 1.0
+
+    @property
+    def seeds(self) -> int:
+        """How many."""
+        return len(self.ends[0])
+
+    def beyond(self, share: float) -> Array:
+        """Return the growth of each seed beyond a share of its start, rad/s."""
+        first, last = self.ends
+        growth: Array = last - (1.0 + share) * first
+        return growth
 
 
-def growths(runs: ResultTable, drive: str) -> dict[str, tuple[tuple[float, float], Ends]]:
-    """Return RMSE at both ends of the noise, means and seeds, of the baselines and of full.
-
-    The mean is infinite for what diverges under noise.
-    """
+def growths(runs: ResultTable, drive: str) -> dict[str, Growth]:
+    """Return the growth of the baselines and of the full controller."""
+    starts = baselines(runs, drive, 0.0, exact=False)
+    full = by_seed(runs, FULL, drive, 0.0)
+    if full is not None:
+        starts[FULL] = full
     found = {}
-    for row in runs.where(drive=drive, noise=0.0, case=NOMINAL):
-        name = row['controller']
+    for name, first in starts.items():
         last = by_seed(runs, name, drive, LOUDEST)
-        if name in found or last is None or EXACT in name or not (row['baseline'] or name == FULL):
-            continue
-        first = by_seed(runs, name, drive, 0.0)
-        assert first is not None
-        if math.isfinite(mean(first)):
+        if last is not None and math.isfinite(mean(first)):
             end = mean(last) if math.isfinite(mean(last)) else math.inf
-            found[name] = (mean(first), end), (first, last)
+            found[name] = Growth(mean(first), end, (first, last))
     return found
-
-
-def beyond(ends: Ends, share: float) -> Array:
-    """Return the growth of RMSE with the most noise beyond a share of its start, by seed."""
-    first, last = ends
-    growth: Array = last - (1.0 + share) * first
-    return growth
 
 
 def _rmse(value: float) -> str:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Figures 8 to 15 of the paper, and of the comparison: bars, growth with noise, ablation."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import math
 from textwrap import wrap
 from typing import Any
@@ -97,29 +97,17 @@ def portrait_in_words(showcase: FigureRuns) -> str:
     return f'A simulated robot: RMSE {run.rmse():.3f} rad/s, settled {settled:.3f} rad/s.'
 
 
-def robot_portrait(showcase: FigureRuns) -> Any:
-    """Return the phase portrait of the simulated robot's wheels, the paper's Fig. 9."""
-    return _portrait(showcase.velocity)
-
-
-def portrait(showcase: FigureRuns) -> Any:
-    """Return the phase portrait of the outputs in the paper's parameter, its Fig. 14."""
-    return _portrait(showcase.torque)
-
-
-def _portrait(run: Record) -> Any:
+def portrait(run: Record) -> Any:
+    """Return the phase portrait of the wheels and of their reference, Fig. 9 and 14."""
     figure = new_figure(3.4)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
-    for axis, values, colour, title in zip(
-        axes,
-        (run.reference, run.speeds),
-        (REFERENCE_COLOUR, DRIVEN),
-        ('reference', 'robot'),
-        strict=True,
+    # The robot's way through a switch is part of its portrait, the reference's jump is not.
+    reference = broken_at_switches(run, run.reference)
+    for axis, values, colour, title in (
+        (axes[0], reference, REFERENCE_COLOUR, 'reference'),
+        (axes[1], run.speeds, DRIVEN, 'robot'),
     ):
-        # The robot's way through a switch is part of its portrait, the reference's jump is not.
-        shown = broken_at_switches(run, values) if values is run.reference else values
-        axis.plot(shown[:, 1], shown[:, 0], color=colour, linewidth=0.8)
+        axis.plot(values[:, 1], values[:, 0], color=colour, linewidth=0.8)
         axis.set(title=title, xlabel='left wheel / rad/s')
     axes[0].set_ylabel('right wheel / rad/s')
     return figure
@@ -148,21 +136,12 @@ def modes(showcase: FigureRuns) -> Any:
 def outputs(showcase: FigureRuns) -> Any:
     """Return both outputs with their references, whole run and one switch, the paper's Fig. 11."""
     run = showcase.torque
-    figure, axes = run_and_zoom(run, 'speed / rad/s', before=0.4, after=1.6)
-    for row, i in zip(axes, range(2), strict=True):
-        for axis, rows in zip(row, windows(run, 0.4, 1.6), strict=True):
-            time = run.time[rows]
-            if rows.size < run.time.size:
-                axis.plot(
-                    time, run['measured'][rows, i], '.', color=MEASURED, ms=2.5, label='measured'
-                )
-            axis.plot(
-                *thinned(time, run.reference[rows, i]),
-                color=REFERENCE_COLOUR,
-                lw=1.0,
-                label='reference',
-            )
-            axis.plot(*thinned(time, run.speeds[rows, i]), color=DRIVEN, lw=1.2, label='robot')
+    dots = {'color': MEASURED, 'marker': '.', 'linestyle': '', 'ms': 2.5, 'label': 'measured'}
+    reference = {'color': REFERENCE_COLOUR, 'lw': 1.0, 'label': 'reference'}
+    driven = {'color': DRIVEN, 'lw': 1.2, 'label': 'robot'}
+    columns = ((run.reference, reference), (run.speeds, driven))
+    samples = run['measured'], dots
+    figure, axes = run_and_zoom(run, 'speed / rad/s', 0.4, 1.6, columns, samples)
     legend_above(figure, axes[0][-1])
     return figure
 
@@ -170,36 +149,24 @@ def outputs(showcase: FigureRuns) -> Any:
 def control(showcase: FigureRuns) -> Any:
     """Return the control signals with their total variation, the paper's Fig. 12."""
     run = showcase.torque
-    figure, axes = run_and_zoom(run, 'u / rad/s²', before=0.4, after=1.6)
-    span = run.time[-1] - run.time[0]
-    for row, i in zip(axes, range(2), strict=True):
-        varied = float(np.abs(np.diff(run['acceleration'][:, i])).sum() / span)
-        row[0].set_title(f'{WHEELS[i]} wheel, varies by {varied:.0f} rad/s² a second')
-        for axis, rows in zip(row, windows(run, 0.4, 1.6), strict=True):
-            axis.plot(
-                *thinned(run.time[rows], run['acceleration'][rows, i]), color=COMMAND, lw=1.0
-            )
+    effort = run['acceleration']
+    columns = ((effort, {'color': COMMAND, 'lw': 1.0}),)
+    figure, axes = run_and_zoom(run, 'u / rad/s²', 0.4, 1.6, columns)
+    varied = np.abs(np.diff(effort, axis=0)).sum(axis=0) / (run.time[-1] - run.time[0])
+    for axis, wheel, rate in zip(axes[:, 0], WHEELS, varied, strict=True):
+        axis.set_title(f'{wheel} wheel, varies by {rate:.0f} rad/s² a second')
     return figure
 
 
 def estimates(showcase: FigureRuns) -> Any:
     """Return the estimates g with their targets, the paper's Fig. 13."""
     run = showcase.torque
-    target, found = true_unknown(run), estimated_unknown(run)
-    figure, axes = run_and_zoom(run, 'rad/s²', before=2.0, after=4.0)
-    for row, i, share in zip(axes, range(2), explained(run), strict=True):
-        row[0].set_title(f'{WHEELS[i]} wheel, {100 * share:.0f} % of the variance explained')
-        for axis, rows in zip(row, windows(run, 2.0, 4.0), strict=True):
-            rows = rows[rows < target.shape[0]]
-            time = run.time[rows]
-            axis.plot(
-                *thinned(time, target[rows, i]),
-                color=COLOURS['target'], lw=0.9, label="unknown, $\\dot\\chi - u$",
-            )  # fmt: skip
-            axis.plot(
-                *thinned(time, found[rows, i]),
-                color=COLOURS['estimate'], lw=1.3, label='estimate g',
-            )  # fmt: skip
+    target = {'color': COLOURS['target'], 'lw': 0.9, 'label': 'unknown, $\\dot\\chi - u$'}
+    found = {'color': COLOURS['estimate'], 'lw': 1.3, 'label': 'estimate g'}
+    columns = ((true_unknown(run), target), (estimated_unknown(run)[:-1], found))
+    figure, axes = run_and_zoom(run, 'rad/s²', 2.0, 4.0, columns)
+    for axis, wheel, share in zip(axes[:, 0], WHEELS, explained(run), strict=True):
+        axis.set_title(f'{wheel} wheel, {100 * share:.0f} % of the variance explained')
     legend_above(figure, axes[0][-1])
     return figure
 
@@ -216,14 +183,8 @@ def preview(showcase: FigureRuns) -> Any:
     figure, axes = new_panels(2, 2.1)
     for axis, i in zip(axes, range(2), strict=True):
         axis.axvline(0.0, color=COLOURS['switch'], linewidth=0.8, linestyle=(0, (4, 3)))
-        axis.step(
-            time,
-            run.reference[rows, i],
-            color=REFERENCE_COLOUR,
-            lw=1.0,
-            where='post',
-            label='reference',
-        )
+        reference = {'color': REFERENCE_COLOUR, 'lw': 1.0, 'label': 'reference'}
+        axis.step(time, run.reference[rows, i], where='post', **reference)
         axis.plot(time, run.speeds[rows, i], color=DRIVEN, lw=1.6, label='with preview')
         axis.plot(time, blind.speeds[rows, i], color='#ea580c', lw=1.6, label='without preview')
         axis.set(title=f'{WHEELS[i]} wheel', ylabel='speed / rad/s')
@@ -233,33 +194,44 @@ def preview(showcase: FigureRuns) -> Any:
     return figure
 
 
-def run_and_zoom(run: Record, unit: str, before: float, after: float) -> tuple[Any, Any]:
-    """Return a figure with a row per wheel: the whole run, and about its largest switch."""
+Column = tuple[Array, Mapping[str, Any]]
+"""Values of both wheels, shape (n, 2), and the style of their line."""
+
+
+def run_and_zoom(
+    run: Record,
+    unit: str,
+    before: float,
+    after: float,
+    columns: Sequence[Column],
+    samples: Column | None = None,
+) -> tuple[Any, Any]:
+    """Return a figure with a row per wheel: the whole run, and about its largest switch.
+
+    ``before`` and ``after`` are times about the switch, s; samples are drawn there alone.
+    """
+    stretches = [np.arange(run.time.size)]
+    middle = largest_switch(run)
+    if middle is not None:
+        switch = run.time[middle]
+        stretches.append(rows_between(run, switch - before, switch + after))
     figure = new_figure(4.6)
-    zoomed = largest_switch(run) is not None
-    widths = {'width_ratios': (1.7, 1.0)} if zoomed else {}
-    columns = 2 if zoomed else 1
-    axes = figure.subplots(2, columns, sharex='col', squeeze=False, gridspec_kw=widths)
-    for row, wheel in zip(axes, WHEELS, strict=True):
-        row[0].set(title=f'{wheel} wheel', ylabel=unit)
-        for axis in row:
+    ratios = {'width_ratios': (1.7, 1.0)[: len(stretches)]}
+    axes = figure.subplots(2, len(stretches), sharex='col', squeeze=False, gridspec_kw=ratios)
+    for i, wheel in enumerate(WHEELS):
+        axes[i, 0].set(title=f'{wheel} wheel', ylabel=unit)
+        for k, (axis, rows) in enumerate(zip(axes[i], stretches, strict=True)):
             mark_switches(axis, switches_of(run))
-    for axis, rows in zip(axes[-1], windows(run, before, after), strict=True):
+            for values, style in (samples, *columns) if samples and k else columns:
+                shown = rows[rows < len(values)]
+                axis.plot(*thinned(run.time[shown], values[shown, i]), **style)
+    for axis, rows in zip(axes[-1], stretches, strict=True):
         axis.set_xlim(run.time[rows[0]], run.time[rows[-1]])
         axis.xaxis.set_major_locator(MaxNLocator(nbins=6, steps=(1, 2, 5, 10)))
         _name_time(axis)
-    if zoomed:
-        axes[0][1].set_title('about a switch')
+    for axis in axes[0, 1:]:
+        axis.set_title('about a switch')
     return figure, axes
-
-
-def windows(run: Record, before: float, after: float) -> list[NDArray[np.intp]]:
-    """Return the rows of the whole run, and those about its largest switch if it has one."""
-    found = [np.arange(run.time.size)]
-    middle = largest_switch(run)
-    if middle is not None:
-        found.append(rows_between(run, run.time[middle] - before, run.time[middle] + after))
-    return found
 
 
 def rows_between(run: Record, begin: float, end: float) -> NDArray[np.intp]:
@@ -295,7 +267,13 @@ def colours_of(results: Results) -> dict[str, str]:
 
 def rmse_bars(results: Results) -> Any:
     """Return the RMSE with intervals of all methods at the paper's noise."""
-    shown = {drive: _ranked(results, drive) for drive in results.drives}
+    shown = {
+        drive: sorted(
+            (row for row in results.compared(drive) if math.isfinite(row['rmse_mean'])),
+            key=lambda row: float(row['rmse_mean']),
+        )
+        for drive in results.drives
+    }
     colours = colours_of(results)
     longest = max(map(len, shown.values()))
     figure = new_figure(0.9 + len(shown) * (0.5 + 0.23 * longest))
@@ -462,12 +440,6 @@ def _name_wheels(axes: Any) -> None:
         axis.set_xlabel('left wheel / rad/s')
     for axis in axes[:, 0]:
         axis.set_ylabel('right wheel / rad/s')
-
-
-def _ranked(results: Results, drive: str) -> list[Row]:
-    rows = [results.row(name, drive, PAPER_NOISE) for name in results.compared(drive)]
-    known = [row for row in rows if row is not None and math.isfinite(row['rmse_mean'])]
-    return sorted(known, key=lambda row: float(row['rmse_mean']))
 
 
 def _bars(rows: Sequence[Row]) -> tuple[list[float], list[float]]:

@@ -34,6 +34,8 @@ class ExhibitData:
 
     results: Results
     showcase: FigureRuns
+    claims: Sequence[Claim]
+    tables: Mapping[str, Sequence[Table]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +88,7 @@ EXHIBITS = (
         'The same real run as a phase portrait: the robot follows the chaotic reference.',
         'Simulated robot, velocity drive, both panels with the same axes.',
         stem='fig09_robot_portrait',
-        draw=lambda m: paper_figures.robot_portrait(m.showcase),
+        draw=lambda m: paper_figures.portrait(m.showcase.velocity),
         finding=lambda m: paper_figures.portrait_in_words(m.showcase),
         comparable=False,
     ),
@@ -129,7 +131,7 @@ EXHIBITS = (
         'Full controller, torque drive, noise variance 0.04 (rad/s)².',
         ('outputs follow',),
         'fig14_portrait',
-        lambda m: paper_figures.portrait(m.showcase),
+        lambda m: paper_figures.portrait(m.showcase.torque),
     ),
     Exhibit(
         'Fuzzy systems as estimators, without a controller (Fig. 15, Table 3)',
@@ -219,15 +221,6 @@ HEADLINE = 'table3_rmse'
 """Stem of the exhibit that the page shows first."""
 
 
-def findings(material: ExhibitData) -> dict[str, str]:
-    """Return what was found where there is no claim to decide, by the exhibits' stems."""
-    return {
-        exhibit.stem: exhibit.finding(material)
-        for exhibit in EXHIBITS
-        if exhibit.finding is not None
-    }
-
-
 _KINDS = {
     'held': 'yes',
     'not held': 'no',
@@ -237,31 +230,25 @@ _KINDS = {
 }
 
 
-def page(
-    title: str,
-    origin: str,
-    claims: Sequence[Claim],
-    tables: Mapping[str, Sequence[Table]],
-    pictures: Mapping[str, bytes],
-    findings: Mapping[str, str],
-) -> str:
+def page(title: str, origin: str, material: ExhibitData, pictures: Mapping[str, bytes]) -> str:
     """Return the page as HTML that loads nothing from anywhere.
 
-    ``origin`` says where the numbers come from; tables are by heading, pictures (PNG) and findings
-    by the stem of their exhibit.
+    ``origin`` says where the numbers come from; pictures (PNG) are by the stem of their exhibit.
     """
-    first = [each for each in EXHIBITS if each.stem == HEADLINE]
-    others = [each for each in EXHIBITS if each.stem != HEADLINE]
+    headline, *others = (
+        _exhibit(each, material, pictures)
+        for each in sorted(EXHIBITS, key=lambda each: each.stem != HEADLINE)
+    )
     return html_page(
         title,
         [
             Paragraph(origin, 'quiet'),
-            *(_exhibit(exhibit, claims, tables, pictures, findings) for exhibit in first),
+            headline,
             Contents(),
             Heading('Claims'),
-            _claims('What this project claims', [c for c in claims if c.origin == 'ours']),
-            _claims('What the paper claims', [c for c in claims if c.origin == 'paper']),
-            *(_exhibit(exhibit, claims, tables, pictures, findings) for exhibit in others),
+            _claims('What this project claims', material.claims, 'ours'),
+            _claims('What the paper claims', material.claims, 'paper'),
+            *others,
         ],
     )
 
@@ -272,36 +259,33 @@ def counted(claims: Sequence[Claim]) -> str:
     return ', '.join(f'{verdicts.count(kind)} {kind}' for kind in list(_KINDS)[:4])
 
 
-def _claims(title: str, claims: Sequence[Claim]) -> Details:
-    rows = [(claim.text, claim.found, _mark(claim.verdict)) for claim in claims]
+def _claims(title: str, claims: Sequence[Claim], origin: str) -> Details:
+    chosen = [claim for claim in claims if claim.origin == origin]
+    rows = [(claim.text, claim.found, _mark(claim.verdict)) for claim in chosen]
     table = Table('', ('claim', 'found', ''), rows, text=3, wrap=True)
-    return Details(f'{title}: {counted(claims)}', [table], opened=True)
+    return Details(f'{title}: {counted(chosen)}', [table], opened=True)
 
 
-def _exhibit(
-    exhibit: Exhibit,
-    claims: Sequence[Claim],
-    tables: Mapping[str, Sequence[Table]],
-    pictures: Mapping[str, bytes],
-    findings: Mapping[str, str],
-) -> Group:
+def _exhibit(exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, bytes]) -> Group:
+    claims = exhibit.decided_by(material.claims)
     found: list[Sequence[str | Mark]] = [
-        (f'{claim.text}: {claim.found}', _mark(claim.verdict))
-        for claim in exhibit.decided_by(claims)
-    ] or [(findings.get(exhibit.stem, exhibit.caption),)]
+        (f'{claim.text}: {claim.found}', _mark(claim.verdict)) for claim in claims
+    ]
+    if not found:
+        found = [(exhibit.finding(material) if exhibit.finding else exhibit.caption,)]
     sides = [
         Items([(exhibit.paper,)], 'side', 'The paper'),
         Items(found, 'side', 'Found here'),
     ]
     blocks: list[Block] = [
-        Heading(exhibit.title, _mark(exhibit.mark(claims))),
+        Heading(exhibit.title, _mark(exhibit.mark(material.claims))),
         Group(sides, 'div', 'sides'),
     ]
     if png := pictures.get(exhibit.stem):
         blocks.append(Picture(exhibit.title, png, exhibit.caption))
     elif exhibit.stem:
         blocks.append(Paragraph('Left out: nothing of it was measured.', 'quiet'))
-    shown = tables.get(exhibit.tables, ())
+    shown = material.tables.get(exhibit.tables, ())
     blocks += shown[:2]
     if more := shown[2:]:
         blocks.append(Details(f'{len(more)} more tables', more))

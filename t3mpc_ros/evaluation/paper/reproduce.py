@@ -11,7 +11,7 @@ from t3mpc_ros.evaluation.experiment import Report, ResultTable, run_experiment,
 from t3mpc_ros.evaluation.methods import methods
 from t3mpc_ros.evaluation.paper.claims import all_claims, markdown
 from t3mpc_ros.evaluation.paper.figure_runs import simulate_figure_runs
-from t3mpc_ros.evaluation.paper.paper_page import EXHIBITS, ExhibitData, counted, findings, page
+from t3mpc_ros.evaluation.paper.paper_page import EXHIBITS, ExhibitData, counted, page
 from t3mpc_ros.evaluation.paper.results import Results, all_tables, write_csv
 from t3mpc_ros.evaluation.paper.study import (
     DRIVES,
@@ -69,7 +69,7 @@ def reproduce(options: PaperOptions, report: Report | None = None) -> str:
     write('  figures and page')
     claims = (*all_claims(results.runs, estimated), *showcase.claims())
     tables = all_tables(results, estimated)
-    material = ExhibitData(results, showcase)
+    material = ExhibitData(results, showcase, claims, tables)
     compared = [row for row in results.means if EXACT not in row['controller']]
     exact = [row for row in results.means if EXACT in row['controller']]
     content = {
@@ -103,7 +103,7 @@ def reproduce(options: PaperOptions, report: Report | None = None) -> str:
     (output / 'tables.md').write_text(markdown(tables, claims), encoding='utf-8')
     drawn = write_pictures(EXHIBITS, material, output / 'figures')
     title = "The paper's figures and tables, reproduced"
-    html = page(title, _origin(extent, options), claims, tables, drawn, findings(material))
+    html = page(title, _origin(extent, options), material, drawn)
     (output / 'paper.html').write_text(html, encoding='utf-8')
     return f'claims: {counted(claims)}\n{output / "paper.html"}'
 

@@ -68,10 +68,10 @@ class Results:
         """Return the nominal rows at the paper's noise, where every method runs."""
         return self.means.where(drive=drive, noise=PAPER_NOISE, case=NOMINAL)
 
-    def compared(self, drive: str) -> list[str]:
-        """Return the names of the baselines and of the full controller."""
+    def compared(self, drive: str) -> list[Row]:
+        """Return those of the baselines and of the full controller."""
         rows = self.methods(drive)
-        return [row['controller'] for row in rows if row['baseline'] or row['controller'] == FULL]
+        return [row for row in rows if row['baseline'] or row['controller'] == FULL]
 
     def _differences(self, pairs: Sequence[tuple[str, str]]) -> ResultTable:
         situations = dict.fromkeys(tuple(row[name] for name in SITUATION) for row in self.means)
@@ -169,7 +169,7 @@ def cases(results: Results, drive: str, noise: float, *, baselines: bool) -> Tab
     names = [*STAGES, *WITHOUT.values()]
     if baselines:
         what, column = 'Methods in every case', 'method'
-        names = results.compared(drive)
+        names = [row['controller'] for row in results.compared(drive)]
     found: dict[str, dict[str, Row]] = {name: {} for name in names}
     for row in results.means.where(drive=drive, noise=noise):
         if row['controller'] in found:
