@@ -193,9 +193,10 @@ def digest(*parts: Any) -> str:
 _IRRELEVANT_SOURCES = (
     'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'evaluation/bag_report/',
     'evaluation/process_replay/', 'evaluation/tuning/', 'evaluation/comparison',
-    'evaluation/fault_page.py', 'evaluation/plotting.py', 'evaluation/reporting.py',
-    'evaluation/result_file.py', 'evaluation/paper/', 'evaluation/patrol/patrol_page.py',
-    'evaluation/patrol/patrol_figures.py', 'evaluation/patrol/tracking_page.py',
+    'evaluation/claim.py', 'evaluation/fault_page.py', 'evaluation/plotting.py',
+    'evaluation/reporting.py', 'evaluation/result_file.py', 'evaluation/paper/',
+    'evaluation/patrol/patrol_page.py', 'evaluation/patrol/patrol_figures.py',
+    'evaluation/patrol/tracking_page.py',
 )  # fmt: skip
 
 
