@@ -102,7 +102,7 @@ def loop_record(shift=0.0):
 
 RUN, SERVO, BLIND, OTHER = map(loop_record, (0.0, 100.0, 200.0, 300.0))
 SHOWCASE = FigureRuns(
-    1, RUN, SERVO, BLIND, {FULL: RUN, 'PI': OTHER}, ((1, 2), (3, 4)),
+    RUN, SERVO, BLIND, {FULL: RUN, 'PI': OTHER}, ((1, 2), (3, 4)),
     RUN.speeds, {'type3': RUN.speeds + 0.5, 'type1': OTHER.speeds},
 )  # fmt: skip
 SIDES = ('right', 'left')

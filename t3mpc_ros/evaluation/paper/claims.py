@@ -61,6 +61,7 @@ ALONE = (
 """The same of what is left out, and never added."""
 
 Query = Callable[..., Finding | None]
+"""Asks the runs about a claim; None where something was not measured."""
 
 
 def all_claims(runs: ResultTable, estimated: Sequence[EstimationResult]) -> list[Claim]:
@@ -174,6 +175,7 @@ def definitions() -> Iterator[tuple[Claim, Query]]:
 def _of_drives(
     origin: str, name: str, text: str, query: Query, drives: Sequence[str] = DRIVES
 ) -> Iterator[tuple[Claim, Query]]:
+    """Yield a claim for each drive; name and text have its name in place of ``{drive}``."""
     for drive in drives:
         claim = Claim(name.format(drive=drive), origin, text.format(drive=drive))
         yield claim, partial(query, drive=drive)

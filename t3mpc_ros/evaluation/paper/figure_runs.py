@@ -53,7 +53,6 @@ EXPLAINS = 0.5
 class FigureRuns:
     """One run of each kind, all with the same seed and the paper's noise."""
 
-    seed: int
     torque: Record
     """The full controller in the paper's parameter."""
     velocity: Record
@@ -89,7 +88,6 @@ def simulate_figure_runs(extent: Extent, results: Results, workers: int | Execut
     alone = simulate_open_loop(torque_robot(PAPER_NOISE, seed), SETTLE + extent.duration, seed)
     first = round(SETTLE / alone.period)
     return FigureRuns(
-        seed=seed,
         torque=found['torque', FULL],
         velocity=found['velocity', FULL],
         blind=found['velocity', NO_PREVIEW],
