@@ -143,11 +143,6 @@ def _measured(measure: Callable[[Record], T], job: Job) -> T:
     return measure(run(*job))
 
 
-def full_record(record: Record) -> Record:
-    """Return the record itself: the measure that leaves nothing out."""
-    return record
-
-
 def _job_error(job: tuple[Any, Named], error: BaseException) -> JobError:
     scenario, method = job
     return JobError(f'{method.name} on {scenario} failed: {error!r}')

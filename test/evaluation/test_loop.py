@@ -27,7 +27,7 @@ from t3mpc_ros.evaluation.scenario import (
     Scenario,
 )
 from t3mpc_ros.evaluation.simulated_links import NO_FAULTS
-from t3mpc_ros.evaluation.workers import JobError, WorkerPool, full_record, measure_many
+from t3mpc_ros.evaluation.workers import JobError, WorkerPool, measure_many
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
@@ -540,6 +540,10 @@ def test_what_does_not_fit_the_loop_is_refused(monkeypatch):
 # -- many runs --------------------------------------------------------------------------------
 
 
+def whole(record):
+    return record
+
+
 def test_many_runs_are_the_same_in_one_process_and_in_two():
     jobs = [
         (
@@ -549,11 +553,11 @@ def test_many_runs_are_the_same_in_one_process_and_in_two():
         for robot in PLANTS
         for seed, gain in ((1, 4.0), (2, 9.0))
     ]
-    alone = dict(measure_many(jobs, full_record, 1))
+    alone = dict(measure_many(jobs, whole, 1))
     assert sorted(alone) == list(range(len(jobs)))
     bad = (jobs[0][0], MethodSpec('bad', Proportional, ProportionalParameters(fails=True)))
     with WorkerPool(2) as workers:
-        together = dict(measure_many(iter(jobs), full_record, workers))
+        together = dict(measure_many(iter(jobs), whole, workers))
         assert sorted(together) == sorted(alone)
         for index, record in together.items():
             assert_equal_records(record, alone[index])
@@ -563,12 +567,12 @@ def test_many_runs_are_the_same_in_one_process_and_in_two():
             index: record.rmse(1.0) for index, record in alone.items()
         }
         with pytest.raises(JobError, match=r'bad on servo, .*, load change, seed 1 failed: Zero'):
-            list(measure_many([jobs[1], bad, *jobs], full_record, workers))
-        assert len(dict(measure_many(jobs[:3], full_record, workers))) == 3
+            list(measure_many([jobs[1], bad, *jobs], whole, workers))
+        assert len(dict(measure_many(jobs[:3], whole, workers))) == 3
     with pytest.raises(JobError, match=r'bad on servo.*on purpose'):
-        list(measure_many([jobs[1], bad], full_record))
+        list(measure_many([jobs[1], bad], whole))
     with pytest.raises(ValueError, match='workers must be at least 1: got 0'):
-        list(measure_many(jobs, full_record, 0))
+        list(measure_many(jobs, whole, 0))
 
 
 # -- records ----------------------------------------------------------------------------------

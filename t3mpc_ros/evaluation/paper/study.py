@@ -94,7 +94,7 @@ def chosen_extent(*, quick: bool = False, seeds: int | None = None) -> Extent:
 
 
 def study_runs(extent: Extent) -> list[Run]:
-    """Return all runs, seed by seed, so that cheap and dear methods stay mixed.
+    """Return all runs, seed by seed, so that fast and slow methods stay mixed.
 
     Every baseline and every stage of the controller in the nominal case at every noise; the stages
     in every other case at ``perturbed_noises``; at the paper's noise the controller with one part
