@@ -180,17 +180,17 @@ def _run(error, time=10.0):
 
 
 @pytest.mark.parametrize(
-    'rival, verdict',
+    'baseline, verdict',
     [
         ([0.004, 0.005, 0.006], 'ours is better'),
         ([0.0010, 0.0011, 0.0012], 'ours is worse'),
         ([0.001, 0.003, 0.002], 'inconclusive'),
     ],
 )
-def test_the_verdict_is_that_of_paired_seeds(rival, verdict):
+def test_the_verdict_is_that_of_paired_seeds(baseline, verdict):
     runs = {
         OURS: [_run(error) for error in (0.0020, 0.0021, 0.0022)],
-        'pure pursuit': [_run(error, math.nan) for error in rival],
+        'pure pursuit': [_run(error, math.nan) for error in baseline],
     }
     text = tracking_page.path_table('square', runs).markdown()
     (row,) = (line for line in text.splitlines() if line.startswith('| pure pursuit'))

@@ -1,12 +1,13 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a patrol against theory: coverage, entropies, exponents, skill, rival paths."""
+"""Figures of a patrol against theory: coverage, entropies, exponents, skill, baseline paths."""
 
 import math
 
 import numpy as np
 import pytest
 
+from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, LANES, Rectangle
 from t3mpc_ros.evaluation.patrol.coverage import (
     CoverageGrid,
     coverage_at,
@@ -14,16 +15,15 @@ from t3mpc_ros.evaluation.patrol.coverage import (
     time_to_cover,
     visits,
 )
-from t3mpc_ros.evaluation.patrol.delay_embedding import delay_vectors
-from t3mpc_ros.evaluation.patrol.divergence_rate import divergence
-from t3mpc_ros.evaluation.patrol.path_entropy import (
+from t3mpc_ros.evaluation.patrol.patrol_metrics import patrol_metrics
+from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, predictability
+from t3mpc_ros.evaluation.patrol.time_series import (
+    delay_vectors,
+    divergence,
     ordinal_shares,
     permutation_entropy,
     spectral_entropy,
 )
-from t3mpc_ros.evaluation.patrol.patrol_metrics import patrol_metrics
-from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, predictability
-from t3mpc_ros.evaluation.patrol.rival_paths import LANES, RIVALS, Rectangle
 
 AREA = Rectangle((-1.8, -1.3), (1.8, 1.3))
 
@@ -220,9 +220,9 @@ def test_a_robot_at_rest_is_predicted_and_a_short_path_refused():
 # -- paths and all figures together ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize('name', RIVALS)
-def test_rival_paths_stay_inside_and_follow_from_the_seed(name):
-    make = RIVALS[name]
+@pytest.mark.parametrize('name', BASELINE_PATHS)
+def test_baseline_paths_stay_inside_and_follow_from_the_seed(name):
+    make = BASELINE_PATHS[name]
     path, again, other = (make(AREA, 50.0, np.random.default_rng(seed)) for seed in (5, 5, 6))
     assert (path >= np.array(AREA.low) - 1e-9).all()
     assert (path <= np.array(AREA.high) + 1e-9).all()
@@ -232,7 +232,7 @@ def test_rival_paths_stay_inside_and_follow_from_the_seed(name):
 
 
 def test_a_boustrophedon_covers_every_cell_once_and_evenly():
-    corners = RIVALS['boustrophedon'](AREA, 1.0, np.random.default_rng(0))[: 2 * LANES]
+    corners = BASELINE_PATHS['boustrophedon'](AREA, 1.0, np.random.default_rng(0))[: 2 * LANES]
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(corners, axis=0).T))])
     grid = CoverageGrid(*AREA)
     found = patrol_metrics(length / 0.4, *corners.T, grid)

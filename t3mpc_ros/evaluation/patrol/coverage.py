@@ -9,9 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.patrol.delay_embedding import check_path
-
-Array = NDArray[np.float64]
+from t3mpc_ros.evaluation.patrol.time_series import check_path, normalised_entropy
+from t3mpc_ros.geometry.types import Array
 
 
 @dataclass(frozen=True)
@@ -136,9 +135,3 @@ def evenness(found: Visits, grid: CoverageGrid) -> float:
     if total <= 0.0 or dwell.size < 2:
         return math.nan
     return normalised_entropy(dwell / total)
-
-
-def normalised_entropy(shares: Array) -> float:
-    """Return the Shannon entropy of shares that add up to 1, relative to that of equal ones."""
-    held = shares[shares > 0.0]
-    return float(-(held * np.log(held)).sum() / math.log(shares.size)) + 0.0

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-r"""Pure pursuit and regulated pure pursuit: the rivals of the pose loop.
+r"""Pure pursuit and regulated pure pursuit: the baselines of the pose loop.
 
 Pure pursuit drives the arc through a point of the path at the distance :math:`L`, the lookahead,
 which is at :math:`y` to the left of the robot; the arc has the curvature :math:`2 y/L^2`
@@ -17,14 +17,11 @@ import math
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.control.actuation import LimitParameters, limit_command, wheel_limits
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.path_timing import check_points, polyline_length, resample
-from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, Pose, WheelSpeeds
-
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import STANDSTILL, Array, BodyTwist, Pose, WheelSpeeds
 
 SPACING = 0.002
 """Distance of the points at which the path is searched, m."""

@@ -5,8 +5,8 @@
 Every method drives the digital twin with noise, lag, slippery patches on the path and lost
 commands; dead time, wheel radius and wheel separation are drawn from the seed and are not those
 that the methods assume. All have the same place, the same top speed along the path and the same
-limits of the command. The gains of ours and the lookaheads of the rivals are the best of grids of
-equal size on a path that is not compared (:func:`tune_trackers`).
+limits of the command. The gains of ours and the lookaheads of the baselines are the best of grids
+of equal size on a path that is not compared (:func:`tune_trackers`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.confidence_intervals import mean, rms
@@ -43,14 +42,12 @@ from t3mpc_ros.geometry.path_timing import (
     resample,
     time_path,
 )
-from t3mpc_ros.geometry.types import ORIGIN
-
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import ORIGIN, Array
 
 RECORDED_PATH = Path(__file__).with_name('recorded_path.csv')
 """Odometry of a robot that followed switching chaotic wheel speeds, thinned to 10 mm."""
 SPARE_TIME, SLOW_SPARE_TIME = 1.25, 3.0
-"""Time for a path as a multiple of that of its reference; for a rival that slows down."""
+"""Time for a path as a multiple of that of its reference; for a baseline that slows down."""
 ARRIVED = 0.05
 """Distance from the goal (m) within which a robot that has arrived stays."""
 LAST_PIECE = 1.0
@@ -76,7 +73,7 @@ class TrackingMethod:
     controller: Mapping[str, object] = field(default_factory=dict)
     """Parameters of our controller that differ."""
     pursuit: PurePursuitParameters | RegulatedParameters | None = None
-    """A rival in place of our controller."""
+    """A baseline in place of our controller."""
 
     @property
     def spare_time(self) -> float:
@@ -85,7 +82,7 @@ class TrackingMethod:
 
 
 TUNED_GAINS: Mapping[str, object] = {'pose.gain_across': 240.0, 'pose.gain_yaw': 8.0}
-"""The best of :func:`tune_trackers`, as the lookaheads of the rivals below."""
+"""The best of :func:`tune_trackers`, as the lookaheads of the baselines below."""
 OURS = 'ours'
 METHODS = {
     method.name: method
@@ -184,7 +181,7 @@ class TrackingRun(NamedTuple):
     largest: float
     """Largest distance of the drive from the path, or of the path from the drive, m"""
     timed: float
-    """Root mean square distance from the reference at the same time, m; NaN for a rival."""
+    """Root mean square distance from the reference at the same time, m; NaN for a baseline."""
     time: float
     """Until the robot stays within 50 mm of the goal, s; NaN if it never does."""
     speed: tuple[float, float]
@@ -314,7 +311,7 @@ def _pair(values: Array) -> tuple[float, float]:
 
 
 def tuning_grids() -> Mapping[str, Sequence[TrackingMethod]]:
-    """Return the methods to choose from, equally many for ours and each rival."""
+    """Return the methods to choose from, equally many for ours and each baseline."""
     ours = [
         TrackingMethod(f'k_y {across:g}, k_theta {yaw:g}', {'pose.gain_across': across,
                                                             'pose.gain_yaw': yaw})

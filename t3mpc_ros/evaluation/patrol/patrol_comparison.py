@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Our patrol and its rivals: the same robot, room, time, speed limits and safety for all.
+"""Our patrol and the baselines: the same robot, room, time, speed limits and safety for all.
 
 Every path is a polyline. Timing under the limits of speed and acceleration makes it a reference
 (:mod:`t3mpc_ros.geometry.path_timing`), which one of two robots follows: ``exact`` is always where
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.portrait import PortraitParameters
 from t3mpc_ros.evaluation.paper.experiment_runs import source_digest
+from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, Visits, coverage_at
 from t3mpc_ros.evaluation.patrol.patrol_metrics import PatrolMetrics, patrol_metrics
 from t3mpc_ros.evaluation.patrol.patrol_run import (
@@ -35,24 +36,21 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     world_file,
 )
 from t3mpc_ros.evaluation.patrol.predictability import Skill
-from t3mpc_ros.evaluation.patrol.rival_paths import RIVALS, Rectangle
 from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
 from t3mpc_ros.evaluation.workers import WorkerPool
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
-from t3mpc_ros.geometry.types import ORIGIN
+from t3mpc_ros.geometry.types import ORIGIN, Array
 from t3mpc_ros.robot.description import ray_ends, sensor_mounts
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 from t3mpc_ros.simulation.world import World, parse_world
 from t3mpc_ros.version import VERSION
 
-Array = NDArray[np.float64]
-
 OURS = 'portraits (85)'
 """Name of our path, the switched portraits of system (85)."""
-PATHS = (OURS, *RIVALS)
+PATHS = (OURS, *BASELINE_PATHS)
 ROBOTS = ('twin', 'exact')
 BOXES = 3
 """Unknown boxes in the room of the twin."""
@@ -100,7 +98,7 @@ class PatrolPlan:
 
     @property
     def area(self) -> Rectangle:
-        """The arena, for the rivals."""
+        """The arena, for the baselines."""
         left, bottom, right, top = self.arena
         return Rectangle((left, bottom), (right, top))
 
@@ -253,7 +251,7 @@ def path_points(plan: PatrolPlan, name: str, seed: int) -> Iterator[Array]:
         parameters = PortraitParameters.from_dict({'arena': list(plan.arena)})
         return portrait_points(seed, plan.limits, parameters)
     length = plan.limits.linear * plan.duration + 10.0
-    return iter([RIVALS[name](plan.area, length, np.random.default_rng((seed, 21)))])
+    return iter([BASELINE_PATHS[name](plan.area, length, np.random.default_rng((seed, 21)))])
 
 
 def plan_world(plan: PatrolPlan, seed: int) -> str:

@@ -7,7 +7,6 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.patrol.coverage import visits
@@ -18,8 +17,6 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     Results,
 )
 from t3mpc_ros.evaluation.plotting import TitledDrawing, draw_world, new_figure
-
-Array = NDArray[np.float64]
 
 PALETTE = (
     '#be123c', '#0284c7', '#65a30d', '#7c3aed', '#a16207', '#15803d', '#4338ca', '#6b7280'

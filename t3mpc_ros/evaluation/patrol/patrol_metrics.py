@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.patrol.coverage import (
     CoverageGrid,
@@ -17,12 +16,15 @@ from t3mpc_ros.evaluation.patrol.coverage import (
     time_to_cover,
     visits,
 )
-from t3mpc_ros.evaluation.patrol.delay_embedding import delay_vectors, resampled
-from t3mpc_ros.evaluation.patrol.divergence_rate import divergence
-from t3mpc_ros.evaluation.patrol.path_entropy import permutation_entropy, spectral_entropy
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, Skill, predictability
-
-Array = NDArray[np.float64]
+from t3mpc_ros.evaluation.patrol.time_series import (
+    delay_vectors,
+    divergence,
+    permutation_entropy,
+    resampled,
+    spectral_entropy,
+)
+from t3mpc_ros.geometry.types import Array
 
 SHARES = (0.5, 0.9, 0.95)
 """Shares of the grid whose times are measured."""
@@ -115,7 +117,7 @@ def patrol_metrics(
     Raises
     ------
     ValueError
-        Not a path: see :func:`~t3mpc_ros.evaluation.patrol.delay_embedding.check_path`.
+        Not a path: see :func:`~t3mpc_ros.evaluation.patrol.time_series.check_path`.
     """
     found = visits(t, x, y, grid)
     exponent = permutation = spectral = math.nan
@@ -152,7 +154,7 @@ def patrol_metrics(
 def path_exponent(t: Array, x: Array, y: Array) -> float:
     """Return the largest Lyapunov exponent of a path, 1/s; NaN if it never moves.
 
-    By :func:`~t3mpc_ros.evaluation.patrol.divergence_rate.divergence` of delay vectors of x and y
+    By :func:`~t3mpc_ros.evaluation.patrol.time_series.divergence` of delay vectors of x and y
     with 0, 1 and 2 s of past; neighbours are more than 10 s apart and followed for 20 s.
     """
     points = delay_vectors(resampled(t, x, y, _STEP), _EXPONENT_LAGS)

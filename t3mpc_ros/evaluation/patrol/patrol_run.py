@@ -30,6 +30,7 @@ from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
 from t3mpc_ros.geometry.types import (
     ORIGIN,
     STANDSTILL,
+    Array,
     BodyTwist,
     Pose,
     State,
@@ -39,8 +40,6 @@ from t3mpc_ros.robot.interface import RobotCommand, RobotState
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.plant_robot import Signals
 from t3mpc_ros.simulation.world import load_world
-
-Array = NDArray[np.float64]
 
 START = KINDS['twin'].start
 """Standstill before the drive, s."""

@@ -27,13 +27,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.patrol.delay_embedding import (
+from t3mpc_ros.evaluation.patrol.time_series import (
     delay_vectors,
     resampled,
     square_distances,
 )
-
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import Array
 
 STEP = 0.25
 """Interval of the observations, s."""

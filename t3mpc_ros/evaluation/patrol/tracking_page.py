@@ -169,7 +169,7 @@ def _numbers(run: TrackingRun) -> dict[str, Any]:
 
 
 def draw_tracks(results: TrackingResults) -> Any:
-    """Return each path with the drives of ours and of the rivals, first seed."""
+    """Return each path with the drives of ours and of the baselines, first seed."""
     figure = new_figure(6.4)
     axes = figure.subplots(2, 2, squeeze=False).ravel()
     for axis in axes[len(results) :]:

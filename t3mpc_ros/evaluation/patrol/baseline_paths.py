@@ -11,13 +11,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.system import QuadraticSystem
 from t3mpc_ros.geometry.path_timing import polyline_length
-
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import Array
 
 LEG = 1.0
 """Length of a straight leg of the random walk and of the logistic path, m: a quarter of a room."""
@@ -169,7 +167,7 @@ def logistic(area: Rectangle, length: float, generator: np.random.Generator) -> 
     return np.array(path)
 
 
-RIVALS: Mapping[str, PathMaker] = {
+BASELINE_PATHS: Mapping[str, PathMaker] = {
     'Lorenz': lorenz,
     'Chen': chen,
     'Arnold': arnold,
