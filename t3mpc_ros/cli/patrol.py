@@ -3,10 +3,10 @@
 """``t3mpc patrol``: how good a patrol our path is, against other paths."""
 
 import argparse
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 import sys
-from typing import Any, NamedTuple
+from typing import Any
 
 from t3mpc_ros.cli.run_options import add_seeds, add_workers, executor_of
 from t3mpc_ros.parameters.command_line import bounded_float
@@ -68,46 +68,45 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 
 def run(options: argparse.Namespace) -> int:
     """Print the tables, write page, pictures and numbers, and return 0."""
+    from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.plotting import write_pictures
     from t3mpc_ros.evaluation.reporting import strict_json
 
     figures = options.output / 'figures'
     figures.mkdir(parents=True, exist_ok=True)  # an error before the runs, not after them
+    if options.tracking == 'tune':
+        return _tune_tracking(options)
+    name = 'tracking' if options.tracking else 'patrol'
+    page, plan, compare = (_tracking if options.tracking else _patrols)(options)
+    runs = options.output / f'{name}{RUNS}'
     with executor_of(options) as executor:
-        if options.tracking == 'tune':
-            return _tune_tracking(executor)
-        study = (_tracking if options.tracking else _patrols)(options, executor)
-    page, plan, results = study.page, study.plan, study.results
-    print(page.markdown(plan, results))
-    drawn = write_pictures(page.PICTURES, study.drawn, figures)
-    numbers = strict_json(page.record(plan, results))
-    (options.output / f'{study.name}.json').write_text(numbers, encoding='utf-8')
-    written = options.output / f'{study.name}.html'
-    written.write_text(page.page(plan, results, drawn), encoding='utf-8')
-    (options.output / f'{study.name}{RUNS}').unlink(missing_ok=True)
+        study = compare(plan, runs, executor, print_report)
+    print(page.markdown(study))
+    drawn = write_pictures(page.PICTURES, study, figures)
+    numbers = strict_json(page.record(study))
+    (options.output / f'{name}.json').write_text(numbers, encoding='utf-8')
+    written = options.output / f'{name}.html'
+    written.write_text(page.page(study, drawn), encoding='utf-8')
+    runs.unlink(missing_ok=True)
     print(f'written to {written}', file=sys.stderr)
     return 0
 
 
-def _tune_tracking(executor: Any) -> int:
+def _tune_tracking(options: argparse.Namespace) -> int:
+    from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.patrol import tracking_page
     from t3mpc_ros.evaluation.patrol.path_tracking import tune_trackers
 
-    print(tracking_page.tuning_markdown(tune_trackers(executor, progress=True)))
+    with executor_of(options) as executor:
+        print(tracking_page.tuning_markdown(tune_trackers(executor, print_report)))
     return 0
 
 
-class _Study(NamedTuple):
-    """Results, the module with their page, and what its pictures are drawn of."""
-
-    name: str
-    page: Any
-    plan: Any
-    results: Any
-    drawn: Any
+_Study = tuple[Any, Any, Callable[..., Any]]
+"""Module of the page, plan, and the function that measures it."""
 
 
-def _tracking(options: argparse.Namespace, executor: Any) -> _Study:
+def _tracking(options: argparse.Namespace) -> _Study:
     from t3mpc_ros.evaluation.patrol import tracking_page
     from t3mpc_ros.evaluation.patrol.path_tracking import (
         TRACKED_PATHS,
@@ -117,17 +116,13 @@ def _tracking(options: argparse.Namespace, executor: Any) -> _Study:
     from t3mpc_ros.parameters.table import find_names
 
     names = tuple(TRACKED_PATHS)
-    plan = TrackingPlan(
-        paths=find_names('path', options.paths, names) or names, seeds=options.seeds
-    )
-    results = compare_trackers(plan, executor, progress=True)
-    return _Study('tracking', tracking_page, plan, results, results)
+    paths = find_names('path', options.paths, names) or names
+    return tracking_page, TrackingPlan(paths=paths, seeds=options.seeds), compare_trackers
 
 
-def _patrols(options: argparse.Namespace, executor: Any) -> _Study:
+def _patrols(options: argparse.Namespace) -> _Study:
     from t3mpc_ros.evaluation.patrol import patrol_page
     from t3mpc_ros.evaluation.patrol.patrol_comparison import PATHS, PatrolPlan, compare_patrols
-    from t3mpc_ros.evaluation.patrol.patrol_figures import Comparison
     from t3mpc_ros.parameters.table import find_names
 
     plan = PatrolPlan(
@@ -137,6 +132,4 @@ def _patrols(options: argparse.Namespace, executor: Any) -> _Study:
         robot=options.robot,
         arena=tuple(options.arena),
     )
-    file = options.output / f'patrol{RUNS}'
-    results = compare_patrols(plan, file, executor, partial(print, file=sys.stderr, flush=True))
-    return _Study('patrol', patrol_page, plan, results, Comparison(plan, results))
+    return patrol_page, plan, compare_patrols

@@ -17,6 +17,7 @@ import jinja2
 from tqdm import tqdm
 
 from t3mpc_ros.evaluation.charts import Chart, PageData, Plane, Timeline
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.page.page_files import page_file
 
 EMPTY_CELL = '–'
@@ -255,6 +256,12 @@ def format_interval(mean: float, ci95: float, sign: str = '', digits: int = 3) -
         return 'diverged'
     text = f'{mean:{sign}.{digits}f}'
     return f'{text} ± {ci95:.{digits}f}' if math.isfinite(ci95) else text
+
+
+def format_mean(values: Sequence[float], digits: int = 3) -> str:
+    """Return the mean of the finite values ± half its interval; an empty cell if there is none."""
+    known = [value for value in values if math.isfinite(value)]
+    return format_interval(mean(known), interval(known), digits=digits) if known else EMPTY_CELL
 
 
 def _line(cells: Sequence[str]) -> str:

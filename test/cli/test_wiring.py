@@ -347,7 +347,7 @@ TABLE = {
             '--minutes 2': {'compare_patrols.plan.duration': 120.0},
             '--arena -1 -2 3 4': {'compare_patrols.plan.arena': (-1.0, -2.0, 3.0, 4.0)},
             '--paths Lorenz': {'compare_patrols.plan.paths': ('Lorenz',)},
-            '--output new': {'compare_patrols.file': 'new/patrol.runs.jsonl'},
+            '--output new': {'compare_patrols.store': 'new/patrol.runs.jsonl'},
             **workers('compare_patrols.workers'),
         },
     ),

@@ -29,15 +29,15 @@ from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.results import Results
 from t3mpc_ros.evaluation.paper.study import STAGES, WITHOUT
 from t3mpc_ros.evaluation.patrol import patrol_figures, tracking_page
-from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid
+from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, visits
 from t3mpc_ros.evaluation.patrol.path_tracking import OURS as TRACKER
-from t3mpc_ros.evaluation.patrol.path_tracking import TRACKED_PATHS
+from t3mpc_ros.evaluation.patrol.path_tracking import TRACKED_PATHS, TrackingPlan, TrackingStudy
 from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     OURS,
     PatrolPlan,
-    PatrolResult,
-    PatrolTrack,
+    PatrolStudy,
 )
+from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
 from t3mpc_ros.evaluation.process_replay import replay_comparison
 from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     Comparison,
@@ -473,25 +473,28 @@ def test_the_first_divergence_shows_both_runs_and_the_tolerance(caught, tmp_path
 # -- patrols and the twin -------------------------------------------------------------------------
 
 
-def patrol(coverage, skills):
-    metrics = SimpleNamespace(
-        skills=[SimpleNamespace(horizon=h) for h in (1.0, 5.0)],
-        skill=dict(zip((1.0, 5.0), skills, strict=True)).get,
-    )
-    return PatrolResult(metrics, np.linspace(0.0, coverage, 11), 0, 0.0, None)
-
-
-PATROLS = {
-    OURS: [patrol(0.8, (0.9, 0.4)), patrol(0.6, (0.7, 0.1))],
-    'random walk': [patrol(0.5, (0.8, 0.3)), patrol(0.3, (0.2, 0.2))],
-}
+SKILLS = {(OURS, 1): (0.9, 0.4), (OURS, 2): (0.7, 0.1), ('random walk', 1): (0.8, 0.3),
+          ('random walk', 2): (0.2, 0.2)}  # fmt: skip
+PATROLS = PatrolStudy(
+    PatrolPlan((OURS, 'random walk'), (1, 2), duration=600.0),
+    ResultTable(
+        [
+            {
+                'controller': name,
+                'seed': seed,
+                'curve': np.linspace(0.0, first, 11),
+                **{f'skill_{h:g}': first if h < 5.0 else later for h in HORIZONS},
+            }
+            for (name, seed), (first, later) in SKILLS.items()
+        ]
+    ),
+)
 
 
 def test_coverage_is_the_mean_in_per_cent_over_minutes():
-    plan = PatrolPlan(tuple(PATROLS), (1, 2), duration=600.0)
-    (axis,) = patrol_figures.draw_coverage(patrol_figures.Comparison(plan, PATROLS)).axes
+    (axis,) = patrol_figures.draw_coverage(PATROLS).axes
     shown = lines(axis)
-    for name, last in ((OURS, 70.0), ('random walk', 40.0)):
+    for name, last in ((OURS, 80.0), ('random walk', 50.0)):
         time, share = shown[name]
         assert (time[0], time[-1]) == (0.0, pytest.approx(10.0))
         assert share == pytest.approx(np.linspace(0.0, last, 11))
@@ -499,11 +502,10 @@ def test_coverage_is_the_mean_in_per_cent_over_minutes():
 
 
 def test_skills_have_their_intervals():
-    plan = PatrolPlan(tuple(PATROLS), (1, 2))
-    (axis,) = patrol_figures.draw_predictability(patrol_figures.Comparison(plan, PATROLS)).axes
-    for (name, each), container in zip(PATROLS.items(), axis.containers, strict=True):
+    (axis,) = patrol_figures.draw_predictability(PATROLS).axes
+    for name, container in zip(PATROLS.plan.paths, axis.containers, strict=True):
         assert container.get_label() == name
-        values = [[one.metrics.skill(h) for one in each] for h in (1.0, 5.0)]
+        values = [PATROLS.table.values(f'skill_{h:g}', controller=name) for h in HORIZONS]
         middles, half = halves(container, 1)
         assert middles == pytest.approx([np.mean(row) for row in values])
         assert half == pytest.approx([interval(row) for row in values])
@@ -538,34 +540,38 @@ def walls_of(axis):
     return np.reshape(walls.get_segments(), (-1, 4)), discs, corners
 
 
-def patrol_track(place, hits):
+GRID = CoverageGrid((0.0, 0.0), (4.0, 2.0), 8, 4)
+
+
+def patrol_row(name, place, hits):
     """Return a patrol that stays at a place for 3 s and at another one for 1 s."""
-    time = np.arange(0.0, 5.0)
-    position = np.array([place, place, place, place, (3.5, 1.75)])
-    blocked = np.zeros((4, 8), dtype=bool)
-    blocked[3, 1] = True  # x 0.5 to 1, y 1.5 to 2
-    grid = CoverageGrid((0.0, 0.0), (4.0, 2.0), 8, 4, blocked)
-    return PatrolTrack(
-        time, position, position + 9.0, time > 0.0, grid, WORLD, np.asarray(hits, dtype=float)
-    )
+    track = np.array([place, place, place, place, (3.5, 1.75)])
+    dwell = visits(np.arange(0.0, 5.0), *track.T, GRID).dwell
+    dwell[3, 1] = math.nan  # x 0.5 to 1, y 1.5 to 2 does not count
+    return {'controller': name, 'seed': 1, 'track': track.tolist(), 'dwell': dwell.tolist(),
+            'hits': hits}  # fmt: skip
 
 
-TRACKS = {
-    OURS: patrol_track((0.25, 0.25), [(4.0, 0.5), (3.2, 1.7)]),
-    'random walk': patrol_track((2.75, 0.75), [(1.0, 1.3)]),
-}
+DRAWN = PatrolStudy(
+    SimpleNamespace(arena=(0.0, 0.0, 4.0, 2.0)),
+    ResultTable(
+        [
+            patrol_row(OURS, (0.25, 0.25), [(4.0, 0.5), (3.2, 1.7)]),
+            patrol_row('random walk', (2.75, 0.75), [(1.0, 1.3)]),
+        ]
+    ),
+    WORLD,
+)
 
 
 def test_heat_maps_are_where_the_robot_was():
     """Between the walls and axes of the room: the picture of an array begins at the top."""
-    *axes, bar = patrol_figures.heat_maps(TRACKS).axes
-    for axis, (name, track), place in zip(
-        axes, TRACKS.items(), ((0.25, 0.25), (2.75, 0.75)), strict=True
-    ):
-        assert title(axis) == name
+    *axes, bar = patrol_figures.draw_heat_maps(DRAWN).axes
+    for axis, row, place in zip(axes, DRAWN.table, ((0.25, 0.25), (2.75, 0.75)), strict=True):
+        assert title(axis) == row['controller']
         even = 4.0 / 31  # s in each of the cells that count
         assert 3.0 / even <= value_at(axis, *place) < 4.0 / even
-        entered = {(x, y) for x, y in track.grid.centres().reshape(-1, 2).tolist()
+        entered = {(x, y) for x, y in GRID.centres().reshape(-1, 2).tolist()
                    if value_at(axis, x, y) > 0.0}  # fmt: skip
         steps = np.linspace(place, (3.5 - 1e-9, 1.75 - 1e-9), 1000)
         assert entered == {(*cell,) for cell in (0.5 * np.floor(2.0 * steps) + 0.25).tolist()}
@@ -582,15 +588,13 @@ def test_heat_maps_are_where_the_robot_was():
 
 
 def test_patrols_are_drawn_with_their_hits_and_the_room():
-    for axis, (name, track) in zip(
-        patrol_figures.path_panels(TRACKS).axes, TRACKS.items(), strict=True
-    ):
-        assert title(axis) == name
+    for axis, row in zip(patrol_figures.draw_paths(DRAWN).axes, DRAWN.table, strict=True):
+        assert title(axis) == row['controller']
         hits, path = axis.lines
-        assert hits.get_xydata() == pytest.approx(track.hits)
+        assert hits.get_xydata() == pytest.approx(np.array(row['hits']))
         assert to_hex(hits.get_color()) == '#f59e0b'  # orange, as the title says
         assert (hits.get_marker(), hits.get_linestyle()) == ('.', 'None')
-        assert path.get_xydata() == pytest.approx(track.position)
+        assert path.get_xydata() == pytest.approx(np.array(row['track']))
         assert axis.get_aspect() == 1.0
         segments, discs, (corners,) = walls_of(axis)
         assert segments == pytest.approx(WORLD.segments)
@@ -609,20 +613,24 @@ def test_patrols_are_drawn_with_their_hits_and_the_room():
 def test_tracked_paths_have_the_drives_of_their_methods():
     paths = [*TRACKED_PATHS][:2]
     colours = {'path': '#9ca3af', TRACKER: '#be123c', 'pure pursuit': '#0284c7'}
-    results = {
-        path: {
-            method: [SimpleNamespace(track=np.array([[k, 2.0 * n], [k + 1.0, 3.0 * n]]))]
-            for n, method in enumerate(('pure pursuit', TRACKER, 'with the default gains'), 1)
-        }
+    methods = ('pure pursuit', TRACKER, 'with the default gains')
+    tracks = {
+        (path, method): np.array([[k, 2.0 * n], [k + 1.0, 3.0 * n]])
         for k, path in enumerate(paths)
+        for n, method in enumerate(methods, 1)
     }
-    first, second, *empty = tracking_page.draw_tracks(results).axes
+    table = ResultTable(
+        [{'path': path, 'controller': method, 'seed': 1, 'track': track}
+         for (path, method), track in tracks.items()]
+    )  # fmt: skip
+    study = TrackingStudy(TrackingPlan(paths, (1,), methods), table)
+    first, second, *empty = tracking_page.draw_tracks(study).axes
     for axis, path in zip((first, second), paths, strict=True):
         shown = lines(axis)
         assert shown.keys() == colours.keys()
         assert pytest.approx(TRACKED_PATHS[path]()) == shown.pop('path').T
         for name, drawn in shown.items():
-            assert pytest.approx(results[path][name][0].track) == drawn.T
+            assert pytest.approx(tracks[path, name]) == drawn.T
         assert {each.get_label(): to_hex(each.get_color()) for each in axis.lines} == colours
         assert texts(axis) == (path, 'x / m', 'y / m')
     assert not any(axis.get_visible() for axis in empty)

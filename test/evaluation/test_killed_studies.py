@@ -56,8 +56,7 @@ def patrols(folder, begun, monkeypatch):
 
     monkeypatch.setattr(patrol_comparison, 'measured_patrol', measured)
     plan = PatrolPlan(('boustrophedon', 'random walk'), (101, 102), 5.0)
-    found = compare_patrols(plan, folder / 'runs.jsonl')
-    return {name: [result.metrics.coverage for result in found[name]] for name in plan.paths}
+    return compare_patrols(plan, folder / 'runs.jsonl').table.values('coverage')
 
 
 def tuning(folder, begun, monkeypatch):

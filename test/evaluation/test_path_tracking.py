@@ -12,6 +12,7 @@ from support.records import record_of
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.actuation import LimitParameters
+from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.patrol import tracking_page
 from t3mpc_ros.evaluation.patrol.path_trackers import (
     PurePursuitParameters,
@@ -25,7 +26,7 @@ from t3mpc_ros.evaluation.patrol.path_tracking import (
     TRACKED_PATHS,
     TrackingJob,
     TrackingPlan,
-    TrackingRun,
+    TrackingStudy,
     drive,
     errors_of,
     figure_of_eight,
@@ -35,7 +36,7 @@ from t3mpc_ros.evaluation.patrol.path_tracking import (
     tuning_grids,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, wheels_from_twist
-from t3mpc_ros.geometry.path_timing import MotionLimits, distance_to_path, resample
+from t3mpc_ros.geometry.path_timing import distance_to_path, resample
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose
 
 PERIOD = 0.01
@@ -130,13 +131,13 @@ def test_errors_are_distances_both_ways():
     ahead = np.linspace(0.0, 2.0, 1001)
     beside = np.column_stack([ahead, np.full(1001, 0.01)])
     run = errors_of(_record(beside), line, timed=False)
-    assert run.cross_track == pytest.approx(0.01)
-    assert run.largest == pytest.approx(0.01)
-    assert run.time == pytest.approx(9.76, abs=0.02)
+    assert run['cross_track'] == pytest.approx(0.01)
+    assert run['largest'] == pytest.approx(0.01)
+    assert run['time'] == pytest.approx(9.76, abs=0.02)
     half = errors_of(_record(np.column_stack([0.5 * ahead, 0.0 * ahead])), line, timed=False)
-    assert half.cross_track == pytest.approx(0.0, abs=1e-9)
-    assert half.largest == pytest.approx(1.0, abs=0.01)
-    assert math.isnan(half.time)
+    assert half['cross_track'] == pytest.approx(0.0, abs=1e-9)
+    assert half['largest'] == pytest.approx(1.0, abs=0.01)
+    assert math.isnan(half['time'])
 
 
 def test_the_recorded_path_is_that_of_the_golden_bag():
@@ -161,22 +162,15 @@ def test_grids_are_equally_large_and_contain_what_is_compared():
 @pytest.mark.slow
 def test_a_drive_is_repeatable_and_the_pose_loop_pays():
     """Off by a wheel of another radius, speeds alone leave the path; the pose loop does not."""
-    limits = MotionLimits()
-    job = TrackingJob('recorded path', recorded_path(), 101, limits)
+    job = TrackingJob('recorded path', recorded_path(), 101)
     closed, again, open_loop = (
         drive((job, METHODS[name])) for name in (OURS, OURS, 'without the pose loop')
     )
     assert np.array_equal(closed['truth'], again['truth'])
     errors = [errors_of(each, job.points, timed=True) for each in (closed, open_loop)]
-    assert errors[0].cross_track < 0.5 * errors[1].cross_track
-    assert errors[0].within_limits
-    assert math.isfinite(errors[0].time)
-
-
-def _run(error, time=10.0):
-    return TrackingRun(
-        error, 2.0 * error, math.nan, time, (0.2, 1.0), (0.5, 2.0), np.zeros((2, 2))
-    )
+    assert errors[0]['cross_track'] < 0.5 * errors[1]['cross_track']
+    assert errors[0]['within_limits']
+    assert math.isfinite(errors[0]['time'])
 
 
 @pytest.mark.parametrize(
@@ -188,11 +182,15 @@ def _run(error, time=10.0):
     ],
 )
 def test_the_verdict_is_that_of_paired_seeds(baseline, verdict):
-    runs = {
-        OURS: [_run(error) for error in (0.0020, 0.0021, 0.0022)],
-        'pure pursuit': [_run(error, math.nan) for error in baseline],
-    }
-    text = tracking_page.path_table('square', runs).markdown()
+    times = {OURS: (10.0, [0.0020, 0.0021, 0.0022]), 'pure pursuit': (math.nan, baseline)}
+    rows = [
+        {'path': 'square', 'controller': name, 'seed': seed, 'cross_track': error,
+         'largest': 2.0 * error, 'timed': math.nan, 'time': time, 'within_limits': True}
+        for name, (time, errors) in times.items()
+        for seed, error in enumerate(errors)
+    ]  # fmt: skip
+    plan = TrackingPlan(('square',), (0, 1, 2), tuple(times))
+    text = tracking_page.path_table(TrackingStudy(plan, ResultTable(rows)), 'square').markdown()
     (row,) = (line for line in text.splitlines() if line.startswith('| pure pursuit'))
     assert row.endswith(f'| {verdict} |')
     assert 'arrived in 0 of 3' in row

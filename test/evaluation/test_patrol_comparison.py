@@ -13,6 +13,7 @@ from support.long_tests import few_of
 from support.unrendered import unrendered  # noqa: F401 - a fixture
 
 from t3mpc_ros.cli.main import main
+from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.patrol import patrol_comparison, patrol_page
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid
 from t3mpc_ros.evaluation.patrol.patrol_comparison import (
@@ -20,14 +21,12 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     OURS,
     PATHS,
     PatrolPlan,
-    PatrolResult,
+    PatrolStudy,
     compare_patrols,
     free_cells,
     measured_patrol,
     patrol_track,
 )
-from t3mpc_ros.evaluation.patrol.patrol_metrics import PatrolMetrics
-from t3mpc_ros.evaluation.patrol.predictability import Skill
 from t3mpc_ros.geometry.path_timing import MotionLimits
 from t3mpc_ros.simulation.world import clearance, load_world
 
@@ -55,12 +54,17 @@ def test_cells_near_walls_and_boxes_do_not_count():
     assert free_cells(PatrolPlan(), None).free.all()
 
 
-def _result(time_to_90, skill, coverage=0.95, spread=1.0):
-    error = math.sqrt((1.0 - skill) * spread)
-    skills = tuple(Skill(h, skill, 'linear', {}, error) for h in (1.0, 2.0, 5.0, 10.0))
-    times = {0.5: 100.0, 0.9: time_to_90, 0.95: math.inf}
-    metrics = PatrolMetrics(900.0, 200.0, coverage, times, 0.9, 0.1, 0.5, 0.6, skills)
-    return PatrolResult(metrics, np.zeros(5), 0, 0.0, None)
+def judged(duration=1300.0, **rows):
+    """Return the claims on patrols of three seeds with the given columns of each path."""
+    names = {'own': OURS, 'walk': 'random walk', 'lanes': 'boustrophedon'}
+    table = ResultTable(
+        [
+            {'controller': names[short], 'seed': seed, **dict(zip(columns, values, strict=True))}
+            for short, (columns, *seeds) in rows.items()
+            for seed, values in enumerate(zip(*seeds, strict=True), 1)
+        ]
+    )
+    return patrol_page.claims(PatrolStudy(PatrolPlan(seeds=(1, 2, 3), duration=duration), table))
 
 
 @pytest.mark.parametrize(
@@ -73,40 +77,28 @@ def _result(time_to_90, skill, coverage=0.95, spread=1.0):
     ],
 )
 def test_verdict_on_coverage_needs_its_interval(own, verdict):
-    results = {
-        OURS: [_result(time, 0.5) for time in own],
-        'boustrophedon': [_result(time, 1.0) for time in (300.0, 301.0, 299.0)],
-    }
-    (claim,) = patrol_page.claims(PatrolPlan(seeds=(1, 2, 3), duration=1300.0), results)
+    column = ('time_to_90',)
+    (claim,) = judged(own=(column, own), lanes=(column, (300.0, 301.0, 299.0)))
     assert claim.verdict == verdict
 
 
 @pytest.mark.parametrize(
-    'own, verdict',
+    'skills, spread, verdicts',
     [
-        ([0.51, 0.50, 0.52], 'holds'),
-        ([0.60, 0.61, 0.59], 'does not hold'),
-        ([0.40, 0.60, 0.55], 'inconclusive'),
+        ([0.51, 0.50, 0.52], 1.0, ('holds', 'holds')),
+        ([0.60, 0.61, 0.59], 1.0, ('does not hold', 'does not hold')),
+        ([0.40, 0.60, 0.55], 1.0, ('inconclusive', 'inconclusive')),
+        # A path that surprised by as many metres was refused for covering more of the room.
+        ([0.66, 0.67, 0.68], 1.5, ('holds', 'does not hold')),
     ],
 )
-def test_verdict_on_skill_is_relative_to_the_random_walk(own, verdict):
-    results = {
-        OURS: [_result(700.0, skill) for skill in own],
-        'random walk': [_result(700.0, skill) for skill in (0.50, 0.51, 0.52)],
-    }
-    _, claim = patrol_page.claims(PatrolPlan(seeds=(1, 2, 3)), results)
-    assert claim.verdict == verdict
+def test_verdicts_on_the_observer_refer_to_the_random_walk(skills, spread, verdicts):
+    def observed(values, spread):
+        errors = [math.sqrt((1.0 - value) * spread) for value in values]
+        return ('skill_5', 'prediction_error_5'), values, errors
 
-
-def test_a_path_that_spreads_more_may_have_a_higher_skill():
-    """A path that surprised by as many metres was refused for covering more of the room."""
-    results = {
-        OURS: [_result(700.0, skill, spread=1.5) for skill in (0.66, 0.67, 0.68)],
-        'random walk': [_result(700.0, skill) for skill in (0.50, 0.51, 0.52)],
-    }
-    error, skill = patrol_page.claims(PatrolPlan(seeds=(1, 2, 3)), results)
-    assert error.verdict == 'holds'
-    assert skill.verdict == 'does not hold'
+    found = judged(own=observed(skills, spread), walk=observed([0.50, 0.51, 0.52], 1.0))
+    assert tuple(claim.verdict for claim in found) == verdicts
 
 
 @pytest.mark.usefixtures('unrendered')
@@ -136,7 +128,7 @@ def test_the_command_writes_page_pictures_and_numbers(tmp_path, capsys):
 def test_an_interrupted_study_goes_on_with_equal_results(tmp_path, monkeypatch, robot):
     """Only the patrols that are missing are run; those in the file are equal to the last bit."""
     plan = PatrolPlan(('boustrophedon', 'random walk'), (102, 101), 5.0, robot)
-    whole = compare_patrols(plan, tmp_path / 'whole.jsonl')
+    whole = compare_patrols(plan).table
     done = []
 
     def until(last):
@@ -152,49 +144,36 @@ def test_an_interrupted_study_goes_on_with_equal_results(tmp_path, monkeypatch, 
     for last in (3, 4):
         monkeypatch.setattr(patrol_comparison, 'measured_patrol', until(last))
         with contextlib.suppress(KeyboardInterrupt):
-            resumed = compare_patrols(plan, file, report=said.append)
+            resumed = compare_patrols(plan, file, report=said.append).table
     assert len(done) == 4
     assert '3 are there already, 1 to do' in said[-1]
-    for name in plan.paths:
-        for one, other in zip(whole[name], resumed[name], strict=True):
-            np.testing.assert_equal(_numbers(one), _numbers(other))
+    np.testing.assert_equal(resumed.rows, whole.rows)
+    assert [(row['seed'], 'track' in row) for row in whole] == [
+        (102, True), (102, True), (101, False), (101, False)
+    ]  # fmt: skip
     # A longer patrol is another one.
     monkeypatch.setattr(patrol_comparison, 'measured_patrol', measured_patrol)
     compare_patrols(replace(plan, duration=6.0), file, report=said.append)
     assert '0 are there already, 4 to do' in said[-1]
 
 
-def test_the_key_of_a_patrol_changes_with_all_that_determines_it(monkeypatch, tmp_path):
-    def keys(plan):
-        found = []
-        monkeypatch.setattr(
-            patrol_comparison,
-            'run_missing_jobs',
-            lambda file, jobs, *_: found.extend(jobs) or dict.fromkeys(jobs),
-        )
-        compare_patrols(plan, tmp_path / 'runs.jsonl')
-        return found
-
+def test_the_key_of_a_patrol_changes_with_its_plan(monkeypatch):
+    found = []
+    monkeypatch.setattr(
+        patrol_comparison,
+        'run_experiment',
+        lambda runs, *_, **__: found.extend(run.key for run in runs),
+    )
     base = PatrolPlan(('boustrophedon',), (1,))
     changes = {
-        'paths': ('random walk',), 'seeds': (2,), 'duration': 60.0, 'robot': 'twin',
-        'arena': (-1.0, -1.0, 1.0, 1.0), 'limits': MotionLimits(linear=0.1),
+        'paths': ('random walk',), 'seeds': (2,), 'duration': 60.0,
+        'arena': (-1.0, -1.0, 1.0, 1.0), 'limits': MotionLimits(linear=0.1), 'robot': 'twin',
     }  # fmt: skip
     assert changes.keys() == {each.name for each in fields(PatrolPlan)}
-    found = [*keys(base), *(keys(replace(base, **{k: v}))[0] for k, v in changes.items())]
-    found += keys(PatrolPlan(('boustrophedon',), (3, 1)))  # only the first has a track
-    assert len({*found}) == len(found)
-    monkeypatch.setattr(patrol_comparison, 'source_digest', lambda **_: 'other')
-    assert not {*keys(base)} & {*found}
-
-
-def _numbers(result):
-    """Return a result with its world, which has no equality, by its walls."""
-    track = result.track
-    if track is not None:
-        world = None if track.world is None else track.world.segments
-        track = track._replace(grid=vars(track.grid), world=world)._asdict()
-    return {**vars(result.metrics), **result._replace(metrics=None, track=None)._asdict()}, track
+    for plan in (base, *(replace(base, **{name: value}) for name, value in changes.items())):
+        compare_patrols(plan)
+    compare_patrols(PatrolPlan(('boustrophedon',), (3, 1)))  # only the first has a track
+    assert len(found) == len({*found}) == 9
 
 
 def test_a_wrong_plan_is_refused(capsys, tmp_path):

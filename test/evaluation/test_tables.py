@@ -18,10 +18,10 @@ from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.metrics import METRICS, START, measure
 from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
 from t3mpc_ros.evaluation.paper.results import Results, estimation
-from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolResult
-from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES, PatrolMetrics
+from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolStudy
+from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
 from t3mpc_ros.evaluation.patrol.patrol_page import coverage_table, surprise_table
-from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, Skill
+from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
 from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     Comparison,
     FieldComparison,
@@ -96,28 +96,30 @@ def test_numbers_of_a_run_on_the_twin():
     assert {*found} == {metric.name for metric in METRICS}
 
 
-def patrol(k):
-    skills = tuple(
-        Skill(h, 0.1 * k + 0.01 * j, 'linear', {}, 3.0 * k + j) for j, h in enumerate(HORIZONS)
-    )
-    times = {share: 100.0 * k + j for j, share in enumerate(SHARES)}
-    metrics = PatrolMetrics(
-        900.0, 200.0 * k, 0.2 * k, times, 0.3 * k, 0.01 * k, 0.4 * k, 0.15 * k, skills,
-        path_error=0.002 * k,
-    )  # fmt: skip
-    return PatrolResult(metrics, np.zeros(5), k - 1, 0.05 * k, None)
+def patrol(name, k):
+    return {
+        'controller': name, 'seed': 1, 'coverage': 0.2 * k, 'evenness': 0.3 * k,
+        'exponent': 0.01 * k, 'permutation_entropy': 0.4 * k, 'spectral_entropy': 0.15 * k,
+        'path_error': 0.002 * k, 'contacts': k - 1, 'avoiding': 0.05 * k,
+        **{f'time_to_{100.0 * share:g}': 100.0 * k + j for j, share in enumerate(SHARES)},
+        **{f'skill_{h:g}': 0.1 * k + 0.01 * j for j, h in enumerate(HORIZONS)},
+        **{f'prediction_error_{h:g}': 3.0 * k + j for j, h in enumerate(HORIZONS)},
+        **{f'predictor_{h:g}': 'linear' if h == 5.0 else 'kernel' for h in HORIZONS},
+    }  # fmt: skip
 
 
 def test_tables_of_patrols():
-    results = {OURS: [patrol(1)], 'random walk': [patrol(2)]}
+    names = (OURS, 'random walk')
+    table = ResultTable([patrol(name, k) for k, name in enumerate(names, 1)])
+    study = PatrolStudy(PatrolPlan(names, (1,), robot='twin'), table)
     heads = ('coverage, %', 'evenness', 'path error, mm', 'avoiding, %', 'patrols with contacts')
-    rows = columns(coverage_table(PatrolPlan(robot='twin'), results))
+    rows = columns(coverage_table(study))
     for k, row in enumerate(rows, 1):
         cells = [float(row[head]) for head in heads]
         assert cells == pytest.approx([20.0 * k, 0.3 * k, 2.0 * k, 5.0 * k, k - 1])
         times = [float(row[f'{100.0 * share:g} %, s']) for share in SHARES]
         assert times == pytest.approx([100.0 * k + j for j in range(len(SHARES))])
-    for k, row in enumerate(columns(surprise_table(results)), 1):
+    for k, row in enumerate(columns(surprise_table(study)), 1):
         skills = [float(row[f'skill at {horizon:g} s']) for horizon in HORIZONS]
         assert skills == pytest.approx([0.1 * k + 0.01 * j for j in range(len(HORIZONS))])
         judged = [*HORIZONS].index(5.0)

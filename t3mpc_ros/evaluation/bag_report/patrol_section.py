@@ -10,8 +10,9 @@ import numpy as np
 from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.charts import Chart, Line
-from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at
+from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at, visits
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES, SHORTEST, patrol_metrics
+from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
 from t3mpc_ros.evaluation.reporting import Block, Heading, Paragraph, Table
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
@@ -68,37 +69,34 @@ def patrol_blocks(run: Run) -> Iterator[Block]:
         wanted[~inside] = math.nan
     torn = bool(gaps(motion.time))
     found = patrol_metrics(time, x, y, grid, wanted, whole=not torn)
-    rows = [['cells entered', f'{100.0 * found.coverage:.1f} %']]
+    entered = f'{100.0 * found["coverage"]:.1f} %'
+    rows = [['cells entered', entered]]
     for share in SHARES:
-        needed = found.times[share]
+        needed = found[f'time_to_{100.0 * share:g}']
         text = f'after {needed:.1f} s' if math.isfinite(needed) else 'not reached'
         rows.append([f'{100.0 * share:g} % of the cells', text])
-    rows.append(['evenness of the time in the cells', f'{found.evenness:.3f}'])
-    if math.isfinite(found.path_error):
-        rows.append(['path error, root mean square', f'{1e3 * found.path_error:.1f} mm'])
-    for skill in found.skills:
-        rows.append(
-            [
-                f'skill of an observer, {skill.horizon:g} s ahead',
-                f'{skill.best:.3f} ({skill.predictor})',
-            ]
-        )
-    for name, value, unit in (
-        ('permutation entropy', found.permutation_entropy, ''),
-        ('spectral entropy', found.spectral_entropy, ''),
-        ('largest Lyapunov exponent of the path', found.exponent, ' 1/s'),
+    rows.append(['evenness of the time in the cells', f'{found["evenness"]:.3f}'])
+    if math.isfinite(found['path_error']):
+        rows.append(['path error, root mean square', f'{1e3 * found["path_error"]:.1f} mm'])
+    observed = 'skill_1' in found
+    for horizon in HORIZONS if observed else ():
+        skill, predictor = found[f'skill_{horizon:g}'], found[f'predictor_{horizon:g}']
+        rows.append([f'skill of an observer, {horizon:g} s ahead', f'{skill:.3f} ({predictor})'])
+    for name, column, unit in (
+        ('permutation entropy', 'permutation_entropy', ''),
+        ('spectral entropy', 'spectral_entropy', ''),
+        ('largest Lyapunov exponent of the path', 'exponent', ' 1/s'),
     ):
-        if math.isfinite(value):
-            rows.append([name, f'{value:.3f}{unit}'])
+        if math.isfinite(found[column]):
+            rows.append([name, f'{found[column]:.3f}{unit}'])
     yield Heading('Coverage and predictability')
     yield Table('', ['quantity', 'value'], rows)
-    assert found.visits is not None
-    curve = 100.0 * coverage_at(found.visits, grid, time - time[0])
-    seen = f'{100.0 * found.coverage:.1f} % of the cells were entered.'
+    curve = 100.0 * coverage_at(visits(time, x, y, grid), grid, time - time[0])
+    seen = f'{entered} of the cells were entered.'
     yield Chart('Coverage', '%', [Line('cells entered', 'c1', time, curve)], seen)
     short = (
         f' Predictability, entropies and exponent need {SHORTEST:g} s without a gap.'
-        if not found.skills
+        if not observed
         else ' Skill: an observer learns from the first half of the path and predicts the '
         'second; 1 exact, 0 no better than the mean position.'
     )

@@ -20,6 +20,7 @@ import numpy as np
 
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.confidence_intervals import mean, rms
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, digest, run_experiment
 from t3mpc_ros.evaluation.patrol.path_trackers import (
     PurePursuitParameters,
     Pursuit,
@@ -32,7 +33,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     world_file,
 )
 from t3mpc_ros.evaluation.record import RATE, Record
-from t3mpc_ros.evaluation.workers import map_jobs
+from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_file import load_path
 from t3mpc_ros.geometry.path_timing import (
@@ -173,40 +174,12 @@ class TrackingPlan:
             raise ValueError('at least one path, one seed and one method must be given')
 
 
-class TrackingRun(NamedTuple):
-    """Errors of one drive along a path."""
+class TrackingStudy(NamedTuple):
+    """What was compared, and what came out."""
 
-    cross_track: float
-    """Root mean square distance from the path, each piece of the drive counted by its length, m"""
-    largest: float
-    """Largest distance of the drive from the path, or of the path from the drive, m"""
-    timed: float
-    """Root mean square distance from the reference at the same time, m; NaN for a baseline."""
-    time: float
-    """Until the robot stays within 50 mm of the goal, s; NaN if it never does."""
-    speed: tuple[float, float]
-    """Largest commanded |v| (m/s) and |omega| (rad/s)."""
-    acceleration: tuple[float, float]
-    """Largest |dv/dt| (m/s²) and |d omega/dt| (rad/s²) from one command to the next."""
-    track: Array
-    """True positions, m, shape (n, 2)."""
-
-    @property
-    def within_limits(self) -> bool:
-        """Whether every command is within the limits of the controller."""
-        limits = LimitParameters()
-        bounds = (
-            limits.linear,
-            limits.angular,
-            limits.linear_acceleration,
-            limits.angular_acceleration,
-        )
-        values = (*self.speed, *self.acceleration)
-        return all(v <= b * (1.0 + 1e-9) for v, b in zip(values, bounds, strict=True))
-
-
-TrackingResults = Mapping[str, Mapping[str, Sequence[TrackingRun]]]
-"""Runs by path and method, in the order of the seeds."""
+    plan: TrackingPlan
+    table: ResultTable
+    """One row a drive with its ``path``, method as ``controller``, and :func:`errors_of` it."""
 
 
 class TrackingJob(NamedTuple):
@@ -215,40 +188,47 @@ class TrackingJob(NamedTuple):
     path: str
     points: Array
     seed: int
-    limits: MotionLimits
+    limits: MotionLimits = MotionLimits()
+    drawn: bool = False
+    """Whether the true positions are kept."""
 
     def __str__(self) -> str:
         return f'{self.path}, seed {self.seed}'
 
 
 def compare_trackers(
-    plan: TrackingPlan, workers: int | Executor = 1, *, progress: bool = False
-) -> TrackingResults:
-    """Return the runs of every path, method and seed of a plan."""
-    keys = [(p, m, s) for s in plan.seeds for p in plan.paths for m in plan.methods]
-    jobs = [
-        (TrackingJob(path, TRACKED_PATHS[path](), seed, plan.limits), METHODS[method])
-        for path, method, seed in keys
-    ]
-    runs = map_jobs(measured_drive, jobs, workers, 'drives', progress=progress)
-    found = dict(zip(keys, runs, strict=True))
-    return {
-        path: {
-            method: [found[path, method, seed] for seed in plan.seeds] for method in plan.methods
-        }
-        for path in plan.paths
-    }
+    plan: TrackingPlan,
+    store: Path | None = None,
+    workers: int | Executor = 1,
+    report: Report | None = None,
+) -> TrackingStudy:
+    """Return the drives of every path, method and seed; arguments as of :func:`run_experiment`."""
+    runs = []
+    for seed in plan.seeds:
+        for path in plan.paths:
+            points = TRACKED_PATHS[path]()
+            for name in plan.methods:
+                drawn = seed == plan.seeds[0]
+                job = TrackingJob(path, points, seed, plan.limits, drawn), METHODS[name]
+                fields = {'path': path, 'controller': name, 'seed': seed}
+                runs.append(Run(job, fields, digest(job)))
+    return TrackingStudy(
+        plan, run_experiment(runs, measured_drive, workers, store=store, report=report)
+    )
 
 
-def measured_drive(job: tuple[TrackingJob, TrackingMethod]) -> TrackingRun:
+def measured_drive(job: tuple[TrackingJob, TrackingMethod]) -> Row:
     """Return the errors of a method on a path."""
-    (_, points, _, _), method = job
-    return errors_of(drive(job), points, timed=method.pursuit is None)
+    (_, points, _, _, drawn), method = job
+    row = errors_of(drive(job), points, timed=method.pursuit is None)
+    if not drawn:
+        del row['track']
+    return row
 
 
 def drive(job: tuple[TrackingJob, TrackingMethod]) -> Record:
     """Return the record of a method on a path; equal arguments give equal records."""
-    (_, points, seed, limits), method = job
+    (_, points, seed, limits, _), method = job
     generator = np.random.default_rng((seed, 31))
     late, radius, separation = generator.uniform([0.0, -0.005, -0.01], [0.03, 0.005, 0.01])
     robot: dict[str, object] = {
@@ -283,31 +263,41 @@ def slippery_floor(points: Array, generator: np.random.Generator) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def errors_of(record: Record, points: Array, *, timed: bool) -> TrackingRun:
-    """Return the errors of a drive along a path (m), shape (n, 2)."""
+def errors_of(record: Record, points: Array, *, timed: bool) -> Row:
+    """Return the errors of a drive along a path (m), shape (n, 2).
+
+    ``cross_track``, root mean square distance from the path, each piece of the drive counted by
+    its length (m); ``largest``, distance of the drive from the path, or of the path from the drive
+    (m); ``timed``, root mean square distance from the reference at the same time (m), NaN for a
+    baseline; ``time`` until the robot stays near the goal (s), NaN if it never does; ``speed``,
+    largest commanded |v| (m/s) and |omega| (rad/s); ``acceleration``, their largest changes from
+    one command to the next (m/s², rad/s²); ``within_limits``, whether these are those of the
+    controller; ``track``, true positions (m).
+    """
     away = np.hypot(*(record['truth'][:, :2] - points[-1]).T) > ARRIVED
     arrival = int(np.flatnonzero(away)[-1]) + 1 if away.any() else 0
-    arrived = arrival < record.time.size
     track = record['truth'][: arrival + round(LAST_PIECE * RATE), :2]
     driven = resample(track, SPACING) if polyline_length(track) > SPACING else track[[0, -1]]
     path = resample(points, SPACING)
     distance = distance_to_path(driven, path)
     changes = np.abs(np.diff(record['command'], axis=0, prepend=0.0)) * RATE
-    error = path_error(record)[: len(track)]
-    return TrackingRun(
-        rms(distance),
-        float(max(distance.max(), distance_to_path(path, driven).max())),
-        rms(error) if timed else math.nan,
-        float(record.time[arrival]) if arrived else math.nan,
-        _pair(np.abs(record['command']).max(axis=0)),
-        _pair(changes.max(axis=0)),
-        track,
-    )
-
-
-def _pair(values: Array) -> tuple[float, float]:
-    first, second = values.tolist()
-    return first, second
+    speed, acceleration = np.abs(record['command']).max(axis=0), changes.max(axis=0)
+    limits = LimitParameters()
+    fastest = limits.linear, limits.angular
+    steepest = limits.linear_acceleration, limits.angular_acceleration
+    return {
+        'cross_track': rms(distance),
+        'largest': float(max(distance.max(), distance_to_path(path, driven).max())),
+        'timed': rms(path_error(record)[: len(track)]) if timed else math.nan,
+        'time': float(record.time[arrival]) if arrival < record.time.size else math.nan,
+        'speed': speed.tolist(),
+        'acceleration': acceleration.tolist(),
+        'within_limits': all(
+            bool((values <= np.array(bounds) * (1.0 + 1e-9)).all())
+            for values, bounds in ((speed, fastest), (acceleration, steepest))
+        ),
+        'track': track.tolist(),
+    }
 
 
 def tuning_grids() -> Mapping[str, Sequence[TrackingMethod]]:
@@ -334,31 +324,32 @@ def tuning_grids() -> Mapping[str, Sequence[TrackingMethod]]:
 
 
 def tune_trackers(
-    workers: int | Executor = 1, *, progress: bool = False
+    workers: int | Executor = 1, report: Report | None = None
 ) -> Mapping[str, Sequence[tuple[str, float]]]:
     """Return by method each choice with its mean cross-track error (m) on the hook, best first.
 
     The error of a choice that does not arrive in time is infinite.
     """
     grids, points = tuning_grids(), hook()
-    jobs = [
-        (TrackingJob('hook', points, seed, MotionLimits()), choice)
-        for grid in grids.values()
+    runs = [
+        Run(
+            (TrackingJob('hook', points, seed), choice),
+            {'controller': name, 'choice': choice.name},
+        )
+        for name, grid in grids.items()
         for choice in grid
         for seed in TUNING_SEEDS
     ]
-    runs = iter(map_jobs(measured_drive, jobs, workers, 'drives', progress=progress))
+    table = run_experiment(runs, measured_drive, workers, report=report)
+
+    def error(name: str, choice: TrackingMethod) -> float:
+        rows = table.where(controller=name, choice=choice.name)
+        return mean([row['cross_track'] if math.isfinite(row['time']) else math.inf
+                     for row in rows])  # fmt: skip
+
     return {
         name: sorted(
-            (
-                (each.name, mean([_tuning_error(next(runs)) for _ in TUNING_SEEDS]))
-                for each in grid
-            ),
-            key=lambda choice: choice[1],
+            ((choice.name, error(name, choice)) for choice in grid), key=lambda found: found[1]
         )
         for name, grid in grids.items()
     }
-
-
-def _tuning_error(run: TrackingRun) -> float:
-    return run.cross_track if math.isfinite(run.time) else math.inf

@@ -8,12 +8,9 @@ the reference is, in an empty room; ``twin`` is the digital twin with noise, lag
 commands, among boxes that it does not know, with the controller of the nodes and its keep-out.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import partial
-import hashlib
-import json
 import math
 from pathlib import Path
 from typing import NamedTuple
@@ -22,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.portrait import PortraitParameters
-from t3mpc_ros.evaluation.paper.experiment_runs import source_digest
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, digest, run_experiment
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
-from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, Visits, coverage_at
-from t3mpc_ros.evaluation.patrol.patrol_metrics import PatrolMetrics, patrol_metrics
+from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at, visits
+from t3mpc_ros.evaluation.patrol.patrol_metrics import patrol_metrics
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     PatrolScenario,
     contact_count,
@@ -35,10 +32,8 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     run_patrol,
     world_file,
 )
-from t3mpc_ros.evaluation.patrol.predictability import Skill
 from t3mpc_ros.evaluation.record import Record
-from t3mpc_ros.evaluation.result_file import ResultFile, run_missing_jobs
-from t3mpc_ros.evaluation.workers import WorkerPool
+from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
@@ -46,7 +41,6 @@ from t3mpc_ros.geometry.types import ORIGIN, Array
 from t3mpc_ros.robot.description import ray_ends, sensor_mounts
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 from t3mpc_ros.simulation.world import World, parse_world
-from t3mpc_ros.version import VERSION
 
 OURS = 'portraits (85)'
 """Name of our path, the switched portraits of system (85)."""
@@ -122,81 +116,21 @@ class PatrolTrack(NamedTuple):
     """Periods in which the robot touched something."""
 
 
-class PatrolResult(NamedTuple):
-    """Figures of one patrol, and for the first seed its track."""
+class PatrolStudy(NamedTuple):
+    """What was compared, and what came out."""
 
-    metrics: PatrolMetrics
-    curve: Array
-    """Coverage at :data:`CURVE` even times from 0 to the duration."""
-    contacts: int
-    avoiding: float
-    """Share of the time in which the robot avoids an obstacle."""
-    track: PatrolTrack | None
+    plan: PatrolPlan
+    table: ResultTable
+    """One row a patrol, see :func:`measured_patrol`; its ``controller`` is the path."""
+    world: World | None = None
+    """The room of the first seed; None if it is empty."""
 
 
-Results = Mapping[str, Sequence[PatrolResult]]
-"""Results by path, in the order of the seeds."""
+class Patrol(NamedTuple):
+    """A plan of one path and one seed, and whether what is drawn of it is kept."""
 
-
-def compare_patrols(
-    plan: PatrolPlan,
-    file: Path,
-    workers: int | Executor = 1,
-    report: Callable[[str], None] | None = None,
-) -> Results:
-    """Return the results of every path and seed of a plan.
-
-    Finished patrols are kept in ``file``, and those that it holds are not run again.
-    ``report`` receives messages; with None there is no progress line either.
-    """
-    keys = {(name, seed): _run_key(plan, name, seed) for seed in plan.seeds for name in plan.paths}
-    jobs = {key: ((plan, seed), NamedPath(name)) for (name, seed), key in keys.items()}
-
-    def run(missing: 'Sequence[_Job]') -> Iterator[tuple[int, PatrolResult]]:
-        with WorkerPool(workers) as pool:
-            yield from pool.map(measured_patrol, missing)
-
-    kept = ResultFile(file, _encoded, partial(_decoded, plan))
-    found = run_missing_jobs(kept, jobs, run, report)
-    return {name: [found[keys[name, seed]] for seed in plan.seeds] for name in plan.paths}
-
-
-def _run_key(plan: PatrolPlan, name: str, seed: int) -> str:
-    """Return a digest of all that determines a result; that of the first seed has a track."""
-    run = replace(plan, paths=(name,), seeds=(seed,)), seed == plan.seeds[0]
-    content = repr((VERSION, source_digest(every=True), run))
-    return hashlib.sha256(content.encode()).hexdigest()[:16]
-
-
-def _encoded(key: str, result: PatrolResult) -> str:
-    metrics, curve, contacts, avoiding, track = result
-    row = {
-        'run': key,
-        'metrics': {**vars(metrics), 'times': [*metrics.times.items()]},
-        'curve': curve,
-        'contacts': contacts,
-        'avoiding': avoiding,
-        'track': track and (*track[:4], track.hits, track.contacts),
-    }
-    return json.dumps(row, default=np.ndarray.tolist)
-
-
-def _decoded(plan: PatrolPlan, line: str) -> tuple[str, PatrolResult]:
-    row = json.loads(line)
-    metrics, track = row['metrics'], row['track']
-    first, dwell, duration = metrics['visits']
-    metrics['visits'] = Visits(np.array(first), np.array(dwell), duration)
-    metrics['times'] = dict(metrics['times'])
-    metrics['skills'] = tuple(Skill(*each) for each in metrics['skills'])
-    if track is not None:
-        *rows, contacts = track
-        time, position, reference, counted, hits = map(np.array, rows)
-        twin = plan.robot == 'twin'
-        world = parse_world(plan_world(plan, plan.seeds[0]), 'room') if twin else None
-        cells, hits = free_cells(plan, world), hits.reshape(-1, 2)
-        track = PatrolTrack(time, position, reference, counted, cells, world, hits, contacts)
-    curve, contacts, avoiding = np.array(row['curve']), row['contacts'], row['avoiding']
-    return row['run'], PatrolResult(PatrolMetrics(**metrics), curve, contacts, avoiding, track)
+    plan: PatrolPlan
+    drawn: bool
 
 
 class NamedPath(NamedTuple):
@@ -205,25 +139,50 @@ class NamedPath(NamedTuple):
     name: str
 
 
-_Job = tuple[tuple[PatrolPlan, int], NamedPath]
+def compare_patrols(
+    plan: PatrolPlan,
+    store: Path | None = None,
+    workers: int | Executor = 1,
+    report: Report | None = None,
+) -> PatrolStudy:
+    """Return the patrols of every path and seed; arguments as of :func:`run_experiment`."""
+    first = plan.seeds[0]
+    runs = []
+    for seed in plan.seeds:
+        for name in plan.paths:
+            patrol = Patrol(replace(plan, paths=(name,), seeds=(seed,)), seed == first)
+            job = patrol, NamedPath(name)
+            runs.append(Run(job, {'controller': name, 'seed': seed}, digest(job)))
+    table = run_experiment(runs, measured_patrol, workers, store=store, report=report)
+    room = parse_world(plan_world(plan, first), 'room') if plan.robot == 'twin' else None
+    return PatrolStudy(plan, table, room)
 
 
-def measured_patrol(job: _Job) -> PatrolResult:
-    """Return the result of a plan's seed and a path."""
-    (plan, seed), path = job
-    track = patrol_track(plan, path.name, seed)
+def measured_patrol(job: tuple[Patrol, NamedPath]) -> Row:
+    """Return the row of a patrol.
+
+    The numbers of :func:`.patrol_metrics.patrol_metrics`, and ``contacts``, periods in which the
+    robot touched something; ``avoiding``, share of the time in which it avoids an obstacle;
+    ``curve``, coverage at :data:`CURVE` even times from 0 to the duration. What is drawn:
+    ``track``, positions (m); ``dwell``, time in each cell (s), NaN in those that do not count;
+    ``hits`` of the range sensors (m).
+    """
+    (plan, drawn), path = job
+    track = patrol_track(plan, path.name, plan.seeds[0])
     reference = np.where(track.counted[:, None], track.reference, math.nan)
     x, y = track.position.T
-    metrics = patrol_metrics(track.time, x, y, track.grid, reference)
-    times = np.linspace(0.0, plan.duration, CURVE)
-    assert metrics.visits is not None
-    return PatrolResult(
-        metrics,
-        coverage_at(metrics.visits, track.grid, times),
-        track.contacts,
-        1.0 - float(track.counted.mean()),
-        track if seed == plan.seeds[0] else None,
-    )
+    found = visits(track.time, x, y, track.grid)
+    row = {
+        **patrol_metrics(track.time, x, y, track.grid, reference),
+        'contacts': track.contacts,
+        'avoiding': 1.0 - float(track.counted.mean()),
+        'curve': coverage_at(found, track.grid, np.linspace(0.0, plan.duration, CURVE)).tolist(),
+    }
+    if drawn:
+        row['track'] = track.position.tolist()
+        row['dwell'] = np.where(track.grid.free, found.dwell, math.nan).tolist()
+        row['hits'] = track.hits.tolist()
+    return row
 
 
 def patrol_track(plan: PatrolPlan, name: str, seed: int) -> PatrolTrack:

@@ -2,21 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """All figures of a patrol from its path."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 import math
+from typing import Any
 
 import numpy as np
 
 from t3mpc_ros.evaluation.patrol.coverage import (
     CoverageGrid,
-    Visits,
     coverage_at,
     evenness,
     time_to_cover,
     visits,
 )
-from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, Skill, predictability
+from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, predictability
 from t3mpc_ros.evaluation.patrol.time_series import (
     delay_vectors,
     divergence,
@@ -39,58 +37,6 @@ _APART, _FOLLOWED = 40, 80
 _SEGMENT = 64
 
 
-@dataclass(frozen=True)
-class PatrolMetrics:
-    """Figures of one patrol; NaN where the path is too short or a quantity is not known."""
-
-    duration: float
-    """s"""
-    distance: float
-    """Length of the path, m."""
-    coverage: float
-    """Share of the free cells entered."""
-    times: Mapping[float, float]
-    """Time (s) until a share of the cells is entered, by :data:`SHARES`; inf if it is not."""
-    evenness: float
-    """See :func:`~t3mpc_ros.evaluation.patrol.coverage.evenness`."""
-    exponent: float
-    """Largest Lyapunov exponent of the path, 1/s."""
-    permutation_entropy: float
-    """Of patterns of 4 positions 1 s apart, mean of x and y."""
-    spectral_entropy: float
-    """Of the displacements per second, mean of x and y."""
-    skills: tuple[Skill, ...]
-    """Skill of an observer at 1, 2, 5 and 10 s; empty for a path that is too short."""
-    path_error: float = math.nan
-    """Root mean square distance from the reference at the same time, m."""
-    visits: Visits | None = None
-    """What the coverage was computed from."""
-
-    def skill(self, horizon: float) -> float:
-        """Return the skill of the observer at a horizon (s); NaN if it was not computed."""
-        return next((each.best for each in self.skills if each.horizon == horizon), math.nan)
-
-    def prediction_error(self, horizon: float) -> float:
-        """Return the error (m) of the observer at a horizon (s); NaN if it was not computed."""
-        return next((each.error for each in self.skills if each.horizon == horizon), math.nan)
-
-    def record(self) -> dict[str, object]:
-        """Return the numbers for a JSON file."""
-        return {
-            'duration': self.duration,
-            'distance': self.distance,
-            'coverage': self.coverage,
-            **{f'time_to_{100.0 * share:g}': self.times[share] for share in SHARES},
-            'evenness': self.evenness,
-            'exponent': self.exponent,
-            'permutation_entropy': self.permutation_entropy,
-            'spectral_entropy': self.spectral_entropy,
-            **{f'skill_{each.horizon:g}': each.best for each in self.skills},
-            **{f'prediction_error_{each.horizon:g}': each.error for each in self.skills},
-            'path_error': self.path_error,
-        }
-
-
 def patrol_metrics(
     t: Array,
     x: Array,
@@ -99,8 +45,17 @@ def patrol_metrics(
     reference: Array | None = None,
     *,
     whole: bool = True,
-) -> PatrolMetrics:
-    """Return all figures of a path.
+) -> dict[str, Any]:
+    """Return all figures of a path by name; NaN where it is too short or they are not known.
+
+    ``duration`` (s); ``distance``, length of the path (m); ``coverage``, share of the free cells
+    entered; ``time_to_90`` (s) until 90 % of them are, for each of :data:`SHARES`, inf if they are
+    not; ``evenness``, see :func:`~t3mpc_ros.evaluation.patrol.coverage.evenness`; ``exponent``,
+    largest Lyapunov exponent of the path (1/s); ``permutation_entropy`` of patterns of 4 positions
+    1 s apart and ``spectral_entropy`` of the displacements per second, means of x and y;
+    ``skill_5``, ``prediction_error_5`` (m) and ``predictor_5``, the best predictor, of an observer
+    5 s ahead, for each of :data:`HORIZONS`, absent for a path that is too short; ``path_error``,
+    root mean square distance from the reference at the same time (m).
 
     Parameters
     ----------
@@ -120,35 +75,39 @@ def patrol_metrics(
         Not a path: see :func:`~t3mpc_ros.evaluation.patrol.time_series.check_path`.
     """
     found = visits(t, x, y, grid)
-    exponent = permutation = spectral = math.nan
-    skills: tuple[Skill, ...] = ()
+    exponent = permutation = spectral = error = math.nan
+    observed: dict[str, Any] = {}
     if whole and found.duration >= SHORTEST:
         recent = t >= t[-1] - LONGEST
-        t, px, py = t[recent], x[recent], y[recent]
-        exponent = path_exponent(t, px, py)
-        seconds = resampled(t, px, py, 1.0)
+        late, px, py = t[recent], x[recent], y[recent]
+        exponent = path_exponent(late, px, py)
+        seconds = resampled(late, px, py, 1.0)
         permutation = float(np.mean([permutation_entropy(axis) for axis in seconds.T]))
         moves = np.diff(seconds, axis=0)
         spectral = float(np.mean([spectral_entropy(axis, _SEGMENT) for axis in moves.T]))
-        skills = predictability(t, px, py, HORIZONS)
-    error = math.nan
+        skills = predictability(late, px, py, HORIZONS)
+        for name, of in (
+            ('skill', 'best'),
+            ('prediction_error', 'error'),
+            ('predictor', 'predictor'),
+        ):
+            observed |= {f'{name}_{each.horizon:g}': getattr(each, of) for each in skills}
     if reference is not None:
         squares = ((np.column_stack([x, y]) - reference) ** 2).sum(axis=1)
         if (counted := np.isfinite(squares)).any():
             error = math.sqrt(float(squares[counted].mean()))
-    return PatrolMetrics(
-        duration=found.duration,
-        distance=float(np.hypot(np.diff(x), np.diff(y)).sum()),
-        coverage=float(coverage_at(found, grid, np.array([found.duration]))[0]),
-        times={share: time_to_cover(found, grid, share) for share in SHARES},
-        evenness=evenness(found, grid),
-        exponent=exponent,
-        permutation_entropy=permutation,
-        spectral_entropy=spectral,
-        skills=skills,
-        path_error=error,
-        visits=found,
-    )
+    return {
+        'duration': found.duration,
+        'distance': float(np.hypot(np.diff(x), np.diff(y)).sum()),
+        'coverage': float(coverage_at(found, grid, np.array([found.duration]))[0]),
+        **{f'time_to_{100.0 * share:g}': time_to_cover(found, grid, share) for share in SHARES},
+        'evenness': evenness(found, grid),
+        'exponent': exponent,
+        'permutation_entropy': permutation,
+        'spectral_entropy': spectral,
+        **observed,
+        'path_error': error,
+    }
 
 
 def path_exponent(t: Array, x: Array, y: Array) -> float:

@@ -4,24 +4,23 @@
 
 from collections.abc import Mapping, Sequence
 import math
+from statistics import mode
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
+from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean, paired
 from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     BOXES,
     CLEARANCE,
     OURS,
     PatrolPlan,
-    PatrolResult,
-    Results,
+    PatrolStudy,
 )
 from t3mpc_ros.evaluation.patrol.patrol_figures import PICTURES
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
 from t3mpc_ros.evaluation.reporting import (
-    EMPTY_CELL,
     Block,
     Contents,
     Heading,
@@ -30,8 +29,10 @@ from t3mpc_ros.evaluation.reporting import (
     Picture,
     Table,
     format_interval,
+    format_mean,
     html_page,
 )
+from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.version import VERSION
 
 COVERED, TIMES_SLOWER = 0.9, 3.0
@@ -50,91 +51,78 @@ class Claim(NamedTuple):
     numbers: str
 
 
-def claims(plan: PatrolPlan, results: Results) -> list[Claim]:
+def claims(study: PatrolStudy) -> list[Claim]:
     """Return the claims that the compared paths permit to be judged."""
+    own, walk, lanes = (
+        study.table.where(controller=name) for name in (OURS, 'random walk', 'boustrophedon')
+    )
     found = []
-    if {OURS, 'boustrophedon'} <= set(results):
-        found.append(_coverage_claim(plan, results))
-    if {OURS, 'random walk'} <= set(results) and results[OURS][0].metrics.skills:
-        found += [_error_claim(results), _skill_claim(results)]
-    if OURS in results and plan.robot == 'twin':
-        touched = sum(result.contacts > 0 for result in results[OURS])
-        found.append(
-            Claim(
-                'the robot touches nothing',
-                FAILS if touched else HOLDS,
-                f'contacts in {touched} of {len(results[OURS])} patrols',
-            )
-        )
+    if own and lanes:
+        found.append(_coverage_claim(study.plan, own, lanes))
+    if own and walk and f'skill_{JUDGED_HORIZON:g}' in own[0]:
+        found += [_error_claim(own, walk), _skill_claim(own, walk)]
+    if own and study.plan.robot == 'twin':
+        touched = sum(row['contacts'] > 0 for row in own)
+        numbers = f'contacts in {touched} of {len(own)} patrols'
+        found.append(Claim('the robot touches nothing', FAILS if touched else HOLDS, numbers))
     return found
 
 
-def _coverage_claim(plan: PatrolPlan, results: Results) -> Claim:
+def _verdict(excess: Difference) -> str:
+    """Return what the interval of a quantity that should be at most 0 says."""
+    if excess.mean + excess.half <= 0.0:
+        return HOLDS
+    return FAILS if excess.mean - excess.half > 0.0 else INCONCLUSIVE
+
+
+def _coverage_claim(plan: PatrolPlan, own: Sequence[Row], lanes: Sequence[Row]) -> Claim:
+    times, others = (
+        [row[f'time_to_{100.0 * COVERED:g}'] for row in rows] for rows in (own, lanes)
+    )
     text = (
         f'{100.0 * COVERED:g} % of the cells within {TIMES_SLOWER:g} times what the '
         'boustrophedon needs'
     )
-    own = [result.metrics.times[COVERED] for result in results[OURS]]
-    other = [result.metrics.times[COVERED] for result in results['boustrophedon']]
-    if not all(map(math.isfinite, other)):
+    if not all(map(math.isfinite, others)):
         return Claim(text, INCONCLUSIVE, 'the boustrophedon does not reach it in this time')
-    bound = TIMES_SLOWER * mean(other)
+    bound = TIMES_SLOWER * mean(others)
     # A patrol that never gets there took longer than it lasted, and nothing more is known of it.
-    censored = [min(time, plan.duration) for time in own]
-    difference = paired(censored, [TIMES_SLOWER * time for time in other])
-    reached = [time for time in own if math.isfinite(time)]
-    verdict = INCONCLUSIVE
-    if difference.certain and difference.mean > 0.0:
-        verdict = FAILS
-    elif difference.certain and len(reached) == len(own):
-        verdict = HOLDS
-    within = sum(time <= bound for time in own)
+    censored = [min(time, plan.duration) for time in times]
+    verdict = _verdict(paired(censored, [TIMES_SLOWER * time for time in others]))
+    if verdict == HOLDS and not all(map(math.isfinite, times)):
+        verdict = INCONCLUSIVE
+    within = sum(time <= bound for time in times)
     numbers = (
-        f'in seconds: {_time(own)} against {TIMES_SLOWER:g} × {_time(other)} = {bound:.0f}; '
-        f'{within} of {len(own)} seeds within it'
+        f'in seconds: {_time(times)} against {TIMES_SLOWER:g} × {_time(others)} = {bound:.0f}; '
+        f'{within} of {len(times)} seeds within it'
     )
     return Claim(text, verdict, numbers)
 
 
-def _error_claim(results: Results) -> Claim:
-    own, walk = (
-        [result.metrics.prediction_error(JUDGED_HORIZON) for result in results[name]]
-        for name in (OURS, 'random walk')
-    )
-    least = (1.0 - MARGIN) * mean(walk)
-    found = paired(own, [(1.0 - MARGIN) * error for error in walk])
-    verdict = INCONCLUSIVE
-    if found.certain:
-        verdict = HOLDS if found.mean > 0.0 else FAILS
+def _error_claim(own: Sequence[Row], walk: Sequence[Row]) -> Claim:
+    column, share = f'prediction_error_{JUDGED_HORIZON:g}', 1.0 - MARGIN
+    allowed = [share * row[column] for row in walk]
+    above = paired([row[column] for row in own], allowed)
     return Claim(
-        f'error of the observer at {JUDGED_HORIZON:g} s at least {100.0 * (1.0 - MARGIN):g} % of '
+        f'error of the observer at {JUDGED_HORIZON:g} s at least {100.0 * share:g} % of '
         'that on a random walk',
-        verdict,
-        f'in metres: {format_interval(mean(own), interval(own))} against '
-        f'{format_interval(mean(walk), interval(walk))}, of which {least:.3f}; difference '
-        f'{format_interval(found.mean, found.half, "+")}',
+        _verdict(Difference(-above.mean, above.half)),
+        f'in metres: {_cell(own, column)} against {_cell(walk, column)}, of which '
+        f'{share * mean([row[column] for row in walk]):.3f}; difference '
+        f'{format_interval(*above, "+")}',
     )
 
 
-def _skill_claim(results: Results) -> Claim:
-    own, walk = (
-        [result.metrics.skill(JUDGED_HORIZON) for result in results[name]]
-        for name in (OURS, 'random walk')
-    )
-    allowed = MARGIN * mean(walk)
-    found = paired(own, walk)
-    verdict = INCONCLUSIVE
-    if found.mean + found.half <= allowed:
-        verdict = HOLDS
-    elif found.mean - found.half > allowed:
-        verdict = FAILS
+def _skill_claim(own: Sequence[Row], walk: Sequence[Row]) -> Claim:
+    column = f'skill_{JUDGED_HORIZON:g}'
+    allowed = MARGIN * mean([row[column] for row in walk])
+    above = paired([row[column] for row in own], [row[column] for row in walk])
     return Claim(
         f'skill of the observer at {JUDGED_HORIZON:g} s within {100.0 * MARGIN:g} % of a random '
         "walk's",
-        verdict,
-        f'{format_interval(mean(own), interval(own))} against '
-        f'{format_interval(mean(walk), interval(walk))}; difference '
-        f'{format_interval(found.mean, found.half, "+")}, allowed {allowed:.3f}',
+        _verdict(Difference(above.mean - allowed, above.half)),
+        f'{_cell(own, column)} against {_cell(walk, column)}; difference '
+        f'{format_interval(*above, "+")}, allowed {allowed:.3f}',
     )
 
 
@@ -142,73 +130,62 @@ def _time(times: Sequence[float]) -> str:
     """Return a time (s) with its interval, or in how many seeds it was reached."""
     if all(map(math.isfinite, times)):
         return format_interval(mean(times), interval(times), digits=0)
-    reached = [time for time in times if math.isfinite(time)]
-    return f'reached in {len(reached)} of {len(times)}' if reached else 'not reached'
+    reached = sum(map(math.isfinite, times))
+    return f'reached in {reached} of {len(times)}' if reached else 'not reached'
 
 
-def claims_table(plan: PatrolPlan, results: Results) -> Table:
+def claims_table(study: PatrolStudy) -> Table:
     """Return the claims with their verdicts."""
-    rows = [
-        (claim.text, Mark(claim.verdict, _KINDS[claim.verdict]), claim.numbers)
-        for claim in claims(plan, results)
-    ]
+    rows = [(text, Mark(verdict, _KINDS[verdict]), numbers)
+            for text, verdict, numbers in claims(study)]  # fmt: skip
     return Table('', ('claim', 'verdict', 'measured'), rows, text=3, wrap=True)
 
 
-def coverage_table(plan: PatrolPlan, results: Results) -> Table:
+def coverage_table(study: PatrolStudy) -> Table:
     """Return coverage, times, evenness and, on the twin, errors and contacts of each path."""
-    head = ['path', 'coverage, %', *(f'{100.0 * share:g} %, s' for share in SHARES), 'evenness']
-    twin = plan.robot == 'twin'
+    shares = [f'{100.0 * share:g}' for share in SHARES]
+    head = ['path', 'coverage, %', *(f'{share} %, s' for share in shares), 'evenness']
+    twin = study.plan.robot == 'twin'
     if twin:
         head += ['path error, mm', 'avoiding, %', 'patrols with contacts']
-    rows = []
-    for name, each in results.items():
-        row = [name, _cell(each, lambda one: 100.0 * one.metrics.coverage, 1)]
-        row += [_time([one.metrics.times[share] for one in each]) for share in SHARES]
-        row.append(_cell(each, lambda one: one.metrics.evenness))
+    lines = []
+    for name in study.plan.paths:
+        rows = study.table.where(controller=name)
+        line = [name, _cell(rows, 'coverage', 1, 100.0)]
+        line += [_time([row[f'time_to_{share}'] for row in rows]) for share in shares]
+        line.append(_cell(rows, 'evenness'))
         if twin:
-            row.append(_cell(each, lambda one: 1e3 * one.metrics.path_error, 1))
-            row.append(_cell(each, lambda one: 100.0 * one.avoiding, 1))
-            row.append(str(sum(one.contacts > 0 for one in each)))
-        rows.append(tuple(row))
-    return Table('Coverage of a 20 × 20 grid', head, rows, (OURS,), wrap=True)
+            line.append(_cell(rows, 'path_error', 1, 1e3))
+            line.append(_cell(rows, 'avoiding', 1, 100.0))
+            line.append(str(sum(row['contacts'] > 0 for row in rows)))
+        lines.append(line)
+    return Table('Coverage of a 20 × 20 grid', head, lines, (OURS,), wrap=True)
 
 
-def surprise_table(results: Results) -> Table:
+def surprise_table(study: PatrolStudy) -> Table:
     """Return skill of the observer, entropies and exponent of each path."""
-    head = ['path', *(f'skill at {horizon:g} s' for horizon in HORIZONS)]
-    head += [
-        'error at 5 s, m',
-        'best predictor at 5 s',
-        'permutation entropy',
-        'spectral entropy',
-        'exponent, 1/s',
-    ]
-    rows = []
-    for name, each in results.items():
-        row = [name]
-        for horizon in HORIZONS:
-            row.append(_cell(each, lambda one, h=horizon: one.metrics.skill(h)))
-        row.append(_cell(each, lambda one: one.metrics.prediction_error(JUDGED_HORIZON)))
-        names = [
-            skill.predictor
-            for one in each
-            for skill in one.metrics.skills
-            if skill.horizon == JUDGED_HORIZON
-        ]
-        row.append(max(set(names), key=names.count) if names else EMPTY_CELL)
-        row.append(_cell(each, lambda one: one.metrics.permutation_entropy))
-        row.append(_cell(each, lambda one: one.metrics.spectral_entropy))
-        row.append(_cell(each, lambda one: one.metrics.exponent))
-        rows.append(tuple(row))
-    return Table('How hard the path is to predict', head, rows, (OURS,), wrap=True)
+    numbers = {
+        **{f'skill at {horizon:g} s': f'skill_{horizon:g}' for horizon in HORIZONS},
+        'error at 5 s, m': 'prediction_error_5',
+        'best predictor at 5 s': 'predictor_5',
+        'permutation entropy': 'permutation_entropy',
+        'spectral entropy': 'spectral_entropy',
+        'exponent, 1/s': 'exponent',
+    }
+    lines = []
+    for name in study.plan.paths:
+        rows = study.table.where(controller=name)
+        line = [name]
+        for column in numbers.values():
+            values = [row[column] for row in rows if column in row]
+            words = bool(values) and isinstance(values[0], str)
+            line.append(mode(values) if words else _cell(rows, column))
+        lines.append(line)
+    return Table('How hard the path is to predict', ['path', *numbers], lines, (OURS,), wrap=True)
 
 
-def _cell(results: Sequence[PatrolResult], value: Any, digits: int = 3) -> str:
-    numbers = [number for one in results if math.isfinite(number := float(value(one)))]
-    if not numbers:
-        return EMPTY_CELL
-    return format_interval(mean(numbers), interval(numbers), digits=digits)
+def _cell(rows: Sequence[Row], column: str, digits: int = 3, factor: float = 1.0) -> str:
+    return format_mean([factor * row[column] for row in rows if column in row], digits)
 
 
 def description(plan: PatrolPlan) -> str:
@@ -245,37 +222,44 @@ EXPLANATION = (
 )
 
 
-def markdown(plan: PatrolPlan, results: Results) -> str:
+def markdown(study: PatrolStudy) -> str:
     """Return all tables in Markdown."""
-    tables = [coverage_table(plan, results), surprise_table(results)]
-    if claims(plan, results):
-        tables.append(claims_table(plan, results))
-    return '\n\n'.join([description(plan), *(each.markdown() for each in tables), EXPLANATION])
+    tables = [coverage_table(study), surprise_table(study)]
+    if claims(study):
+        tables.append(claims_table(study))
+    texts = [description(study.plan), *(each.markdown() for each in tables), EXPLANATION]
+    return '\n\n'.join(texts)
 
 
-def page(plan: PatrolPlan, results: Results, drawn: Mapping[str, bytes]) -> str:
+def page(study: PatrolStudy, drawn: Mapping[str, bytes]) -> str:
     """Return the page as self-contained HTML, with pictures (PNG) by their stems."""
-    blocks: list[Block] = [*_shown(drawn, 'coverage'), Contents(), Paragraph(description(plan))]
-    if claims(plan, results):
-        blocks += [Heading('Does our path do what it should?'), claims_table(plan, results)]
-    blocks += [Heading('Coverage'), coverage_table(plan, results)]
-    blocks += _shown(drawn, 'heat_maps')
-    blocks += [Heading('Predictability'), surprise_table(results)]
-    blocks += [*_shown(drawn, 'predictability'), Paragraph(EXPLANATION, 'quiet')]
-    blocks += [Heading('Paths'), *_shown(drawn, 'paths')]
+    shown = {each.stem: [Picture(each.title, drawn[each.stem], each.title)]
+             for each in PICTURES if each.stem in drawn}  # fmt: skip
+    blocks: list[Block] = [*shown.get('coverage', ()), Contents()]
+    blocks.append(Paragraph(description(study.plan)))
+    if claims(study):
+        blocks += [Heading('Does our path do what it should?'), claims_table(study)]
+    blocks += [Heading('Coverage'), coverage_table(study), *shown.get('heat_maps', ())]
+    blocks += [Heading('Predictability'), surprise_table(study)]
+    blocks += [*shown.get('predictability', ()), Paragraph(EXPLANATION, 'quiet')]
+    blocks += [Heading('Paths'), *shown.get('paths', ())]
     return html_page('Patrols compared', blocks)
 
 
-def _shown(drawn: Mapping[str, bytes], *stems: str) -> list[Block]:
-    return [
-        Picture(each.title, drawn[each.stem], each.title)
-        for each in PICTURES
-        if each.stem in stems and each.stem in drawn
-    ]
-
-
-def record(plan: PatrolPlan, results: Results) -> dict[str, Any]:
+def record(study: PatrolStudy) -> dict[str, Any]:
     """Return plan, claims and every number for a JSON file."""
+    plan = study.plan
+    paths = {}
+    for name in plan.paths:
+        rows = study.table.where(controller=name)
+        paths[name] = {
+            'runs': [
+                {key: value for key, value in row.items()
+                 if key != 'seed' and isinstance(value, int | float)}
+                for row in rows
+            ],
+            'coverage': np.mean([row['curve'] for row in rows], axis=0).tolist(),
+        }  # fmt: skip
     return {
         'format': 1,
         'version': VERSION,
@@ -284,19 +268,6 @@ def record(plan: PatrolPlan, results: Results) -> dict[str, Any]:
         'duration': plan.duration,
         'arena': list(plan.arena),
         'limits': plan.limits.to_dict(),
-        'claims': [claim._asdict() for claim in claims(plan, results)],
-        'paths': {
-            name: {
-                'runs': [
-                    {
-                        **one.metrics.record(),
-                        'contacts': one.contacts,
-                        'avoiding': one.avoiding,
-                    }
-                    for one in each
-                ],
-                'coverage': np.mean([one.curve for one in each], axis=0).tolist(),
-            }
-            for name, each in results.items()
-        },
+        'claims': [claim._asdict() for claim in claims(study)],
+        'paths': paths,
     }

@@ -6,15 +6,16 @@ from collections.abc import Mapping, Sequence
 import math
 from typing import Any
 
-from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean, paired
+import numpy as np
+
+from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean
 from t3mpc_ros.evaluation.patrol.path_tracking import (
     ARRIVED,
     OURS,
     TRACKED_PATHS,
     TUNING_SEEDS,
     TrackingPlan,
-    TrackingResults,
-    TrackingRun,
+    TrackingStudy,
 )
 from t3mpc_ros.evaluation.plotting import TitledDrawing, new_figure
 from t3mpc_ros.evaluation.reporting import (
@@ -27,6 +28,7 @@ from t3mpc_ros.evaluation.reporting import (
     Picture,
     Table,
     format_interval,
+    format_mean,
     html_page,
 )
 from t3mpc_ros.version import VERSION
@@ -43,48 +45,31 @@ def verdict(difference: Difference) -> str:
     return BETTER if difference.mean > 0.0 else WORSE
 
 
-def path_table(path: str, runs: Mapping[str, Sequence[TrackingRun]]) -> Table:
+def path_table(study: TrackingStudy, path: str) -> Table:
     """Return errors, time and verdict of each method on a path."""
     head = ['method', 'error rms, mm', 'largest, mm', 'from the timed reference rms, mm']
     head += ['time, s', 'commands within the limits']
-    if OURS in runs:
+    compared = OURS in study.plan.methods
+    if compared:
         head += ['rms above ours, mm', 'verdict']
-    rows = []
-    for name, each in runs.items():
-        row: list[str | Mark] = [name]
-        for value in (_cross_track, _largest, _timed):
-            row.append(_cell([1e3 * value(run) for run in each]))
-        row.append(_time([run.time for run in each]))
-        row.append('yes' if all(run.within_limits for run in each) else 'no')
+    lines = []
+    for name in study.plan.methods:
+        rows = study.table.where(path=path, controller=name)
+        line: list[str | Mark] = [name]
+        for column in ('cross_track', 'largest', 'timed'):
+            line.append(format_mean([1e3 * row[column] for row in rows], 2))
+        line.append(_time([row['time'] for row in rows]))
+        line.append('yes' if all(row['within_limits'] for row in rows) else 'no')
+        own = {'path': path, 'controller': OURS}
+        above = study.table.difference('cross_track', {**own, 'controller': name}, own)
         if name == OURS:
-            row += [EMPTY_CELL, EMPTY_CELL]
-        elif OURS in runs:
-            found = paired(
-                [1e3 * run.cross_track for run in each],
-                [1e3 * run.cross_track for run in runs[OURS]],
-            )
-            judged = verdict(found)
-            row += [format_interval(found.mean, found.half, '+', 2), Mark(judged, _KINDS[judged])]
-        rows.append(tuple(row))
-    return Table(path.capitalize(), head, rows, (OURS,), wrap=True)
-
-
-def _cross_track(run: TrackingRun) -> float:
-    return run.cross_track
-
-
-def _largest(run: TrackingRun) -> float:
-    return run.largest
-
-
-def _timed(run: TrackingRun) -> float:
-    return run.timed
-
-
-def _cell(values: Sequence[float]) -> str:
-    if not all(map(math.isfinite, values)):
-        return EMPTY_CELL
-    return format_interval(mean(values), interval(values), digits=2)
+            line += [EMPTY_CELL, EMPTY_CELL]
+        elif above is not None:
+            judged = verdict(above)
+            difference = format_interval(1e3 * above.mean, 1e3 * above.half, '+', 2)
+            line += [difference, Mark(judged, _KINDS[judged])]
+        lines.append(line)
+    return Table(path.capitalize(), head, lines, (OURS,), wrap=True)
 
 
 def _time(times: Sequence[float]) -> str:
@@ -118,19 +103,19 @@ EXPLANATION = (
 )
 
 
-def markdown(plan: TrackingPlan, results: TrackingResults) -> str:
+def markdown(study: TrackingStudy) -> str:
     """Return all tables in Markdown."""
-    tables = [path_table(path, runs).markdown() for path, runs in results.items()]
-    return '\n\n'.join([description(plan), *tables, EXPLANATION])
+    tables = [path_table(study, path).markdown() for path in study.plan.paths]
+    return '\n\n'.join([description(study.plan), *tables, EXPLANATION])
 
 
-def page(plan: TrackingPlan, results: TrackingResults, drawn: Mapping[str, bytes]) -> str:
+def page(study: TrackingStudy, drawn: Mapping[str, bytes]) -> str:
     """Return the page as self-contained HTML, with the picture (PNG) by its stem."""
-    blocks: list[Block] = [Contents(), Paragraph(description(plan))]
+    blocks: list[Block] = [Contents(), Paragraph(description(study.plan))]
     if 'tracks' in drawn:
         blocks.append(Picture(PICTURES[0].title, drawn['tracks'], PICTURES[0].title))
-    for path, runs in results.items():
-        blocks += [Heading(path.capitalize()), path_table(path, runs)]
+    for path in study.plan.paths:
+        blocks += [Heading(path.capitalize()), path_table(study, path)]
     blocks.append(Paragraph(EXPLANATION, 'quiet'))
     return html_page('Path tracking compared', blocks)
 
@@ -148,8 +133,10 @@ def tuning_markdown(found: Mapping[str, Sequence[tuple[str, float]]]) -> str:
     return '\n\n'.join(tables)
 
 
-def record(plan: TrackingPlan, results: TrackingResults) -> dict[str, Any]:
+def record(study: TrackingStudy) -> dict[str, Any]:
     """Return plan and every number for a JSON file."""
+    plan = study.plan
+    numbers = ('cross_track', 'largest', 'timed', 'time', 'speed', 'acceleration')
     return {
         'format': 1,
         'version': VERSION,
@@ -157,28 +144,28 @@ def record(plan: TrackingPlan, results: TrackingResults) -> dict[str, Any]:
         'limits': plan.limits.to_dict(),
         'paths': {
             path: {
-                method: [_numbers(run) for run in each] for method, each in runs.items()
+                method: [
+                    {name: row[name] for name in numbers}
+                    for row in study.table.where(path=path, controller=method)
+                ]
+                for method in plan.methods
             }
-            for path, runs in results.items()
+            for path in plan.paths
         },
-    }  # fmt: skip
+    }
 
 
-def _numbers(run: TrackingRun) -> dict[str, Any]:
-    return {name: value for name, value in run._asdict().items() if name != 'track'}
-
-
-def draw_tracks(results: TrackingResults) -> Any:
+def draw_tracks(study: TrackingStudy) -> Any:
     """Return each path with the drives of ours and of the baselines, first seed."""
     figure = new_figure(6.4)
     axes = figure.subplots(2, 2, squeeze=False).ravel()
-    for axis in axes[len(results) :]:
+    for axis in axes[len(study.plan.paths) :]:
         axis.set_visible(False)
-    for axis, (path, runs) in zip(axes, results.items(), strict=False):
+    for axis, path in zip(axes, study.plan.paths, strict=False):
         axis.plot(*TRACKED_PATHS[path]().T, color='#9ca3af', linewidth=2.5, label='path')
         for method, colour in _DRAWN.items():
-            if method in runs:
-                axis.plot(*runs[method][0].track.T, color=colour, linewidth=0.9, label=method)
+            for track in study.table.values('track', path=path, controller=method):
+                axis.plot(*np.transpose(track), color=colour, linewidth=0.9, label=method)
         axis.set_title(path)
         axis.set_aspect('equal', adjustable='datalim')
         axis.set(xlabel='x / m', ylabel='y / m')
