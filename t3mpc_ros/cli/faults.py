@@ -3,8 +3,9 @@
 """``t3mpc faults``: fault study of the closed loop."""
 
 import argparse
-from dataclasses import asdict
 from pathlib import Path
+
+from t3mpc_ros.cli.run_options import add_workers, executor_of
 
 
 def add_outcomes_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -20,18 +21,15 @@ def add_outcomes_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentP
     )
     parser.add_argument('--html', type=Path, help='write one page to this file')
     parser.add_argument('--json', type=Path, help='also write the numbers to this file')
+    add_workers(parser)
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the outcome of each fault; return 0 when every loop stayed bounded, else 1."""
     from t3mpc_ros.evaluation import fault_page
-    from t3mpc_ros.evaluation.fault_study import (
-        FAULT_RUNS,
-        console_text,
-        study_faults,
-        update_page,
-    )
+    from t3mpc_ros.evaluation.experiment import print_report
+    from t3mpc_ros.evaluation.fault_study import FAULT_RUNS, study_faults
     from t3mpc_ros.evaluation.reporting import strict_json
 
     known = dict.fromkeys(fault_run.fault for fault_run in FAULT_RUNS)
@@ -45,13 +43,13 @@ def run(options: argparse.Namespace) -> int:
         for fault_run in FAULT_RUNS
         if not options.names or fault_run.fault in options.names
     ]
-    results = study_faults(fault_runs, progress=True)
-    print(console_text(results))
+    with executor_of(options) as executor:
+        rows = study_faults(fault_runs, executor, print_report)
+    print(fault_page.console_text(rows))
     if options.output:
-        update_page(options.output, results)
+        fault_page.update_page(options.output, rows)
     if options.html:
-        options.html.write_text(fault_page.page(results), encoding='utf-8')
+        options.html.write_text(fault_page.page(rows), encoding='utf-8')
     if options.json:
-        text = strict_json([asdict(one) for one in results])
-        options.json.write_text(text, encoding='utf-8')
-    return 1 if any(one.verdict == 'unbounded' for one in results) else 0
+        options.json.write_text(strict_json(list(rows)), encoding='utf-8')
+    return 1 if any(row['verdict'] == 'unbounded' for row in rows) else 0

@@ -1,15 +1,19 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""HTML page of the fault study."""
+"""Outcomes of the fault study: lines, the tables of docs/faults.md, and an HTML page."""
 
+from collections import Counter
 from collections.abc import Sequence
+import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.fault_study import TABLE_HEAD, TITLES, Outcome, table_row
+from t3mpc_ros.evaluation.fault_study import ALLOWED, BEGIN, DURATION, PAUSE
 from t3mpc_ros.evaluation.plotting import COLOURS, legend_above, new_figure, png_of
 from t3mpc_ros.evaluation.reporting import (
+    EMPTY_CELL,
     Block,
     Contents,
     Heading,
@@ -18,67 +22,190 @@ from t3mpc_ros.evaluation.reporting import (
     VerdictBox,
     html_page,
 )
+from t3mpc_ros.evaluation.result_file import Row
 
+BEGIN_MARK = '<!-- outcomes: written by `t3mpc faults`, do not edit by hand -->'
+END_MARK = '<!-- end of outcomes -->'
+
+TITLES = {
+    'chaotic': 'Along the chaotic reference',
+    'straight': 'Straight on at 0.2 m/s',
+    'arc': 'Along an arc at 0.2 m/s',
+}
+TABLE_HEAD = (
+    'fault',
+    'outcome',
+    'error of the wheels before, during, after (rad/s)',
+    'odometry error before, at the end',
+    'detected by robot or controller',
+    'shown by ground truth only',
+)
+UNDETECTED = '**undetected by the robot**: '
+UNREPORTED = '**no flag, no reason, and the counters advance**: '
 _COLOURS = {'before': '#6b7280', 'during': COLOURS['error'], 'after': COLOURS['applied']}
+_ENDINGS = {
+    'bounded': 'stay within the limits and recover',
+    'stops': 'stop the robot with a reason',
+    'impaired': 'stay within the limits, but the error remains',
+    'unbounded': 'exceed a limit',
+}
 
 
-def page(results: Sequence[Outcome]) -> str:
+def outcome_sentence(row: Row) -> str:
+    """Return the outcome in words."""
+    if row['verdict'] == 'unbounded':
+        return f'unbounded: {row["reason"]}'
+    if row['verdict'] == 'impaired':
+        return 'within limits, but error not recovered'
+    time = row['recovery_time']
+    recovery = 'not recovered' if time is None else f'recovered after {time:g} s'
+    recovery = 'error ' + ('recovered at once' if time == 0.0 else recovery)
+    if row['verdict'] == 'bounded':
+        return 'bounded' + ('' if row['after'] is None else f', {recovery}')
+    text = f'stops: {_short(row["reason"])}'
+    if row['resumption'] == 'by itself':
+        return f'{text}, for {row["stopped_for"]:.1f} s; resumes by itself, {recovery}'
+    if row['resumption'] == 'after a pause':
+        return f'{text}, until commands pause; then resumes, {recovery}'
+    return f'{text}, and remains stopped'
+
+
+def hidden(row: Row) -> bool:
+    """Return whether only ground truth shows an effect."""
+    return bool(row['undetected'] and not row['detected'])
+
+
+def table_row(row: Row) -> tuple[str, ...]:
+    """Return the cells of a table."""
+    after = EMPTY_CELL if row['after'] is None else f'{row["after"]:.2f}'
+    undetected = ', '.join(row['undetected']) or EMPTY_CELL
+    if hidden(row):
+        undetected = (UNREPORTED if row['ranges'] else UNDETECTED) + undetected
+    return (
+        f'`{row["name"]}`',
+        outcome_sentence(row),
+        f'{row["before"]:.2f}, {row["during"]:.2f}, {after}',
+        f'{_place(*row["odometry_before"])}; {_place(*row["odometry_after"])}',
+        ', '.join(filter(None, [*row['detected'], row['ranges']])) or EMPTY_CELL,
+        undetected,
+    )
+
+
+def by_course(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
+    """Return title and rows of each course that was driven."""
+    found = [(title, [row for row in rows if row['course'] == course])
+             for course, title in TITLES.items()]  # fmt: skip
+    return [(title, chosen) for title, chosen in found if chosen]
+
+
+def markdown_tables(rows: Sequence[Row]) -> str:
+    """Return a table for each course, one row for each outcome."""
+    return '\n'.join(
+        f'### {title}\n\n{Table("", TABLE_HEAD, [*map(table_row, chosen)]).markdown()}\n'
+        for title, chosen in by_course(rows)
+    )
+
+
+def console_text(rows: Sequence[Row]) -> str:
+    """Return the outcomes for a terminal, one line each."""
+    lines = []
+    for title, chosen in by_course(rows):
+        lines.append(f'{title}:')
+        for row in chosen:
+            note = ' (not detected by the robot)' if hidden(row) else ''
+            lines.append(f'  {row["name"]:24} {outcome_sentence(row)}{note}')
+    return '\n'.join(lines)
+
+
+def page_section(rows: Sequence[Row]) -> str:
+    """Return the section of the page from mark to mark."""
+    after, pause = PAUSE
+    return f"""{BEGIN_MARK}
+
+The controller drives the twin. Each fault begins at {BEGIN:g} s and lasts 5 s; `brown_out`
+restarts the board, which takes 0.5 s. A run lasts {DURATION:g} s, one into a wall 25 s, of which
+the robot needs 11 s to get there.
+
+Errors are root mean squares over both wheels, of rotor speed against reference:
+from 3 s on before the fault, during it, and from 2 s after it to the end. The error has
+*recovered* when the rest of the run is no worse than {ALLOWED:g} times the same run without the
+fault. Where the robot stands until commands pause, a person pauses the controller for {pause:g} s,
+{after:g} s after the fault: the error after the fault then counts after the pause, and the
+odometry is that of the run without a pause.
+
+Ground truth shows full steps lost by the right and the left motor at most, and how much
+faster (root mean square) the wheels turn than they roll.
+
+{markdown_tables(rows)}
+{END_MARK}
+"""
+
+
+def update_page(page: Path, rows: Sequence[Row]) -> None:
+    """Replace the section between the marks of a page, which has both once and in this order."""
+    text = page.read_text(encoding='utf-8')
+    head, begun, rest = text.partition(BEGIN_MARK)
+    _, ended, tail = rest.partition(END_MARK)
+    if not begun or not ended or BEGIN_MARK in rest or END_MARK in tail:
+        raise ValueError(
+            f'{page} must hold the lines {BEGIN_MARK} and {END_MARK} once, in this order'
+        )
+    page.write_text(head + page_section(rows).rstrip('\n') + tail, encoding='utf-8')
+
+
+def _short(reason: str) -> str:
+    parts = [part for part in reason.split('; ') if not part.startswith('stop commanding ')]
+    return '; '.join(part.split(':')[0] for part in parts)
+
+
+def _place(metres: float, angle: float) -> str:
+    length = f'{100.0 * metres:.1f} cm' if metres < 1.0 else f'{metres:.2f} m'
+    return f'{length}, {math.degrees(angle):.1f}°'
+
+
+def page(rows: Sequence[Row]) -> str:
     """Return the page as self-contained HTML."""
-    blocks: list[Block] = [_verdict(results)]
-    for course, title in TITLES.items():
-        chosen = [result for result in results if result.course == course]
-        picture = png_of(_draw_errors, chosen)
-        if picture is None:
-            continue
-        what = f'{title}: error of the wheels before, during and after each fault'
-        worst = max(chosen, key=lambda each: each.during)
-        seen = f'{what}; the largest during one is {worst.during:.2f} rad/s, of {worst.name}.'
-        rows = [[cell.replace('`', '').replace('**', '') for cell in table_row(r)] for r in chosen]
-        blocks += [Heading(title), Picture(seen, picture, seen)]
-        if len(blocks) == 3:
+    blocks: list[Block] = [_verdict(rows)]
+    for number, (title, chosen) in enumerate(by_course(rows)):
+        worst = max(chosen, key=lambda row: row['during'])
+        seen = (
+            f'{title}: error of the wheels before, during and after each fault; the largest '
+            f'during one is {worst["during"]:.2f} rad/s, of {worst["name"]}.'
+        )
+        blocks.append(Heading(title))
+        if picture := png_of(_draw_errors, chosen):
+            blocks.append(Picture(seen, picture, seen))
+        if number == 0:
             blocks.append(Contents())
-        blocks.append(Table('', TABLE_HEAD, rows, text=len(TABLE_HEAD), wrap=True))
+        cells = [[cell.replace('`', '').replace('**', '') for cell in table_row(row)]
+                 for row in chosen]  # fmt: skip
+        blocks.append(Table('', TABLE_HEAD, cells, text=len(TABLE_HEAD), wrap=True))
     return html_page('Fault study of the closed loop', blocks)
 
 
-def _verdict(results: Sequence[Outcome]) -> VerdictBox:
+def _verdict(rows: Sequence[Row]) -> VerdictBox:
     """Return how many faults end in which way."""
-    count = {
-        kind: sum(each.verdict == kind for each in results)
-        for kind in ('bounded', 'stops', 'impaired', 'unbounded')
-    }
-    hidden = [each.name for each in results if each.undetected and not each.detected]
-    words = {
-        'bounded': 'stay within the limits and recover',
-        'stops': 'stop the robot with a reason',
-        'impaired': 'stay within the limits, but the error remains',
-        'unbounded': 'exceed a limit',
-    }
-    reasons = [f'{count[kind]} {text}.' for kind, text in words.items() if count[kind]]
-    if hidden:
-        reasons.append(f'Not detected by robot or controller: {", ".join(sorted(set(hidden)))}.')
+    count = Counter(row['verdict'] for row in rows)
+    reasons = [f'{count[kind]} {text}.' for kind, text in _ENDINGS.items() if count[kind]]
+    if names := sorted({row['name'] for row in rows if hidden(row)}):
+        reasons.append(f'Not detected by robot or controller: {", ".join(names)}.')
     if count['unbounded']:
         return VerdictBox('Not every fault stays bounded', reasons, 'bad')
     return VerdictBox('Every fault stays bounded', reasons, 'good')
 
 
-def _draw_errors(results: Sequence[Outcome]) -> Any:
-    """Return a figure of the errors of each fault; None without a fault."""
-    if not results:
-        return None
-    figure = new_figure(0.9 + 0.19 * len(results))
+def _draw_errors(rows: Sequence[Row]) -> Any:
+    """Return a figure of the errors of each fault."""
+    figure = new_figure(0.9 + 0.19 * len(rows))
     axis = figure.subplots()
-    places = np.arange(len(results))[::-1]
+    places = np.arange(len(rows))[::-1]
     for name, colour in _COLOURS.items():
-        known = [
-            (getattr(each, name), place)
-            for each, place in zip(results, places, strict=True)
-            if getattr(each, name) is not None
-        ]
+        known = [(row[name], place) for row, place in zip(rows, places, strict=True)
+                 if row[name] is not None]  # fmt: skip
         if known:
             axis.plot(*zip(*known, strict=True), 'o', color=colour, markersize=4, label=name)
     axis.set_xscale('log')
-    axis.set_yticks(places, [each.name for each in results])
+    axis.set_yticks(places, [row['name'] for row in rows])
     axis.set_xlabel('error of the wheels / (rad/s)')
     legend_above(figure, axis)
     return figure

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Outcome of the closed loop under each named fault, and the table of docs/faults.md.
+"""Outcome of the closed loop under each named fault.
 
 Every fault begins and ends while the controller drives the twin; its errors are compared with the
 same run without the fault. What the robot can detect is kept apart from what only ground truth
@@ -8,20 +8,20 @@ shows.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import Executor
+from dataclasses import dataclass
 from functools import cache, lru_cache
-import math
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.method import NodeMethod
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.record import RATE, STATUS_FLAGS, Record, rolling_speeds
-from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, progress_bar
+from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.scenario import (
     LEAD,
     OwnParts,
@@ -40,8 +40,6 @@ from t3mpc_ros.simulation.fault_injection import (
     active_faults,
 )
 
-Array = NDArray[np.float64]
-
 BEGIN = 10.0
 """Begin of every fault, s."""
 SETTLED = 3.0
@@ -54,57 +52,39 @@ REST = 4.0
 """Shortest time over which an error can count as recovered, s."""
 BRAKING_TIME = 0.6
 """Time after a stop reason by which the robot must stand still, s."""
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """Outcome of one run; errors are root mean squares over time and both wheels."""
-
-    name: str
-    course: str
-    verdict: str
-    """``bounded``: the robot stays within its limits and the error recovers; ``stops``: it stops
-    with a reason; ``impaired``: within limits, but the error remains; ``unbounded``: otherwise."""
-    reason: str
-    """Reason of the stop, or the violated bound."""
-    stopped_for: float
-    """Time with a stop reason, s"""
-    resumption: str
-    """Resumption: ``by itself``, ``after a pause`` or ``not``; '' if the robot never stopped."""
-    before: float
-    """Error of the wheel speeds before the fault, rad/s"""
-    during: float
-    after: float | None
-    """None if the robot stands at the end, or the fault lasts."""
-    recovery_time: float | None
-    """Time from the end of the fault until the error stays recovered, s; None if it does not."""
-    odometry_before: tuple[float, float]
-    """Odometry error before the fault: m, rad"""
-    odometry_after: tuple[float, float]
-    """Odometry error at the end of the run."""
-    detected: tuple[str, ...]
-    """Signs that robot or controller show: flags, reasons, a larger error."""
-    ranges: str
-    """Range readings before and at a wall; the loop does not use them."""
-    undetected: tuple[str, ...]
-    """Effects that only ground truth shows."""
+METHOD = NodeMethod(FULL, {})
 
 
 def evaluate_outcome(
-    name: str,
-    course: str,
     record: Record,
     undisturbed_run: Record,
     begin: float,
     end: float,
     parameters: DigitalTwinParameters,
-) -> Outcome:
+) -> Row:
     """Return the outcome of a recorded run, beside the same one without the fault.
 
-    ``begin`` and ``end`` (s) are those of the fault; the end may lie beyond the record.
+    ``verdict``: ``bounded``, the robot stays within its limits and the error recovers; ``stops``,
+    it stops with a reason; ``impaired``, within limits, but the error remains; ``unbounded``
+    otherwise. ``reason`` of the stop, or the violated bound; ``stopped_for``, time with a stop
+    reason (s); ``resumption``: ``by itself``, ``after a pause``, ``not``, or '' without a stop.
+
+    ``before``, ``during``, ``after``: root mean square error of the speeds of both wheels (rad/s),
+    the last one None if the robot stands at the end or the fault lasts; ``recovery_time`` from the
+    end of the fault until the error stays recovered (s), None if it does not; ``odometry_before``
+    the fault and ``odometry_after``, at the end of the run: its error (m, rad).
+
+    ``detected``: signs that robot or controller show; ``ranges`` before and at a wall, which the
+    loop does not use; ``undetected``: effects that only ground truth shows.
+
+    Parameters
+    ----------
+    begin, end
+        Those of the fault, s; the end may lie beyond the record.
     """
     last = float(record.time[-1])
     stays = end >= last
+    during = begin, min(end, last)
     reasons = stop_reasons(record, begin)
     stopped = bool(record.robot_reasons[-1] or record.driver_reasons[-1])
     recovery_time = None if stays or stopped else time_to_return(record, undisturbed_run, end)
@@ -115,27 +95,22 @@ def evaluate_outcome(
         verdict = 'stops'
     else:
         verdict = 'bounded' if stays or recovery_time is not None else 'impaired'
-    resumption = ('not' if stopped else 'by itself') if reasons else ''
-    before, after = _odometry_error(record, begin), _odometry_error(record, last)
-    return Outcome(
-        name=name,
-        course=course,
-        verdict=verdict,
-        reason=violation or '; '.join(reasons),
-        stopped_for=sum(reasons.values()),
-        resumption=resumption,
-        before=wheel_error(record, SETTLED, begin),
-        during=wheel_error(record, begin, end),
-        after=None if stays or stopped else wheel_error(record, end + AFTER, last),
-        recovery_time=recovery_time,
-        odometry_before=before,
-        odometry_after=after,
-        detected=_detected(record, undisturbed_run, begin, min(end, last)),
-        ranges=_ranges(record, begin, min(end, last)),
-        undetected=_undetected(
-            record, begin, min(end, last), after, _odometry_error(undisturbed_run, last)
-        ),
-    )
+    off = _odometry_error(record, last)
+    return {
+        'verdict': verdict,
+        'reason': violation or '; '.join(reasons),
+        'stopped_for': sum(reasons.values()),
+        'resumption': ('not' if stopped else 'by itself') if reasons else '',
+        'before': wheel_error(record, SETTLED, begin),
+        'during': wheel_error(record, begin, end),
+        'after': None if stays or stopped else wheel_error(record, end + AFTER, last),
+        'recovery_time': recovery_time,
+        'odometry_before': _odometry_error(record, begin),
+        'odometry_after': off,
+        'detected': _detected(record, undisturbed_run, *during),
+        'ranges': _ranges(record, *during),
+        'undetected': _undetected(record, *during, off, _odometry_error(undisturbed_run, last)),
+    }
 
 
 def time_to_return(record: Record, undisturbed_run: Record, end: float) -> float | None:
@@ -159,11 +134,11 @@ def wheel_error(record: Record, begin: float, end: float) -> float:
     return rms((record.speeds - record.reference)[record.rows(begin, end)])
 
 
-def _odometry_error(record: Record, time: float) -> tuple[float, float]:
+def _odometry_error(record: Record, time: float) -> list[float]:
     """Return the odometry error (m, rad) just before ``time`` (s)."""
     row = record.rows(time, time + 1.0).start - 1
     x, y, yaw = (record['odometry'][row] - record['truth'][row]).tolist()
-    return float(np.hypot(x, y)), abs(wrap_angle(yaw))
+    return [float(np.hypot(x, y)), abs(wrap_angle(yaw))]
 
 
 def stop_reasons(record: Record, begin: float) -> dict[str, float]:
@@ -202,9 +177,7 @@ def _bound_violation(record: Record, begin: float, parameters: DigitalTwinParame
     return ''
 
 
-def _detected(
-    record: Record, undisturbed_run: Record, begin: float, end: float
-) -> tuple[str, ...]:
+def _detected(record: Record, undisturbed_run: Record, begin: float, end: float) -> list[str]:
     """Return the signs of robot and controller from the begin of the fault."""
     found = []
     rows = record.rows(begin, float(record.time[-1]))
@@ -229,7 +202,7 @@ def _detected(
     usual = rms((undisturbed_run['measured'] - undisturbed_run.reference)[during])
     if error > ALLOWED * usual and not any(record.robot_reasons[during]):
         found.append(f'tracking error {error:.2f} rad/s')
-    return tuple(found)
+    return found
 
 
 def _ranges(record: Record, begin: float, end: float) -> str:
@@ -248,12 +221,8 @@ def _ranges(record: Record, begin: float, end: float) -> str:
 
 
 def _undetected(
-    record: Record,
-    begin: float,
-    end: float,
-    off: tuple[float, float],
-    usual: tuple[float, float],
-) -> tuple[str, ...]:
+    record: Record, begin: float, end: float, off: Sequence[float], usual: Sequence[float]
+) -> list[str]:
     """Return the effects that only ground truth shows."""
     found = []
     rows = record.rows(begin, end)
@@ -265,7 +234,7 @@ def _undetected(
         found.append(f'tyres slide ({slide:.1f} rad/s)')
     if off[0] > usual[0] + 0.02 or off[1] > usual[1] + 0.05:
         found.append('odometry is wrong')
-    return tuple(found)
+    return found
 
 
 DURATION = 40.0
@@ -294,7 +263,7 @@ class FaultRun:
 
     name: str
     course: str
-    """One of :data:`COURSES`."""
+    """One of :data:`REFERENCE_COURSES`."""
     event: FaultEvent | None
     """None for a wall instead of a fault."""
     world: str = ''
@@ -316,73 +285,78 @@ class FaultRun:
         return Scenario('twin', 'nominal', 1, self.duration, own=own)
 
 
-def _fault_runs() -> tuple[FaultRun, ...]:
-    strengths: tuple[tuple[str, tuple[Value, ...], float], ...] = (
-        ('command_delay', (0.05, 0.1, 0.2, 0.3), 5.0),
-        ('command_jitter', (0.05, 0.2), 5.0),
-        ('command_loss', (0.1, 0.3, 0.9, 1.0), 5.0),
-        ('gyro_bias_jump', (0.02, 0.35), 5.0),
-        ('gyro_dead', (True,), 5.0),
-        ('ranges_dead', (True,), 5.0),
-        ('wheel_blocked', ('right', 'both'), 5.0),
-        ('load_change', (1.0, 3.0, -0.5), 5.0),
-        ('slippery', (0.3, 0.05, 0.0), 5.0),
-        ('supply_sag', (2.0, 5.0), 5.0),
-        ('brown_out', (True,), 0.1),
-    )
-    fault_runs = []
-    for course in ('chaotic', 'straight'):
-        for fault, values, duration in strengths:
-            for value in values:
-                (name,) = active_faults(FaultParameters().with_values({fault: value}))
-                fault_runs.append(
-                    FaultRun(name, course, FaultEvent(BEGIN, fault, value, duration))
-                )
-    fault_runs.append(FaultRun('collision, head-on', 'straight', None, 'room', 25.0))
-    fault_runs.append(FaultRun('collision, at a slant', 'arc', None, 'room', 25.0))
-    return tuple(fault_runs)
+STRENGTHS: Mapping[str, tuple[Value, ...]] = {
+    'command_delay': (0.05, 0.1, 0.2, 0.3),
+    'command_jitter': (0.05, 0.2),
+    'command_loss': (0.1, 0.3, 0.9, 1.0),
+    'gyro_bias_jump': (0.02, 0.35),
+    'gyro_dead': (True,),
+    'ranges_dead': (True,),
+    'wheel_blocked': ('right', 'both'),
+    'load_change': (1.0, 3.0, -0.5),
+    'slippery': (0.3, 0.05, 0.0),
+    'supply_sag': (2.0, 5.0),
+    'brown_out': (True,),
+}
+"""Values of each fault."""
 
 
-FAULT_RUNS = _fault_runs()
+def fault_run(course: str, fault: str, value: Value) -> FaultRun:
+    """Return the run of a fault on a course."""
+    (name,) = active_faults(FaultParameters().with_values({fault: value}))
+    lasts = 0.1 if fault == 'brown_out' else 5.0
+    return FaultRun(name, course, FaultEvent(BEGIN, fault, value, lasts))
+
+
+FAULT_RUNS = (
+    *(
+        fault_run(course, fault, value)
+        for course in ('chaotic', 'straight')
+        for fault, values in STRENGTHS.items()
+        for value in values
+    ),
+    FaultRun('collision, head-on', 'straight', None, 'room', 25.0),
+    FaultRun('collision, at a slant', 'arc', None, 'room', 25.0),
+)
 """Every run, grouped by course."""
 
 
-def study_faults(fault_runs: Sequence[FaultRun], *, progress: bool = False) -> list[Outcome]:
-    """Return the outcome of each run."""
-    results = []
-    with progress_bar(len(fault_runs), show=progress) as bar:
-        for fault_run in fault_runs:
-            results.append(run_fault(fault_run))
-            bar.update()
-    return results
+def study_faults(
+    fault_runs: Sequence[FaultRun], workers: int | Executor = 1, report: Report | None = None
+) -> ResultTable:
+    """Return the outcome of each run by ``name`` and ``course``, see :func:`evaluate_outcome`."""
+    runs = [Run((each, METHOD), {'name': each.name, 'course': each.course}) for each in fault_runs]
+    return run_experiment(runs, measured_fault, workers, report=report)
 
 
-def run_fault(fault_run: FaultRun) -> Outcome:
+def measured_fault(job: tuple[FaultRun, NodeMethod]) -> Row:
     """Return the outcome of the closed loop in one run.
 
     If the robot stands at the end, the run is repeated with a pause of the controller.
     """
-    parameters = fault_run.scenario().true_robot()
+    trial, _ = job
+    event = trial.event
+    parameters = trial.scenario().true_robot()
     assert isinstance(parameters, DigitalTwinParameters)
-    record = _run(fault_run)
-    undisturbed_run = undisturbed(fault_run.course, fault_run.duration)
-    begin, end = _span(fault_run, record, parameters)
-    result = evaluate_outcome(
-        fault_run.name, fault_run.course, record, undisturbed_run, begin, end, parameters
-    )
-    if result.verdict == 'stops' and result.resumption == 'not' and fault_run.event is not None:
+    record = _run(trial)
+    undisturbed_run = undisturbed(trial.course, trial.duration)
+    if event is None:
+        touches = record['contact_force'] > 0.0
+        begin = float(record.time[np.argmax(touches)] if touches.any() else 0.0)
+        end = trial.duration
+    else:
+        begin = event.at
+        end = event.until + (parameters.boot_time if event.fault == 'brown_out' else 0.0)
+    row = evaluate_outcome(record, undisturbed_run, begin, end, parameters)
+    if row['verdict'] == 'stops' and row['resumption'] == 'not' and event is not None:
         again, wait = end + PAUSE[0], PAUSE[1]
-        paused = _run(fault_run, ((again, again + wait),))
-        remaining = stop_reasons(paused, again + wait + AFTER)
-        if not remaining:
+        paused = _run(trial, ((again, again + wait),))
+        if not stop_reasons(paused, again + wait + AFTER):
             end = again + wait
-            result = replace(
-                result,
-                resumption='after a pause',
-                after=wheel_error(paused, end + AFTER, fault_run.duration),
-                recovery_time=time_to_return(paused, undisturbed_run, end),
-            )
-    return result
+            row['resumption'] = 'after a pause'
+            row['after'] = wheel_error(paused, end + AFTER, trial.duration)
+            row['recovery_time'] = time_to_return(paused, undisturbed_run, end)
+    return row
 
 
 @lru_cache(maxsize=8)
@@ -391,154 +365,10 @@ def undisturbed(course: str, duration: float) -> Record:
     return _run(FaultRun('none', course, None, '', duration))
 
 
-def _run(fault_run: FaultRun, pauses: tuple[tuple[float, float], ...] = ()) -> Record:
-    return run(fault_run.scenario(pauses), NodeMethod(FULL, {}))
+def _run(trial: FaultRun, pauses: tuple[tuple[float, float], ...] = ()) -> Record:
+    return run(trial.scenario(pauses), METHOD)
 
 
 @cache
 def _course(name: str, duration: float) -> SampledReference:
     return REFERENCE_COURSES[name](duration)
-
-
-def _span(
-    fault_run: FaultRun, record: Record, parameters: DigitalTwinParameters
-) -> tuple[float, float]:
-    """Return begin and end of the fault or the collision, s."""
-    if fault_run.event is None:
-        touches = record['contact_force'] > 0.0
-        return float(record.time[np.argmax(touches)] if touches.any() else 0.0), fault_run.duration
-    away = parameters.boot_time if fault_run.event.fault == 'brown_out' else 0.0
-    return fault_run.event.at, fault_run.event.until + away
-
-
-BEGIN_MARK = '<!-- outcomes: written by `t3mpc faults`, do not edit by hand -->'
-END_MARK = '<!-- end of outcomes -->'
-
-TITLES = {
-    'chaotic': 'Along the chaotic reference',
-    'straight': 'Straight on at 0.2 m/s',
-    'arc': 'Along an arc at 0.2 m/s',
-}
-TABLE_HEAD = (
-    'fault',
-    'outcome',
-    'error of the wheels before, during, after (rad/s)',
-    'odometry error before, at the end',
-    'detected by robot or controller',
-    'shown by ground truth only',
-)
-UNDETECTED = '**undetected by the robot**: '
-UNREPORTED = '**no flag, no reason, and the counters advance**: '
-
-
-def outcome_sentence(outcome: Outcome) -> str:
-    """Return the outcome in words."""
-    recovery_time = (
-        'error not recovered' if outcome.recovery_time is None
-        else f'error recovered after {outcome.recovery_time:g} s'
-        if outcome.recovery_time > 0.0 else 'error recovered at once'
-    )  # fmt: skip
-    if outcome.verdict == 'unbounded':
-        return f'unbounded: {outcome.reason}'
-    if outcome.verdict == 'impaired':
-        return 'within limits, but error not recovered'
-    if outcome.verdict == 'bounded':
-        return 'bounded' + ('' if outcome.after is None else f', {recovery_time}')
-    text = f'stops: {_short(outcome.reason)}'
-    if outcome.resumption == 'by itself':
-        return f'{text}, for {outcome.stopped_for:.1f} s; resumes by itself, {recovery_time}'
-    if outcome.resumption == 'after a pause':
-        return f'{text}, until commands pause; then resumes, {recovery_time}'
-    return f'{text}, and remains stopped'
-
-
-def table_row(outcome: Outcome) -> tuple[str, ...]:
-    """Return the cells of a table."""
-    after = EMPTY_CELL if outcome.after is None else f'{outcome.after:.2f}'
-    before_m, before_rad = outcome.odometry_before
-    after_m, after_rad = outcome.odometry_after
-    undetected = ', '.join(outcome.undetected) or EMPTY_CELL
-    if outcome.undetected and not outcome.detected:
-        undetected = (UNREPORTED if outcome.ranges else UNDETECTED) + undetected
-    known = [*outcome.detected, outcome.ranges] if outcome.ranges else outcome.detected
-    return (
-        f'`{outcome.name}`',
-        outcome_sentence(outcome),
-        f'{outcome.before:.2f}, {outcome.during:.2f}, {after}',
-        f'{_length(before_m)}, {_degrees(before_rad)}; {_length(after_m)}, {_degrees(after_rad)}',
-        ', '.join(known) or EMPTY_CELL,
-        undetected,
-    )
-
-
-def markdown_tables(results: Sequence[Outcome]) -> str:
-    """Return a table for each course, one row for each outcome."""
-    parts = []
-    for course, title in TITLES.items():
-        rows = [table_row(result) for result in results if result.course == course]
-        if rows:
-            parts.append(f'### {title}\n\n{Table("", TABLE_HEAD, rows).markdown()}\n')
-    return '\n'.join(parts)
-
-
-def console_text(results: Sequence[Outcome]) -> str:
-    """Return the outcomes for a terminal, one line each."""
-    lines = []
-    for course, title in TITLES.items():
-        chosen = [result for result in results if result.course == course]
-        lines += [f'{title}:'] if chosen else []
-        for result in chosen:
-            hidden = (
-                ' (not detected by the robot)' if result.undetected and not result.detected else ''
-            )
-            lines.append(f'  {result.name:24} {outcome_sentence(result)}{hidden}')
-    return '\n'.join(lines)
-
-
-def page_section(results: Sequence[Outcome]) -> str:
-    """Return the section of the page from mark to mark."""
-    after, pause = PAUSE
-    return f"""{BEGIN_MARK}
-
-The controller drives the twin. Each fault begins at {BEGIN:g} s and lasts 5 s; `brown_out`
-restarts the board, which takes 0.5 s. A run lasts {DURATION:g} s, one into a wall 25 s, of which
-the robot needs 11 s to get there.
-
-Errors are root mean squares over both wheels, of rotor speed against reference:
-from 3 s on before the fault, during it, and from 2 s after it to the end. The error has
-*recovered* when the rest of the run is no worse than {ALLOWED:g} times the same run without the
-fault. Where the robot stands until commands pause, a person pauses the controller for {pause:g} s,
-{after:g} s after the fault: the error after the fault then counts after the pause, and the
-odometry is that of the run without a pause.
-
-Ground truth shows full steps lost by the right and the left motor at most, and how much
-faster (root mean square) the wheels turn than they roll.
-
-{markdown_tables(results)}
-{END_MARK}
-"""
-
-
-def update_page(page: Path, results: Sequence[Outcome]) -> None:
-    """Replace the section between the marks of a page, which has both once and in this order."""
-    text = page.read_text(encoding='utf-8')
-    head, begun, rest = text.partition(BEGIN_MARK)
-    _, ended, tail = rest.partition(END_MARK)
-    if not begun or not ended or BEGIN_MARK in rest or END_MARK in tail:
-        raise ValueError(
-            f'{page} must hold the lines {BEGIN_MARK} and {END_MARK} once, in this order'
-        )
-    page.write_text(head + page_section(results).rstrip('\n') + tail, encoding='utf-8')
-
-
-def _short(reason: str) -> str:
-    parts = [part for part in reason.split('; ') if not part.startswith('stop commanding ')]
-    return '; '.join(part.split(':')[0] for part in parts)
-
-
-def _length(metres: float) -> str:
-    return f'{100.0 * metres:.1f} cm' if metres < 1.0 else f'{metres:.2f} m'
-
-
-def _degrees(angle: float) -> str:
-    return f'{math.degrees(angle):.1f}°'

@@ -82,8 +82,8 @@ def graph(**answers):
 
 def studied(*verdicts):
     return {
-        'evaluation.fault_study.study_faults': [SimpleNamespace(verdict=v) for v in verdicts],
-        'evaluation.fault_study.console_text': '',
+        'evaluation.fault_study.study_faults': [{'verdict': v} for v in verdicts],
+        'evaluation.fault_page.console_text': '',
     }
 
 

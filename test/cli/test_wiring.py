@@ -165,8 +165,8 @@ TRAIN = {
 }
 FAULTS = {
     'evaluation.fault_study.study_faults': [],
-    'evaluation.fault_study.console_text': '',
-    'evaluation.fault_study.update_page': None,
+    'evaluation.fault_page.console_text': '',
+    'evaluation.fault_page.update_page': None,
     'evaluation.fault_page.page': '',
 }
 REPLAYED = SimpleNamespace(steps=100, parameters=SimpleNamespace(rate=100.0))
@@ -410,12 +410,13 @@ TABLE = {
         },
     ),
     'faults': (
-        FAULTS,
+        FAULTS | SHARED,
         {
             'brown_out': {'study_faults.fault_runs.0.event.fault': 'brown_out'},
             '--output page.md': {'update_page.page': 'page.md'},
             '--html new.html': {'files': 'new.html'},
             '--json new.json': {'files': 'new.json'},
+            **workers('study_faults.workers'),
         },
     ),
     'view': (

@@ -12,23 +12,26 @@ import pytest
 from support.long_tests import few_of
 
 from t3mpc_ros.cli.main import main
-from t3mpc_ros.evaluation import fault_study as fault_runs
-from t3mpc_ros.evaluation.fault_study import (
+from t3mpc_ros.evaluation import fault_study
+from t3mpc_ros.evaluation.fault_page import (
     BEGIN_MARK,
     END_MARK,
-    FAULT_RUNS,
     TITLES,
     UNDETECTED,
     UNREPORTED,
-    FaultRun,
     console_text,
-    evaluate_outcome,
     markdown_tables,
     page_section,
-    run_fault,
     table_row,
-    undisturbed,
     update_page,
+)
+from t3mpc_ros.evaluation.fault_study import (
+    FAULT_RUNS,
+    STRENGTHS,
+    FaultRun,
+    evaluate_outcome,
+    study_faults,
+    undisturbed,
 )
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.method import NodeMethod
@@ -148,13 +151,13 @@ SHORT = ('command_delay 0.1 s', 'gyro_bias_jump 0.35 rad/s')
 @pytest.mark.parametrize('name', few_of(dict.fromkeys((*SHORT, *EXPECTED)), len(SHORT)))
 def test_the_loop_stays_bounded_or_stops_with_a_reason(name):
     """One strength of each fault, and the page says of it what comes out here."""
-    result = run_fault(fault_run('chaotic', name))
-    assert (result.verdict, result.reason, result.resumption) == EXPECTED[name]
+    (result,) = study_faults([fault_run('chaotic', name)])
+    assert (result['verdict'], result['reason'], result['resumption']) == EXPECTED[name]
     assert_same(row_text(result), page_rows()['chaotic', name])
 
 
 def test_every_fault_is_among_those_expected():
-    assert [name.split()[0] for name in EXPECTED] == list(FAULTS)
+    assert [name.split()[0] for name in EXPECTED] == list(FAULTS) == list(STRENGTHS)
 
 
 @pytest.mark.parametrize(
@@ -170,9 +173,9 @@ def test_every_fault_is_among_those_expected():
     ),
 )
 def test_undetected_faults_are_named(course, name):
-    result = run_fault(fault_run(course, name))
-    assert not result.detected
-    assert 'odometry is wrong' in result.undetected
+    (result,) = study_faults([fault_run(course, name)])
+    assert not result['detected']
+    assert 'odometry is wrong' in result['undetected']
     line = row_text(result)
     assert (UNREPORTED if 'collision' in name else UNDETECTED) in line
     assert 'not detected' in console_text([result])
@@ -206,23 +209,23 @@ def test_a_known_delay_costs_little():
 AT = fault_run('chaotic', 'gyro_dead')
 
 
-def judged(record):
+def judged(record, parameters=None):
     undisturbed_run = undisturbed('chaotic', AT.duration)
-    return evaluate_outcome(AT.name, AT.course, record, undisturbed_run, 10.0, 15.0, noisy_twin())
+    return evaluate_outcome(record, undisturbed_run, 10.0, 15.0, parameters or noisy_twin())
 
 
-def changed(record, column, values):
+def changed(column, rows, value):
+    """Return the run without a fault with another value in some rows of a column."""
+    record = undisturbed('chaotic', AT.duration)
+    values = record[column].copy()
+    values[rows] = value
     return replace(record, columns={**record.columns, column: values})
 
 
 def test_a_run_without_fault_is_bounded_and_notices_nothing():
     result = judged(undisturbed('chaotic', AT.duration))
-    assert (result.verdict, result.recovery_time, result.detected, result.undetected) == (
-        'bounded',
-        0.0,
-        (),
-        (),
-    )
+    found = [result[name] for name in ('verdict', 'recovery_time', 'detected', 'undetected')]
+    assert found == ['bounded', 0.0, [], []]
 
 
 def test_a_robot_moving_with_a_stop_reason_is_out_of_bounds():
@@ -230,40 +233,26 @@ def test_a_robot_moving_with_a_stop_reason_is_out_of_bounds():
     record = undisturbed('chaotic', AT.duration)
     says = tuple(SLIP_STOP_REASON if 11.0 <= time < 15.0 else '' for time in record.time)
     result = judged(replace(record, robot_reasons=says))
-    assert result.verdict == 'unbounded'
-    assert 'moves' in result.reason
+    assert result['verdict'] == 'unbounded'
+    assert 'moves' in result['reason']
 
 
 @pytest.mark.parametrize(
     'field, value', [('commanded', (10.1, 10.1)), ('commanded', (-9.9, 9.9)), ('speeds', (0, 11))]
 )
 def test_speeds_beyond_the_limits_are_unbounded(field, value):
-    record = undisturbed('chaotic', AT.duration)
-    values = record[field].copy()
-    values[1200] = value
     parameters = noisy_twin().with_values({'angular.z.max_velocity': 4.0})
-    undisturbed_run = undisturbed('chaotic', AT.duration)
-    result = evaluate_outcome(
-        AT.name,
-        AT.course,
-        changed(record, field, values),
-        undisturbed_run,
-        10.0,
-        15.0,
-        parameters,
-    )
-    assert result.verdict == 'unbounded'
+    assert judged(changed(field, 1200, value), parameters)['verdict'] == 'unbounded'
 
 
 def test_a_lasting_error_is_impaired_a_passing_one_recovers():
-    record = undisturbed('chaotic', AT.duration)
-    speeds = record.speeds.copy()
-    speeds[1500:] += 0.2
-    assert judged(changed(record, 'speeds', speeds)).verdict == 'impaired'
-    speeds[2000:] -= 0.2
-    result = judged(changed(record, 'speeds', speeds))
-    assert result.verdict == 'bounded'
-    assert 3.0 <= result.recovery_time <= 5.0
+    speeds = undisturbed('chaotic', AT.duration).speeds
+    lasting, passing = slice(1500, None), slice(1500, 2000)
+    result = judged(changed('speeds', lasting, speeds[lasting] + 0.2))
+    assert result['verdict'] == 'impaired'
+    result = judged(changed('speeds', passing, speeds[passing] + 0.2))
+    assert result['verdict'] == 'bounded'
+    assert 3.0 <= result['recovery_time'] <= 5.0
 
 
 # --- the page and the command -------------------------------------------------------------------
@@ -276,7 +265,7 @@ def two(monkeypatch):
     made = tuple(
         FaultRun('gyro_dead', course, event, '', 17.0) for course in ('chaotic', 'straight')
     )
-    monkeypatch.setattr(fault_runs, 'FAULT_RUNS', made)
+    monkeypatch.setattr(fault_study, 'FAULT_RUNS', made)
 
 
 def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
@@ -284,7 +273,7 @@ def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     page.write_text(f'before\n{BEGIN_MARK}\nold\n{END_MARK}\nafter\n')
     html = tmp_path / 'faults.html'
     files = ['--output', str(page), '--json', str(numbers), '--html', str(html)]
-    assert main(['faults', *files]) == 0
+    assert main(['faults', '--workers', '1', *files]) == 0
     shown = capsys.readouterr()
     assert 'gyro_dead' in shown.out
     assert '2/2 [' in shown.err
@@ -309,7 +298,7 @@ def test_a_page_without_the_marks_is_left_alone(text, tmp_path):
 
 
 def test_every_row_of_the_table_has_as_many_cells_as_its_head():
-    result = judged(undisturbed('chaotic', AT.duration))
-    lines = markdown_tables([result, replace(result, course='arc')]).splitlines()
+    result = {'name': AT.name, 'course': 'arc', **judged(undisturbed('chaotic', AT.duration))}
+    lines = markdown_tables([result, {**result, 'course': 'chaotic'}]).splitlines()
     assert {line.count('|') for line in lines if line.startswith('|')} == {7}
     assert {line.count('|') for line in page_rows().values()} == {7}

@@ -21,7 +21,6 @@ from t3mpc_ros.evaluation import comparison_page, fault_page, plotting
 from t3mpc_ros.evaluation.comparison import ComparisonPlan
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.fault_study import Outcome
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.metrics import METRICS
 from t3mpc_ros.evaluation.paper import paper_figures
@@ -425,14 +424,15 @@ def test_differences_of_methods_are_coloured_by_their_verdict(caught):
     assert axis.get_xlabel() == 'settled / (rad/s)'
 
 
-OUTCOME = Outcome(
-    'gyro_dead', 'chaotic', 'bounded', '', 0.0, '', 0.1, 0.7, 0.2, 1.0, (0.0, 0.0), (0.0, 0.0),
-    ('imu',), '', (),
-)  # fmt: skip
+OUTCOME = {
+    'name': 'gyro_dead', 'course': 'chaotic', 'verdict': 'bounded', 'before': 0.1, 'during': 0.7,
+    'after': 0.2, 'recovery_time': 1.0, 'odometry_before': [0.0, 0.0], 'detected': ['imu'],
+    'odometry_after': [0.0, 0.0], 'ranges': '', 'undetected': [], 'reason': 'a command of 2 m/s',
+}  # fmt: skip
 
 
 def test_errors_of_faults_are_named_and_judged_by_the_worst(caught):
-    other = replace(OUTCOME, name='brown_out', before=0.3, during=0.9, after=None)
+    other = OUTCOME | {'name': 'brown_out', 'before': 0.3, 'during': 0.9, 'after': None}
     page = fault_page.page([OUTCOME, other])
     (axis,) = caught[0].axes
     shown = lines(axis)
@@ -446,7 +446,7 @@ def test_errors_of_faults_are_named_and_judged_by_the_worst(caught):
     assert [to_hex(each.get_color()) for each in axis.lines] == [GREY, RED, COMMAND]
     assert 'Every fault stays bounded' in page
     assert '2 stay within the limits and recover.' in page
-    worse = fault_page.page([OUTCOME, replace(other, verdict='unbounded', undetected=('tilt',))])
+    worse = fault_page.page([OUTCOME, other | {'verdict': 'unbounded', 'undetected': ['tilt']}])
     assert 'Not every fault stays bounded' in worse
     assert '1 exceed a limit.' in worse
 
