@@ -7,6 +7,7 @@ obstacles: like our own path, they are followed by the same robot with the same 
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 import math
 from typing import NamedTuple
 
@@ -85,32 +86,6 @@ def boustrophedon(area: Rectangle, length: float, generator: np.random.Generator
     return np.tile(there_and_back, (laps, 1))
 
 
-def lorenz(area: Rectangle, length: float, generator: np.random.Generator) -> Array:
-    """Return the portrait (y1, y3) of Lorenz' system with the classical parameters 10, 28, 8/3.
-
-    J. Atmos. Sci. 20, 1963, doi 10.1175/1520-0469(1963)020<0130:DNF>2.0.CO;2.
-    """
-    system = QuadraticSystem(
-        (1.0,) * 3,
-        ((0, 0, -10.0), (0, 1, 10.0), (1, 0, 28.0), (1, 1, -1.0), (2, 2, -8.0 / 3.0)),
-        ((1, 0, 2, -1.0), (2, 0, 1, 1.0)),
-    )
-    return _portrait(system, (0, 2), (1.0, 1.0, 25.0), area, length, generator)
-
-
-def chen(area: Rectangle, length: float, generator: np.random.Generator) -> Array:
-    """Return the portrait (y1, y3) of Chen's system with the parameters 35, 3, 28.
-
-    Chen and Ueta, Int. J. Bifurcation Chaos 9, 1999, doi 10.1142/S0218127499001024.
-    """
-    system = QuadraticSystem(
-        (1.0,) * 3,
-        ((0, 0, -35.0), (0, 1, 35.0), (1, 0, -7.0), (1, 1, 28.0), (2, 2, -3.0)),
-        ((1, 0, 2, -1.0), (2, 0, 1, 1.0)),
-    )
-    return _portrait(system, (0, 2), (1.0, 1.0, 20.0), area, length, generator)
-
-
 def arnold(area: Rectangle, length: float, generator: np.random.Generator) -> Array:
     """Return the path whose direction is a state of Arnold's flow, mirrored at the walls.
 
@@ -167,9 +142,48 @@ def logistic(area: Rectangle, length: float, generator: np.random.Generator) -> 
     return np.array(path)
 
 
+def portrait(
+    system: QuadraticSystem,
+    initial: tuple[float, float, float],
+    area: Rectangle,
+    length: float,
+    generator: np.random.Generator,
+) -> Array:
+    """Return y3 over y1 of a chaotic system, stretched to touch all four sides of the area."""
+    solver = FractionalSolver(system, 1e-3, np.array(initial) + generator.uniform(-0.5, 0.5, 3))
+    solver.advance(20_000)
+    size = np.array(area.high) - area.low
+    found: list[Array] = []
+    while True:
+        found += [solver.advance(4)[[0, 2]] for _ in range(2000)]
+        points = np.array(found)
+        low, high = points.min(axis=0), points.max(axis=0)
+        path: Array = area.low + size * (points - low) / (high - low)
+        if polyline_length(path) >= length:
+            return path
+
+
+LORENZ = QuadraticSystem(
+    (1.0,) * 3,
+    ((0, 0, -10.0), (0, 1, 10.0), (1, 0, 28.0), (1, 1, -1.0), (2, 2, -8.0 / 3.0)),
+    ((1, 0, 2, -1.0), (2, 0, 1, 1.0)),
+)
+"""With the classical parameters 10, 28, 8/3.
+
+J. Atmos. Sci. 20, 1963, doi 10.1175/1520-0469(1963)020<0130:DNF>2.0.CO;2.
+"""
+CHEN = QuadraticSystem(
+    (1.0,) * 3,
+    ((0, 0, -35.0), (0, 1, 35.0), (1, 0, -7.0), (1, 1, 28.0), (2, 2, -3.0)),
+    ((1, 0, 2, -1.0), (2, 0, 1, 1.0)),
+)
+"""With the parameters 35, 3, 28.
+
+Chen and Ueta, Int. J. Bifurcation Chaos 9, 1999, doi 10.1142/S0218127499001024.
+"""
 BASELINE_PATHS: Mapping[str, PathMaker] = {
-    'Lorenz': lorenz,
-    'Chen': chen,
+    'Lorenz': partial(portrait, LORENZ, (1.0, 1.0, 25.0)),
+    'Chen': partial(portrait, CHEN, (1.0, 1.0, 20.0)),
     'Arnold': arnold,
     'logistic': logistic,
     'random walk': random_walk,
@@ -207,27 +221,3 @@ def _mirrored(points: Array, area: Rectangle) -> Array:
     folded = np.abs(np.mod(np.vstack(pieces) + 1.0, 2.0) - 1.0)
     path: Array = low + size * folded
     return path
-
-
-def _portrait(
-    system: QuadraticSystem,
-    states: tuple[int, int],
-    initial: tuple[float, ...],
-    area: Rectangle,
-    length: float,
-    generator: np.random.Generator,
-) -> Array:
-    """Return two states over each other, stretched to touch all four sides of the area."""
-    step = 1e-3
-    start = np.array(initial) + generator.uniform(-0.5, 0.5, len(initial))
-    solver = FractionalSolver(system, step, start)
-    solver.advance(20_000)
-    size = np.array(area.high) - area.low
-    found: list[Array] = []
-    while True:
-        found += [solver.advance(4)[list(states)] for _ in range(2000)]
-        points = np.array(found)
-        low, high = points.min(axis=0), points.max(axis=0)
-        path: Array = area.low + size * (points - low) / (high - low)
-        if polyline_length(path) >= length:
-            return path

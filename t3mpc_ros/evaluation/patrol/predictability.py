@@ -57,8 +57,6 @@ class Skill(NamedTuple):
     """That of the best predictor, at least 0: climatology is one of them."""
     predictor: str
     """Its name."""
-    each: dict[str, float]
-    """Skill by predictor; may be negative."""
     error: float
     """Root mean square error of the best predictor, m. Unlike the skill it does not depend on how
     far the path spreads: of two paths that surprise equally, the one that covers more of the room
@@ -101,7 +99,7 @@ def predictability(
     target = _positions(path, origins, steps)
     climatology = _square_errors(path[:half].mean(axis=0), target)
     if climatology.min() <= 0.0:  # a robot that stands where it stood
-        return tuple(Skill(h, 1.0, CLIMATOLOGY, {CLIMATOLOGY: 1.0}, 0.0) for h in horizons)
+        return tuple(Skill(h, 1.0, CLIMATOLOGY, 0.0) for h in horizons)
     each = {CLIMATOLOGY: np.zeros(steps.size)}
     for name, predict in _PREDICTORS.items():
         found = predict(path, half, origins, steps)
@@ -112,7 +110,6 @@ def predictability(
             horizon,
             float(each[best[row]][row]),
             best[row],
-            {name: float(skills[row]) for name, skills in each.items()},
             float(np.sqrt((1.0 - each[best[row]][row]) * climatology[row])),
         )
         for row, horizon in enumerate(horizons)
