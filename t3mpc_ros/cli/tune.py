@@ -5,7 +5,6 @@
 import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
-import sys
 from typing import TYPE_CHECKING
 
 from t3mpc_ros.cli.run_options import (
@@ -92,6 +91,8 @@ def _tuned(
     options: argparse.Namespace, methods: 'Sequence[MethodDefinition]', executor: 'int | Executor'
 ) -> 'TunedParameters':
     """Return the parameters after tuning on the chosen robots."""
+    from t3mpc_ros.evaluation.experiment import print_report
+
     output = options.output or OUTPUT
     if options.robot == TWIN:
         from t3mpc_ros.evaluation.tuning.twin_tuning import tune_twin, twin_definitions
@@ -101,7 +102,7 @@ def _tuned(
             options.evaluations or TWIN_EVALUATIONS,
             executor,
             output,
-            _print_progress,
+            print_report,
             resume=options.resume,
         )
     from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
@@ -113,7 +114,7 @@ def _tuned(
         options.evaluations or EVALUATIONS,
         executor,
         output,
-        _print_progress,
+        print_report,
         resume=options.resume,
     )
 
@@ -137,7 +138,3 @@ def _identify(options: argparse.Namespace) -> int:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         options.output.write_text(text, encoding='utf-8')
     return 0
-
-
-def _print_progress(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
