@@ -32,7 +32,7 @@ distance only.
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -40,7 +40,7 @@ from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, esti
 from t3mpc_ros.fuzzy.inference import FuzzyParameters, FuzzyTables
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import Structure, TypedKernel, kernel
-from t3mpc_ros.parameters.table import Parameters, group, parameter
+from t3mpc_ros.parameters.table import Parameters, parameter
 
 HISTORY = 64
 """Number of commands kept."""
@@ -95,9 +95,10 @@ class BodyCorrectionParameters(Parameters):
         (0.0, 10.0),
         dynamic=True,
     )
-    fuzzy: FuzzyParameters = group(
-        FuzzyParameters, sets=5, centre_exponent=1.0, input_fuzziness=0.05
+    fuzzy: ClassVar[FuzzyParameters] = FuzzyParameters(
+        sets=5, centre_exponent=1.0, input_fuzziness=0.05
     )
+    """Sets of the map over the wheel speeds, assumed."""
 
 
 class BodyMemory(Structure):

@@ -5,7 +5,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -97,13 +97,9 @@ class FrictionTermParameters(Parameters):
         (0.0, 1e4),
         dynamic=True,
     )
-    width: float = parameter(
-        0.3,
-        'wheel speed of the reference at which the friction has 76 % of its value',
-        'rad/s',
-        (1e-3, 100.0),
-        dynamic=True,
-    )
+    width: ClassVar[float] = 0.3
+    """w: wheel speed of the reference at which the friction has 76 % of its value, rad/s,
+    assumed."""
 
 
 @dataclass(frozen=True)

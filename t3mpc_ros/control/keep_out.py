@@ -33,7 +33,7 @@ from collections import deque
 from dataclasses import dataclass
 import enum
 import math
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,7 +71,8 @@ TURN_WEIGHT = 0.12
 class FreeSpaceMapParameters(Parameters):
     """Size of the map, and how much a reading is trusted."""
 
-    resolution: float = parameter(0.02, 'side of a cell', 'm', (0.005, 0.2))
+    resolution: ClassVar[float] = 0.02
+    """Side of a cell, m, assumed."""
     half_size: float = parameter(
         3.0,
         'half the side of the square map around the origin of the odometry; floor beyond it is '
@@ -79,21 +80,14 @@ class FreeSpaceMapParameters(Parameters):
         'm',
         (0.5, 20.0),
     )
-    beam_half_width: float = parameter(
-        0.025,
-        'half the width over which a ray shows the floor to be free; half of the smallest '
-        'obstacle',
-        'm',
-        (0.005, 0.2),
-    )
-    error_floor: float = parameter(0.02, 'largest error of a short reading', 'm', (0.0, 0.2))
-    error_growth: float = parameter(
-        0.12,
-        'growth of the error with the square of the distance; noise and offset of 10 mV each '
-        'make 0.08',
-        '1/m',
-        (0.0, 2.0),
-    )
+    beam_half_width: ClassVar[float] = 0.025
+    """Half the width over which a ray shows the floor to be free, m, assumed: half of the smallest
+    obstacle."""
+    error_floor: ClassVar[float] = 0.02
+    """Largest error of a short reading, m, assumed."""
+    error_growth: ClassVar[float] = 0.12
+    """Growth of the error with the square of the distance, 1/m, assumed; noise and offset of 10 mV
+    each make 0.08."""
     range: float = parameter(0.80, 'distance up to which a sensor sees', 'm', (0.1, 10.0))
 
 
@@ -268,7 +262,8 @@ class KeepOutParameters(Parameters):
         'm',
         (0.02, 2.0),
     )
-    ahead: float = parameter(0.05, 'l: distance of the point ahead', 'm', (0.005, 0.5))
+    ahead: ClassVar[float] = 0.05
+    """l: distance of the point ahead, m, assumed."""
     rate: float = parameter(
         2.0,
         'lambda: speed of the approach per distance; times the speed at most the deceleration',
@@ -278,16 +273,14 @@ class KeepOutParameters(Parameters):
     scan_rate: float = parameter(
         1.2, 'yaw rate at which the robot looks around', 'rad/s', (0.1, 5.0)
     )
-    scan_angle: float = parameter(
-        1.2,
-        'angle to both sides by which the robot looks around before floor that it has not seen',
-        'rad',
-        (0.1, 3.2),
-    )
+    scan_angle: ClassVar[float] = 1.2
+    """Angle to both sides by which the robot looks around before floor that it has not seen, rad,
+    assumed."""
     stuck_time: float = parameter(
         6.0, 'time without progress after which the robot is stuck', 's', (0.5, 600.0)
     )
-    stuck_distance: float = parameter(0.05, 'motion that is progress', 'm', (0.001, 1.0))
+    stuck_distance: ClassVar[float] = 0.05
+    """Motion that is progress, m, assumed."""
     world: str = parameter(
         '',
         'known walls and pillars: name of a bundled world, or path of a YAML file, in the frame '

@@ -6,6 +6,7 @@ from collections import deque
 from dataclasses import dataclass
 import enum
 from statistics import median
+from typing import ClassVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
 from t3mpc_ros.parameters.table import Parameters, parameter
@@ -41,12 +42,8 @@ class WatchdogParameters(Parameters):
     response_window: float = parameter(
         0.15, 'maximum delay between a command and its effect in the odometry', 's', (0.01, 2.0)
     )
-    response_timeout: float = parameter(
-        0.1,
-        'duration of a missing or restored response before the decision changes',
-        's',
-        (0.0, 5.0),
-    )
+    response_timeout: ClassVar[float] = 0.1
+    """Duration of a missing or restored response before the decision changes, s, assumed."""
 
 
 class Reason(enum.Enum):

@@ -5,7 +5,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 import math
-from typing import NamedTuple, Self
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -41,12 +41,12 @@ from t3mpc_ros.mpc.quadratic_program import (
     make_workspace,
     solve_quadratic_program,
 )
-from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 
 @dataclass(frozen=True)
 class PredictiveParameters(Parameters):
-    """Horizon, bounds, machine, learning and authority of the predictive controller."""
+    """Horizon, bounds, machine and learning of the predictive controller."""
 
     enabled: bool = parameter(
         True, 'whether v_p is applied; the machine learns in either case', dynamic=True
@@ -61,8 +61,11 @@ class PredictiveParameters(Parameters):
     control_horizon: int = parameter(
         5, 'control horizon n_c: later changes of v_p are zero', bounds=(1, 50)
     )
-    error_weight: float = parameter(1.0, 'mu of (60)', 's²/rad²', (0.0, 1e6), dynamic=True)
-    move_weight: float = parameter(0.029, 'pi of (60)', 's⁴/rad²', (1e-9, 1e6), dynamic=True)
+    error_weight: ClassVar[float] = 1.0
+    """mu of (60), s²/rad²: only its ratio to pi matters."""
+    move_weight: float = parameter(
+        0.029, 'pi of (60), with mu = 1 s²/rad²', 's⁴/rad²', (1e-9, 1e6), dynamic=True
+    )
     v_max: float = parameter(
         10.0, 'bound of v_p, v_p-bar of (80)', 'rad/s²', (0.0, 1e4), dynamic=True
     )
@@ -77,60 +80,61 @@ class PredictiveParameters(Parameters):
         (0.0, 1e3),
         dynamic=True,
     )
-    probe: float = parameter(1.0, 'step dv of the step response (48), (51)', 'rad/s²', (1e-3, 1e3))
-    delta_lags: int = parameter(4, 'past errors in the visible layer, tau of (35)', bounds=(1, 50))
+    probe: ClassVar[float] = 1.0
+    """Step dv of the step response (48), (51), rad/s², assumed."""
+    delta_lags: ClassVar[int] = 4
+    """Past errors in the visible layer, tau of (35), assumed."""
     move_lags: int = parameter(
         4, 'past v_p in the visible layer; they must cover the dead time', bounds=(1, 50)
     )
     hidden: int = parameter(
         12, 'number of hidden units, at least that of the lags', bounds=(2, 200)
     )
-    spread: float = parameter(1.0, 'length of each row of the initial X_v', bounds=(1e-3, 2.0))
-    delta_scale: float = parameter(3.0, 'error that is 1 inside the machine', 'rad/s', (1e-3, 1e3))
-    move_scale: float = parameter(20.0, 'v_p that is 1 inside the machine', 'rad/s²', (1e-3, 1e4))
+    spread: ClassVar[float] = 1.0
+    """Length of each row of the initial X_v, assumed."""
+    delta_scale: ClassVar[float] = 3.0
+    """Error that is 1 inside the machine, rad/s, assumed."""
+    move_scale: ClassVar[float] = 20.0
+    """v_p that is 1 inside the machine, rad/s², assumed."""
     learning: bool = parameter(True, 'whether the machine learns online', dynamic=True)
     algorithm: str = parameter(
         'recursive',
         'learning of the output layer: recursive least squares, or the normalised gradient (44)',
         choices=('recursive', 'gradient'),
     )
-    memory: float = parameter(20.0, 'time constant of forgetting', 's', (0.1, 1e4))
-    trust: float = parameter(
-        30.0, 'weight of the pretraining, as a duration of online learning', 's', (0.01, 1e5)
-    )
-    output_rate: float = parameter(0.05, 'gamma of (44), normalised', bounds=(0.0, 1.0))
-    contrast_rate: float = parameter(1e-4, 'gamma of (43) online', bounds=(0.0, 1.0))
+    memory: ClassVar[float] = 20.0
+    """Time constant of forgetting, s, assumed."""
+    trust: ClassVar[float] = 30.0
+    """Weight of the pretraining, as a duration of online learning, s, assumed."""
+    output_rate: ClassVar[float] = 0.05
+    """gamma of (44), normalised, assumed."""
+    contrast_rate: ClassVar[float] = 1e-4
+    """gamma of (43) online, assumed."""
     offset_gain: float = parameter(
         0.0032, 'gain of the offset e on the last prediction error', bounds=(0.0, 1.0)
     )
-    noise: float = parameter(
-        0.05, 'standard deviation of the noise of a sample of the error', 'rad/s', (1e-9, 10.0)
-    )
-    skill_memory: float = parameter(5.0, 'time constant of the skill', 's', (0.1, 1e4))
-    skill_low: float = parameter(
-        -1.0, 'skill up to which the authority of v_p is 0', bounds=(-100.0, 1.0)
-    )
-    skill_high: float = parameter(
-        0.0,
-        'skill from which the authority of v_p is 1; 0 is as good as persistence',
-        bounds=(-100.0, 1.0),
-    )
-    gain_low: float = parameter(
-        0.2,
-        'step response over the nominal one up to which the authority is 0',
-        bounds=(-1.0, 1.0),
-    )
-    gain_high: float = parameter(
-        0.5, 'step response over the nominal one from which it is 1', bounds=(-1.0, 1.0)
-    )
+    noise: ClassVar[float] = 0.05
+    """Standard deviation of the noise of a sample of the error, rad/s, assumed."""
+    skill_memory: ClassVar[float] = 5.0
+    """Time constant of the skill, s, assumed."""
+    skill_low: ClassVar[float] = -1.0
+    """Skill up to which the authority of v_p is 0, assumed."""
+    skill_high: ClassVar[float] = 0.0
+    """Skill from which the authority of v_p is 1, assumed; 0 is as good as persistence."""
+    gain_low: ClassVar[float] = 0.2
+    """Step response over the nominal one up to which the authority is 0, assumed."""
+    gain_high: ClassVar[float] = 0.5
+    """Step response over the nominal one from which it is 1, assumed."""
     seed: int = parameter(
         1, 'seed of the initial weights and of the simulated run', bounds=(0, None)
     )
-    nominal: NominalLoopParameters = group(NominalLoopParameters)
-    excitation: ExcitationParameters = group(ExcitationParameters)
+    nominal: ClassVar[NominalLoopParameters] = NominalLoopParameters()
+    """Loop of the pretraining; the controller replaces its feedback gain by its own."""
+    excitation: ClassVar[ExcitationParameters] = ExcitationParameters()
+    """Run of the pretraining."""
 
     def check_consistency(self) -> None:
-        """Raise :class:`ParameterError` for horizons, lags or limits in the wrong order."""
+        """Raise :class:`ParameterError` for horizons or lags in the wrong order."""
         for low, high in (
             ('control_horizon', 'horizon'),
             ('average', 'decimation'),
@@ -143,11 +147,6 @@ class PredictiveParameters(Parameters):
                 f'hidden must be at least delta_lags + move_lags = '
                 f'{self.delta_lags + self.move_lags}: got {self.hidden}'
             )
-        for low, high in (('skill_low', 'skill_high'), ('gain_low', 'gain_high')):
-            if not getattr(self, low) < getattr(self, high):
-                raise ParameterError(
-                    f'{low} must be below {high} = {getattr(self, high)}: got {getattr(self, low)}'
-                )
 
 
 def learning_constants(parameters: PredictiveParameters, span: float) -> LearningConstants:

@@ -22,7 +22,9 @@ def parse_assignments(table: type[Parameters], texts: Iterable[str]) -> dict[str
     kept; :meth:`Parameters.from_dict` rejects them. ParameterError: an argument is not
     ``NAME=VALUE``.
     """
+    constants = table.class_constants()
     text_parameters = {spec.name for spec in table.specs() if spec.kind is str and not spec.many}
+    text_parameters |= {name for name in constants if isinstance(constants[name], str)}
     values: dict[str, object] = {}
     for text in texts:
         name, sign, value = text.partition('=')

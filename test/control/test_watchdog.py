@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule
 import numpy as np
 import pytest
+from support.constants import split_constants
 from support.control_loops import GEOMETRY, PERIOD, ServoLoop
 from support.properties import PROPERTY, STATEFUL
 
@@ -143,7 +144,8 @@ NEAR = st.sampled_from((0.0, 1.0, 1.5, -3.0, 4.0))
 
 
 def response_monitor(**changes):
-    return ResponseMonitor(WatchdogParameters(**changes), 0.01)
+    table, values = split_constants(WatchdogParameters, changes)
+    return ResponseMonitor(table(**values), 0.01)
 
 
 @pytest.mark.parametrize('delay', [0, 1, 5, 12])

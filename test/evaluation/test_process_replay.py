@@ -7,6 +7,7 @@ import contextlib
 import functools
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -455,7 +456,7 @@ def test_a_model_is_found_by_its_checksum_or_missed_and_said(tmp_path):
 
 
 KEEP_OUT = {'pose.enabled': True, 'keep_out.enabled': True, 'keep_out.scan_rate': 5.0}
-PAPER = {'composition': 'paper', 'predictive.excitation.duration': 20.0}
+PAPER = {'composition': 'paper'}
 OF_WHEELS = {
     'rate': 50.0,
     'wheel_radius': 0.05,
@@ -551,6 +552,29 @@ def test_every_parameter_is_read_as_it_was_recorded(bag, tmp_path):
     for path in (writer.path, rest):
         (session,) = load_inputs(path).sessions
         assert session.parameters[session.start].to_dict() == parameters.to_dict()
+
+
+@pytest.mark.parametrize('published', [True, False], ids=['revisions', 'record'])
+def test_a_former_parameter_with_another_value_is_named(published, tmp_path):
+    """With its value of today, the bag of an older version is replayed."""
+    now, parameters = 1_700_000_000_000_000_000, StepperControllerParameters()
+
+    def path_of(name, memory):
+        former = {'predictive.memory': memory, 'body.fuzzy.kind': 'type3'}
+        older = SimpleNamespace(to_dict=lambda: parameters.to_dict() | former)
+        with ControllerBag(tmp_path / name, older) as writer:
+            if published:
+                writer.parameters(now, 0, older.to_dict())
+            writer.motion('reference', now, State(now, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, 0.0)))
+            writer.motion('odom', now, State(now, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, 0.0)))
+            writer.command(now + 1, BodyTwist(0.0, 0.0))
+            writer.row(now + 2, Journal().step(now))
+        return writer.path
+
+    (session,) = load_inputs(path_of('same', 20.0)).sessions
+    assert session.parameters[session.start].to_dict() == parameters.to_dict()
+    with pytest.raises(ReplayError, match=r'predictive.memory .* always 20.0: got 10.0'):
+        load_inputs(path_of('other', 10.0))
 
 
 def test_a_command_before_a_kill_is_not_that_of_the_next_process():

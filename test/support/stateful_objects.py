@@ -229,13 +229,13 @@ def drive_controller(controller, r):
 def make_controller(
     table=StepperControllerParameters, **values: object
 ) -> Callable[[], Controller]:
-    """Return what makes a controller; its predictor has little to learn."""
-    quick = {'predictive.excitation.duration': 20.0, 'predictive.dither': 0.5}
-    parameters = table.from_dict({**quick, **{k.replace('__', '.'): v for k, v in values.items()}})
+    """Return what makes a controller."""
+    given = {'predictive.dither': 0.5, **{k.replace('__', '.'): v for k, v in values.items()}}
+    parameters = table.from_dict(given)
     return lambda: Controller(parameters)
 
 
-QUICK = PredictiveParameters.from_dict({'excitation.duration': 20.0, 'dither': 0.5})
+DITHERED = PredictiveParameters(dither=0.5)
 
 
 def drive_predictive(controller, r):
@@ -254,9 +254,7 @@ def drive_predictive(controller, r):
 
 def other_weights(controller):
     """Return weights of another seed."""
-    return PredictiveController(
-        PredictiveParameters.from_dict({'excitation.duration': 20.0, 'seed': 5}), PERIOD, 15.0
-    ).get_weights()
+    return PredictiveController(PredictiveParameters(seed=5), PERIOD, 15.0).get_weights()
 
 
 WEIGHTS = other_weights(None)
@@ -719,7 +717,7 @@ FRESH = {
     ),
     # mpc
     PredictiveController: Stateful(
-        lambda: PredictiveController(QUICK, PERIOD, 15.0),
+        lambda: PredictiveController(DITHERED, PERIOD, 15.0),
         drive_predictive,
         {
             'reset': Operation(lambda c: c.reset(), kept=MACHINE, continued=SKILL),
@@ -1009,7 +1007,6 @@ CONFIGURED = {
                 'pose.enabled': True,
                 'keep_out.enabled': True,
                 'keep_out.map.half_size': 1.0,
-                'predictive.excitation.duration': 10.0,
                 'fuzzy.sets': 3,
             }
         ),
@@ -1024,9 +1021,7 @@ CONFIGURED = {
         settle=lambda controller: controller.law.predictive.pretrain(),
     ),
     Controller: Configured(
-        ControllerParameters.from_dict(
-            {'predictive.excitation.duration': 10.0, 'fuzzy.sets': 3, 'friction.gamma': 5.0}
-        ),
+        ControllerParameters.from_dict({'fuzzy.sets': 3, 'friction.gamma': 5.0}),
         Controller,
         configure,
         drive_controller,

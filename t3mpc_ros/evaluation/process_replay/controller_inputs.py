@@ -189,12 +189,7 @@ def recorded_parameters(
     absent = [row.name for row in ControllerParameters.specs() if row.name not in known]
     if absent:
         notes.append(f'not in the bag, taken at their defaults: {", ".join(absent)}')
-    try:
-        return ControllerParameters.from_dict(values)
-    except ParameterError as error:
-        raise ReplayError(
-            f'{recording.folder}: the recorded settings cannot be used: {error}'
-        ) from error
+    return _parameters(recording, values)
 
 
 def motions(column: TopicColumns) -> StateArray:
@@ -227,15 +222,22 @@ def _revisions(recording: BagReader, topic: str) -> list[Revision]:
         raise ReplayError(f'{topic}: {error}') from error
 
 
-def _parameters(values: Mapping[str, object]) -> ControllerParameters:
+def _parameters(recording: BagReader, values: Mapping[str, object]) -> ControllerParameters:
     """Return the controller's own part of the node parameters."""
     names = _names()
-    return ControllerParameters.from_dict({k: v for k, v in values.items() if k in names})
+    try:
+        return ControllerParameters.from_dict({k: v for k, v in values.items() if k in names})
+    except ParameterError as error:
+        raise ReplayError(
+            f'{recording.folder}: the recorded settings cannot be used: {error}'
+        ) from error
 
 
 @cache
 def _names() -> frozenset[str]:
-    return frozenset(row.name for row in ControllerParameters.specs())
+    """Return the names of parameters and former parameters of the controller."""
+    table = ControllerParameters
+    return frozenset((*(row.name for row in table.specs()), *table.class_constants()))
 
 
 @dataclass
@@ -350,7 +352,7 @@ class _Reader:
         begin = before[-1] if before else 0
         later = [i for i in starts if i > begin]
         own = self.revisions[begin : later[0] if later else len(self.revisions)]
-        found = {revision: _parameters(values) for _, revision, values in own}
+        found = {revision: _parameters(self.recording, values) for _, revision, values in own}
         changes = rows[rows[:, 1] == Event.CONFIGURE, 4]
         start = 0
         if rows[0, 0] > 0:  # in force before the first change in the bag
