@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 from t3mpc_ros.control.controller import SCALAR_NAMES
+from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.nodes.registry import INTERFACES
 from t3mpc_ros.nodes.sim_robot import SimRobotParameters
-from t3mpc_ros.robot.interface import RANGE_SENSORS
 
 pytestmark = pytest.mark.ros
 

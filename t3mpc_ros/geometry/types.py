@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Pose, twist, wheel speeds, and stamped states of the robot, in SI units."""
+"""Pose, twist, wheel speeds, stamped states and range sensors of the robot, in SI units."""
 
 from collections.abc import Iterator
 from itertools import repeat
@@ -15,6 +15,18 @@ Array = NDArray[np.float64]
 
 NANOSECONDS = 1_000_000_000
 """Nanoseconds per second: stamps are ``int`` nanoseconds, durations ``float`` seconds."""
+
+RANGE_SENSORS = (
+    'front_left',
+    'front_right',
+    'left_front',
+    'left_back',
+    'rear_left',
+    'rear_right',
+    'right_front',
+    'right_back',
+)
+"""The eight range sensors, two on each side, in the order of every list of them."""
 
 
 class Pose(NamedTuple):

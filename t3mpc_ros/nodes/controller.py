@@ -27,7 +27,7 @@ from t3mpc_ros.control.controller import (
 )
 from t3mpc_ros.control.watchdog import InputMonitor, Reason
 from t3mpc_ros.geometry.arena import Obstacles
-from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist
+from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import (
     ADAPT_PERIOD,
@@ -39,7 +39,6 @@ from t3mpc_ros.nodes.base_node import (
 )
 from t3mpc_ros.nodes.conversions import FrameParameters, age_problem, message_age_ns
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
-from t3mpc_ros.robot.interface import RANGE_SENSORS
 
 CONFIGURATION_ERRORS = (ModelError,)
 """Errors of :func:`make` other than :class:`ParameterError`."""

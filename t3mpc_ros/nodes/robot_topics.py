@@ -12,12 +12,12 @@ from rclpy.node import Node
 from sensor_msgs.msg import BatteryState, Imu, JointState, Range
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import Pose
+from t3mpc_ros.geometry.types import RANGE_SENSORS, Pose
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.conversions import UNKNOWN_VARIANCE, FrameParameters
 from t3mpc_ros.parameters.table import parameter
 from t3mpc_ros.robot.description import FrameNames, fixed_frames
-from t3mpc_ros.robot.interface import RANGE_SENSORS, BatteryReading, ImuSample, RobotState
+from t3mpc_ros.robot.interface import BatteryReading, ImuSample, RobotState
 from t3mpc_ros.robot.sensor_conversions import (
     GRAVITY,
     BatteryParameters,

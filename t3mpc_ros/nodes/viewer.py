@@ -36,13 +36,12 @@ from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
-from t3mpc_ros.geometry.types import NANOSECONDS, State
+from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, State
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.entry_point import init_ros
 from t3mpc_ros.nodes.qos import PolledCallbackGroup, take_waiting
 from t3mpc_ros.nodes.remote_parameters import RemoteParameters, plain_value
 from t3mpc_ros.robot.description import sensor_mounts
-from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 from t3mpc_ros.simulation.world import world_outline
 

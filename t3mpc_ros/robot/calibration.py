@@ -20,8 +20,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.parameters.table import Parameters, parameter
-from t3mpc_ros.robot.interface import RANGE_SENSORS
 
 Array = npt.NDArray[np.float64]
 

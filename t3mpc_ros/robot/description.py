@@ -14,8 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.robot.interface import RANGE_SENSORS
+from t3mpc_ros.geometry.types import RANGE_SENSORS, Array
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 
 _TYRE_WIDTH = 0.02  # m

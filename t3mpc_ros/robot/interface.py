@@ -16,18 +16,6 @@ from t3mpc_ros.geometry.types import BodyTwist, State, WheelSpeeds
 
 ZERO_WHEEL_SPEEDS = WheelSpeeds(0.0, 0.0)
 
-RANGE_SENSORS = (
-    'front_left',
-    'front_right',
-    'left_front',
-    'left_back',
-    'rear_left',
-    'rear_right',
-    'right_front',
-    'right_back',
-)
-"""The eight range sensors, two on each side, in the order of every list of them."""
-
 
 class RobotCommand(NamedTuple):
     """Commanded wheel speeds and the time of the command."""

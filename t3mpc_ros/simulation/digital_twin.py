@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
-from t3mpc_ros.geometry.types import Pose, State, WheelSpeeds, check_pose
+from t3mpc_ros.geometry.types import RANGE_SENSORS, Pose, State, WheelSpeeds, check_pose
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 from t3mpc_ros.robot import interface
 from t3mpc_ros.robot.command_limiter import CommandLimiter
@@ -45,7 +45,7 @@ from t3mpc_ros.simulation.transport_delay import TransportDelay
 from t3mpc_ros.simulation.world import cast_rays, clearance, grip_at, load_world
 
 BROWN_OUT_REASON = 'brown-out: the board restarts'
-_NO_OBSTACLE = (math.inf,) * len(interface.RANGE_SENSORS)
+_NO_OBSTACLE = (math.inf,) * len(RANGE_SENSORS)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from support.avr_bench import on_avr
 from support.emulator_bench import RobotBench
 from support.missing_tools import AVR, needing
 
-from t3mpc_ros.robot.interface import RANGE_SENSORS
+from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 
 pytestmark = needing(*AVR)

@@ -17,9 +17,9 @@ from std_srvs.srv import SetBool
 from support.radio_bench import FakeDongle, FakeRobot
 from support.ros_graph import CommandSource, diagnostic, diagnostic_level, reason, twist
 
+from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.radio.protocol.authentication import KeyFileError
-from t3mpc_ros.robot.interface import RANGE_SENSORS
 
 pytestmark = pytest.mark.ros
 

@@ -28,13 +28,12 @@ from support.ros_graph import (
     twist,
 )
 
-from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.base_node import OK, WARN
 from t3mpc_ros.nodes.recorder.node import RecorderNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.robot.interface import RANGE_SENSORS
 
 pytestmark = pytest.mark.ros
 

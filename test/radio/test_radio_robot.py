@@ -7,10 +7,11 @@ import random
 import pytest
 from support.radio_bench import COMMAND_TIME, LinkBench
 
+from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.radio_robot import RadioRobot, RadioRobotParameters
-from t3mpc_ros.robot.interface import RANGE_SENSORS, RobotCommand, RobotInterface
+from t3mpc_ros.robot.interface import RobotCommand, RobotInterface
 
 KEY = bytes(range(16))
 

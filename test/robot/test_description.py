@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.robot.description import FrameNames, fixed_frames, sensor_mounts, urdf
-from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 
 NAMES = FrameNames('base', 'gyro', 'sharp_', 'right_hinge_joint', 'left_hinge_joint')

@@ -9,9 +9,9 @@ import re
 import numpy as np
 import pytest
 
-from t3mpc_ros.geometry.types import Pose, WheelSpeeds
+from t3mpc_ros.geometry.types import RANGE_SENSORS, Pose, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.robot.interface import RANGE_SENSORS, RobotCommand, RobotInterface
+from t3mpc_ros.robot.interface import RobotCommand, RobotInterface
 from t3mpc_ros.robot.sensor_conversions import ImuParameters
 from t3mpc_ros.simulation.digital_twin import (
     BROWN_OUT_REASON,

@@ -7,9 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.description import sensor_mounts
-from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.robot.sensor_conversions import (
     BEYOND,
     FAULT,

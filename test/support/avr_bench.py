@@ -22,11 +22,11 @@ from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import Fault, FaultInjection
 from t3mpc_ros.emulator.link.serial_line import SerialLine
 from t3mpc_ros.emulator.plant import Plant, Registers
+from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.radio.protocol.codec import decode_downlink
 from t3mpc_ros.radio.protocol.frames import Command
 from t3mpc_ros.radio.protocol.framing import crc16
 from t3mpc_ros.robot.description import sensor_mounts
-from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.simulation.sensors.range_sensor import output_voltage
 from t3mpc_ros.simulation.world import cast_rays, load_world
 

@@ -28,11 +28,10 @@ from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
 from t3mpc_ros.evaluation.plotting import COLOURS, STYLE, draw_world
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH, ReportError, ReportOptions
-from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.geometry.types import RANGE_SENSORS, Array
 from t3mpc_ros.parameters.command_line import parsed_value
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.description import ray_ends, sensor_mounts
-from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 from t3mpc_ros.simulation.world import World, recorded_world
 

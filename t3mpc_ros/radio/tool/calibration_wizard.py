@@ -16,6 +16,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool import procedure, robot_records, robot_settings
 from t3mpc_ros.radio.tool.manoeuvre import HandTurn, Manoeuvre, Rest
@@ -35,7 +36,7 @@ from t3mpc_ros.robot.calibration import (
     StraightRun,
     VoltageReading,
 )
-from t3mpc_ros.robot.interface import RANGE_SENSORS, WheelAngles
+from t3mpc_ros.robot.interface import WheelAngles
 
 Value = TypeVar('Value')
 

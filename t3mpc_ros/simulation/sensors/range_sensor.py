@@ -21,8 +21,8 @@ from typing import ClassVar
 
 import numpy as np
 
+from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.parameters.table import parameter
-from t3mpc_ros.robot.interface import RANGE_SENSORS
 from t3mpc_ros.robot.sensor_conversions import (
     RangeSensorParameters,
     decode_range,
