@@ -33,7 +33,7 @@ from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.chaos.system import hyperchaotic_system
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+from t3mpc_ros.parameters.table import Parameters, group, parameter
 
 SPACING = 0.01
 """Distance of the points of the path, m."""
@@ -58,6 +58,7 @@ class PortraitParameters(Parameters):
     )
     switching: SwitchingParameters = group(
         SwitchingParameters,
+        fixed=('kind', 'modes', 'times'),
         kind='random',
         modes=(2, 3, 3, 4, 4, 2, 3, 2, 4, 3, 2, 4),
         blend=2.0,
@@ -74,13 +75,8 @@ class PortraitParameters(Parameters):
     )
 
     def check_consistency(self) -> None:
-        """Raise :class:`ParameterError` for an impossible arena or a portrait of one state."""
+        """Raise :class:`ParameterError` for an impossible arena."""
         Arena(self.arena)
-        for first, second in self.switching.pairs:
-            if first == second:
-                raise ParameterError(
-                    f'portrait.switching.modes must pair different states: got {first} with itself'
-                )
 
 
 class PortraitPath:

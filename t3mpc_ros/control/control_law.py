@@ -121,8 +121,12 @@ class Nt3fsMpcParameters(Parameters):
     law: LawParameters = group(LawParameters)
     jump_transition: JumpTransitionParameters = group(JumpTransitionParameters)
     speed_filter: SpeedFilterParameters = group(SpeedFilterParameters)
-    fuzzy: FuzzyParameters = group(FuzzyParameters)
-    adaptation: AdaptationParameters = group(AdaptationParameters)
+    fuzzy: FuzzyParameters = group(
+        FuzzyParameters, fixed=('centre_exponent', 'footprint_of_uncertainty')
+    )
+    adaptation: AdaptationParameters = group(
+        AdaptationParameters, fixed=('sigma_modification', 'step_limit')
+    )
     friction: FrictionTermParameters = group(FrictionTermParameters)
     predictive: PredictiveParameters = group(PredictiveParameters)
 

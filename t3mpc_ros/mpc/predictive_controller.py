@@ -84,12 +84,10 @@ class PredictiveParameters(Parameters):
     """Step dv of the step response (48), (51), rad/s², assumed."""
     delta_lags: ClassVar[int] = 4
     """Past errors in the visible layer, tau of (35), assumed."""
-    move_lags: int = parameter(
-        4, 'past v_p in the visible layer; they must cover the dead time', bounds=(1, 50)
-    )
-    hidden: int = parameter(
-        12, 'number of hidden units, at least that of the lags', bounds=(2, 200)
-    )
+    move_lags: ClassVar[int] = 4
+    """Past v_p in the visible layer, assumed; they must cover the dead time."""
+    hidden: ClassVar[int] = 12
+    """Number of hidden units, assumed; at least that of the lags."""
     spread: ClassVar[float] = 1.0
     """Length of each row of the initial X_v, assumed."""
     delta_scale: ClassVar[float] = 3.0
@@ -134,7 +132,7 @@ class PredictiveParameters(Parameters):
     """Run of the pretraining."""
 
     def check_consistency(self) -> None:
-        """Raise :class:`ParameterError` for horizons or lags in the wrong order."""
+        """Raise :class:`ParameterError` for horizons or periods in the wrong order."""
         for low, high in (
             ('control_horizon', 'horizon'),
             ('average', 'decimation'),
@@ -142,11 +140,6 @@ class PredictiveParameters(Parameters):
             small, large = getattr(self, low), getattr(self, high)
             if small > large:
                 raise ParameterError(f'{low} must be at most {high} = {large}: got {small}')
-        if self.hidden < self.delta_lags + self.move_lags:
-            raise ParameterError(
-                f'hidden must be at least delta_lags + move_lags = '
-                f'{self.delta_lags + self.move_lags}: got {self.hidden}'
-            )
 
 
 def learning_constants(parameters: PredictiveParameters, span: float) -> LearningConstants:
@@ -449,8 +442,9 @@ class PredictiveController:
         """Predictive period T, s."""
         if parameters.move_lags * span < parameters.nominal.dead_time + span:
             raise ParameterError(
-                f'move_lags must cover the dead time of {parameters.nominal.dead_time} s and one '
-                f'period of {span:g} s: got {parameters.move_lags}'
+                f'{parameters.move_lags} periods of v_p must cover the dead time of '
+                f'{parameters.nominal.dead_time} s and one period: got {span:g} s for a period, '
+                'which predictive.decimation sets'
             )
         self.signals = Signals(*np.zeros((len(Signals._fields), outputs)))
         """The signals, for kernels."""

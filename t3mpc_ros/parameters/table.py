@@ -176,12 +176,21 @@ def with_default(table: type['Parameters'], attribute: str, default: Value) -> A
     return field(default=default, metadata=inherited.metadata)
 
 
-def group(table: type['Parameters'], *, inline: bool = False, **defaults: Value) -> Any:
+def group(
+    table: type['Parameters'],
+    *,
+    inline: bool = False,
+    fixed: tuple[str, ...] = (),
+    **defaults: Value,
+) -> Any:
     """Return a dataclass field that holds another table, with some of its defaults replaced.
 
-    Its parameters are named ``<attribute>.<name>``; with ``inline`` they have no prefix.
+    Its parameters are named ``<attribute>.<name>``; with ``inline`` they have no prefix. Those
+    named ``fixed`` are constants in this group: it has them with their defaults alone.
     """
-    return field(default_factory=partial(table, **defaults), metadata={'inline': inline})
+    return field(
+        default_factory=partial(table, **defaults), metadata={'inline': inline, 'fixed': fixed}
+    )
 
 
 @dataclass(frozen=True)
@@ -312,7 +321,9 @@ def _constants(table: type[Parameters]) -> Iterator[tuple[str, Value]]:
             nested = isinstance(value, Parameters)
             held = (value.to_dict() | value.class_constants()).items() if nested else [('', value)]
         elif isinstance(hint, type) and issubclass(hint, Parameters):
-            held = _constants(hint)
+            defaults = groups[name].default_factory().to_dict()  # type: ignore[operator]
+            fixed = ((key, defaults[key]) for key in groups[name].metadata['fixed'])
+            held = (*fixed, *_constants(hint))
         else:
             continue
         inline = name in groups and groups[name].metadata.get('inline')
@@ -346,6 +357,8 @@ def _declared(table: type[Parameters]) -> Iterator[_Entry]:
             prefix = '' if item.metadata.get('inline') else f'{item.name}.'
             defaults = item.default_factory()  # type: ignore[operator]
             for entry in _entries(hint):
+                if entry.spec.name in item.metadata['fixed']:
+                    continue
                 spec = replace(
                     entry.spec,
                     name=prefix + entry.spec.name,

@@ -10,7 +10,6 @@ from t3mpc_ros.chaos.pose_reference import PathReferenceParameters, PortraitSour
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import ORIGIN
-from t3mpc_ros.parameters.table import ParameterError
 
 pytestmark = pytest.mark.compiled
 
@@ -79,8 +78,3 @@ def test_a_robot_that_is_held_up_does_not_change_the_path():
             pose, _ = source.advance()
         places.append((pose.x, pose.y))
     assert places[1] == pytest.approx(places[0], abs=0.01)
-
-
-def test_a_portrait_needs_two_states():
-    with pytest.raises(ParameterError, match='different states'):
-        PortraitParameters.from_dict({'switching.modes': (2, 3, 4, 4)})

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Models fitted to bags and to simulated runs: the run is rebuilt exactly."""
 
-from dataclasses import replace
 import math
 import re
 
@@ -560,7 +559,6 @@ def test_a_model_of_another_format_is_refused_by_name(trained, tmp_path, monkeyp
 
 
 def test_a_model_for_other_shapes_is_refused_when_it_is_loaded(trained):
-    parameters = ControllerParameters()
-    other = replace(parameters, predictive=replace(parameters.predictive, hidden=16))
+    other = ControllerParameters.from_dict({'fuzzy.sets': 5})
     with pytest.raises(ValueError, match='must have shape'):
         Controller(other).law.set_weights(trained.learnt)

@@ -155,6 +155,7 @@ class Cart(Parameters):
     sizes: ClassVar[tuple[float, ...]] = (1.0, 2.0)
     wheel: Wheel = group(Wheel)
     front: Wheel = group(Wheel, inline=True)
+    rear: Wheel = group(Wheel, fixed=('radius',), radius=0.3)
     spare: ClassVar[Wheel] = Wheel(radius=0.2)
 
 
@@ -163,15 +164,21 @@ def test_a_former_parameter_is_accepted_with_its_value_alone():
         'sizes': (1.0, 2.0),
         'wheel.width': 0.02,
         'width': 0.02,
+        'rear.radius': 0.3,
+        'rear.width': 0.02,
         'spare.radius': 0.2,
         'spare.width': 0.02,
     }
     assert Cart.class_constants() == constants
     assert [spec.name for spec in Cart.specs()] == ['wheel.radius', 'radius']
     assert Cart.from_dict(constants | {'sizes': [1.0, 2.0]}) == Cart()
+    assert Cart().rear.radius == 0.3
+    assert 'rear.radius' not in Cart().to_dict()
     with pytest.raises(ParameterError) as caught:
         Cart.from_dict({'wheel.width': 0.03})
     assert str(caught.value) == 'wheel.width is no longer a parameter, it is always 0.02: got 0.03'
+    with pytest.raises(ParameterError, match=r'rear.radius is no longer .* always 0.3: got 0.1'):
+        Cart.from_dict({'rear.radius': 0.1})
 
 
 def test_direct_construction_is_validated():
