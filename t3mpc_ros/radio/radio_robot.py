@@ -43,7 +43,8 @@ class RadioRobotParameters(Parameters):
 
     geometry: WheelGeometry = group(WheelGeometry, inline=True)
     limiter: CommandLimiterParameters = group(CommandLimiterParameters, inline=True)
-    odometry: GyroOdometryParameters = group(GyroOdometryParameters)
+    # The delay is that of the low-pass filter that the board sets.
+    odometry: GyroOdometryParameters = group(GyroOdometryParameters, fixed=('gyro_delay',))
     link: LinkParameters = group(LinkParameters)
     calibration: CalibrationParameters = group(CalibrationParameters)
     slip_stop: float = parameter(

@@ -34,8 +34,6 @@ from t3mpc_ros.robot.wheel_odometry import (
     wrap_to_pi,
 )
 
-DATA_SHEET = 'data sheet PS-MPU-6000A r3.4'
-
 STANDSTILL_RATE = 1e-4
 """rad/s, far below the gyro noise: the response of its filter to a turn has decayed."""
 MIN_SAMPLES = 20
@@ -51,14 +49,9 @@ class GyroOdometryParameters(WheelOdometryParameters):
         'use the gyro; without it the odometry uses the steps alone and detects no slip',
         dynamic=True,
     )
-    gyro_noise: float = parameter(
-        8.7e-5,
-        'noise density of the gyro: a turn integrated over a time t has the variance noise² t',
-        'rad/s/√Hz',
-        (1e-7, 1.0),
-        dynamic=True,
-        source=f'{DATA_SHEET}: 0.005 deg/s/√Hz',
-    )
+    gyro_noise: ClassVar[float] = 8.7e-5
+    """Noise density of the gyro, rad/s/√Hz: 0.005 deg/s/√Hz (data sheet PS-MPU-6000A r3.4). A
+    turn integrated over a time t has the variance noise² t."""
     gyro_scale: float = parameter(
         1.0,
         'true rate / rate by the data sheet, from t3mpc robot calibrate',
@@ -95,13 +88,9 @@ class GyroOdometryParameters(WheelOdometryParameters):
         (0.01, 10.0),
         dynamic=True,
     )
-    slip_time: float = parameter(
-        0.15,
-        'time the difference must last; a third of it is the smoothing time constant',
-        's',
-        (0.0, 10.0),
-        dynamic=True,
-    )
+    slip_time: ClassVar[float] = 0.15
+    """Time that the difference must last, s, assumed; a third of it is the time constant of the
+    smoothing."""
     slip_inflation: ClassVar[float] = 3000.0
     """Factor on the variance of the wheel travel while gyro and steps disagree, assumed."""
     standstill_time: ClassVar[float] = 1.0

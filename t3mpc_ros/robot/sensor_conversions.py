@@ -103,7 +103,6 @@ CODE_STEP = 0.005
 """m per step of the range code in a radio frame."""
 NOT_MEASURED, TOO_NEAR, BEYOND, FAULT = 0, 1, 254, 255
 """Range codes that are not a distance."""
-RANGE_DATA_SHEET = 'Sharp E4-A00201EN'
 
 
 @dataclass(frozen=True)
@@ -112,23 +111,12 @@ class RangeSensorParameters(Parameters):
 
     type: ClassVar[str] = 'GP2Y0A21YK0F'
     """The sensors whose voltages the board converts."""
-    minimum: float = parameter(
-        0.10,
-        'smallest distance; the board reports anything nearer as too near',
-        'm',
-        (0.07, 0.5),
-        source=f'{RANGE_DATA_SHEET}, distance measuring range',
-    )
-    maximum: float = parameter(
-        0.80,
-        'largest distance; the board reports anything farther as no object',
-        'm',
-        (0.2, 1.2),
-        source=f'{RANGE_DATA_SHEET}, distance measuring range',
-    )
-    field_of_view: float = parameter(
-        0.1, 'opening angle of the beam, which the data sheet does not give', 'rad', (0.0, 1.0)
-    )
+    minimum: ClassVar[float] = 0.10
+    """Smallest distance, m (Sharp E4-A00201EN); the board reports anything nearer as too near."""
+    maximum: ClassVar[float] = 0.80
+    """Largest distance, m (same data sheet); the board reports anything farther as no object."""
+    field_of_view: ClassVar[float] = 0.1
+    """Opening angle of the beam, rad, assumed: the data sheet does not give it."""
 
     half_length: float = parameter(
         0.10, 'distance from the axle to the front and rear sensor faces', 'm', (0.01, 1.0)
@@ -141,11 +129,7 @@ class RangeSensorParameters(Parameters):
     )
 
     def check_consistency(self) -> None:
-        """Raise ParameterError when the range is empty or a sensor is mounted beyond the body."""
-        if self.maximum <= self.minimum:
-            raise ParameterError(
-                f'maximum must be more than minimum ({self.minimum:g} m): got {self.maximum:g}'
-            )
+        """Raise ParameterError when a sensor is mounted beyond the body."""
         side = min(self.half_length, self.half_width)
         if self.offset > side:
             raise ParameterError(
