@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import BagReader
 from t3mpc_ros.bag.schema import DataError
-from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.geometry.types import NANOSECONDS, Array
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 

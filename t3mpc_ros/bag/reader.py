@@ -12,7 +12,6 @@ import re
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader
@@ -32,9 +31,7 @@ from t3mpc_ros.bag.mcap_file import (
 from t3mpc_ros.bag.metadata import METADATA_FILE_NAME, TopicInformation
 from t3mpc_ros.bag.qos import UNLIMITED, QosProfile
 from t3mpc_ros.bag.schema import BagError, DataError, UnknownTopicError
-from t3mpc_ros.geometry.types import NANOSECONDS
-
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import NANOSECONDS, Array
 
 SQLITE_SUFFIX, ROS1_SUFFIX = '.db3', '.bag'
 _RUN_BAG = 'bag'

@@ -7,17 +7,15 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
 from t3mpc_ros.evaluation.topic_roles import bag_display_name
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import world_outline
 from t3mpc_ros.view.live_data import STEP, LiveData
-
-Array = NDArray[np.float64]
 
 
 def recorded_run(bag: Path) -> LiveData:

@@ -32,12 +32,10 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
-
-Array = NDArray[np.float64]
 
 MAX_DEAD_TIME = 0.15
 """Largest dead time of the grid, s."""

@@ -18,13 +18,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report.continuity import parts
 from t3mpc_ros.evaluation.bag_report.run_data import Series
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
-
-Array = NDArray[np.float64]
 
 LONGEST_DEAD_TIME, LONGEST_LAG = 1.0, 3.0
 """Largest dead time and lag that are searched, s."""

@@ -89,15 +89,15 @@ class ResultTable(Sequence[Row]):
         ValueError
             They do not have the same seeds.
         """
-        sides = [
+        one, other = (
             {row[pair]: row[metric] for row in self.where(**wanted) if metric in row}
             for wanted in (first, second)
-        ]
-        if not all(sides):
+        )
+        if not (one and other):
             return None
-        if sides[0].keys() != sides[1].keys():
+        if one.keys() != other.keys():
             raise ValueError(f'{metric} must be paired by {pair}: got {first} and {second}')
-        return paired(*([side[key] for key in sides[0]] for side in sides))
+        return paired(list(one.values()), [other[key] for key in one])
 
 
 def measured_run(job: Job) -> Numbers:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import Nt3fsMpcParameters
 from t3mpc_ros.control.controller import SwitchingTracker
@@ -20,10 +19,8 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     future_jump,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.scripting.references import numbers
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
 from t3mpc_ros.scripting.table_files import write_csv
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

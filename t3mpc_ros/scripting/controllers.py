@@ -15,7 +15,6 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
@@ -28,10 +27,10 @@ from t3mpc_ros.evaluation.loop import Method
 from t3mpc_ros.evaluation.method import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.methods import methods_for, require_libraries
 from t3mpc_ros.evaluation.scenario import Scenario
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters, find_names
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
 
-Array = NDArray[np.float64]
 Settings = Mapping[str, Any]
 FILE_SEPARATOR = '.py:'
 MODEL = 'model'

@@ -9,7 +9,6 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
@@ -23,9 +22,8 @@ from t3mpc_ros.evaluation.plotting import (
     png_of,
 )
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.scripting.script_error import ScriptError
-
-Array = NDArray[np.float64]
 
 
 def drawn(draw: Callable[[], Any], path: str | os.PathLike[str] | None) -> Any:

@@ -8,17 +8,16 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from t3mpc_ros.control.actuation import LimitParameters
-from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.geometry.types import Array, WheelSpeeds
 from t3mpc_ros.mpc.pretraining import matrix_exponential
 from t3mpc_ros.scripting.controllers import described
 from t3mpc_ros.scripting.references import numbers
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
-Array = NDArray[np.float64]
 DRIVES = ('velocity', 'torque')
 LONGEST_DEAD_TIME = 0.4
 """Upper bound of a dead time, s."""

@@ -17,9 +17,9 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import JUMP
 from t3mpc_ros.evaluation.record import RATE
 from t3mpc_ros.evaluation.scenario import SampledReference
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheel_speeds
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
 
-Array = NDArray[np.float64]
 TIME = 'time'
 WHEELS, TWIST = ('right', 'left'), ('linear', 'angular')
 """Columns of a CSV file beside the time: wheel speeds (rad/s), or m/s and rad/s of the body."""

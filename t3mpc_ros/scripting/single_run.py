@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import rms
@@ -19,6 +18,7 @@ from t3mpc_ros.evaluation.record import Record, counted_rows
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.scripting.controllers import as_controller
 from t3mpc_ros.scripting.plants import NoiseLaw
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
@@ -26,7 +26,6 @@ from t3mpc_ros.scripting.setting import Setting
 from t3mpc_ros.scripting.table_files import write_csv, write_parquet
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
-Array = NDArray[np.float64]
 SIDES = ('right', 'left')
 
 

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
 from t3mpc_ros.evaluation.topic_roles import COMMAND
-
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import Array
 
 WINDOW = 0.2
 """Least smoothing width (s) before differentiation."""

@@ -7,16 +7,14 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import compensator
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
 from t3mpc_ros.evaluation.baselines.feedback_control import FeedbackBaseline, FeedbackParameters
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
 from t3mpc_ros.fuzzy.inference import FuzzyParameters
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

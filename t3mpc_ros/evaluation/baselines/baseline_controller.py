@@ -19,9 +19,9 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.control.jump_transition import MotorLimit
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
@@ -32,8 +32,6 @@ from t3mpc_ros.simulation.plant.dynamics import (
     wheel_inertia,
 )
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,6 @@ import math
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
@@ -43,9 +42,8 @@ from t3mpc_ros.evaluation.baselines.predictive_baseline import (
     torque_units,
     wheel_model,
 )
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter, with_default
-
-Array = NDArray[np.float64]
 
 SETTLED = 1e-4
 """Where a response ends: this share of its last value is left to come."""

@@ -14,7 +14,6 @@ What feedback and learning are worth is the difference to this method.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
@@ -23,10 +22,8 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     Observation,
     future_jump,
 )
-from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.parameters.table import Parameters, group, parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,6 @@ import math
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
@@ -37,9 +36,8 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     Observation,
     WheelLoads,
 )
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters, group, parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
@@ -41,9 +40,8 @@ from t3mpc_ros.evaluation.baselines.predictive_baseline import (
     response_matrix,
     wheel_model,
 )
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters, parameter
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,6 @@ import importlib
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
@@ -37,11 +36,10 @@ from t3mpc_ros.evaluation.baselines.predictive_baseline import (
     ObserverParameters,
     PredictiveParameters,
 )
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.plant.dynamics import BodyParameters, coriolis_factor, wheel_inertia
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

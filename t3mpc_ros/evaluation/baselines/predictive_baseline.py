@@ -13,17 +13,15 @@ from typing import NamedTuple
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,
     Observation,
 )
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
-
-Array = NDArray[np.float64]
 
 TOLERANCES = {'primal_tol': 1e-12, 'dual_tol': 1e-12, 'eps_prox': 0.0}
 """The answer is exact to rounding for the bounds that are found active."""

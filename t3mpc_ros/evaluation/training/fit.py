@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.control_law import Nt3fsMpcParameters
 from t3mpc_ros.evaluation.training.training_data import TrainingData, TrainingError
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.mpc.boltzmann_machine import BoltzmannMachine, LayerSizes, make_machine
 from t3mpc_ros.mpc.predictive_controller import PredictiveParameters, learning_constants
 from t3mpc_ros.mpc.predictor import Predictor
 from t3mpc_ros.mpc.pretraining import SampleTiming, nominal_step_response
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from pathlib import Path
 import warnings
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
@@ -32,10 +31,9 @@ from t3mpc_ros.evaluation.training.training_data import (
     check_compatible,
     load_training_data,
 )
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.mpc.predictive_controller import PredictiveController
 from t3mpc_ros.parameters.provenance import provenance
-
-Array = NDArray[np.float64]
 
 FITTED, NOMINAL, RANDOM = 'fitted', 'nominal loop', 'random'
 """Compared predictors: fitted to the other folds, nominal only, and with random output

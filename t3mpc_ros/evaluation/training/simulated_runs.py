@@ -5,7 +5,6 @@
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.cases import NOMINAL
@@ -27,9 +26,8 @@ from t3mpc_ros.evaluation.scenario import (
 from t3mpc_ros.evaluation.training.fit import periods, skills, stretches
 from t3mpc_ros.evaluation.training.recorded_runs import MIDDLE, NEXT_STEP, pair
 from t3mpc_ros.evaluation.training.training_data import TrainingData
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.mpc.predictive_controller import PredictiveController
-
-Array = NDArray[np.float64]
 
 EARLY = 10.0
 """Length of the initial phase, in which a model matters most, s."""

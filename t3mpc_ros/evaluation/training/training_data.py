@@ -19,9 +19,7 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
 )
 from t3mpc_ros.evaluation.process_replay.controller_replay import make_controllers, replay_steps
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
-
-Array = NDArray[np.float64]
+from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist
 
 AGREES = 1e-4
 """Largest difference of a replayed command from the recorded one, m/s and rad/s."""

@@ -21,13 +21,12 @@ from typing import Any, NamedTuple
 
 import cma
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.result_file import ResultFile
 from t3mpc_ros.evaluation.tuning.search_space import SearchSpace, Values
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters
 
-Array = NDArray[np.float64]
 Objective = Callable[[Sequence[Values]], Sequence[float]]
 """Returns one value for each of several points, which may be evaluated at the same time."""
 

@@ -13,7 +13,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control.controller import WHEELS, ControllerParameters, StepperControllerParameters
@@ -35,10 +34,9 @@ from t3mpc_ros.evaluation.drive_response import (
 )
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, ReportOptions
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.yaml_files import parameter_file
 from t3mpc_ros.robot.calibration import Estimate
-
-Array = NDArray[np.float64]
 
 MIN_DURATION = 10.0
 """Least time without a gap, s."""

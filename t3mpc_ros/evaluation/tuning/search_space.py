@@ -15,12 +15,11 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, Parameters, nearest_hint, short_name
 
-Array = NDArray[np.float64]
 Values = dict[str, int | float]
 """Tuned parameters by their dotted names."""
 
