@@ -123,7 +123,7 @@ def _compare_and_write(options: argparse.Namespace, plan: 'ComparisonPlan') -> i
     from t3mpc_ros.evaluation.comparison import compare
     from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.reporting import strict_json
-    from t3mpc_ros.scripting.executors import workers_for
+    from t3mpc_ros.scripting.run_executors import workers_for
 
     for path in (options.json, options.html):
         if path:  # a folder that cannot be made is an error before the runs, not after them

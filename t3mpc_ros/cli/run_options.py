@@ -108,7 +108,7 @@ def executor_of(options: argparse.Namespace) -> Iterator[Any]:
     if not options.scheduler:
         yield options.workers
         return
-    from t3mpc_ros.scripting.executors import cluster
+    from t3mpc_ros.scripting.run_executors import cluster
 
     with cluster(options.scheduler) as executor:
         yield executor

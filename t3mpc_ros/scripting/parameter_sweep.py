@@ -33,8 +33,8 @@ from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.scripting.comparison_runs import checked_seeds
 from t3mpc_ros.scripting.controllers import as_controllers
-from t3mpc_ros.scripting.executors import workers_for
 from t3mpc_ros.scripting.plants import NoiseLaw
+from t3mpc_ros.scripting.run_executors import workers_for
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence, sentence
 from t3mpc_ros.scripting.setting import Setting
 from t3mpc_ros.scripting.table_files import columns_of, write_csv, write_parquet

@@ -72,7 +72,7 @@ def compared(same):
     return {
         f'{module}controller_inputs.load_inputs': None,
         f'{module}controller_replay.replay_controller': None,
-        f'{module}comparison.compare': outcome,
+        f'{module}replay_comparison.compare': outcome,
     }
 
 

@@ -96,7 +96,7 @@ def context(value):
     return lambda **_: nullcontext(value)
 
 
-SHARED = {'scripting.executors.cluster': context(5)}
+SHARED = {'scripting.run_executors.cluster': context(5)}
 CSV = 'time,right,left\n' + ''.join(f'{0.01 * k:.2f},1.0,2.0\n' for k in range(300))
 FILES = {
     'speeds.csv': CSV,

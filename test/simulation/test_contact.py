@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.simulation.plant.contact import BumperParameters, contact_force
+from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters, contact_force
 from t3mpc_ros.simulation.world import clearance, join_walls, load_world
 
 NO_SEGMENTS, NO_CIRCLES = np.zeros((0, 4)), np.zeros((0, 3))

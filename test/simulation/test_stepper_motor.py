@@ -14,7 +14,7 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
-from t3mpc_ros.simulation.plant.contact import BumperParameters
+from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
 from t3mpc_ros.simulation.plant.disturbances import (
     Disturbance,
     DisturbanceParameters,

@@ -10,7 +10,7 @@ import shutil
 import numpy as np
 import pytest
 
-from t3mpc_ros.simulation.plant.contact import BumperParameters
+from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
 from t3mpc_ros.simulation.world import (
     JOIN_TOLERANCE,
     MAX_CIRCLES,

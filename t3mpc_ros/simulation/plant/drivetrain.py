@@ -28,7 +28,7 @@ from t3mpc_ros.geometry.types import Array, Pose, WheelSpeeds, wrap_angle
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.robot.command_limiter import ramp_towards
-from t3mpc_ros.simulation.plant.contact import Bumper, BumperParameters, contact_force
+from t3mpc_ros.simulation.plant.bumper_contact import Bumper, BumperParameters, contact_force
 from t3mpc_ros.simulation.plant.disturbances import (
     Disturbance,
     DisturbanceSignals,
