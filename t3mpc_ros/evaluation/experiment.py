@@ -188,11 +188,11 @@ def digest(*parts: Any) -> str:
     return hashlib.sha256(repr(content).encode()).hexdigest()[:16]
 
 
-# Sources that only display, record or select, or whose values are part of a method. All others
-# make stored runs invalid: a needless repetition is better than an outdated result.
+# Sources that only display, record or select. All others, and the tuned values, make stored runs
+# invalid: a needless repetition is better than an outdated result.
 _IRRELEVANT_SOURCES = (
     'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'evaluation/bag_report/',
-    'evaluation/process_replay/', 'evaluation/tuning/', 'evaluation/comparison',
+    'evaluation/process_replay/', 'evaluation/comparison',
     'evaluation/claim.py', 'evaluation/fault_page.py', 'evaluation/plotting.py',
     'evaluation/reporting.py', 'evaluation/result_file.py', 'evaluation/paper/',
     'evaluation/patrol/patrol_page.py', 'evaluation/patrol/patrol_figures.py',

@@ -123,9 +123,9 @@ Numbers = Mapping[str, float]
 
 
 def measure(scenario: Scenario, record: Record) -> Numbers:
-    """Return the metrics of a run."""
-    if not record.finite:
-        return {metric.name: math.nan for metric in (SETTLED, OVERALL, VARIATION)}
+    """Return the metrics of a run; NaN for each that it would have, where the run diverged."""
     run = MeasuredRun(scenario, record)
-    found = {metric.name: metric.value(run) for metric in METRICS}
-    return {name: value for name, value in found.items() if value is not None}
+    with np.errstate(invalid='ignore', over='ignore'):
+        found = {metric.name: metric.value(run) for metric in METRICS}
+    known = {name: value for name, value in found.items() if value is not None}
+    return known if record.finite else dict.fromkeys(known, math.nan)

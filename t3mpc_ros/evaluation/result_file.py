@@ -134,5 +134,5 @@ class ResultFile:
         if others:
             text += f'; {others} of other versions, settings or extents are left alone'
         if self.unreadable:
-            text += f'; {self.unreadable} torn lines are skipped'
+            text += f'; {self.unreadable} lines that are torn or of an older version are skipped'
         return text

@@ -34,7 +34,7 @@ class FuzzyParameters(Parameters):
     kind: str = parameter(
         'type3',
         'type of the sets; type1 and interval_type2 are single slices at level one, the latter '
-        'with footprint_of_uncertainty',
+        'with a footprint of uncertainty',
         choices=('type3', 'interval_type2', 'type1'),
         source='paper: NT3FS, compared with the others',
     )

@@ -12,6 +12,7 @@ import pytest
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.cli.run_options import ROBOTS, seed_range
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
+from t3mpc_ros.evaluation import comparison
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
 from t3mpc_ros.evaluation.baselines.feedback_control import (
@@ -29,8 +30,10 @@ from t3mpc_ros.evaluation.comparison_page import (
     BETTER,
     INCONCLUSIVE,
     WORSE,
+    case_table,
     difference,
     judged_metrics,
+    record,
     verdict,
 )
 from t3mpc_ros.evaluation.drivers import MethodDriver, NodeDriver
@@ -339,6 +342,45 @@ def test_differences_are_paired_with_their_verdict():
     assert judged([math.nan, 2.0, 3.0], [1.0, 2.0, 3.0]) == WORSE
     assert judged([0.5], [1.0]) == INCONCLUSIVE
     assert found([1.0], [1.0], FEED_FORWARD) is None
+
+
+class NotFinite(ProportionalIntegral):
+    """A controller whose accelerations are no numbers."""
+
+    def step(self, observation):
+        return np.full(2, math.nan)
+
+
+class Diverging:
+    """A method that diverges with one seed only."""
+
+    name = 'diverging'
+    parameters = ProportionalIntegralParameters()
+
+    def driver(self, scenario):
+        kind = NotFinite if scenario.seed == 2 else ProportionalIntegral
+        return MethodDriver(lambda model: kind(self.parameters, model), scenario)
+
+
+@pytest.mark.parametrize('first', [1, 2])
+def test_a_seed_that_diverges_makes_every_mean_diverge(first, monkeypatch):
+    """Its missing metrics once ended the JSON, or left means over the other seeds beside it."""
+    known = {**methods_for('twin'), 'diverging': Diverging()}
+    monkeypatch.setattr(comparison, 'methods_for', lambda robot: known)
+    seeds = (first, 3 - first)
+    plan = ComparisonPlan('twin', (NOMINAL,), (FEED_FORWARD, 'diverging'), seeds, 4.0)
+    results = compare(plan)
+    for metric in (SETTLED, DRIFT, YAW_RATE, STOPPED):
+        assert len(results.values(metric.name, controller='diverging')) == 2
+    row = next(
+        line
+        for line in case_table(plan, results, NOMINAL).markdown().splitlines()
+        if line.startswith('| diverging')
+    )
+    assert '±' not in row
+    assert WORSE in row
+    stored = record(plan, results)['cases'][NOMINAL]['methods']['diverging']
+    assert stored['difference_from_feed_forward'][YAW_RATE.name]['verdict'] == WORSE
 
 
 def test_the_body_decides_where_it_is_not_known():
