@@ -139,21 +139,19 @@ def run_experiment(
     RuntimeError
         Another process writes to the file.
     """
-    jobs = [run.job for run in runs]
     if store is None:
+        jobs = [run.job for run in runs]
         found = map_jobs(task, jobs, workers, progress=report is not None)
         return ResultTable(
             [{**run.fields, **numbers} for run, numbers in zip(runs, found, strict=True)]
         )
-    by_key = {run.key: run for run in runs}
+    by_key = {run.key: run.job for run in runs}
     if len(by_key) < len(runs) or '' in by_key:
         raise ValueError('runs must have different keys')
     file = ResultFile(store, fresh=fresh)
     for left in reversed(range(RESTARTS + 1)):
         try:
-            kept = file.complete(
-                {run.key: run.job for run in runs}, lambda jobs: _made(task, jobs, workers), report
-            )
+            kept = file.complete(by_key, lambda jobs: _made(task, jobs, workers), report)
             break
         except JobError as error:
             if not (left and isinstance(error.__cause__, BrokenExecutor)):

@@ -21,12 +21,11 @@ from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.claim import Claim, Finding
 from t3mpc_ros.evaluation.confidence_intervals import mean, paired
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.methods import EXACT_MODEL, FULL
 from t3mpc_ros.evaluation.open_loop_estimation import KINDS, EstimationResult
 from t3mpc_ros.evaluation.paper.study import (
     DRIVES,
     DURATION,
-    EXACT,
     PAPER_NOISE,
     PARTS,
     STAGES,
@@ -350,7 +349,7 @@ def baselines(
     """Return a number of each seed of every baseline, or of those of a kind."""
     found: dict[str, list[float]] = {}
     for row in runs.where(drive=drive, noise=noise, case=case, baseline=True):
-        if exact in (None, EXACT in row['controller']) and preview in (None, row['preview']):
+        if exact in (None, EXACT_MODEL in row['controller']) and preview in (None, row['preview']):
             found.setdefault(row['controller'], []).append(row[column])
     return {name: np.array(values) for name, values in found.items()}
 

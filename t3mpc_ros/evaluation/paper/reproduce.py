@@ -8,14 +8,13 @@ from pathlib import Path
 
 from t3mpc_ros.evaluation import open_loop_estimation
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, run_experiment, source_digest
-from t3mpc_ros.evaluation.methods import methods
+from t3mpc_ros.evaluation.methods import EXACT_MODEL, methods
 from t3mpc_ros.evaluation.paper.claims import all_claims, markdown
 from t3mpc_ros.evaluation.paper.figure_runs import simulate_figure_runs
 from t3mpc_ros.evaluation.paper.paper_page import EXHIBITS, ExhibitData, counted, page
 from t3mpc_ros.evaluation.paper.results import Results, all_tables, write_csv
 from t3mpc_ros.evaluation.paper.study import (
     DRIVES,
-    EXACT,
     Extent,
     chosen_extent,
     measured_run,
@@ -70,8 +69,8 @@ def reproduce(options: PaperOptions, report: Report | None = None) -> str:
     claims = (*all_claims(results.runs, estimated), *showcase.claims())
     tables = all_tables(results, estimated)
     material = ExhibitData(results, showcase, claims, tables)
-    compared = [row for row in results.means if EXACT not in row['controller']]
-    exact = [row for row in results.means if EXACT in row['controller']]
+    compared = [row for row in results.means if EXACT_MODEL not in row['controller']]
+    exact = [row for row in results.means if EXACT_MODEL in row['controller']]
     content = {
         'version': VERSION,
         'parameters': {

@@ -11,8 +11,8 @@ import numpy as np
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
 from t3mpc_ros.evaluation.experiment import Run, digest
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.methods import EXACT_MODEL, ComparedMethod, methods
 from t3mpc_ros.evaluation.methods import STAGES as METHOD_STAGES
+from t3mpc_ros.evaluation.methods import ComparedMethod, methods
 from t3mpc_ros.evaluation.metrics import START
 from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, KINDS, PLANT_OF, Scenario
@@ -25,9 +25,6 @@ NOISES = (0.0, 0.01, 0.04, 0.1)
 """Noise variance of the measured wheel speeds, (rad/s)²: the paper's range."""
 PAPER_NOISE = 0.04
 """The paper's own noise variance, (rad/s)²."""
-EXACT = EXACT_MODEL
-"""In the name of a baseline whose model has the nominal inertia; the models of all other baselines
-with preview believe in one that is 30 % off."""
 DEAD_TIME = 'dead time'
 """The case that only the velocity drive has."""
 STAGES = tuple(METHOD_STAGES)
