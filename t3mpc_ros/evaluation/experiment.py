@@ -230,7 +230,7 @@ def content_of(value: Any) -> object:
         return [content_of(item) for item in value]
     if is_dataclass(value) and not isinstance(value, type):
         items = [content_of(getattr(value, item.name)) for item in fields(value)]
-        return type(value).__name__, items
+        return _source(type(value)), items
     return _code(value)
 
 

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one table of results and the runner that fills it."""
 
+from importlib import import_module
+
 import pytest
 
 from t3mpc_ros.evaluation.experiment import ResultTable, Run, content_of, run_experiment
@@ -54,3 +56,16 @@ def test_rows_are_those_of_the_runs_in_their_order(stored, tmp_path):
 def test_content_tells_equal_numbers_of_other_kinds_apart():
     values = [1, 1.0, True, '1', [1], (1, 2), {'1': 1}, None, Named, doubled]
     assert len({repr(content_of(value)) for value in values}) == len(values)
+
+
+def test_an_object_is_known_by_the_source_of_its_class(tmp_path, monkeypatch):
+    """A sweep kept the rows of a dataclass controller whose method had been edited."""
+    monkeypatch.syspath_prepend(tmp_path)
+    text = '@dataclass\nclass Law:\n    gain: float\n    def step(self, _):\n        return {}\n'
+    found = []
+    for name, code in (('law_a', 'self.gain'), ('law_b', '-self.gain'), ('law_c', 'self.gain')):
+        source = 'from dataclasses import dataclass\n' + text.format(code)
+        (tmp_path / f'{name}.py').write_text(source)
+        found.append(content_of(import_module(name).Law(1.0)))
+    assert found[0] == found[2]
+    assert found[0] != found[1]
