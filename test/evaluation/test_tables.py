@@ -11,7 +11,7 @@ import pytest
 from support.records import record_of
 
 from t3mpc_ros.evaluation.bag_report import report_page
-from t3mpc_ros.evaluation.bag_report.response import MotionSummary, Roughness
+from t3mpc_ros.evaluation.bag_report.response import MotionSummary
 from t3mpc_ros.evaluation.bag_report.run_data import BY_WHEEL
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
@@ -179,14 +179,3 @@ def test_tables_of_motion(monkeypatch):
         'standstill at': '1.0 to 2.5, 7.0 to 7.5 s',
         'of that, motion was commanded': '0.8 s',
     }
-    rough = {('command', 'right'): 1, ('motion', 'right'): 5}
-    monkeypatch.setattr(
-        report_page,
-        'roughness',
-        lambda series, name, held: Roughness(
-            *(rough.get((series, name), 8.0) + 0.1 * k for k in range(4))
-        ),
-    )
-    rows = report_page.roughness_table(run).rows
-    assert rows[0] == ['command', 'right wheel', '1.00', '1.10', '1.20', '1.30', 'rad/s², rad/s³']
-    assert rows[2][:6] == ['robot', 'right wheel', '5.00', '5.10', '5.20', '5.30']

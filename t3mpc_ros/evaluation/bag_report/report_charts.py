@@ -24,7 +24,6 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     path_of,
     tracking_error,
 )
-from t3mpc_ros.evaluation.bag_report.response import smooth
 from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.charts import Chart, Curve, Line, Plane, thinned
 from t3mpc_ros.evaluation.drive_response import ResponseFit, busiest, predicted
@@ -205,22 +204,6 @@ def _fitted(fit: ResponseFit, command: Series, name: str, start: float, end: flo
     value = predicted(fit, command, name, time) if time.size > 1 else np.zeros(time.size)
     near = time >= start
     return Line('fit', 'c4', time[near], value[near], (4, 2))
-
-
-def acceleration(run: Run, metrics: ReportMetrics) -> Shown:
-    """Yield acceleration and jerk of the measured speeds."""
-    motion = run.motions.get(run.measured)
-    if not is_long(motion):
-        return
-    for name, title, _, unit in run.channels:
-        time, _, rate, bend = smooth(motion, name)
-        if not np.isfinite(rate).any():
-            continue
-        for values, what, power in ((rate, 'acceleration', '²'), (bend, 'jerk', '³')):
-            few, some = thinned(time, values, 4000)
-            lines = [Line(what, COLOURS[run.measured], few, some)]
-            seen = f'The {what} runs {_extent(values, unit + power)}.'
-            yield Chart(f'{title.capitalize()}: {what}', f'{unit}{power}', lines, seen)
 
 
 def terms(run: Run, metrics: ReportMetrics) -> Shown:
@@ -509,11 +492,6 @@ SECTIONS = (
         'the disturbance is larger than assumed, or just after a jump of the reference. '
         'Skill is 1 for perfect prediction and 0 for no better than persistence.',
         certificate,
-    ),
-    Section(
-        'Acceleration and jerk over time',
-        'Derivatives of the measured speeds, of parabolas fitted to short windows.',
-        acceleration,
     ),
     Section(
         'The radio link',

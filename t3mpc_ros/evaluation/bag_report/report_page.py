@@ -3,14 +3,13 @@
 """HTML report of a recorded run."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from datetime import UTC, datetime
 import math
 from pathlib import Path
 
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.bag.recording.message_losses import LOSS_CAUSES, LOSSES
-from t3mpc_ros.evaluation.bag_report.continuity import gaps, parts
+from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     SETTLING,
@@ -26,11 +25,7 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 )
 from t3mpc_ros.evaluation.bag_report.patrol_section import patrol_blocks
 from t3mpc_ros.evaluation.bag_report.report_charts import LABELS, SECTIONS
-from t3mpc_ros.evaluation.bag_report.response import (
-    motion_summary,
-    responses,
-    roughness,
-)
+from t3mpc_ros.evaluation.bag_report.response import motion_summary
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, load_run
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
@@ -64,8 +59,6 @@ FIRST = ('tracking', 'error', 'path')
 """Sections before the events and tables."""
 MAX_EVENTS = 300
 """Events that a page lists."""
-MAX_SEGMENTS = 12
-"""Parts of a torn recording that are listed."""
 
 
 def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> Table:
@@ -82,22 +75,6 @@ def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> Table:
         gain = format_number(fit.gain) if fit.clear else EMPTY_CELL
         rows.append([each.title, *numbers, gain, format_number(100.0 * max(fit.explained, 0.0))])
     return Table('', head, rows)
-
-
-def roughness_table(run: Run) -> Table:
-    """Return acceleration and jerk of command and motion."""
-    head = ['of', 'speed', 'acceleration RMS', '99 % below', 'jerk RMS', '99 % below', 'unit']
-    rows = []
-    for words, name in (('command', COMMAND), ('robot', run.measured)):
-        series = run.motions.get(name)
-        if series is None:
-            continue
-        for each in run.channels:
-            found = roughness(series, each.name, held=name == COMMAND)
-            numbers = found.acceleration, found.acceleration_99, found.jerk, found.jerk_99
-            unit = f'{each.unit}², {each.unit}³'
-            rows.append([words, each.title, *map(format_number, numbers), unit])
-    return Table('', head, rows, text=2)
 
 
 def motion_table(run: Run) -> Table:
@@ -172,7 +149,6 @@ def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
     blocks += [Heading('Events'), _timeline(run, figures)]
     if run.ours or figures.measured:
         blocks += [Heading('Tracking error'), *_errors(run)]
-    blocks += _segments(run)
     blocks += _response(run, figures)
     blocks += _sections(run, figures, first=False)
     blocks += patrol_blocks(run)
@@ -317,41 +293,6 @@ def _events(run: Run, figures: ReportMetrics) -> list[tuple[float, str, str]]:
     return sorted(found)[:MAX_EVENTS]
 
 
-def _segments(run: Run) -> list[Block]:
-    """Return the numbers of each part of a recording that has gaps, fitted by itself."""
-    names = [name for name in (run.measured, COMMAND, REFERENCE) if name in run.motions]
-    if not run.measured or not any(gaps(run.motions[name].time) for name in names):
-        return []
-    spans = parts(*(run.motions[name].time for name in names))
-    head = ['from / s', 'to / s', 'samples']
-    for channel in run.channels:
-        head += [
-            f'settled RMSE {channel.short} / {channel.unit}',
-            f'responds {channel.short} / ms',
-        ]
-    rows = []
-    for low, high in spans[:MAX_SEGMENTS]:
-        part = replace(
-            run,
-            motions={
-                name: motion.between(low, high)
-                for name, motion in run.motions.items()
-                if motion.between(low, high).time.size
-            },
-        )
-        errors, fits = errors_of(part, run.measured), responses(part)
-        row = [f'{low:.1f}', f'{high:.1f}', str(len(run.motions[run.measured].between(low, high)))]
-        for channel in run.channels:
-            fit = fits.get(channel.name)
-            late = f'{1e3 * (fit.dead_time + fit.lag):.0f}' if fit and fit.clear else EMPTY_CELL
-            row += [format_number(errors[channel.name][1].rmse), late]
-        rows.append(row)
-    blocks: list[Block] = [Heading('Parts between gaps'), Table('', head, rows, text=0)]
-    if len(spans) > MAX_SEGMENTS:
-        blocks.append(Paragraph(f'The first {MAX_SEGMENTS} of {len(spans)} parts.', 'quiet'))
-    return blocks
-
-
 def _errors(run: Run) -> list[Block]:
     rows = []
     for source in (TRUTH, ODOMETRY):
@@ -400,7 +341,6 @@ def _extents(run: Run) -> str:
 def _response(run: Run, figures: ReportMetrics) -> Iterator[Block]:
     """Yield the tables of response, motion and radio link, with their titles."""
     tables = [
-        ('Acceleration and jerk', roughness_table(run)),
         ('Path and stops', motion_table(run)),
         ('Radio link', link_table(figures.links)),
     ]

@@ -1,83 +1,49 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of a robot: its responses to commands, accelerations, stops."""
+"""Motion of a robot: its responses to commands, path length, stops."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-import math
 
 import numpy as np
 
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
-from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
 from t3mpc_ros.evaluation.topic_roles import COMMAND
 from t3mpc_ros.geometry.types import Array
 
 WINDOW = 0.2
-"""Least smoothing width (s) before differentiation."""
+"""Least smoothing width, s."""
 STILL = {'linear': 0.01, 'angular': 0.05}
 """Smoothed speeds (m/s, rad/s) below which the robot is at standstill."""
 PAUSE = 0.5
 """Least duration of a stop, s."""
 
 
-def smooth(series: Series, name: str, held: bool = False) -> tuple[Array, Array, Array, Array]:
-    """Return evenly spaced times with the speed and its first and second derivatives.
+def smooth(series: Series, name: str) -> tuple[Array, Array]:
+    """Return evenly spaced times with the smoothed speed.
 
     Parabolas are fitted to windows of :data:`WINDOW` or of eight samples, whichever is longer.
-    Empty arrays when the series is too short; NaN across gaps longer than a window. ``held``:
-    each value holds until the next, as a command does.
+    Empty arrays when the series is too short; NaN across gaps longer than a window.
     """
     nothing = np.empty(0)
     if len(series) < 3:
-        return nothing, nothing, nothing, nothing
+        return nothing, nothing
     width = max(WINDOW, 8.0 * float(np.median(np.diff(series.time))))
     half = 10
     step = 0.5 * width / half
     count = int((series.time[-1] - series.time[0]) / step) + 1
     if not 2 * half + 1 <= count <= 20_000_000:
-        return nothing, nothing, nothing, nothing
+        return nothing, nothing
     grid = series.time[0] + step * np.arange(count)
-    if held:
-        value = series[name][np.searchsorted(series.time, grid, 'right') - 1]
-    else:
-        value = np.interp(grid, series.time, series[name])
+    value = np.interp(grid, series.time, series[name])
     offsets = step * np.arange(-half, half + 1.0)
     design = np.stack([np.ones_like(offsets), offsets, 0.5 * offsets**2], axis=1)
-    weights = np.linalg.pinv(design)
-    fitted = [np.correlate(value, row, 'valid') for row in weights]
+    fitted = np.correlate(value, np.linalg.pinv(design)[0], 'valid')
     time = grid[half : count - half]
     following = np.clip(np.searchsorted(series.time, time, 'right'), 1, len(series) - 1)
     torn = np.diff(series.time)[following - 1] > width
-    if not held:
-        fitted = [np.where(torn, np.nan, each) for each in fitted]
-    return time, fitted[0], fitted[1], fitted[2]
-
-
-@dataclass(frozen=True)
-class Roughness:
-    """Rates of change of a speed, per s and per s² of its unit; NaN where unknown."""
-
-    acceleration: float
-    """Root mean square of acceleration and jerk."""
-    acceleration_99: float
-    """99th percentile of acceleration and jerk."""
-    jerk: float
-    jerk_99: float
-
-
-def roughness(series: Series, name: str, held: bool = False) -> Roughness:
-    """Return the rates of change of one quantity after smoothing, see :func:`smooth`."""
-    _, _, rate, bend = smooth(series, name, held)
-    numbers = []
-    for each in (rate, bend):
-        size = np.abs(each[np.isfinite(each)])
-        if size.size:
-            numbers += [rms(size), float(np.percentile(size, 99.0))]
-        else:
-            numbers += [math.nan, math.nan]
-    return Roughness(*numbers)
+    return time, np.where(torn, np.nan, fitted)
 
 
 @dataclass(frozen=True)
@@ -103,8 +69,8 @@ def motion_summary(run: Run) -> MotionSummary | None:
     motion = run.motions.get(run.measured)
     if motion is None:
         return None
-    time, linear, _, _ = smooth(motion, 'linear')
-    _, angular, _, _ = smooth(motion, 'angular')
+    time, linear = smooth(motion, 'linear')
+    _, angular = smooth(motion, 'angular')
     known = np.isfinite(linear)
     if not known.any():
         return None
