@@ -463,8 +463,6 @@ def test_standstill_before_and_after_does_not_change_statistics(rows, tmp_path, 
         assert astuple(other.settled) == pytest.approx(astuple(one.settled), rel=1e-6)
     text = page_of(longer).text()
     assert 'from the first command other than zero, at 3.2 s, to the last, at 9.2 s' in text
-    assert '5.0 s counted' in text
-    assert 'in 5.0 s, settled ' in longer.summary()
 
 
 def test_leaving_for_a_switch_that_is_known_is_no_settled_error(rows, tmp_path):
@@ -525,8 +523,8 @@ def test_where_nothing_is_left_to_count_no_number_is_given(rows, tmp_path, why):
             assert (part.count, part.seconds) == (0, 0.0)
             assert np.isnan(part.rmse)
     text = page_of(figures).text()
-    assert 'RMSE right/left while driven not measured, settled not measured;' in figures.summary()
-    assert text.count('not measured') == 2 + 3 * 8 + 4  # tiles, cells of eight rows, four charts
+    assert 'RMSE' not in figures.summary()
+    assert text.count('not measured') == 3 * 8 + 4  # cells of eight rows, four charts
     assert ('Every command was zero' in text) == idle
 
 
@@ -730,7 +728,7 @@ def test_any_topic_may_be_empty(rows, tmp_path, gone):
     if gone == TRUTH:
         assert figures.measured == ODOMETRY
     if gone == REFERENCE:
-        assert 'RMSE right/left while driven not measured' in figures.summary()
+        assert 'RMSE' not in figures.summary()
 
 
 @pytest.mark.parametrize('count', few_of([2, 1, 3]))

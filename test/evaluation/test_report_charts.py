@@ -300,17 +300,17 @@ def test_every_metric_has_its_quantity():
 
 
 def statistics(rmse, seconds):
-    return ErrorStatistics(rmse, 0.0, 0.0, 9, seconds)
+    return ErrorStatistics(rmse, 0.0, rmse + 0.4, 9, seconds)
 
 
 FIT = ResponseFit(0.031, 0.012, 0.98, 0.994, 0.001)
 SOUND = Verdict((), stopped=0.3)
 COUNTS = dict(zip(COUNTED, (1000.0, 13.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0), strict=True))
 GIVEN = ReportMetrics(
-    report=Path('r.html'), duration=61.26, messages=9, switches=4, measured=TRUTH,
+    report=Path('r.html'), duration=61.26, messages=12345, switches=4, measured=TRUTH,
     wheels={
         'right': ChannelMetrics(statistics(0.11, 58.0), statistics(0.13, 50.0), 21.0, 1.0),
-        'left': ChannelMetrics(statistics(0.12, 58.0), statistics(0.14, 50.0), 22.0, 1.0),
+        'left': ChannelMetrics(statistics(0.12, 58.0), statistics(0.14, 50.0), 22.0, 2.0),
     },
     channels=BY_WHEEL, responses={'right': FIT, 'left': replace(FIT, lag=0.022)},
     links={'radio': LinkMetrics(COUNTS, 0.987, 0.0065, 0.012, 0.4)},
@@ -320,16 +320,25 @@ GIVEN = ReportMetrics(
 
 def test_the_summary_in_full():
     assert GIVEN.summary() == (
-        '61.3 s, 4 switches; RMSE right/left while driven 0.110/0.120 rad/s in 58.0 s, settled '
-        '0.130/0.140 rad/s in 50.0 s; command varies by 21.0/22.0 rad/s²; responds after right '
-        '43 ms, left 53 ms; radio: 98.7 % of cycles answered; loop 3.10 ms, 99 % below 4.20 ms; '
-        '2.34 % of odom missing: r.html'
+        'RMSE while driven, right / left 0.110 / 0.120 rad/s; RMSE settled, right / left '
+        '0.130 / 0.140 rad/s; largest error, right / left 0.510 / 0.520 rad/s; variation of the '
+        'command per second, right / left 21.0 / 22.0 rad/s; variation of the reference per '
+        'second, right / left 1.00 / 2.00 rad/s; command to motion, right / left 43.0 / 53.0 ms; '
+        'duration 61.3 s; messages 12345; switches 4; stopped between the first and the last '
+        'command to move 0.300 s; odometry to command, median 3.10 ms; odometry to command, 99 % '
+        'below 4.20 ms; odometry missing 2.34 %; cycles answered, radio 98.7 %; round trip, '
+        'median, radio 6.50 ms; round trip, worst 99 %, radio 12.0 ms; oldest measurement, radio '
+        '0.400 s: r.html'
     )
     body = {'linear': GIVEN.wheels['right'], 'angular': GIVEN.wheels['left']}
     unknown = replace(GIVEN, channels=BY_BODY, wheels=body, responses={}, links={}, missing={})
-    assert 'RMSE forward/turning while driven 0.110 m/s/0.120 rad/s' in unknown.summary()
-    assert 'varies by 21.0 m/s²/22.0 rad/s²; loop' in unknown.summary()
-    assert '– % of odom missing' in unknown.summary()
+    assert unknown.summary().startswith(
+        'RMSE while driven, forward / turning 0.110 m/s / 0.120 rad/s; '
+    )
+    for left_out in ('command to motion', 'missing', 'radio'):
+        assert left_out not in unknown.summary()
+    half = replace(GIVEN, responses={'left': FIT, 'right': replace(FIT, explained=0.2)})
+    assert ('– / 43.0 ms', 'command to motion, right / left') in half.numbers()
 
 
 def test_tables_of_response_and_link_in_full():

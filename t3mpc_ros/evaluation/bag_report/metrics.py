@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics of a recorded run: tracking errors, chatter, latencies."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 from pathlib import Path
@@ -239,33 +239,76 @@ class ReportMetrics:
     verdict: Verdict
     """Whether the numbers measure the controller."""
 
-    def summary(self) -> str:
-        """Return the metrics in one line."""
-        right, left = (self.wheels[each.name] for each in self.channels)
-        overall, calm = (
-            f'{format_channels(one.rmse, other.rmse, self.channels)} in {one.seconds:.1f} s'
-            if one.count
-            else UNMEASURED
-            for one, other in ((right.overall, left.overall), (right.settled, left.settled))
-        )
-        chatter = format_channels(right.chatter, left.chatter, self.channels, '²')
-        titles = '/'.join(each.short for each in self.channels)
-        delays = [
-            f'{each.short} {1e3 * (fit.dead_time + fit.lag):.0f} ms'
-            for each in self.channels
-            if (fit := self.responses.get(each.name)) and fit.clear
+    def delay(self, channel: str) -> float:
+        """Return the time from command to motion of a channel, s; NaN if it is not clear."""
+        fit = self.responses.get(channel)
+        return fit.dead_time + fit.lag if fit and fit.clear else math.nan
+
+    def numbers(self) -> list[tuple[str, str]]:
+        """Return the main numbers that are known, each with its unit, and what it is."""
+        found = []
+        names = ' / '.join(each.short for each in self.channels)
+        for title, unit, value in CHANNEL_NUMBERS:
+            pair = [value(self, each.name) for each in self.channels]
+            if any(map(math.isfinite, pair)):
+                units = [unit.format(each.unit) for each in self.channels]
+                found.append((_both(pair, units), f'{title}, {names}'))
+        rows = [(title, unit, value(self)) for title, unit, value in RUN_NUMBERS]
+        rows += [
+            (f'{title}, {name}', unit, value(link))
+            for name, link in self.links.items()
+            for title, unit, value in LINK_NUMBERS
         ]
-        response = f'responds after {", ".join(delays)}; ' if delays else ''
-        for name, link in self.links.items():
-            response += f'{name}: {format_number(100.0 * link.answered)} % of cycles answered; '
-        missing = format_number(100.0 * self.missing.get(ODOMETRY, math.nan))
-        return (
-            f'{self.duration:.1f} s, {self.switches} switches; RMSE {titles} while driven '
-            f'{overall}, settled {calm}; command varies by {chatter}; {response}'
-            f'loop {format_number(1e3 * self.latency)} ms, 99 % below '
-            f'{format_number(1e3 * self.latency_99)} ms; {missing} % of odom missing: '
-            f'{self.report}'
-        )
+        found += [
+            (f'{format_number(number)} {unit}'.rstrip(), title)
+            for title, unit, number in rows
+            if math.isfinite(number)
+        ]
+        return found
+
+    def summary(self) -> str:
+        """Return the main numbers in one line."""
+        numbers = '; '.join(f'{title} {number}' for number, title in self.numbers())
+        return f'{numbers}: {self.report}'
+
+
+CHANNEL_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics, str], float]], ...] = (
+    ('RMSE while driven', '{}', lambda run, name: run.wheels[name].overall.rmse),
+    ('RMSE settled', '{}', lambda run, name: run.wheels[name].settled.rmse),
+    ('largest error', '{}', lambda run, name: run.wheels[name].overall.largest),
+    ('variation of the command per second', '{}', lambda run, name: run.wheels[name].chatter),
+    ('variation of the reference per second', '{}', lambda run, name: run.wheels[name].demand),
+    ('command to motion', 'ms', lambda run, name: 1e3 * run.delay(name)),
+)
+"""Main numbers of each channel: what it is, unit with ``{}`` for that of the channel, value."""
+RUN_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics], float]], ...] = (
+    ('duration', 's', lambda run: run.duration),
+    ('messages', '', lambda run: run.messages),
+    ('switches', '', lambda run: run.switches),
+    (
+        'stopped between the first and the last command to move', 's',
+        lambda run: run.verdict.stopped if run.verdict.judged else math.nan,
+    ),
+    ('odometry to command, median', 'ms', lambda run: 1e3 * run.latency),
+    ('odometry to command, 99 % below', 'ms', lambda run: 1e3 * run.latency_99),
+    ('odometry missing', '%', lambda run: 100.0 * run.missing.get(ODOMETRY, math.nan)),
+)  # fmt: skip
+"""Main numbers of a run."""
+LINK_NUMBERS: tuple[tuple[str, str, Callable[[LinkMetrics], float]], ...] = (
+    ('cycles answered', '%', lambda link: 100.0 * link.answered),
+    ('round trip, median', 'ms', lambda link: 1e3 * link.round_trip),
+    ('round trip, worst 99 %', 'ms', lambda link: 1e3 * link.round_trip_99),
+    ('oldest measurement', 's', lambda link: link.oldest),
+)
+"""Main numbers of a radio link."""
+
+
+def _both(values: Sequence[float], units: Sequence[str]) -> str:
+    """Return the numbers of both channels with their units, which may differ."""
+    one, other = map(format_number, values)
+    if units[0] == units[1]:
+        return f'{one} / {other} {units[0]}'
+    return f'{one} {units[0]} / {other} {units[1]}'
 
 
 def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
@@ -328,18 +371,10 @@ def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, Error
     }
 
 
-def format_channels(
-    one: float, other: float, channels: tuple[Channel, Channel], power: str = ''
-) -> str:
-    """Return the values of both channels with their units, which may differ."""
-    units = [each.unit + power for each in channels]
-    if units[0] == units[1]:
-        return f'{format_number(one)}/{format_number(other)} {units[0]}'
-    return f'{format_number(one)} {units[0]}/{format_number(other)} {units[1]}'
-
-
 def format_number(value: float) -> str:
-    """Return three significant digits, or a dash for an unknown value."""
+    """Return three significant digits, a count in full, or a dash for an unknown value."""
+    if isinstance(value, int):
+        return str(value)
     if not math.isfinite(value):
         return '–'
     return f'{value:.0f}' if abs(value) >= 99.95 else f'{value:#.3g}'

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """HTML report of a recorded run."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 import math
 from pathlib import Path
@@ -12,21 +12,20 @@ from t3mpc_ros.bag.recording.message_losses import LOSS_CAUSES, LOSSES
 from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
+    LINK_NUMBERS,
     SETTLING,
     UNMEASURED,
-    ErrorStatistics,
     ReportMetrics,
     compute_metrics,
     driving,
     errors_of,
-    format_channels,
     format_number,
     preview_before_switch,
 )
 from t3mpc_ros.evaluation.bag_report.patrol_section import patrol_blocks
 from t3mpc_ros.evaluation.bag_report.report_charts import LABELS, SECTIONS
 from t3mpc_ros.evaluation.bag_report.response import motion_summary
-from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, load_run
+from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
 from t3mpc_ros.evaluation.drive_response import ResponseFit
@@ -103,13 +102,10 @@ def motion_table(run: Run) -> Table:
 
 def link_table(links: Mapping[str, LinkMetrics]) -> Table:
     """Return the metrics of each link, one column each."""
-    quantities: list[tuple[str, Callable[[LinkMetrics], str]]] = [
-        ('cycles answered', lambda each: f'{format_number(100.0 * each.answered)} %'),
-        ('round trip, median', lambda each: f'{format_number(1e3 * each.round_trip)} ms'),
-        ('round trip, worst 99 %', lambda each: f'{format_number(1e3 * each.round_trip_99)} ms'),
-        ('oldest measurement', lambda each: f'{format_number(each.oldest)} s'),
+    rows = [
+        [title, *(f'{format_number(value(each))} {unit}' for each in links.values())]
+        for title, unit, value in LINK_NUMBERS
     ]
-    rows = [[text, *map(show, links.values())] for text, show in quantities]
     for key, text in COUNTED.items():
         rows.append([text, *(_whole(each.counts[key]) for each in links.values())])
     return Table('', ['quantity', *links], rows if links else [])
@@ -141,7 +137,7 @@ def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
     ]
     if oddities := [*run.oddities, *_losses(recording)]:
         blocks.append(Items([[each] for each in oddities], title='Unusual in this bag'))
-    blocks.append(Tiles(_tiles(figures)))
+    blocks.append(Tiles(figures.numbers()))
     if remarks := _remarks(run):
         blocks.append(Items([[each] for each in remarks], 'side'))
     blocks.append(Contents())
@@ -177,66 +173,6 @@ def _origin(recording: BagReader, run: Run) -> str:
             f'{run.geometry.wheel_separation:g} m apart'
         )
     return ' · '.join(words)
-
-
-def _tiles(figures: ReportMetrics) -> list[tuple[str, str]]:
-    """Return the main figures."""
-    channels = figures.channels
-    right, left = (figures.wheels[each.name] for each in channels)
-    names = ' / '.join(each.short for each in channels)
-    tiles = [
-        (f'{figures.duration:.1f} s', f'{figures.messages} messages, {figures.switches} switches')
-    ]
-    if right.overall.count or REFERENCE not in figures.absent:
-        tiles += [
-            (
-                _rmse(right.overall, left.overall, channels),
-                f'error RMSE while the robot was being driven, {names}; '
-                f'{right.overall.seconds:.1f} s counted',
-            ),
-            (
-                _rmse(right.settled, left.settled, channels),
-                f'RMSE settled, away from switches; {right.settled.seconds:.1f} s counted',
-            ),
-        ]
-    if figures.verdict.judged:
-        stopped = f'{figures.verdict.stopped:.1f} s'
-        tiles.append((stopped, 'stopped between the first and the last command to move'))
-    fits = [figures.responses.get(each.name) for each in channels]
-    if any(fit is not None and fit.clear for fit in fits):
-        delays = ' / '.join(
-            f'{1e3 * (fit.dead_time + fit.lag):.0f}' if fit and fit.clear else EMPTY_CELL
-            for fit in fits
-        )
-        tiles.append((f'{delays} ms', f'from command to motion, {names}'))
-    for name, link in figures.links.items():
-        tiles.append(
-            (
-                f'{format_number(100.0 * link.answered)} %',
-                f'of the cycles answered, {name}; round trip '
-                f'{format_number(1e3 * link.round_trip)} ms',
-            )
-        )
-    tiles += [
-        (
-            format_channels(right.chatter, left.chatter, channels, '²'),
-            'variation of the command per second'
-            + (
-                f'; the reference has {format_number(right.demand)} / {format_number(left.demand)}'
-                if REFERENCE not in figures.absent
-                else ''
-            ),
-        ),
-        (
-            f'{format_number(1e3 * figures.latency)} ms',
-            f'odometry to command; 99 % below {format_number(1e3 * figures.latency_99)} ms',
-        ),
-        (
-            f'{format_number(100.0 * figures.missing.get(ODOMETRY, math.nan))} %',
-            'of the odometry missing',
-        ),
-    ]
-    return tiles
 
 
 def _losses(recording: BagReader) -> list[str]:
@@ -409,7 +345,3 @@ def _contents(recording: BagReader) -> Iterator[Block]:
     for title, values in sorted(recording.metadata_records.items()):
         table = Table('', ['name', 'value'], list(values.items()), text=2, wrap=True)
         yield Details(f'{title}, {len(values)} values', [table])
-
-
-def _rmse(right: ErrorStatistics, left: ErrorStatistics, channels: tuple[Channel, Channel]) -> str:
-    return format_channels(right.rmse, left.rmse, channels) if right.count else UNMEASURED

@@ -11,7 +11,8 @@ import numpy as np
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.evaluation.bag_report.metrics import (
-    ChannelMetrics,
+    CHANNEL_NUMBERS,
+    RUN_NUMBERS,
     ReportMetrics,
     compute_metrics,
     driven,
@@ -40,7 +41,6 @@ from t3mpc_ros.evaluation.reporting import (
 )
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
-    ODOMETRY,
     REFERENCE,
     ReportError,
     ReportOptions,
@@ -246,43 +246,21 @@ def _verdict(first: ComparedRun, other: ComparedRun) -> VerdictBox:
 
 def _metrics_table(runs: Sequence[ComparedRun]) -> Table:
     """Return the main numbers of all runs side by side."""
-    channels = runs[0].run.channels
-    rows: list[tuple[str, Callable[[ComparedRun], float]]] = [
-        ('duration / s', lambda each: each.run.duration),
-        ('stopped / s', lambda each: each.metrics.verdict.stopped),
-        ('odometry to command, median / ms', lambda each: 1e3 * each.metrics.latency),
-        ('odometry to command, 99 % below / ms', lambda each: 1e3 * each.metrics.latency_99),
-        ('odometry missing / %', _missing),
-    ]
-    cells = [[text, *(format_number(measure(each)) for each in runs)] for text, measure in rows]
-    cells.insert(2, ['switches', *(str(each.metrics.switches) for each in runs)])
-    for channel in channels:
-        name, unit = channel.name, channel.unit
-        measures: list[tuple[str, Callable[[ChannelMetrics], float]]] = [
-            ('RMSE settled', lambda found: found.settled.rmse),
-            ('RMSE while driven', lambda found: found.overall.rmse),
-            ('largest error', lambda found: found.overall.largest),
-            ('variation of the command per second', lambda found: found.chatter),
-        ]
-        for text, value in measures:
+    cells = []
+    for title, unit, number in RUN_NUMBERS:
+        heading = f'{title} / {unit}' if unit else title
+        cells.append([heading, *(format_number(number(each.metrics)) for each in runs)])
+    for channel in runs[0].run.channels:
+        for title, unit, value in CHANNEL_NUMBERS:
             numbers = [
-                format_number(value(each.metrics.wheels[name]))
-                if name in each.metrics.wheels
+                format_number(value(each.metrics, channel.name))
+                if channel.name in each.metrics.wheels
                 else EMPTY_CELL
                 for each in runs
             ]
-            cells.append([f'{text}, {channel.title} / {unit}', *numbers])
-        late = []
-        for each in runs:
-            fit = each.metrics.responses.get(name)
-            delay = fit.dead_time + fit.lag if fit and fit.clear else math.nan
-            late.append(format_number(1e3 * delay))
-        cells.append([f'command to motion, {channel.title} / ms', *late])
+            heading = f'{title}, {channel.title} / {unit.format(channel.unit)}'
+            cells.append([heading, *numbers])
     return Table('', ['quantity', *(each.label for each in runs)], cells, wrap=True)
-
-
-def _missing(each: ComparedRun) -> float:
-    return 100.0 * each.metrics.missing.get(ODOMETRY, math.nan)
 
 
 def _shifted(each: ComparedRun, series: Series) -> Series:
