@@ -72,10 +72,6 @@ class TopicColumns:
     """Floating-point numbers of the :class:`CdrLayout`, shape (n, number of columns)."""
     integers: Integers
     """Integers of a layout of integers, same shape; else empty."""
-    frames: tuple[str, ...] = ()
-    """Values of the last string before the numbers, the base frame of odometry."""
-    frame_of: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    """Index in ``frames`` of each message, shape (n,); zeros for a type without strings."""
 
     def __len__(self) -> int:
         return int(self.received_ns.size)
@@ -90,9 +86,8 @@ class _Batches:
     times: list[tuple[int, int]] = field(default_factory=list)
     """Receive and publish times of all messages."""
     waiting: list[bytes] = field(default_factory=list)
-    parts: list[tuple[Integers, NDArray[Any], Integers]] = field(default_factory=list)
-    """Stamps, numbers and frames by batch."""
-    frames: dict[bytes, int] = field(default_factory=dict)
+    parts: list[tuple[Integers, NDArray[Any]]] = field(default_factory=list)
+    """Stamps and numbers by batch."""
 
     def add(self, received_ns: int, published_ns: int, data: bytes) -> None:
         self.times.append((received_ns, published_ns))
@@ -102,20 +97,17 @@ class _Batches:
 
     def convert(self) -> None:
         """Convert the waiting messages."""
-        self.parts.append(_numbers(self.topic, self.layout, self.waiting, self.frames))
+        self.parts.append(_numbers(self.topic, self.layout, self.waiting))
         self.waiting = []
 
     def columns(self) -> TopicColumns:
         self.convert()
         times = np.array(self.times, dtype=np.int64).reshape(-1, 2)
-        stamps, numbers, frame_of = (
-            np.concatenate(each) for each in zip(*self.parts, strict=True)
-        )
+        stamps, numbers = (np.concatenate(each) for each in zip(*self.parts, strict=True))
         none = np.zeros((len(times), 0))
         floats, integers = (none, numbers) if self.layout.integer else (numbers, none.astype(int))
         received, published = np.ascontiguousarray(times.T)
-        frames = tuple(name.rstrip(b'\0').decode(errors='replace') for name in self.frames)
-        return TopicColumns(received, published, stamps, floats, integers, frames, frame_of)
+        return TopicColumns(received, published, stamps, floats, integers)
 
 
 def read_columns(bag: BagReader, topics: Iterable[str]) -> dict[str, TopicColumns]:
@@ -141,9 +133,9 @@ def read_columns(bag: BagReader, topics: Iterable[str]) -> dict[str, TopicColumn
 
 
 def _numbers(
-    name: str, layout: CdrLayout, messages: Sequence[bytes], frames: dict[bytes, int]
-) -> tuple[Integers, NDArray[Any], Integers]:
-    """Return header stamps, numbers and frames of messages; add new frames to ``frames``."""
+    name: str, layout: CdrLayout, messages: Sequence[bytes]
+) -> tuple[Integers, NDArray[Any]]:
+    """Return header stamps and numbers of messages."""
     data = np.frombuffer(b''.join([*messages, PADDING]), dtype=np.uint8)
     lengths = np.array([*map(len, messages)], dtype=np.int64)
     starts = np.cumsum(lengths) - lengths
@@ -151,14 +143,11 @@ def _numbers(
     if np.any(data[starts + 1] != _LITTLE_ENDIAN):
         raise DataError(f'{name} has a message that is not little-endian CDR')
     # A scalar for types without strings, else one offset per message.
-    sizes: Integers = np.zeros(starts.shape, dtype=np.int64)
     at: Any = _CDR_HEADER + 8 * layout.stamped + 4 * len(layout.head)
     for _ in range(layout.strings):
         at = (at + 3) // 4 * 4
-        sizes = _values_at(data, starts + at, '<u4').astype(np.int64)
-        at = at + 4 + sizes
+        at = at + 4 + _values_at(data, starts + at, '<u4').astype(np.int64)
         _check(name, bool((at <= lengths).all()))
-    frame_of = _labels(messages, at - sizes, sizes, frames)
     at = (at - _CDR_HEADER + 7) // 8 * 8 + _CDR_HEADER
     _check(name, bool((at + 8 * max(layout.numbers) + 8 <= lengths).all()))
     for k, expected in enumerate(layout.head):
@@ -173,18 +162,7 @@ def _numbers(
     numbers = np.empty((starts.size, len(layout.numbers)), dtype)
     for column, k in enumerate(layout.numbers):
         numbers[:, column] = _values_at(data, starts + at + 8 * k, dtype)
-    return stamps, numbers, frame_of
-
-
-def _labels(
-    messages: Sequence[bytes], begins: Any, sizes: Integers, known: dict[bytes, int]
-) -> Integers:
-    """Return the index in ``known`` of the text in each message, shape (n,); add new texts."""
-    if not sizes.any():
-        return np.zeros(sizes.shape, dtype=np.int64)
-    rows = zip(messages, begins.tolist(), (begins + sizes).tolist(), strict=True)
-    texts = [message[begin:end] for message, begin, end in rows]
-    return np.array([known.setdefault(text, len(known)) for text in texts], dtype=np.int64)
+    return stamps, numbers
 
 
 def _values_at(data: Bytes, starts: Integers, dtype: str) -> NDArray[Any]:

@@ -32,8 +32,6 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     **dict.fromkeys(SCALARS, ('std_msgs/msg/Float64',)),
 }
 """Message types by role."""
-_ALIEN = ('truth', 'reference', 'goal', 'target', 'desired', 'gps', 'map', 'visual')
-"""Words in names of odometry that is not the robot's measured one."""
 
 
 class ReportError(RuntimeError):
@@ -88,12 +86,19 @@ def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
     if wanted.odom and not wanted.namespace:
         chosen.pop(TRUTH, None)  # errors refer to the given topic
     notes = []
-    if not wanted.odom:
-        others = _candidates(ODOMETRY, filled.values(), chosen, wanted.namespace, namespaces[0])
-        notes += _choose_by_type(ODOMETRY, 'Odometry', '--odom', chosen, others)
-    if not wanted.cmd_vel:
-        others = _candidates(COMMAND, filled.values(), chosen, wanted.namespace, namespaces[0])
-        notes += _choose_by_type(COMMAND, 'The command', '--cmd-vel', chosen, others)
+    for name, given, what, option in (
+        (ODOMETRY, wanted.odom, 'Odometry', '--odom'),
+        (COMMAND, wanted.cmd_vel, 'The command', '--cmd-vel'),
+    ):
+        if given:
+            continue
+        others = _candidates(name, filled.values(), chosen, wanted.namespace, namespaces[0])
+        by_name = name in chosen
+        if not by_name and others:
+            chosen[name] = others.pop(0)
+        if others or (name in chosen and not by_name):
+            rest = f'; there is also {", ".join(others)} ({option} chooses)' if others else ''
+            notes.append(f'{what} is taken from {chosen[name]}{rest}.')
     if not chosen:
         raise ReportError(
             f'{recording.folder}: there is nothing to report: no message of odometry '
@@ -111,7 +116,10 @@ def _candidates(
     namespace: str | None,
     preferred: str,
 ) -> list[str]:
-    """Return the topics that a role may have by their type, beside the chosen ones, best first."""
+    """Return the topics that a role may have by their type, beside the chosen ones.
+
+    Those of the preferred namespace come first, then those with most messages.
+    """
     space = f'/{namespace.strip("/")}/' if namespace else ''
     found = [
         topic
@@ -122,20 +130,8 @@ def _candidates(
         and not any(topic.name.endswith(f'/{known}') for known in NAMES if known != name)
         and topic.name.startswith(space)
     ]
-    return [topic.name for topic in sorted(found, key=lambda each: _rank(name, each, preferred))]
-
-
-def _choose_by_type(
-    name: str, what: str, option: str, chosen: dict[str, str], others: list[str]
-) -> list[str]:
-    """Choose the best of ``others`` for a role that no name decides; return what to note."""
-    by_name = name in chosen
-    if not by_name and others:
-        chosen[name] = others.pop(0)
-    if name not in chosen or (by_name and not others):
-        return []
-    rest = f'; there is also {", ".join(others)} ({option} chooses)' if others else ''
-    return [f'{what} is taken from {chosen[name]}{rest}.']
+    found.sort(key=lambda t: (not t.name.startswith(f'{preferred}/'), -t.message_count, t.name))
+    return [topic.name for topic in found]
 
 
 def _requested_topic(recording: BagReader, name: str, full: str) -> str:
@@ -162,15 +158,6 @@ def _listing(recording: BagReader) -> str:
     words = [f'{t.name} ({t.type_name}, {t.message_count} messages)' for t in topics[:_MAX_LISTED]]
     more = [f'{len(topics) - _MAX_LISTED} more'] if len(topics) > _MAX_LISTED else []
     return ', '.join(words + more) or 'no topic at all'
-
-
-def _rank(name: str, topic: TopicInformation, space: str) -> tuple[int, int, int, int, str]:
-    """Return a sort key that puts the likeliest topic first."""
-    low = topic.name.lower()
-    words = ('odom',) if name == ODOMETRY else ('cmd_vel', 'cmd', 'command')
-    fit = next((i for i, word in enumerate(words) if word in low), len(words))
-    alien = any(word in low for word in _ALIEN)
-    return alien, fit, not low.startswith(f'{space}/'), -topic.message_count, topic.name
 
 
 def bag_display_name(folder: Path) -> str:

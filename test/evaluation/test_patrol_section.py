@@ -40,7 +40,7 @@ def _rows(blocks):
 def test_equal_laps_are_predicted_and_their_error_measured(recorded):
     time = np.arange(0.0, 140.0, 0.05)
     run = _driven(recorded, time, 1.2 * np.cos(time / 4.0), 0.8 * np.sin(time / 4.0), 0.03)
-    rows = _rows(patrol_blocks(run))
+    rows = _rows(patrol_blocks(replace(run, follows_path=True)))
     assert rows['path error, root mean square'] == '30.0 mm'
     assert rows['skill of an observer, 5 s ahead'].startswith('1.000')
     assert float(rows['cells entered'].split()[0]) < 30.0  # an ellipse in its bounding box
@@ -69,14 +69,12 @@ def test_a_gap_leaves_predictions_out_and_standstill_all(recorded):
     assert list(patrol_blocks(_driven(recorded, time, 0.0 * time, 0.0 * time))) == []
 
 
-def test_a_reference_is_followed_if_the_robot_stays_at_it(recorded):
+def test_a_reference_is_followed_by_a_controller_of_paths(recorded):
+    """A path controller far from its path once lost the line that says how far."""
     time = np.arange(0.0, 60.0, 0.05)
-    path = np.cos(time / 4.0), np.sin(time / 4.0)
-    assert followed_reference(_driven(recorded, time, *path, 0.05)) is not None
-    beside = _driven(recorded, time, *path, 0.5)
+    beside = _driven(recorded, time, np.cos(time / 4.0), np.sin(time / 4.0), 0.5)
     assert followed_reference(beside) is None
-    # A path controller far from its path once lost the line that says how far.
-    assert followed_reference(replace(beside, follows_path=True)) is not None
-    stands = _driven(recorded, time, *path)
-    stands.motions[REFERENCE].values['x'][:] = stands.motions[REFERENCE].values['y'][:] = 0.0
-    assert followed_reference(stands) is None
+    followed = replace(beside, follows_path=True)
+    assert followed_reference(followed) is followed.motions[REFERENCE]
+    del followed.motions[REFERENCE].values['x']
+    assert followed_reference(followed) is None

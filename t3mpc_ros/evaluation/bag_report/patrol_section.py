@@ -20,33 +20,17 @@ from t3mpc_ros.simulation.world import recorded_world
 
 LEAST_DISTANCE, LEAST_SIZE = 2.0, 0.5
 """Length of the path, and of a side of its bounding box, from which on there is a section, m."""
-CLOSE = 0.1
-"""Distance from the recorded pose of the reference that a robot which follows it keeps, m."""
-FOLLOWED = 0.9
-"""Share of the time in which it does."""
 BODY = 0.11
 """Radius of the robot, m: cells whose centre it cannot reach do not count."""
 _SAMPLE = 0.05
 
 
 def followed_reference(run: Run) -> Series | None:
-    """Return the reference if the robot follows its positions; None if it tracks speeds alone.
-
-    The recorded parameters decide. Without them, in a bag of another robot, the distance does.
-    """
+    """Return the reference if the controller follows its positions; None if its speeds alone."""
     reference, motion = run.motions.get(REFERENCE), run.motions.get(run.measured)
-    if motion is None or reference is None or 'x' not in reference.values or len(reference) < 2:
+    if motion is None or reference is None or not run.follows_path:
         return None
-    inside = (motion.time >= reference.time[0]) & (motion.time <= reference.time[-1])
-    if not inside.any() or not np.ptp(reference['x']) + np.ptp(reference['y']) > 0.0:
-        return None
-    if run.follows_path:
-        return reference
-    away = [
-        motion[axis][inside] - np.interp(motion.time[inside], reference.time, reference[axis])
-        for axis in 'xy'
-    ]
-    return reference if float(np.quantile(np.hypot(*away), FOLLOWED)) < CLOSE else None
+    return reference if 'x' in reference.values and len(reference) > 1 else None
 
 
 def patrol_blocks(run: Run) -> Iterator[Block]:
@@ -78,7 +62,7 @@ def patrol_blocks(run: Run) -> Iterator[Block]:
     rows.append(['evenness of the time in the cells', f'{found["evenness"]:.3f}'])
     if math.isfinite(found['path_error']):
         rows.append(['path error, root mean square', f'{1e3 * found["path_error"]:.1f} mm'])
-    observed = 'skill_1' in found
+    observed = f'skill_{HORIZONS[0]:g}' in found
     for horizon in HORIZONS if observed else ():
         skill, predictor = found[f'skill_{horizon:g}'], found[f'predictor_{horizon:g}']
         rows.append([f'skill of an observer, {horizon:g} s ahead', f'{skill:.3f} ({predictor})'])

@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Data of a recorded run: motions, commands and control terms on one time axis."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.bag.columns import CDR_LAYOUTS, TopicColumns, read_columns
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
@@ -357,7 +356,7 @@ def _read(
 ) -> tuple[dict[str, Array], bool]:
     """Return the arrays of one topic, and whether it mixed several robots.
 
-    Rows that are not finite, that repeat the one before or are of another robot are left out.
+    Rows that are not finite are left out.
     """
     kind = recording.topics[topic].type_name
     if kind.endswith(('/Twist', '/TwistStamped')):
@@ -384,46 +383,12 @@ def _read(
     table = {key: values[sound] for key, values in table.items()}
     mixed = False
     if fields is _ODOMETRY_FIELDS:
-        if column is not None and len(column.frames) > 1:
-            mixed = True
-            table = _of_one_frame(table, topic, column.frames, column.frame_of[sound], notes)
-        table = _each_once(table, topic, notes)
         times = table['received'], table['stamp']
         places = np.stack([table['x'], table['y']], axis=1)
         notes += continuity_notes(topic, *times, places, table['linear'])
-        mixed |= several_robots(table['stamp'], places, table['linear'])
+        mixed = several_robots(table['stamp'], places, table['linear'])
         _mend_stamps(table, topic, notes)
     return table, mixed
-
-
-def _of_one_frame(
-    table: Mapping[str, Array],
-    topic: str,
-    frames: Sequence[str],
-    frame_of: NDArray[np.int64],
-    notes: list[str],
-) -> dict[str, Array]:
-    """Return the messages of the most frequent base frame: a frame is a robot."""
-    counts = np.bincount(frame_of, minlength=len(frames))
-    kept = int(np.argmax(counts))
-    listed = ', '.join(f'{name} ({n})' for name, n in zip(frames, counts, strict=True))
-    notes.append(
-        f'Several robots: the messages of {topic} are of {len(frames)} frames: {listed}; '
-        f'those of {frames[kept]} are used.'
-    )
-    return {name: column[frame_of == kept] for name, column in table.items()}
-
-
-def _each_once(table: dict[str, Array], topic: str, notes: list[str]) -> dict[str, Array]:
-    """Return the rows without those that repeat the row before but for the receive time."""
-    columns = [column for name, column in table.items() if name != 'received']
-    same = np.all([column[1:] == column[:-1] for column in columns], axis=0)
-    again = np.concatenate([np.zeros(min(1, table['stamp'].size), dtype=np.bool_), same])
-    if np.unique(table['stamp']).size < 2 or not again.any():
-        return table  # without stamps, a robot at standstill repeats itself
-    notes.append(f'{np.count_nonzero(again)} messages of {topic} are repetitions; each counts '
-                 'once.')  # fmt: skip
-    return {name: column[~again] for name, column in table.items()}
 
 
 def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str]) -> None:
