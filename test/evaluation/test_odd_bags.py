@@ -185,6 +185,18 @@ ODD_BAGS = {
         ('The stamps of /odom leap 1 times, first by -100.0 s at 8.0',),
         True,
     ),
+    'robot clock set forward': (
+        lambda: changed('/odom', lambda i, t, m: restamped(m, 1e6 * (t > 8.0))),
+        'Good run',
+        ('The stamps of /odom leap 1 times, first by 1000000.0 s at 8.0',),
+        True,
+    ),
+    'no stamps': (
+        lambda: changed('/odom', lambda i, t, m: restamped(m, -t - START / 1e9)),
+        'Good run',
+        ('The stamps of /odom are constant; its messages were placed by receive time',),
+        True,
+    ),
     'receipt out of order': (
         lambda: [(t - 3.0 * (i % 60 == 7), *row) for i, (t, *row) in enumerate(ROWS)],
         'Good run',
