@@ -85,6 +85,13 @@ def stand(i, t, message):
     message.twist.twist.linear.x = message.twist.twist.angular.z = 0.0
 
 
+def stand_outside(i, t, message):
+    """Stand before 3 s and after 13 s, while the reference goes on."""
+    if not 3.0 < t < 13.0:
+        twist = message.twist.twist if hasattr(message, 'twist') else message
+        twist.linear.x = twist.angular.z = 0.0
+
+
 def second_robot(pose=(0.0, 0.0, 0.0)):
     """Return odometry of another robot that publishes to the same topic, more slowly."""
     rows = []
@@ -197,6 +204,31 @@ ODD_BAGS = {
         ('The stamps of /odom are constant; its messages were placed by receive time',),
         True,
     ),
+    'simulated time': (
+        lambda: changed(
+            '/reference',
+            lambda i, t, m: restamped(m, 1.0 - START / 1e9),
+            changed('/odom', lambda i, t, m: restamped(m, 1.0 - START / 1e9)),
+        ),
+        'Good run',
+        ('The stamps are of another clock than the receive times',),
+        True,
+    ),
+    'stands before and after': (
+        lambda: changed('/cmd_vel', stand_outside, changed('/odom', stand_outside)),
+        'Good run',
+        (),
+        True,
+    ),
+    'driven for less than a second': (
+        lambda: [
+            (t, topic, twist_message((0.0, 0.0)) if topic == '/cmd_vel' and t > 0.9 else m)
+            for t, topic, m in ROWS
+        ],
+        'No valid measurement',
+        ('No settled motion was measured',),
+        False,
+    ),
     'receipt out of order': (
         lambda: [(t - 3.0 * (i % 60 == 7), *row) for i, (t, *row) in enumerate(ROWS)],
         'Good run',
@@ -273,6 +305,7 @@ ODD_BAGS = {
 NAMED = ODD_BAGS.keys() - {
     'whole', 'reference at once', 'only commands', 'no reference', 'no command', 'stopped',
     'slow machine', 'slow machine without harm', 'two rates', 'messages twice',
+    'stands before and after', 'driven for less than a second',
 }  # fmt: skip
 """Bags with an oddity beside the verdict."""
 

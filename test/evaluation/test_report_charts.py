@@ -353,6 +353,23 @@ def test_tables_of_response_and_link_in_full():
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize(
+    ('command', 'text'),
+    [
+        (COMMANDED, 'from the first command other than zero, at 0.0 s, to the last, at 20.0 s.'),
+        (dict.fromkeys(MOTIONS, 0.0 * TIME), 'Every command was zero: the robot was not'),
+        (None, 'the bag holds no command that would show when the robot was driven'),
+    ],
+)
+def test_what_is_counted_in_words(command, text):
+    motions = {**RUN.motions, COMMAND: Series(TIME, command)} if command else {
+        name: each for name, each in RUN.motions.items() if name != COMMAND
+    }  # fmt: skip
+    page = report_page.extents(replace(RUN, motions=motions))
+    assert text in page
+    assert ('the 0.2 s before each switch' in page) == ('Every' not in text)
+
+
 def test_regularity_of_a_topic_in_its_units(monkeypatch, tmp_path):
     timing = {ODOMETRY: Timing(70, 0.02, 0.003, 0.04)}
     run = replace(RUN, topics={ODOMETRY: '/odom'}, timing=timing)

@@ -245,10 +245,10 @@ def _errors(run: Run) -> list[Block]:
     if not rows:
         return [Paragraph('The bag lacks a reference, or odometry to compare with it.')]
     head = ['motion', 'speed', 'extent', 'RMSE', 'MAE', 'max', 'counted / s', 'samples', 'unit']
-    return [Table('', head, rows, text=3), Paragraph(_extents(run), 'quiet')]
+    return [Table('', head, rows, text=3), Paragraph(extents(run), 'quiet')]
 
 
-def _extents(run: Run) -> str:
+def extents(run: Run) -> str:
     """Return the description of the time in which errors are counted."""
     first, last = driving(run)
     if COMMAND not in run.motions:
