@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     with executor_of(options) as executor:
         study = compare(plan, runs, executor, print_report)
     print(page.markdown(study))
-    drawn = write_pictures(page.PICTURES, study, figures)
+    drawn = write_pictures({each.stem: each.draw for each in page.PICTURES}, study, figures)
     numbers = strict_json(page.record(study))
     (options.output / f'{name}.json').write_text(numbers, encoding='utf-8')
     written = options.output / f'{name}.html'

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Style and layout of all figures."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 import io
 import math
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -20,7 +20,6 @@ from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import World
 
 Subject = TypeVar('Subject')
-Subject_contra = TypeVar('Subject_contra', contravariant=True)
 
 WIDTH = 6.2
 """Inches: narrow enough that 9-point text stays legible on a phone at half the size."""
@@ -77,18 +76,6 @@ def png_of(draw: Callable[[Subject], Any], subject: Subject) -> bytes | None:
         return buffer.getvalue()
 
 
-class Drawing(Protocol[Subject_contra]):
-    """A figure of a report."""
-
-    @property
-    def stem(self) -> str:
-        """Name of its file."""
-
-    @property
-    def draw(self) -> Callable[[Subject_contra], Any] | None:
-        """Return the figure of a subject; None when there is nothing to draw."""
-
-
 class TitledDrawing(NamedTuple, Generic[Subject]):
     """A figure with its title."""
 
@@ -98,15 +85,15 @@ class TitledDrawing(NamedTuple, Generic[Subject]):
 
 
 def write_pictures(
-    drawings: Iterable[Drawing[Subject]], subject: Subject, folder: Path
+    drawings: Mapping[str, Callable[[Subject], Any]], subject: Subject, folder: Path
 ) -> dict[str, bytes]:
     """Write the figures with something to draw as PNG files, and return them by their stems."""
     folder.mkdir(parents=True, exist_ok=True)
     found = {}
-    for drawing in drawings:
-        if drawing.draw is not None and (png := png_of(drawing.draw, subject)) is not None:
-            found[drawing.stem] = png
-            (folder / f'{drawing.stem}.png').write_bytes(png)
+    for stem, draw in drawings.items():
+        if (png := png_of(draw, subject)) is not None:
+            found[stem] = png
+            (folder / f'{stem}.png').write_bytes(png)
     return found
 
 

@@ -175,20 +175,28 @@ def counted_rows(
     never count, nor those before it in which preview leaves the old reference: what that costs
     would count, and not what it gains.
     """
-    counted: NDArray[np.bool_] = time >= after
-    before, behind = margins
+    counted = (time >= after) & away_from_switches(time, switches, *margins)
     leaving, crossed = CROSSING
     for switch in switches.tolist():
         if time.size and switch + crossed > time[-1]:
             counted &= time < switch - leaving
-        counted &= (time < switch - before) | (time >= switch + behind)
     if not counted.any():
         end = time[-1] if time.size else 0.0
         raise ValueError(
             f'after and margins must leave rows of a run that ends at {end:g} s: '
-            f'got {after:g} s, {before:g} s and {behind:g} s'
+            f'got {after:g} s, {margins[0]:g} s and {margins[1]:g} s'
         )
     return counted
+
+
+def away_from_switches(
+    time: Array, switches: Array, before: float, behind: float
+) -> NDArray[np.bool_]:
+    """Return which instants are not from ``before`` a switch to ``behind`` it, all in s."""
+    away = np.ones(time.size, dtype=np.bool_)
+    for switch in switches.tolist():
+        away &= (time < switch - before) | (time >= switch + behind)
+    return away
 
 
 def switch_times(time: Array, modes: NDArray[np.generic]) -> Array:

@@ -36,7 +36,6 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     estimation_target,
     path_of,
     preview_before_switch,
-    settled,
     statistics,
     tracking_error,
     variation,
@@ -373,25 +372,6 @@ def test_the_path_is_the_exact_arc_of_each_twist():
         assert (x[i], y[i]) == pytest.approx((pose.x, pose.y))
         twist = BodyTwist(motion['linear'][i], motion['angular'][i])
         pose = advance_pose(pose, twist, time[i + 1] - time[i])
-
-
-def test_settled_excludes_the_window_around_each_switch():
-    """The start is no longer its business: whether the robot is driven is asked apart."""
-    time, switches = np.arange(0.0, 10.0, 0.5), np.array([3.0, 3.2, 9.9])
-    late = np.arange(4.5, 10.0, 0.5).tolist()
-    assert time[settled(time, switches, 0.0)].tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, *late]
-    assert time[settled(time, switches, 0.45)].tolist() == [
-        0.0,
-        0.5,
-        1.0,
-        1.5,
-        2.0,
-        2.5,
-        *late[:-1],
-    ]
-    assert time[settled(time, switches, 0.6)].tolist() == [0.0, 0.5, 1.0, 1.5, 2.0, *late[:-1]]
-    assert settled(np.empty(0), switches, 0.45).size == 0
-    assert settled(time, np.empty(0), 0.45).all()
 
 
 # -- which errors count -------------------------------------------------------------------------

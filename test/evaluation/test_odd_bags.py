@@ -148,6 +148,16 @@ ODD_BAGS = {
         ('Odometry is taken from /base/odom', 'also holds topics of /base'),
         True,
     ),
+    'odometry of two robots': (
+        lambda: by_time(
+            in_namespace('/one', only('/cmd_vel', '/reference')),
+            [(t, '/one/wheels', message) for t, _, message in only('/odom')],
+            [(t + k, '/two/wheels', message) for t, _, message in only('/odom') for k in (0, 1)],
+        ),
+        'Good run',
+        ('Odometry is taken from /one/wheels; there is also /two/wheels',),
+        True,
+    ),
     'foreign types': (
         lambda: by_time(
             only('/odom', '/reference'), [(1.0 + i, '/cmd_vel', TEXT) for i in range(9)]
@@ -305,7 +315,7 @@ ODD_BAGS = {
 NAMED = ODD_BAGS.keys() - {
     'whole', 'reference at once', 'only commands', 'no reference', 'no command', 'stopped',
     'slow machine', 'slow machine without harm', 'two rates', 'messages twice',
-    'stands before and after', 'driven for less than a second',
+    'stands before and after', 'driven for less than a second', 'odometry of two robots',
 }  # fmt: skip
 """Bags with an oddity beside the verdict."""
 

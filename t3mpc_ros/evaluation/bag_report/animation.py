@@ -18,7 +18,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from t3mpc_ros.bag.reader import BagReader, open_bag
@@ -117,7 +116,8 @@ def animate_bag(
     output.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar(count, 'frames', show=progress) as bar:
         preview = _frames(run, times[[0, count // 2, -1]], ranges, world, options.width)
-        palette = _palette(np.vstack([np.asarray(each) for each in preview]))
+        shown = Image.fromarray(np.vstack([np.asarray(each) for each in preview]))
+        palette = shown.quantize(_NUMBER_OF_COLOURS, Image.Quantize.MAXCOVERAGE)
         few = [
             frame.quantize(palette=palette, dither=Image.Dither.NONE)
             for frame in _frames(run, times, ranges, world, options.width, bar.update)
@@ -133,18 +133,6 @@ def animate_bag(
         disposal=1,
     )
     return output
-
-
-def _palette(picture: NDArray[np.uint8]) -> Image.Image:
-    """Return the most frequent colours that differ by more than the resolution of Pillow."""
-    most: Any = sorted(Image.fromarray(picture).getcolors(picture.size) or (), reverse=True)
-    chosen = np.empty((0, 3), dtype=np.int64)
-    for _, colour in most:
-        if (np.abs(chosen - np.array(colour)).max(axis=1) > 8).all():
-            chosen = np.vstack([chosen, colour])[:_NUMBER_OF_COLOURS]
-    palette = Image.new('P', (1, 1))
-    palette.putpalette(chosen.astype(np.uint8).tobytes())
-    return palette
 
 
 def read_ranges(recording: BagReader, run: Run) -> RangeReadings | None:

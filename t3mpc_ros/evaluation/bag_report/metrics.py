@@ -17,6 +17,7 @@ from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit
+from t3mpc_ros.evaluation.record import away_from_switches
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
 
@@ -113,15 +114,12 @@ def preview_before_switch(run: Run) -> float:
     return min(run.lead, SETTLING)
 
 
-def settled(time: Array, switches: Array, before: float) -> NDArray[np.bool_]:
+def settled(time: Array, run: Run) -> NDArray[np.bool_]:
     """Return the mask of ``time`` (s) that excludes the window around each switch.
 
-    The window is from ``before`` seconds before a switch to :data:`SETTLING` seconds after it.
+    The window is from :func:`preview_before_switch` before it to :data:`SETTLING` seconds after.
     """
-    following = np.searchsorted(switches, time, 'right')
-    since: Array = time - np.concatenate([[-math.inf], switches])[following]
-    until: Array = np.concatenate([switches, [math.inf]])[following] - time
-    return (since >= SETTLING) & (until > before)
+    return away_from_switches(time, run.switches, preview_before_switch(run), SETTLING)
 
 
 def variation(series: Series, name: str) -> float:
@@ -360,7 +358,7 @@ def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, Error
         nothing = statistics(np.empty(0))
         return dict.fromkeys((each.name for each in run.channels), (nothing, nothing))
     moving = driven(error.time, run)
-    calm = moving & settled(error.time, run.switches, preview_before_switch(run))
+    calm = moving & settled(error.time, run)
     period = float(np.median(np.diff(error.time))) if len(error) > 1 else math.nan
     return {
         wheel: (

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Charts of the bag report in page order, each with a sentence on what is seen in it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
@@ -163,14 +163,8 @@ def control(run: Run, metrics: ReportMetrics) -> Shown:
         if np.isfinite(found.demand):
             seen += f'; the reference varies by {format_number(found.demand)}'
         yield Chart(f'Command, {title}', unit, [shown], f'{seen}.')
-    applied = {
-        wheel: series for wheel in WHEELS if is_long(series := _term(run, 'applied', wheel))
-    }
-    if applied:
-        lines = [
-            line(f'{wheel} wheel', wheel, series, dash=() if wheel == 'right' else (6, 3))
-            for wheel, series in applied.items()
-        ]
+    if applied := _by_wheel(run, 'terms/applied'):
+        lines = _wheel_lines(applied)
         values = np.concatenate([series['value'] for series in applied.values()])
         seen = f'The acceleration u after all limits is {_extent(values, "rad/s²")}.'
         yield Chart('Acceleration u applied', 'rad/s²', lines, seen)
@@ -215,7 +209,7 @@ def terms(run: Run, metrics: ReportMetrics) -> Shown:
         for name, symbol, colour, dash in zip(
             names, symbols, TERM_COLOURS, TERM_DASHES, strict=True
         ):
-            if is_long(series := _term(run, name, wheel)):
+            if series := _by_wheel(run, f'terms/{name}').get(wheel):
                 lines.append(line(f'{name} {symbol}', colour, series, dash=dash))
                 size = float(np.sqrt(np.nanmean(series['value'] ** 2)))
                 sizes.append(f'{name} {format_number(size)}')
@@ -226,10 +220,7 @@ def terms(run: Run, metrics: ReportMetrics) -> Shown:
 
 def estimates(run: Run, metrics: ReportMetrics) -> Shown:
     """Yield the estimates of the unknown dynamics and their targets, the paper's Fig. 13."""
-    for wheel in WHEELS:
-        series = run.numbers.get(f'controller/estimate/{wheel}')
-        if not is_long(series):
-            continue
+    for wheel, series in _by_wheel(run, 'estimate').items():
         lines = []
         seen = f'The estimate runs {_extent(series["value"], "rad/s²")}'
         target = estimation_target(run, wheel)
@@ -345,19 +336,12 @@ def certificate(run: Run, metrics: ReportMetrics) -> Shown:
         seen = f'The margin is below zero {below:.1f} % of the time.'
         lines = [line('margin', 'c5', margin)]
         yield Chart('Margin of the guaranteed decrease', 'rad²/s³', lines, seen)
-    skill = {
-        w: series for w in WHEELS if is_long(series := run.numbers.get(f'controller/skill/{w}'))
-    }
-    if skill:
-        lines = [
-            line(f'{wheel} wheel', wheel, series, dash=() if wheel == 'right' else (6, 3))
-            for wheel, series in skill.items()
-        ]
+    if skill := _by_wheel(run, 'skill'):
         means = ', '.join(
             f'{format_number(float(np.nanmean(series["value"])))} of the {wheel} wheel'
             for wheel, series in skill.items()
         )
-        yield Chart('Skill of the predictor', 'share', lines, f'Mean: {means}.')
+        yield Chart('Skill of the predictor', 'share', _wheel_lines(skill), f'Mean: {means}.')
 
 
 def link(run: Run, metrics: ReportMetrics) -> Shown:
@@ -420,8 +404,17 @@ def _motions(run: Run, *names: str) -> dict[str, Series]:
     return {name: motion for name in names if is_long(motion := run.motions.get(name))}
 
 
-def _term(run: Run, name: str, wheel: str) -> Series | None:
-    return run.numbers.get(f'controller/terms/{name}/{wheel}')
+def _by_wheel(run: Run, name: str) -> dict[str, Series]:
+    """Return a scalar of the controller by wheel, where there is more than one value."""
+    found = ((wheel, run.numbers.get(f'controller/{name}/{wheel}')) for wheel in WHEELS)
+    return {wheel: series for wheel, series in found if is_long(series)}
+
+
+def _wheel_lines(found: Mapping[str, Series]) -> list[Line]:
+    return [
+        line(f'{wheel} wheel', wheel, series, dash=() if wheel == 'right' else (6, 3))
+        for wheel, series in found.items()
+    ]
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     driven,
     driving,
     format_number,
-    preview_before_switch,
     settled,
     tracking_error,
 )
@@ -109,7 +108,7 @@ def block_errors(run: Run, name: str) -> list[float]:
     if error is None or len(error) < 2:
         return []
     counted = driven(error.time, run)
-    counted &= settled(error.time, run.switches, preview_before_switch(run))
+    counted &= settled(error.time, run)
     squares = error[name][counted & np.isfinite(error[name])] ** 2
     size = max(1, round(BLOCK / float(np.median(np.diff(error.time)))))
     count = squares.size // size

@@ -100,7 +100,9 @@ def reproduce(options: PaperOptions, report: Report | None = None) -> str:
             path.write_text(strict_json(content), encoding='utf-8')
     write_csv(output / 'results.csv', [*compared, *exact])
     (output / 'tables.md').write_text(markdown(tables, claims), encoding='utf-8')
-    drawn = write_pictures(EXHIBITS, material, output / 'figures')
+    drawn = write_pictures(
+        {each.stem: each.draw for each in EXHIBITS if each.draw}, material, output / 'figures'
+    )
     title = "The paper's figures and tables, reproduced"
     html = page(title, _origin(extent, options), material, drawn)
     (output / 'paper.html').write_text(html, encoding='utf-8')
