@@ -4,6 +4,7 @@
 
 import base64
 from collections.abc import Iterator, Mapping, Sequence
+import csv
 from dataclasses import dataclass
 from functools import cache
 import json
@@ -14,6 +15,8 @@ import sys
 from typing import ClassVar, NamedTuple
 
 import jinja2
+import numpy as np
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from t3mpc_ros.evaluation.charts import Chart, PageData, Plane, Timeline
@@ -234,6 +237,19 @@ def progress_bar(
         dynamic_ncols=True,
         mininterval=0.5 if sys.stderr.isatty() else 15.0,
     )
+
+
+def write_columns(
+    path: Path, columns: Mapping[str, Sequence[object] | NDArray[np.generic]]
+) -> None:
+    """Write columns as CSV with one line of names, numbers with all their digits."""
+    with path.open('w', newline='', encoding='utf-8') as stream:
+        writer = csv.writer(stream, lineterminator='\n')
+        writer.writerow(columns)
+        values = [
+            each.tolist() if isinstance(each, np.ndarray) else each for each in columns.values()
+        ]
+        writer.writerows(zip(*values, strict=True))
 
 
 def strict_json(content: object) -> str:

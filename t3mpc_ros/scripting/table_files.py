@@ -3,13 +3,13 @@
 """Tables of a script as CSV and Parquet files."""
 
 from collections.abc import Mapping, Sequence
-import csv
 import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.evaluation.reporting import write_columns
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.scripting.script_error import ScriptError
 
@@ -25,13 +25,7 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
 def write_csv(path: str | os.PathLike[str], columns: Columns) -> Path:
     """Write columns as CSV with one line of names, numbers with all their digits."""
     target = _prepared(path)
-    with target.open('w', newline='', encoding='utf-8') as stream:
-        writer = csv.writer(stream)
-        writer.writerow(columns)
-        values = [
-            each.tolist() if isinstance(each, np.ndarray) else each for each in columns.values()
-        ]
-        writer.writerows(zip(*values, strict=True))
+    write_columns(target, columns)
     return target
 
 

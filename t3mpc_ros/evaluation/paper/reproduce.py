@@ -12,7 +12,7 @@ from t3mpc_ros.evaluation.methods import EXACT_MODEL, methods
 from t3mpc_ros.evaluation.paper.claims import all_claims, markdown
 from t3mpc_ros.evaluation.paper.figure_runs import simulate_figure_runs
 from t3mpc_ros.evaluation.paper.paper_page import EXHIBITS, ExhibitData, counted, page
-from t3mpc_ros.evaluation.paper.results import Results, all_tables, write_csv
+from t3mpc_ros.evaluation.paper.results import Results, all_tables, csv_columns
 from t3mpc_ros.evaluation.paper.study import (
     DRIVES,
     Extent,
@@ -21,7 +21,7 @@ from t3mpc_ros.evaluation.paper.study import (
     study_runs,
 )
 from t3mpc_ros.evaluation.plotting import write_pictures
-from t3mpc_ros.evaluation.reporting import strict_json
+from t3mpc_ros.evaluation.reporting import strict_json, write_columns
 from t3mpc_ros.version import VERSION
 
 RUNS = 'runs.jsonl'
@@ -98,7 +98,7 @@ def reproduce(options: PaperOptions, report: Report | None = None) -> str:
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(strict_json(content), encoding='utf-8')
-    write_csv(output / 'results.csv', [*compared, *exact])
+    write_columns(output / 'results.csv', csv_columns([*compared, *exact]))
     (output / 'tables.md').write_text(markdown(tables, claims), encoding='utf-8')
     drawn = write_pictures(
         {each.stem: each.draw for each in EXHIBITS if each.draw}, material, output / 'figures'

@@ -3,9 +3,7 @@
 """Results of the paper's study: means with intervals, paired differences, and their tables."""
 
 from collections.abc import Callable, Iterable, Sequence
-import csv
 import math
-from pathlib import Path
 
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
@@ -114,13 +112,9 @@ def label(row: Row) -> str:
     return f'{name} (preview)' if marked else name
 
 
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Write the rows with the names of the JSON's keys on top; empty for what is not finite."""
-    with path.open('w', newline='', encoding='utf-8') as stream:
-        writer = csv.DictWriter(stream, list(rows[0]), lineterminator='\n')
-        writer.writeheader()
-        for row in rows:
-            writer.writerow({name: _csv_cell(value) for name, value in row.items()})
+def csv_columns(rows: Sequence[Row]) -> dict[str, list[object]]:
+    """Return the columns of the CSV file, by the keys of the JSON; empty if not finite."""
+    return {name: [_csv_cell(row[name]) for row in rows] for name in rows[0]}
 
 
 def _csv_cell(value: object) -> object:
