@@ -106,12 +106,13 @@ def _tuned(
             resume=options.resume,
         )
     from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
+    from t3mpc_ros.evaluation.tuning.tuned_parameters import TuningBudget
 
     drives = [DRIVES[options.robot]] if options.robot else list(DRIVES.values())
     return tune_methods(
         methods,
         [drive for drive in drives if options.robot or any(drive in m.start for m in methods)],
-        options.evaluations or EVALUATIONS,
+        TuningBudget(options.evaluations or EVALUATIONS),
         executor,
         output,
         print_report,

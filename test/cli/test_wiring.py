@@ -366,12 +366,12 @@ TABLE = {
         {
             '': {
                 'tune_methods.drives': ('torque', 'velocity'),
-                'tune_methods.evaluations': 120,
+                'tune_methods.budget.evaluations': 120,
                 'tune_methods.path': 'runs/tuned.json',
             },
             'DMC': {'tune_methods.methods.0.name': 'DMC'},
             '--robot servo': {'tune_methods.drives': ('velocity',)},
-            '--evaluations 7': {'tune_methods.evaluations': 7},
+            '--evaluations 7': {'tune_methods.budget.evaluations': 7},
             '--output new.json': {'tune_methods.path': 'new.json'},
             '--resume': {'tune_methods.resume': True},
             **workers('tune_methods.workers'),

@@ -18,7 +18,7 @@ from t3mpc_ros.evaluation.paper.study import Extent
 from t3mpc_ros.evaluation.patrol import patrol_comparison
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
 from t3mpc_ros.evaluation.tuning.tune_methods import history_path, tune_methods
-from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
+from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters, TuningBudget
 from t3mpc_ros.scripting import parameter_sweep
 
 measured_patrol = cache(patrol_comparison.measured_patrol)
@@ -66,7 +66,9 @@ def tuning(folder, begun, monkeypatch):
 
     chosen = [each for each in method_definitions() if each.name in ('ADRC', 'PI + feed-forward')]
     path = folder / 'tuned.json'
-    store = tune_methods(chosen, ['velocity'], 30, 1, path, evaluate=evaluate, resume=True)
+    store = tune_methods(
+        chosen, ['velocity'], TuningBudget(30), 1, path, evaluate=evaluate, resume=True
+    )
     assert all(history_path(path, each, 'velocity').is_file() for each in chosen)
     assert TunedParameters.load(path) == store
     return store.table()

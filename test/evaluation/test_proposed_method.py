@@ -230,6 +230,6 @@ def test_methods_tuned_with_unequal_effort_are_not_compared():
     assert set(methods('velocity', store)) >= {'full', 'PI + feed-forward'}
     entry = store.entry('full', 'velocity')
     more = replace(entry.budget, evaluations=2 * entry.budget.evaluations)
-    store.put('full', 'velocity', replace(entry, budget=more))
+    store['full', 'velocity'] = replace(entry, budget=more)
     with pytest.raises(StoreError, match='was tuned with'):
         methods('velocity', store)

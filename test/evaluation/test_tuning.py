@@ -19,7 +19,7 @@ from t3mpc_ros.evaluation.loop import run as closed_loop_run
 from t3mpc_ros.evaluation.method import MethodSpec
 from t3mpc_ros.evaluation.methods import method_definitions, methods
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
-from t3mpc_ros.evaluation.tuning.cma_search import SearchProgress, search_best
+from t3mpc_ros.evaluation.tuning.cma_search import search_best
 from t3mpc_ros.evaluation.tuning.search_space import (
     MethodDefinition,
     SearchRange,
@@ -27,16 +27,14 @@ from t3mpc_ros.evaluation.tuning.search_space import (
 )
 import t3mpc_ros.evaluation.tuning.tune_methods as tune_module
 from t3mpc_ros.evaluation.tuning.tune_methods import (
-    SMOOTHNESS,
     ClosedLoopObjective,
-    TuningScenarios,
     history_path,
-    mean_objectives,
     objective,
     tune_methods,
 )
 from t3mpc_ros.evaluation.tuning.tuned_parameters import (
     PACKAGED_FILE,
+    SMOOTHNESS,
     StoreError,
     TunedEntry,
     TunedParameters,
@@ -175,14 +173,16 @@ def test_every_method_gets_exactly_its_evaluations(n, evaluations):
         seen.extend(points)
         return each(sphere)(points)
 
-    found = search_best(objective, linear(n), Gains(), evaluations, 1, progress.append)
+    found = search_best(
+        objective, linear(n), Gains(), evaluations, 1, lambda *each: progress.append(each)
+    )
     assert len(seen) == evaluations
     assert [point.values for point in found.history] == seen
     assert seen[0] == dict.fromkeys(LETTERS[:n], 2.0)
     assert found.value == min(point.value for point in found.history)
     assert sphere(np.array(list(found.values.values()))) == found.value
-    assert progress[-1] == SearchProgress(evaluations, evaluations, found.value)
-    done = [one.done for one in progress]
+    assert progress[-1] == (evaluations, found.value)
+    done = [count for count, _ in progress]
     assert done == sorted({*done})
 
 
@@ -397,47 +397,53 @@ class Measured:
         return self.varied
 
 
-def test_a_thousand_of_variation_costs_a_hundredth():
-    assert objective(Measured(0.2, 0.0)) == 0.2
-    assert objective(Measured(0.2, 1000.0)) == pytest.approx(0.21)
-    for broken in (Measured(math.nan, 1.0), Measured(1.0, math.nan), Measured(math.inf, 1.0)):
-        assert objective(broken) == math.inf
+@pytest.mark.parametrize(
+    'error, varied, cost',
+    [
+        (0.2, 0.0, 0.2),
+        (0.2, 1000.0, 0.21),
+        (math.nan, 1.0, math.inf),
+        (1.0, math.nan, math.inf),
+        (math.inf, 1.0, math.inf),
+    ],
+)
+def test_a_thousand_of_variation_costs_a_hundredth(error, varied, cost, monkeypatch):
+    monkeypatch.setattr(tune_module, 'run', Measured)
+    assert objective((error, varied)) == pytest.approx(cost)
 
 
 @pytest.mark.slow
 def test_tuning_mixes_noises_and_excludes_held_out_seeds():
-    training = TuningScenarios()
-    assert not set(training.seeds) & set(HELD_OUT_SEEDS)
-    counts = [[noise for _, noise, _ in training.runs()].count(x) for x in (0.0, 0.04, 0.1)]
-    assert len(set(counts)) == 1
-    assert sum(counts) == len(TUNING_SEEDS)
-    for scenario in training.scenarios('torque'):
+    runs = TuningBudget().scenarios('torque')
+    assert {run.seed for run in runs} == {*TUNING_SEEDS}
+    assert not {*TUNING_SEEDS} & {*HELD_OUT_SEEDS}
+    assert [run.noise for run in runs] == 3 * [0.0, 0.04, 0.1]
+    for scenario in runs:
         modes = scenario.reference().modes[: scenario.steps]
         assert np.count_nonzero(np.diff(modes)) >= 1
-        assert scenario.case == 'nominal'
-    with pytest.raises(ValueError, match='differ'):
-        TuningScenarios(seeds=(1, 1), noise_levels=(0.0,))
-    with pytest.raises(ValueError, match='a seed for each'):
-        TuningScenarios(seeds=(1, 2))
-    with pytest.raises(ValueError, match='2 cases and 1 seeds'):
-        TuningScenarios(seeds=(1,), noise_levels=(0.0,), cases=('nominal', 'mass +30 %'))
-    mixed = TuningScenarios((1, 2, 3), (0.04,), 3.0, ('nominal', 'mass +30 %'))
-    cases = [scenario.case for scenario in mixed.scenarios('velocity')]
-    assert cases == ['nominal', 'mass +30 %', 'nominal']
+        assert (scenario.robot, scenario.case) == ('torque', 'nominal')
+    mixed = budget(3, noise_levels=(0.04,), cases=('nominal', 'mass +30 %'))
+    cases = [(run.robot, run.case) for run in mixed.scenarios('velocity')]
+    assert cases == [('servo', case) for case in ('nominal', 'mass +30 %', 'nominal')]
 
 
-def test_mean_objective_is_independent_of_run_order():
-    objectives = np.random.default_rng(1).uniform(size=12)
-    expected = objectives.reshape(3, 4).mean(axis=1)
-    pairs = list(enumerate(objectives.tolist()))
-    first = mean_objectives(3, 4, pairs)
-    assert first == pytest.approx(expected)
-    assert mean_objectives(3, 4, pairs[::-1]) == first
-    assert mean_objectives(3, 4, [*pairs[:-1], (11, math.inf)])[:2] == first[:2]
-    assert mean_objectives(3, 4, [*pairs[:-1], (11, math.inf)])[2] == math.inf
-    for wrong in (pairs[:-1], [*pairs, pairs[0]], [*pairs[:-1], (12, 0.0)]):
-        with pytest.raises(ValueError, match='evaluated'):
-            mean_objectives(3, 4, wrong)
+@pytest.mark.parametrize(
+    'changes, complaint',
+    [
+        ({'training_seeds': (1, 1)}, 'training_seeds must differ'),
+        ({'noise_levels': (0.0, 0.1, 0.2)}, 'noise_levels must be 1 to 2, a seed each'),
+        ({'noise_levels': ()}, 'noise_levels must be 1 to 2'),
+        ({'cases': ('nominal', 'mass +30 %', 'jitter')}, 'cases must be 1 to 2'),
+    ],
+)
+def test_an_evaluation_has_a_seed_for_each_noise_and_case(changes, complaint):
+    with pytest.raises(ParameterError, match=complaint):
+        budget(2, **changes)
+
+
+def budget(seeds, **changes):
+    given = {'noise_levels': (0.0, 0.1), 'duration': 5.0, **changes}
+    return TuningBudget(**{'training_seeds': tuple(range(1, seeds + 1)), **given})
 
 
 @dataclass(frozen=True)
@@ -471,12 +477,11 @@ FEEDBACK = MethodDefinition(
     {'torque': FeedbackParameters(), 'velocity': FeedbackParameters(gain=4.0)},
     (SearchRange('gain', 0.5, 50.0),),
 )
-SHORT = TuningScenarios(seeds=(1, 2), noise_levels=(0.0, 0.1), duration=5.0)
 
 
 def test_closed_loop_objective_is_computed_per_run():
     candidates = [FeedbackParameters(gain=gain) for gain in (1.0, 8.0)]
-    with ClosedLoopObjective(SHORT, 1) as evaluate:
+    with ClosedLoopObjective(budget(2), 1) as evaluate:
         found = evaluate(FEEDBACK, 'torque', candidates)
     for candidate, value in zip(candidates, found, strict=True):
         spec = MethodSpec('P feedback', Feedback, candidate)
@@ -492,7 +497,7 @@ def test_closed_loop_objective_is_computed_per_run():
 def test_failing_parameters_are_worst_a_failing_method_raises():
     good, bad = FeedbackParameters(), FeedbackParameters(fault=1.0)
     said = []
-    with ClosedLoopObjective(SHORT, 1, said.append) as evaluate:
+    with ClosedLoopObjective(budget(2), 1, said.append) as evaluate:
         with pytest.raises(JobError, match='asked to fail'):
             evaluate(FEEDBACK, 'torque', [bad])
         said.clear()
@@ -552,7 +557,7 @@ def tune_both(path, evaluate=lag_plant, evaluations=80, **more):
     return tune_methods(
         [FEEDBACK, WIDER],
         ['torque', 'velocity'],
-        evaluations,
+        TuningBudget(evaluations),
         1,
         path,
         evaluate=evaluate,
@@ -609,13 +614,6 @@ def test_tuning_many_is_resumed_where_it_stopped(tmp_path):
     assert len(history.read_text().splitlines()) == 80
 
 
-def test_progress_names_method_count_and_best(tmp_path, capsys):
-    tune_methods(
-        [WIDER], ['velocity'], 40, 1, tmp_path / 'a.json', print, evaluate=lag_plant,
-    )  # fmt: skip
-    assert re.search(r'wider, 2nd, velocity: 100%.* 40/40 .*best 0\.', capsys.readouterr().err)
-
-
 def test_inconsistent_parameters_cost_an_evaluation_no_run(tmp_path):
     """The table refuses a + c beyond 1500, though each is in range."""
     method = MethodDefinition(
@@ -627,7 +625,9 @@ def test_inconsistent_parameters_cost_an_evaluation_no_run(tmp_path):
     evaluate, counts = counted(
         lambda method, drive, candidates: [1e4 - each.a - each.c for each in candidates]
     )
-    store = tune_methods([method], ['torque'], 150, 1, tmp_path / 'a.json', evaluate=evaluate)
+    store = tune_methods(
+        [method], ['torque'], TuningBudget(150), 1, tmp_path / 'a.json', evaluate=evaluate
+    )
     assert counts['pair', 'torque'] < 150
     found = store.applied('pair', 'torque', Gains())
     assert 1400.0 < found.a + found.c <= 1500.0
@@ -653,8 +653,8 @@ def test_results_of_unequal_budgets_do_not_share_a_file(tmp_path):
     path = tmp_path / 'tuned.json'
     tune_both(path, evaluations=20)
     with pytest.raises(StoreError, match='20 evaluations.*this would be 30 evaluations'):
-        tune_methods([WIDER], ['velocity'], 30, 1, path, evaluate=lag_plant)
-    tune_methods([WIDER], ['velocity'], 20, 1, path, evaluate=lag_plant)
+        tune_methods([WIDER], ['velocity'], TuningBudget(30), 1, path, evaluate=lag_plant)
+    tune_methods([WIDER], ['velocity'], TuningBudget(20), 1, path, evaluate=lag_plant)
     tune_both(path, evaluations=30)
     budgets = [entry.budget.evaluations for entry in TunedParameters.load(path).values()]
     assert budgets == [30, 30, 30]
@@ -664,9 +664,9 @@ def test_methods_that_cannot_be_tuned_are_refused(tmp_path):
     path = tmp_path / 'tuned.json'
     twin = replace(WIDER, name='P-Feedback')
     with pytest.raises(ValueError, match='different names: got p-feedback, p-feedback'):
-        tune_methods([FEEDBACK, twin], ['torque'], 5, 1, path, evaluate=lag_plant)
+        tune_methods([FEEDBACK, twin], ['torque'], TuningBudget(), 1, path, evaluate=lag_plant)
     with pytest.raises(ValueError, match="drive 'torque'"):
-        tune_methods([WIDER], ['torque'], 5, 1, path, evaluate=lag_plant)
+        tune_methods([WIDER], ['torque'], TuningBudget(), 1, path, evaluate=lag_plant)
 
 
 # The file of tuned settings
@@ -784,7 +784,7 @@ def parser():
 def test_the_command_tunes_what_was_named(tmp_path, monkeypatch, capsys):
     asked = {}
 
-    def instead(training, workers, report):
+    def instead(budget, workers, report):
         asked['workers'] = workers
         return _Instead()
 

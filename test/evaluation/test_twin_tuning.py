@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tuning on the digital twin: what an evaluation counts, and what the comparison uses of it."""
 
-from dataclasses import replace
+from concurrent.futures import ThreadPoolExecutor
+import time
 
 import numpy as np
 import pytest
@@ -17,19 +18,16 @@ from t3mpc_ros.evaluation.metrics import OVERALL, VARIATION, measure
 from t3mpc_ros.evaluation.record import rolling_speeds
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning import twin_tuning
-from t3mpc_ros.evaluation.tuning.tune_methods import SMOOTHNESS, TuningScenarios
-from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
+from t3mpc_ros.evaluation.tuning.tune_methods import ClosedLoopObjective
+from t3mpc_ros.evaluation.tuning.tuned_parameters import SMOOTHNESS, TunedParameters
 from t3mpc_ros.evaluation.tuning.twin_tuning import (
     CASES,
     FULL_RANGES,
     TRAINING,
     TWIN,
     VALIDATION_SEEDS,
-    TwinObjective,
-    kept_start,
     tune_twin,
     twin_definitions,
-    twin_method,
     twin_objective,
 )
 
@@ -45,20 +43,25 @@ def test_every_method_starts_from_what_it_has_on_the_twin(definitions):
     assert list(definitions) == [each.name for each in method_definitions()]
     assert definitions[PI].start[TWIN].gain == pytest.approx(96.43, abs=0.01)
     assert definitions[FULL].start[TWIN] == StepperControllerParameters()
+    start = definitions[PI].start[TWIN]
+    trained = [definitions[PI].compared(start, drive).pretrained for drive in (TWIN, 'velocity')]
+    assert trained == [False, True]
     assert definitions[FULL].space.names == tuple(each.name for each in FULL_RANGES)
 
 
 def test_no_seed_of_the_tuning_is_reported():
-    seeds = {*TRAINING.seeds, *VALIDATION_SEEDS}
+    seeds = {*TRAINING.training_seeds, *VALIDATION_SEEDS}
     assert seeds <= {*TUNING_SEEDS}
     assert not seeds & {*HELD_OUT_SEEDS}
-    assert not {*TRAINING.seeds} & {*VALIDATION_SEEDS}
-    assert [case for _, _, case in TRAINING.runs()] == list(CASES)
+    assert not {*TRAINING.training_seeds} & {*VALIDATION_SEEDS}
+    assert [(run.robot, run.case) for run in TRAINING.scenarios(TWIN)] == [
+        (TWIN, case) for case in CASES
+    ]
 
 
 @pytest.mark.slow
 def test_the_body_counts_where_baselines_have_the_gyro(definitions, monkeypatch):
-    method = twin_method(definitions[PI], definitions[PI].start[TWIN])
+    method = definitions[PI].compared(definitions[PI].start[TWIN], TWIN)
     for case, body in (('nominal', False), ('miscalibrated', True)):
         scenario = Scenario('twin', case, 1, 8.0)
         record = run(scenario, method)
@@ -72,16 +75,20 @@ def test_the_body_counts_where_baselines_have_the_gyro(definitions, monkeypatch)
         assert (cost == pytest.approx(numbers[OVERALL.name], rel=0.001)) != body
 
 
-def test_an_evaluation_is_the_mean_of_its_runs(definitions, monkeypatch):
+def test_an_evaluation_is_the_mean_of_its_runs(definitions):
+    """In whatever order they are finished."""
+
     def cost(job):
         scenario, method = job
+        time.sleep(0.02 * (scenario.seed == 1))
         return scenario.seed * method.parameters.gain + 1e3 * CASES.index(scenario.case)
 
-    monkeypatch.setattr(twin_tuning, 'twin_objective', cost)
-    training = TuningScenarios((1, 2), (0.04,), 6.0, CASES)
     method = definitions[PI]
     candidates = [method.start[TWIN], method.start[TWIN].with_values({'gain': 20.0})]
-    with TwinObjective(training, 1) as objective:
+    with (
+        ThreadPoolExecutor(4) as executor,
+        ClosedLoopObjective(TRAINING, executor, cost=cost) as objective,
+    ):
         found = objective(method, TWIN, candidates)
     expected = [500.0 + 1.5 * parameters.gain for parameters in candidates]
     assert found == pytest.approx(expected, rel=1e-12)
@@ -90,7 +97,9 @@ def test_an_evaluation_is_the_mean_of_its_runs(definitions, monkeypatch):
 def test_the_full_controller_is_that_of_the_node(definitions):
     changed = definitions[FULL].start[TWIN].with_values({'body.yaw_gain': 3.0})
     scenario = Scenario('twin', 'nominal', 1)
-    parameters = twin_method(definitions[FULL], changed).parameters_for(scenario)
+    method = definitions[FULL].compared(changed, TWIN)
+    assert {*method.changes} == {*definitions[FULL].space.names}
+    parameters = method.parameters_for(scenario)
     own = scenario.kind.controller_parameters(scenario)
     assert parameters == own.with_values({'body.yaw_gain': 3.0})
     assert parameters != own
@@ -105,11 +114,10 @@ def test_defaults_stay_unless_others_are_better(
     method = definitions[FULL]
     default = method.start[TWIN].to_dict()['body.yaw_gain']
 
-    class Instead(TwinObjective):
-        def objectives(self, method, drive, candidates):
-            return [each.to_dict()['body.yaw_gain'] for each in candidates]
+    def cost(job):
+        return job[1].changes['body.yaw_gain']
 
-    monkeypatch.setattr(twin_tuning, 'TwinObjective', Instead)
+    monkeypatch.setattr(twin_tuning, 'twin_objective', cost)
     monkeypatch.setattr(twin_tuning, 'validate', lambda *_: Difference(mean, half))
     lines = []
     path = tmp_path / 'tuned.json'
@@ -121,12 +129,6 @@ def test_defaults_stay_unless_others_are_better(
     assert (entry.objective == entry.start_objective) == kept
 
 
-def test_defaults_that_do_not_run_are_not_kept(definitions):
-    entry = TunedParameters.load().entry(PI, TWIN)
-    with pytest.raises(ValueError, match='full: the start parameters must have an objective'):
-        kept_start(definitions[FULL], replace(entry, start_objective=None))
-
-
 # The packaged entries
 
 
@@ -136,7 +138,10 @@ def test_every_method_was_tuned_on_the_twin_alike(definitions):
     for name, method in definitions.items():
         entry = store.entry(name, TWIN)
         assert entry.tuned == method.space.names
-        assert (entry.budget.training_seeds, entry.budget.cases) == (TRAINING.seeds, CASES)
+        assert (entry.budget.training_seeds, entry.budget.cases) == (
+            TRAINING.training_seeds,
+            CASES,
+        )
         assert entry.objective <= entry.start_objective
         for each in method.space.ranges:
             assert each.low <= entry.values[each.name] <= each.high

@@ -29,6 +29,8 @@ from t3mpc_ros.parameters.table import Parameters
 
 Objective = Callable[[Sequence[Values]], Sequence[float]]
 """Returns one value for each of several points, which may be evaluated at the same time."""
+Progress = Callable[[int, float], None]
+"""Receives the number of evaluations so far, and the best value."""
 
 STEP = 0.15
 """Standard deviation of the first generation, as a share of each range.
@@ -48,14 +50,6 @@ class Evaluation(NamedTuple):
 
     values: Values
     value: float
-
-
-class SearchProgress(NamedTuple):
-    """How far a search has come."""
-
-    done: int
-    total: int
-    best: float
 
 
 class SearchResult(NamedTuple):
@@ -80,7 +74,7 @@ def search_best(
     start: Parameters,
     evaluations: int,
     seed: int,
-    report: Callable[[SearchProgress], None] | None = None,
+    report: Progress | None = None,
     *,
     path: Path | None = None,
     resume: bool = False,
@@ -140,7 +134,7 @@ class _Evaluator:
         total: int,
         digest: str,
         file: ResultFile | None,
-        report: Callable[[SearchProgress], None] | None,
+        report: Progress | None,
     ) -> None:
         self._objective, self._total, self._digest = objective, total, digest
         self._file, self._report = file, report
@@ -173,7 +167,7 @@ class _Evaluator:
         values = [float(self._known[key]['objective']) for key in keys]
         self.done += map(Evaluation, asked, values)
         if self._report is not None:
-            self._report(SearchProgress(len(self.done), self._total, self.best.value))
+            self._report(len(self.done), self.best.value)
         return values
 
 

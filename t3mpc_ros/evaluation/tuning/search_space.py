@@ -17,6 +17,9 @@ import math
 import numpy as np
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
+from t3mpc_ros.evaluation.loop import Method
+from t3mpc_ros.evaluation.method import MethodSpec, NodeMethod
+from t3mpc_ros.evaluation.scenario import PLANT_OF
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, Parameters, nearest_hint, short_name
 
@@ -124,7 +127,8 @@ class MethodDefinition:
     ranges
         What is tuned, in either drive. All else stays as in ``start``.
     table
-        The table of the parameters; by default that of the controller.
+        The table of the controller of the node, whose method this is then; by default the
+        parameters are those of ``controller_type``.
     """
 
     name: str
@@ -144,6 +148,14 @@ class MethodDefinition:
     def space(self) -> SearchSpace:
         """What is searched."""
         return SearchSpace(self.table or self.controller_type.parameters_type, self.ranges)
+
+    def compared(self, parameters: Parameters, drive: str) -> Method:
+        """Return the method with parameters; on the paper's plant after its pre-training."""
+        if self.table is None:
+            trained = drive in PLANT_OF
+            return MethodSpec(self.name, self.controller_type, parameters, pretrained=trained)
+        values = parameters.to_dict()
+        return NodeMethod(self.name, {name: values[name] for name in self.space.names})
 
     @property
     def short(self) -> str:

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Tuned parameters of all methods in one JSON file of the package.
+"""Tuned parameters of all methods in one JSON file of the package, and what each tuning was given.
 
 The file holds all parameters of a method, not only the tuned ones: it shows what was compared
 when a default changes later.
@@ -14,8 +14,16 @@ from typing import Self, TypeVar
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.reporting import Table
+from t3mpc_ros.evaluation.scenario import PLANT_OF, TUNING_SEEDS, Scenario
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
+SMOOTHNESS = 1e-5
+"""rho, s²: what a unit of chatter (rad/s³) costs in tracking error (rad/s).
+
+Small: 1000 rad/s³ of total variation of u per second cost 0.01 rad/s. It keeps a method from
+buying the last percent of tracking with a command that shakes the motors, and decides between
+parameters that track alike; it is too small to make any method track worse to be smooth.
+"""
 PACKAGED_FILE = Path(__file__).resolve().parent / 'tuned.json'
 """Bundled file of tuned parameters."""
 
@@ -29,20 +37,48 @@ class StoreError(ValueError):
 
 @dataclass(frozen=True)
 class TuningBudget(Parameters):
-    """What a tuning was given: a comparison is fair when it is equal for all."""
+    """What a tuning is given: a comparison is fair when it is equal for all.
+
+    An evaluation is one run for each seed, none of which is one of the results. Run i has noise
+    level i and case i, both counted round; there are seeds enough for each.
+    """
 
     evaluations: int = parameter(1, 'evaluations of the objective', bounds=(1, None))
     search_seed: int = parameter(1, 'seed of the search')
-    training_seeds: tuple[int, ...] = parameter((), 'runs of one evaluation')
+    training_seeds: tuple[int, ...] = parameter(TUNING_SEEDS, 'runs of one evaluation')
     noise_levels: tuple[float, ...] = parameter(
-        (),
+        (0.0, 0.04, 0.1),
         'noise of the wheel speeds, counted round the runs',
         '(rad/s)²',
         (0.0, None),
     )
-    duration: float = parameter(0.0, 'length of each run', 's', (0.0, None))
-    smoothness: float = parameter(0.0, 'rho of the objective', 's²', (0.0, None))
+    duration: float = parameter(
+        26.0, 'length of each run; in 26 s the reference switches twice', 's', (0.0, None)
+    )
+    smoothness: float = parameter(SMOOTHNESS, 'rho of the objective', 's²', (0.0, None))
     cases: tuple[str, ...] = parameter(('nominal',), 'cases, counted round the runs')
+
+    def check_consistency(self) -> None:
+        """Raise :class:`ParameterError` unless there is a seed for each noise level and case."""
+        seeds = len(self.training_seeds)
+        if len({*self.training_seeds}) != seeds:
+            raise ParameterError(f'training_seeds must differ: got {self.training_seeds}')
+        for name, values in (('noise_levels', self.noise_levels), ('cases', self.cases)):
+            if not 1 <= len(values) <= seeds:
+                raise ParameterError(f'{name} must be 1 to {seeds}, a seed each: got {values}')
+
+    def scenarios(self, drive: str) -> list[Scenario]:
+        """Return the runs of one evaluation on the paper's plant with a drive, or on the twin."""
+        return [
+            Scenario(
+                PLANT_OF.get(drive, drive),
+                self.cases[i % len(self.cases)],
+                seed,
+                self.duration,
+                self.noise_levels[i % len(self.noise_levels)],
+            )
+            for i, seed in enumerate(self.training_seeds)
+        ]
 
     def __str__(self) -> str:
         seeds = ', '.join(map(str, self.training_seeds))
@@ -101,10 +137,6 @@ class TunedParameters(dict[tuple[str, str], TunedEntry]):
         content = {'format': _FORMAT, 'methods': methods}
         text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
         write_atomically(path, text + '\n')
-
-    def put(self, method: str, drive: str, entry: TunedEntry) -> None:
-        """Add or replace an entry."""
-        self[method, drive] = entry
 
     def entry(self, method: str, drive: str) -> TunedEntry:
         """Return what was found for a method in a drive."""

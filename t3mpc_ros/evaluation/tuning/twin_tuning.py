@@ -6,38 +6,37 @@ Half of the runs of an evaluation are on the default twin, half on the miscalibr
 the baselines have the gyro.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired, rms
-from t3mpc_ros.evaluation.loop import Method, run
-from t3mpc_ros.evaluation.method import MethodSpec, NodeMethod
+from t3mpc_ros.evaluation.experiment import Report
+from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, methods, twin_start
 from t3mpc_ros.evaluation.metrics import START, VARIATION, measure
 from t3mpc_ros.evaluation.proposed_method import ProposedController
 from t3mpc_ros.evaluation.record import rolling_speeds
 from t3mpc_ros.evaluation.scenario import KINDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
-from t3mpc_ros.evaluation.tuning.tune_methods import (
+from t3mpc_ros.evaluation.tuning.tune_methods import ClosedLoopObjective, tune_methods
+from t3mpc_ros.evaluation.tuning.tuned_parameters import (
     SMOOTHNESS,
-    ClosedLoopObjective,
-    TuningScenarios,
-    mean_objectives,
-    tune_methods,
+    TunedEntry,
+    TunedParameters,
+    TuningBudget,
 )
-from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedEntry, TunedParameters
+from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.parameters.table import Parameters
 
 TWIN = KINDS['twin'].tuned_for
 CASES = ('nominal', 'miscalibrated')
-TRAINING = TuningScenarios(TUNING_SEEDS[:2], (0.04,), 26.0, CASES)
+TRAINING = TuningBudget(training_seeds=TUNING_SEEDS[:2], noise_levels=(0.04,), cases=CASES)
 """Runs of one evaluation."""
 VALIDATION_SEEDS = TUNING_SEEDS[2:]
 """Seeds on which the tuned parameters of the full controller are compared with its defaults."""
@@ -75,36 +74,7 @@ def twin_definitions(known: Iterable[MethodDefinition]) -> list[MethodDefinition
     return found
 
 
-class TwinObjective(ClosedLoopObjective):
-    """Mean objective of parameters on the twin."""
-
-    def objectives(
-        self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
-    ) -> list[float]:
-        """Return the mean objective of each candidate, infinite where a run broke off."""
-        training = self.training
-        scenarios = [
-            Scenario('twin', case, seed, training.duration, noise)
-            for seed, noise, case in training.runs()
-        ]
-        jobs = [
-            (scenario, twin_method(method, candidate))
-            for candidate in candidates
-            for scenario in scenarios
-        ]
-        found = self.workers.map(twin_objective, jobs)
-        return mean_objectives(len(candidates), len(scenarios), found)
-
-
-def twin_method(method: MethodDefinition, parameters: Parameters) -> Method:
-    """Return a method with parameters, for the closed loop with the twin."""
-    if method.name == FULL:
-        values = parameters.to_dict()
-        return NodeMethod(FULL, {name: values[name] for name in method.space.names})
-    return MethodSpec(method.name, method.controller_type, parameters)
-
-
-def twin_objective(job: tuple[Scenario, Any]) -> float:
+def twin_objective(job: Job) -> float:
     """Return RMSE + rho times the variation of a run, rad/s; infinite if it is not finite.
 
     On the default twin the error is that of the rotors. Where the baselines have the gyro it is
@@ -132,7 +102,7 @@ def validate(
     start = method.start[TWIN]
     found = start.with_values({name: tuned.values[name] for name in tuned.tuned})
     jobs = [
-        (Scenario('twin', case, seed, TRAINING.duration), twin_method(method, parameters))
+        (Scenario(TWIN, case, seed, TRAINING.duration), method.compared(parameters, TWIN))
         for seed in VALIDATION_SEEDS
         for case in CASES
         for parameters in (found, start)
@@ -142,20 +112,12 @@ def validate(
     return paired(with_tuned, with_start)
 
 
-def kept_start(method: MethodDefinition, tuned: TunedEntry) -> TunedEntry:
-    """Return the entry with the start parameters in place of the tuned ones."""
-    if tuned.start_objective is None:
-        raise ValueError(f'{method.name}: the start parameters must have an objective')
-    values = method.start[TWIN].to_dict()
-    return replace(tuned, values=values, objective=tuned.start_objective)
-
-
 def tune_twin(
     selected: Sequence[MethodDefinition],
     evaluations: int,
     workers: int | Executor,
     path: Path,
-    report: Callable[[str], None],
+    report: Report,
     *,
     resume: bool = False,
 ) -> TunedParameters:
@@ -164,17 +126,10 @@ def tune_twin(
     The full controller keeps its defaults unless the tuned parameters are better on seeds that
     they were not tuned on, by more than the 95 % interval of the paired difference.
     """
-    with TwinObjective(TRAINING, workers, report) as objective:
+    budget = replace(TRAINING, evaluations=evaluations)
+    with ClosedLoopObjective(budget, workers, report, twin_objective) as objective:
         store = tune_methods(
-            selected,
-            [TWIN],
-            evaluations,
-            workers,
-            path,
-            report,
-            resume=resume,
-            training=TRAINING,
-            evaluate=objective,
+            selected, [TWIN], budget, workers, path, report, resume=resume, evaluate=objective
         )
         for method in selected:
             if method.name != FULL:
@@ -188,6 +143,8 @@ def tune_twin(
                 f'{difference.half:.5f} rad/s: {"they are stored" if better else "kept defaults"}'
             )
             if not better:
-                store.put(FULL, TWIN, kept_start(method, tuned))
+                assert tuned.start_objective is not None
+                values = method.start[TWIN].to_dict()
+                store[FULL, TWIN] = replace(tuned, values=values, objective=tuned.start_objective)
                 store.save(path)
     return store
