@@ -71,6 +71,7 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.plotting import write_pictures
     from t3mpc_ros.evaluation.reporting import strict_json
+    from t3mpc_ros.evaluation.result_file import ResultFile
 
     figures = options.output / 'figures'
     figures.mkdir(parents=True, exist_ok=True)  # an error before the runs, not after them
@@ -87,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
     (options.output / f'{name}.json').write_text(numbers, encoding='utf-8')
     written = options.output / f'{name}.html'
     written.write_text(page.page(study, drawn), encoding='utf-8')
-    runs.unlink(missing_ok=True)
+    ResultFile(runs).remove(study.table.keys)
     print(f'written to {written}', file=sys.stderr)
     return 0
 

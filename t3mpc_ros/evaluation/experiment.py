@@ -7,7 +7,7 @@ on other machines, and returns a :class:`ResultTable`, from which means, paired 
 and pages are made.
 """
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
@@ -50,8 +50,10 @@ class Run:
 class ResultTable(Sequence[Row]):
     """Measured runs, one row each: what tells the run from others, and its numbers by name."""
 
-    def __init__(self, rows: Sequence[Row]) -> None:
+    def __init__(self, rows: Sequence[Row], keys: Collection[str] = ()) -> None:
         self.rows = list(rows)
+        self.keys = keys
+        """Keys of the runs in the file that keeps them."""
         self._groups: dict[tuple[str, ...], dict[tuple[Hashable, ...], list[Row]]] = {}
 
     def __len__(self) -> int:
@@ -158,7 +160,7 @@ def run_experiment(
                 raise
             if report is not None:
                 report('a worker process was lost; its runs are begun again')
-    return ResultTable([{**run.fields, **kept[run.key]} for run in runs])
+    return ResultTable([{**run.fields, **kept[run.key]} for run in runs], by_key.keys())
 
 
 def _made(

@@ -2,14 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finished runs in a file of JSON lines, and the runs that it lacks."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 import contextlib
 import fcntl
 from io import TextIOWrapper
+from itertools import starmap
 import json
 from pathlib import Path
 from typing import Any, Self
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.reporting import progress_bar
 
 Row = dict[str, Any]
@@ -54,7 +56,7 @@ class ResultFile:
         """Append a finished run."""
         if self._stream is None:
             raise RuntimeError('the file must be entered before runs are added')
-        self._stream.write(json.dumps({KEY: key, **row}, ensure_ascii=False) + '\n')
+        self._stream.write(_line(key, row))
         self._stream.flush()
 
     def __enter__(self) -> Self:
@@ -79,6 +81,15 @@ class ResultFile:
         if self._stream is not None:
             self._stream.close()
             self._stream = None
+
+    def remove(self, keys: Collection[str]) -> None:
+        """Remove runs from the file, and the file if it holds no others."""
+        with self:
+            others = {key: row for key, row in self.read().items() if key not in keys}
+            if others:
+                write_atomically(self.path, ''.join(starmap(_line, others.items())))
+            else:
+                self.path.unlink()
 
     def complete(
         self,
@@ -136,3 +147,7 @@ class ResultFile:
         if self.unreadable:
             text += f'; {self.unreadable} lines that are torn or of an older version are skipped'
         return text
+
+
+def _line(key: str, row: Mapping[str, Any]) -> str:
+    return json.dumps({KEY: key, **row}, ensure_ascii=False) + '\n'

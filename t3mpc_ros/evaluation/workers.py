@@ -7,7 +7,7 @@ work by ``if __name__ == '__main__':``.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import nullcontext
 from functools import partial
 import multiprocessing
@@ -97,7 +97,10 @@ class WorkerPool:
         begun: dict[Future[T], tuple[int, J]] = {}
         try:
             for index, job in enumerate(jobs):
-                begun[self._pool.submit(task, job)] = index, job
+                try:
+                    begun[self._pool.submit(task, job)] = index, job
+                except BrokenExecutor as error:  # a process was lost meanwhile
+                    raise _job_error(job, error) from error
             for future in as_completed(begun):
                 index, job = begun.pop(future)
                 failure = future.exception()

@@ -26,7 +26,7 @@ from t3mpc_ros.evaluation.experiment import (
 )
 from t3mpc_ros.evaluation.metrics import METRICS
 from t3mpc_ros.evaluation.reporting import Table, format_interval
-from t3mpc_ros.evaluation.result_file import Row
+from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.parameters.provenance import provenance
@@ -281,7 +281,7 @@ def _checked_path(output: str | os.PathLike[str] | None) -> Path | None:
 def _run_to_file(
     path: Path, runs: Sequence[Run], workers: int | Executor, report: Report | None
 ) -> list[Row]:
-    """Run what the file and its journal lack, write the file, and remove the journal."""
+    """Run what the file and its journal lack, write the file, and remove them from the journal."""
     stored = _read(path)
     wanted = [run for run in runs if run.key not in stored]
     if stored and report is not None:
@@ -294,7 +294,7 @@ def _run_to_file(
     write_parquet(
         path, columns_of([*rows, *(row for key, row in stored.items() if key not in keys)])
     )
-    journal.unlink(missing_ok=True)
+    ResultFile(journal).remove(made.keys)
     return rows
 
 

@@ -142,8 +142,12 @@ PATROL = {
     for function, result in (('markdown', ''), ('record', {}), ('page', ''))
 } | {
     'evaluation.plotting.write_pictures': {},
-    'evaluation.patrol.patrol_comparison.compare_patrols': {},
-    'evaluation.patrol.path_tracking.compare_trackers': {},
+    'evaluation.patrol.patrol_comparison.compare_patrols': SimpleNamespace(
+        table=SimpleNamespace(keys=())
+    ),
+    'evaluation.patrol.path_tracking.compare_trackers': SimpleNamespace(
+        table=SimpleNamespace(keys=())
+    ),
     'evaluation.patrol.path_tracking.tune_trackers': {},
     'evaluation.patrol.tracking_page.tuning_markdown': '',
 }

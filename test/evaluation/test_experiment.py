@@ -2,11 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one table of results and the runner that fills it."""
 
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
 from importlib import import_module
 
 import pytest
 
 from t3mpc_ros.evaluation.experiment import ResultTable, Run, content_of, run_experiment
+from t3mpc_ros.evaluation.workers import JobError
 
 ROWS = [
     {'controller': name, 'seed': seed, 'error': error}
@@ -51,6 +55,36 @@ def test_rows_are_those_of_the_runs_in_their_order(stored, tmp_path):
     store = tmp_path / 'runs.jsonl' if stored else None
     table = run_experiment(runs(3, 1, 2), doubled, store=store)
     assert list(table) == [{'number': n, 'double': 2.0 * n} for n in (3, 1, 2)]
+
+
+class LosingWorkers(ThreadPoolExecutor):
+    """Loses a process at some submissions."""
+
+    def __init__(self, lost_at):
+        super().__init__(1)
+        self.left = lost_at
+
+    def submit(self, *arguments):
+        self.left -= 1
+        if self.left % 3 == 0 and self.left >= 0:
+            raise BrokenProcessPool('lost')
+        return super().submit(*arguments)
+
+
+@pytest.mark.parametrize('losses, finished', [(3, True), (4, False)])
+def test_runs_of_lost_workers_are_begun_again_three_times(losses, finished, tmp_path):
+    """A worker lost while runs were still being submitted ended the study."""
+    told = []
+    with LosingWorkers(3 * losses) as executor:
+        outcome = nullcontext() if finished else pytest.raises(JobError, match='m on .* failed')
+        with outcome:
+            store = tmp_path / 'runs.jsonl'
+            table = run_experiment(
+                runs(1, 2, 3), doubled, executor, store=store, report=told.append
+            )
+            assert [row['double'] for row in table] == [2.0, 4.0, 6.0]
+            assert {*table.keys} == {'key 1', 'key 2', 'key 3'}
+    assert sum('begun again' in text for text in told) == 3
 
 
 def test_content_tells_equal_numbers_of_other_kinds_apart():

@@ -78,6 +78,18 @@ def test_a_fresh_file_forgets_its_runs(tmp_path):
         assert file.read() == {}
 
 
+def test_only_the_runs_of_a_finished_study_are_removed(tmp_path):
+    """A patrol and a sweep removed the runs of other settings, too."""
+    path = tmp_path / 'r'
+    whole, _ = table(path)
+    file = ResultFile(path)
+    file.remove({'key 2', 'key 5'})
+    found, done = table(path)
+    assert (found, done) == (whole, [(2, 'method'), (5, 'method')])
+    file.remove([run.key for run in RUNS])
+    assert not path.exists()
+
+
 def test_two_experiments_do_not_share_a_file(tmp_path):
     with ResultFile(tmp_path / 'r'), pytest.raises(RuntimeError, match='another process'):
         table(tmp_path / 'r')
