@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 
+from t3mpc_ros.chaos.portrait import PortraitParameters
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     PatrolScenario,
@@ -18,9 +19,9 @@ from t3mpc_ros.evaluation.record import RATE
 
 
 def _run(seed, duration):
-    with world_file(room_with_boxes(seed)) as world:
+    with world_file(room_with_boxes(seed, (4.0, 3.0), 3)) as world:
         scenario = PatrolScenario(seed=seed, duration=duration, world=world)
-        return run_patrol(portrait_points(seed, scenario.limits), scenario)
+        return run_patrol(portrait_points(seed, PortraitParameters()), scenario)
 
 
 @pytest.mark.slow

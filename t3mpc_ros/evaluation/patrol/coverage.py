@@ -29,12 +29,6 @@ class CoverageGrid:
     def __post_init__(self) -> None:
         if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
             raise ValueError(f'low must be below high: got {self.low}, {self.high}')
-        if self.columns < 1 or self.rows < 1:
-            raise ValueError(f'columns and rows must be >= 1: got {self.columns}, {self.rows}')
-        if self.blocked is not None and self.blocked.shape != (self.rows, self.columns):
-            raise ValueError(
-                f'blocked must have shape ({self.rows}, {self.columns}): got {self.blocked.shape}'
-            )
         if not self.free.any():
             raise ValueError('blocked must leave at least one cell free')
 

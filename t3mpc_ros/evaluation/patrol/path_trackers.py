@@ -19,6 +19,7 @@ from typing import Protocol
 import numpy as np
 
 from t3mpc_ros.control.actuation import LimitParameters, limit_command, wheel_limits
+from t3mpc_ros.evaluation.record import RATE
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.path_timing import check_points, polyline_length, resample
 from t3mpc_ros.geometry.types import STANDSTILL, Array, BodyTwist, Pose, WheelSpeeds
@@ -97,36 +98,18 @@ def pursuit_curvature(pose: Pose, target: tuple[float, float]) -> float:
 
 
 class Pursuit:
-    """Pure pursuit of a path, plain or regulated by the kind of its parameters.
+    """Pure pursuit of a path (m, shape (n, 2)), plain or regulated by the kind of its parameters.
 
-    Parameters
-    ----------
-    points
-        Path, m, shape (n, 2).
-    parameters
-        :class:`PurePursuitParameters` or :class:`RegulatedParameters`.
-    limits, geometry, period
-        Every command keeps these limits, as those of the controller; the period is in s.
-
-    Raises
-    ------
-    PathError
-        The points are not finite.
+    Every command has the limits of the controller.
     """
 
     def __init__(
-        self,
-        points: Array,
-        parameters: PurePursuitParameters | RegulatedParameters,
-        limits: LimitParameters | None = None,
-        geometry: WheelGeometry | None = None,
-        period: float = 0.01,
+        self, points: Array, parameters: PurePursuitParameters | RegulatedParameters
     ) -> None:
         check_points(points)
         self._parameters = parameters
-        self._geometry = geometry or WheelGeometry()
-        self._limits = wheel_limits(limits or LimitParameters(), self._geometry)
-        self._period = period
+        self._geometry = WheelGeometry()
+        self._limits = wheel_limits(LimitParameters(), self._geometry)
         path = resample(points, SPACING)
         self._spacing = polyline_length(path) / (len(path) - 1)
         self._goal = len(path) - 1
@@ -154,7 +137,7 @@ class Pursuit:
             wanted = BodyTwist(speed, speed * curvature)
         wheels = wheels_from_twist(wanted, self._geometry)
         limit_command(
-            wheels.right, wheels.left, self._command, self._limits, self._period, self._command
+            wheels.right, wheels.left, self._command, self._limits, 1.0 / RATE, self._command
         )
         command = twist_from_wheels(WheelSpeeds(*self._command.tolist()), self._geometry)
         self._speed = abs(command.linear)

@@ -27,6 +27,8 @@ from t3mpc_ros.evaluation.patrol.path_trackers import (
     RegulatedParameters,
 )
 from t3mpc_ros.evaluation.patrol.patrol_run import (
+    GRIP,
+    LIMITS,
     PatrolScenario,
     path_error,
     run_patrol,
@@ -37,7 +39,6 @@ from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_file import load_path
 from t3mpc_ros.geometry.path_timing import (
-    MotionLimits,
     distance_to_path,
     polyline_length,
     resample,
@@ -53,8 +54,8 @@ ARRIVED = 0.05
 """Distance from the goal (m) within which a robot that has arrived stays."""
 LAST_PIECE = 1.0
 """Time for the rest of the path after the arrival, which counts, s."""
-PATCHES, PATCH_RADIUS, PATCH_GRIP = 2, 0.08, 0.25
-"""Slippery places on each path: number, radius (m), share of the grip."""
+PATCHES, PATCH_RADIUS = 2, 0.08
+"""Slippery places on each path: number, radius (m)."""
 TUNING_SEEDS = (901, 902)
 SPACING = 0.005
 """Distance of the places at which errors are measured, m."""
@@ -161,7 +162,6 @@ class TrackingPlan:
     paths: Sequence[str] = tuple(TRACKED_PATHS)
     seeds: Sequence[int] = (101, 102, 103, 104, 105)
     methods: Sequence[str] = tuple(METHODS)
-    limits: MotionLimits = MotionLimits()
 
     def __post_init__(self) -> None:
         for name in self.paths:
@@ -188,7 +188,6 @@ class TrackingJob(NamedTuple):
     path: str
     points: Array
     seed: int
-    limits: MotionLimits = MotionLimits()
     drawn: bool = False
     """Whether the true positions are kept."""
 
@@ -209,7 +208,7 @@ def compare_trackers(
             points = TRACKED_PATHS[path]()
             for name in plan.methods:
                 drawn = seed == plan.seeds[0]
-                job = TrackingJob(path, points, seed, plan.limits, drawn), METHODS[name]
+                job = TrackingJob(path, points, seed, drawn), METHODS[name]
                 fields = {'path': path, 'controller': name, 'seed': seed}
                 runs.append(Run(job, fields, digest(job)))
     return TrackingStudy(
@@ -219,7 +218,7 @@ def compare_trackers(
 
 def measured_drive(job: tuple[TrackingJob, TrackingMethod]) -> Row:
     """Return the errors of a method on a path."""
-    (_, points, _, _, drawn), method = job
+    (_, points, _, drawn), method = job
     row = errors_of(drive(job), points, timed=method.pursuit is None)
     if not drawn:
         del row['track']
@@ -228,7 +227,7 @@ def measured_drive(job: tuple[TrackingJob, TrackingMethod]) -> Row:
 
 def drive(job: tuple[TrackingJob, TrackingMethod]) -> Record:
     """Return the record of a method on a path; equal arguments give equal records."""
-    (_, points, seed, limits, _), method = job
+    (_, points, seed, _), method = job
     generator = np.random.default_rng((seed, 31))
     late, radius, separation = generator.uniform([0.0, -0.005, -0.01], [0.03, 0.005, 0.01])
     robot: dict[str, object] = {
@@ -236,14 +235,13 @@ def drive(job: tuple[TrackingJob, TrackingMethod]) -> Record:
         'right_wheel_radius_multiplier': 1.0 + float(radius),
         'wheel_separation_multiplier': 1.0 + float(separation),
     }
-    least = float(time_path(points, limits, WheelGeometry(), 1.0 / RATE, ORIGIN).time[-1])
+    least = float(time_path(points, LIMITS, WheelGeometry(), 1.0 / RATE, ORIGIN).time[-1])
     tracker = None if method.pursuit is None else Pursuit(points, method.pursuit)
     with world_file(slippery_floor(points, generator)) as world:
         scenario = PatrolScenario(
             seed=seed,
             duration=math.ceil(method.spare_time * least) + 2.0,
             world=world,
-            limits=limits,
             keep_out=False,
             robot=robot,
             controller=method.controller,
@@ -257,9 +255,7 @@ def slippery_floor(points: Array, generator: np.random.Generator) -> str:
     places = along[generator.integers(0, len(along), PATCHES)]
     lines = ['name: slippery_floor', 'patches:']
     for x, y in places.tolist():
-        lines.append(
-            f'  - {{center: [{x:.4f}, {y:.4f}], radius: {PATCH_RADIUS}, grip: {PATCH_GRIP}}}'
-        )
+        lines.append(f'  - {{center: [{x:.4f}, {y:.4f}], radius: {PATCH_RADIUS}, grip: {GRIP}}}')
     return '\n'.join(lines) + '\n'
 
 

@@ -24,6 +24,7 @@ from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at, visits
 from t3mpc_ros.evaluation.patrol.patrol_metrics import patrol_metrics
 from t3mpc_ros.evaluation.patrol.patrol_run import (
+    LIMITS,
     PatrolScenario,
     contact_count,
     outside_avoidance,
@@ -36,7 +37,7 @@ from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
+from t3mpc_ros.geometry.path_timing import PathTiming
 from t3mpc_ros.geometry.types import ORIGIN, Array
 from t3mpc_ros.robot.description import ray_ends, sensor_mounts
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
@@ -69,7 +70,6 @@ class PatrolPlan:
     arena: tuple[float, ...] = PortraitParameters().arena
     """left, bottom, right, top of the area of the paths, m; the walls of the twin's room are
     0.25 m outside."""
-    limits: MotionLimits = MotionLimits()
 
     def __post_init__(self) -> None:
         for name in self.paths:
@@ -126,17 +126,12 @@ class PatrolStudy(NamedTuple):
     """The room of the first seed; None if it is empty."""
 
 
-class Patrol(NamedTuple):
-    """A plan of one path and one seed, and whether what is drawn of it is kept."""
-
-    plan: PatrolPlan
-    drawn: bool
-
-
-class NamedPath(NamedTuple):
+class DrivenPath(NamedTuple):
     """A path by its name."""
 
     name: str
+    drawn: bool
+    """Whether what is drawn of it is kept."""
 
 
 def compare_patrols(
@@ -150,16 +145,16 @@ def compare_patrols(
     runs = []
     for seed in plan.seeds:
         for name in plan.paths:
-            patrol = Patrol(replace(plan, paths=(name,), seeds=(seed,)), seed == first)
-            job = patrol, NamedPath(name)
+            own = replace(plan, paths=(name,), seeds=(seed,))
+            job = own, DrivenPath(name, seed == first)
             runs.append(Run(job, {'controller': name, 'seed': seed}, digest(job)))
     table = run_experiment(runs, measured_patrol, workers, store=store, report=report)
     room = parse_world(plan_world(plan, first), 'room') if plan.robot == 'twin' else None
     return PatrolStudy(plan, table, room)
 
 
-def measured_patrol(job: tuple[Patrol, NamedPath]) -> Row:
-    """Return the row of a patrol.
+def measured_patrol(job: tuple[PatrolPlan, DrivenPath]) -> Row:
+    """Return the row of a patrol, by a plan of one path and one seed.
 
     The numbers of :func:`.patrol_metrics.patrol_metrics`, and ``contacts``, periods in which the
     robot touched something; ``avoiding``, share of the time in which it avoids an obstacle;
@@ -167,8 +162,8 @@ def measured_patrol(job: tuple[Patrol, NamedPath]) -> Row:
     ``track``, positions (m); ``dwell``, time in each cell (s), NaN in those that do not count;
     ``hits`` of the range sensors (m).
     """
-    (plan, drawn), path = job
-    track = patrol_track(plan, path.name, plan.seeds[0])
+    plan, (name, drawn) = job
+    track = patrol_track(plan, name, plan.seeds[0])
     reference = np.where(track.counted[:, None], track.reference, math.nan)
     x, y = track.position.T
     found = visits(track.time, x, y, track.grid)
@@ -193,14 +188,7 @@ def patrol_track(plan: PatrolPlan, name: str, seed: int) -> PatrolTrack:
     text = plan_world(plan, seed)
     walls = text.partition('boxes:')[0]
     with world_file(walls) as known, world_file(text) as path:
-        scenario = PatrolScenario(
-            seed=seed,
-            duration=plan.duration,
-            known_world=known,
-            world=path,
-            limits=plan.limits,
-        )
-        record = run_patrol(points, scenario)
+        record = run_patrol(points, PatrolScenario(seed, plan.duration, known, path))
     return _twin_track(plan, record, parse_world(text, 'room'))
 
 
@@ -208,8 +196,8 @@ def path_points(plan: PatrolPlan, name: str, seed: int) -> Iterator[Array]:
     """Return the pieces of a path, m, each of shape (k, 2); they never end before the patrol."""
     if name == OURS:
         parameters = PortraitParameters.from_dict({'arena': list(plan.arena)})
-        return portrait_points(seed, plan.limits, parameters)
-    length = plan.limits.linear * plan.duration + 10.0
+        return portrait_points(seed, parameters)
+    length = LIMITS.linear * plan.duration + 10.0
     return iter([BASELINE_PATHS[name](plan.area, length, np.random.default_rng((seed, 21)))])
 
 
@@ -233,7 +221,7 @@ def free_cells(plan: PatrolPlan, world: World | None) -> CoverageGrid:
 
 
 def _exact_track(plan: PatrolPlan, points: Iterator[Array]) -> PatrolTrack:
-    timing = PathTiming(plan.limits, WheelGeometry(), SAMPLE, ORIGIN)
+    timing = PathTiming(LIMITS, WheelGeometry(), SAMPLE, ORIGIN)
     count = math.floor(plan.duration / SAMPLE) + 1
     position = np.empty((count, 2))
     for row in position:

@@ -14,7 +14,7 @@ from t3mpc_ros.evaluation.patrol.coverage import (
     time_to_cover,
     visits,
 )
-from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, predictability
+from t3mpc_ros.evaluation.patrol.predictability import predictability
 from t3mpc_ros.evaluation.patrol.time_series import (
     delay_vectors,
     divergence,
@@ -34,7 +34,6 @@ LONGEST = 1800.0
 _STEP = 0.25
 _EXPONENT_LAGS = (0, 4, 8)
 _APART, _FOLLOWED = 40, 80
-_SEGMENT = 64
 
 
 def patrol_metrics(
@@ -84,8 +83,8 @@ def patrol_metrics(
         seconds = resampled(late, px, py, 1.0)
         permutation = float(np.mean([permutation_entropy(axis) for axis in seconds.T]))
         moves = np.diff(seconds, axis=0)
-        spectral = float(np.mean([spectral_entropy(axis, _SEGMENT) for axis in moves.T]))
-        skills = predictability(late, px, py, HORIZONS)
+        spectral = float(np.mean([spectral_entropy(axis) for axis in moves.T]))
+        skills = predictability(late, px, py)
         for name, of in (
             ('skill', 'best'),
             ('prediction_error', 'error'),
@@ -119,4 +118,4 @@ def path_exponent(t: Array, x: Array, y: Array) -> float:
     points = delay_vectors(resampled(t, x, y, _STEP), _EXPONENT_LAGS)
     if not np.ptp(points, axis=0).any():
         return math.nan
-    return divergence(points, _STEP, _APART, _FOLLOWED).exponent
+    return divergence(points, _STEP, _APART, _FOLLOWED)

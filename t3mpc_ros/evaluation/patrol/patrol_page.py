@@ -19,6 +19,7 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
 )
 from t3mpc_ros.evaluation.patrol.patrol_figures import PICTURES
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
+from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
 from t3mpc_ros.evaluation.reporting import (
     Block,
@@ -204,8 +205,8 @@ def description(plan: PatrolPlan) -> str:
     )
     return (
         f'{robots[plan.robot]}; {right - left:g} m × {top - bottom:g} m, '
-        f'{plan.duration / 60.0:g} min, at most {plan.limits.linear:g} m/s and '
-        f'{plan.limits.angular:g} rad/s for every path; '
+        f'{plan.duration / 60.0:g} min, at most {LIMITS.linear:g} m/s and '
+        f'{LIMITS.angular:g} rad/s for every path; '
         f'{len(plan.seeds)} seeds, {plan.seeds[0]} to {plan.seeds[-1]}. '
         'Mean ± half the 95 % interval over the seeds. A cell is covered when the centre of the '
         f'robot has entered it.{cells}'
@@ -267,7 +268,7 @@ def record(study: PatrolStudy) -> dict[str, Any]:
         'seeds': list(plan.seeds),
         'duration': plan.duration,
         'arena': list(plan.arena),
-        'limits': plan.limits.to_dict(),
+        'limits': LIMITS.to_dict(),
         'claims': [claim._asdict() for claim in claims(study)],
         'paths': paths,
     }

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
-from t3mpc_ros.chaos.pose_reference import PathClock, WaitParameters
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.keep_out import Activity
@@ -47,11 +46,19 @@ SETTLING = 2.0
 """Time after the robot has reached its path again that still counts as avoidance, s."""
 ACTIVITIES = tuple(Activity)
 """Meaning of the column ``activity``."""
+LIMITS = MotionLimits()
+"""Limits of every path."""
+COMMAND_LOSS = 0.1
+"""Share of commands that are lost."""
+POSITION_NOISE, YAW_NOISE = 0.003, 0.005
+"""Standard deviation of the given position in each coordinate (m), and of the given yaw (rad)."""
+GRIP = 0.25
+"""Share of the grip that slippery patches of floor have."""
 
 
 @dataclass(frozen=True)
 class PatrolScenario:
-    """World, robot and localisation of a patrol."""
+    """World and robot of a patrol."""
 
     seed: int = 1
     """Seed of the robot, of its noise and of the unknown boxes."""
@@ -61,18 +68,6 @@ class PatrolScenario:
     """World that the keep-out knows: a name or a file; empty: nothing."""
     world: str = ''
     """World in which the robot drives: a name or a file; empty: that which it knows."""
-    localised: bool = True
-    """Whether the pose of the robot is given with noise; else it is that of its odometry."""
-    position_noise: float = 0.003
-    """Standard deviation of a given position in each coordinate, m."""
-    yaw_noise: float = 0.005
-    """That of a given yaw, rad."""
-    command_loss: float = 0.1
-    """Share of commands that are lost."""
-    limits: MotionLimits = field(default_factory=MotionLimits)
-    """Limits of the path."""
-    wait: WaitParameters = WaitParameters(distance=0.0)
-    """Where and how long the path waits for the robot; by default never."""
     keep_out: bool = True
     """Whether the keep-out is used."""
     robot: Mapping[str, object] = field(default_factory=dict)
@@ -81,13 +76,9 @@ class PatrolScenario:
     """Further parameters of the controller by name."""
 
 
-def portrait_points(
-    seed: int, limits: MotionLimits, parameters: PortraitParameters | None = None
-) -> Iterator[Array]:
+def portrait_points(seed: int, parameters: PortraitParameters) -> Iterator[Array]:
     """Yield the points (m) of the chaotic path of a seed, about 1 m at a time."""
-    path = PortraitPath(
-        ReferenceParameters(), parameters or PortraitParameters(), limits.linear, seed
-    )
+    path = PortraitPath(ReferenceParameters(), parameters, LIMITS.linear, seed)
     while True:
         yield path.advance(1.0)
 
@@ -124,7 +115,7 @@ def run_patrol(
         Pieces (m), shape (k, 2), of the path from where the robot starts, at (0, 0) facing x; a
         path that ends leaves the robot at its last point.
     scenario
-        World, robot and localisation.
+        World and robot.
     tracker
         Law in place of the controller; the path is then only recorded as the reference.
     """
@@ -133,7 +124,7 @@ def run_patrol(
             'noise.variance': 0.04,
             'world': scenario.world or scenario.known_world,
             'seed': scenario.seed,
-            'faults.command_loss': scenario.command_loss,
+            'faults.command_loss': COMMAND_LOSS,
             **scenario.robot,
         }
     )
@@ -161,8 +152,7 @@ def run_patrol(
 class PathDriver:
     """The controller of the node on a path, with a localisation; or a law in its place.
 
-    The path waits for the robot where the scenario says so. Before the drive the robot is where it
-    was placed, which is known without noise.
+    Before the drive the robot is where it was placed, which is known without noise.
     """
 
     def __init__(
@@ -172,16 +162,14 @@ class PathDriver:
         geometry: WheelGeometry,
         tracker: PathTracker | None,
     ) -> None:
-        self._points, self._scenario, self._geometry = points, scenario, geometry
-        self._tracker = tracker
+        self._points, self._geometry, self._tracker = points, geometry, tracker
         values = {'pose.enabled': True, 'keep_out.enabled': scenario.keep_out}
         self._controller = Controller(
             StepperControllerParameters.from_dict({**values, **scenario.controller}),
             load_world(scenario.known_world).obstacles,
         )
         self._controller.warm_up()
-        self._timing = PathTiming(scenario.limits, geometry, 1.0 / RATE, ORIGIN)
-        self._clock = PathClock(scenario.wait)
+        self._timing = PathTiming(LIMITS, geometry, 1.0 / RATE, ORIGIN)
         self._generator = np.random.default_rng((scenario.seed, 7))
         self._references: list[tuple[Pose, BodyTwist]] = []
         self._ranges: tuple[float, ...] = ()
@@ -197,16 +185,14 @@ class PathDriver:
             stamp = stamp_of(len(self._references))
             reference = (ORIGIN, BodyTwist(0.0, 0.0))
             if len(self._references) >= round(START * RATE):
-                reference = self._timing.advance_along(self._points, self._clock.rate)
+                reference = self._timing.advance_along(self._points)
             self._references.append(reference)
             self._controller.add_reference(State(stamp, *reference))
-            self._clock.add_reference(stamp, reference[0])
         self._controller.enable(enabled)
 
     def step(self, state: RobotState) -> RobotCommand:
         """Return the command that follows from a report of the robot."""
         self._pose = self._localised(state)
-        self._clock.observe(state.stamp_ns, self._pose)
         for sensor, reading in enumerate(state.ranges):
             if not self._ranges or reading != self._ranges[sensor] or self._k % 4 == 0:
                 self._controller.add_range(sensor, reading)
@@ -221,16 +207,15 @@ class PathDriver:
 
     def _localised(self, state: RobotState) -> Pose:
         """Return the pose that the controller receives."""
-        scenario, noise = self._scenario, self._generator.standard_normal(3)
+        noise = self._generator.standard_normal(3).tolist()
         if not self._driving:
             return ORIGIN
-        if not scenario.localised or state.truth is None:
-            return state.odometry.pose
+        assert state.truth is not None
         x, y, yaw = state.truth.pose
         return Pose(
-            x + scenario.position_noise * float(noise[0]),
-            y + scenario.position_noise * float(noise[1]),
-            wrap_angle(yaw + scenario.yaw_noise * float(noise[2])),
+            x + POSITION_NOISE * noise[0],
+            y + POSITION_NOISE * noise[1],
+            wrap_angle(yaw + YAW_NOISE * noise[2]),
         )
 
     @property
@@ -250,13 +235,11 @@ class PathDriver:
         }
 
 
-def room_with_boxes(
-    seed: int, size: tuple[float, float] = (4.0, 3.0), boxes: int = 3, grip: float = 0.25
-) -> str:
+def room_with_boxes(seed: int, size: tuple[float, float], boxes: int) -> str:
     """Return the YAML text of a room around the origin, with boxes drawn from a seed.
 
     The boxes have sides of 0.2 to 0.5 m. They leave 0.5 m free around the origin and to each
-    other, and stand anywhere else, also at a wall. Two patches of floor have the given grip.
+    other, and stand anywhere else, also at a wall. Two patches of floor are slippery.
     """
     generator = np.random.default_rng((seed, 11))
     half = 0.5 * np.array(size)
@@ -282,7 +265,7 @@ def room_with_boxes(
         )
     lines.append('patches:')
     for x, y in generator.uniform(0.3 - half, half - 0.3, (2, 2)).tolist():
-        lines.append(f'  - {{center: [{x:.4f}, {y:.4f}], radius: 0.25, grip: {grip}}}')
+        lines.append(f'  - {{center: [{x:.4f}, {y:.4f}], radius: 0.25, grip: {GRIP}}}')
     return '\n'.join(lines) + '\n'
 
 

@@ -37,7 +37,7 @@ from t3mpc_ros.geometry.types import Array
 STEP = 0.25
 """Interval of the observations, s."""
 HORIZONS = (1.0, 2.0, 5.0, 10.0)
-"""s"""
+"""s; multiples of :data:`STEP`"""
 CLIMATOLOGY = 'climatology'
 
 _LAGS = ((0, 1, 2, 4), (0, 1, 2, 4, 8, 12, 16), (0, 1, 2, 4, 8, 12, 16, 24, 32, 40, 48))
@@ -63,43 +63,31 @@ class Skill(NamedTuple):
     has the higher skill."""
 
 
-def predictability(
-    t: Array, x: Array, y: Array, horizons: Sequence[float] = HORIZONS
-) -> tuple[Skill, ...]:
-    r"""Return the skill of the observer at each horizon (s).
+def predictability(t: Array, x: Array, y: Array) -> tuple[Skill, ...]:
+    r"""Return the skill of the observer at each of :data:`HORIZONS`.
 
     With the mean position m of the first half, over the second half:
 
     .. math:: s(h) = 1 - \frac{\sum_n |\hat p_n(h) - p(t_n + h)|^2}{\sum_n |m - p(t_n + h)|^2}
 
-    Parameters
-    ----------
-    t, x, y
-        Times (s) and positions (m), shape (n,); sampled again every :data:`STEP` seconds.
-    horizons
-        s; multiples of :data:`STEP`.
-
-    Raises
-    ------
-    ValueError
-        The path is too short: each half must last 24 s and three of the longest horizon.
+    Times (s) and positions (m), shape (n,), are sampled again every :data:`STEP` seconds. Raises
+    ValueError for a path that is too short: each half must last 24 s and three of the longest
+    horizon.
     """
     path = resampled(t, x, y, STEP)
-    steps = np.array([round(horizon / STEP) for horizon in horizons], dtype=np.int64)
-    if not steps.size or steps.min() < 1 or np.abs(steps * STEP - horizons).max() > 1e-9:
-        raise ValueError(f'horizons must be positive multiples of {STEP:g} s: got {horizons}')
+    steps = np.array([round(horizon / STEP) for horizon in HORIZONS], dtype=np.int64)
     half, longest = len(path) // 2, int(steps.max())
     least = max(2 * _LAGS[-1][-1], 3 * longest)
     if half < least:
         raise ValueError(
             f'the path must last at least {2 * least * STEP:g} s for horizons up to '
-            f'{max(horizons):g} s: got {len(path) * STEP:g} s'
+            f'{max(HORIZONS):g} s: got {len(path) * STEP:g} s'
         )
     origins = np.arange(half, len(path) - longest)
     target = _positions(path, origins, steps)
     climatology = _square_errors(path[:half].mean(axis=0), target)
     if climatology.min() <= 0.0:  # a robot that stands where it stood
-        return tuple(Skill(h, 1.0, CLIMATOLOGY, 0.0) for h in horizons)
+        return tuple(Skill(h, 1.0, CLIMATOLOGY, 0.0) for h in HORIZONS)
     each = {CLIMATOLOGY: np.zeros(steps.size)}
     for name, predict in _PREDICTORS.items():
         found = predict(path, half, origins, steps)
@@ -112,7 +100,7 @@ def predictability(
             best[row],
             float(np.sqrt((1.0 - each[best[row]][row]) * climatology[row])),
         )
-        for row, horizon in enumerate(horizons)
+        for row, horizon in enumerate(HORIZONS)
     )
 
 

@@ -4,7 +4,6 @@
 
 from collections.abc import Sequence
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,18 +99,13 @@ def normalised_entropy(shares: Array) -> float:
     return float(-(held * np.log(held)).sum() / math.log(shares.size)) + 0.0
 
 
-def ordinal_shares(series: Array, order: int, delay: int = 1) -> Array:
+def ordinal_shares(series: Array, order: int) -> Array:
     """Return how often each order of size of ``order`` values occurs, shape (order!,).
 
     Of equal values the earlier one counts as the smaller. The patterns are in the lexicographic
     order of the ranks.
     """
-    span = (order - 1) * delay
-    if not 2 <= order <= 8 or delay < 1:
-        raise ValueError(f'order must be 2 to 8 and delay >= 1: got {order}, {delay}')
-    if series.ndim != 1 or series.size <= span:
-        raise ValueError(f'series must have more than {span} values: got {series.shape}')
-    windows = np.stack([series[k * delay : series.size - span + k * delay] for k in range(order)])
+    windows = np.lib.stride_tricks.sliding_window_view(series, order).T
     ranks = windows.argsort(axis=0, kind='stable').argsort(axis=0, kind='stable')
     # The number of a permutation in the factorial number system (Lehmer code).
     number = np.zeros(ranks.shape[1], dtype=np.int64)
@@ -122,26 +116,23 @@ def ordinal_shares(series: Array, order: int, delay: int = 1) -> Array:
     return count
 
 
-def permutation_entropy(series: Array, order: int = 4, delay: int = 1) -> float:
+def permutation_entropy(series: Array, order: int = 4) -> float:
     """Return the entropy of the ordinal patterns, from 0 (monotone) to 1 (white noise).
 
     Bandt and Pompe, Phys. Rev. Lett. 88, 2002 (doi 10.1103/PhysRevLett.88.174102), divided by
     ln(order!). From N patterns white noise gives about (order! - 1) / (2 N ln(order!)) less
     than 1.
 
-    Parameters
-    ----------
-    series
-        Uniform samples, shape (n,).
-    order
-        Values in a pattern.
-    delay
-        Samples between the values.
+    ``series`` are uniform samples, shape (n,); ``order`` is the number of values in a pattern.
     """
-    return normalised_entropy(ordinal_shares(series, order, delay))
+    return normalised_entropy(ordinal_shares(series, order))
 
 
-def spectral_entropy(series: Array, segment: int = 64) -> float:
+SEGMENT = 64
+"""Samples of a segment of the spectrum, which has half as many frequencies."""
+
+
+def spectral_entropy(series: Array) -> float:
     r"""Return the entropy of the power spectrum, from 0 (one line) to 1 (all alike).
 
     Shannon entropy of the shares of power of the frequencies above zero, relative to that of a
@@ -151,26 +142,15 @@ def spectral_entropy(series: Array, segment: int = 64) -> float:
 
     .. math:: 1 - (\psi(K + 1) - \ln K) / \ln N, \qquad \psi(K + 1) - \ln K \approx 1 / (2 K)
 
-    NaN for a constant series.
-
-    Parameters
-    ----------
-    series
-        Uniform samples, shape (n,), n >= segment.
-    segment
-        Samples of a segment; there are segment // 2 frequencies.
+    NaN for a constant series. ``series`` are at least :data:`SEGMENT` uniform samples, shape (n,).
     """
-    if segment < 4 or series.ndim != 1 or series.size < segment:
-        raise ValueError(
-            f'series must have at least segment >= 4 values: got {series.shape}, {segment}'
-        )
-    count = series.size // segment
-    pieces = series[: count * segment].reshape(count, segment)
+    count = series.size // SEGMENT
+    pieces = series[: count * SEGMENT].reshape(count, SEGMENT)
     pieces = pieces - series.mean()
-    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(segment) / segment)
+    window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(SEGMENT) / SEGMENT)
     power = (np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2).mean(axis=0)[1:]
     total = power.sum()
-    if total <= 1e-24 * segment**2 * max(1.0, float(np.abs(series).max()) ** 2):
+    if total <= 1e-24 * SEGMENT**2 * max(1.0, float(np.abs(series).max()) ** 2):
         return math.nan
     return normalised_entropy(power / total)
 
@@ -178,34 +158,19 @@ def spectral_entropy(series: Array, segment: int = 64) -> float:
 # -- exponent -------------------------------------------------------------------------------------
 
 
-class Divergence(NamedTuple):
-    """Mean logarithmic distance of neighbours over time, and the exponent that fits it."""
-
-    exponent: float
-    """Slope of the fitted part, 1/s (1/sample where a sample is taken as a second)."""
-    time: Array
-    """s, shape (n,)"""
-    log_distance: Array
-    """Mean of ln distance, shape (n,)"""
-    fitted: tuple[float, float]
-    """First and last time of the fit, s."""
+FITTED = 0.8
+"""Share of the way of the logarithmic distance that is fitted."""
 
 
-def divergence(
-    points: Array,
-    step: float,
-    apart: int,
-    horizon: int,
-    part: tuple[float, float] = (0.0, 0.8),
-) -> Divergence:
-    """Return the largest exponent by the method of Rosenstein, Collins and De Luca.
+def divergence(points: Array, step: float, apart: int, horizon: int) -> float:
+    """Return the largest exponent (1/s) by the method of Rosenstein, Collins and De Luca.
 
     Physica D 65, 1993 (doi 10.1016/0167-2789(93)90009-P): the slope of the mean logarithmic
     distance of each point from its nearest neighbour, both followed in time. The slope is that
-    of a straight line, by least squares, over a part of the way of the distance, in logarithms,
-    to that of two random points: before it the neighbours turn into the direction that grows
-    fastest, beyond it the size of the attractor bounds the distance. The default is within 6 % for
-    the logistic map, the Hénon map and the Lorenz system from 3000 to 5000 points.
+    of a straight line, by least squares, over the first part of the way of the distance, in
+    logarithms, to that of two random points: beyond it the size of the attractor bounds the
+    distance. It is within 6 % for the logistic map, the Hénon map and the Lorenz system from 3000
+    to 5000 points.
 
     Any data give a number. Noise has no exponent: there the number grows without bound as the
     samples become denser, and compares only with that of other paths of the same sampling.
@@ -220,8 +185,6 @@ def divergence(
         Neighbours are more than so many samples apart in time: about a mean period.
     horizon
         Samples for which neighbours are followed.
-    part
-        First and last share of the way that is fitted.
 
     Raises
     ------
@@ -234,8 +197,6 @@ def divergence(
             f'points must be more than horizon + apart + 1 = {horizon + apart + 1}, with '
             f'horizon >= 2: got {len(points)} and {horizon}'
         )
-    if not 0.0 <= part[0] < part[1] <= 1.0:
-        raise ValueError(f'part must be two increasing shares: got {part}')
     neighbour = nearest_apart(points, count, apart)
     own = np.flatnonzero(neighbour >= 0)
     if not own.size:
@@ -248,15 +209,10 @@ def divergence(
     half = len(points) // 2
     limit = _mean_log(points[: len(points) - half] - points[half:])
     time: Array = step * np.arange(horizon + 1, dtype=np.float64)
-    first, last = (
-        int(reached[0]) if (reached := np.flatnonzero(logs >= level)).size else horizon
-        for level in (logs[0] + share * (limit - logs[0]) for share in part)
-    )
-    if last - first < 2:  # two points at least, three where there are three
-        first, last = max(0, last - 2), max(2, last)
-    rows = slice(first, last + 1)
-    slope = np.polyfit(time[rows], logs[rows], 1)[0]
-    return Divergence(float(slope), time, logs, (float(time[first]), float(time[last])))
+    reached = np.flatnonzero(logs >= logs[0] + FITTED * (limit - logs[0]))
+    last = int(reached[0]) if reached.size else horizon
+    rows = slice(0, max(last, 2) + 1)  # three points at least
+    return float(np.polyfit(time[rows], logs[rows], 1)[0])
 
 
 def _mean_log(differences: Array) -> float:

@@ -17,6 +17,7 @@ from t3mpc_ros.evaluation.patrol.path_tracking import (
     TrackingPlan,
     TrackingStudy,
 )
+from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
 from t3mpc_ros.evaluation.plotting import TitledDrawing, new_figure
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
@@ -86,7 +87,7 @@ def description(plan: TrackingPlan) -> str:
         'Digital twin with noise, lag, two slippery patches on each path and 10 % of the commands '
         'lost; dead time 0 to 30 ms above the nominal 10 ms, right wheel within 0.5 % and wheel '
         'separation within 1 % of nominal, drawn from the seed; position given within 3 mm, yaw '
-        f'within 5 mrad. Every method plans at most {plan.limits.linear:g} m/s, and all '
+        f'within 5 mrad. Every method plans at most {LIMITS.linear:g} m/s, and all '
         f'commands have the limits of the controller. {seeds} seed{"s" * (seeds > 1)}, '
         f'{plan.seeds[0]} to {plan.seeds[-1]}; mean ± half the 95 % interval. Error: distance of '
         'the true position from the path, each piece of the drive counted by its length; largest: '
@@ -141,7 +142,7 @@ def record(study: TrackingStudy) -> dict[str, Any]:
         'format': 1,
         'version': VERSION,
         'seeds': list(plan.seeds),
-        'limits': plan.limits.to_dict(),
+        'limits': LIMITS.to_dict(),
         'paths': {
             path: {
                 method: [
