@@ -8,8 +8,6 @@ work by ``if __name__ == '__main__':``.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
-from contextlib import nullcontext
-from functools import partial
 import multiprocessing
 import os
 from typing import Any, Protocol, Self, TypeVar
@@ -18,7 +16,6 @@ from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForward
 from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
 from t3mpc_ros.evaluation.loop import Method, run
 from t3mpc_ros.evaluation.method import MethodSpec
-from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.stop_signal import end_with_parent
@@ -116,34 +113,16 @@ def map_jobs(
     task: Callable[[J], T],
     jobs: Sequence[J],
     workers: int | Executor = 1,
-    unit: str = 'runs',
     *,
     progress: bool = False,
 ) -> list[T]:
     """Return ``task`` of every job in their order; ``workers`` as for :class:`WorkerPool`."""
     found: dict[int, T] = {}
-    with WorkerPool(workers) as pool, progress_bar(len(jobs), unit, show=progress) as bar:
+    with WorkerPool(workers) as pool, progress_bar(len(jobs), show=progress) as bar:
         for index, result in pool.map(task, jobs):
             found[index] = result
             bar.update()
     return [found[index] for index in range(len(jobs))]
-
-
-def measure_many(
-    jobs: Iterable[Job], measure: Callable[[Record], T], workers: int | WorkerPool = 1
-) -> Iterator[tuple[int, T]]:
-    """Yield (index of the job, measure of its record) as the jobs are finished.
-
-    ``measure`` is applied in the worker, so that whole records need not travel: a function of a
-    module. ``workers`` is how many processes, for this batch alone, or a :class:`WorkerPool`.
-    """
-    team = nullcontext(workers) if isinstance(workers, WorkerPool) else WorkerPool(workers)
-    with team as running:
-        yield from running.map(partial(_measured, measure), jobs)
-
-
-def _measured(measure: Callable[[Record], T], job: Job) -> T:
-    return measure(run(*job))
 
 
 def _job_error(job: tuple[Any, Named], error: BaseException) -> JobError:

@@ -4,7 +4,6 @@
 
 from dataclasses import dataclass
 import math
-from operator import methodcaller
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from t3mpc_ros.evaluation.scenario import (
     Scenario,
 )
 from t3mpc_ros.evaluation.simulated_links import NO_FAULTS
-from t3mpc_ros.evaluation.workers import JobError, WorkerPool, measure_many
+from t3mpc_ros.evaluation.workers import JobError, WorkerPool
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
@@ -540,8 +539,12 @@ def test_what_does_not_fit_the_loop_is_refused(monkeypatch):
 # -- many runs --------------------------------------------------------------------------------
 
 
-def whole(record):
-    return record
+def whole(job):
+    return run(*job)
+
+
+def rmse(job):
+    return run(*job).rmse(1.0)
 
 
 def test_many_runs_are_the_same_in_one_process_and_in_two():
@@ -553,26 +556,25 @@ def test_many_runs_are_the_same_in_one_process_and_in_two():
         for robot in PLANTS
         for seed, gain in ((1, 4.0), (2, 9.0))
     ]
-    alone = dict(measure_many(jobs, whole, 1))
+    alone = dict(WorkerPool(1).map(whole, jobs))
     assert sorted(alone) == list(range(len(jobs)))
     bad = (jobs[0][0], MethodSpec('bad', Proportional, ProportionalParameters(fails=True)))
     with WorkerPool(2) as workers:
-        together = dict(measure_many(iter(jobs), whole, workers))
+        together = dict(workers.map(whole, iter(jobs)))
         assert sorted(together) == sorted(alone)
         for index, record in together.items():
             assert_equal_records(record, alone[index])
         # The same processes serve the next batch, and outlive a failed one.
-        rmse = methodcaller('rmse', 1.0)
-        assert dict(measure_many(jobs, rmse, workers)) == {
+        assert dict(workers.map(rmse, jobs)) == {
             index: record.rmse(1.0) for index, record in alone.items()
         }
         with pytest.raises(JobError, match=r'bad on servo, .*, load change, seed 1 failed: Zero'):
-            list(measure_many([jobs[1], bad, *jobs], whole, workers))
-        assert len(dict(measure_many(jobs[:3], whole, workers))) == 3
+            list(workers.map(whole, [jobs[1], bad, *jobs]))
+        assert len(dict(workers.map(whole, jobs[:3]))) == 3
     with pytest.raises(JobError, match=r'bad on servo.*on purpose'):
-        list(measure_many([jobs[1], bad], whole))
+        list(WorkerPool(1).map(whole, [jobs[1], bad]))
     with pytest.raises(ValueError, match='workers must be at least 1: got 0'):
-        list(measure_many(jobs, whole, 0))
+        WorkerPool(0)
 
 
 # -- records ----------------------------------------------------------------------------------
