@@ -4,12 +4,11 @@
 
 from pathlib import Path
 
-from mcap.reader import make_reader
 import numpy as np
 import pytest
+from support.bag_files import copied_bag
 
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
 from t3mpc_ros.evaluation.process_replay.replay_comparison import ELSEWHERE, Tolerances, compare
@@ -38,25 +37,16 @@ def record_late(folder, lost, republished):
     republished
         Number of first messages of each input that the controller has republished.
     """
-    counts = {}
-    with GOLDEN.open('rb') as file:
-        reader = make_reader(file)
-        records = {item.name: dict(item.metadata) for item in reader.iter_metadata()}
-        records.pop('rosbag2')
-        with BagWriter(folder, metadata_records=records) as writer:
-            for schema, channel, message in reader.iter_messages():
-                topic, times = channel.topic, (message.log_time, message.publish_time)
-                number = counts[topic] = counts.get(topic, -1) + 1
-                if topic.strip('/') in INPUTS:
-                    if number < republished:
-                        initial = f'/controller/initial_inputs{topic}'
-                        writer.add_topic(initial, schema.name)
-                        writer.write(initial, times[0] + LATE, times[1] + 1000, message.data)
-                    if number < lost:
-                        continue
-                writer.add_topic(topic, schema.name)
-                writer.write(topic, *times, message.data)
-    return folder
+
+    def late(topic, k, received, published):
+        is_input = topic.strip('/') in INPUTS
+        if is_input and k < republished:
+            initial = f'/controller/initial_inputs{topic}'
+            yield initial, received + LATE, published + 1000
+        if not is_input or k >= lost:
+            yield topic, received, published
+
+    return copied_bag(GOLDEN, folder, late)
 
 
 def same_columns(one, other):

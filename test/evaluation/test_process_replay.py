@@ -14,6 +14,7 @@ from mcap.writer import Writer
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
+from support.bag_files import copied_bag
 from support.golden_bags import (
     GOLDEN_SCENARIOS,
     ControllerBag,
@@ -50,7 +51,7 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     write_divergence_figure,
 )
 from t3mpc_ros.evaluation.topic_roles import SCALARS
-from t3mpc_ros.geometry.types import BodyTwist, Pose, State
+from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.simulation.world import load_world
 
@@ -58,6 +59,8 @@ pytestmark = pytest.mark.slow
 
 GOLDEN = sorted((Path(__file__).parents[1] / 'golden').glob('*.mcap'))
 JOURNAL = '/controller/journal'
+START = 1_700_000_000_000_000_000
+"""Begin of the recorded runs, ns."""
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -98,19 +101,11 @@ def again(inputs):
 
 def without(bag, folder, drop):
     """Write a copy of a bag without the messages for which ``drop(topic, count)`` is true."""
-    counts = {}
-    with bag.open('rb') as file:
-        reader = make_reader(file)
-        metadata_records = {item.name: dict(item.metadata) for item in reader.iter_metadata()}
-        metadata_records.pop('rosbag2')
-        with BagWriter(folder, metadata_records=metadata_records) as writer:
-            for schema, channel, message in reader.iter_messages():
-                counts[channel.topic] = counts.get(channel.topic, -1) + 1
-                if drop(channel.topic, counts[channel.topic]):
-                    continue
-                writer.add_topic(channel.topic, schema.name)
-                writer.write(channel.topic, message.log_time, message.publish_time, message.data)
-    return folder
+
+    def kept(topic, k, *times):
+        return () if drop(topic, k) else [(topic, *times)]
+
+    return copied_bag(bag, folder, kept)
 
 
 # -- golden bags ----------------------------------------------------------------------------------
@@ -331,18 +326,22 @@ def test_after_a_lost_message_comparison_resumes_at_a_reset(topic, words, bag, t
     assert int(np.count_nonzero(outcome.compared)) == inputs.events.size - gap.size
 
 
+def straight_on(folder, begins, steps, first=0):
+    """Record processes whose robot is reported at one place; references from step ``first`` on."""
+    parameters, twist = StepperControllerParameters(), BodyTwist(0.1, 0.2)
+    with ControllerBag(folder, parameters) as writer:
+        for begin in begins:
+            recorded = RecordedController(parameters, writer, begin)
+            for k in range(steps):
+                now = begin + 10_000_000 * k
+                if k >= first:
+                    recorded.add_reference(now, State(now + 400_000_000, ORIGIN, twist))
+                recorded.step(now + 1000, State(now, ORIGIN, twist))
+
+
 def test_odometry_lost_before_the_first_reference_is_harmless(tmp_path):
     """The robot has not moved yet, as when the nodes have not all found each other."""
-    parameters = StepperControllerParameters()
-    start = 1_700_000_000_000_000_000
-    with ControllerBag(tmp_path / 'bag', parameters) as writer:
-        recorded = RecordedController(parameters, writer, start)
-        for k in range(200):
-            now = start + 10_000_000 * k
-            twist = BodyTwist(0.1, 0.2)
-            if k > 50:
-                recorded.add_reference(now, State(now + 400_000_000, Pose(0.0, 0.0, 0.0), twist))
-            recorded.step(now + 1000, State(now, Pose(0.0, 0.0, 0.0), twist))
+    straight_on(tmp_path / 'bag', [START], 200, first=51)
     lost = without(tmp_path / 'bag/bag_0.mcap', tmp_path / 'copy', lambda *it: it == ('/odom', 20))
     inputs = load_inputs(lost)
     assert any('1 odometry messages' in note for note in inputs.notes)
@@ -352,15 +351,13 @@ def test_odometry_lost_before_the_first_reference_is_harmless(tmp_path):
 
 def test_a_recorder_that_notes_no_time_of_publication_will_do(bag, tmp_path):
     """A command received after its row of the journal is still the one of that row."""
-    moved = tmp_path / 'moved'
-    with bag.open('rb') as file, BagWriter(moved, metadata_records={}) as writer:
-        for schema, channel, message in make_reader(file).iter_messages():
-            writer.add_topic(channel.topic, schema.name)
-            late = 300_000 if channel.topic == '/cmd_vel' else 0
-            late += 1_000_000 if channel.topic.startswith('/controller/l') else 0
-            when = message.log_time + late
-            writer.write(channel.topic, when, when, message.data)
-    inputs = load_inputs(moved)
+
+    def late(topic, _, received, __):
+        received += 300_000 if topic == '/cmd_vel' else 0
+        received += 1_000_000 if topic.startswith('/controller/l') else 0
+        return [(topic, received, received)]
+
+    inputs = load_inputs(copied_bag(bag, tmp_path / 'moved', late))
     assert inputs.notes == ()
     outcome = compare(inputs, replay_controller(inputs))
     assert not any(row.differing for row in outcome.rows[:2]), outcome.table()
@@ -426,11 +423,10 @@ def test_settings_survive_their_topic_to_the_last_bit():
 def short_run(folder, model=None, steps=120):
     """Drive along a gentle course, open loop: enough to see whether a model was loaded."""
     parameters = StepperControllerParameters()
-    start = 1_700_000_000_000_000_000
     with ControllerBag(folder, parameters) as writer:
-        recorded = RecordedController(parameters, writer, start, model=model)
+        recorded = RecordedController(parameters, writer, START, model=model)
         for k in range(steps + 40):
-            now = start + 10_000_000 * k
+            now = START + 10_000_000 * k
             twist = BodyTwist(0.1 * math.sin(0.05 * k), 0.5)
             recorded.add_reference(now, State(now + 400_000_000, Pose(0.0, 0.0, 0.0), twist))
             if k >= 40:
@@ -493,13 +489,12 @@ def built_run(folder, changes):
     """Drive past some walls, open loop, with readings of a sensor that sees none of them."""
     parameters = StepperControllerParameters().with_values(changes)
     world = parameters.keep_out.world
-    start = 1_700_000_000_000_000_000
     with ControllerBag(folder, parameters) as writer:
         recorded = RecordedController(
-            parameters, writer, start, obstacles=load_world(world).obstacles if world else None
+            parameters, writer, START, obstacles=load_world(world).obstacles if world else None
         )
         for k in range(240):
-            now, way = start + 10_000_000 * k, 0.002 * max(k - 150, 0)
+            now, way = START + 10_000_000 * k, 0.002 * max(k - 150, 0)
             turn = 0.05 * max(0, min(k, 150) - 5)  # a controller that looks around sees it turn
             if k < 230:  # later, the reference is stale
                 twist = BodyTwist(0.2 + 0.1 * math.sin(0.15 * k), 0.3 * math.sin(0.1 * k))
@@ -533,6 +528,19 @@ def test_a_replay_builds_the_controller_as_its_node_did(name, plain_runs, tmp_pa
         np.testing.assert_allclose(changed[key], built.recorded[key], atol=1e-9)
 
 
+def one_step(folder, parameters, *, published=True):
+    """Return a bag with one message of each topic of a controller, which stands still."""
+    state = State(START, ORIGIN, STANDSTILL)
+    with ControllerBag(folder, parameters) as writer:
+        if published:
+            writer.parameters(START, 0, parameters.to_dict())
+        writer.motion('reference', START, state)
+        writer.motion('odom', START, state)
+        writer.command(START + 1, STANDSTILL)
+        writer.row(START + 2, Journal().step(START))
+    return writer.path
+
+
 def test_every_parameter_is_read_as_it_was_recorded(bag, tmp_path):
     """From the revisions that the node publishes, or from the record of the recorder alone."""
     parameters = StepperControllerParameters()
@@ -541,35 +549,22 @@ def test_every_parameter_is_read_as_it_was_recorded(bag, tmp_path):
             parameters = with_other_value(parameters, spec)
     texts = {'keep_out.world': 'room', 'keep_out.mounts': (0.1, 0.0, 2.0)}
     parameters = parameters.with_values(KEEP_OUT | texts)
-    now = 1_700_000_000_000_000_000
-    with ControllerBag(tmp_path / 'bag', parameters) as writer:
-        writer.parameters(now, 0, parameters.to_dict())
-        writer.motion('reference', now, State(now, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, 0.0)))
-        writer.motion('odom', now, State(now, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, 0.0)))
-        writer.command(now + 1, BodyTwist(0.0, 0.0))
-        writer.row(now + 2, Journal().step(now))
-    rest = without(writer.path, tmp_path / 'rest', lambda topic, _: 'parameters' in topic)
-    for path in (writer.path, rest):
-        (session,) = load_inputs(path).sessions
+    path = one_step(tmp_path / 'bag', parameters)
+    rest = without(path, tmp_path / 'rest', lambda topic, _: 'parameters' in topic)
+    for each in (path, rest):
+        (session,) = load_inputs(each).sessions
         assert session.parameters[session.start].to_dict() == parameters.to_dict()
 
 
 @pytest.mark.parametrize('published', [True, False], ids=['revisions', 'record'])
 def test_a_former_parameter_with_another_value_is_named(published, tmp_path):
     """With its value of today, the bag of an older version is replayed."""
-    now, parameters = 1_700_000_000_000_000_000, StepperControllerParameters()
+    parameters = StepperControllerParameters()
 
     def path_of(name, memory):
         former = {'predictive.memory': memory, 'body.fuzzy.kind': 'type3'}
         older = SimpleNamespace(to_dict=lambda: parameters.to_dict() | former)
-        with ControllerBag(tmp_path / name, older) as writer:
-            if published:
-                writer.parameters(now, 0, older.to_dict())
-            writer.motion('reference', now, State(now, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, 0.0)))
-            writer.motion('odom', now, State(now, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, 0.0)))
-            writer.command(now + 1, BodyTwist(0.0, 0.0))
-            writer.row(now + 2, Journal().step(now))
-        return writer.path
+        return one_step(tmp_path / name, older, published=published)
 
     (session,) = load_inputs(path_of('same', 20.0)).sessions
     assert session.parameters[session.start].to_dict() == parameters.to_dict()
@@ -594,16 +589,7 @@ def test_a_command_before_a_kill_is_not_that_of_the_next_process():
 
 def test_a_node_that_was_started_again_is_another_session(tmp_path):
     """Both are in one bag, and the second knows nothing of the first."""
-    parameters = StepperControllerParameters()
-    start = 1_700_000_000_000_000_000
-    with ControllerBag(tmp_path / 'bag', parameters) as writer:
-        for begin in (start, start + 2_000_000_000):
-            recorded = RecordedController(parameters, writer, begin)
-            for k in range(100):
-                now = begin + 10_000_000 * k
-                still = BodyTwist(0.1, 0.2)
-                recorded.add_reference(now, State(now + 400_000_000, Pose(0.0, 0.0, 0.0), still))
-                recorded.step(now + 1000, State(now, Pose(0.0, 0.0, 0.0), still))
+    straight_on(tmp_path / 'bag', [START, START + 2_000_000_000], 100)
     inputs = load_inputs(tmp_path / 'bag')
     assert [len(session.events) for session in inputs.sessions] == [100, 100]
     assert inputs.notes == ()

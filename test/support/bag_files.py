@@ -1,7 +1,8 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""What other readers see of a bag."""
+"""What other readers see of a bag, and copies of bags with other messages."""
 
+from collections import Counter
 import io
 
 from mcap.reader import make_reader
@@ -9,6 +10,7 @@ import yaml
 
 from t3mpc_ros.bag.mcap_file import SerializedMessage
 from t3mpc_ros.bag.recovery import recover_file
+from t3mpc_ros.bag.writer import BagWriter
 
 
 def metadata_of(folder):
@@ -41,3 +43,25 @@ def kept_messages(path):
         SerializedMessage(channel.topic, item.log_time, item.publish_time, item.data)
         for _, channel, item in reader.iter_messages()
     ]
+
+
+def copied_bag(bag, folder, change):
+    """Return ``folder`` with a copy of a bag file.
+
+    ``change(topic, k, received_ns, published_ns)`` yields (topic, received_ns, published_ns) of
+    every copy of message k of a topic: none where it is left out.
+    """
+    counts = Counter()
+    with bag.open('rb') as file:
+        reader = make_reader(file)
+        records = {item.name: dict(item.metadata) for item in reader.iter_metadata()}
+        records.pop('rosbag2')
+        with BagWriter(folder, metadata_records=records) as writer:
+            for schema, channel, message in reader.iter_messages():
+                k, counts[channel.topic] = counts[channel.topic], counts[channel.topic] + 1
+                for topic, *times in change(
+                    channel.topic, k, message.log_time, message.publish_time
+                ):
+                    writer.add_topic(topic, schema.name)
+                    writer.write(topic, *times, message.data)
+    return folder
