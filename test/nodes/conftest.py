@@ -18,6 +18,22 @@ def harness(ros):
 
 
 @pytest.fixture
+def logged(capfd):
+    """Return a function that returns the lines with a text that nodes have logged so far.
+
+    Read from the terminal: a subscription to /rosout may miss what precedes its match.
+    """
+    text = ''
+
+    def logged(words):
+        nonlocal text
+        text += capfd.readouterr().err
+        return [line for line in text.splitlines() if words in line]
+
+    return logged
+
+
+@pytest.fixture
 def execute(graph, capfd):
     """Return a function that runs an executable in this process until its nodes have started."""
     from t3mpc_ros.nodes.entry_point import run

@@ -12,7 +12,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mcap.reader import make_reader
 from nav_msgs.msg import Odometry
 import pytest
-from rcl_interfaces.msg import Log
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Int32, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
@@ -75,8 +74,7 @@ def test_reception_is_stamped_on_arrival_not_on_taking(harness, tmp_path):
         assert before - 1_000 <= received < after
 
 
-def test_messages_beyond_the_queue_are_dropped_and_counted(harness, tmp_path, monkeypatch):
-    log = harness.subscribe(Log, '/rosout', LATCHED)
+def test_messages_beyond_the_queue_are_dropped_and_counted(harness, logged, tmp_path, monkeypatch):
     recorder = record(harness, tmp_path, 'text', 'number', storage__max_cache_size=65_536)
     text, number = (
         harness.create_publisher(String, 'text', DEEP),
@@ -90,10 +88,9 @@ def test_messages_beyond_the_queue_are_dropped_and_counted(harness, tmp_path, mo
         text.publish(String(data=f'{i} {"x" * 200}'))
         number.publish(Int32(data=i))
     harness.spin_until(lambda: values(recorder)['dropped'] > 0)
-    harness.spin_until(lambda: any('the disk is too slow' in entry.msg for entry in log))
-    entry = next(entry for entry in log if 'the disk is too slow' in entry.msg)
-    assert entry.level == 40
-    assert '/text' in entry.msg
+    line, *_ = logged('the disk is too slow')
+    assert line.startswith('[ERROR]')
+    assert '/text' in line
     harness.spin_until(lambda: any(s.level == ERROR for s in harness.statuses('recorder')))
     assert values(recorder)['queue_bytes'] <= 65_536
     stuck.set()
@@ -235,8 +232,7 @@ def test_a_requested_snapshot_holds_the_last_seconds(harness, tmp_path):
     assert texts(tmp_path)[-1] == 'after'
 
 
-def test_a_fault_starts_one_snapshot_with_its_reason(harness, tmp_path):
-    log = harness.subscribe(Log, '/rosout', LATCHED)
+def test_a_fault_starts_one_snapshot_with_its_reason(harness, logged, tmp_path):
     recorder = record(harness, tmp_path, 'text')
     text = harness.create_publisher(String, 'text')
     reports = harness.create_publisher(DiagnosticArray, '/diagnostics')
@@ -256,7 +252,7 @@ def test_a_fault_starts_one_snapshot_with_its_reason(harness, tmp_path):
     harness.spin_until(lambda: values(recorder)['snapshots'] == 1)
     report(OK, 'following commands')
     report(ERROR, 'e-stop latched')  # again within snapshot_pause
-    harness.spin_until(lambda: any('snapshot.min_interval' in entry.msg for entry in log))
+    harness.spin_until(lambda: logged('snapshot.min_interval'))
     harness.remove(recorder)
     (folder,) = snapshots(tmp_path)
     assert 'sim-robot-e-stop-latched' in folder.name
@@ -335,16 +331,16 @@ def test_snapshots_can_be_turned_off(harness, tmp_path):
     assert 'storage.snapshot_duration must be above 0' in response.message
 
 
-def test_a_failed_snapshot_is_reported_and_recording_continues(harness, tmp_path):
+def test_a_failed_snapshot_is_reported_and_recording_continues(harness, logged, tmp_path):
     (tmp_path / 'snapshots').write_text('a file where a folder is wanted')
-    log = harness.subscribe(Log, '/rosout', LATCHED)
     recorder = record(harness, tmp_path, 'text')
     text = harness.create_publisher(String, 'text')
     harness.wait_for_subscriber(text)
     text.publish(String(data='one'))
     harness.spin_until(lambda: values(recorder)['messages'] == 1)
     assert harness.call(Trigger, 'recorder/snapshot').success
-    harness.spin_until(lambda: any(e.level == 40 and 'no snapshot of' in e.msg for e in log))
+    harness.spin_until(lambda: logged('no snapshot of'))
+    assert logged('no snapshot of')[0].startswith('[ERROR]')
     assert diagnostic_level(recorder) == WARN
     text.publish(String(data='two'))
     harness.spin_until(lambda: values(recorder)['messages'] == 2)

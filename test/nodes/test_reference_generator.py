@@ -9,7 +9,6 @@ from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry, Path
 import numpy as np
 import pytest
-from rcl_interfaces.msg import Log
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import LATCHED, diagnostic, on_grid, reason, speed, stamp
@@ -72,10 +71,9 @@ def test_a_paused_reference_stands_still_and_resumes(harness):
     assert on_grid(received, 100)
 
 
-def test_reseed_changes_the_reference_and_hides_the_seed(harness):
+def test_reseed_changes_the_reference_and_hides_the_seed(harness, logged):
     """The seed determines the path of the robot."""
     seed = 918_273_645
-    log = harness.subscribe(Log, '/rosout', LATCHED)
     reference = harness.add(ReferenceGeneratorNode, seed=seed, ramp=1.0)
     received = harness.subscribe(Odometry, 'reference')
     harness.spin_until(lambda: len(received) > 150)
@@ -84,7 +82,7 @@ def test_reseed_changes_the_reference_and_hides_the_seed(harness):
     count = len(received)
     harness.spin_until(lambda: len(received) > count + 100)
     status = harness.next_status('reference_generator')
-    texts = [response.message, str(status), *(entry.msg for entry in log)]
+    texts = [response.message, str(status), *logged('')]
     for text in texts:
         assert not any(character.isdigit() for character in str(response.message))
         for number in range(seed - 2, seed + 3):
@@ -183,7 +181,7 @@ def test_a_twist_message_is_followed_until_it_expires(harness):
     harness.spin_until(lambda: speed(received[-1]) == 0.0)  # no more messages
 
 
-def test_a_patrol_keeps_its_seed_and_its_future(harness, monkeypatch):
+def test_a_patrol_keeps_its_seed_and_its_future(harness, logged, monkeypatch):
     """No parameter, topic, log line or service answer has a seed; no path is ahead of the lead.
 
     Each further seed, by service or at random times, is as secret as the first.
@@ -195,7 +193,6 @@ def test_a_patrol_keeps_its_seed_and_its_future(harness, monkeypatch):
         return seeds[-1]
 
     monkeypatch.setattr('t3mpc_ros.nodes.reference_generator._random_seed', random_seed)
-    logs = harness.subscribe(Log, '/rosout')
     status = harness.subscribe(DiagnosticArray, '/diagnostics')
     path = harness.subscribe(Path, 'reference/path', LATCHED)
     reference, received = _drive(
@@ -208,7 +205,7 @@ def test_a_patrol_keeps_its_seed_and_its_future(harness, monkeypatch):
         reseed__longest=0.6,
     )
     answer = harness.call(Trigger, 'reference_generator/reseed').message
-    texts = [repr(each) for each in (*logs, *status, *path, *received, answer)]
+    texts = [repr(each) for each in (*logged(''), *status, *path, *received, answer)]
     texts.append(repr(reference.parameters.to_dict()))
     texts.append(repr([p.get_parameter_value() for p in reference._parameters.values()]))
     assert len(seeds) >= 4
