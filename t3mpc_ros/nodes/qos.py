@@ -265,7 +265,7 @@ def command_publishers_problem(node: Node) -> str:
     own = {each.topic_name for each in (*node.subscriptions, *node.publishers)}
     if topic not in own:
         return ''
-    names = sorted(map(_full_name, node.get_publishers_info_by_topic(topic)))
+    names = sorted(map(full_name, node.get_publishers_info_by_topic(topic)))
     return f'{topic} has {len(names)} publishers: {", ".join(names)}' if len(names) > 1 else ''
 
 
@@ -297,10 +297,11 @@ def _comparable(profile: QoSProfile) -> QoSProfile:
 
 def _mismatch(topic: str, peer: TopicEndpointInfo, reason: str) -> str:
     policies = reason.removeprefix('ERROR: ').strip('; ').replace('; ERROR:', ',')
-    return f'no message passes between {_full_name(peer)} and this node on {topic}: {policies}'
+    return f'no message passes between {full_name(peer)} and this node on {topic}: {policies}'
 
 
-def _full_name(info: TopicEndpointInfo) -> str:
+def full_name(info: TopicEndpointInfo) -> str:
+    """Return the full name of the node of an endpoint."""
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 

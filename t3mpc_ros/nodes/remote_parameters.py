@@ -41,9 +41,9 @@ class RemoteParameters:
         self._types: dict[str, int] = {}
 
     def destroy(self) -> None:
-        """Destroy the clients."""
-        for client in self._clients.values():
-            self._node.destroy_client(client)
+        """Destroy the clients; an answer that arrives later has no effect."""
+        while self._clients:
+            self._node.destroy_client(self._clients.popitem()[1])
 
     def ready(self) -> bool:
         """Return whether all services of the other node are there."""
@@ -77,7 +77,7 @@ class RemoteParameters:
 
     def _call(self, word: str, done: Callable[[Any], None], **fields: Any) -> None:
         def finish(future: Future) -> None:
-            if (answer := future.result()) is not None:
+            if self._clients and (answer := future.result()) is not None:
                 done(answer)
 
         request = SERVICES[word].Request(**fields)

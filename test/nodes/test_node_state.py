@@ -491,11 +491,11 @@ def test_a_player_that_cannot_start_has_no_bag_open(ros, tmp_path):
 
 
 def test_parameters_are_read_once_for_each_start_of_a_node():
-    present, requested = [('controller', '/')], []
+    present, requested, waiting = [('controller', '/')], [], []
     client = SimpleNamespace(
         service_is_ready=lambda: True,
         call_async=lambda request: (
-            requested.append(request) or SimpleNamespace(add_done_callback=lambda callback: None)
+            requested.append(request) or SimpleNamespace(add_done_callback=waiting.append)
         ),
     )
     collector = ParameterCollector(
@@ -511,6 +511,9 @@ def test_parameters_are_read_once_for_each_start_of_a_node():
         present[:] = [('controller', '/'), ('talker', '/')] if there else []
         collector.request_new()
         assert len(requested) == count
+    # An answer that arrives after the end raised an error: its clients are destroyed.
+    collector.close()
+    waiting[-1](SimpleNamespace(result=lambda: pytest.fail('an answer is used')))
 
 
 def test_a_recorder_knows_when_a_fingerprint_is_new(start):

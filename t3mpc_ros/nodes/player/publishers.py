@@ -17,7 +17,6 @@ from rclpy.qos import (
     QoSProfile,
     ReliabilityPolicy,
 )
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from t3mpc_ros.bag.merged_reader import MergedReader
 from t3mpc_ros.bag.player import VELOCITY_TYPES, velocity_command_risk
@@ -25,7 +24,7 @@ from t3mpc_ros.bag.qos import UNLIMITED, QosProfile, adapt_offer_to_recorded_off
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import conversions
-from t3mpc_ros.nodes.qos import RCLError
+from t3mpc_ros.nodes.qos import RCLError, full_name
 
 CLOCK = '/clock'
 ROBOT_NODES = ('radio_bridge', 'sim_robot')
@@ -115,7 +114,7 @@ class TopicPublishers:
                 continue
             for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name):
                 if info.node_name in ROBOT_NODES:
-                    found[topic] = _full_name(info)
+                    found[topic] = full_name(info)
         return found
 
     def other_publishers(self) -> dict[str, str]:
@@ -126,8 +125,8 @@ class TopicPublishers:
             if publisher.topic_name in SHARED_TOPICS:
                 continue
             for info in self._node.get_publishers_info_by_topic(publisher.topic_name):
-                if _full_name(info) != own:
-                    found[topic] = _full_name(info)
+                if full_name(info) != own:
+                    found[topic] = full_name(info)
         return found
 
     def wait_for_acked(self, timeout: float) -> None:
@@ -157,7 +156,3 @@ def qos_profile(profile: QosProfile) -> QoSProfile:
 
 def _duration(nanoseconds: int) -> Duration:
     return Duration(nanoseconds=0 if nanoseconds == UNLIMITED else nanoseconds)  # 0: unlimited
-
-
-def _full_name(info: TopicEndpointInfo) -> str:
-    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'

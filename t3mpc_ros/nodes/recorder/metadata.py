@@ -2,20 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metadata and attachments of a recording: provenance, parameters of the nodes, model files."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rcl_interfaces.srv import GetParameters, ListParameters
-from rclpy.client import Client
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
 
 from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.run.model_file import find_model
 from t3mpc_ros.bag.writer import AttachmentError, read_attachment
 from t3mpc_ros.nodes.registry import NODES
+from t3mpc_ros.nodes.remote_parameters import RemoteParameters
 from t3mpc_ros.parameters.provenance import provenance
 
 SEED_RECORD = 'seed_fingerprints'
@@ -96,46 +94,39 @@ class ParameterCollector:
     def __init__(self, node: Node, callback: ParametersCallback) -> None:
         self._node = node
         self._callback = callback
+        self._remote: dict[str, RemoteParameters] = {}
         self._requested: set[str] = set()
 
     def request_new(self) -> None:
         """Request the parameters of the nodes that are new in the graph."""
         present = set()
         for name, namespace in self._node.get_node_names_and_namespaces():
+            if name not in NODES:
+                continue
             full_name = f'{namespace.rstrip("/")}/{name}'
             present.add(full_name)
-            if name not in NODES or full_name in self._requested:
-                continue
-            lister = self._node.create_client(ListParameters, f'{full_name}/list_parameters')
-            getter = self._node.create_client(GetParameters, f'{full_name}/get_parameters')
-            if lister.service_is_ready() and getter.service_is_ready():
+            if full_name not in self._remote:
+                self._remote[full_name] = RemoteParameters(self._node, full_name)
+            if full_name not in self._requested and self._remote[full_name].ready():
                 self._requested.add(full_name)
-                future = lister.call_async(ListParameters.Request())
                 # The nodes of other robots have the same names in other namespaces.
                 record = name if namespace == self._node.get_namespace() else full_name
-                future.add_done_callback(partial(self._on_names, record, name, lister, getter))
-            else:
-                self._node.destroy_client(lister)
-                self._node.destroy_client(getter)
+                found = partial(self._on_parameters, record, name, self._remote[full_name])
+                self._remote[full_name].read(found)
+        for left in self._remote.keys() - present:
+            self._remote.pop(left).destroy()
         self._requested &= present
 
-    def _on_names(
-        self, record: str, node: str, lister: Client, getter: Client, future: Any
-    ) -> None:
-        names = list(future.result().result.names)
-        self._node.destroy_client(lister)
-        values = getter.call_async(GetParameters.Request(names=names))
-        values.add_done_callback(partial(self._on_values, record, node, names, getter))
+    def close(self) -> None:
+        """Ignore the answers that have not arrived."""
+        for remote in self._remote.values():
+            remote.destroy()
 
-    def _on_values(
-        self, record: str, node: str, names: list[str], getter: Client, future: Any
+    def _on_parameters(
+        self, record: str, node: str, remote: RemoteParameters, rows: Sequence[Mapping[str, Any]]
     ) -> None:
-        values = {
-            key: str(parameter_value_to_python(value))
-            for key, value in zip(names, future.result().values, strict=True)
-        }
-        self._node.destroy_client(getter)
-        self._callback(record, node, values)
+        remote.destroy()
+        self._callback(record, node, {row['name']: str(row['value']) for row in rows})
 
 
 def _attachment_name(record: str, path: str) -> str:

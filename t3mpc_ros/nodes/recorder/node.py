@@ -342,6 +342,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     def on_shutdown(self) -> None:
         """Write the received messages and close the bag."""
+        self._collector.close()
         try:
             self._take_messages()
             self._raw_subscriptions.count_lost()
