@@ -27,6 +27,7 @@ from t3mpc_ros.bag.merged_reader import (
     transient_local_count,
 )
 from t3mpc_ros.bag.player import (
+    PlaybackParameters,
     PlaybackTimeline,
     ReadAheadQueue,
     velocity_command_risk,
@@ -41,8 +42,9 @@ from t3mpc_ros.bag.qos import (
 )
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.schema import BagError
-from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilterError, parse_remappings
+from t3mpc_ros.bag.topic_filter import PlayTopicFilter, parse_remappings
 from t3mpc_ros.bag.writer import BagWriter
+from t3mpc_ros.parameters.table import ParameterError
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TEXT, NUMBER = 'std_msgs/msg/String', 'std_msgs/msg/Float64'
@@ -318,15 +320,28 @@ def test_remapped_topics_have_new_names_and_may_merge(tape, tmp_path):
     assert [m.topic for m in made.messages(0)] == ['/map']
 
 
-@pytest.mark.parametrize('items', [['a'], ['a:='], [':=b'], ['a:=b', '/a:=c']])
-def test_invalid_remapping_is_rejected(items):
-    with pytest.raises(TopicFilterError, match='play.topic_remapping_options must'):
-        parse_remappings(items)
+@pytest.mark.parametrize(
+    'given, words',
+    [
+        ({'play.playback_until': 0.1, 'play.start_offset': 0.1}, 'play.playback_until must be'),
+        ({'play.bag_offsets': [1.0, 2.0]}, 'one number for each of the 1 bags: got 2'),
+        ({'play.regex_to_filter': '['}, 'play.regex_to_filter must be a regular expression'),
+        ({'play.exclude_regex': '('}, 'play.exclude_regex must be a regular expression'),
+        *(
+            ({'play.topic_remapping_options': items}, 'play.topic_remapping_options must')
+            for items in (['a'], ['a:='], [':=b'], ['a:=b', '/a:=c'], ['a=b'])
+        ),
+    ],
+)
+def test_parameters_that_cannot_be_played_are_rejected(given, words):
+    with pytest.raises(ParameterError, match=words):
+        PlaybackParameters.from_dict({'storage.uris': ['bag'], **given})
 
 
-def test_invalid_regex_of_the_player_is_rejected():
-    with pytest.raises(TopicFilterError, match='play.exclude_regex must be a regular expression'):
-        PlayTopicFilter(exclude_regex='(')
+def test_a_rate_must_be_positive(bag):
+    for rate in (0.0, -1.0, float('nan'), float('inf')):
+        with pytest.raises(ValueError, match='rate must be a positive number'):
+            Player(bag).made.set_rate(0, rate)
 
 
 @pytest.mark.parametrize(
@@ -602,36 +617,6 @@ def test_seek_continues_with_latched_messages(bag):
         assert words in player.made.seek(player.now, stamp)
 
 
-def test_seek_while_paused_plays_only_latched_messages(bag):
-    player = Player(bag, paused=True)
-    player.made.seek(player.now, START + SECOND)
-    player.run()
-    assert player.messages == bag.latched_messages_before(START + SECOND)
-    assert player.wake is None
-    assert player.made.bag_time_ns(player.now + SECOND) == START + SECOND
-
-
-def test_play_next_plays_messages_only_while_paused(bag):
-    player = Player(bag, paused=True).run()
-    assert player.messages == []
-    for count in (1, 2, 30):
-        assert player.made.play_next(player.now, count) == ''
-        before = len(player.messages)
-        player.wake = player.now
-        player.run()
-        assert len(player.messages) == before + count
-        assert player.made.bag_time_ns(player.now) == player.messages[-1].received_ns
-        assert player.wake is None
-    assert 'at least 1' in player.made.play_next(player.now, 0)
-    player.made.resume(player.now)
-    assert 'paused' in player.made.play_next(player.now)
-    player.wake = player.now
-    player.run()
-    assert player.messages == expected(ticks())
-    player.made.pause(player.now)
-    assert 'no next message' in player.made.play_next(player.now)
-
-
 def test_stepping_into_the_next_loop_does_not_play_the_map_early(bag):
     begin = START + 2
     player = Player(bag, begin, START + SECOND // 100 + 1000, loop=True, paused=True).run()
@@ -643,21 +628,6 @@ def test_stepping_into_the_next_loop_does_not_play_the_map_early(bag):
         player.run()
         played += more
         assert [m.topic for m in player.messages] == played
-
-
-def test_position_and_remaining_time_follow_the_rate(bag):
-    player = Player(bag, rate=2.0)
-    player.run(player.now + SECOND // 4)
-    assert player.made.bag_time_ns(player.now) == START + SECOND // 2
-    assert player.made.remaining_ns(player.now) == (bag.end_ns - START - SECOND // 2) // 2
-    player.made.set_rate(player.now, 0.5)
-    assert player.made.bag_time_ns(player.now) == START + SECOND // 2
-    assert player.made.remaining_ns(player.now) == (bag.end_ns - START - SECOND // 2) * 2
-    player.made.pause(player.now)
-    assert player.made.bag_time_ns(player.now + SECOND) == START + SECOND // 2
-    for rate in (0.0, -1.0, float('nan'), float('inf')):
-        with pytest.raises(ValueError, match='rate must be a positive number'):
-            player.made.set_rate(player.now, rate)
 
 
 def test_clock_has_its_rate_and_is_monotonic(bag):

@@ -481,22 +481,6 @@ def test_a_message_that_cannot_be_decoded_is_a_clear_error(folder):
         reader.series('/n', {'x': 'data'})
 
 
-def test_no_bag_is_a_clear_error(tmp_path):
-    with pytest.raises(BagError, match='no complete bag file'):
-        open_bag(tmp_path)
-    (tmp_path / 'a.mcap').write_bytes(b'')
-    with pytest.raises(BagError, match='incomplete: a.mcap'):
-        open_bag(tmp_path)
-
-
-def test_one_file_can_be_opened_without_its_folder(folder):
-    with BagWriter(folder, metadata_records=DETAILS) as bag:
-        fill(bag, 5)
-    with open_bag(bag.path) as reader:
-        assert reader.message_count == 10
-        assert reader.metadata_records == DETAILS
-
-
 # -- missing samples ----------------------------------------------------------------------------
 
 
