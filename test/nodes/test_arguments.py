@@ -68,6 +68,7 @@ INVALID = [
         'publish_clock must be true',
         'real_time_factor 10',
     ),
+    ('player', '--ros-args -p storage.uris:=["/nowhere"]', 'player: there is no bag /nowhere'),
     ('recorder', '--ros-args --params-file MISSING', 'MISSING', 'cannot be read'),
     ('recorder', '--ros-args --params-file BROKEN', 'BROKEN', 'is not YAML'),
     ('recorder', '--ros-args -p storage.uri:=FILE/bag', 'FILE/bag'),

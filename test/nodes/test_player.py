@@ -346,43 +346,14 @@ def test_a_damaged_bag_is_played_with_a_warning_and_a_count(harness, logged, tmp
 @pytest.mark.parametrize(
     'given, error, words',
     [
-        ({'storage__uris': ['/nowhere/at/all']}, BagError, 'there is no bag /nowhere/at/all'),
-        (
-            {'play__start_offset': 9.0},
-            ParameterError,
-            'play.start_offset must be at most .* 0.180 s: got 9 s',
-        ),
-        (
-            {'play__start_offset': 0.1, 'play__playback_until': 0.1},
-            ParameterError,
-            'play.playback_until must be later than',
-        ),
-        (
-            {'play__topic_remapping_options': ['a=b']},
-            ParameterError,
-            "play.topic_remapping_options must be a list of old:=new: got 'a=b'",
-        ),
-        (
-            {'play__regex_to_filter': '['},
-            ParameterError,
-            'play.regex_to_filter must be a regular expression',
-        ),
-        (
-            {'play__bag_offsets': [1.0, 2.0]},
-            ParameterError,
-            'one number for each of the 1 bags: got 2',
-        ),
-        (
-            {'play__qos_profile_overrides_path': '/none.yaml'},
-            BagError,
-            '/none.yaml cannot be read',
-        ),
+        ({'play__start_offset': 9.0}, ParameterError, 'at most .* 0.180 s: got 9 s'),
+        ({'play__qos_profile_overrides_path': '/none.yaml'}, BagError, 'cannot be read'),
     ],
 )
-def test_unusable_parameters_are_rejected_at_start(given, error, words, harness, tmp_path):
+def test_a_bag_that_cannot_be_played_so_is_refused(given, error, words, harness, tmp_path):
     bag = write(tmp_path / 'bag', texts())
     with pytest.raises(error, match=words):
-        harness.add(PlayerNode, **({'storage__uris': [bag]} | given))
+        play(harness, bag, **given)
 
 
 # -- in a terminal --------------------------------------------------------------------------------
@@ -483,13 +454,12 @@ def test_keys_pause_play_next_and_change_the_rate(terminal, tmp_path):
     assert shell.settings() == shell.before
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-def test_the_terminal_is_restored_after_a_signal(number, terminal, tmp_path):
+def test_the_terminal_is_restored_after_a_signal(terminal, tmp_path):
     bag = write(tmp_path / 'bag', texts(100, 0.1))
     shell = terminal(f'storage.uris:=["{bag}"]', 'play.start_paused:=true')
     shell.until('paused')
     assert shell.settings() != shell.before
-    shell.process.send_signal(number)
+    shell.process.send_signal(signal.SIGTERM)
     assert shell.wait() == 0
     assert shell.settings() == shell.before
     assert 'Traceback' not in shell.text
@@ -527,14 +497,6 @@ def test_without_a_terminal_the_player_plays_to_the_end(graph, tmp_path):
     assert done.returncode == 0, done.stderr
     assert '5 messages, timing error at most' in done.stderr
     assert done.stdout == '', 'no progress line without a terminal'
-    refused = subprocess.run(
-        [*command, 'storage.uris:=["/nowhere"]'],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-    )
-    assert refused.returncode == 2
-    assert refused.stderr == 'player: there is no bag /nowhere\n'
 
 
 def test_keys_are_parsed_from_any_input():

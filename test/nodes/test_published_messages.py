@@ -100,17 +100,6 @@ def test_fixed_frames_have_the_names_of_the_messages(harness, monkeypatch):
 
 
 @pytest.mark.ros
-def test_the_acceleration_contains_gravity(harness):
-    """REP 145; filters that take the direction of gravity from it saw free fall."""
-    imu = harness.subscribe(Imu, 'imu/data_raw')
-    harness.add(SimRobotNode)
-    harness.spin_until(lambda: len(imu) > 20)
-    vector = imu[-1].linear_acceleration
-    assert vector.z == pytest.approx(9.81, abs=0.01)
-    assert np.hypot(vector.x, vector.y) < 1.0
-
-
-@pytest.mark.ros
 def test_the_covariance_of_a_reset_pose_is_positive_definite(harness):
     """It was exactly 0, which filters cannot invert."""
     odom = harness.subscribe(Odometry, 'odom')

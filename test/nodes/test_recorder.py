@@ -176,11 +176,6 @@ def test_expressions_and_types_select_in_the_graph(harness, tmp_path):
         assert sorted(recording.topics) == ['/cam_1', '/count']
 
 
-def test_an_invalid_regular_expression_is_rejected(harness, tmp_path):
-    with pytest.raises(ParameterError, match=r'regex must be a regular expression.*position 0'):
-        record(harness, tmp_path, record__regex='*')
-
-
 def test_an_expected_latched_topic_is_recorded_from_its_start(harness, tmp_path):
     """The early subscription is transient local, so it receives earlier messages."""
     journal = harness.create_publisher(Int64MultiArray, 'controller/journal', LATCHED)
@@ -506,26 +501,3 @@ def test_a_hundred_patrols_differ_and_no_bag_has_a_seed(harness, tmp_path):
 def test_secret_seed_excludes_a_given_seed(harness):
     with pytest.raises(ParameterError, match='seed must be 0 with secret_seed: got 7'):
         harness.add(ReferenceGeneratorNode, secret_seed=True, seed=7)
-
-
-def test_exception_in_the_writer_thread_is_an_error(harness, tmp_path, monkeypatch):
-    recorder = record(harness, tmp_path, 'text')
-    text = harness.create_publisher(String, 'text')
-    harness.wait_for_subscriber(text)
-    text.publish(String(data='kept'))
-    harness.spin_until(lambda: values(recorder)['messages'] == 1)
-    assert harness.call(Trigger, 'recorder/split_bagfile').success
-
-    def wrong(*_):
-        raise TypeError('a mistake')
-
-    monkeypatch.setattr(BagWriter, 'write', wrong)
-    text.publish(String(data='lost'))
-    harness.spin_until(lambda: recorder.exit_code == 1)
-    assert (diagnostic_level(recorder), reason(recorder)) == (
-        ERROR,
-        'writing failed: TypeError: a mistake',
-    )
-    assert not harness.call(Trigger, 'recorder/split_bagfile').success
-    harness.remove(recorder)
-    assert texts(tmp_path) == ['kept']

@@ -31,7 +31,6 @@ from support.ros_graph import (
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.base_node import OK, WARN
-from t3mpc_ros.nodes.recorder.node import RecorderNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
 from t3mpc_ros.parameters.table import ParameterError
 
@@ -179,13 +178,6 @@ def test_the_paper_plant_has_no_sensors(harness):
     assert not any('/range/' in name for name in names)
     for name in ('imu/data_raw', 'battery_state'):
         assert f'/servo/{name}' not in names
-
-
-def test_sensor_topics_are_recorded_by_default(harness, tmp_path):
-    harness.add(SimRobotNode)
-    recorder = harness.add(RecorderNode, storage__uri=str(tmp_path / 'bag'))
-    wanted = {'/imu/data_raw', '/battery_state', *(f'/range/{name}' for name in RANGE_SENSORS)}
-    harness.spin_until(lambda: wanted <= recorder._recorded_types.keys(), 'all are recorded')
 
 
 def test_twist_covariance_matches_the_noise(harness):
