@@ -21,7 +21,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
 from t3mpc_ros.nodes.player.player_thread import PlayerThread
-from t3mpc_ros.nodes.player.publishers import CLOCK, PublishingRules, TopicPublishers
+from t3mpc_ros.nodes.player.publishers import CLOCK, TopicPublishers
 from t3mpc_ros.nodes.player.terminal import KeyboardHandler, ProgressLine
 from t3mpc_ros.parameters.table import ParameterError, parameter
 
@@ -132,7 +132,11 @@ class PlayerNode(BaseNode[PlayerParameters]):
             parameters.clock_publish_frequency > 0.0 or parameters.clock_publish_on_topic_publish
         )
         self._topic_publishers = TopicPublishers(
-            self, reader, PublishingRules(parameters.allow_commands, publishes_clock, overrides)
+            self,
+            reader,
+            allow_commands=parameters.allow_commands,
+            publishes_clock=publishes_clock,
+            qos_overrides=overrides,
         )
         for topic, reason in self._topic_publishers.unusable.items():
             self.get_logger().error(f'{topic} is not played: {reason}')

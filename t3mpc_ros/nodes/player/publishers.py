@@ -3,7 +3,6 @@
 """One publisher per played topic, with its QoS; velocity commands are excluded by default."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 import time
 
 from rclpy.duration import Duration
@@ -33,26 +32,27 @@ SHARED_TOPICS = ('/diagnostics', '/rosout', '/parameter_events', '/tf', '/tf_sta
 """Topics with several publishers in every graph."""
 
 
-@dataclass(frozen=True)
-class PublishingRules:
-    """What may be published, and with which QoS."""
-
-    allow_commands: bool
-    publishes_clock: bool
-    """Whether the player publishes ``/clock`` itself."""
-    qos_overrides: Mapping[str, QosProfile]
-    """QoS profiles by topic, under the recorded or the new name."""
-
-
 class TopicPublishers:
     """The publishers of the played topics; other topics are excluded from the reader.
 
-    The rule on velocity commands applies to the names after the remapping of ``node``.
+    The rule on velocity commands applies to the names after the remapping of ``node``. With
+    ``publishes_clock`` the player publishes ``/clock`` itself. ``qos_overrides`` are by topic,
+    under the recorded or the new name.
     """
 
-    def __init__(self, node: Node, reader: MergedReader, rules: PublishingRules) -> None:
+    def __init__(
+        self,
+        node: Node,
+        reader: MergedReader,
+        *,
+        allow_commands: bool,
+        publishes_clock: bool,
+        qos_overrides: Mapping[str, QosProfile],
+    ) -> None:
         self._node = node
-        self._allow_commands = rules.allow_commands
+        self._allow_commands = allow_commands
+        self._publishes_clock = publishes_clock
+        self._qos_overrides = qos_overrides
         self.by_topic: dict[str, Publisher] = {}
         self.unusable: dict[str, str] = {}
         """Reasons by topic that cannot be published."""
@@ -63,14 +63,9 @@ class TopicPublishers:
                 if problem := self._velocity_risk(reader, topic):
                     self.blocked[topic] = problem
                 else:
-                    self.by_topic[topic] = self._create(reader, topic, rules)
+                    self.by_topic[topic] = self._create(reader, topic)
                     continue
-            except (
-                BagError,
-                ImportError,
-                NameValidationException,
-                RCLError,
-            ) as error:
+            except (BagError, ImportError, NameValidationException, RCLError) as error:
                 self.unusable[topic] = str(error)
             except ValueError as error:
                 self.unusable[topic] = f'its type is unusable: {error}'
@@ -86,16 +81,15 @@ class TopicPublishers:
         )
         return next(filter(None, problems), '')
 
-    def _create(self, reader: MergedReader, topic: str, rules: PublishingRules) -> Publisher:
+    def _create(self, reader: MergedReader, topic: str) -> Publisher:
         track = reader.topics[topic]
         if track.serialization_format != 'cdr':
             raise BagError(f'its messages are {track.serialization_format}, not cdr')
-        if rules.publishes_clock and self._node.resolve_topic_name(topic) == CLOCK:
+        if self._publishes_clock and self._node.resolve_topic_name(topic) == CLOCK:
             raise BagError('the player publishes its own clock (play.clock_publish_frequency)')
         names = [topic, *reader.recorded_names[topic]]
-        overrides = rules.qos_overrides
-        override = next((overrides[name] for name in names if name in overrides), None)
-        offer = override or adapt_offer_to_recorded_offers(track.offered_qos_profiles)
+        overrides = [self._qos_overrides[name] for name in names if name in self._qos_overrides]
+        offer = (*overrides, adapt_offer_to_recorded_offers(track.offered_qos_profiles))[0]
         message = conversions.message_class(track.type_name)
         return self._node.create_publisher(message, topic, qos_profile(offer))
 
