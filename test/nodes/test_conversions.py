@@ -300,6 +300,7 @@ def test_a_discharging_battery_has_a_negative_current():
     assert (message.voltage, message.current, message.percentage) == (15.0, -0.5, 0.75)
     assert message.charge == 1.5
     assert message.design_capacity == 2.0
+    assert message.power_supply_status == message.POWER_SUPPLY_STATUS_DISCHARGING
     assert len(message.cell_voltage) == 4
     assert np.isnan([*message.cell_voltage, message.temperature, message.capacity]).all()
     robot_topics.fill_battery(message, BatteryReading(15.0, math.nan, math.nan), 8)
