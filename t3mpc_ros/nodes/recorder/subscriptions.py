@@ -39,24 +39,20 @@ from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.qos import PolledCallbackGroup, unused_callback
 
-EXPECTED_TOPICS = {
-    'reference': 'nav_msgs/msg/Odometry',
-    'odom': 'nav_msgs/msg/Odometry',
-    'ground_truth/odom': 'nav_msgs/msg/Odometry',
-    'cmd_vel': 'geometry_msgs/msg/Twist',
-    'controller/journal': 'std_msgs/msg/Int64MultiArray',
-    'controller/initial_inputs/reference': 'nav_msgs/msg/Odometry',
-    'controller/initial_inputs/odom': 'nav_msgs/msg/Odometry',
-}
-"""Types of topics subscribed to before they are published, to record the first message."""
+_ODOMETRY = 'nav_msgs/msg/Odometry'
 
-LATCHED_TOPICS = (
-    'controller/journal',
-    'controller/initial_inputs/reference',
-    'controller/initial_inputs/odom',
-)
-"""Expected topics with transient-local publishers: their messages from before discovery, without
-which a run cannot be replayed, are received, too."""
+EXPECTED_TOPICS = {
+    'reference': (_ODOMETRY, qos.RECORDER),
+    'odom': (_ODOMETRY, qos.RECORDER),
+    'ground_truth/odom': (_ODOMETRY, qos.RECORDER),
+    'cmd_vel': ('geometry_msgs/msg/Twist', qos.RECORDER),
+    'controller/journal': ('std_msgs/msg/Int64MultiArray', qos.RECORDER_LATCHED),
+    'controller/initial_inputs/reference': (_ODOMETRY, qos.RECORDER_LATCHED),
+    'controller/initial_inputs/odom': (_ODOMETRY, qos.RECORDER_LATCHED),
+}
+"""Types and requests of topics subscribed to before they are published, to record the first
+message. Of transient-local publishers the messages from before discovery, without which a run
+cannot be replayed, are received, too."""
 
 FULL_DISCOVERY = 10
 """Calls of :meth:`TopicDiscovery.discover` after which all publishers are queried again."""
@@ -232,11 +228,10 @@ class TopicDiscovery:
 
     def subscribe_expected(self) -> None:
         """Subscribe to the expected topics before they are published."""
-        for name, type_name in EXPECTED_TOPICS.items():
+        for name, (type_name, profile) in EXPECTED_TOPICS.items():
             topic = self._node.resolve_topic_name(name)
             if not self._topic_filter.matches(topic, [type_name]):
                 continue
-            profile = qos.RECORDER_LATCHED if name in LATCHED_TOPICS else qos.RECORDER
             try:
                 self._subscriptions.subscribe(topic, type_name, profile)
             except qos.RCLError:
