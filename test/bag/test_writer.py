@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
 from support.bag_files import kept_messages, metadata_of, topics_of
+from support.bag_messages import START, STORE, number, odometry_message, twist_message
 import yaml
 
 from t3mpc_ros.bag import writer
@@ -25,9 +25,6 @@ from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
 from t3mpc_ros.bag.schema import BagError, DataError, UnknownTopicError, UnknownTypeError
 from t3mpc_ros.bag.writer import BagWriter, DiskError, FolderError
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
-TYPES = STORE.types
-START = 1_700_000_000_000_000_000
 STEP = 10_000_000
 ODOM, TWIST, NUMBER = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist', 'std_msgs/msg/Float64'
 DETAILS = {
@@ -36,34 +33,10 @@ DETAILS = {
 }
 
 
-def vector(x=0.0, y=0.0, z=0.0):
-    return TYPES['geometry_msgs/msg/Vector3'](x=x, y=y, z=z)
-
-
-def twist(linear, angular):
-    return TYPES[TWIST](linear=vector(linear), angular=vector(z=angular))
-
-
 def odometry(stamp_ns, linear, angular):
-    header = TYPES['std_msgs/msg/Header'](
-        stamp=TYPES['builtin_interfaces/msg/Time'](
-            sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9
-        ),
-        frame_id='odom',
-    )
-    pose = TYPES['geometry_msgs/msg/Pose'](
-        position=TYPES['geometry_msgs/msg/Point'](x=1.0, y=2.0, z=3.0),
-        orientation=TYPES['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.6, w=0.8),
-    )
-    covariance = np.arange(36.0)
-    return TYPES[ODOM](
-        header=header,
-        child_frame_id='base_link',
-        pose=TYPES['geometry_msgs/msg/PoseWithCovariance'](pose=pose, covariance=covariance),
-        twist=TYPES['geometry_msgs/msg/TwistWithCovariance'](
-            twist=twist(linear, angular), covariance=covariance
-        ),
-    )
+    message = odometry_message(stamp_ns, (linear, angular), (1.0, 2.0, 0.5))
+    message.pose.covariance = message.twist.covariance = np.arange(36.0)
+    return message
 
 
 def serialised(message):
@@ -80,7 +53,7 @@ def fill(bag, count=200, start=START, step=STEP):
         now = start + i * step
         for topic, data in (
             ('/robot/odom', serialised(odometry(now - 3_000_000, 0.01 * i, -0.02 * i))),
-            ('/robot/cmd_vel', serialised(twist(0.1 * i, float(np.sin(i))))),
+            ('/robot/cmd_vel', serialised(twist_message((0.1 * i, np.sin(i))))),
         ):
             bag.write(topic, now, now - 1_000_000, data)
             written.append((topic, now, data))
@@ -246,7 +219,7 @@ def test_topic_with_other_qos_after_restart_keeps_all_messages(folder):
     for depth in (1, 5):
         with BagWriter(folder, metadata_records={}) as bag:
             bag.add_topic('/n', NUMBER, [QosProfile(depth=depth)])
-            bag.write('/n', START + depth, START, serialised(TYPES[NUMBER](data=float(depth))))
+            bag.write('/n', START + depth, START, serialised(number(depth)))
     assert [count for *_, count in topics_of(folder)] == [1, 1]
     assert len(read_with_rosbags(folder)) == 2
     with open_bag(folder) as reader:
