@@ -179,7 +179,9 @@ def test_twist_covariance_follows_the_noise(harness):
     for variance in (0.04, 0.0):
         assert change(harness, robot, noise__variance=variance)[0].successful
         wanted = twist_covariance(robot.parameters.geometry, variance + counted)
-        harness.spin_until(lambda w=wanted: odom and list(odom[-1].twist.covariance) == w)
+        later_ns = robot.now_ns() + NANOSECONDS // 20
+        harness.spin_until(lambda at_ns=later_ns: odom and stamp(odom[-1]) > at_ns)
+        assert odom[-1].twist.covariance.tolist() == wanted
 
 
 # -- faults ---------------------------------------------------------------------------------------
