@@ -363,7 +363,8 @@ def test_model_files_are_attached_to_every_file(harness, tmp_path):
     harness.spin_until(
         lambda: {'controller', '/paper/controller'} <= set(recorder._metadata.records)
     )
-    assert harness.call(Trigger, 'recorder/split_bagfile').success
+    response = harness.call(Trigger, 'recorder/split_bagfile')
+    assert (response.success, response.message) == (True, 'continues in bag_1.mcap')
     assert harness.call(Trigger, 'controller/save_model').success
     harness.remove(recorder)
     one, two = sorted(bag.glob('*.mcap'))

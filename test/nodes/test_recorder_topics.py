@@ -145,24 +145,6 @@ def test_earlier_latched_messages_are_recorded(harness, tmp_path):
         assert [message.data for _, message in recording.messages('/map')] == ['once']
 
 
-def test_a_split_bag_loses_no_message(harness, tmp_path):
-    recorder = _recorder(harness, tmp_path, 'text')
-    text = harness.connected_publisher(String, 'text')
-    for part in range(3):
-        for number in range(5):
-            text.publish(String(data=f'{part} {number}'))
-        _count(harness, recorder, 5 * (part + 1))
-        if part < 2:
-            response = harness.call(Trigger, 'recorder/split_bagfile')
-            assert response.success
-            assert f'_{part + 1}.mcap' in response.message
-    harness.remove(recorder)
-    assert len(list(tmp_path.glob('*.mcap'))) == 3
-    with open_bag(tmp_path) as recording:
-        received = [message.data for _, message in recording.messages('/text')]
-    assert received == [f'{part} {number}' for part in range(3) for number in range(5)]
-
-
 def test_a_full_disk_ends_the_recording_only(harness, logged, tmp_path, monkeypatch):
     recorder = _recorder(harness, tmp_path, 'odom')
     robot = harness.add(SimRobotNode)
