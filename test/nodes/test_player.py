@@ -156,8 +156,9 @@ def test_qos_overrides_replace_the_recorded_qos(harness, tmp_path):
         return [(i.qos_profile.reliability, i.qos_profile.durability) for i in infos]
 
     weak = ReliabilityPolicy.BEST_EFFORT
-    harness.spin_until(lambda: offered('/other') == [(weak, DurabilityPolicy.VOLATILE)])
-    harness.spin_until(lambda: offered('/text') == [(weak, DurabilityPolicy.TRANSIENT_LOCAL)])
+    harness.spin_until(lambda: offered('/other') and offered('/text'))
+    assert offered('/other') == [(weak, DurabilityPolicy.VOLATILE)]
+    assert offered('/text') == [(weak, DurabilityPolicy.TRANSIENT_LOCAL)]
 
 
 def test_the_time_of_the_bag_is_published_as_clock(harness, logged, tmp_path):

@@ -182,6 +182,8 @@ def test_an_expected_latched_topic_is_recorded_from_its_start(harness, tmp_path)
     for number in range(5):
         journal.publish(Int64MultiArray(data=[number]))
     recorder = record(harness, tmp_path, 'controller/*')
+    early = recorder._raw_subscriptions.get('/controller/journal')
+    assert early.qos.durability == LATCHED.durability
     harness.spin_until(lambda: values(recorder)['messages'] == 5)
     harness.wait_for_subscriber(journal)
     journal.publish(Int64MultiArray(data=[5]))
