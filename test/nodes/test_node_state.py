@@ -491,7 +491,7 @@ def test_a_player_that_cannot_start_has_no_bag_open(ros, tmp_path):
 
 
 def test_parameters_are_read_once_for_each_start_of_a_node():
-    present, requested, waiting = [('controller', '/')], [], []
+    present, requested, waiting, destroyed = [('controller', '/')], [], [], []
     client = SimpleNamespace(
         service_is_ready=lambda: True,
         call_async=lambda request: (
@@ -503,7 +503,7 @@ def test_parameters_are_read_once_for_each_start_of_a_node():
             get_node_names_and_namespaces=lambda: present,
             get_namespace=lambda: '/',
             create_client=lambda kind, name: client,
-            destroy_client=lambda client: None,
+            destroy_client=destroyed.append,
         ),
         print,
     )
@@ -511,6 +511,7 @@ def test_parameters_are_read_once_for_each_start_of_a_node():
         present[:] = [('controller', '/'), ('talker', '/')] if there else []
         collector.request_new()
         assert len(requested) == count
+    assert len(destroyed) == 4, 'the clients of the node that has left'
     # An answer that arrives after the end raised an error: its clients are destroyed.
     collector.close()
     waiting[-1](SimpleNamespace(result=lambda: pytest.fail('an answer is used')))
