@@ -53,16 +53,22 @@ def short_name(name: str) -> str:
 
 
 def find_names(kind: str, names: Sequence[str], known: Iterable[str]) -> tuple[str, ...]:
-    """Return the named entries of ``known`` in its order; case and punctuation are ignored."""
-    by_short_name = {short_name(name): name for name in known}
+    """Return the named entries of ``known`` in its order; case and punctuation are ignored.
+
+    Unless they tell two entries apart: ``mass +30 %`` and ``mass -30 %`` must be written in full.
+    """
+    known = tuple(known)
+    wanted = set()
     for name in names:
-        if short_name(name) not in by_short_name:
-            near = difflib.get_close_matches(short_name(name), by_short_name, n=1)
+        short = short_name(name)
+        found = [name] if name in known else [each for each in known if short_name(each) == short]
+        if len(found) != 1:
+            by_short_name = {short_name(each): each for each in known}
+            near = difflib.get_close_matches(short, by_short_name, n=1)
             hint = f'; did you mean {by_short_name[near[0]]}?' if near else ''
-            all_names = ', '.join(by_short_name.values())
-            raise ValueError(f'{kind} must be one of {all_names}: got {name}{hint}')
-    wanted = {short_name(name) for name in names}
-    return tuple(name for short, name in by_short_name.items() if short in wanted)
+            raise ValueError(f'{kind} must be one of {", ".join(known)}: got {name}{hint}')
+        wanted |= {*found}
+    return tuple(name for name in known if name in wanted)
 
 
 @dataclass(frozen=True, slots=True)

@@ -225,3 +225,13 @@ def test_names_that_are_not_known_are_refused_with_the_nearest():
         find_names('method', ['xyz'], known)
     assert find_names('method', [], known) == ()
     assert find_names('method', ['dmc', 'pi-feed-forward'], known) == ('PI + feed-forward', 'DMC')
+
+
+def test_names_that_differ_by_a_sign_are_told_apart():
+    """``compare --cases "mass +30 %"`` once ran the lighter robot."""
+    known = ['mass +30 %', 'mass -30 %', 'Friction x3']
+    for name in known:
+        assert find_names('case', [name], known) == (name,)
+    assert find_names('case', ['friction-X3'], known) == ('Friction x3',)
+    with pytest.raises(ValueError, match='got mass 30; did you mean mass'):
+        find_names('case', ['mass 30'], known)
