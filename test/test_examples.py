@@ -19,7 +19,7 @@ BAG = ROOT / 'test' / 'golden' / 'stops.mcap'
 
 def _own_controller(module, folder):
     table = module.main(folder, 3.0, executor=1)
-    assert table.plan.methods == ('full', 'Pi', 'Pi, gain 40.0, integral 400.0')
+    assert tuple(table.plan.methods) == ('full', 'Pi', 'Pi, gain 40.0, integral 400.0')
     assert 'own_controller' in {path.stem for path in folder.iterdir()}
 
 
@@ -50,9 +50,9 @@ def _read_bag(module, folder):
 def _recorded_reference(module, folder):
     """From the first message on, the simulated reference is the recorded one."""
     table = module.main(BAG, folder, 2.0, executor=1)
-    assert table.plan.methods == ('full', 'DMC')
+    assert tuple(table.plan.methods) == ('full', 'DMC')
     recorded = t3.read_bag(BAG)['/reference']['twist.twist.linear.x'][:200]
-    right, left = table.plan.setting.own_reference.speeds[:200].T
+    right, left = table.plan.scenario.own.reference.speeds[:200].T
     np.testing.assert_allclose(0.5 * WheelGeometry().wheel_radius * (right + left), recorded)
 
 

@@ -11,6 +11,7 @@ import sys
 from typing import Any
 
 from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.scripting.script_error import sentence
 from t3mpc_ros.version import VERSION
 
 
@@ -69,7 +70,7 @@ def run_command(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
         print('stopped', file=sys.stderr)
         return 130
     except (OSError, RuntimeError, ValueError) as error:
-        print(f'error: {error}', file=sys.stderr)
+        print(f'error: {sentence(error)}', file=sys.stderr)
         return 1
     return code
 

@@ -3,18 +3,9 @@
 """``t3mpc compare``: the controller and every baseline on one robot, case by case."""
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from t3mpc_ros.cli.run_options import (
-    FULL,
-    NOMINAL,
-    ROBOTS,
-    add_seeds,
-    add_setting,
-    add_workers,
-    executor_of,
-)
+from t3mpc_ros.cli import run_options
 
 if TYPE_CHECKING:
     from t3mpc_ros.evaluation.comparison import ComparisonPlan
@@ -37,8 +28,8 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         help='a controller of your own: a class with step(observation), or a function of the '
         'observation',
     )
-    add_setting(parser)
-    add_seeds(
+    run_options.add_setting(parser)
+    run_options.add_seeds(
         parser,
         DEFAULT_SEEDS,
         'reference and robot; none of the default ones, a quick look, was used for tuning or is '
@@ -65,75 +56,54 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         help='twin: baselines take the yaw rate from the gyro in every case, not only where the '
         'robot is miscalibrated',
     )
-    add_workers(parser)
-    parser.add_argument('--json', type=Path, help='write every number to this file')
-    parser.add_argument('--html', type=Path, help='write one page to this file')
+    run_options.add_workers(parser)
+    run_options.add_outputs(parser, json='write every number to this file')
     parser.set_defaults(run=run)
     return parser
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the tables and return 0."""
-    from t3mpc_ros.evaluation.cases import cases_for
-    from t3mpc_ros.evaluation.comparison import ComparisonPlan, default_methods
-    from t3mpc_ros.evaluation.methods import methods_for, require_libraries
-    from t3mpc_ros.parameters.table import find_names
-
-    if options.own or options.reference or options.robot not in ROBOTS:
-        return _run_own(options)
-    known = methods_for(options.robot)
-    wanted = list(known) if options.methods == ['all'] else options.methods
-    names = find_names('method', wanted, known)
-    plan = ComparisonPlan(
-        options.robot,
-        find_names('case', options.cases, cases_for(options.robot)) or cases_for(options.robot),
-        names or default_methods(options.robot),
-        options.seeds,
-        options.duration,
-        options.noise,
-        options.gyro,
-    )
-    require_libraries(plan.methods)
-    return _compare_and_write(options, plan)
-
-
-def _run_own(options: argparse.Namespace) -> int:
-    """Compare controllers, or on a robot or reference, of one's own; errors are one sentence."""
-    from t3mpc_ros.scripting.script_error import one_sentence
-
-    return one_sentence(_compare_own)(options)
-
-
-def _compare_own(options: argparse.Namespace) -> int:
-    from t3mpc_ros.scripting.comparison_runs import make_plan
-    from t3mpc_ros.scripting.controllers import loaded
-    from t3mpc_ros.scripting.setting import Setting
-
-    if options.gyro:
-        raise ValueError('--gyro is for the methods of the package: got your own')
-    plant = options.robot if options.robot in ROBOTS else loaded(options.robot)
-    setting = Setting(plant, options.reference, options.noise, duration=options.duration)
-    chosen = [*(options.methods or [FULL]), *options.own]
-    plan = make_plan(chosen, options.seeds, options.cases or (NOMINAL,), setting)
-    return _compare_and_write(options, plan)
-
-
-def _compare_and_write(options: argparse.Namespace, plan: 'ComparisonPlan') -> int:
     from t3mpc_ros.evaluation import comparison_page
     from t3mpc_ros.evaluation.comparison import compare
     from t3mpc_ros.evaluation.experiment import print_report
-    from t3mpc_ros.evaluation.reporting import strict_json
     from t3mpc_ros.scripting.run_executors import workers_for
 
-    for path in (options.json, options.html):
-        if path:  # a folder that cannot be made is an error before the runs, not after them
-            path.parent.mkdir(parents=True, exist_ok=True)
-    with executor_of(options) as executor:
+    plan = _plan(options)
+    run_options.prepare_outputs(options)
+    with run_options.executor_of(options) as executor:
         results = compare(plan, workers_for(executor, plan.runs()), print_report)
     print(comparison_page.markdown(plan, results))
-    if options.json:
-        content = comparison_page.record(plan, results)
-        options.json.write_text(strict_json(content), encoding='utf-8')
-    if options.html:
-        options.html.write_text(comparison_page.page(plan, results), encoding='utf-8')
+    run_options.write_outputs(
+        options,
+        lambda: comparison_page.record(plan, results),
+        lambda: comparison_page.page(plan, results),
+    )
     return 0
+
+
+def _plan(options: argparse.Namespace) -> 'ComparisonPlan':
+    """Return what is compared: methods of the package, or with a part of one's own what is named.
+
+    With a controller, robot or reference of one's own, the first named method is the reference of
+    the comparison.
+    """
+    from t3mpc_ros.evaluation.comparison import ComparisonPlan
+    from t3mpc_ros.evaluation.methods import default_methods, methods_for, require_libraries
+    from t3mpc_ros.parameters.table import find_names
+    from t3mpc_ros.scripting.comparison_runs import make_plan
+    from t3mpc_ros.scripting.own_scenario import own_scenario
+
+    own = bool(options.own or options.reference or options.robot not in run_options.ROBOTS)
+    if own and options.gyro:
+        raise ValueError('--gyro is for the methods of the package: got your own')
+    scenario = own_scenario(**run_options.setting_of(options), gyro=options.gyro)
+    if own:
+        chosen = [*(options.methods or [run_options.FULL]), *options.own]
+        return make_plan(chosen, options.seeds, options.cases or (run_options.NOMINAL,), scenario)
+    known = methods_for(scenario.robot)
+    wanted = list(known) if options.methods == ['all'] else options.methods
+    names = find_names('method', wanted, known) or default_methods(scenario.robot)
+    require_libraries(names)
+    cases = find_names('case', options.cases, scenario.known_cases) or scenario.known_cases
+    return ComparisonPlan(scenario, cases, {name: known[name] for name in names}, options.seeds)

@@ -5,7 +5,13 @@
 import argparse
 from pathlib import Path
 
-from t3mpc_ros.cli.run_options import add_workers, executor_of
+from t3mpc_ros.cli.run_options import (
+    add_outputs,
+    add_workers,
+    executor_of,
+    prepare_outputs,
+    write_outputs,
+)
 
 
 def add_outcomes_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -19,8 +25,7 @@ def add_outcomes_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentP
     parser.add_argument(
         '--output', type=Path, help='page whose table is to be replaced, docs/faults.md say'
     )
-    parser.add_argument('--html', type=Path, help='write one page to this file')
-    parser.add_argument('--json', type=Path, help='also write the numbers to this file')
+    add_outputs(parser)
     add_workers(parser)
     parser.set_defaults(run=run)
 
@@ -30,7 +35,6 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation import fault_page
     from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.fault_study import FAULT_RUNS, study_faults
-    from t3mpc_ros.evaluation.reporting import strict_json
 
     known = dict.fromkeys(fault_run.fault for fault_run in FAULT_RUNS)
     for name in options.names:
@@ -43,13 +47,11 @@ def run(options: argparse.Namespace) -> int:
         for fault_run in FAULT_RUNS
         if not options.names or fault_run.fault in options.names
     ]
+    prepare_outputs(options)
     with executor_of(options) as executor:
         rows = study_faults(fault_runs, executor, print_report)
     print(fault_page.console_text(rows))
     if options.output:
         fault_page.update_page(options.output, rows)
-    if options.html:
-        options.html.write_text(fault_page.page(rows), encoding='utf-8')
-    if options.json:
-        options.json.write_text(strict_json(list(rows)), encoding='utf-8')
+    write_outputs(options, lambda: list(rows), lambda: fault_page.page(rows))
     return 1 if any(row['verdict'] == 'unbounded' for row in rows) else 0

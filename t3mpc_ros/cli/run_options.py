@@ -3,7 +3,7 @@
 """Options that several commands share: robot, seeds, noise, who computes, topics of a bag."""
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 import os
@@ -74,6 +74,45 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
         help='compute on the workers of this Dask scheduler, tcp://HOST:8786, in place of '
         'processes here',
     )
+
+
+def setting_of(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what :func:`add_setting` added, as arguments of a function of the interface."""
+    from t3mpc_ros.scripting.controllers import loaded
+
+    return {
+        'plant': options.robot if options.robot in ROBOTS else loaded(options.robot),
+        'reference': options.reference,
+        'noise': options.noise,
+        'duration': options.duration,
+    }
+
+
+def add_outputs(
+    parser: argparse.ArgumentParser, *, json: str = 'also write the numbers to this file'
+) -> None:
+    """Add the files for the numbers and for the page of a study."""
+    parser.add_argument('--json', type=Path, help=json)
+    parser.add_argument('--html', type=Path, help='write one page to this file')
+
+
+def prepare_outputs(options: argparse.Namespace) -> None:
+    """Make the folders of the files: one that cannot be made is an error before the runs."""
+    for path in (options.json, options.html):
+        if path:
+            path.parent.mkdir(parents=True, exist_ok=True)
+
+
+def write_outputs(
+    options: argparse.Namespace, record: Callable[[], object], page: Callable[[], str]
+) -> None:
+    """Write the files of :func:`add_outputs` that are wanted."""
+    from t3mpc_ros.evaluation.reporting import strict_json
+
+    if options.json:
+        options.json.write_text(strict_json(record()), encoding='utf-8')
+    if options.html:
+        options.html.write_text(page(), encoding='utf-8')
 
 
 def add_topic_options(parser: argparse._ActionsContainer) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 from t3mpc_ros.cli.run_options import (
     FULL,
     NOMINAL,
-    ROBOTS,
     add_seeds,
     add_setting,
     add_workers,
     executor_of,
+    setting_of,
 )
 from t3mpc_ros.parameters.command_line import parsed_value
 
@@ -59,7 +59,6 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 
 def run(options: argparse.Namespace) -> int:
     """Run the sweep, print its table and return 0."""
-    from t3mpc_ros.scripting.controllers import loaded
     from t3mpc_ros.scripting.parameter_sweep import sweep
 
     with executor_of(options) as executor:
@@ -68,10 +67,7 @@ def run(options: argparse.Namespace) -> int:
             dict(options.set),
             seeds=options.seeds,
             cases=options.cases,
-            reference=options.reference,
-            plant=options.robot if options.robot in ROBOTS else loaded(options.robot),
-            noise=options.noise,
-            duration=options.duration,
+            **setting_of(options),
             output=options.output,
             executor=executor,
             progress=True,

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables, HTML page and JSON record of a comparison."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 import math
 from typing import Any
 
@@ -12,7 +12,7 @@ from t3mpc_ros.evaluation.cases import CASES, NOMINAL
 from t3mpc_ros.evaluation.comparison import ComparisonPlan
 from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.method import NodeMethod
+from t3mpc_ros.evaluation.method import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, TWIN_ADVANCE
 from t3mpc_ros.evaluation.metrics import (
     DRIFT,
@@ -39,7 +39,6 @@ from t3mpc_ros.evaluation.reporting import (
 )
 from t3mpc_ros.evaluation.scenario import (
     HELD_OUT_SEEDS,
-    KINDS,
     PRETRAINING_SEEDS,
     TUNING_SEEDS,
     Scenario,
@@ -48,6 +47,11 @@ from t3mpc_ros.version import VERSION
 
 BETTER, WORSE, INCONCLUSIVE = 'better', 'worse', 'inconclusive'
 """Verdicts on a paired difference: its 95 % interval lies below zero, above it, or contains it."""
+OWN_KNOWLEDGE = (
+    'the Observation of each step: estimated speeds and disturbance, reference, and with preview '
+    'the reference 0.4 s ahead; a class with an argument model: the nominal model'
+)
+"""What a controller of one's own knows."""
 
 
 def difference(
@@ -96,7 +100,7 @@ def summary_table(plan: ComparisonPlan, results: ResultTable) -> Table:
 
 def case_table(plan: ComparisonPlan, results: ResultTable, case: str) -> Table:
     """Return every metric of a case, and the paired differences of those that decide it."""
-    first = results.where(case=case, controller=plan.methods[0])[0]
+    first = results.where(case=case, controller=next(iter(plan.methods)))[0]
     metrics = [
         metric
         for metric in METRICS
@@ -141,10 +145,12 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
         'predictive with preview': 'a model with 1.3 times the inertia of the body; "exact '
         'model": that of the nominal robot',
     }
-    if plan.robot == 'twin':
+    if plan.scenario.robot == 'twin':
         scenario = Scenario('twin', 'nominal', 0)
         model = scenario.nominal_model()
-        gyro = [name for name in plan.cases if plan.gyro or CASES[name].gyro] or ['no case']
+        gyro = [name for name in plan.cases if plan.scenario.gyro or CASES[name].gyro] or [
+            'no case'
+        ]
         rows |= {
             FULL: 'the controller of the node with the parameters of the node for this robot, and '
             'no learnt weights at the start; likewise with a part left out. It receives the '
@@ -168,7 +174,13 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
             'baselines': 'the tuned parameters of this drive, with equal effort; adaptive ones '
             'start with the weights of the same pretraining runs',
         }
-    rows |= plan.additional_knowledge
+    own = [
+        name
+        for name, method in plan.methods.items()
+        if not isinstance(method, MethodSpec | NodeMethod)
+    ]
+    if own:
+        rows[', '.join(own)] = OWN_KNOWLEDGE
     return Table(
         'What each method knows', ('method', 'knows'), list(rows.items()), text=2, wrap=True
     )
@@ -179,11 +191,12 @@ def description(plan: ComparisonPlan) -> str:
     seeds = ', '.join(map(str, plan.seeds))
     outside = ' (none is used for tuning or in another table)' if _are_outside(plan.seeds) else ''
     text = (
-        f'{plan.robot_text}, {plan.duration:g} s, noise variance {plan.noise:g} (rad/s)², '
+        f'{plan.scenario.text}, {plan.scenario.duration:g} s, '
+        f'noise variance {plan.scenario.noise:g} (rad/s)², '
         f'seeds {seeds}{outside}. '
         'True wheel speeds against the reference; mean ± half the 95 % interval over the seeds. '
     )
-    kind = KINDS[plan.robot]
+    kind = plan.scenario.kind
     before, after = kind.settling
     text += (
         f'The first {START:g} s of control do not count. Settled: without {before:g} s before and '
@@ -227,7 +240,7 @@ def page(plan: ComparisonPlan, results: ResultTable) -> str:
             blocks += [Contents(), Paragraph(description(plan)), summary_table(plan, results)]
         blocks.append(case_table(plan, results, case))
     blocks += [Heading('What each method knows'), knowledge_table(plan)]
-    return html_page(f'Comparison of methods: {plan.robot}', blocks)
+    return html_page(f'Comparison of methods: {plan.scenario.robot}', blocks)
 
 
 def record(plan: ComparisonPlan, results: ResultTable) -> dict[str, Any]:
@@ -240,23 +253,28 @@ def record(plan: ComparisonPlan, results: ResultTable) -> dict[str, Any]:
     return {
         'format': 1,
         'version': VERSION,
-        'robot': plan.robot,
-        'drive_of_tuning': KINDS[plan.robot].tuned_for,
+        'robot': plan.scenario.robot,
+        'drive_of_tuning': plan.scenario.kind.tuned_for,
         'seeds': list(plan.seeds),
-        'duration': plan.duration,
-        'noise': plan.noise,
-        'gyro': plan.gyro,
+        'duration': plan.scenario.duration,
+        'noise': plan.scenario.noise,
+        'gyro': plan.scenario.gyro,
         'units': {metric.name: metric.unit for metric in METRICS},
-        'parameters': {name: _parameters(plan, name) for name in plan.methods},
+        'parameters': {
+            name: _parameters(plan.scenario.robot, method) for name, method in plan.methods.items()
+        },
         'cases': cases,
     }
 
 
-def _parameters(plan: ComparisonPlan, name: str) -> Mapping[str, object]:
-    method: Any = plan.known_methods()[name]
+def _parameters(robot: str, method: Any) -> dict[str, object]:
     if isinstance(method, NodeMethod):
-        return dict(method.parameters_for(Scenario(plan.robot, NOMINAL, 0)).to_dict())
-    return dict(method.parameters.to_dict())
+        return dict(method.parameters_for(Scenario(robot, NOMINAL, 0)).to_dict())
+    if isinstance(method, MethodSpec):
+        return dict(method.parameters.to_dict())
+    # The settings of a controller of one's own may be of any kind.
+    plain = bool, int, float, str
+    return {name: v if isinstance(v, plain) else repr(v) for name, v in method.settings}
 
 
 def _method_record(

@@ -213,14 +213,9 @@ def source_digest(package: Path = PACKAGE_DIRECTORY) -> str:
 
 
 def content_of(value: Any) -> object:
-    """Return what a value is, as text and numbers; equal ones have equal content.
-
-    An object with a method ``content()`` says itself what it is.
-    """
-    if callable(own := getattr(value, 'content', None)) and not isinstance(value, type):
-        return own()
+    """Return what a value is, as text and numbers; equal ones have equal content."""
     if isinstance(value, str | os.PathLike):
-        return os.fspath(value), _file_digest(Path(value).expanduser())
+        return os.fspath(value), _file_digest(value)
     if value is None or isinstance(value, bool | int | float):
         return value
     if isinstance(value, np.ndarray) and value.dtype != object:
@@ -236,8 +231,14 @@ def content_of(value: Any) -> object:
     return _code(value)
 
 
-def _file_digest(path: Path) -> str:
-    """Return a digest of a file, a schedule of faults or a world say; '' if there is none."""
+def _file_digest(value: str | os.PathLike[str]) -> str:
+    """Return a digest of a file, such as a world or a model; '' if it is none.
+
+    A word without suffix and folder is a name, whatever files there are where the program runs.
+    """
+    path = Path(os.path.expanduser(value))
+    if isinstance(value, str) and not path.suffix and path.name == value:
+        return ''
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ''
     except OSError:

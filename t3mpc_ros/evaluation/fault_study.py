@@ -36,7 +36,6 @@ from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import (
     FaultEvent,
     FaultParameters,
-    FaultSchedule,
     active_faults,
 )
 
@@ -278,7 +277,7 @@ class FaultRun:
         """Return the run on the twin, with pauses of the controller (s)."""
         own = OwnParts(
             reference=_course(self.course, self.duration),
-            events=FaultSchedule([] if self.event is None else [self.event], self.name),
+            events=() if self.event is None else (self.event,),
             robot_parameters={'world': self.world},
             pauses=pauses,
         )

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scenario of one simulated run: all that it depends on but its driver, as plain data."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 import math
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,12 @@ from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
-from t3mpc_ros.evaluation.cases import CASES, ROBOTS, Case, cases_for
+from t3mpc_ros.evaluation.cases import CASES, NOMINAL, ROBOTS, Case, cases_for
 from t3mpc_ros.evaluation.record import RATE, stamp_of
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.parameters.table import ParameterError, nearest_hint
+from t3mpc_ros.parameters.table import ParameterError, find_names
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule, load_schedule
 from t3mpc_ros.simulation.plant.disturbances import MeasurementNoise
@@ -77,25 +77,43 @@ class SampledReference:
     """Whether this is the first sample of a new mode, shape (n + m,)"""
 
 
+class PlantSource(Protocol):
+    """A plant of a script, as plain data."""
+
+    def simulation(self) -> Plant:
+        """Return the plant at its start, without noise."""
+        ...
+
+
+class NoiseSource(Protocol):
+    """Noise of a script, as plain data."""
+
+    def simulation(self, seed: int) -> MeasurementNoise:
+        """Return the noise of a run."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class OwnParts:
     """What a script puts in place of the parts of a scenario."""
 
     reference: SampledReference | None = None
     links: LinkFaults | None = None
-    events: FaultSchedule = field(default_factory=FaultSchedule)
+    events: Sequence[FaultEvent] = ()
     """Further faults of the twin."""
-    noise: Callable[[int], MeasurementNoise] | None = None
-    """Makes the noise of the wheel speeds from a seed."""
+    noise: NoiseSource | None = None
+    """Noise of the wheel speeds."""
     nominal: PaperRobotParameters | None = None
     """The robot that the methods assume, in place of the paper's."""
     limits: LimitParameters | None = None
-    plant: Callable[[], Plant] | None = None
-    """Makes a plant without noise; ``noise`` is given with it."""
+    plant: PlantSource | None = None
+    """``noise`` is given with it."""
     robot_parameters: Mapping[str, Any] = field(default_factory=dict)
     """Changes of the true robot, unknown to all methods."""
     pauses: Sequence[tuple[float, float]] = ()
     """Times at which a person disables and re-enables the driver, s."""
+    text: str = ''
+    """What the robot is, in words."""
 
 
 NO_PARTS = OwnParts()
@@ -131,8 +149,10 @@ class Scenario:
     own: OwnParts = NO_PARTS
 
     def __post_init__(self) -> None:
-        check_name('robot', self.robot, ROBOTS)
-        check_name('case', self.case, cases_for(self.robot))
+        (robot,) = find_names('robot', [self.robot], ROBOTS)
+        object.__setattr__(self, 'robot', robot)
+        (case,) = find_names('case', [self.case], self.known_cases)
+        object.__setattr__(self, 'case', case)
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise ValueError(f'seed must be a whole number of at least 0: got {self.seed!r}')
         for name, low, high, unit in (
@@ -143,7 +163,7 @@ class Scenario:
             if not low <= value <= high:
                 raise ValueError(f'{name} must be from {low:g} to {high:g} {unit}: got {value}')
         if self.gyro and not self.kind.has_gyro:
-            raise ValueError(f'gyro must be false on a robot without one: got robot {self.robot}')
+            raise ValueError(f'gyro is for the twin alone: got robot {self.robot}')
 
     def __str__(self) -> str:
         return f'{self.robot}, noise {self.noise:g}, {self.case}, seed {self.seed}'
@@ -152,6 +172,16 @@ class Scenario:
     def kind(self) -> 'RobotKind':
         """What is particular to the robot."""
         return KINDS[self.robot]
+
+    @property
+    def text(self) -> str:
+        """What the robot is, in words."""
+        return self.own.text or self.kind.text
+
+    @property
+    def known_cases(self) -> tuple[str, ...]:
+        """Cases that its robot can have; a plant of a script has the nominal one alone."""
+        return cases_for(self.robot) if self.own.plant is None else (NOMINAL,)
 
     @property
     def parts(self) -> Case:
@@ -294,8 +324,8 @@ class RobotKind:
             plant = DisturbedPlant(parameters)
         else:
             quiet = parameters.with_values({'noise.variance': 0.0})
-            inner = DisturbedPlant(quiet) if own.plant is None else own.plant()
-            plant = NoisyPlant(inner, own.noise(parameters.seed))
+            inner = DisturbedPlant(quiet) if own.plant is None else own.plant.simulation()
+            plant = NoisyPlant(inner, own.noise.simulation(parameters.seed))
         later = scenario.parts.later.get(scenario.robot)
         links = scenario.links
         least, most = links.command_delay
@@ -382,7 +412,9 @@ class TwinKind(RobotKind):
         noise = scenario.own.noise
         further = load_schedule(parameters.faults.schedule).events
         schedule = FaultSchedule([*further, *fault_events(scenario)], scenario.case)
-        return DigitalTwin(parameters, schedule, noise(parameters.seed) if noise else None)
+        return DigitalTwin(
+            parameters, schedule, noise.simulation(parameters.seed) if noise else None
+        )
 
 
 def noisy_twin(world: str = '', seed: int = 1) -> DigitalTwinParameters:
@@ -405,7 +437,7 @@ def fault_events(scenario: Scenario) -> list[FaultEvent]:
     ]
     for name, value in scenario.parts.later.get(scenario.robot, {}).items():
         events.append(FaultEvent(0.5 * scenario.duration, name, value))
-    return [*scenario.own.events.events, *events]
+    return [*scenario.own.events, *events]
 
 
 KINDS: Mapping[str, RobotKind] = {
@@ -414,13 +446,6 @@ KINDS: Mapping[str, RobotKind] = {
     'torque': RobotKind("The paper's plant with torque drive", 'torque'),
 }
 """The robots by name."""
-
-
-def check_name(kind: str, name: str, known: Collection[str]) -> None:
-    """Raise ValueError, with the nearest name, when ``name`` is not known."""
-    if name not in known:
-        hint = nearest_hint(name, known)
-        raise ValueError(f'{kind} must be one of {", ".join(known)}: got {name!r}{hint}')
 
 
 @lru_cache(maxsize=128)  # about 0.3 MB for a run of a minute

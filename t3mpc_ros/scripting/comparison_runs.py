@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Controllers side by side over seeds and cases: ``compare`` and its result."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import os
 from pathlib import Path
 from typing import Any
@@ -14,65 +14,25 @@ from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan
 from t3mpc_ros.evaluation.comparison import compare as run_plan
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.experiment import ResultTable, print_report
-from t3mpc_ros.evaluation.loop import Method
 from t3mpc_ros.evaluation.metrics import METRICS, Metric
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
-from t3mpc_ros.scripting.controllers import OwnMethod, as_controllers
+from t3mpc_ros.scripting.controllers import as_controllers
+from t3mpc_ros.scripting.own_scenario import own_scenario
 from t3mpc_ros.scripting.plants import NoiseLaw
 from t3mpc_ros.scripting.run_executors import workers_for
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
-from t3mpc_ros.scripting.setting import Setting
 from t3mpc_ros.scripting.table_files import columns_of, write_csv, write_parquet
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
-
-OWN_KNOWLEDGE = (
-    'the Observation of each step: estimated speeds and disturbance, reference, and with preview '
-    'the reference 0.4 s ahead; a class with an argument model: the nominal model'
-)
-
-
-@dataclass(frozen=True)
-class ScriptedPlan(ComparisonPlan):
-    """What a script compares."""
-
-    setting: Setting = field(default_factory=Setting)
-    controllers: Mapping[str, Method] = field(default_factory=dict)
-    reference_name: str = ''
-    """The method with which every other is compared; by default the first one."""
-
-    @property
-    def against(self) -> str:
-        """The method with which every other is compared."""
-        return self.reference_name or self.methods[0]
-
-    @property
-    def robot_text(self) -> str:
-        """What the robot is, in words."""
-        return self.setting.robot_text
-
-    @property
-    def additional_knowledge(self) -> Mapping[str, str]:
-        """What controllers of one's own know."""
-        own = [name for name, method in self.controllers.items() if isinstance(method, OwnMethod)]
-        return {', '.join(own): OWN_KNOWLEDGE} if own else {}
-
-    def known_methods(self) -> Mapping[str, Method]:
-        """Return the compared methods by name."""
-        return self.controllers
-
-    def scenario(self, case: str, seed: int) -> Scenario:
-        """Return one run without its method."""
-        return self.setting.scenario(case, seed)
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """Result of a comparison: the metrics of every run, and what is made of them."""
 
-    plan: ScriptedPlan
+    plan: ComparisonPlan
     results: ResultTable
     """One row for each run: controller, case, seed and metrics by name."""
 
@@ -184,42 +144,41 @@ def compare(
     ScriptError
         As for :func:`simulate`.
     """
-    plan = make_plan(controllers, seeds, cases, Setting(plant, reference, noise, faults, duration))
+    scenario = own_scenario(plant, reference, noise, faults, duration)
+    plan = make_plan(controllers, seeds, cases, scenario)
     workers = workers_for(executor, plan.runs())
     return Comparison(plan, run_plan(plan, workers, print_report if progress else None))
 
 
 def make_plan(
-    controllers: Any, seeds: Iterable[int], cases: Sequence[str], setting: Setting
-) -> ScriptedPlan:
-    """Return what is compared.
+    controllers: Any, seeds: Iterable[int], cases: str | Sequence[str], scenario: Scenario
+) -> ComparisonPlan:
+    """Return what is compared with the first of some controllers.
 
     Raises
     ------
     ValueError
         An unknown name, a bad seed, or two controllers of one name.
     """
-    methods = [each.method(setting.robot) for each in as_controllers(controllers)]
+    methods = [each.method(scenario.robot) for each in as_controllers(controllers)]
     names = [method.name for method in methods]
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise ScriptError(
             f'controllers must have different names, see Controller(name=…): got {repeated[0]} '
             'more than once'
         )
-    chosen = checked_seeds(seeds)
-    plan = ScriptedPlan(
-        setting.robot,
-        setting.chosen_cases(cases),
-        tuple(names),
-        chosen,
-        setting.duration,
-        setting.variance,
-        setting=setting,
-        controllers=dict(zip(names, methods, strict=True)),
+    return ComparisonPlan(
+        scenario,
+        chosen_cases(cases, scenario),
+        dict(zip(names, methods, strict=True)),
+        checked_seeds(seeds),
+        next(iter(names), ''),
     )
-    for case in plan.cases:
-        setting.scenario(case, chosen[0])
-    return plan
+
+
+def chosen_cases(cases: str | Sequence[str], scenario: Scenario) -> tuple[str, ...]:
+    """Return the full names of one or more cases of a robot."""
+    return find_names('case', [cases] if isinstance(cases, str) else cases, scenario.known_cases)
 
 
 def checked_seeds(seeds: Any) -> tuple[int, ...]:

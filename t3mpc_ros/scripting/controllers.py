@@ -22,7 +22,6 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     Observation,
 )
 from t3mpc_ros.evaluation.drivers import MethodDriver
-from t3mpc_ros.evaluation.experiment import content_of
 from t3mpc_ros.evaluation.loop import Method
 from t3mpc_ros.evaluation.method import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.methods import methods_for, require_libraries
@@ -76,13 +75,6 @@ class Controller:
         if isinstance(self.source, str) and FILE_SEPARATOR not in self.source:
             return self._packaged(robot, self.source)
         return OwnMethod(self.name, checked_source(self.source), tuple(self.settings.items()))
-
-    def content(self) -> object:
-        """Return what determines its runs: a file counts with its text."""
-        source = self.source
-        if isinstance(source, str) and FILE_SEPARATOR in source:
-            source = FileController.load(source)
-        return self.name, content_of(source), content_of(self.settings)
 
     def _packaged(self, robot: str, wanted: str) -> Method:
         known = methods_for(robot)

@@ -18,7 +18,6 @@ from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.experiment import (
     Report,
     Run,
-    content_of,
     digest,
     measured_run,
     print_report,
@@ -27,16 +26,17 @@ from t3mpc_ros.evaluation.experiment import (
 from t3mpc_ros.evaluation.metrics import METRICS
 from t3mpc_ros.evaluation.reporting import Table, format_interval
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
+from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
-from t3mpc_ros.scripting.comparison_runs import checked_seeds
+from t3mpc_ros.scripting.comparison_runs import checked_seeds, chosen_cases
 from t3mpc_ros.scripting.controllers import as_controllers
+from t3mpc_ros.scripting.own_scenario import own_scenario
 from t3mpc_ros.scripting.plants import NoiseLaw
 from t3mpc_ros.scripting.run_executors import workers_for
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence, sentence
-from t3mpc_ros.scripting.setting import Setting
 from t3mpc_ros.scripting.table_files import columns_of, write_csv, write_parquet
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
@@ -166,7 +166,13 @@ def sweep(
     ScriptError
         As for :func:`simulate`, or because every run failed.
     """
-    setting = Setting(plant, reference, noise, faults, duration)
+    setting = {
+        'plant': plant,
+        'reference': reference,
+        'noise': noise,
+        'faults': faults,
+        'duration': duration,
+    }
     runs = make_runs(controllers, parameters, checked_seeds(seeds), cases, setting)
     path = _checked_path(output)
     workers = workers_for(executor, runs)
@@ -185,49 +191,58 @@ def make_runs(
     parameters: Mapping[str, Sequence[Any]],
     seeds: Sequence[int],
     cases: Sequence[str],
-    setting: Setting,
+    setting: Mapping[str, Any],
 ) -> list[Run]:
     """Return the runs of a sweep, each with the digest of all that determines it.
 
-    Seed by seed, so that an estimate of the time left holds.
+    Seed by seed, so that an estimate of the time left holds. ``setting`` has the arguments of
+    :func:`own_scenario` that no parameter sweeps.
     """
-    chosen = setting.chosen_cases(cases)
-    combinations = _combinations(parameters)
-    origin = provenance()
+    combinations = [(values, _scenario(setting, values)) for values in _combinations(parameters)]
+    chosen = chosen_cases(cases, combinations[0][1])
     prepared = []
     for controller in as_controllers(controllers):
-        for values in combinations:
+        for values, scenario in combinations:
             own = {k: v for k, v in values.items() if not (k in OF_SETTING or k.startswith(ROBOT))}
-            changed = replace(
-                setting,
-                **{name: values[name] for name in OF_SETTING if name in values},
-                robot_parameters=_robot_values(setting, values),
-            )
             source = replace(controller, settings={**controller.settings, **own})
-            content = content_of([origin['python'], source, changed])
-            prepared.append(
-                (controller.name, values, source.method(setting.robot), changed, content)
-            )
+            prepared.append((controller.name, values, scenario, source.method(scenario.robot)))
+    origin = provenance()
     runs = []
     for seed in seeds:
         for case in chosen:
-            for name, values, method, changed, content in prepared:
+            for name, values, some, method in prepared:
+                scenario = replace(some, case=case, seed=seed)
                 row = {
                     'controller': name,
                     **values,
-                    'robot': changed.robot,
-                    'reference': changed.reference_text,
+                    'robot': scenario.robot,
+                    'reference': reference_text(setting.get('reference')),
                     'case': case,
                     'seed': seed,
-                    'noise': changed.variance,
-                    'duration': float(changed.duration),
+                    'noise': scenario.noise,
+                    'duration': float(scenario.duration),
                 }
-                key = digest(content, name, case, seed)
-                job = changed.scenario(case, seed), method
-                runs.append(Run(job, {**row, **origin, RUN: key}, key))
+                key = digest(origin['python'], scenario, method)
+                runs.append(Run((scenario, method), {**row, **origin, RUN: key}, key))
     if len({run.key for run in runs}) < len(runs):
         raise ScriptError('controllers and values must differ: got two runs that are the same')
     return runs
+
+
+def _scenario(setting: Mapping[str, Any], values: Row) -> Scenario:
+    """Return one run with swept values of the setting and of the true robot."""
+    swept = {name: values[name] for name in OF_SETTING if name in values}
+    robot = {k.removeprefix(ROBOT): v for k, v in values.items() if k.startswith(ROBOT)}
+    return own_scenario(**{**setting, **swept}, robot_parameters=robot)
+
+
+def reference_text(reference: Any) -> str:
+    """Return what a reference is: ``chaotic``, the path of a file, or the kind of the source."""
+    if reference is None:
+        return 'chaotic'
+    if isinstance(reference, str | os.PathLike):
+        return os.fspath(reference)
+    return str(getattr(reference, '__name__', type(reference).__name__))
 
 
 def _combinations(parameters: Mapping[str, Sequence[Any]]) -> list[Row]:
@@ -245,11 +260,6 @@ def _combinations(parameters: Mapping[str, Sequence[Any]]) -> list[Row]:
 
 def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
-
-
-def _robot_values(setting: Setting, values: Row) -> Row:
-    own = {k.removeprefix(ROBOT): v for k, v in values.items() if k.startswith(ROBOT)}
-    return {**setting.robot_parameters, **own}
 
 
 def numbers_or_error(job: Job) -> Row:
@@ -273,6 +283,8 @@ def _checked_path(output: str | os.PathLike[str] | None) -> Path | None:
     path = Path(output).expanduser()
     if path.suffix != SUFFIX:
         raise ScriptError(f'output must end in {SUFFIX}: got {path}')
+    if path.is_dir():
+        raise ScriptError(f'output must be a file: got the folder {path}')
     import pyarrow.parquet  # noqa: F401
 
     return path

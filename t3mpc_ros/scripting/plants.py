@@ -348,6 +348,10 @@ class NoiseLaw:
         if not (isinstance(self.variance, int | float) and 0.0 <= self.variance <= 100.0):
             raise ScriptError(f'variance must be from 0 to 100 (rad/s)²: got {self.variance!r}')
 
+    def simulation(self, seed: int) -> 'LawNoise':
+        """Return the noise of a run."""
+        return LawNoise(self, seed)
+
 
 class LawNoise:
     """Noise drawn by a law.

@@ -12,7 +12,7 @@ import numpy as np
 
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.loop import Method, run
+from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.metrics import METRICS, START, Numbers, measure
 from t3mpc_ros.evaluation.record import Record, counted_rows
 from t3mpc_ros.evaluation.reporting import Table
@@ -20,9 +20,9 @@ from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.scripting.controllers import as_controller
+from t3mpc_ros.scripting.own_scenario import own_scenario
 from t3mpc_ros.scripting.plants import NoiseLaw
 from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
-from t3mpc_ros.scripting.setting import Setting
 from t3mpc_ros.scripting.table_files import write_csv, write_parquet
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
@@ -148,19 +148,8 @@ def simulate(
     ScriptError
         Wrong use, or a controller or plant that failed; the text says what and where.
     """
-    setting = Setting(plant, reference, noise, faults, duration)
-    scenario = setting.scenario(case, seed)
-    return run_once(scenario, as_controller(controller).method(setting.robot))
-
-
-def run_once(scenario: Scenario, method: Method) -> RunResult:
-    """Return the result of one run.
-
-    Raises
-    ------
-    ScriptError
-        The run diverged.
-    """
+    scenario = own_scenario(plant, reference, noise, faults, duration, case=case, seed=seed)
+    method = as_controller(controller).method(scenario.robot)
     record = run(scenario, method)
     if not record.finite:
         k = int(np.argmax(~np.isfinite(record.speeds).all(axis=1)))

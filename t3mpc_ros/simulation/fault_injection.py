@@ -223,7 +223,7 @@ def load_schedule(name_or_path: str | Path) -> FaultSchedule:
     name = os.fspath(name_or_path)
     if not name:
         return FaultSchedule()
-    path = Path(name).expanduser()
+    path = Path(os.path.expanduser(name))  # of an unknown user, too
     by_path = (
         isinstance(name_or_path, Path) or path.suffix in ('.yaml', '.yml') or path.name != name
     )

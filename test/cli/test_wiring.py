@@ -58,7 +58,8 @@ def flat(path, value):
             return {path: tuple(value)}
     else:
         return {path: 'callable'} if callable(value) else {}
-    return {
+    names = {path: tuple(value)} if isinstance(value, dict) else {}
+    return names | {
         name: found
         for key, item in items.items()
         for name, found in flat(f'{path}.{key}', item).items()
@@ -98,6 +99,8 @@ def context(value):
 
 SHARED = {'scripting.run_executors.cluster': context(5)}
 CSV = 'time,right,left\n' + ''.join(f'{0.01 * k:.2f},1.0,2.0\n' for k in range(300))
+OWN_RATE = tuple([0.0, 0.0] for _ in range(6100))
+"""Slope of that reference over a run and a second."""
 FILES = {
     'speeds.csv': CSV,
     'mine.py': 'import numpy as np\ndef step(observation):\n    return np.zeros(2)\n',
@@ -294,13 +297,13 @@ TABLE = {
     'compare': (
         COMPARE | SHARED,
         {
-            '--robot servo': {'compare.plan.robot': 'servo'},
+            '--robot servo': {'compare.plan.scenario.robot': 'servo'},
             '--seeds 3-4': {'compare.plan.seeds': (3, 4)},
-            '--duration 9': {'compare.plan.duration': 9.0},
-            '--noise 0.01': {'compare.plan.noise': 0.01},
+            '--duration 9': {'compare.plan.scenario.duration': 9.0},
+            '--noise 0.01': {'compare.plan.scenario.noise': 0.01},
             '--cases nominal': {'compare.plan.cases': ('nominal',)},
             '--methods full DMC': {'compare.plan.methods': ('full', 'DMC')},
-            '--gyro': {'compare.plan.gyro': True},
+            '--gyro': {'compare.plan.scenario.gyro': True},
             '--json new.json': {'files': 'new.json'},
             '--html new.html': {'files': 'new.html'},
             **workers('compare.workers'),
@@ -310,16 +313,13 @@ TABLE = {
         COMPARE | SHARED,
         {
             'ADRC': {'compare.plan.methods': ('full', 'step', 'ADRC')},
-            '--robot torque': {'compare.plan.robot': 'torque'},
+            '--robot torque': {'compare.plan.scenario.robot': 'torque'},
             '--seeds 3-4': {'compare.plan.seeds': (3, 4)},
-            '--duration 9': {
-                'compare.plan.duration': 9.0,
-                'compare.plan.setting.duration': 9.0,
-            },
-            '--noise 0.01': {'compare.plan.noise': 0.01, 'compare.plan.setting.noise': 0.01},
+            '--duration 9': {'compare.plan.scenario.duration': 9.0},
+            '--noise 0.01': {'compare.plan.scenario.noise': 0.01},
             '--cases nominal disturbance': {'compare.plan.cases': ('nominal', 'disturbance')},
             '--methods DMC': {'compare.plan.methods': ('DMC', 'step')},
-            '--reference speeds.csv': {'compare.plan.setting.reference': 'speeds.csv'},
+            '--reference speeds.csv': {'compare.plan.scenario.own.reference.rate': OWN_RATE},
         },
     ),
     'sweep': (

@@ -45,7 +45,7 @@ from t3mpc_ros.evaluation.scenario import (
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 from t3mpc_ros.simulation.digital_twin import BROWN_OUT_REASON
-from t3mpc_ros.simulation.fault_injection import FAULTS, FaultEvent, FaultSchedule
+from t3mpc_ros.simulation.fault_injection import FAULTS, FaultEvent
 
 pytestmark = pytest.mark.slow
 
@@ -53,8 +53,8 @@ PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'faults.md'
 NUMBER = re.compile(r'(?<![\w.])\d+(?:\.\d+)?')
 
 
-def short_run(schedule=None, pauses=(), **changes):
-    own = OwnParts(events=schedule or FaultSchedule(), robot_parameters=changes, pauses=pauses)
+def short_run(*events, pauses=(), **changes):
+    own = OwnParts(events=events, robot_parameters=changes, pauses=pauses)
     return run(Scenario('twin', 'nominal', 1, 6.0, own=own), NodeMethod('full', {}))
 
 
@@ -92,7 +92,7 @@ def assert_same(line, other):
 
 def test_equal_runs_are_bit_equal_with_scheduled_faults(tmp_path):
     event = FaultEvent(3.0, 'command_delay', 0.1, 1.0)
-    first = short_run(FaultSchedule([event]))
+    first = short_run(event)
     path = tmp_path / 'ride.yaml'
     path.write_text('- {at: 3.0, fault: command_delay, value: 0.1, for: 1.0}\n')
     second = short_run(**{'faults.schedule': str(path)})

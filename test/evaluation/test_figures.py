@@ -21,7 +21,7 @@ from t3mpc_ros.evaluation import comparison_page, fault_page, plotting
 from t3mpc_ros.evaluation.comparison import ComparisonPlan
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.methods import FULL
+from t3mpc_ros.evaluation.methods import FULL, methods_for
 from t3mpc_ros.evaluation.metrics import METRICS
 from t3mpc_ros.evaluation.paper import paper_figures
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
@@ -43,6 +43,7 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     FieldComparison,
     Tolerances,
 )
+from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.scripting.chaos_generator import ChaosSolution
 from t3mpc_ros.scripting.parameter_sweep import Sweep
 from t3mpc_ros.scripting.single_run import RunResult
@@ -399,7 +400,8 @@ def test_differences_of_methods_are_coloured_by_their_verdict(caught):
     """Green is better, which is a smaller error; an interval about zero is grey."""
     apart = {'DMC': -0.3, 'ADRC': 0.3, FULL: 0.0}
     noise = np.array([-0.01, 0.0, 0.02])
-    plan = ComparisonPlan('servo', ('nominal',), ('feed-forward', *apart), (1, 2, 3), 60.0)
+    methods = {name: methods_for('servo')[name] for name in ('feed-forward', *apart)}
+    plan = ComparisonPlan(Scenario('servo', 'nominal', 1), ('nominal',), methods, (1, 2, 3))
 
     rows = [
         {'controller': name, 'case': 'nominal', 'seed': seed, 'settled': 1.0 + n, 'overall': 2.0}

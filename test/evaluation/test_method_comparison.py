@@ -12,7 +12,6 @@ import pytest
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.cli.run_options import ROBOTS, seed_range
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
-from t3mpc_ros.evaluation import comparison
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
 from t3mpc_ros.evaluation.baselines.feedback_control import (
@@ -20,12 +19,7 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
     ProportionalIntegralParameters,
 )
 from t3mpc_ros.evaluation.cases import NOMINAL, cases_for
-from t3mpc_ros.evaluation.comparison import (
-    QUICK_SEEDS,
-    ComparisonPlan,
-    compare,
-    default_methods,
-)
+from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, compare
 from t3mpc_ros.evaluation.comparison_page import (
     BETTER,
     INCONCLUSIVE,
@@ -40,7 +34,13 @@ from t3mpc_ros.evaluation.drivers import MethodDriver, NodeDriver
 from t3mpc_ros.evaluation.experiment import ResultTable, measured_run
 from t3mpc_ros.evaluation.loop import run, run_loop
 from t3mpc_ros.evaluation.method import MethodSpec
-from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, methods_for, twin_start
+from t3mpc_ros.evaluation.methods import (
+    FEED_FORWARD,
+    FULL,
+    default_methods,
+    methods_for,
+    twin_start,
+)
 from t3mpc_ros.evaluation.metrics import DRIFT, SETTLED, STOPPED, YAW_RATE, measure
 from t3mpc_ros.evaluation.record import stamp_of
 from t3mpc_ros.evaluation.scenario import (
@@ -320,8 +320,15 @@ def test_the_gain_that_tuning_starts_with_cancels_the_noise():
     assert abs(commands[1] - commands[0]).max() < 0.001
 
 
+def plan_of(robot, *names, seeds=QUICK_SEEDS, duration=4.0, **own):
+    """Return the comparison of methods of a robot, by name, and of others."""
+    known = methods_for(robot)
+    methods = {name: known[name] for name in names} | own
+    return ComparisonPlan(Scenario(robot, NOMINAL, 1, duration), (NOMINAL,), methods, seeds)
+
+
 def test_differences_are_paired_with_their_verdict():
-    plan = ComparisonPlan('servo', (NOMINAL,), (PI,))
+    plan = plan_of('servo', PI)
 
     def found(mine, other, method=PI):
         rows = [
@@ -356,6 +363,7 @@ class Diverging:
 
     name = 'diverging'
     parameters = ProportionalIntegralParameters()
+    settings = (('gain', 3.0), ('law', object))
 
     def driver(self, scenario):
         kind = NotFinite if scenario.seed == 2 else ProportionalIntegral
@@ -363,12 +371,9 @@ class Diverging:
 
 
 @pytest.mark.parametrize('first', [1, 2])
-def test_a_seed_that_diverges_makes_every_mean_diverge(first, monkeypatch):
+def test_a_seed_that_diverges_makes_every_mean_diverge(first):
     """Its missing metrics once ended the JSON, or left means over the other seeds beside it."""
-    known = {**methods_for('twin'), 'diverging': Diverging()}
-    monkeypatch.setattr(comparison, 'methods_for', lambda robot: known)
-    seeds = (first, 3 - first)
-    plan = ComparisonPlan('twin', (NOMINAL,), (FEED_FORWARD, 'diverging'), seeds, 4.0)
+    plan = plan_of('twin', FEED_FORWARD, seeds=(first, 3 - first), diverging=Diverging())
     results = compare(plan)
     for metric in (SETTLED, DRIFT, YAW_RATE, STOPPED):
         assert len(results.values(metric.name, controller='diverging')) == 2
@@ -379,7 +384,9 @@ def test_a_seed_that_diverges_makes_every_mean_diverge(first, monkeypatch):
     )
     assert '±' not in row
     assert WORSE in row
-    stored = record(plan, results)['cases'][NOMINAL]['methods']['diverging']
+    found = record(plan, results)
+    assert found['parameters']['diverging'] == {'gain': 3.0, 'law': "<class 'object'>"}
+    stored = found['cases'][NOMINAL]['methods']['diverging']
     assert stored['difference_from_feed_forward'][YAW_RATE.name]['verdict'] == WORSE
 
 
@@ -390,7 +397,7 @@ def test_the_body_decides_where_it_is_not_known():
 
 @pytest.mark.parametrize('robot', ['servo', 'torque'])
 def test_the_plant_of_the_paper_is_compared_too(robot):
-    plan = ComparisonPlan(robot, ('nominal',), (FEED_FORWARD, PI), (201,), 2.0)
+    plan = plan_of(robot, FEED_FORWARD, PI, seeds=(201,), duration=2.0)
     results = compare(plan)
     assert results.values('controller') == [FEED_FORWARD, PI]
     (row,) = results.where(controller=PI, case='nominal')

@@ -17,7 +17,6 @@ from t3mpc_ros.evaluation import experiment
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.scripting import parameter_sweep
 from t3mpc_ros.scripting.parameter_sweep import make_runs
-from t3mpc_ros.scripting.setting import Setting
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 
 SHORT = {'plant': 'servo', 'duration': 2.0}
@@ -159,7 +158,7 @@ def doubled(state):
     return 2.0 * state[:2]
 
 
-SERVO, TWIN = Setting('servo', duration=2.0), Setting('twin', duration=2.0)
+SERVO, TWIN = SHORT, {'plant': 'twin', 'duration': 2.0}
 LINKS = LinkFaults(0.1, (0.01, 0.02), 0.2, (0.0, 0.01), 0.5, 1.0)
 EVENT = FaultEvent(0.5, 'gyro_dead', True, 1.0)
 LAW, ODE = t3.NoiseLaw(first_noise, 0.1), t3.OdePlant(right_hand_side, output=first)
@@ -167,21 +166,17 @@ SPACE = t3.StateSpace(-np.eye(2), np.eye(2), np.eye(2))
 OTHER_ROBOT = t3.Robot(lag=0.05)
 
 
-def on(base, name):
+def on(setting, name):
     """Return how a value becomes a setting, as its argument of that name."""
-    return lambda value: replace(base, **{name: value})
+    return lambda value: {**setting, name: value}
 
 
 CHANGES = [
-    (SERVO, lambda setting: setting, {
-        'plant': 'torque', 'reference': np.ones((300, 2)), 'noise': 0.1, 'faults': LINKS,
-        'duration': 3.0, 'robot_parameters': {'friction_factor': 2.0},
-    }),
     (LINKS, on(SERVO, 'faults'), {
         'command_loss': 0.3, 'command_delay': (0.01, 0.03), 'odometry_loss': 0.4,
         'odometry_delay': (0.0, 0.02), 'begin': 0.6, 'lasting': 2.0,
     }),
-    (EVENT, lambda event: replace(TWIN, faults=FaultSchedule([event])), {
+    (EVENT, lambda event: {**TWIN, 'faults': FaultSchedule([event])}, {
         'at': 0.6, 'fault': 'ranges_dead', 'value': False, 'duration': 2.0,
     }),
     (LAW, on(SERVO, 'noise'), {'draw': other_noise, 'variance': 0.2}),
@@ -227,7 +222,14 @@ def test_the_key_of_a_run_changes_with_all_that_determines_it(base, setting, cha
     assert key(replace(base)) == found[0]
 
 
-def test_the_key_of_a_run_changes_with_its_place_in_the_sweep(monkeypatch, tmp_path):
+def test_the_key_of_a_run_changes_with_its_place_in_the_sweep(monkeypatch):
+    settings = {
+        'plant': 'torque', 'reference': np.ones((300, 2)), 'noise': 0.1, 'faults': LINKS,
+        'duration': 3.0,
+    }  # fmt: skip
+    alone = [*keys(), *(keys({**SERVO, name: value})[0] for name, value in settings.items())]
+    alone += keys(parameters={'robot.friction_factor': [2.0]})
+    assert len({*alone}) == 1 + len(settings) + 1
     found = keys(parameters={'gain': [10.0, 20.0]}, seeds=(1, 2), cases=('nominal', 'disturbance'))
     assert len({*found}) == 8
     again = keys(parameters={'gain': [20.0]}, seeds=(2,), cases=('disturbance',))
@@ -251,9 +253,17 @@ def test_the_key_of_a_run_changes_with_the_content_of_its_files(tmp_path):
     found = set()
     for at in (0.5, 0.7, 0.5):
         faults.write_text(f'- {{at: {at}, fault: gyro_dead, value: true}}\n')
-        found |= {*keys(replace(TWIN, faults=str(faults)), 'full')}
-        found |= {*keys(replace(TWIN, faults=faults), 'full')}
+        found |= {*keys({**TWIN, 'faults': str(faults)}, 'full')}
+        found |= {*keys({**TWIN, 'faults': faults}, 'full')}
     assert len(found) == 2
+
+
+def test_the_key_of_a_run_ignores_files_named_like_a_case(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    before = keys(TWIN, 'full')
+    for name in ('full', 'twin', 'nominal'):
+        (tmp_path / name).write_text('not meant')
+    assert keys(TWIN, 'full') == before
 
 
 @pytest.mark.parametrize(
@@ -272,11 +282,14 @@ def test_wrong_use_of_a_sweep_is_a_sentence(arguments, text):
         t3.sweep(*arguments, executor=1, seeds=[1], **SHORT)
 
 
-def test_a_file_of_another_kind_is_left_alone(tmp_path):
+def test_a_file_of_another_kind_is_left_alone(tmp_path, monkeypatch):
     pytest.importorskip('pyarrow')
+    monkeypatch.chdir(tmp_path)
     path = tmp_path / 'sweep.parquet'
-    with pytest.raises(t3.ScriptError, match='output must end in .parquet: got x.csv'):
-        t3.sweep(Proportional, GAINS, executor=1, output='x.csv', **SHORT)
+    (tmp_path / 'folder.parquet').mkdir()
+    for name, text in (('x.csv', 'end in .parquet: got x.csv'), ('folder.parquet', 'be a file')):
+        with pytest.raises(t3.ScriptError, match=f'output must {text}'):
+            t3.sweep(Proportional, GAINS, executor=1, output=name, **SHORT)
     t3.simulate(Proportional, **SHORT).to_parquet(path)
     content = path.read_bytes()
     with pytest.raises(t3.ScriptError, match='is no file of a sweep'):
