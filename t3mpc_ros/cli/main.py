@@ -27,7 +27,6 @@ from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
 
 if TYPE_CHECKING:
     from t3mpc_ros.evaluation.bag_report.verdict import Verdict
-    from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition
 
 
 SECONDS = bounded_float(1.0, 86_400.0, 'seconds')
@@ -189,12 +188,6 @@ def _compile_controllers() -> None:
         run(Scenario(robot, NOMINAL, 1, 1.0), spec)
 
 
-def _method_definitions() -> 'Sequence[MethodDefinition]':
-    from t3mpc_ros.evaluation.methods import method_definitions
-
-    return method_definitions()
-
-
 def _parser() -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = ArgumentParser(
         prog='t3mpc',
@@ -269,7 +262,7 @@ def _parser() -> argparse.ArgumentParser:
     add_compare(commands)
     add_sweep(commands)
     add_patrol(commands)
-    add_tune(commands, _method_definitions)
+    add_tune(commands)
     add_train(commands)
     add_outcomes_parser(commands)
     add_view(commands)

@@ -3,7 +3,7 @@
 """``t3mpc tune``: tunes the compared methods, or identifies the drive of a robot from a bag."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,13 +29,8 @@ EVALUATIONS = 120
 TWIN_EVALUATIONS = 30
 OUTPUT = Path('runs') / 'tuned.json'
 
-Table = Callable[[], 'Sequence[MethodDefinition]']
-"""Returns the methods that can be tuned; a function, so that ``--help`` does not load them."""
 
-
-def add_parser(
-    commands: 'argparse._SubParsersAction[argparse.ArgumentParser]', table: Table
-) -> None:
+def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
     """Add the subcommand ``tune``."""
     parser = commands.add_parser(
         'tune',
@@ -67,17 +62,17 @@ def add_parser(
         '--resume', action='store_true', help='go on where the last tuning was interrupted'
     )
     add_topic_options(parser.add_argument_group('with a bag'))
-    parser.set_defaults(run=run, table=table)
+    parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Tune every method, or identify the drive in a bag; print the result and return 0."""
-    from t3mpc_ros.evaluation.methods import require_libraries
+    from t3mpc_ros.evaluation.methods import method_definitions, require_libraries
     from t3mpc_ros.parameters.table import find_names
 
     if options.robot not in (None, TWIN, *DRIVES):
         return _identify(options)
-    known = options.table()
+    known = method_definitions()
     names = find_names('method', options.methods, [method.name for method in known])
     methods = [method for method in known if method.name in names or not names]
     require_libraries(method.name for method in methods)

@@ -121,7 +121,6 @@ class OdePlant:
 
     @one_sentence
     def __post_init__(self) -> None:
-        check_drive(self.drive)
         if isinstance(self.states, bool) or not (
             isinstance(self.states, int) and self.states >= 1
         ):
@@ -137,12 +136,7 @@ class OdePlant:
 
     def simulation(self) -> 'OdeSimulation':
         """Return the plant at its start, after one call of each function."""
-        start = np.zeros(self.states)
-        if self.initial is not None:
-            start = numbers('initial', self.initial, f'({self.states},)')
-        if start.shape != (self.states,):
-            raise ScriptError(f'initial must have the shape ({self.states},): got {start.shape}')
-        return OdeSimulation(self, start)
+        return OdeSimulation(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +162,6 @@ class StateSpace:
 
     @one_sentence
     def __post_init__(self) -> None:
-        check_drive(self.drive)
         size = self.matrices()[0].shape[0]
         for name, shape in (('A', (size, size)), ('B', (size, 2)), ('C', (2, size))):
             found = np.shape(getattr(self, name))
@@ -193,30 +186,23 @@ class StateSpace:
 
     def simulation(self) -> 'LinearSimulation':
         """Return the plant at its start."""
-        start = np.zeros(np.shape(self.A)[0])
-        if self.initial is not None:
-            start = numbers('initial', self.initial, f'{start.shape}')
-        if start.shape != np.shape(self.A)[:1]:
-            raise ScriptError(
-                f'initial must have the shape {np.shape(self.A)[:1]}: got {start.shape}'
-            )
-        return LinearSimulation(self, start)
-
-
-def check_drive(drive: str) -> None:
-    """Raise :class:`ScriptError` for an unknown drive."""
-    if drive not in DRIVES:
-        raise ScriptError(f'drive must be one of {", ".join(DRIVES)}: got {drive!r}')
+        return LinearSimulation(self)
 
 
 class OwnSimulation:
     """State of a plant of one's own, behind its dead time."""
 
-    def __init__(self, robot: Robot, drive: str, start: Array) -> None:
-        self.state = start.copy()
-        parameters = robot.plant_parameters(drive)
+    def __init__(self, plant: OdePlant | StateSpace, size: int) -> None:
+        if plant.drive not in DRIVES:
+            raise ScriptError(f'drive must be one of {", ".join(DRIVES)}: got {plant.drive!r}')
+        self.state = np.zeros(size)
+        if plant.initial is not None:
+            self.state = numbers('initial', plant.initial, f'({size},)')
+        if self.state.shape != (size,):
+            raise ScriptError(f'initial must have the shape ({size},): got {self.state.shape}')
+        parameters = plant.robot.plant_parameters(plant.drive)
         self.step = parameters.step
-        delay = parameters.drive.dead_time if drive == 'velocity' else 0.0
+        delay = parameters.drive.dead_time if plant.drive == 'velocity' else 0.0
         self._waiting = [np.zeros(2)] * round(delay / self.step)
         self._steps = 0
 
@@ -260,10 +246,10 @@ class OwnSimulation:
 class OdeSimulation(OwnSimulation):
     """State of an :class:`OdePlant`."""
 
-    def __init__(self, plant: OdePlant, start: Array) -> None:
-        super().__init__(plant.robot, plant.drive, start)
+    def __init__(self, plant: OdePlant) -> None:
+        super().__init__(plant, plant.states)
         self._plant = plant
-        self._slope(0.0, start, np.zeros(2))
+        self._slope(0.0, self.state, np.zeros(2))
         self._wheels()
 
     def _advanced(self, u: Array) -> Array:
@@ -305,10 +291,10 @@ class OdeSimulation(OwnSimulation):
 class LinearSimulation(OwnSimulation):
     """State of a :class:`StateSpace` plant."""
 
-    def __init__(self, plant: StateSpace, start: Array) -> None:
-        super().__init__(plant.robot, plant.drive, start)
+    def __init__(self, plant: StateSpace) -> None:
         a, b, self._output = plant.matrices()
         size = len(a)
+        super().__init__(plant, size)
         both = np.zeros((size + 2, size + 2))
         both[:size] = np.hstack([a, b]) * self.step
         held = matrix_exponential(both)

@@ -157,9 +157,19 @@ CASES = [
     ('train bag --robot torque', {}, 1, 'robot must be servo for bags: got torque'),
     ('train --keep-predictor', {}, 1, '--keep-predictor is for bags'),
     ('tune --robot none', {}, 1, 'robot must be twin, servo, torque or an existing bag: got none'),
-    ('tune --robot key --resume', {}, 1, 'are for simulated robots: got a bag'),
-    ('compare --methods nothing', {}, 1, 'method must be one of'),
-    ('compare --cases nothing', {}, 1, 'case must be one of'),
+    *(
+        (f'tune --robot key {words}', {}, 1, text)
+        for words, text in {
+            '--resume': 'are for simulated robots: got a bag',
+            '--evaluations 3': 'are for simulated robots: got a bag',
+            'adrc': 'are for simulated robots: got a bag',
+            '--track 0.2': '--wheel-radius and --track must be given together',
+        }.items()
+    ),
+    ('compare --methods feedforward', {}, 1, 'got feedforward; did you mean feed-forward'),
+    ('compare --cases nominel', {}, 1, 'got nominel; did you mean nominal'),
+    ('compare --robot servo --cases miscalibrated', {}, 1, 'case must be one of nominal, mass'),
+    ('compare --robot servo --gyro', {}, 1, 'gyro is for the twin alone: got robot servo'),
     ('compare --gyro --reference x.csv', {}, 1, '--gyro is for the methods of the package'),
     ('patrol --paths nothing', {}, 1, 'path must be one of'),
     ('patrol --arena 1 1 2 2', {}, 1, 'arena must contain the start'),

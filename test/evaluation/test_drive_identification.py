@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drives identified from bags: of known robots, and bags that do not determine them."""
 
-import argparse
 import math
 
 import numpy as np
@@ -13,7 +12,7 @@ from support.training_runs import Tape
 from support.velocity_robot import VelocityRobot
 import yaml
 
-from t3mpc_ros.cli import tune
+from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.controller import StepperControllerParameters
 from t3mpc_ros.control.dead_time_estimator import IDENTIFIED_DEVIATION
 from t3mpc_ros.evaluation.topic_roles import ReportOptions
@@ -242,30 +241,12 @@ def test_a_bag_without_a_topic_is_refused(tmp_path, driven, topic, name):
 # The command line
 
 
-def run(*words):
-    parser = argparse.ArgumentParser(prog='t3mpc')
-    tune.add_parser(parser.add_subparsers(required=True), list)
-    options = parser.parse_args(['tune', *map(str, words)])
-    return options.run(options)
-
-
 def test_the_command_prints_and_writes_the_file(tmp_path, driven, capsys):
     folder, output = driven.write(tmp_path / 'drive'), tmp_path / 'new' / 'robot.yaml'
-    assert run('--robot', folder, '--output', output) == 0
+    assert main(['tune', '--robot', str(folder), '--output', str(output)]) == 0
     text = capsys.readouterr().out
     assert output.read_text() == text
     assert text.startswith('# Drive identified from drive: 30.0 s, ')
     values = yaml.safe_load(text)['/**/controller']['ros__parameters']
     assert values['speed_filter.lag'] == pytest.approx(0.02, abs=0.006)
     assert values['wheel_radius'] == GEOMETRY.wheel_radius
-
-
-def test_options_that_contradict_are_refused(tmp_path):
-    missing = tmp_path / 'missing'
-    with pytest.raises(ValueError, match=f'twin, servo, torque or an existing bag: got {missing}'):
-        run('--robot', missing)
-    for words in (['PI + feed-forward'], ['--evaluations', '3'], ['--resume']):
-        with pytest.raises(ValueError, match='for simulated robots'):
-            run('--robot', tmp_path, *words)
-    with pytest.raises(ValueError, match='given together'):
-        run('--robot', tmp_path, '--track', '0.2')

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tuning: equal budgets, a search that finds known optima, and a store that refuses bad files."""
 
-import argparse
 from dataclasses import dataclass, replace
 import itertools
 import json
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.cli import tune
+from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.loop import run as closed_loop_run
 from t3mpc_ros.evaluation.method import MethodSpec
@@ -774,13 +773,6 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monke
 # The command line
 
 
-def parser():
-    made = argparse.ArgumentParser(prog='lab')
-    commands = made.add_subparsers(required=True)
-    tune.add_parser(commands, lambda: [FEEDBACK, WIDER])
-    return made
-
-
 def test_the_command_tunes_what_was_named(tmp_path, monkeypatch, capsys):
     asked = {}
 
@@ -789,10 +781,11 @@ def test_the_command_tunes_what_was_named(tmp_path, monkeypatch, capsys):
         return _Instead()
 
     monkeypatch.setattr(tune_module, 'ClosedLoopObjective', instead)
+    tunable = 't3mpc_ros.evaluation.methods.method_definitions'
+    monkeypatch.setattr(tunable, lambda: [FEEDBACK, WIDER])
     path = tmp_path / 'tuned.json'
     line = ['tune', 'P-feedback', '--evaluations', '12', '--workers', '3', '--output', str(path)]
-    options = parser().parse_args([*line, '--robot', 'servo'])
-    assert options.run(options) == 0
+    assert main([*line, '--robot', 'servo']) == 0
     store = TunedParameters.load(path)
     assert list(store) == [('P feedback', 'velocity')]
     assert store.entry('P feedback', 'velocity').budget.evaluations == 12
@@ -801,8 +794,7 @@ def test_the_command_tunes_what_was_named(tmp_path, monkeypatch, capsys):
     said = capsys.readouterr()
     assert said.out == store.table() + '\n'
     assert re.search(r'P feedback, velocity: 100%.* 12/12 .*best 0\.', said.err)
-    options = parser().parse_args(['tune', *line[2:], '--resume'])
-    assert options.run(options) == 0
+    assert main(['tune', *line[2:], '--resume']) == 0
     assert len(TunedParameters.load(path)) == 3
 
 
