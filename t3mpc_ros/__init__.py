@@ -3,8 +3,8 @@
 """Type-3 fuzzy, Boltzmann-machine predictive control along chaotic references.
 
 The names of :data:`__all__` are the scripting interface, ``import t3mpc_ros as t3``. Each is
-imported from :mod:`t3mpc_ros.scripting` when it is first used: the import of the package alone
-imports no library and compiles nothing.
+imported from :mod:`t3mpc_ros.evaluation.api` when it is first used: the import of the package
+alone imports no library and compiles nothing.
 """
 
 from importlib import import_module
@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING, Any
 from t3mpc_ros.version import VERSION
 
 if TYPE_CHECKING:
+    from t3mpc_ros.evaluation.api.bag_columns import BagColumns, read_bag
+    from t3mpc_ros.evaluation.api.chaos_generator import ChaosSolution, chaos
+    from t3mpc_ros.evaluation.api.comparison_runs import Comparison, compare
+    from t3mpc_ros.evaluation.api.controllers import Controller
+    from t3mpc_ros.evaluation.api.fuzzy_system import FuzzySystem, fuzzy
+    from t3mpc_ros.evaluation.api.parameter_sweep import Sweep, sweep
+    from t3mpc_ros.evaluation.api.plants import NoiseLaw, OdePlant, Robot, StateSpace
+    from t3mpc_ros.evaluation.api.references import Waypoints
+    from t3mpc_ros.evaluation.api.script_error import ScriptError
+    from t3mpc_ros.evaluation.api.single_run import RunResult, simulate
     from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
     from t3mpc_ros.evaluation.simulated_links import LinkFaults
-    from t3mpc_ros.scripting.bag_columns import BagColumns, read_bag
-    from t3mpc_ros.scripting.chaos_generator import ChaosSolution, chaos
-    from t3mpc_ros.scripting.comparison_runs import Comparison, compare
-    from t3mpc_ros.scripting.controllers import Controller
-    from t3mpc_ros.scripting.fuzzy_system import FuzzySystem, fuzzy
-    from t3mpc_ros.scripting.parameter_sweep import Sweep, sweep
-    from t3mpc_ros.scripting.plants import NoiseLaw, OdePlant, Robot, StateSpace
-    from t3mpc_ros.scripting.references import Waypoints
-    from t3mpc_ros.scripting.script_error import ScriptError
-    from t3mpc_ros.scripting.single_run import RunResult, simulate
     from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 
 __version__ = VERSION
@@ -59,16 +59,16 @@ __all__ = [
 
 _BASELINE = 'evaluation.baselines.baseline_controller'
 _HOMES = {
-    'scripting.bag_columns': ('BagColumns', 'read_bag'),
-    'scripting.chaos_generator': ('ChaosSolution', 'chaos'),
-    'scripting.comparison_runs': ('Comparison', 'compare'),
-    'scripting.controllers': ('Controller',),
-    'scripting.fuzzy_system': ('FuzzySystem', 'fuzzy'),
-    'scripting.parameter_sweep': ('Sweep', 'sweep'),
-    'scripting.plants': ('NoiseLaw', 'OdePlant', 'Robot', 'StateSpace'),
-    'scripting.references': ('Waypoints',),
-    'scripting.script_error': ('ScriptError',),
-    'scripting.single_run': ('RunResult', 'simulate'),
+    'evaluation.api.bag_columns': ('BagColumns', 'read_bag'),
+    'evaluation.api.chaos_generator': ('ChaosSolution', 'chaos'),
+    'evaluation.api.comparison_runs': ('Comparison', 'compare'),
+    'evaluation.api.controllers': ('Controller',),
+    'evaluation.api.fuzzy_system': ('FuzzySystem', 'fuzzy'),
+    'evaluation.api.parameter_sweep': ('Sweep', 'sweep'),
+    'evaluation.api.plants': ('NoiseLaw', 'OdePlant', 'Robot', 'StateSpace'),
+    'evaluation.api.references': ('Waypoints',),
+    'evaluation.api.script_error': ('ScriptError',),
+    'evaluation.api.single_run': ('RunResult', 'simulate'),
     'evaluation.simulated_links': ('LinkFaults',),
     'simulation.fault_injection': ('FaultEvent', 'FaultSchedule'),
     _BASELINE: ('NominalModel', 'Observation'),

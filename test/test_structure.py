@@ -41,16 +41,15 @@ PACKAGES = {
     'simulation': BASE | {'robot'},
     'radio': BASE | {'robot'},
     'emulator': BASE | {'robot', 'simulation', 'radio'},
-    'evaluation': CORE | {'page', 'atomic_file', 'stop_signal'},
-    'scripting': CORE | {'evaluation', 'missing_library'},
+    'evaluation': CORE | {'page', 'atomic_file', 'stop_signal', 'missing_library'},
     'nodes': CORE | {'radio', 'stop_signal', 'missing_library'},
     'cli': CORE
     | {'radio', 'stop_signal', 'missing_library'}
-    | {'emulator', 'evaluation', 'nodes', 'scripting', 'view'},
+    | {'emulator', 'evaluation', 'nodes', 'view'},
     'page': set(),
     'view': {'page'},
 }
-FRONT = {'scripting', 'evaluation', 'simulation'}
+FRONT = {'evaluation', 'simulation'}
 """Packages that hold the names of the top level, which imports them when they are used."""
 # Libraries that each package may import.
 LIBRARIES = {
@@ -58,9 +57,9 @@ LIBRARIES = {
     'parameters': {'yaml'},
     'radio': {'serial'},
     'bag': {'mcap', 'rosbags', 'yaml'},
-    'evaluation': {'matplotlib', 'PIL', 'yaml', 'cma', 'casadi', 'jinja2', 'tqdm', 'daqp'},
+    'evaluation': {'matplotlib', 'PIL', 'yaml', 'cma', 'casadi', 'jinja2', 'tqdm', 'daqp'}
+    | {'pyarrow', 'distributed'},
     'nodes': {'yaml'},
-    'scripting': {'matplotlib', 'pyarrow', 'distributed'},
     'cli': {'yaml'},
 }
 ROS = re.compile(
@@ -163,6 +162,15 @@ def test_imports_follow_the_direction_of_the_packages(path):
         else:
             allowed = set(sys.stdlib_module_names) | {'numpy'} | LIBRARIES.get(package, set())
             assert top in allowed, f'{path} imports {name}'
+
+
+def test_the_engine_does_not_import_its_interface():
+    interface = PACKAGE / 'evaluation' / 'api'
+    inside = PACKAGE.joinpath('evaluation').rglob('*.py')
+    for path in (each for each in inside if interface not in each.parents):
+        names = {name.removeprefix('t3mpc_ros.evaluation.') for name in _imports(path)}
+        assert not [name for name in names if name.split('.')[0] == 'api'], path
+        assert not names & {'pyarrow', 'pyarrow.parquet', 'distributed'}, path
 
 
 def test_no_module_imports_the_root_package():

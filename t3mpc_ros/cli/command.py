@@ -10,8 +10,8 @@ import select
 import sys
 from typing import Any
 
+from t3mpc_ros.evaluation.api.script_error import sentence
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.scripting.script_error import sentence
 from t3mpc_ros.version import VERSION
 
 

@@ -65,9 +65,9 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 def run(options: argparse.Namespace) -> int:
     """Print the tables and return 0."""
     from t3mpc_ros.evaluation import comparison_page
+    from t3mpc_ros.evaluation.api.run_executors import workers_for
     from t3mpc_ros.evaluation.comparison import compare
     from t3mpc_ros.evaluation.experiment import print_report
-    from t3mpc_ros.scripting.run_executors import workers_for
 
     plan = _plan(options)
     run_options.prepare_outputs(options)
@@ -88,11 +88,11 @@ def _plan(options: argparse.Namespace) -> 'ComparisonPlan':
     With a controller, robot or reference of one's own, the first named method is the reference of
     the comparison.
     """
+    from t3mpc_ros.evaluation.api.comparison_runs import make_plan
+    from t3mpc_ros.evaluation.api.own_scenario import own_scenario
     from t3mpc_ros.evaluation.comparison import ComparisonPlan
     from t3mpc_ros.evaluation.methods import default_methods, methods_for, require_libraries
     from t3mpc_ros.parameters.table import find_names
-    from t3mpc_ros.scripting.comparison_runs import make_plan
-    from t3mpc_ros.scripting.own_scenario import own_scenario
 
     own = bool(options.own or options.reference or options.robot not in run_options.ROBOTS)
     if own and options.gyro:

@@ -78,7 +78,7 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
 
 def setting_of(options: argparse.Namespace) -> dict[str, Any]:
     """Return what :func:`add_setting` added, as arguments of a function of the interface."""
-    from t3mpc_ros.scripting.controllers import loaded
+    from t3mpc_ros.evaluation.api.controllers import loaded
 
     return {
         'plant': options.robot if options.robot in ROBOTS else loaded(options.robot),
@@ -147,7 +147,7 @@ def executor_of(options: argparse.Namespace) -> Iterator[Any]:
     if not options.scheduler:
         yield options.workers
         return
-    from t3mpc_ros.scripting.run_executors import cluster
+    from t3mpc_ros.evaluation.api.run_executors import cluster
 
     with cluster(options.scheduler) as executor:
         yield executor

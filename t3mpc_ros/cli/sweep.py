@@ -59,7 +59,7 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
 
 def run(options: argparse.Namespace) -> int:
     """Run the sweep, print its table and return 0."""
-    from t3mpc_ros.scripting.parameter_sweep import sweep
+    from t3mpc_ros.evaluation.api.parameter_sweep import sweep
 
     with executor_of(options) as executor:
         found = sweep(

@@ -15,6 +15,8 @@ from support.parsers import commands, options
 from t3mpc_ros.cli import tune
 from t3mpc_ros.cli.demo import DemoOptions
 from t3mpc_ros.cli.main import main
+from t3mpc_ros.evaluation.api.comparison_runs import compare
+from t3mpc_ros.evaluation.api.parameter_sweep import sweep
 from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions
 from t3mpc_ros.evaluation.open_loop_estimation import compare as compare_estimators
 from t3mpc_ros.evaluation.paper.study import chosen_extent
@@ -24,8 +26,6 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances
 from t3mpc_ros.evaluation.training.recorded_runs import fit_bags
 from t3mpc_ros.radio.tool.calibration_wizard import WizardOptions
 from t3mpc_ros.robot.calibration import MARKS
-from t3mpc_ros.scripting.comparison_runs import compare
-from t3mpc_ros.scripting.parameter_sweep import sweep
 from t3mpc_ros.version import VERSION
 
 UNIT = re.compile(

@@ -18,6 +18,9 @@ from support.records import PAIRS, record_of
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation import comparison_page, fault_page, plotting
+from t3mpc_ros.evaluation.api.chaos_generator import ChaosSolution
+from t3mpc_ros.evaluation.api.parameter_sweep import Sweep
+from t3mpc_ros.evaluation.api.single_run import RunResult
 from t3mpc_ros.evaluation.comparison import ComparisonPlan
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
@@ -44,9 +47,6 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     Tolerances,
 )
 from t3mpc_ros.evaluation.scenario import Scenario
-from t3mpc_ros.scripting.chaos_generator import ChaosSolution
-from t3mpc_ros.scripting.parameter_sweep import Sweep
-from t3mpc_ros.scripting.single_run import RunResult
 from t3mpc_ros.simulation.world import World
 
 GREEN, RED, GREY, COMMAND = '#15803d', '#be123c', '#6b7280', '#0f766e'

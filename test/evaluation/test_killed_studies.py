@@ -11,6 +11,7 @@ import shutil
 import pytest
 
 import t3mpc_ros as t3
+from t3mpc_ros.evaluation.api import parameter_sweep
 from t3mpc_ros.evaluation.methods import FULL, method_definitions, methods
 from t3mpc_ros.evaluation.paper import reproduce, study
 from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, run_study
@@ -19,7 +20,6 @@ from t3mpc_ros.evaluation.patrol import patrol_comparison
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
 from t3mpc_ros.evaluation.tuning.tune_methods import history_path, tune_methods
 from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters, TuningBudget
-from t3mpc_ros.scripting import parameter_sweep
 
 measured_patrol = cache(patrol_comparison.measured_patrol)
 

@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
+from t3mpc_ros.evaluation.api.references import numbers
+from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
+from t3mpc_ros.evaluation.api.table_files import write_csv
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.scripting.references import numbers
-from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
-from t3mpc_ros.scripting.table_files import write_csv
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class ChaosSolution:
 
         Each state over time, or with ``plane`` the second state over the first.
         """
-        from t3mpc_ros.scripting.figures import drawn, lines_figure, plane_figure
+        from t3mpc_ros.evaluation.api.figures import drawn, lines_figure, plane_figure
 
         names = [f'y{i + 1}' for i in range(self.system.size)]
         if plane and len(names) > 1:

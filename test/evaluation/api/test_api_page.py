@@ -3,13 +3,14 @@
 """The page of the interface is generated from its docstrings, and complete."""
 
 import inspect
-from pathlib import Path
 import re
 import runpy
 
+from support.checkout import ROOT
+
 import t3mpc_ros as t3
 
-PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'api.md'
+PAGE = ROOT / 'docs' / 'api.md'
 GENERATOR = runpy.run_path(str(PAGE.with_name('api_page.py')))
 SECTIONS = GENERATOR['SECTIONS']
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import t3mpc_ros as t3
-from t3mpc_ros.scripting.references import sampled
+from t3mpc_ros.evaluation.api.references import sampled
 
 PERIOD = 0.01
 SHORT = {'plant': 'servo', 'duration': 4.0}

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,
@@ -27,8 +28,8 @@ from t3mpc_ros.evaluation.method import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.methods import methods_for, require_libraries
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.parameters.table import Parameters, find_names
-from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
 
 Settings = Mapping[str, Any]
 FILE_SEPARATOR = '.py:'
@@ -323,7 +324,7 @@ def described(error: BaseException, file: str = '') -> str:
     if isinstance(error, SyntaxError):
         return f'SyntaxError in line {error.lineno}: {error.msg}'
     frames = traceback.extract_tb(error.__traceback__)
-    package = str(Path(__file__).resolve().parent.parent)
+    package = str(PACKAGE_DIRECTORY)
     own = [
         frame
         for frame in frames

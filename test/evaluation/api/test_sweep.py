@@ -14,9 +14,9 @@ import pytest
 import t3mpc_ros as t3
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation import experiment
+from t3mpc_ros.evaluation.api import parameter_sweep
+from t3mpc_ros.evaluation.api.parameter_sweep import make_runs
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
-from t3mpc_ros.scripting import parameter_sweep
-from t3mpc_ros.scripting.parameter_sweep import make_runs
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 
 SHORT = {'plant': 'servo', 'duration': 2.0}

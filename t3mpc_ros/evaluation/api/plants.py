@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from t3mpc_ros.control.actuation import LimitParameters
+from t3mpc_ros.evaluation.api.controllers import described
+from t3mpc_ros.evaluation.api.references import numbers
+from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
 from t3mpc_ros.geometry.types import Array, WheelSpeeds
 from t3mpc_ros.mpc.pretraining import matrix_exponential
-from t3mpc_ros.scripting.controllers import described
-from t3mpc_ros.scripting.references import numbers
-from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 DRIVES = ('velocity', 'torque')

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
 from t3mpc_ros.evaluation.baselines.baseline_controller import JUMP
 from t3mpc_ros.evaluation.record import RATE
 from t3mpc_ros.evaluation.scenario import SampledReference
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheel_speeds
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
 
 TIME = 'time'
 WHEELS, TWIST = ('right', 'left'), ('linear', 'angular')

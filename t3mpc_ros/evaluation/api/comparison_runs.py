@@ -9,6 +9,12 @@ import os
 from pathlib import Path
 from typing import Any
 
+from t3mpc_ros.evaluation.api.controllers import as_controllers
+from t3mpc_ros.evaluation.api.own_scenario import own_scenario
+from t3mpc_ros.evaluation.api.plants import NoiseLaw
+from t3mpc_ros.evaluation.api.run_executors import workers_for
+from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
+from t3mpc_ros.evaluation.api.table_files import columns_of, write_csv, write_parquet
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan
 from t3mpc_ros.evaluation.comparison import compare as run_plan
@@ -19,12 +25,6 @@ from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
-from t3mpc_ros.scripting.controllers import as_controllers
-from t3mpc_ros.scripting.own_scenario import own_scenario
-from t3mpc_ros.scripting.plants import NoiseLaw
-from t3mpc_ros.scripting.run_executors import workers_for
-from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
-from t3mpc_ros.scripting.table_files import columns_of, write_csv, write_parquet
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
 

@@ -13,6 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds, chosen_cases
+from t3mpc_ros.evaluation.api.controllers import as_controllers
+from t3mpc_ros.evaluation.api.own_scenario import own_scenario
+from t3mpc_ros.evaluation.api.plants import NoiseLaw
+from t3mpc_ros.evaluation.api.run_executors import workers_for
+from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence, sentence
+from t3mpc_ros.evaluation.api.table_files import columns_of, write_csv, write_parquet
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.experiment import (
@@ -31,13 +38,6 @@ from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
-from t3mpc_ros.scripting.comparison_runs import checked_seeds, chosen_cases
-from t3mpc_ros.scripting.controllers import as_controllers
-from t3mpc_ros.scripting.own_scenario import own_scenario
-from t3mpc_ros.scripting.plants import NoiseLaw
-from t3mpc_ros.scripting.run_executors import workers_for
-from t3mpc_ros.scripting.script_error import ScriptError, one_sentence, sentence
-from t3mpc_ros.scripting.table_files import columns_of, write_csv, write_parquet
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
 ROBOT = 'robot.'
@@ -100,7 +100,7 @@ class Sweep:
 
         Means over all else, with 95 % intervals; written to ``path`` (.png) if one is given.
         """
-        from t3mpc_ros.scripting.figures import drawn, sweep_figure
+        from t3mpc_ros.evaluation.api.figures import drawn, sweep_figure
 
         (name,) = find_names('parameter', [parameter], self.parameters)
         known = {each.name: each for each in METRICS}

@@ -10,6 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.evaluation.api.controllers import as_controller
+from t3mpc_ros.evaluation.api.own_scenario import own_scenario
+from t3mpc_ros.evaluation.api.plants import NoiseLaw
+from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
+from t3mpc_ros.evaluation.api.table_files import write_csv, write_parquet
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.loop import run
@@ -19,11 +24,6 @@ from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.scripting.controllers import as_controller
-from t3mpc_ros.scripting.own_scenario import own_scenario
-from t3mpc_ros.scripting.plants import NoiseLaw
-from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
-from t3mpc_ros.scripting.table_files import write_csv, write_parquet
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
 SIDES = ('right', 'left')
@@ -87,7 +87,7 @@ class RunResult:
     @one_sentence
     def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
         """Return a Matplotlib figure of speeds and error; write it to ``path`` if one is given."""
-        from t3mpc_ros.scripting.figures import drawn, run_figure
+        from t3mpc_ros.evaluation.api.figures import drawn, run_figure
 
         return drawn(lambda: run_figure(self.controller, self.columns), path)
 

@@ -2,16 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Generator, fuzzy system and bags alone: the same numbers as inside of the package."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
+from support.checkout import ROOT
 from support.equations import linear_decay_system, output_by_double_sum, solve_full_memory
 
 import t3mpc_ros as t3
 from t3mpc_ros.bag.reader import open_bag
 
-BAG = Path(__file__).resolve().parents[1] / 'golden' / 'stops.mcap'
+BAG = ROOT / 'test' / 'golden' / 'stops.mcap'
 
 
 def test_the_solution_is_that_of_the_full_memory():

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.evaluation.api.script_error import ScriptError
 from t3mpc_ros.evaluation.reporting import write_columns
 from t3mpc_ros.parameters.provenance import provenance
-from t3mpc_ros.scripting.script_error import ScriptError
 
 Columns = Mapping[str, Sequence[Any] | np.ndarray[Any, Any]]
 

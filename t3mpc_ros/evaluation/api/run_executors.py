@@ -11,8 +11,8 @@ import pickle
 import sys
 from typing import Any
 
+from t3mpc_ros.evaluation.api.script_error import LOST_PROCESS, ScriptError
 from t3mpc_ros.evaluation.experiment import Run
-from t3mpc_ros.scripting.script_error import LOST_PROCESS, ScriptError
 
 
 def workers_for(executor: Any, runs: Sequence[Run]) -> int | Executor:

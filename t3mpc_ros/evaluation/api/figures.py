@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
+from t3mpc_ros.evaluation.api.script_error import ScriptError
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.plotting import (
@@ -23,7 +24,6 @@ from t3mpc_ros.evaluation.plotting import (
 )
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.scripting.script_error import ScriptError
 
 
 def drawn(draw: Callable[[], Any], path: str | os.PathLike[str] | None) -> Any:

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from t3mpc_ros.evaluation.api.references import numbers
+from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
 from t3mpc_ros.fuzzy.inference import FuzzyParameters, FuzzyTables, build_sets, evaluate_basis
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.scripting.references import numbers
-from t3mpc_ros.scripting.script_error import ScriptError, one_sentence
 
 
 class FuzzySystem:
