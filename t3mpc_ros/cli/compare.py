@@ -3,7 +3,7 @@
 """``t3mpc compare``: the controller and every baseline on one robot, case by case."""
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from t3mpc_ros.cli import run_options
 
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 DEFAULT_SEEDS = '201-206'
 
 
-def add_parser(commands: Any) -> argparse.ArgumentParser:
-    """Return the parser of ``compare``, added to the sub-parsers of a program."""
-    parser: argparse.ArgumentParser = commands.add_parser(
+def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add the subcommand ``compare``."""
+    parser = commands.add_parser(
         'compare',
         help='the controller, every baseline and your own on one robot, case by case',
         description='Compares the controller with every baseline; with your own controllers, '
@@ -59,7 +59,6 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
     run_options.add_workers(parser)
     run_options.add_outputs(parser, json='write every number to this file')
     parser.set_defaults(run=run)
-    return parser
 
 
 def run(options: argparse.Namespace) -> int:

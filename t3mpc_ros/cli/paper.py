@@ -5,15 +5,14 @@
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from t3mpc_ros.cli.run_options import add_workers, executor_of
 from t3mpc_ros.parameters.command_line import bounded_int
 
 
-def add_parser(commands: Any) -> argparse.ArgumentParser:
-    """Return the parser of ``paper``, added to the sub-parsers of a program."""
-    parser: argparse.ArgumentParser = commands.add_parser(
+def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add the subcommand ``paper``."""
+    parser = commands.add_parser(
         'paper', help='every figure and table of the paper, and the verdict on its claims'
     )
     parser.add_argument(
@@ -36,7 +35,6 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         '--fresh', action='store_true', help='discard the runs that the folder holds'
     )
     parser.set_defaults(run=run)
-    return parser
 
 
 def run(options: argparse.Namespace) -> int:

@@ -17,9 +17,9 @@ RUNS = '.runs.jsonl'
 """End of the name of the file with the finished runs of an interrupted study."""
 
 
-def add_parser(commands: Any) -> argparse.ArgumentParser:
-    """Return the parser of ``patrol``, added to the sub-parsers of a program."""
-    parser: argparse.ArgumentParser = commands.add_parser(
+def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add the subcommand ``patrol``."""
+    parser = commands.add_parser(
         'patrol', help='coverage and predictability of the chaotic patrol against other paths'
     )
     parser.add_argument(
@@ -63,7 +63,6 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
         '--output', type=Path, default=OUTPUT, help=f'folder of the page (default {OUTPUT})'
     )
     parser.set_defaults(run=run)
-    return parser
 
 
 def run(options: argparse.Namespace) -> int:

@@ -4,7 +4,6 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from t3mpc_ros.cli.run_options import (
     FULL,
@@ -20,9 +19,9 @@ from t3mpc_ros.parameters.command_line import parsed_value
 OUTPUT = Path('runs') / 'sweep.parquet'
 
 
-def add_parser(commands: Any) -> argparse.ArgumentParser:
-    """Return the parser of ``sweep``, added to the sub-parsers of a program."""
-    parser: argparse.ArgumentParser = commands.add_parser(
+def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+    """Add the subcommand ``sweep``."""
+    parser = commands.add_parser(
         'sweep',
         help='parameters × seeds × cases × controllers, on all processors or a cluster',
         description='Runs every combination and writes one row for each run. Started again after '
@@ -54,7 +53,6 @@ def add_parser(commands: Any) -> argparse.ArgumentParser:
     )
     add_workers(parser)
     parser.set_defaults(run=run)
-    return parser
 
 
 def run(options: argparse.Namespace) -> int:

@@ -280,3 +280,9 @@ def twin_start(parameters: Parameters) -> Parameters:
         return parameters
     model = Scenario('twin', NOMINAL, 0).nominal_model()
     return parameters.with_values({'gain': model.share / model.period})
+
+
+def default_methods(robot: str) -> tuple[str, ...]:
+    """Return the full controller and every baseline, without stages and ablations."""
+    parts = {*STAGES, *WITHOUT, *TWIN_PARTS} - {FULL}
+    return tuple(name for name in methods_for(robot) if name not in parts)

@@ -61,6 +61,8 @@ class ResultFile:
 
     def __enter__(self) -> Self:
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.is_dir():
+            raise RuntimeError(f'{self.path} must be a file for the runs: move that folder away')
         stream = self.path.open('a+', encoding='utf-8', errors='replace')
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)

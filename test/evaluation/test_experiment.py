@@ -5,8 +5,10 @@
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import nullcontext
+from dataclasses import make_dataclass, replace
 from importlib import import_module
 
+import numpy as np
 import pytest
 
 from t3mpc_ros.evaluation.experiment import ResultTable, Run, content_of, run_experiment
@@ -90,6 +92,14 @@ def test_runs_of_lost_workers_are_begun_again_three_times(losses, finished, tmp_
 def test_content_tells_equal_numbers_of_other_kinds_apart():
     values = [1, 1.0, True, '1', [1], (1, 2), {'1': 1}, None, Named, doubled]
     assert len({repr(content_of(value)) for value in values}) == len(values)
+
+
+def test_content_changes_with_every_field():
+    values = {'one': [0, np.array([0.0])], 'two': [None, doubled], 'three': [{'a': 1}, 'b']}
+    made = make_dataclass('Made', values)
+    first = made(*(value for value, _ in values.values()))
+    others = [replace(first, **{name: other}) for name, (_, other) in values.items()]
+    assert len({repr(content_of(each)) for each in (first, *others)}) == 4
 
 
 def test_an_object_is_known_by_the_source_of_its_class(tmp_path, monkeypatch):

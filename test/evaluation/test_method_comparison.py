@@ -3,6 +3,8 @@
 """Comparison: equal runs, pairing, what each case changes, feed-forward against its plan."""
 
 from argparse import ArgumentTypeError
+from dataclasses import replace
+from itertools import product
 import json
 import math
 import re
@@ -389,6 +391,16 @@ def test_a_seed_that_diverges_makes_every_mean_diverge(first):
     assert found['parameters']['diverging'] == {'gain': 3.0, 'law': "<class 'object'>"}
     stored = found['cases'][NOMINAL]['methods']['diverging']
     assert stored['difference_from_feed_forward'][YAW_RATE.name]['verdict'] == WORSE
+
+
+def test_a_plan_has_every_case_and_seed_of_every_method():
+    plan = replace(plan_of('servo', FULL, PI, seeds=(1, 2)), cases=(NOMINAL, 'dropouts'))
+    runs = [(run.job[0].case, run.job[0].seed, run.job[1].name) for run in plan.runs()]
+    assert runs == [*product(plan.cases, plan.seeds, plan.methods)]
+    rows = [
+        (run.fields['case'], run.fields['seed'], run.fields['controller']) for run in plan.runs()
+    ]
+    assert rows == runs
 
 
 def test_the_body_decides_where_it_is_not_known():

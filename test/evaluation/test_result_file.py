@@ -95,6 +95,11 @@ def test_two_experiments_do_not_share_a_file(tmp_path):
         table(tmp_path / 'r')
 
 
+def test_a_folder_in_place_of_the_file_is_an_error_with_a_remedy(tmp_path):
+    with pytest.raises(RuntimeError, match='must be a file for the runs: move that folder away'):
+        table(tmp_path)
+
+
 def test_runs_that_never_come_back_are_an_error(tmp_path):
     with pytest.raises(RuntimeError, match='never came back'):
         ResultFile(tmp_path / 'r').complete({'key': 1}, lambda jobs: iter(()))

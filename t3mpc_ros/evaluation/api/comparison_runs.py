@@ -55,7 +55,7 @@ class Comparison:
     def values(self, controller: str, metric: str = 'overall', case: str = '') -> list[float]:
         """Return a metric of a controller, one number for each seed."""
         chosen = self._chosen(controller, case)
-        return self.results.values(_metric(metric).name, **chosen)
+        return self.results.values(find_metric(metric).name, **chosen)
 
     @one_sentence
     def difference(
@@ -70,7 +70,7 @@ class Comparison:
         return (
             None
             if first == second
-            else self.results.difference(_metric(metric).name, first, second)
+            else self.results.difference(find_metric(metric).name, first, second)
         )
 
     def _chosen(self, controller: str, case: str) -> dict[str, str]:
@@ -195,7 +195,8 @@ def checked_seeds(seeds: Any) -> tuple[int, ...]:
     return found
 
 
-def _metric(name: str) -> Metric:
+def find_metric(name: str) -> Metric:
+    """Return the metric of a name, of which a part of the spelling may differ."""
     known = {metric.name: metric for metric in METRICS}
     (found,) = find_names('metric', [name], known)
     return known[found]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds, chosen_cases
+from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds, chosen_cases, find_metric
 from t3mpc_ros.evaluation.api.controllers import as_controllers
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
@@ -30,7 +30,6 @@ from t3mpc_ros.evaluation.experiment import (
     print_report,
     run_experiment,
 )
-from t3mpc_ros.evaluation.metrics import METRICS
 from t3mpc_ros.evaluation.reporting import Table, format_interval
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.scenario import Scenario
@@ -71,13 +70,13 @@ class Sweep:
     @one_sentence
     def table(self, metric: str = 'overall') -> str:
         """Return a metric in Markdown: mean and 95 % interval over the seeds of each cell."""
-        known = {each.name: each for each in METRICS}
-        (name,) = find_names('metric', [metric], known)
+        chosen = find_metric(metric)
         names = ('controller', *self.parameters, 'case')
         cells: dict[tuple[Any, ...], list[float]] = {}
         for row in self.rows:
-            cells.setdefault(tuple(row[n] for n in names), []).append(row.get(name, math.nan))
-        chosen = known[name]
+            cells.setdefault(tuple(row[n] for n in names), []).append(
+                row.get(chosen.name, math.nan)
+            )
         lines = [
             (
                 *(str(value) for value in cell),
@@ -103,13 +102,12 @@ class Sweep:
         from t3mpc_ros.evaluation.api.figures import drawn, sweep_figure
 
         (name,) = find_names('parameter', [parameter], self.parameters)
-        known = {each.name: each for each in METRICS}
-        (wanted,) = find_names('metric', [metric], known)
+        wanted = find_metric(metric)
         lines: dict[str, dict[float, list[float]]] = {}
         for row in self.rows:
             line = lines.setdefault(str(row['controller']), {})
-            line.setdefault(row[name], []).append(row.get(wanted, math.nan))
-        label = f'{known[wanted].heading} / ({known[wanted].unit})'
+            line.setdefault(row[name], []).append(row.get(wanted.name, math.nan))
+        label = f'{wanted.heading} / ({wanted.unit})'
         return drawn(lambda: sweep_figure(lines, name, label), path)
 
     @one_sentence

@@ -77,6 +77,14 @@ WRONG = {
         lambda: t3.OdePlant(wrong_states),
         r'wrong_states must return 2 numbers, one for each state: got the shape \(3,\)',
     ),
+    'initial state of wrong shape': (
+        lambda: t3.OdePlant(unstable, initial=[1.0, 1.0, 1.0]),
+        r'initial must have the shape \(2,\): got \(3,\)',
+    ),
+    'case of a plant of its own': (
+        lambda: t3.simulate(plant=t3.OdePlant(unstable), case='friction x3'),
+        'case must be one of nominal: got friction x3',
+    ),
     'unknown controller': (lambda: t3.simulate('ful'), 'did you mean full'),
     'unknown plant': (lambda: t3.simulate(plant='twn'), 'plant must be .* did you mean twin'),
     'unknown case': (lambda: t3.simulate(case='nominl'), 'did you mean nominal'),
