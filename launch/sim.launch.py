@@ -19,7 +19,8 @@ def nodes(launched):
     clock = {'publish_clock': launched.flag('use_sim_time')}
     loop = [
         *launched.robot('sim_robot', {**launched.given('world'), **seed}, defaults=clock),
-        launched.node('controller'),
+        # The gyro of the simulated robot is calibrated.
+        launched.node('controller', defaults={'body.gyro_scale_tolerance': 0.001}),
         launched.node('reference_generator', seed),
     ]
     return [*loop, launched.node('recorder')] if launched.flag('record') else loop

@@ -25,8 +25,10 @@ BOARD = 'emulator'
 """Not a node: it has no parameters and its own ready message."""
 PAPER_NOISE = 0.04
 """Variance of the measured wheel speeds, (rad/s)², as in the paper's simulations."""
+CALIBRATED_GYRO = {'body.gyro_scale_tolerance': 0.001}
+"""What the simulated gyro has, and what its odometry states."""
 ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
-    'twin': {'sim_robot': {'drive.kind': 'stepper'}},
+    'twin': {'sim_robot': {'drive.kind': 'stepper'}, 'controller': CALIBRATED_GYRO},
     'servo': {
         'sim_robot': {'drive.kind': 'velocity'},
         'controller': {
@@ -42,7 +44,7 @@ ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
         'radio_bridge': {},
         # Fifty measurements a second; a command goes with the cycle after that of its sample,
         # 19 ms after the sample: test_radio_delay.py.
-        'controller': {'rate': 50.0, 'speed_filter.dead_time': 0.02},
+        'controller': {'rate': 50.0, 'speed_filter.dead_time': 0.02, **CALIBRATED_GYRO},
     },
 }
 """Robots, and the parameters of each node for them: the digital twin, the paper's plant, and

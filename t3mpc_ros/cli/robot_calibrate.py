@@ -78,7 +78,9 @@ def calibration_file(found: Calibration, date: str, link: Mapping[str, object]) 
             bridge[f'calibration.range_{name}'] = values
     nodes = {'radio_bridge': bridge}
     if geometry:
-        nodes |= {'controller': geometry, 'reference_generator': geometry}
+        nodes |= {'controller': dict(geometry), 'reference_generator': geometry}
+    if (tolerance := bridge.get('odometry.gyro_scale_tolerance')) is not None:
+        nodes.setdefault('controller', {})['body.gyro_scale_tolerance'] = tolerance
     title = 'Calibration of the robot, written by t3mpc robot calibrate.'
     return parameter_file(title, {f'/**/{node}': values for node, values in nodes.items()})
 

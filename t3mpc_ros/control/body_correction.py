@@ -1,29 +1,33 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-r"""Body correction: NT3FS learns how the body turns under commanded wheel speeds.
+r"""Body correction: a Kalman filter learns how the body turns under commanded wheel speeds.
 
 The wheels of a stepper follow their command almost exactly; the body does not: wheel radii and
-separation differ from the nominal ones, and tyres slip. With w the yaw rate expressed as half of
+separation differ from the nominal ones, and tyres creep. With the yaw rate expressed as half of
 the difference of the wheel speeds, w = b omega / R, the body obeys
 
-.. math:: w_a = w_c + g_b^*(U) + \nu, \qquad U = (\dot\theta_{R,c}, \dot\theta_{L,c})        E20
+.. math:: w_a - w_c = k_m m_c + k_w w_c + s w_a + c + \tau \dot w_c + \nu                    E20
 
-for the commanded wheel speeds U of one dead time before, with an unknown map g_b* and the noise nu
-of the gyro. g_b(U|alpha) is a fuzzy system (31) with the adaptation (77) of its coefficients,
+for mean m_c and half difference w_c of the wheel speeds commanded one dead time before. Two gains
+are properties of the robot: k_m of unequal radii, k_w of a wrong separation or mean radius. The
+others are not, and nothing is corrected by them: the scale error s of the gyro, its bias c, and
+the error tau of the assumed delay. The filter estimates all five from means over a quarter of a
+second, and starts from what is stated of each.
 
-.. math:: \dot\alpha = \gamma \Phi \, \mathrm{clip}(w_a - w_c - g_b(U|\alpha)),
+To steps and gyro, k_w and s are one quantity. How an error is shared between them follows from
+the stated deviations, ``wheel_tolerance`` and ``gyro_scale_tolerance``: with a calibrated gyro it
+is the robot's, with one that has the tolerance of its data sheet it is the gyro's. A sudden error
+that lasts is a jump of the bias first; what contradicts that later returns to the gains.
 
-clipped to 0.08 rad/s, so that a slide of the tyres is hardly learnt; the product gamma |Phi|² =
-``learning_rate`` normalises. With V = |alpha* - alpha|²/(2 gamma), e = g_b* - g_b and
-g_b* = alpha*ᵀ Phi, V' = -e clip(e + nu): V decreases outside the noise. The reference of the law
-becomes
+The reference of the law becomes
 
-.. math:: w_r - a\,g_b(U_r|\alpha) - a\,v_\psi, \qquad v_\psi = \bar v \tanh(k e_\psi/\bar v)  E21
+.. math:: w_r - a (k_m m_r + k_w w_r) - a v_\psi, \quad v_\psi = \bar v \tanh(k e_\psi/\bar v)  E21
 
-with e_psi the integral of w_a - w_r: the compensator (81)-(82) in the form of E14, for the yaw.
-The authority a in [0, 1] is the measured skill of g_b: the share of the variance of w_a - w_c,
-averaged over a quarter of a second, that the map predicts *before* it learns from it. On a robot
-with nominal geometry there is nothing to predict: a is 0, and nothing is corrected.
+with e_psi the integral of w_a - s w_a - c - w_r: the compensator (81)-(82) in the form of E14, for
+the yaw. The authority a in [0, 1] is the measured skill of both gains: the share of the variance
+of what they explain, w_a - w_c without the terms of gyro and delay, that they predict *before*
+they learn from it. On a robot with nominal geometry there is nothing to predict: a is 0, and
+nothing is corrected.
 
 What odometry and gyro cannot measure stays: a scale error common to both wheels changes the
 distance only.
@@ -32,12 +36,10 @@ distance only.
 from collections.abc import Sequence
 from dataclasses import dataclass
 import math
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, estimate
-from t3mpc_ros.fuzzy.inference import FuzzyParameters, FuzzyTables
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import Structure, TypedKernel, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
@@ -45,17 +47,41 @@ from t3mpc_ros.parameters.table import Parameters, parameter
 HISTORY = 64
 """Number of commands kept."""
 BLOCK = 0.25
-"""Time over which a residual is averaged for the skill, s."""
+"""Time over which E20 is averaged, s."""
+SKILL_TIME = 5.0
+"""Time constant of the measured skill, s."""
+DEAD_ZONE = 0.015
+"""Error of a wheel that is not worth correcting, rad/s: noise of the gyro and of the rotors,
+averaged over a block."""
+FULL_SKILL, NO_SKILL = 0.6, 0.2
+"""Skill from which on the authority is 1, and up to which it is 0."""
 IMPLAUSIBLE = 0.2
 """Error relative to the commanded wheel speeds above which nothing is corrected: the odometry has
 no yaw, or the wheels do not move the robot."""
-OUTLIER = 1.0
-"""Error of a single step (rad/s) that is no property of the robot: a push, or a slip."""
-CLIP = 0.08
-"""Largest error that is learnt at once, rad/s. A slide of the tyres, which depends on the floor
-and not on the commands, changes the map no more than an error of this size does."""
-FULL_SKILL, NO_SKILL = 0.6, 0.2
-"""Skill from which on the authority is 1, and up to which it is 0."""
+OUTLIER, RELATIVE_OUTLIER = 1.0, 0.3
+"""Error of a single step (rad/s, and share of w_c) that is no property of the robot: a push, or a
+slip. Nothing is learnt from its block."""
+YAW_JUMP = 20.0
+"""Error of a single step (rad/s) that is no motion: the yaw of the odometry was set."""
+STANDSTILL_SPEED = 0.05
+"""Commanded speed (rad/s, mean square over a block) below which a block shows nothing."""
+
+GAINS = ASYMMETRY, TURNING, GYRO_SCALE, BIAS, DELAY = range(5)
+"""k_m, k_w, s, c, tau: rows of the estimate."""
+BIAS_DEVIATION, DELAY_DEVIATION = 0.01, 0.02
+"""Standard deviations of c after a standstill (rad/s of a wheel) and of tau (s) at the start."""
+WALK = (0.0005, 0.0005, 0.0, 0.0003, 0.0005)
+"""Random walk of each: standard deviation after a second, in its unit."""
+NOISE, SLOPE_NOISE = 0.006, 0.01
+"""Standard deviation of the mean of a block, rad/s, and per slope of w_c, s."""
+SUDDEN = 3.0
+"""Innovation (in its standard deviation) that is not learnt."""
+SLACK, LARGEST, JUMP = 1.5, 4.0, 6.0
+"""Of a cumulative sum of innovations (in their standard deviations, at most LARGEST): what a block
+takes off, and the sum at which the bias has jumped; three blocks in a row at least. Page 1954, doi
+10.1093/biomet/41.1-2.100."""
+CLIP = 2.0
+"""Largest innovation that is learnt at once, in its standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -67,25 +93,21 @@ class BodyCorrectionParameters(Parameters):
         'whether the yaw rate is corrected; needs an odometry whose yaw comes from a gyro',
         dynamic=True,
     )
-    learning_rate: float = parameter(
-        2.0,
-        'gamma |Phi|²: rate at which the map approaches the present yaw rate',
-        '1/s',
-        (0.0, 50.0),
-        dynamic=True,
+    gyro_scale_tolerance: float = parameter(
+        0.03,
+        'standard deviation of the relative scale error of the gyro: 0.001 after a calibration '
+        'over ten turns; the larger it is beside wheel_tolerance, the less is corrected',
+        bounds=(0.0, 0.5),
+        source='data sheet PS-MPU-6000A r3.4, 6.1: ±3 %',
     )
-    skill_time: float = parameter(5.0, 'time constant of the measured skill', 's', (0.5, 600.0))
-    dead_zone: float = parameter(
-        0.015,
-        'error of a wheel that is not worth correcting: noise of the gyro, averaged over 0.25 s, '
-        'and errors of the assumed delay',
-        'rad/s',
-        (0.0, 10.0),
-        dynamic=True,
+    wheel_tolerance: float = parameter(
+        0.01,
+        'standard deviation of the relative errors of wheel radii and separation',
+        bounds=(0.0, 0.5),
     )
-    yaw_gain: float = parameter(0.15, 'gain k of the yaw error', '1/s', (0.0, 20.0), dynamic=True)
+    yaw_gain: float = parameter(0.15, 'gain k of the yaw error', '1/s', (0.0, 1.0), dynamic=True)
     max_correction: float = parameter(
-        1.0, 'bound of the correction of a wheel by the map', 'rad/s', (0.0, 10.0), dynamic=True
+        1.0, 'bound of the correction of a wheel by the gains', 'rad/s', (0.0, 10.0), dynamic=True
     )
     max_yaw_correction: float = parameter(
         0.06,
@@ -95,17 +117,14 @@ class BodyCorrectionParameters(Parameters):
         (0.0, 10.0),
         dynamic=True,
     )
-    fuzzy: ClassVar[FuzzyParameters] = FuzzyParameters(
-        sets=5, centre_exponent=1.0, input_fuzziness=0.05
-    )
-    """Sets of the map over the wheel speeds, assumed."""
 
 
 class BodyMemory(Structure):
     """What :func:`correct_body` remembers, in wheel speeds (rad/s) and s.
 
-    Sums are over the present block, powers are means over the past blocks. *raw* is w_a - w_c with
-    the residual clipped, *error* without; *residual* is what the map leaves of it.
+    Sums are over the present block, powers are means over the past blocks: *raw* of w_a - w_c,
+    *error* of what is left of it without the terms of gyro and delay, *residual* of what the gains
+    leave of that; the last two without sudden errors.
     """
 
     yaw: float
@@ -114,29 +133,45 @@ class BodyMemory(Structure):
     """Whether there is one."""
     last_reference: float
     yaw_error: float
-    """Integral of w_a - w_r."""
+    """Integral of w_a - s w_a - c - w_r."""
     commands: int
     """Number of known commands, at most HISTORY."""
     block_time: float
-    raw_sum: float
-    residual_sum: float
-    command_sum: float
-    error_sum: float
+    last: float
+    """Last w_c."""
+    linked: bool
+    """Whether it is that of the last period; a gap belongs to no block."""
+    rise: float
+    """Sum of the changes of w_c."""
+    mean_sum: float
+    """Sum of m_c."""
+    commanded_sum: float
+    """Sum of w_c."""
+    achieved_sum: float
+    """Sum of w_a."""
+    square_sum: float
+    """Sum of the squared commands of a wheel."""
+    spoilt: bool
+    """Whether nothing is learnt from the block."""
+    above: float
+    below: float
+    """Cumulative sums of positive and of negative innovations."""
     raw_power: float
+    error_power: float
     residual_power: float
     command_power: float
-    error_power: float
     authority: float
     """Share of the correction that is in use."""
 
 
 DRIVE = (
-    *('started', 'yaw_error', 'commands'),
-    *('block_time', 'raw_sum', 'residual_sum', 'command_sum', 'error_sum'),
+    *('started', 'yaw_error', 'commands', 'above', 'below'),
+    *('block_time', 'mean_sum', 'commanded_sum', 'achieved_sum', 'square_sum', 'rise'),
+    *('linked', 'spoilt'),
 )
 """Fields of the memory that belong to one drive."""
-SKILL = 'raw_power', 'residual_power', 'command_power', 'error_power', 'authority'
-"""Fields that say how well the map predicts."""
+SKILL = 'raw_power', 'error_power', 'residual_power', 'command_power', 'authority'
+"""Fields that say how well the gains predict."""
 
 
 class BodyConstants(NamedTuple):
@@ -146,18 +181,14 @@ class BodyConstants(NamedTuple):
     """R/b"""
     period: float
     """s"""
-    learning_rate: float
-    """gamma |Phi|², 1/s"""
-    share: float
-    """Part of the powers that a block replaces."""
     yaw_gain: float
     """k, 1/s"""
     bound: float
-    """Bound of the map's correction, rad/s"""
+    """Bound of the correction by the gains, rad/s"""
     yaw_bound: float
     """v-bar, rad/s"""
-    dead_zone: float
-    """rad/s"""
+    jump_variance: float
+    """Variance that a jump adds to those of k_m and k_w."""
 
 
 class BodyState(NamedTuple):
@@ -167,10 +198,12 @@ class BodyState(NamedTuple):
     """Array of one."""
     history: Array
     """Commands, newest first, rad/s, shape (n, 2)."""
-    point: Array
-    """Work space: inputs of the map, shape (2,)."""
-    output: Array
-    """Work space: output of the map, shape (1,)."""
+    estimate: Array
+    """k_m, k_w, s, c, tau, shape (5,)."""
+    covariance: Array
+    """Of the estimate, shape (5, 5)."""
+    work: Array
+    """Work space, shape (3, 5)."""
 
 
 class BodyCorrection:
@@ -189,11 +222,13 @@ class BodyCorrection:
     ) -> None:
         self._turn = wheel_radius / half_separation
         self._period = period
-        self.fuzzy = FuzzyEstimator(parameters.fuzzy, AdaptationParameters(), outputs=1)
         self._memory = BodyMemory.new()
-        self._state = BodyState(self._memory, np.zeros((HISTORY, 2)), np.zeros(2), np.zeros(1))
+        self._state = BodyState(
+            self._memory, np.zeros((HISTORY, 2)), np.zeros(5), np.zeros((5, 5)), np.zeros((3, 5))
+        )
         self._correct_body = TypedKernel(correct_body)
         self.configure(parameters)
+        self.reset()
 
     def configure(self, parameters: BodyCorrectionParameters) -> None:
         """Use new values of the dynamic parameters from the next step on."""
@@ -201,12 +236,10 @@ class BodyCorrection:
         self._constants = BodyConstants(
             self._turn,
             self._period,
-            parameters.learning_rate,
-            BLOCK / parameters.skill_time,
             parameters.yaw_gain,
             parameters.max_correction,
             parameters.max_yaw_correction,
-            parameters.dead_zone,
+            parameters.wheel_tolerance**2,
         )
 
     @property
@@ -219,26 +252,57 @@ class BodyCorrection:
         """Yaw of the robot minus that of the reference since the start of the drive, rad."""
         return float(self._memory[0].yaw_error * self._turn)
 
+    @property
+    def estimate(self) -> Array:
+        """Copy of k_m, k_w, s, c (rad/s of a wheel) and tau (s), shape (5,)."""
+        return self._state.estimate.copy()
+
+    @property
+    def deviations(self) -> Array:
+        """Standard deviations of :attr:`estimate`, shape (5,)."""
+        deviations: Array = np.sqrt(np.diagonal(self._state.covariance))
+        return deviations
+
+    @property
+    def gyro_bias(self) -> float:
+        """Estimated bias of the yaw rate of the odometry, rad/s."""
+        return float(self._state.estimate[BIAS] * self._turn)
+
     def restart(self) -> None:
-        """Start a drive: clear yaw error and history; map and skill are kept."""
+        """Start a drive: clear yaw error and history; gains and skill are kept."""
         self._state.history[:] = 0.0
         for name in DRIVE:
             setattr(self._memory[0], name, 0)
 
     def reset(self) -> None:
-        """Discard the map and its skill too."""
+        """Discard the gains and their skill too."""
         for name in BodyMemory.__annotations__:
             setattr(self._memory[0], name, 0)
-        self.fuzzy.reset()
+        wheel, gyro = self.parameters.wheel_tolerance, self.parameters.gyro_scale_tolerance
+        deviations = np.array([wheel, wheel, gyro, BIAS_DEVIATION, DELAY_DEVIATION])
+        self._state.estimate[:] = 0.0
+        self._state.covariance[:] = np.diag(deviations**2)
         self.restart()
 
+    def get_weights(self) -> Array:
+        """Return estimate (row 0) and covariance (the others), shape (6, 5)."""
+        return np.vstack([self._state.estimate, self._state.covariance])
+
+    def set_weights(self, weights: Array) -> None:
+        """Use what :meth:`get_weights` returned."""
+        if np.shape(weights) != (6, 5):
+            raise ValueError(f'the body correction has shape (6, 5): got {np.shape(weights)}')
+        self._state.estimate[:] = weights[0]
+        self._state.covariance[:] = weights[1:]
+
     def snapshot(self) -> tuple[Array, dict[str, float]]:
-        """Return map and skill for :meth:`rollback`."""
-        return self.fuzzy.coefficients, {name: getattr(self._memory[0], name) for name in SKILL}
+        """Return gains and skill for :meth:`rollback`."""
+        return self.get_weights(), {name: getattr(self._memory[0], name) for name in SKILL}
 
     def rollback(self, snapshot: tuple[Array, dict[str, float]]) -> None:
-        """Restore the map and its skill; the yaw error since is kept."""
-        self.fuzzy.coefficients, skill = snapshot
+        """Restore the gains and their skill; the yaw error since is kept."""
+        weights, skill = snapshot
+        self.set_weights(weights)
         for name, value in skill.items():
             setattr(self._memory[0], name, value)
 
@@ -260,19 +324,10 @@ class BodyCorrection:
         planned   : reference to which the correction is added, rad/s, shape (2,)
         sent      : wheel speeds commanded at the last step, rad/s, shape (2,)
         delay     : time between a command and the motion it causes, s
-        learn     : whether the map adapts
+        learn     : whether anything is learnt from this step
         """
         return self._correct_body(
-            yaw,
-            elapsed,
-            reference,
-            planned,
-            sent,
-            delay,
-            learn,
-            self._constants,
-            self._state,
-            self.fuzzy.tables,
+            yaw, elapsed, reference, planned, sent, delay, learn, self._constants, self._state
         )
 
 
@@ -287,14 +342,13 @@ def correct_body(
     learn: bool,
     constants: BodyConstants,
     state: BodyState,
-    fuzzy: FuzzyTables,
 ) -> float:
     """Learn from the last period (E20) and return the correction (E21), rad/s.
 
     Arguments as in :meth:`BodyCorrection.step`.
     """
     turn, period = constants.turn, constants.period
-    memory, history, point, output = state.memory[0], state.history, state.point, state.output
+    memory, history, gains = state.memory[0], state.history, state.estimate
     # A gap of n periods repeats the last command n times: nothing else was sent.
     count = min(max(int(round(elapsed / period)), 1), history.shape[0])
     for j in range(history.shape[0] - 1, count - 1, -1):
@@ -307,18 +361,24 @@ def correct_body(
         change = yaw - memory.yaw
         change -= 2.0 * math.pi * math.floor(change / (2.0 * math.pi) + 0.5)
         achieved = change / (elapsed * turn)
-        memory.yaw_error += elapsed * (achieved - 0.5 * (turning + memory.last_reference))
+        moved = abs(achieved - turning) < YAW_JUMP
+        if moved:
+            of_body = achieved - gains[GYRO_SCALE] * achieved - gains[BIAS]
+            memory.yaw_error += elapsed * (of_body - 0.5 * (turning + memory.last_reference))
         # Middle of the last period, one delay earlier; row 0 was sent one period ago.
         position = (delay + 0.5 * elapsed) / period - 1.0
-        if position + 2.0 < memory.commands and count == 1:
-            learn_turning(achieved, max(position, 0.0), elapsed, learn, constants, state, fuzzy)
+        if moved and position + 2.0 < memory.commands and count == 1:
+            add_to_block(achieved, max(position, 0.0), elapsed, learn, state)
+        else:
+            memory.linked = False
     memory.yaw, memory.started, memory.last_reference = yaw, True, turning
-    if memory.block_time >= BLOCK:
-        update_authority(memory, constants.share, constants.dead_zone)
-    point[0], point[1] = planned[0], planned[1]
-    estimate(point, fuzzy, output)
+    if memory.block_time >= BLOCK - 0.5 * period:
+        if memory.square_sum > STANDSTILL_SPEED**2 * memory.block_time:
+            learn_block(constants, state)
+        clear_block(memory)
+    mean, half = 0.5 * (planned[0] + planned[1]), 0.5 * (planned[0] - planned[1])
     bound = constants.bound
-    correction = -min(max(output[0], -bound), bound)
+    correction = -min(max(gains[ASYMMETRY] * mean + gains[TURNING] * half, -bound), bound)
     bound = constants.yaw_bound
     if bound > 0.0:
         correction -= bound * math.tanh(constants.yaw_gain * memory.yaw_error / bound)
@@ -326,61 +386,106 @@ def correct_body(
 
 
 @kernel
-def learn_turning(
-    achieved: float,
-    position: float,
-    elapsed: float,
-    learn: bool,
-    constants: BodyConstants,
-    state: BodyState,
-    fuzzy: FuzzyTables,
+def add_to_block(
+    achieved: float, position: float, elapsed: float, learn: bool, state: BodyState
 ) -> None:
-    """Adapt the map to the turning ``achieved`` (rad/s) by the commands of a row (E20)."""
-    memory, history, point, output = state.memory[0], state.history, state.point, state.output
-    coefficients, phi = fuzzy.coefficients, fuzzy.phi
+    """Add the turning ``achieved`` (rad/s) by the commands of a row of the history."""
+    memory, history = state.memory[0], state.history
     row = int(position)
     part = position - row
-    for i in range(2):
-        point[i] = (1.0 - part) * history[row, i] + part * history[row + 1, i]
-    estimate(point, fuzzy, output)
-    raw = achieved - 0.5 * (point[0] - point[1])
-    residual = raw - output[0]
-    power = 0.0
-    for k in range(phi.size):
-        power += phi[k] * phi[k]
-    if learn and power > 0.0 and abs(residual) < OUTLIER:
-        memory.error_sum += raw * elapsed
-        residual = min(max(residual, -CLIP), CLIP)
-        raw = residual + output[0]
-        gain = min(constants.learning_rate * elapsed, 1.0) * residual / power
-        for k in range(phi.size):
-            coefficients[0, k] += gain * phi[k]
-        memory.raw_sum += raw * elapsed
-        memory.residual_sum += residual * elapsed
-        memory.command_sum += 0.5 * (point[0] ** 2 + point[1] ** 2) * elapsed
-        memory.block_time += elapsed
+    right = (1.0 - part) * history[row, 0] + part * history[row + 1, 0]
+    left = (1.0 - part) * history[row, 1] + part * history[row + 1, 1]
+    commanded = 0.5 * (right - left)
+    if memory.linked:
+        memory.rise += commanded - memory.last
+    memory.last, memory.linked = commanded, True
+    memory.block_time += elapsed
+    memory.mean_sum += 0.5 * (right + left) * elapsed
+    memory.commanded_sum += commanded * elapsed
+    memory.achieved_sum += achieved * elapsed
+    memory.square_sum += 0.5 * (right * right + left * left) * elapsed
+    if not learn or abs(achieved - commanded) > OUTLIER + RELATIVE_OUTLIER * abs(commanded):
+        memory.spoilt = True
 
 
 @kernel
-def update_authority(memory: BodyMemory, share: float, dead_zone: float) -> None:
-    """Update the powers of both residuals by one block, and the authority.
+def clear_block(memory: BodyMemory) -> None:
+    """Begin another block."""
+    memory.block_time = memory.mean_sum = memory.commanded_sum = 0.0
+    memory.achieved_sum = memory.square_sum = memory.rise = 0.0
+    memory.spoilt = False
 
-    share : part of the powers that the block replaces
-    dead_zone : error that counts as noise, rad/s
+
+@kernel
+def learn_block(constants: BodyConstants, state: BodyState) -> None:
+    """Update the skill, then the estimate by the means of a block: a step of a Kalman filter.
+
+    A sudden innovation is not learnt, and counts for no skill; if it lasts, the bias has jumped.
     """
-    raw, residual = memory.raw_sum / memory.block_time, memory.residual_sum / memory.block_time
-    memory.raw_power += share * (raw * raw - memory.raw_power)
-    memory.residual_power += share * (residual * residual - memory.residual_power)
-    commanded = memory.command_sum / memory.block_time
-    memory.command_power += share * (commanded - memory.command_power)
-    error = memory.error_sum / memory.block_time
-    memory.error_power += share * (error * error - memory.error_power)
-    memory.block_time = memory.raw_sum = memory.residual_sum = memory.command_sum = 0.0
-    memory.error_sum = 0.0
-    if memory.error_power > IMPLAUSIBLE**2 * memory.command_power:
-        memory.authority = 0.0
+    memory, covariance = state.memory[0], state.covariance
+    row, gain = state.work[0], state.work[1]
+    time = memory.block_time
+    row[ASYMMETRY], row[TURNING] = memory.mean_sum / time, memory.commanded_sum / time
+    row[GYRO_SCALE], row[BIAS] = memory.achieved_sum / time, 1.0
+    row[DELAY] = memory.rise / time
+    error = row[GYRO_SCALE] - row[TURNING]
+    for j in (GYRO_SCALE, BIAS, DELAY):
+        error -= row[j] * state.estimate[j]
+    residual = error
+    for j in (ASYMMETRY, TURNING):
+        residual -= row[j] * state.estimate[j]
+    share = time / SKILL_TIME
+    memory.raw_power += share * ((row[GYRO_SCALE] - row[TURNING]) ** 2 - memory.raw_power)
+    memory.command_power += share * (memory.square_sum / time - memory.command_power)
+    if memory.spoilt:
+        update_authority(memory)
         return
-    if memory.raw_power > 0.0:
-        noise = memory.residual_power + dead_zone * dead_zone
-        skill = 1.0 - noise / memory.raw_power
+    for j in range(5):
+        covariance[j, j] += WALK[j] * WALK[j] * time
+    noise = NOISE * NOISE + (SLOPE_NOISE * row[DELAY]) ** 2
+    variance = spread(row, covariance, gain) + noise
+    score = residual / math.sqrt(variance)
+    sudden = abs(score) > SUDDEN
+    if not sudden:
+        memory.error_power += share * (error * error - memory.error_power)
+        memory.residual_power += share * (residual * residual - memory.residual_power)
+    update_authority(memory)
+    score = min(max(score, -LARGEST), LARGEST)
+    memory.above = max(memory.above + score - SLACK, 0.0)
+    memory.below = max(memory.below - score - SLACK, 0.0)
+    if max(memory.above, memory.below) >= JUMP:
+        memory.above = memory.below = 0.0
+        covariance[BIAS, BIAS] += residual * residual
+        covariance[ASYMMETRY, ASYMMETRY] += constants.jump_variance
+        covariance[TURNING, TURNING] += constants.jump_variance
+        variance = spread(row, covariance, gain) + noise
+    elif sudden:
+        return
+    limit = CLIP * math.sqrt(variance)
+    innovation = min(max(residual, -limit), limit)
+    for j in range(5):
+        state.estimate[j] += gain[j] / variance * innovation
+        for i in range(5):
+            covariance[j, i] -= gain[j] * gain[i] / variance
+
+
+@kernel
+def spread(row: Array, covariance: Array, gain: Array) -> float:
+    """Set ``gain`` to P h and return h' P h, for the row h of E20."""
+    total = 0.0
+    for j in range(5):
+        gain[j] = 0.0
+        for i in range(5):
+            gain[j] += covariance[j, i] * row[i]
+        total += gain[j] * row[j]
+    return total
+
+
+@kernel
+def update_authority(memory: BodyMemory) -> None:
+    """Set the authority from the powers."""
+    if memory.raw_power > IMPLAUSIBLE**2 * memory.command_power:
+        memory.authority = 0.0
+    elif memory.error_power > 0.0:
+        skill = 1.0 - (memory.residual_power + DEAD_ZONE**2) / memory.error_power
         memory.authority = min(max((skill - NO_SKILL) / (FULL_SKILL - NO_SKILL), 0.0), 1.0)

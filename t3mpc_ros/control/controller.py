@@ -58,8 +58,8 @@ from t3mpc_ros.parameters.table import ParameterError, group, parameter, with_de
 JUMP_DETECTION_FACTOR = 2.2
 """A reference acceleration above this multiple of the acceleration limit is a jump."""
 
-BODY_WEIGHTS = 'body.coefficients'
-"""Name of the weights of the body correction."""
+BODY_WEIGHTS = 'body.estimate'
+"""Name of what the body correction has learnt."""
 
 MIN_DEAD_TIME_CHANGE = 0.0005
 """Smallest change (s) of the dead time in use."""
@@ -272,13 +272,13 @@ class Controller:
 
     def get_weights(self) -> dict[str, Array]:
         """Return all adapted arrays by name: those of the law, and the map of the body."""
-        return self.law.get_weights() | {BODY_WEIGHTS: self.body.fuzzy.coefficients}
+        return self.law.get_weights() | {BODY_WEIGHTS: self.body.get_weights()}
 
     def set_weights(self, weights: Mapping[str, Array]) -> None:
         """Use weights as returned by :meth:`get_weights`; those of the body may be missing."""
         body = weights.get(BODY_WEIGHTS)
         if body is not None:
-            self.body.fuzzy.coefficients = body
+            self.body.set_weights(body)
         self.law.set_weights({name: v for name, v in weights.items() if name != BODY_WEIGHTS})
 
     def warm_up(self) -> None:

@@ -77,7 +77,7 @@ lower too; with equal bound it stays, which isolates the effect of v_p."""
 
 
 TWIN_PARTS: Mapping[str, Mapping[str, object]] = {
-    'full without NT3FS': {'body.learning_rate': 0.0},
+    'full without body correction': {'body.enabled': False},
     'full without compensator': {'body.yaw_gain': 0.0},
     'full without shaper': {
         'command_shaper.straight_frequency': 0.0,

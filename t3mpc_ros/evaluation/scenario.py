@@ -250,6 +250,12 @@ class Scenario:
         """Return the true robot, as it is when the run begins."""
         return self.kind.true_robot(self).with_values(self.own.robot_parameters)
 
+    def stated_gyro_tolerance(self) -> float:
+        """Return the relative scale error of the gyro that the twin states."""
+        robot = self.true_robot()
+        assert isinstance(robot, DigitalTwinParameters)
+        return max(robot.odometry.gyro_scale_tolerance, robot.imu.gyro_scale_error)
+
     def simulation(self) -> SimulatedRobot:
         """Return the robot of a new run."""
         return self.kind.simulation(self)
@@ -365,7 +371,11 @@ class TwinKind(RobotKind):
         dead_time = scenario.parts.changes.get('drive.dead_time') if scenario.parts.known else None
         values = {} if dead_time is None else {'speed_filter.dead_time': dead_time}
         return StepperControllerParameters().with_values(
-            {'speed_filter.noise_variance': float(scenario.noise), **values}
+            {
+                'speed_filter.noise_variance': float(scenario.noise),
+                'body.gyro_scale_tolerance': scenario.stated_gyro_tolerance(),
+                **values,
+            }
         )
 
     def limits(self, scenario: Scenario) -> LimitParameters:

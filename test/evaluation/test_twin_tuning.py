@@ -95,13 +95,13 @@ def test_an_evaluation_is_the_mean_of_its_runs(definitions):
 
 
 def test_the_full_controller_is_that_of_the_node(definitions):
-    changed = definitions[FULL].start[TWIN].with_values({'body.yaw_gain': 3.0})
+    changed = definitions[FULL].start[TWIN].with_values({'body.yaw_gain': 0.3})
     scenario = Scenario('twin', 'nominal', 1)
     method = definitions[FULL].compared(changed, TWIN)
     assert {*method.changes} == {*definitions[FULL].space.names}
     parameters = method.parameters_for(scenario)
     own = scenario.kind.controller_parameters(scenario)
-    assert parameters == own.with_values({'body.yaw_gain': 3.0})
+    assert parameters == own.with_values({'body.yaw_gain': 0.3})
     assert parameters != own
 
 

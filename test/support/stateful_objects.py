@@ -62,7 +62,7 @@ from t3mpc_ros.simulation.sensors.range_sensor import (
 )
 from t3mpc_ros.simulation.transport_delay import TransportDelay
 
-BODY_PARAMETERS = BodyCorrectionParameters()
+BODY_PARAMETERS = BodyCorrectionParameters(gyro_scale_tolerance=0.001)
 PERIOD, PERIOD_NS = 0.01, 10_000_000
 GEOMETRY = WheelGeometry()
 Random = random.Random
@@ -162,11 +162,11 @@ def make_keep_out():
 def drive_body(body, r):
     """Turn with wheels other than the nominal ones, with gaps."""
     found, yaw, sent = [], r.uniform(-3.0, 3.0), np.zeros(2)
-    for k in range(120):
+    for k in range(300):
         elapsed = gap(r) if r.random() < 0.1 else PERIOD
         wanted = np.array([6.0 + 3.0 * math.sin(0.1 * k), 2.0]) + 0.1 * pair(r, 0.1)
         yaw += elapsed * 1.1 * (sent[0] - sent[1]) * 0.5 * 0.035 / 0.0735 + r.gauss(0.0, 1e-4)
-        learn = r.random() < 0.9
+        learn = k % 90 > 5
         found.append(body.step(yaw, elapsed, wanted, wanted, sent, 0.02, learn=learn))
         found += [body.authority, body.yaw_error]
         sent = wanted
@@ -559,7 +559,7 @@ BODY_SKILL = tuple(
 BODY_OLD = tuple(
     f'{memory}.{name}'
     for memory in ('._memory[0]', '._state.memory[0]')
-    for name in ('yaw', 'last_reference')
+    for name in ('yaw', 'last_reference', 'last')
 )
 GYRO_RESPONSE = 'first_pole', 'second_pole', 'last_rate', 'last_dt', 'standstill_for'
 
@@ -626,8 +626,8 @@ FRESH = {
             'reset': Operation(lambda b: b.reset()),
             'restart': Operation(
                 lambda b: b.restart(),
-                kept=('.fuzzy.tables.coefficients', '.fuzzy._coefficients', *BODY_SKILL),
-                scratch=(*BODY_OLD, '.fuzzy._phi', '.fuzzy.tables.phi'),
+                kept=('._state.estimate', '._state.covariance', *BODY_SKILL),
+                scratch=BODY_OLD,
             ),
         },
     ),
@@ -1001,24 +1001,8 @@ CONFIGURED = {
     PoseController: Configured(
         PoseLoopParameters(), PoseController, assign, drive_with(drive_pose_controller, 1, 2, 3)
     ),
-    'Controller with keep-out': Configured(
-        StepperControllerParameters.from_dict(
-            {
-                'pose.enabled': True,
-                'keep_out.enabled': True,
-                'keep_out.map.half_size': 1.0,
-                'fuzzy.sets': 3,
-            }
-        ),
-        Controller,
-        configure,
-        drive_controller,
-        elsewhere=tuple(
-            spec.name for spec in ControllerParameters.specs() if not spec.name.startswith('body.')
-        ),
-        triggers=('estimate_dead_time',),
-        late=('.status',),
-        settle=lambda controller: controller.law.predictive.pretrain(),
+    BodyCorrection: Configured(
+        BODY_PARAMETERS, make_body, configure, drive_body, elsewhere=('enabled',)
     ),
     Controller: Configured(
         ControllerParameters.from_dict({'fuzzy.sets': 3, 'friction.gamma': 5.0}),

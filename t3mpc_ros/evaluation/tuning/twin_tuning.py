@@ -41,10 +41,9 @@ TRAINING = TuningBudget(training_seeds=TUNING_SEEDS[:2], noise_levels=(0.04,), c
 VALIDATION_SEEDS = TUNING_SEEDS[2:]
 """Seeds on which the tuned parameters of the full controller are compared with its defaults."""
 FULL_RANGES = (
-    SearchRange('body.learning_rate', 0.3, 20.0),
-    SearchRange('body.skill_time', 1.0, 60.0),
-    SearchRange('body.dead_zone', 0.003, 0.1),
-    SearchRange('body.yaw_gain', 0.1, 10.0),
+    SearchRange('body.wheel_tolerance', 0.002, 0.1),
+    SearchRange('body.yaw_gain', 0.02, 1.0),
+    SearchRange('body.max_yaw_correction', 0.01, 1.0),
 )
 """What is free in the full controller after the rule for the gains."""
 GAIN_RANGE = SearchRange('gain', 5.0, 100.0)
