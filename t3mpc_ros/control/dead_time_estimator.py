@@ -85,6 +85,16 @@ BLOCK_DEVIATION = 0.012
 """Standard deviation from one block that has enough information, s."""
 ADOPTION_TIME = 15.0
 """Driving time after which a changed response is adopted, s."""
+CHANGE_TIME, CHANGE_FIT = 5.0, 1.1
+"""The same (s) where one dead time explains it as well, up to this factor of the squared errors,
+as the estimate explains what is accepted: late commands of a busy machine have no such time."""
+RETURN_TIME, RETURN_DIFFERENCE = 1.5, 0.008
+"""The same (s) for a return to within some difference (s) of the configured dead time."""
+SUPPORT = 1.0
+"""Likelihood ratio, 2 log, by which a block must prefer what the blocks before it show."""
+DRIFT_BOUND, DRIFT_MEMORY = 2.0, 0.25
+"""Likelihood ratio, 2 log, of the recent data above which the estimate may be about to drift, and
+the factor by which accepted data is then forgotten with each block."""
 
 NOISE_QUANTILE = 5.0
 """Bound of the chi-square test, as a quantile of the normal distribution."""
@@ -128,6 +138,7 @@ ESTIMATE = np.dtype(
         [
             ('dead_time', 'f8'),  # s
             ('deviation', 'f8'),  # s
+            ('configured', 'f8'),  # s
             ('noise_ratio', 'f8'),  # variance of the innovation / noise variance
             ('noise_count', 'f8'),  # weight of that ratio, in measured speeds
             ('rate', 'f8'),  # change of the speeds, held for a while, rad/s²
@@ -207,6 +218,7 @@ class DeadTimeEstimator:
         self._state = np.zeros(1, ESTIMATE)
         estimate, prior = self.estimate, min(parameters.dead_time, MAX_DEAD_TIME)
         estimate.dead_time, estimate.deviation = prior, PRIOR_DEVIATION
+        estimate.configured = prior
         estimate.noise_ratio, estimate.noise_count = NOISE_PRIOR_RATIO, NOISE_PRIOR_COUNT
         grid = GRID_STEP * np.arange(GRID_SIZE)
         estimate.accepted.costs = NOISE_PRIOR_RATIO * ((grid - prior) / PRIOR_DEVIATION) ** 2
@@ -475,11 +487,40 @@ def accept_pending(estimate: Any) -> None:
         total = estimate.noise_ratio * estimate.noise_count + pending.nis
         estimate.noise_ratio = max(total / count, 1.0)
         estimate.noise_count = min(count, NOISE_MAX_COUNT)
+    if estimate.support > DRIFT_BOUND and estimate.rejected.duration < BLOCK_TIME:
+        scale(estimate.accepted, DRIFT_MEMORY)
     add(estimate.accepted, pending)
     clear(pending)
     add(pending, estimate.block)
-    clear(estimate.rejected)
+    # What was rejected long ago is no evidence for a change now.
+    scale(estimate.rejected, DRIFT_MEMORY if preference(estimate) < BLOCK_BOUND else 0.0)
     set_estimate(estimate)
+
+
+@kernel
+def preference(estimate: Any) -> float:
+    """Return 2 log of the likelihood ratio of the estimate and of what the rejected data shows.
+
+    It is that of the present block; while the robot hardly accelerates, a block fits both.
+    """
+    rejected = estimate.rejected
+    if rejected.count == 0.0:
+        return 0.0
+    other, _, _ = minimum(rejected.costs)
+    costs = estimate.block.costs
+    apart = cost_at(costs, other) - cost_at(costs, estimate.dead_time)
+    return float(apart / estimate.noise_ratio)
+
+
+@kernel
+def cost_at(costs: Array, dead_time: float) -> float:
+    """Return the cost at a dead time, s: of the parabola through the three nearest of the grid."""
+    position = dead_time / GRID_STEP
+    g = min(max(int(position + 0.5), 1), GRID_SIZE - 2)
+    offset = position - g
+    slope = 0.5 * (costs[g + 1] - costs[g - 1])
+    curvature = costs[g + 1] - 2.0 * costs[g] + costs[g - 1]
+    return float(costs[g] + offset * (slope + 0.5 * curvature * offset))
 
 
 @kernel
@@ -487,13 +528,24 @@ def reject_block(estimate: Any, driving: bool) -> None:
     """Keep the block apart; adopt what is rejected if it persists while the robot is driving."""
     rejected, block = estimate.rejected, estimate.block
     clear(estimate.pending)
-    if driving:
+    preferred = preference(estimate)
+    if preferred > BLOCK_BOUND:
+        clear(rejected)
+        return
+    if rejected.count > 0.0 and preferred > -SUPPORT:
+        return
+    if driving or preferred <= -SUPPORT:
         add(rejected, block)
     else:
         for g in range(GRID_SIZE):
             rejected.costs[g] += block.costs[g]
-    if rejected.duration >= ADOPTION_TIME:
-        _, least, _ = minimum(rejected.costs)
+    other, least, _ = minimum(rejected.costs)
+    returns = abs(other - estimate.configured) < RETURN_DIFFERENCE
+    if rejected.duration < (RETURN_TIME if returns else CHANGE_TIME):
+        return
+    consistent = least <= CHANGE_FIT * estimate.noise_ratio * rejected.count
+    consistent = consistent and likelihood_ratio(estimate, rejected) > BLOCK_BOUND
+    if consistent or rejected.duration >= ADOPTION_TIME:
         estimate.noise_ratio = max(least / rejected.count, 1.0)
         estimate.noise_count = NOISE_PRIOR_COUNT
         clear(estimate.accepted)
@@ -583,13 +635,7 @@ def likelihood_ratio(estimate: Any, data: Any) -> float:
 
     The uncertainty of the estimate, which is no contradiction, reduces it.
     """
-    costs = data.costs
-    _, least, _ = minimum(costs)
-    position = estimate.dead_time / GRID_STEP
-    g = min(max(int(position + 0.5), 1), GRID_SIZE - 2)
-    offset = position - g
-    slope = 0.5 * (costs[g + 1] - costs[g - 1])
-    curvature = costs[g + 1] - 2.0 * costs[g] + costs[g - 1]
-    cost = costs[g] + offset * (slope + 0.5 * curvature * offset)
+    _, least, _ = minimum(data.costs)
+    excess = cost_at(data.costs, estimate.dead_time) - least
     uncertainty = estimate_uncertainty(estimate)
-    return float((cost - least) / (estimate.noise_ratio + data.information * uncertainty))
+    return float(excess / (estimate.noise_ratio + data.information * uncertainty))

@@ -10,7 +10,6 @@ from scipy.signal import lfilter
 from support.long_tests import few_of
 
 from t3mpc_ros.control.dead_time_estimator import (
-    ADOPTION_TIME,
     IDENTIFIED_DEVIATION,
     MAX_DEAD_TIME,
     PRIOR_DEVIATION,
@@ -157,7 +156,7 @@ def test_constant_commands_identify_nothing(speed):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize('duration', few_of([4.0, 1.0, 10.0]))
+@pytest.mark.parametrize('duration', [1.0, 4.0])
 def test_late_commands_leave_no_trace(duration):
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -172,20 +171,40 @@ def test_late_commands_leave_no_trace(duration):
         assert disturbed[at(31.0) : late.stop + 1].mean() > 0.9 or duration <= 1.0
         assert not disturbed[late.stop + at(3.0) :].any()
         before = record[at(30.0), 0]
-        assert np.abs(record[late.start : late.stop + at(5.0), 0] - before).max() < 0.001
+        assert np.abs(record[late.start : late.stop + at(5.0), 0] - before).max() < 0.003
+        assert (record[late.start : late.stop + at(5.0), 3] == 0.01).all()
         assert abs(record[-1, 0] - 0.01) < 0.002
 
 
 @pytest.mark.compiled
-def test_a_persistent_change_is_adopted():
-    count = at(80.0)
-    dead_time = np.where(np.arange(count) < at(30.0), 0.01, 0.045)
-    for seed in range(3):
-        _, record = run(simulate(smooth_commands(80.0, 60 + seed), dead_time, seed))
-        assert abs(record[at(30.0 + 0.8 * ADOPTION_TIME), 0] - 0.01) < 0.004
-        assert abs(record[at(30.0 + ADOPTION_TIME + 5.0), 0] - 0.045) < 0.003
-        assert abs(record[-1, 0] - 0.045) < 0.002
-        assert not record[at(30.0 + ADOPTION_TIME + 5.0) :, 2].any()
+@pytest.mark.parametrize('change', few_of([0.035, 0.02, 0.05], 2))
+@pytest.mark.parametrize('sign', [1, -1])
+def test_a_change_is_adopted_within_8_s(change, sign):
+    """It once took 16 to 63 s, or for ever where it was 20 ms."""
+    count = at(60.0)
+    first, second = (0.01, 0.01 + change)[::sign]
+    dead_time = np.where(np.arange(count) < at(30.0), first, second)
+    for seed in range(4):
+        drive = simulate(smooth_commands(60.0, 60 + seed), dead_time, seed)
+        _, record = run(drive, configured=first)
+        assert np.abs(record[at(20.0) : at(30.0), 0] - first).max() < 0.004
+        assert np.abs(record[at(38.0) :, 0] - second).max() < 0.006
+        assert abs(record[-1, 0] - second) < 0.002
+        assert not record[at(39.0) :, 2].any()
+
+
+@pytest.mark.compiled
+def test_ten_seconds_of_late_commands_leave_within_8_s():
+    """The newest command counts, so commands at random times are a dead time of 60 ms."""
+    for seed in range(4):
+        count = at(60.0)
+        dead_time = np.full(count, 0.01)
+        late = slice(at(30.0), at(40.0))
+        dead_time[late] += np.random.default_rng(seed).uniform(0.02, 0.12, size=at(10.0))
+        _, record = run(simulate(smooth_commands(60.0, 40 + seed), dead_time, seed))
+        assert record[:, 0].max() < 0.07
+        assert np.abs(record[at(48.0) :, 0] - 0.01).max() < 0.006
+        assert abs(record[-1, 0] - 0.01) < 0.002
 
 
 def test_gaps_in_the_odometry_are_no_disturbance():
