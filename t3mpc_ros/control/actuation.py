@@ -182,8 +182,12 @@ class VelocityActuation:
         applied = self.command if self.takes_speeds else self.applied
         self.speed_filter.update(applied, measured, dt, sent=self._sent)
 
-    def send_acceleration(self, acceleration: Array) -> Array:
-        """Command u by E19, and return the part within the limits, rad/s², shape (2,)."""
+    def send_acceleration(self, acceleration: Array, elapsed: float = 0.0) -> Array:
+        """Command u by E19, and return the part within the limits, rad/s², shape (2,).
+
+        The last command was sent ``elapsed`` s ago, by default one period: its change is limited
+        by what the accelerations permit in that time.
+        """
         self._sent = True
         if not self.takes_speeds:
             self.applied[:] = acceleration
@@ -193,7 +197,7 @@ class VelocityActuation:
             self.predicted,
             self.command,
             self._limits,
-            self._period,
+            max(elapsed, self._period),
             self._period / self._servo_step,
             self.applied,
         )
@@ -294,6 +298,7 @@ def actuation_command(
     predicted    : shape (2,), chi when the command takes effect, rad/s
     command      : shape (2,), the previous command, overwritten by the next one, rad/s
     limits       : shape (2, 3), see :func:`wheel_limits`
+    period       : time since the previous command, s
     command_gain : T / (1 - exp(-T/lag)), s
     applied      : shape (2,), overwritten, the u that the command realises, rad/s²
     """

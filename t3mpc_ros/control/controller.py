@@ -28,7 +28,13 @@ from t3mpc_ros.control.jump_transition import JumpTransition, MotorLimit
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
-from t3mpc_ros.control.watchdog import InputWatchdog, Reason, ResponseMonitor, WatchdogParameters
+from t3mpc_ros.control.watchdog import (
+    InputWatchdog,
+    OdometryTwist,
+    Reason,
+    ResponseMonitor,
+    WatchdogParameters,
+)
 from t3mpc_ros.geometry import kinematics
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import (
@@ -63,6 +69,9 @@ BODY_WEIGHTS = 'body.estimate'
 
 MIN_DEAD_TIME_CHANGE = 0.0005
 """Smallest change (s) of the dead time in use."""
+
+MAX_MISSED = 20
+"""Largest number of periods without a step through which a ramp goes on."""
 
 SNAPSHOT_PERIOD = 0.25
 """Time between two snapshots of the weights, s."""
@@ -258,6 +267,10 @@ class Controller:
         self._announced: set[int] = set()
         self._moving = False
         self._last_stamp_ns: int | None = None
+        self.odometry_twist = OdometryTwist()
+        """Whether the odometry has a twist."""
+        self.ignored_odometry = 0
+        """Number of messages that were ignored: repeated, or overtaken by a later one."""
         self.status = self._make_status(0, Reason.NO_ODOMETRY, np.full(2, math.nan))
 
     @property
@@ -329,6 +342,8 @@ class Controller:
         self.pose_controller.reset()
         self._place = ORIGIN
         self._last_stamp_ns = None
+        self.odometry_twist = OdometryTwist()
+        self.ignored_odometry = 0
         self.status = self._make_status(0, Reason.NO_ODOMETRY, np.full(2, math.nan))
         if self.keep_out is not None:
             self.keep_out.reset()
@@ -358,16 +373,19 @@ class Controller:
     def step(self, odometry: State) -> tuple[BodyTwist, Status]:
         """Return the twist to command now, and the status.
 
-        odometry : state of the robot. A second message with the same stamp changes nothing. A
-            message that is not finite, out of order or too late stops the robot, with the reason
-            in the status.
+        odometry : state of the robot. A message with the stamp of the last one, or with one that
+            is older by no more than the time-out, changes nothing and is counted. A message that
+            is not finite, older than that or too late stops the robot, with the reason in the
+            status.
         """
         stamp = odometry.stamp_ns
-        if stamp == self._last_stamp_ns:
+        if self._watchdog.is_out_of_order(stamp):
+            self.ignored_odometry += 1
             return self.actuation.twist, self.status
         restarted = self._last_stamp_ns is not None and stamp < self._last_stamp_ns
         self._last_stamp_ns = stamp
         elapsed = self._watchdog.elapsed(stamp)
+        odometry = self.odometry_twist.measured(odometry, elapsed)
         if restarted:
             self._clear_reference()
             if self.keep_out is not None:
@@ -402,7 +420,7 @@ class Controller:
         if self._jumps or self._announced:
             self._announce_jumps(stamp, plan_ns)
         acceleration = self._acceleration(plan_ns, odometry.pose.yaw, begin, end, dt)
-        applied = actuation.send_acceleration(acceleration).copy()
+        applied = actuation.send_acceleration(acceleration, dt).copy()
         self._tracker.set_applied(applied, saturated=actuation.limited)
         self._response.add_command(*actuation.command.tolist())
         self._take_snapshot()
@@ -460,7 +478,7 @@ class Controller:
         corrects_body = self.parameters.composition == 'body' and self.parameters.body.enabled
         if self._ahead_ns == 0 and not corrects_body:
             return tracker.step(plan_ns, speeds, begin, end, elapsed)
-        planned, rate = tracker.plan(plan_ns, begin, end)
+        planned, rate = tracker.plan(plan_ns, begin, end, elapsed)
         if self._ahead_ns > 0:
             self._shaper.step(planned, elapsed)
             planned, rate = self._shaper.reference, self._shaper.rate
@@ -697,11 +715,20 @@ class SwitchingTracker:
         """
         if self.parameters.jump_transition.method == 'predictive':
             return self._step_predictive(now_ns, speeds, reference, reference_next, dt)
-        return self.law.step(speeds, *self.plan(now_ns, reference, reference_next), dt)
+        return self.law.step(speeds, *self.plan(now_ns, reference, reference_next, dt), dt)
 
-    def plan(self, now_ns: int, reference: Array, reference_next: Array) -> tuple[Array, Array]:
-        """Return reachable reference (rad/s) and its rate (rad/s²) at ``now_ns``, shape (2,)."""
+    def plan(
+        self, now_ns: int, reference: Array, reference_next: Array, dt: float
+    ) -> tuple[Array, Array]:
+        """Return reachable reference (rad/s) and its rate (rad/s²) at ``now_ns``, shape (2,).
+
+        The ramps of jumps go on through the periods without a step, ``dt`` s since the last one.
+        """
         transition = self.transition
+        if transition.count:
+            for missed in range(min(round(dt / self._period), MAX_MISSED) - 1, 0, -1):
+                missed_ns = now_ns - round(missed * self._period * NANOSECONDS)
+                transition.step(missed_ns, reference, reference)
         transition.step(now_ns, reference, reference_next)
         return transition.reachable, transition.rate
 

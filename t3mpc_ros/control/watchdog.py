@@ -5,10 +5,11 @@
 from collections import deque
 from dataclasses import dataclass
 import enum
+import math
 from statistics import median
 from typing import ClassVar
 
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
+from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, Pose, State, wrap_angle
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 
@@ -87,6 +88,16 @@ class InputWatchdog:
         """Register a valid reference; its age counts from the next odometry stamp."""
         self._reference_pending = True
 
+    def is_out_of_order(self, stamp_ns: int) -> bool:
+        """Whether an odometry is the last one again, or was overtaken by it on the way.
+
+        A stamp that is older by more than the time-out is a clock that was set back.
+        """
+        if self._odometry_ns is None:
+            return False
+        late = (self._odometry_ns - stamp_ns) / NANOSECONDS
+        return 0.0 <= late <= self._parameters.odometry_timeout
+
     def elapsed(self, stamp_ns: int) -> float | None:
         """Return the time since the previous odometry, s; None if integration must restart.
 
@@ -140,6 +151,46 @@ class InputWatchdog:
         if last_received_ns is None:
             return True
         return now_ns - last_received_ns > self._parameters.odometry_timeout * NANOSECONDS
+
+
+MOVED, TURNED = 0.01, 0.05
+"""Change of the pose (m, rad) with a twist of zero after which the odometry has no twist."""
+
+
+class OdometryTwist:
+    """The twist of the odometry, or the change of its pose where it has none.
+
+    Some robots publish a pose only. Their twist of zero would be a robot that does not follow.
+    """
+
+    def __init__(self) -> None:
+        self.missing = False
+        """Whether the odometry has no twist: speeds are differences of its pose."""
+        self.reset()
+
+    def reset(self) -> None:
+        """Start again with the next message; what the odometry has is kept."""
+        self._anchor: Pose | None = None
+        """Pose of the first message with a twist of zero since the last other one."""
+        self._last = ORIGIN
+
+    def measured(self, odometry: State, elapsed: float | None) -> State:
+        """Return an odometry with its twist, ``elapsed`` s after the last one, None at a start."""
+        pose, last, self._last = odometry.pose, self._last, odometry.pose
+        if odometry.twist != (0.0, 0.0) or not odometry.is_finite():
+            self.missing, self._anchor = False, None
+            return odometry
+        if self._anchor is None:
+            self._anchor = pose
+        moved = math.hypot(pose.x - self._anchor.x, pose.y - self._anchor.y)
+        turned = abs(wrap_angle(pose.yaw - self._anchor.yaw))
+        self.missing = self.missing or moved > MOVED or turned > TURNED
+        if not (self.missing and elapsed):
+            return odometry
+        turn = wrap_angle(pose.yaw - last.yaw)
+        middle = last.yaw + 0.5 * turn
+        forward = (pose.x - last.x) * math.cos(middle) + (pose.y - last.y) * math.sin(middle)
+        return odometry._replace(twist=BodyTwist(forward / elapsed, turn / elapsed))
 
 
 EVIDENCE_WEIGHT = 20
