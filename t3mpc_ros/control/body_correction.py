@@ -80,6 +80,10 @@ SLACK, LARGEST, JUMP = 1.5, 4.0, 6.0
 """Of a cumulative sum of innovations (in their standard deviations, at most LARGEST): what a block
 takes off, and the sum at which the bias has jumped; three blocks in a row at least. Page 1954, doi
 10.1093/biomet/41.1-2.100."""
+WARNED_BIAS = 0.01
+"""Bias that is reported, rad/s."""
+WARNED_SCALE, WARNED_DEVIATION = 0.01, 0.004
+"""Scale error that is reported, where the error of the robot beside it is so uncertain."""
 CLIP = 2.0
 """Largest innovation that is learnt at once, in its standard deviation."""
 
@@ -267,6 +271,23 @@ class BodyCorrection:
     def gyro_bias(self) -> float:
         """Estimated bias of the yaw rate of the odometry, rad/s."""
         return float(self._state.estimate[BIAS] * self._turn)
+
+    def problem(self) -> str:
+        """Return what the gyro does to the yaw of the odometry, or nothing."""
+        bias, estimate = self.gyro_bias, self._state.estimate
+        if abs(bias) > WARNED_BIAS:
+            return (
+                f'the yaw of odom turns by {bias:.3f} rad/s more than the wheels: bias of the '
+                'gyro; it is not followed; let the robot stand for two seconds'
+            )
+        share, deviations = estimate[TURNING] + estimate[GYRO_SCALE], self.deviations
+        if abs(estimate[GYRO_SCALE]) > WARNED_SCALE and deviations[TURNING] > WARNED_DEVIATION:
+            return (
+                f'the yaw of odom turns by {100.0 * share:.1f} % more than the wheels: scale of '
+                'the gyro, or wheel separation; calibrate the robot, or lower '
+                'body.gyro_scale_tolerance if the gyro is right'
+            )
+        return ''
 
     def restart(self) -> None:
         """Start a drive: clear yaw error and history; gains and skill are kept."""

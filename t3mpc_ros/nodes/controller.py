@@ -136,6 +136,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._steps = 0
         self._rejected_references = 0
         self._rejected_odometry = 0
+        self._reported_ignored = 0
         self._odometry_problem = ''
         self._logged_reason = self._controller.status.reason
         self._command_type = TwistStamped if self.parameters.enable_stamped_cmd_vel else Twist
@@ -338,6 +339,9 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             'body_yaw_error_rad': self._controller.body.yaw_error,
             'skill_right': float(status.skill[0]),
             'skill_left': float(status.skill[1]),
+            'gyro_bias_rad_s': self._controller.body.gyro_bias,
+            'odometry_has_twist': not self._controller.odometry_twist.missing,
+            'odometry_ignored': self._controller.ignored_odometry,
             'references_rejected': self._rejected_references,
             'odometry_rejected': self._rejected_odometry,
         }
@@ -368,7 +372,19 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
     def warnings(self) -> list[str]:
         """Return what does not fit in the odometry or in its response to the commands."""
         simulated = self.get_clock().ros_time_is_active
-        return self._input_monitor.warnings(simulated_time=simulated)
+        found = self._input_monitor.warnings(simulated_time=simulated)
+        ignored = self._controller.ignored_odometry
+        if ignored > self._reported_ignored:
+            found.append(
+                f'{ignored - self._reported_ignored} messages of odom were ignored: repeated, or '
+                'overtaken by later ones; one publisher only, with increasing stamps'
+            )
+        self._reported_ignored = ignored
+        if self._controller.odometry_twist.missing:
+            found.append('odom has no twist: its poses are differentiated; publish the twist')
+        if problem := self._controller.body.problem():
+            found.append(problem)
+        return found
 
     def on_shutdown(self) -> None:
         """Publish a zero command and the last row of the journal."""

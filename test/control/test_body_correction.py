@@ -4,6 +4,7 @@
 
 import itertools
 import math
+import re
 
 import numpy as np
 import pytest
@@ -179,6 +180,35 @@ def test_a_wrong_delay_is_no_geometry(late):
     errors = body.run(40.0) - uncorrected(40.0)
     assert rms(errors[500:]) < 0.003
     assert abs(body.correction.estimate[DELAY] - late) < 0.004
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize(
+    ('scale', 'bias', 'tolerance', 'problem'),
+    [
+        (1.0, 0.0, 0.03, ''),
+        (
+            1.03,
+            0.0,
+            0.03,
+            r'by 2\.\d % more than the wheels: scale of the gyro, or wheel separation',
+        ),
+        (1.0, 0.05, 0.03, r'by 0\.0\d\d rad/s more than the wheels: bias of the gyro'),
+        (1.03, 0.0, CALIBRATED, ''),  # the robot's, and corrected
+    ],
+)
+def test_within_5_s_it_says_what_the_gyro_does(scale, bias, tolerance, problem):
+    body = Body(exact, noise=0.01, gyro_scale_tolerance=tolerance)
+    body.scale = scale
+    if bias:
+        body.run(10.0)
+        assert body.correction.problem() == ''
+        body.bias = bias / TURN
+    body.run(5.0)
+    if problem:
+        assert re.search(problem, body.correction.problem())
+    else:
+        assert body.correction.problem() == ''
 
 
 @pytest.mark.compiled
