@@ -85,8 +85,8 @@ class ControllerParameters(Nt3fsMpcParameters):
 
     composition: str = parameter(
         'paper',
-        'body: the wheels follow the plan by feed-forward, and NT3FS and compensator correct the '
-        'yaw rate of the body; for a robot whose wheels follow commands exactly. paper: NT3FS, '
+        'body: the wheels follow the plan by feed-forward, and gains learnt from the gyro correct '
+        'the yaw rate; for a robot whose wheels follow commands exactly. paper: NT3FS, '
         'compensator and v_p act on the wheel speeds, as in the paper; for a drive with errors',
         choices=('body', 'paper'),
     )
@@ -284,7 +284,7 @@ class Controller:
         return self._tracker.parameters.law.gain
 
     def get_weights(self) -> dict[str, Array]:
-        """Return all adapted arrays by name: those of the law, and the map of the body."""
+        """Return all adapted arrays by name: those of the law, and the gains of the body."""
         return self.law.get_weights() | {BODY_WEIGHTS: self.body.get_weights()}
 
     def set_weights(self, weights: Mapping[str, Array]) -> None:

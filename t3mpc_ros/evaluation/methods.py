@@ -88,7 +88,8 @@ TWIN_PARTS: Mapping[str, Mapping[str, object]] = {
     "full, the paper's composition": {'composition': 'paper'},
 }
 """The node's controller on the twin with one part left out, and with NT3FS, compensator and v_p on
-the wheel speeds. The compensator acts with the authority of NT3FS: without it, neither does."""
+the wheel speeds. The compensator is that of the yaw error (E21), with the authority of the gains:
+without the body correction, neither acts."""
 
 
 @dataclass(frozen=True, slots=True)
