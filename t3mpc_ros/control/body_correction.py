@@ -66,7 +66,7 @@ YAW_JUMP = 20.0
 STANDSTILL_SPEED = 0.05
 """Commanded speed (rad/s, mean square over a block) below which a block shows nothing."""
 
-GAINS = ASYMMETRY, TURNING, GYRO_SCALE, BIAS, DELAY = range(5)
+ASYMMETRY, TURNING, GYRO_SCALE, BIAS, DELAY = range(5)
 """k_m, k_w, s, c, tau: rows of the estimate."""
 BIAS_DEVIATION, DELAY_DEVIATION = 0.01, 0.02
 """Standard deviations of c after a standstill (rad/s of a wheel) and of tau (s) at the start."""
@@ -207,7 +207,7 @@ class BodyState(NamedTuple):
     covariance: Array
     """Of the estimate, shape (5, 5)."""
     work: Array
-    """Work space, shape (3, 5)."""
+    """Work space: row h of E20, and P h, shape (2, 5)."""
 
 
 class BodyCorrection:
@@ -228,7 +228,7 @@ class BodyCorrection:
         self._period = period
         self._memory = BodyMemory.new()
         self._state = BodyState(
-            self._memory, np.zeros((HISTORY, 2)), np.zeros(5), np.zeros((5, 5)), np.zeros((3, 5))
+            self._memory, np.zeros((HISTORY, 2)), np.zeros(5), np.zeros((5, 5)), np.zeros((2, 5))
         )
         self._correct_body = TypedKernel(correct_body)
         self.configure(parameters)

@@ -166,10 +166,6 @@ class OdometryTwist:
     def __init__(self) -> None:
         self.missing = False
         """Whether the odometry has no twist: speeds are differences of its pose."""
-        self.reset()
-
-    def reset(self) -> None:
-        """Start again with the next message; what the odometry has is kept."""
         self._anchor: Pose | None = None
         """Pose of the first message with a twist of zero since the last other one."""
         self._last = ORIGIN
