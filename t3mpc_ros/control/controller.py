@@ -385,7 +385,7 @@ class Controller:
         restarted = self._last_stamp_ns is not None and stamp < self._last_stamp_ns
         self._last_stamp_ns = stamp
         elapsed = self._watchdog.elapsed(stamp)
-        odometry = self.odometry_twist.measured(odometry, elapsed)
+        odometry = self.odometry_twist.measured(odometry, restart=elapsed is None)
         if restarted:
             self._clear_reference()
             if self.keep_out is not None:

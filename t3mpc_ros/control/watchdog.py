@@ -9,7 +9,7 @@ import math
 from statistics import median
 from typing import ClassVar
 
-from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, Pose, State, wrap_angle
+from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State, wrap_angle
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 
@@ -168,12 +168,14 @@ class OdometryTwist:
         """Whether the odometry has no twist: speeds are differences of its pose."""
         self._anchor: Pose | None = None
         """Pose of the first message with a twist of zero since the last other one."""
-        self._last = ORIGIN
+        self._last: State | None = None
 
-    def measured(self, odometry: State, elapsed: float | None) -> State:
-        """Return an odometry with its twist, ``elapsed`` s after the last one, None at a start."""
-        pose, last, self._last = odometry.pose, self._last, odometry.pose
-        if odometry.twist != (0.0, 0.0) or not odometry.is_finite():
+    def measured(self, odometry: State, *, restart: bool) -> State:
+        """Return an odometry with its twist; a ``restart`` follows no message before it."""
+        if not odometry.is_finite():
+            return odometry
+        pose, last, self._last = odometry.pose, self._last, odometry
+        if odometry.twist != (0.0, 0.0):
             self.missing, self._anchor = False, None
             return odometry
         if self._anchor is None:
@@ -181,11 +183,13 @@ class OdometryTwist:
         moved = math.hypot(pose.x - self._anchor.x, pose.y - self._anchor.y)
         turned = abs(wrap_angle(pose.yaw - self._anchor.yaw))
         self.missing = self.missing or moved > MOVED or turned > TURNED
-        if not (self.missing and elapsed):
+        if restart or last is None or not self.missing:
             return odometry
-        turn = wrap_angle(pose.yaw - last.yaw)
-        middle = last.yaw + 0.5 * turn
-        forward = (pose.x - last.x) * math.cos(middle) + (pose.y - last.y) * math.sin(middle)
+        elapsed = (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
+        turn = wrap_angle(pose.yaw - last.pose.yaw)
+        middle = last.pose.yaw + 0.5 * turn
+        x, y = pose.x - last.pose.x, pose.y - last.pose.y
+        forward = x * math.cos(middle) + y * math.sin(middle)
         return odometry._replace(twist=BodyTwist(forward / elapsed, turn / elapsed))
 
 

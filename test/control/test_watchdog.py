@@ -16,12 +16,13 @@ from support.properties import PROPERTY, STATEFUL
 from t3mpc_ros.control.watchdog import (
     EVIDENCE_WEIGHT,
     InputWatchdog,
+    OdometryTwist,
     Reason,
     ResponseMonitor,
     WatchdogParameters,
 )
 from t3mpc_ros.geometry.kinematics import wheels_from_twist
-from t3mpc_ros.geometry.types import BodyTwist
+from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, Pose, State
 
 MS = 1_000_000
 
@@ -319,3 +320,16 @@ def test_the_decision_is_that_of_the_whole_window(steps):
         assert monitor.counts == (len(window), evidence)
         monitor.add_command(right, left)
         window = [*window, (right, left)][-5:]
+
+
+def test_a_message_that_is_not_finite_keeps_the_twist_missing():
+    """One bad message once made the controller look for a twist again, for a centimetre."""
+    twist = OdometryTwist()
+    found = []
+    for k in range(30):
+        at = Pose(math.nan if k == 20 else 0.002 * k, 0.0, 0.0)
+        measured = twist.measured(State(k * 10 * MS, at, STANDSTILL), restart=k == 0)
+        found.append(measured.twist.linear)
+    assert found[:6] == [0.0] * 6
+    assert found[20] == 0.0
+    assert found[7:20] + found[21:] == pytest.approx([0.2] * 22)
