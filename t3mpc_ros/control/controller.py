@@ -374,13 +374,16 @@ class Controller:
         """Return the twist to command now, and the status.
 
         odometry : state of the robot. A message with the stamp of the last one, or with one that
-            is older by no more than the time-out, changes nothing and is counted. A message that
-            is not finite, older than that or too late stops the robot, with the reason in the
-            status.
+            is older by no more than the time-out, is counted and changes nothing, but that it
+            stops a disabled robot. A message that is not finite, older than that or too late
+            stops the robot, with the reason in the status.
         """
         stamp = odometry.stamp_ns
         if self._watchdog.is_out_of_order(stamp):
             self.ignored_odometry += 1
+            if not self._watchdog.enabled:
+                self._stop()
+                self.status = self._make_status(stamp, Reason.DISABLED, self.status.error)
             return self.actuation.twist, self.status
         restarted = self._last_stamp_ns is not None and stamp < self._last_stamp_ns
         self._last_stamp_ns = stamp

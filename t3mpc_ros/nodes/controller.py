@@ -219,11 +219,13 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         if self._odometry_problem:
             self._rejected_odometry += 1 + len(self._odometry.take_waiting())
             return
-        self._last_odometry_ns = self.steady_ns()
         self._take_references()
         self._take_ranges()
         measured = conversions.state_from_odometry(message)
+        ignored = self._controller.ignored_odometry
         command, status = self._controller.step(measured)
+        if self._controller.ignored_odometry == ignored or self._last_odometry_ns is None:
+            self._last_odometry_ns = self.steady_ns()
         self._publish_command(command, status.stamp_ns)
         self._input_monitor.update(
             measured.stamp_ns, self.now_ns(), measured.twist, self._last_command

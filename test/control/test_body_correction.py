@@ -99,7 +99,6 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.compiled
 def test_wrong_radii_and_separation_are_learnt():
     body = Body(miscalibrated, noise=0.02)
     before = uncorrected(40.0, miscalibrated) - uncorrected(40.0)
@@ -112,7 +111,6 @@ def test_wrong_radii_and_separation_are_learnt():
     assert abs(found[TURNING] - (1.005 / 1.03 - 1.0)) < 0.0025
 
 
-@pytest.mark.compiled
 @pytest.mark.slow
 def test_a_robot_that_is_exact_is_left_alone():
     """Noise of the gyro must not turn a good robot into a worse one."""
@@ -123,7 +121,6 @@ def test_a_robot_that_is_exact_is_left_alone():
         np.testing.assert_array_equal(body.sent[-1], body.reference(body.k + 1))
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize('scale', [0.97, 1.03])
 def test_the_scale_of_an_uncalibrated_gyro_is_not_the_robots(scale):
     """3 % of the data sheet once turned an exact robot by 3 %, without a word."""
@@ -134,7 +131,6 @@ def test_the_scale_of_an_uncalibrated_gyro_is_not_the_robots(scale):
     assert abs(body.correction.estimate[GYRO_SCALE] - (scale - 1.0)) < 0.006
 
 
-@pytest.mark.compiled
 def test_stated_deviations_share_what_cannot_be_told_apart():
     """The two are one quantity: the posterior mean divides it as the variances."""
     for wheel, gyro in ((0.01, 0.01), (0.02, 0.01), (0.01, 0.03)):
@@ -146,7 +142,6 @@ def test_stated_deviations_share_what_cannot_be_told_apart():
         assert abs(found[TURNING] / (found[TURNING] + found[GYRO_SCALE]) - share) < 0.12
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize('bias', [0.05, -0.2, 1.5])
 def test_a_jump_of_the_bias_turns_no_robot(bias):
     """0.05 rad/s at 15 s once turned the robot by 1.5 rad in the minute after."""
@@ -160,7 +155,6 @@ def test_a_jump_of_the_bias_turns_no_robot(bias):
         assert abs(body.correction.gyro_bias - bias) < 0.01
 
 
-@pytest.mark.compiled
 def test_a_bias_and_wrong_wheels_are_told_apart():
     body = Body(miscalibrated, noise=0.01)
     body.run(20.0)
@@ -172,7 +166,6 @@ def test_a_bias_and_wrong_wheels_are_told_apart():
     assert abs(body.correction.estimate[BIAS] - 0.1) < 0.01
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize('late', [-0.02, 0.03])
 def test_a_wrong_delay_is_no_geometry(late):
     body = Body(exact, noise=0.01)
@@ -182,7 +175,6 @@ def test_a_wrong_delay_is_no_geometry(late):
     assert abs(body.correction.estimate[DELAY] - late) < 0.004
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize(
     ('scale', 'bias', 'tolerance', 'problem'),
     [
@@ -211,7 +203,6 @@ def test_within_5_s_it_says_what_the_gyro_does(scale, bias, tolerance, problem):
         assert body.correction.problem() == ''
 
 
-@pytest.mark.compiled
 def test_yaw_error_from_a_push_is_removed():
     body = Body(miscalibrated, noise=0.01, yaw_gain=1.0, max_yaw_correction=0.1)
     body.run(20.0)
@@ -223,7 +214,6 @@ def test_yaw_error_from_a_push_is_removed():
     assert abs(body.correction.yaw_error) < 0.03
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize('turn', [0.5, -2.0])
 def test_a_yaw_that_is_set_turns_no_robot(turn):
     """The odometry was reset: nobody turned the robot, which once turned back."""
@@ -236,7 +226,6 @@ def test_a_yaw_that_is_set_turns_no_robot(turn):
     assert rms(errors) < 0.02
 
 
-@pytest.mark.compiled
 def test_a_yaw_that_is_never_measured_changes_nothing():
     """A robot without yaw in its odometry: its "error" is as large as the command itself."""
     body = Body(lambda right, left: 0.0)
@@ -244,7 +233,6 @@ def test_a_yaw_that_is_never_measured_changes_nothing():
     assert body.correction.authority == 0.0
 
 
-@pytest.mark.compiled
 def test_a_yaw_that_freezes_turns_the_robot_no_further():
     body = Body(miscalibrated, noise=0.01)
     body.run(20.0)
@@ -253,7 +241,6 @@ def test_a_yaw_that_freezes_turns_the_robot_no_further():
     assert body.correction.authority == 0.0
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize(('of_gains', 'of_yaw'), [(0.0, 0.0), (0.1, 0.0), (0.0, 0.1), (0.1, 0.2)])
 def test_the_corrections_are_bounded(of_gains, of_yaw):
     body = Body(
@@ -269,7 +256,6 @@ def test_the_corrections_are_bounded(of_gains, of_yaw):
     assert 0.3 * (of_gains + of_yaw) <= max(corrections) <= of_gains + of_yaw + 1e-12
 
 
-@pytest.mark.compiled
 def test_a_rollback_restores_gains_and_authority():
     body = Body(miscalibrated)
     body.run(20.0)
@@ -283,13 +269,11 @@ def test_a_rollback_restores_gains_and_authority():
     assert body.correction.authority == authority
 
 
-@pytest.mark.compiled
 def test_weights_of_another_shape_are_rejected():
     with pytest.raises(ValueError, match=r'\(6, 5\): got \(25,\)'):
         Body(exact).correction.set_weights(np.zeros(25))
 
 
-@pytest.mark.compiled
 @pytest.mark.parametrize('case', ['disturbed', 'at rest'])
 def test_nothing_is_learnt(case):
     body = Body(miscalibrated)
@@ -304,7 +288,6 @@ def test_nothing_is_learnt(case):
     np.testing.assert_array_equal(body.correction.get_weights(), weights)
 
 
-@pytest.mark.compiled
 def test_a_slide_of_the_tyres_is_hardly_learnt():
     """It once stayed: a third of a second on ice turned the robot for seconds."""
     body = Body(miscalibrated, noise=0.01)
@@ -316,7 +299,6 @@ def test_a_slide_of_the_tyres_is_hardly_learnt():
     assert body.correction.authority > 0.9
 
 
-@pytest.mark.compiled
 def test_the_filter_is_the_regression_with_the_stated_prior():
     """A Kalman filter of constants is ridge regression: here its own, of the blocks it got."""
     body = Body(miscalibrated, noise=0.002)

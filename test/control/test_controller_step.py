@@ -57,6 +57,22 @@ def test_the_command_never_exceeds_the_limits():
         before = wheels if status.reason is Reason.TRACKING else None
 
 
+@pytest.mark.parametrize('late', [0, 5 * MS, 200 * MS])
+def test_a_repeated_message_does_not_move_a_disabled_robot(late):
+    """The command of the last step was returned, with the reason of moving."""
+    loop = Loop()
+    loop.run(100)
+    assert loop.twist.linear > 0.0
+    loop.controller.enable(on=False)
+    last = loop.now - PERIOD
+    twist, status = loop.controller.step(State(last - late, ORIGIN, loop.twist))
+    assert (twist, status.reason) == (BodyTwist(0.0, 0.0), Reason.DISABLED)
+    assert loop.controller.ignored_odometry == 1
+    loop.controller.enable(on=True)
+    twist, status = loop.controller.step(State(last, ORIGIN, loop.twist))
+    assert twist == BodyTwist(0.0, 0.0)
+
+
 @pytest.mark.parametrize('composition', ['body', 'paper'])
 @pytest.mark.slow
 def test_the_first_command_is_within_the_acceleration_limits(composition):

@@ -62,6 +62,22 @@ def test_an_odometry_timeout_gives_zero_commands(harness):
     assert bench.commands[-1] == Twist()
 
 
+def test_an_odometry_whose_stamps_stand_still_times_out(harness):
+    """A message that is repeated says nothing new, but kept the robot going."""
+    bench = ControllerHarness(harness, odometry_timeout=0.2)
+    bench.publish_odometry()
+    bench.publish_reference()
+    bench.run(5)
+    assert bench.last_command().linear.x > 0.0
+
+    def stopped():
+        bench.odom_publisher.publish(odometry(bench.stamp_ns))
+        return reason(bench.controller) == 'stopped: no odometry'
+
+    harness.spin_until(stopped)
+    harness.spin_until(lambda: bench.commands[-1] == Twist())
+
+
 def test_non_finite_odometry_or_reference_moves_nothing(harness):
     bench = ControllerHarness(harness)
     controller = bench.controller
