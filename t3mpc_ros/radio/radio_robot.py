@@ -18,20 +18,13 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState, PortAction
 from t3mpc_ros.radio.link.statistics import LinkQuality
 from t3mpc_ros.radio.link.telemetry import Telemetry
+from t3mpc_ros.robot import interface
 from t3mpc_ros.robot.calibration import CalibrationParameters
 from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
-from t3mpc_ros.robot.interface import (
-    ZERO_WHEEL_SPEEDS,
-    RobotCommand,
-    RobotInterface,
-    RobotState,
-    RobotStatus,
-    WheelAngles,
-)
 from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON, SlipMonitor
 
-UNKNOWN_STATUS = RobotStatus(
+UNKNOWN_STATUS = interface.RobotStatus(
     enabled=False, moving=False, estop=False, timed_out=False, limited=False, imu_fault=True
 )
 """Status before the first telemetry."""
@@ -78,7 +71,7 @@ class RadioRobotParameters(Parameters):
         )
 
 
-class RadioRobot(RobotInterface):
+class RadioRobot(interface.RobotInterface):
     """Commands the robot through :class:`Link` and computes its odometry from the telemetry.
 
     The owner of the port calls :meth:`step` as for :class:`Link`. All times and stamps are
@@ -106,8 +99,8 @@ class RadioRobot(RobotInterface):
         self._limited = False
         self._expiry_ns = 0
         """Time at which the robot stops by itself without another command."""
-        self._commanded = ZERO_WHEEL_SPEEDS
-        self._new_states: deque[RobotState] = deque(maxlen=1024)
+        self._commanded = interface.ZERO_WHEEL_SPEEDS
+        self._new_states: deque[interface.RobotState] = deque(maxlen=1024)
         self._state = self._initial_state()
 
     # -- port -------------------------------------------------------------------------------------
@@ -127,7 +120,7 @@ class RadioRobot(RobotInterface):
             self._update(telemetry)
         return actions
 
-    def take_states(self) -> list[RobotState]:
+    def take_states(self) -> list[interface.RobotState]:
         """Return the new states since the last call, oldest first."""
         states = list(self._new_states)
         self._new_states.clear()
@@ -155,13 +148,13 @@ class RadioRobot(RobotInterface):
 
     # -- robot interface --------------------------------------------------------------------------
 
-    def apply(self, command: RobotCommand, now_ns: int) -> str:
+    def apply(self, command: interface.RobotCommand, now_ns: int) -> str:
         """Follow ``command`` from the next cycle on; return the reason for a rejection."""
         if self._slip_monitor.rejects(command, now_ns / NANOSECONDS):
             return SLIP_STOP_REASON
         return self._limiter.accept(command, now_ns)
 
-    def advance(self, now_ns: int) -> RobotState:
+    def advance(self, now_ns: int) -> interface.RobotState:
         """Return the newest state, with the current reason."""
         return self._state._replace(reason=self.reason(now_ns))
 
@@ -205,14 +198,16 @@ class RadioRobot(RobotInterface):
         limited_command = self._limiter.advance(now_ns, self._period_ns / NANOSECONDS)
         self._limited = limited_command.limited
         wheels = self._commanded = limited_command.wheels
-        stops = limited_command.target == ZERO_WHEEL_SPEEDS
+        stops = limited_command.target == interface.ZERO_WHEEL_SPEEDS
         if stops and not self._stops_gently():
-            wheels = ZERO_WHEEL_SPEEDS  # the board has the same ramp, and no late cycle delays it
+            wheels = (
+                interface.ZERO_WHEEL_SPEEDS
+            )  # the board has the same ramp, and no late cycle delays it
         # A step of a stop expires after two cycles, and the board continues by itself.
         valid_ns = 2 * self._period_ns if stops else self._limiter.remaining_ns(now_ns)
         valid_ns = min(valid_ns, self._ttl_ns)
         self._expiry_ns = now_ns + valid_ns
-        if limited_command.reason and wheels == ZERO_WHEEL_SPEEDS:
+        if limited_command.reason and wheels == interface.ZERO_WHEEL_SPEEDS:
             self.link.stop(limited_command.reason)
         else:
             self.link.command(wheels, self._expiry_ns)
@@ -245,13 +240,13 @@ class RadioRobot(RobotInterface):
         self._state = self._make_state(telemetry)
         self._new_states.append(self._state)
 
-    def _make_state(self, telemetry: Telemetry) -> RobotState:
+    def _make_state(self, telemetry: Telemetry) -> interface.RobotState:
         twist = twist_from_wheels(telemetry.wheels, self._parameters.geometry)
         status = telemetry.status._replace(
             slipping=self._odometry.slipping,
             limited=telemetry.status.limited or self._limited,
         )
-        return RobotState(
+        return interface.RobotState(
             stamp_ns=telemetry.stamp_ns,
             wheels=telemetry.wheels,
             angles=telemetry.angles,
@@ -265,14 +260,14 @@ class RadioRobot(RobotInterface):
             battery=self.link.battery,
         )
 
-    def _initial_state(self) -> RobotState:
-        return RobotState(
+    def _initial_state(self) -> interface.RobotState:
+        return interface.RobotState(
             stamp_ns=0,
             wheels=WheelSpeeds(math.nan, math.nan),
-            angles=WheelAngles(0.0, 0.0),
+            angles=interface.WheelAngles(0.0, 0.0),
             odometry=State(0, ORIGIN, STANDSTILL),
             covariance=np.zeros((3, 3)),
-            commanded=ZERO_WHEEL_SPEEDS,
+            commanded=interface.ZERO_WHEEL_SPEEDS,
             status=UNKNOWN_STATUS,
             reason=self.link.reason(0),
         )

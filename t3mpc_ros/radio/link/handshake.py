@@ -14,14 +14,7 @@ from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.transaction import TransactionResult
-from t3mpc_ros.radio.protocol import frames
-from t3mpc_ros.radio.protocol.authentication import (
-    NONCE_SIZE,
-    AnySignedFrame,
-    Signer,
-    session_key,
-    sign_hello,
-)
+from t3mpc_ros.radio.protocol import authentication, frames
 
 Entropy = Callable[[int], bytes]
 """Returns a number of unpredictable bytes."""
@@ -54,9 +47,9 @@ class Session:
         self._last_us = now_ns // 1000
         self._seq = 0
         self._request = 0
-        self._signer: Signer | None = None
+        self._signer: authentication.Signer | None = None
         # Constant over all attempts, so that the robot recognises a repeated HELLO.
-        self._nonce = entropy(NONCE_SIZE) if key else b''
+        self._nonce = entropy(authentication.NONCE_SIZE) if key else b''
         self._hello_us = self._last_us & _WORD
         self.echo_us: int | None = None
         """Robot time of the newest STATE; None before the first: the robot refuses every CMD."""
@@ -66,7 +59,7 @@ class Session:
         if not self._key:
             return frames.Hello(self.number, 0)
         self._hello_us = self._stamp(now_ns)
-        return sign_hello(self._key, self.number, 0, self._hello_us, self._nonce)
+        return authentication.sign_hello(self._key, self.number, 0, self._hello_us, self._nonce)
 
     def accept(self, info: frames.Info) -> str:
         """Start the session with the INFO of the robot; return the problem if there is one."""
@@ -87,8 +80,8 @@ class Session:
         if info.session != self.number:
             return reasons.refused('HELLO', info.refusal)
         if self._key:
-            key = session_key(self._key, self._nonce, info.nonce)
-            self._signer = Signer(key, self._hello_us)
+            key = authentication.session_key(self._key, self._nonce, info.nonce)
+            self._signer = authentication.Signer(key, self._hello_us)
         return ''
 
     def command(self, flags: int, ttl: int, left: int, right: int, now_ns: int) -> frames.Command:
@@ -112,7 +105,9 @@ class Session:
         """Return a POLL."""
         return frames.Poll(self.number, self._seq, what)
 
-    def _sign(self, frame: AnySignedFrame, now_ns: int) -> AnySignedFrame:
+    def _sign(
+        self, frame: authentication.AnySignedFrame, now_ns: int
+    ) -> authentication.AnySignedFrame:
         if self._signer is None:
             return frame
         return self._signer.sign(frame._replace(host_us=self._stamp(now_ns)))

@@ -9,43 +9,7 @@ names the frame, the field, the bound and the value. All numbers are little endi
 import struct
 from typing import Any, NamedTuple
 
-from t3mpc_ros.radio.protocol.frames import (
-    PAYLOAD_LIMIT,
-    VERSION,
-    Ack,
-    Action,
-    Aux,
-    Command,
-    Configure,
-    Configured,
-    Downlink,
-    FrameError,
-    FrameErrorKind,
-    FromBoard,
-    FromDongle,
-    Hello,
-    Info,
-    Key,
-    KeyState,
-    Param,
-    ParamGet,
-    ParamSet,
-    Ping,
-    Poll,
-    Pong,
-    Record,
-    RecordPart,
-    Refusal,
-    Result,
-    Samples,
-    Sense,
-    State,
-    Store,
-    ToBoard,
-    ToDongle,
-    Transmit,
-    Uplink,
-)
+from t3mpc_ros.radio.protocol import frames
 
 
 class ExchangeStatus(NamedTuple):
@@ -73,14 +37,19 @@ def decode_exchange_status(status: int) -> ExchangeStatus:
         or (has_payload and not acknowledged)
         or (skipped and retransmissions)
     ):
-        raise FrameError(
-            FrameErrorKind.VALUE, f'RESULT.status must be consistent: got {status:#04x}'
+        raise frames.FrameError(
+            frames.FrameErrorKind.VALUE, f'RESULT.status must be consistent: got {status:#04x}'
         )
     return ExchangeStatus(acknowledged, has_payload, failed, skipped, retransmissions)
 
 
 def encode(
-    frame: Downlink | Uplink | ToDongle | FromDongle | ToBoard | FromBoard,
+    frame: frames.Downlink
+    | frames.Uplink
+    | frames.ToDongle
+    | frames.FromDongle
+    | frames.ToBoard
+    | frames.FromBoard,
 ) -> bytes:
     """Return the bytes of a frame, without the CRC of the serial line.
 
@@ -89,60 +58,60 @@ def encode(
     layout = _LAYOUTS[type(frame)]
     # The last field shows whether the optional end (nonce, tag, address) is present.
     fixed = layout.forms[-1 if frame[-1] != b'' else 0].pack(frame)
-    if isinstance(frame, Transmit):
+    if isinstance(frame, frames.Transmit):
         _check_payloads(frame)
         return fixed + bytes([len(frame.first)]) + frame.first + frame.second
-    if isinstance(frame, Result):
+    if isinstance(frame, frames.Result):
         _check_result_payload(frame)
         return fixed + frame.payload
     return fixed
 
 
-def decode_downlink(data: bytes) -> Downlink:
+def decode_downlink(data: bytes) -> frames.Downlink:
     """Return the radio payload from a host, or raise FrameError."""
     return _decode(data, _DOWNLINK)  # type: ignore[no-any-return]
 
 
-def decode_uplink(data: bytes) -> Uplink:
+def decode_uplink(data: bytes) -> frames.Uplink:
     """Return the radio payload from a robot, or raise FrameError."""
     return _decode(data, _UPLINK)  # type: ignore[no-any-return]
 
 
-def decode_to_dongle(data: bytes) -> ToDongle:
+def decode_to_dongle(data: bytes) -> frames.ToDongle:
     """Return the USB frame from the host to the dongle, or raise FrameError."""
     if data[:1] != b'\x01':
         return _decode(data, _TO_DONGLE)  # type: ignore[no-any-return]
     if len(data) < 4:
-        raise FrameError(
-            FrameErrorKind.LENGTH, f'TX must be at least 4 bytes long: got {len(data)}'
+        raise frames.FrameError(
+            frames.FrameErrorKind.LENGTH, f'TX must be at least 4 bytes long: got {len(data)}'
         )
     end = 4 + data[3]
-    frame = Transmit(data[1], data[2], data[4:end], data[end:])
+    frame = frames.Transmit(data[1], data[2], data[4:end], data[end:])
     if len(frame.first) != data[3]:
-        raise FrameError(
-            FrameErrorKind.LENGTH,
+        raise frames.FrameError(
+            frames.FrameErrorKind.LENGTH,
             f'TX must have {data[3]} bytes of payload: got {len(frame.first)}',
         )
     _check_payloads(frame)
     return frame
 
 
-def decode_from_dongle(data: bytes) -> FromDongle:
+def decode_from_dongle(data: bytes) -> frames.FromDongle:
     """Return the USB frame from the dongle to the host, or raise FrameError."""
     if data[:1] != b'\x81':
         return _decode(data, _FROM_DONGLE)  # type: ignore[no-any-return]
-    form = _LAYOUTS[Result].forms[0]
-    frame: Result = form.unpack(data[: form.size])._replace(payload=data[form.size :])
+    form = _LAYOUTS[frames.Result].forms[0]
+    frame: frames.Result = form.unpack(data[: form.size])._replace(payload=data[form.size :])
     _check_result_payload(frame)
     return frame
 
 
-def decode_to_board(data: bytes) -> ToBoard:
+def decode_to_board(data: bytes) -> frames.ToBoard:
     """Return the USB frame from the host to the robot board, or raise FrameError."""
     return _decode(data, _TO_BOARD)  # type: ignore[no-any-return]
 
 
-def decode_from_board(data: bytes) -> FromBoard:
+def decode_from_board(data: bytes) -> frames.FromBoard:
     """Return the USB frame from the robot board to the host, or raise FrameError."""
     return _decode(data, _FROM_BOARD)  # type: ignore[no-any-return]
 
@@ -158,14 +127,14 @@ class _Field(NamedTuple):
     def check(self, kind: str, value: object) -> None:
         if self.code.endswith('s'):
             if not isinstance(value, bytes) or len(value) != self.high:
-                raise FrameError(
-                    FrameErrorKind.VALUE,
+                raise frames.FrameError(
+                    frames.FrameErrorKind.VALUE,
                     f'{kind}.{self.name} must be {self.high} bytes: got {value!r}',
                 )
         elif not isinstance(value, int) or not self.low <= value <= self.high:
             bound = f'from {self.low} to {self.high}' if self.low < self.high else f'{self.low}'
-            raise FrameError(
-                FrameErrorKind.VALUE, f'{kind}.{self.name} must be {bound}: got {value!r}'
+            raise frames.FrameError(
+                frames.FrameErrorKind.VALUE, f'{kind}.{self.name} must be {bound}: got {value!r}'
             )
 
 
@@ -206,8 +175,8 @@ class _Form:
             if name not in self._names and name not in _VARIABLE_FIELDS:
                 value = getattr(frame, name)
                 if value != default:
-                    raise FrameError(
-                        FrameErrorKind.VALUE,
+                    raise frames.FrameError(
+                        frames.FrameErrorKind.VALUE,
                         f'{self._name}.{name} must be {default!r} without '
                         f'{self._kind._fields[-1]}: got {value!r}',
                     )
@@ -215,8 +184,8 @@ class _Form:
 
     def unpack(self, data: bytes) -> Any:
         if len(data) != self.size:
-            raise FrameError(
-                FrameErrorKind.LENGTH,
+            raise frames.FrameError(
+                frames.FrameErrorKind.LENGTH,
                 f'{self._name} must be at least {self.size} bytes long: got {len(data)}',
             )
         values = {}
@@ -244,42 +213,46 @@ def _layout(kind: Any, name: str, head: int, fields: str, *longer: str) -> _Layo
 
 
 def _decode(data: bytes, table: dict[int, _Layout]) -> Any:
-    if not data or len(data) > PAYLOAD_LIMIT:
-        raise FrameError(
-            FrameErrorKind.LENGTH, f'a frame must have 1 to {PAYLOAD_LIMIT} bytes: got {len(data)}'
+    if not data or len(data) > frames.PAYLOAD_LIMIT:
+        raise frames.FrameError(
+            frames.FrameErrorKind.LENGTH,
+            f'a frame must have 1 to {frames.PAYLOAD_LIMIT} bytes: got {len(data)}',
         )
     layout = table.get(data[0])
     if layout is None:
-        if table in (_DOWNLINK, _UPLINK) and data[0] >> 4 != VERSION:
-            raise FrameError(
-                FrameErrorKind.VERSION, f'version must be {VERSION}: got {data[0] >> 4}'
+        if table in (_DOWNLINK, _UPLINK) and data[0] >> 4 != frames.VERSION:
+            raise frames.FrameError(
+                frames.FrameErrorKind.VERSION,
+                f'version must be {frames.VERSION}: got {data[0] >> 4}',
             )
-        raise FrameError(FrameErrorKind.KIND, f'kind of frame must be known: got {data[0]:#04x}')
+        raise frames.FrameError(
+            frames.FrameErrorKind.KIND, f'kind of frame must be known: got {data[0]:#04x}'
+        )
     for form in layout.forms:
         if form.size == len(data):
             return form.unpack(data)
     sizes = ' or '.join(str(form.size) for form in layout.forms)
-    raise FrameError(
-        FrameErrorKind.LENGTH, f'{layout.name} must be {sizes} bytes long: got {len(data)}'
+    raise frames.FrameError(
+        frames.FrameErrorKind.LENGTH, f'{layout.name} must be {sizes} bytes long: got {len(data)}'
     )
 
 
-def _check_payloads(frame: Transmit) -> None:
+def _check_payloads(frame: frames.Transmit) -> None:
     for name, payload, least in (('first', frame.first, 1), ('second', frame.second, 0)):
-        if not least <= len(payload) <= PAYLOAD_LIMIT:
-            raise FrameError(
-                FrameErrorKind.LENGTH,
-                f'TX.{name} must have {least} to {PAYLOAD_LIMIT} bytes: got {len(payload)}',
+        if not least <= len(payload) <= frames.PAYLOAD_LIMIT:
+            raise frames.FrameError(
+                frames.FrameErrorKind.LENGTH,
+                f'TX.{name} must have {least} to {frames.PAYLOAD_LIMIT} bytes: got {len(payload)}',
             )
 
 
-def _check_result_payload(frame: Result) -> None:
+def _check_result_payload(frame: frames.Result) -> None:
     statuses = decode_exchange_status(frame.first), decode_exchange_status(frame.second)
     expected = any(status.has_payload for status in statuses)
-    if len(frame.payload) > PAYLOAD_LIMIT or bool(frame.payload) != expected:
-        bound = f'1 to {PAYLOAD_LIMIT}' if expected else 'no'
-        raise FrameError(
-            FrameErrorKind.LENGTH,
+    if len(frame.payload) > frames.PAYLOAD_LIMIT or bool(frame.payload) != expected:
+        bound = f'1 to {frames.PAYLOAD_LIMIT}' if expected else 'no'
+        raise frames.FrameError(
+            frames.FrameErrorKind.LENGTH,
             f'RESULT.payload must have {bound} bytes: got {len(frame.payload)}',
         )
 
@@ -301,34 +274,34 @@ _RADIO_SETUP = (
 _SIGNATURE = ', host_us I, tag 8s'
 
 _DOWNLINK = {
-    0x21: _layout(Command, 'CMD', 0x21, _COMMAND, _COMMAND + _SIGNATURE),
-    0x22: _layout(ParamGet, 'PARAM_GET', 0x22, 'session B, seq B, id B'),
-    0x23: _layout(ParamSet, 'PARAM_SET', 0x23, _PARAM_SET, _PARAM_SET + _SIGNATURE),
+    0x21: _layout(frames.Command, 'CMD', 0x21, _COMMAND, _COMMAND + _SIGNATURE),
+    0x22: _layout(frames.ParamGet, 'PARAM_GET', 0x22, 'session B, seq B, id B'),
+    0x23: _layout(frames.ParamSet, 'PARAM_SET', 0x23, _PARAM_SET, _PARAM_SET + _SIGNATURE),
     0x24: _layout(
-        Hello,
+        frames.Hello,
         'HELLO',
         0x24,
         'session B 1 255, seq B, flags B 0 0',
         'session B 1 255, seq B, flags B 1 1, host_us I, nonce 8s, tag 8s',
     ),
-    0x25: _layout(Poll, 'POLL', 0x25, 'session B, seq B, what B 0 2'),
-    0x26: _layout(Action, 'ACTION', 0x26, _ACTION, _ACTION + _SIGNATURE),
+    0x25: _layout(frames.Poll, 'POLL', 0x25, 'session B, seq B, what B 0 2'),
+    0x26: _layout(frames.Action, 'ACTION', 0x26, _ACTION, _ACTION + _SIGNATURE),
 }
 _UPLINK = {
     0x21: _layout(
-        State,
+        frames.State,
         'STATE',
         0x21,
         'session B, seq B, status B, time_us I, left i, right i, gyro_z h, accel_x h, '
         'accel_y h, age H, ranges 8s',
     ),
     0x22: _layout(
-        Param, 'PARAM', 0x22, 'session B, seq B, id B, rc B 0 4, value i, low i, high i'
+        frames.Param, 'PARAM', 0x22, 'session B, seq B, id B, rc B 0 4, value i, low i, high i'
     ),
-    0x23: _layout(Info, 'INFO', 0x23, _INFO, _INFO + ', nonce 8s'),
-    0x24: _layout(Ack, 'ACK', 0x24, 'session B, seq B, verb B, rc B 0 4'),
+    0x23: _layout(frames.Info, 'INFO', 0x23, _INFO, _INFO + ', nonce 8s'),
+    0x24: _layout(frames.Ack, 'ACK', 0x24, 'session B, seq B, verb B, rc B 0 4'),
     0x25: _layout(
-        Aux,
+        frames.Aux,
         'AUX',
         0x25,
         'session B, seq B, status B, battery H, temperature h, accel_z h, gyro_x h, gyro_y h, '
@@ -337,43 +310,43 @@ _UPLINK = {
     ),
 }
 _TO_DONGLE = {
-    0x01: _layout(Transmit, 'TX', 0x01, 'id B, gap B'),
-    0x02: _layout(Configure, 'CFG', 0x02, 'id B', _RADIO_SETUP),
-    0x03: _layout(Ping, 'PING', 0x03, 'id B, echo 4s'),
+    0x01: _layout(frames.Transmit, 'TX', 0x01, 'id B, gap B'),
+    0x02: _layout(frames.Configure, 'CFG', 0x02, 'id B', _RADIO_SETUP),
+    0x03: _layout(frames.Ping, 'PING', 0x03, 'id B, echo 4s'),
 }
 _FROM_DONGLE = {
-    0x81: _layout(Result, 'RESULT', 0x81, 'id B, first B, second B, dongle_us I'),
-    0x82: _layout(Configured, 'CFG', 0x82, _RADIO_SETUP + ', chip_ok B 0 1'),
+    0x81: _layout(frames.Result, 'RESULT', 0x81, 'id B, first B, second B, dongle_us I'),
+    0x82: _layout(frames.Configured, 'CFG', 0x82, _RADIO_SETUP + ', chip_ok B 0 1'),
     0x83: _layout(
-        Pong,
+        frames.Pong,
         'PONG',
         0x83,
         'id B, echo 4s, time_us I, protocol B, major B, minor B, chip_ok B 0 1, '
         'crc_errors H, frame_errors H, overruns H, reset_cause B, settings B 0 5, '
         'channel B 0 125, address 5s, build I',
     ),
-    0x8F: _layout(Refusal, 'ERR', 0x8F, 'code B 1 3, argument B'),
+    0x8F: _layout(frames.Refusal, 'ERR', 0x8F, 'code B 1 3, argument B'),
 }
 _TO_BOARD = {
     0x03: _TO_DONGLE[0x03],
-    0x04: _layout(Key, 'KEY', 0x04, 'id B', 'id B, key 16s'),
+    0x04: _layout(frames.Key, 'KEY', 0x04, 'id B', 'id B, key 16s'),
     0x06: _layout(
-        Record, 'RECORD', 0x06, 'id B, record B, part B', 'id B, record B, part B, data 16s'
+        frames.Record, 'RECORD', 0x06, 'id B, record B, part B', 'id B, record B, part B, data 16s'
     ),
-    0x07: _layout(Store, 'STORE', 0x07, 'id B, record B, crc H'),
-    0x08: _layout(Sense, 'SENSE', 0x08, 'id B'),
+    0x07: _layout(frames.Store, 'STORE', 0x07, 'id B, record B, crc H'),
+    0x08: _layout(frames.Sense, 'SENSE', 0x08, 'id B'),
 }
 _FROM_BOARD = {
     0x83: _FROM_DONGLE[0x83],
-    0x84: _layout(KeyState, 'KEY', 0x84, 'id B, rc B 0 5, state B 0 2, check I'),
+    0x84: _layout(frames.KeyState, 'KEY', 0x84, 'id B, rc B 0 5, state B 0 2, check I'),
     0x86: _layout(
-        RecordPart,
+        frames.RecordPart,
         'RECORD',
         0x86,
         'id B, rc B 0 5, record B, state B 0 4, size B, part B, data 16s',
     ),
     0x88: _layout(
-        Samples,
+        frames.Samples,
         'SENSE',
         0x88,
         'id B, ranges 16s, battery H, accel_x h, accel_y h, accel_z h, gyro_x h, gyro_y h, '

@@ -11,18 +11,9 @@ import numpy as np
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import CALIBRATION_RECORD, Pong, Samples
-from t3mpc_ros.radio.tool import link_test
+from t3mpc_ros.radio.tool import link_test, robot_records
 from t3mpc_ros.radio.tool.procedure import Pause, Script, wait_for_board
 from t3mpc_ros.radio.tool.robot_log import LogEntry, LogKind, read_log
-from t3mpc_ros.radio.tool.robot_records import (
-    NOT_MEASURED,
-    decode_calibration,
-    is_valid,
-    range_counts,
-    read_record,
-    read_samples,
-    unknown_record,
-)
 from t3mpc_ros.radio.tool.robot_settings import SETTINGS_TEXTS, StoredSettings, read_settings
 from t3mpc_ros.robot.calibration import (
     CONVERTER_COUNTS,
@@ -147,15 +138,15 @@ def examine_board() -> Script[BoardFindings]:
     """Return the records, the log and two seconds of samples of the robot board."""
     pong = yield from wait_for_board()
     settings = yield from read_settings()
-    stored = yield from read_record(CALIBRATION_RECORD)
+    stored = yield from robot_records.read_record(CALIBRATION_RECORD)
     try:
-        calibration = decode_calibration(stored.body)
+        calibration = robot_records.decode_calibration(stored.body)
     except ValueError as error:
-        raise unknown_record(error) from error
+        raise robot_records.unknown_record(error) from error
     log = yield from read_log()
     samples = []
     for _ in range(SAMPLE_COUNT):
-        samples.append((yield from read_samples()))
+        samples.append((yield from robot_records.read_samples()))
         yield Pause(_SAMPLE_PERIOD)
     return BoardFindings(pong, settings, stored.state, calibration, log, tuple(samples))
 
@@ -235,8 +226,8 @@ def _check_settings(found: BoardFindings, parameters: LinkParameters) -> list[Ch
 
 
 def _check_calibration(state: int, found: Calibration) -> Check:
-    usable = is_valid(state) or state == frames.SETTINGS_MISSING
-    if is_valid(state):
+    usable = robot_records.is_valid(state) or state == frames.SETTINGS_MISSING
+    if robot_records.is_valid(state):
         parts = [name for name in found._fields[:-1] if getattr(found, name) is not None]
         curves = sum(curve is not None for curve in found.curves)
         value = ', '.join([*parts, f'{curves} curves'])
@@ -298,14 +289,14 @@ def _check_imu(samples: Sequence[Samples]) -> list[Check]:
 
 
 def _check_ranges(found: BoardFindings) -> Check:
-    counts = np.array([range_counts(sample) for sample in found.samples])
+    counts = np.array([robot_records.range_counts(sample) for sample in found.samples])
     problems = []
     used = 0
     for number, kind in enumerate(found.settings.settings.sensors):
         if kind == 'none':
             continue
         used += 1
-        column = counts[counts[:, number] != NOT_MEASURED, number]
+        column = counts[counts[:, number] != robot_records.NOT_MEASURED, number]
         if not column.size:
             problems.append(f'A{number} not measured')
         elif (column > MAX_SHARP_COUNT).any():

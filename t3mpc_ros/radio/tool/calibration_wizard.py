@@ -22,20 +22,6 @@ from t3mpc_ros.radio.tool import procedure, robot_records, robot_settings
 from t3mpc_ros.radio.tool.manoeuvre import HandTurn, Manoeuvre, Rest
 from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, ProcedureError, Script
 from t3mpc_ros.robot import calibration
-from t3mpc_ros.robot.calibration import (
-    COVERAGE,
-    MARKS,
-    Calibration,
-    CalibrationError,
-    Estimate,
-    GyroTurn,
-    MarkUncertainty,
-    RangeReading,
-    Recording,
-    SharpCurve,
-    StraightRun,
-    VoltageReading,
-)
 from t3mpc_ros.robot.interface import WheelAngles
 
 Value = TypeVar('Value')
@@ -91,15 +77,17 @@ class CalibrationRobot:
         self._interrupted = interrupted
         self._report = report
 
-    def rest(self, seconds: float) -> Recording:
+    def rest(self, seconds: float) -> calibration.Recording:
         """Return a recording of the robot at rest."""
         return self._record(Rest(*self._link, seconds, self._report))
 
-    def drive(self, angles: WheelAngles, speed: float, rests: tuple[float, float]) -> Recording:
+    def drive(
+        self, angles: WheelAngles, speed: float, rests: tuple[float, float]
+    ) -> calibration.Recording:
         """Turn the wheels by angles (rad); return the recording with the rests around it."""
         return self._record(Manoeuvre(*self._link, angles, speed, self._report, rests))
 
-    def turn_by_hand(self, timeout: float, rests: tuple[float, float]) -> Recording:
+    def turn_by_hand(self, timeout: float, rests: tuple[float, float]) -> calibration.Recording:
         """Return the recording of a turn by hand between two rests."""
         return self._record(HandTurn(*self._link, timeout, self._report, rests))
 
@@ -114,14 +102,14 @@ class CalibrationRobot:
             raise ProcedureError('the robot has no valid settings: t3mpc robot setup')
         return stored.settings.divider
 
-    def store(self, found: Calibration) -> None:
+    def store(self, found: calibration.Calibration) -> None:
         """Store a calibration in the robot, in place of the one that it has."""
         try:
             self._at_board(robot_records.write_calibration(found))
         except ValueError as error:
             raise ProcedureError(f'the robot cannot hold this calibration: {error}') from error
 
-    def stored(self) -> Calibration:
+    def stored(self) -> calibration.Calibration:
         """Return the calibration in the robot."""
         return self._at_board(robot_records.read_calibration())
 
@@ -133,7 +121,7 @@ class CalibrationRobot:
                 raise Interrupted from error
             raise
 
-    def _record(self, task: Manoeuvre) -> Recording:
+    def _record(self, task: Manoeuvre) -> calibration.Recording:
         procedure.run_at_port(task, self._port, self._interrupted)
         if self._interrupted():
             raise Interrupted
@@ -145,7 +133,7 @@ class CalibrationRobot:
 class WizardOptions(NamedTuple):
     """What is measured, and how sure a person is of it."""
 
-    marks: MarkUncertainty = MARKS
+    marks: calibration.MarkUncertainty = calibration.MARKS
     geometry: WheelGeometry = WheelGeometry()
     """Nominal wheels, which decide how far the robot drives."""
     steps: tuple[str, ...] = tuple(STEPS)
@@ -176,17 +164,17 @@ class CalibrationWizard:
         ask: Callable[[str], str],
         show: Callable[[str], None],
         options: WizardOptions,
-        start: Calibration,
+        start: calibration.Calibration,
     ) -> None:
         self._robot = robot
         self._ask = ask
         self._show = show
         self._options = options
-        self._turns: list[tuple[float, GyroTurn]] = []
+        self._turns: list[tuple[float, calibration.GyroTurn]] = []
         self.calibration = start
         """The values so far."""
 
-    def run(self) -> Calibration:
+    def run(self) -> calibration.Calibration:
         """Run the steps; return the calibration."""
         steps = [step for step in STEPS if step in self._options.steps]
         if not self._robot.has_usb:
@@ -213,7 +201,7 @@ class CalibrationWizard:
         while True:
             try:
                 action()
-            except (CalibrationError, ProcedureError) as error:
+            except (calibration.CalibrationError, ProcedureError) as error:
                 self._show(f'  Refused: {error}')
                 if self._answer(f'  Enter to repeat, or {_SKIP}: ') in ('', *_YES):
                     continue
@@ -247,7 +235,7 @@ class CalibrationWizard:
         self._do(
             f'Put the robot on the floor with {options.distance + 0.5:g} m free in front of it.'
         )
-        runs: list[StraightRun] = []
+        runs: list[calibration.StraightRun] = []
         for way, sign in (('forward', 1.0), ('back', -1.0)):
             self._confirm(
                 f'Mark where a wheel touches the floor. The robot drives {options.distance:g} m '
@@ -263,7 +251,7 @@ class CalibrationWizard:
             distance = self._number(
                 'Mark where it touches the floor now. Between both marks, in m: '
             )
-            runs.append(StraightRun(distance, right, left))
+            runs.append(calibration.StraightRun(distance, right, left))
             # Refused now, not after the way back.
             found = calibration.estimate_wheel_radius(runs, options.marks)
         self._keep(wheel_radius=found)
@@ -274,7 +262,7 @@ class CalibrationWizard:
         options, geometry = self._options, self._options.geometry
         radius = self.calibration.wheel_radius
         if radius is None:
-            raise CalibrationError(
+            raise calibration.CalibrationError(
                 'the track needs a wheel radius: got none; run the step radius before'
             )
         self._do(
@@ -327,7 +315,7 @@ class CalibrationWizard:
             self._repeat(partial(self._measure_side, side, first))
 
     def _measure_side(self, side: str, first: int) -> None:
-        readings: tuple[list[RangeReading], list[RangeReading]] = ([], [])
+        readings: tuple[list[calibration.RangeReading], list[calibration.RangeReading]] = ([], [])
         for nominal in self._options.distances:
             distance = self._number(
                 f'{side}: put the board at {nominal:g} m. Enter, or its distance in m: ', nominal
@@ -335,7 +323,7 @@ class CalibrationWizard:
             counts = self._robot.counts(_SAMPLES)
             for number in (0, 1):
                 of_sensor = tuple(each[first + number] for each in counts)
-                readings[number].append(RangeReading(distance, of_sensor))
+                readings[number].append(calibration.RangeReading(distance, of_sensor))
             seen = (
                 f'{RANGE_SENSORS[first + number]} {np.mean(readings[number][-1].counts):.1f}'
                 for number in (0, 1)
@@ -346,8 +334,8 @@ class CalibrationWizard:
             name = RANGE_SENSORS[first + number]
             try:
                 curve = calibration.estimate_sharp_curve(readings[number], self._options.marks)
-            except CalibrationError as error:
-                raise CalibrationError(f'{name}: {error}') from error
+            except calibration.CalibrationError as error:
+                raise calibration.CalibrationError(f'{name}: {error}') from error
             curves[first + number] = curve
             self._result(f'{name} {_curve(curve)}')
         self._keep(curves=tuple(curves))
@@ -365,17 +353,17 @@ class CalibrationWizard:
             counts = float(np.mean([each[-1] for each in self._robot.counts(_SAMPLES)]))
             nominal = calibration.nominal_battery_voltage(counts, divider)
             self._see(f'mean count {counts:.1f}: {nominal:.3f} V without correction')
-            readings.append(VoltageReading(meter, nominal))
+            readings.append(calibration.VoltageReading(meter, nominal))
         found = calibration.estimate_divider(readings, divider, marks)
         self._keep(divider=found)
         self._result(
             f'battery voltage times {1.0 + found.gain:.4f}, plus {found.offset:+.3f} V, '
-            f'± {COVERAGE * found.uncertainty:.3f} V'
+            f'± {calibration.COVERAGE * found.uncertainty:.3f} V'
         )
 
     # -- questions --------------------------------------------------------------------------------
 
-    def _read_turn(self, recording: Recording) -> tuple[float, GyroTurn]:
+    def _read_turn(self, recording: calibration.Recording) -> tuple[float, calibration.GyroTurn]:
         """Return the yaw (rad) of a turn, by its mark, and what the gyro measured."""
         turn = calibration.measure_turn(recording)
         fastest = math.degrees(float(np.max(np.abs(recording.rates))))
@@ -431,7 +419,7 @@ class CalibrationWizard:
 _FULL_SCALE = math.degrees(calibration.GYRO_FULL_SCALE)
 
 
-def summary(found: Calibration) -> list[str]:
+def summary(found: calibration.Calibration) -> list[str]:
     """Return the lines of a calibration: value and interval of 95 %."""
     lines = ['Calibration, with intervals of 95 %:']
     for name, text in (
@@ -441,7 +429,7 @@ def summary(found: Calibration) -> list[str]:
         ('bias of the gyro', found.gyro_bias and f'{_degrees(found.gyro_bias)} deg/s'),
         (
             'battery voltage',
-            found.divider and f'± {COVERAGE * found.divider.uncertainty:.3f} V',
+            found.divider and f'± {calibration.COVERAGE * found.divider.uncertainty:.3f} V',
         ),
     ):
         lines.append(f'  {name:<18}  {text or "not calibrated"}')
@@ -450,27 +438,27 @@ def summary(found: Calibration) -> list[str]:
     return lines
 
 
-def _travelled(recording: Recording) -> tuple[float, float]:
+def _travelled(recording: calibration.Recording) -> tuple[float, float]:
     """Return the angles of both wheels, right first, rad."""
     right, left = recording.right, recording.left
     return float(right[-1] - right[0]), float(left[-1] - left[0])
 
 
-def _value(estimate: Estimate, factor: float, digits: int) -> str:
-    half = factor * COVERAGE * estimate.uncertainty
+def _value(estimate: calibration.Estimate, factor: float, digits: int) -> str:
+    half = factor * calibration.COVERAGE * estimate.uncertainty
     return f'{factor * estimate.value:.{digits}f} ± {half:.{digits}f}'
 
 
-def _millimetres(estimate: Estimate) -> str:
+def _millimetres(estimate: calibration.Estimate) -> str:
     return _value(estimate, 1e3, 3)
 
 
-def _degrees(estimate: Estimate) -> str:
+def _degrees(estimate: calibration.Estimate) -> str:
     return _value(estimate, math.degrees(1.0), 3)
 
 
-def _curve(curve: SharpCurve) -> str:
+def _curve(curve: calibration.SharpCurve) -> str:
     return (
         f'{curve.scale:.4f} V m / (d + {curve.shift:.4f} m) + {curve.offset:.4f} V, '
-        f'± {1e3 * COVERAGE * curve.uncertainty:.0f} mm or better'
+        f'± {1e3 * calibration.COVERAGE * curve.uncertainty:.0f} mm or better'
     )

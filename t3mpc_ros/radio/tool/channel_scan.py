@@ -11,14 +11,7 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_exchange_status, encode
 from t3mpc_ros.radio.protocol.frames import Poll, Result, Transmit
-from t3mpc_ros.radio.tool.procedure import (
-    ProcedureError,
-    Request,
-    Script,
-    configure_radio,
-    read_radio_setup,
-    wait_for_dongle,
-)
+from t3mpc_ros.radio.tool import procedure
 
 CHANNELS = 126
 _MIN_PACKETS = 2
@@ -45,10 +38,10 @@ class ChannelResult(NamedTuple):
 
 def scan_channels(
     parameters: LinkParameters, rates: Sequence[str], progress: Progress
-) -> Script[list[ChannelResult]]:
+) -> procedure.Script[list[ChannelResult]]:
     """Return where the robot answers; restore the radio configuration of the dongle."""
-    yield from wait_for_dongle()
-    before = yield from read_radio_setup()
+    yield from procedure.wait_for_dongle()
+    before = yield from procedure.read_radio_setup()
     results: list[ChannelResult] = []
     try:
         total = CHANNELS * len(rates)
@@ -59,17 +52,19 @@ def scan_channels(
                 results.append(result)
             progress(number + 1, total, '' if result is None else format_channel(result))
     finally:
-        yield from configure_radio(before)
+        yield from procedure.configure_radio(before)
     return results
 
 
-def _test_channel(parameters: LinkParameters) -> Script[ChannelResult | None]:
-    yield from configure_radio(parameters.configure(0))
+def _test_channel(parameters: LinkParameters) -> procedure.Script[ChannelResult | None]:
+    yield from procedure.configure_radio(parameters.configure(0))
     packets = answered = retransmissions = 0
     while packets < (_MIN_PACKETS if not answered else _PACKETS):
-        response = yield Request(Transmit(0, 0, encode(Poll(0, 0, frames.STATE))), _REPLY_TIMEOUT)
+        response = yield procedure.Request(
+            Transmit(0, 0, encode(Poll(0, 0, frames.STATE))), _REPLY_TIMEOUT
+        )
         if not isinstance(response.reply, Result):
-            raise ProcedureError(reasons.DONGLE_TIMEOUT)
+            raise procedure.ProcedureError(reasons.DONGLE_TIMEOUT)
         status = decode_exchange_status(response.reply.first)
         packets += 1
         answered += status.acknowledged

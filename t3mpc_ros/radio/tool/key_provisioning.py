@@ -9,13 +9,7 @@ from pathlib import Path
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KEY_SIZE, KeyFileError, key_check
 from t3mpc_ros.radio.protocol.frames import Key, KeyState
-from t3mpc_ros.radio.tool.procedure import (
-    ProcedureError,
-    Request,
-    Script,
-    request_reply,
-    wait_for_board,
-)
+from t3mpc_ros.radio.tool import procedure
 
 ERASE_KEY = bytes(KEY_SIZE)
 """Key value that erases the stored key."""
@@ -45,39 +39,41 @@ def create_key_file(path: Path, entropy: Callable[[int], bytes]) -> int:
     return key_check(key)
 
 
-def read_key_state() -> Script[KeyState]:
+def read_key_state() -> procedure.Script[KeyState]:
     """Return the state of the key in the robot."""
-    yield from wait_for_board()
-    return (yield from request_reply(Key(0), KeyState))
+    yield from procedure.wait_for_board()
+    return (yield from procedure.request_reply(Key(0), KeyState))
 
 
-def write_key(key: bytes) -> Script[KeyState]:
+def write_key(key: bytes) -> procedure.Script[KeyState]:
     """Store a key in the robot, or erase it (:data:`ERASE_KEY`); return the resulting state.
 
     A lost answer is harmless: the state of the key is read back.
     """
-    yield from wait_for_board()
-    yield from request_reply(Key(0), KeyState)  # rejects a dongle, before the key is sent
+    yield from procedure.wait_for_board()
+    yield from procedure.request_reply(
+        Key(0), KeyState
+    )  # rejects a dongle, before the key is sent
     for _ in range(_MAX_ATTEMPTS):
-        response = yield Request(Key(0, key), _WRITE_TIMEOUT)
+        response = yield procedure.Request(Key(0, key), _WRITE_TIMEOUT)
         reply = response.reply
         if isinstance(reply, KeyState):
             key_state = reply
         else:
-            key_state = yield from request_reply(Key(0), KeyState)
+            key_state = yield from procedure.request_reply(Key(0), KeyState)
         if key_state.rc == frames.BUSY:
-            raise ProcedureError(
+            raise procedure.ProcedureError(
                 'the robot stores no key while it moves or its drivers are on: stop the bridge, '
                 'or press the reset button of the board'
             )
         if key_state.rc == frames.FAILED:
-            raise ProcedureError(
+            raise procedure.ProcedureError(
                 'the EEPROM of the board did not store the key: the robot is locked; try again; '
                 'if it fails repeatedly, the chip is worn out'
             )
         if holds_key(key_state, key):
             return key_state
-    raise ProcedureError('the robot does not confirm the key: is the cable good?')
+    raise procedure.ProcedureError('the robot does not confirm the key: is the cable good?')
 
 
 def holds_key(key_state: KeyState, key: bytes) -> bool:

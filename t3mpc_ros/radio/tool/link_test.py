@@ -12,24 +12,7 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.statistics import LOSS_LIMIT, RETRY_COUNTS, ROUND_TRIP_LIMIT
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_exchange_status, decode_uplink, encode
-from t3mpc_ros.radio.protocol.frames import (
-    FrameError,
-    Ping,
-    Poll,
-    Pong,
-    Result,
-    State,
-    StatusFlag,
-    Transmit,
-)
-from t3mpc_ros.radio.tool.procedure import (
-    Pause,
-    Request,
-    Script,
-    configure_radio,
-    read_radio_setup,
-    wait_for_dongle,
-)
+from t3mpc_ros.radio.tool import procedure
 
 _REPLY_TIMEOUT = 0.25
 """s"""
@@ -40,9 +23,9 @@ _MAX_MEAN_RETRIES = 0.5
 """Mean retransmissions per packet above which the radio has no margin."""
 _SEARCH = '{} t3mpc robot scan searches all channels; '
 _PROBLEMS = {
-    StatusFlag.ESTOP: 'its emergency stop is latched',
-    StatusFlag.IMU_FAULT: 'its inertial sensor does not answer: SDA at 20, SCL at 21, 5 V',
-    StatusFlag.LOW_BATTERY: 'its battery is low, or its divider differs from docs/robot.md',
+    frames.StatusFlag.ESTOP: 'its emergency stop is latched',
+    frames.StatusFlag.IMU_FAULT: 'its inertial sensor does not answer: SDA at 20, SCL at 21, 5 V',
+    frames.StatusFlag.LOW_BATTERY: 'its battery is low, or its divider differs from docs/robot.md',
 }
 
 
@@ -59,7 +42,7 @@ class LinkTestResult(NamedTuple):
     """Number of acknowledged packets with 0, 1, … 15 retransmissions."""
     line_errors: int
     """Frames that reached the dongle damaged during the test."""
-    state: State | None
+    state: frames.State | None
     """Last STATE of the robot."""
 
 
@@ -72,55 +55,57 @@ class ReportRow(NamedTuple):
     remedy: str = ''
 
 
-def run_link_test(parameters: LinkParameters, count: int) -> Script[LinkTestResult]:
+def run_link_test(parameters: LinkParameters, count: int) -> procedure.Script[LinkTestResult]:
     """Send ``count`` requests over USB and by radio; restore the radio configuration."""
-    first = yield from wait_for_dongle()
+    first = yield from procedure.wait_for_dongle()
     pings = []
     last = first
     for _ in range(count):
-        response = yield Request(Ping(0, b'ping'), _REPLY_TIMEOUT)
-        if isinstance(response.reply, Pong):
+        response = yield procedure.Request(frames.Ping(0, b'ping'), _REPLY_TIMEOUT)
+        if isinstance(response.reply, frames.Pong):
             pings.append(response.round_trip)
             last = response.reply
-    before = yield from read_radio_setup()
+    before = yield from procedure.read_radio_setup()
     cycles: list[float] = []
     retries = [0] * RETRY_COUNTS
     state = None
     try:
-        yield from configure_radio(parameters.configure(0))
-        poll = encode(Poll(0, 0, frames.STATE))
+        yield from procedure.configure_radio(parameters.configure(0))
+        poll = encode(frames.Poll(0, 0, frames.STATE))
         for _ in range(count):
-            response = yield Request(Transmit(0, parameters.gap, poll, poll), _REPLY_TIMEOUT)
+            response = yield procedure.Request(
+                frames.Transmit(0, parameters.gap, poll, poll), _REPLY_TIMEOUT
+            )
             fetched = _read_state(response.reply, retries)
             if fetched is not None:
                 state = fetched
                 cycles.append(response.round_trip)
             elapsed = (response.returned_ns - response.sent_ns) / NANOSECONDS
-            yield Pause(max(1.0 / parameters.cycle_rate - elapsed, 0.0))
+            yield procedure.Pause(max(1.0 / parameters.cycle_rate - elapsed, 0.0))
     finally:
-        yield from configure_radio(before)
+        yield from procedure.configure_radio(before)
     errors = _line_errors(last) - _line_errors(first) & 0xFFFF
     return LinkTestResult(count, tuple(pings), tuple(cycles), tuple(retries), errors, state)
 
 
-def _read_state(reply: object, retries: list[int]) -> State | None:
+def _read_state(reply: object, retries: list[int]) -> frames.State | None:
     """Count the retransmissions of a cycle; return its STATE.
 
     A retransmission of the first packet may fetch the new STATE; the second then returns none.
     """
-    if not isinstance(reply, Result):
+    if not isinstance(reply, frames.Result):
         return None
     for status in (decode_exchange_status(reply.first), decode_exchange_status(reply.second)):
         if status.acknowledged:
             retries[status.retransmissions] += 1
     try:
         payload = decode_uplink(reply.payload)
-    except FrameError:
+    except frames.FrameError:
         return None
-    return payload if isinstance(payload, State) else None
+    return payload if isinstance(payload, frames.State) else None
 
 
-def _line_errors(pong: Pong) -> int:
+def _line_errors(pong: frames.Pong) -> int:
     return pong.crc_errors + pong.frame_errors + pong.overruns
 
 
@@ -178,7 +163,7 @@ def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[ReportR
             ),
         ]
     if (state := result.state) is not None:
-        found = [text for bit, text in _PROBLEMS.items() if StatusFlag(state.status) & bit]
+        found = [text for bit, text in _PROBLEMS.items() if frames.StatusFlag(state.status) & bit]
         session = f'in session {state.session}' if state.session else 'in no session'
         rows.append(ReportRow('robot', session, _verdict(not found), '; '.join(found)))
     return rows

@@ -16,31 +16,21 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.port_actions import Close, Open, PortAction, Wait, Write
+from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_from_board, decode_from_dongle, encode
-from t3mpc_ros.radio.protocol.frames import (
-    Configure,
-    Configured,
-    FrameError,
-    FromBoard,
-    FromDongle,
-    Key,
-    KeyState,
-    Ping,
-    Pong,
-    Record,
-    RecordPart,
-    Refusal,
-    Result,
-    Samples,
-    Sense,
-    Store,
-    Transmit,
-)
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 from t3mpc_ros.radio.serial_port import PortError, SerialPort
 
-RequestFrame = Ping | Configure | Transmit | Key | Record | Store | Sense
-ReplyFrame = FromDongle | FromBoard
+RequestFrame = (
+    frames.Ping
+    | frames.Configure
+    | frames.Transmit
+    | frames.Key
+    | frames.Record
+    | frames.Store
+    | frames.Sense
+)
+ReplyFrame = frames.FromDongle | frames.FromBoard
 
 NO_BOARD = 'no robot board answers on this port: is it the USB port of the robot?'
 WRONG_BOARD = (
@@ -98,7 +88,7 @@ class Response(NamedTuple):
 
 
 Value = TypeVar('Value')
-Reply = TypeVar('Reply', KeyState, RecordPart, Samples)
+Reply = TypeVar('Reply', frames.KeyState, frames.RecordPart, frames.Samples)
 Script = Generator[Request | Pause, Response, Value]
 """A script; its return value is the result of the procedure."""
 
@@ -186,7 +176,7 @@ class Procedure(Generic[Value]):
         for data in self._decoder.feed(received):
             try:
                 reply = self._decode(data)
-            except FrameError:
+            except frames.FrameError:
                 continue  # from another kind of board, or damaged with a valid CRC
             if self._request is not None and _is_reply_to(reply, self._request):
                 self._resume(reply, now_ns)
@@ -227,27 +217,27 @@ class Procedure(Generic[Value]):
 
 
 def _is_reply_to(reply: ReplyFrame, request: RequestFrame) -> bool:
-    if isinstance(reply, Refusal):
+    if isinstance(reply, frames.Refusal):
         return True  # without an id, but only one request is in flight
     kinds = {
-        Ping: Pong,
-        Configure: Configured,
-        Transmit: Result,
-        Key: KeyState,
-        Record: RecordPart,
-        Store: RecordPart,
-        Sense: Samples,
+        frames.Ping: frames.Pong,
+        frames.Configure: frames.Configured,
+        frames.Transmit: frames.Result,
+        frames.Key: frames.KeyState,
+        frames.Record: frames.RecordPart,
+        frames.Store: frames.RecordPart,
+        frames.Sense: frames.Samples,
     }
     if not isinstance(reply, kinds[type(request)]) or reply.id != request.id:
         return False
-    return not isinstance(request, Ping) or getattr(reply, 'echo', b'') == request.echo
+    return not isinstance(request, frames.Ping) or getattr(reply, 'echo', b'') == request.echo
 
 
-def wait_for_board(absent: str = NO_BOARD) -> Script[Pong]:
+def wait_for_board(absent: str = NO_BOARD) -> Script[frames.Pong]:
     """Wait for a board to start; return its PONG, or raise ProcedureError(absent)."""
     for _ in range(_MAX_PINGS):
-        response = yield Request(Ping(0, b'look'), _PING_TIMEOUT)
-        if isinstance(response.reply, Pong):
+        response = yield Request(frames.Ping(0, b'look'), _PING_TIMEOUT)
+        if isinstance(response.reply, frames.Pong):
             return response.reply
     raise ProcedureError(absent)
 
@@ -258,43 +248,43 @@ def request_reply(frame: RequestFrame, kind: type[Reply]) -> Script[Reply]:
         response = yield Request(frame, _REPLY_TIMEOUT)
         if isinstance(response.reply, kind):
             return response.reply
-        if isinstance(response.reply, Refusal):
+        if isinstance(response.reply, frames.Refusal):
             # A robot board refuses this as well; the answer of a dongle is no frame of a robot.
-            configuration = yield Request(Configure(0), _REPLY_TIMEOUT)
-            is_robot = isinstance(configuration.reply, Refusal)
+            configuration = yield Request(frames.Configure(0), _REPLY_TIMEOUT)
+            is_robot = isinstance(configuration.reply, frames.Refusal)
             raise ProcedureError(OLD_FIRMWARE if is_robot else WRONG_BOARD)
     raise ProcedureError('the board stopped answering: did it restart, is the cable good?')
 
 
-def wait_for_dongle() -> Script[Pong]:
+def wait_for_dongle() -> Script[frames.Pong]:
     """Wait for a dongle with a working radio, or raise ProcedureError."""
     pong = yield from wait_for_board(reasons.NO_DONGLE)
-    response = yield Request(Configure(0), _PING_TIMEOUT)
-    if isinstance(response.reply, Refusal):
+    response = yield Request(frames.Configure(0), _PING_TIMEOUT)
+    if isinstance(response.reply, frames.Refusal):
         raise ProcedureError(reasons.ROBOT_USB)
     if not pong.chip_ok:
         raise ProcedureError(reasons.NO_CHIP)
     return pong
 
 
-def configure_radio(frame: Configure) -> Script[None]:
+def configure_radio(frame: frames.Configure) -> Script[None]:
     """Configure the radio of the dongle, or raise ProcedureError."""
     for _ in range(3):
         response = yield Request(frame, _PING_TIMEOUT)
         reply = response.reply
-        if isinstance(reply, Configured) and reply[1:-1] == frame[1:]:
+        if isinstance(reply, frames.Configured) and reply[1:-1] == frame[1:]:
             if not reply.chip_ok:
                 raise ProcedureError(reasons.NO_CHIP)
             return
     raise ProcedureError(reasons.RADIO_NOT_CONFIGURED)
 
 
-def read_radio_setup() -> Script[Configure]:
+def read_radio_setup() -> Script[frames.Configure]:
     """Return the radio configuration of the dongle, or raise ProcedureError."""
     for _ in range(3):
-        response = yield Request(Configure(0), _PING_TIMEOUT)
-        if isinstance(response.reply, Configured):
-            return Configure(*response.reply[:-1])
+        response = yield Request(frames.Configure(0), _PING_TIMEOUT)
+        if isinstance(response.reply, frames.Configured):
+            return frames.Configure(*response.reply[:-1])
     raise ProcedureError(reasons.DONGLE_TIMEOUT)
 
 

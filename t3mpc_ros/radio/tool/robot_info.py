@@ -10,28 +10,7 @@ from t3mpc_ros.radio.link.handshake import Session
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_uplink, encode
-from t3mpc_ros.radio.protocol.frames import (
-    BOARD_PARAMETERS,
-    VERSION,
-    Downlink,
-    FrameError,
-    FrameErrorKind,
-    Info,
-    Param,
-    ParamGet,
-    Poll,
-    Result,
-    Transmit,
-    Uplink,
-)
-from t3mpc_ros.radio.tool.procedure import (
-    ProcedureError,
-    Request,
-    Script,
-    configure_radio,
-    read_radio_setup,
-    wait_for_dongle,
-)
+from t3mpc_ros.radio.tool import procedure
 from t3mpc_ros.radio.tool.robot_settings import SETTINGS_TEXTS
 
 _REPLY_TIMEOUT = 0.25
@@ -42,22 +21,22 @@ _MAX_ATTEMPTS = 20
 class RobotInfo(NamedTuple):
     """Identity and board parameters of the robot."""
 
-    info: Info
-    values: tuple[Param, ...]
+    info: frames.Info
+    values: tuple[frames.Param, ...]
 
 
 def read_robot_info(
     parameters: LinkParameters, key: bytes, entropy: Callable[[int], bytes]
-) -> Script[RobotInfo]:
+) -> procedure.Script[RobotInfo]:
     """Return identity and board parameters of the robot.
 
     They are read in the current session of the robot, which continues undisturbed. Without one, a
     session is started, which needs the key if the robot has one.
     """
-    yield from wait_for_dongle()
-    before = yield from read_radio_setup()
+    yield from procedure.wait_for_dongle()
+    before = yield from procedure.read_radio_setup()
     try:
-        yield from configure_radio(parameters.configure(0))
+        yield from procedure.configure_radio(parameters.configure(0))
         info = yield from _request_info(parameters)
         if not info.session:
             info = yield from _start_session(parameters, Session(key, entropy, 0, 0))
@@ -65,53 +44,61 @@ def read_robot_info(
         for number in range(info.parameters):
             values.append((yield from _read_parameter(parameters, info.session, number)))
     finally:
-        yield from configure_radio(before)
+        yield from procedure.configure_radio(before)
     return RobotInfo(info, tuple(values))
 
 
-def _transact(parameters: LinkParameters, first: Downlink, what: int) -> Script[Uplink | None]:
-    payloads = encode(first), encode(Poll(0, 0, what))
-    response = yield Request(Transmit(0, parameters.gap_after(first), *payloads), _REPLY_TIMEOUT)
-    if isinstance(response.reply, Result) and response.reply.payload:
+def _transact(
+    parameters: LinkParameters, first: frames.Downlink, what: int
+) -> procedure.Script[frames.Uplink | None]:
+    payloads = encode(first), encode(frames.Poll(0, 0, what))
+    response = yield procedure.Request(
+        frames.Transmit(0, parameters.gap_after(first), *payloads), _REPLY_TIMEOUT
+    )
+    if isinstance(response.reply, frames.Result) and response.reply.payload:
         try:
             return decode_uplink(response.reply.payload)
-        except FrameError as error:
-            if error.kind is FrameErrorKind.VERSION:
+        except frames.FrameError as error:
+            if error.kind is frames.FrameErrorKind.VERSION:
                 version = response.reply.payload[0] >> 4
-                raise ProcedureError(reasons.robot_version(version)) from error
+                raise procedure.ProcedureError(reasons.robot_version(version)) from error
             return None
     return None
 
 
-def _request_info(parameters: LinkParameters) -> Script[Info]:
+def _request_info(parameters: LinkParameters) -> procedure.Script[frames.Info]:
     for _ in range(_MAX_ATTEMPTS):
-        answer = yield from _transact(parameters, Poll(0, 0, frames.INFO), frames.INFO)
-        if isinstance(answer, Info):
-            if answer.protocol != VERSION:
-                raise ProcedureError(reasons.robot_version(answer.protocol))
+        answer = yield from _transact(parameters, frames.Poll(0, 0, frames.INFO), frames.INFO)
+        if isinstance(answer, frames.Info):
+            if answer.protocol != frames.VERSION:
+                raise procedure.ProcedureError(reasons.robot_version(answer.protocol))
             return answer
-    raise ProcedureError(reasons.robot_absent(parameters.channel))
+    raise procedure.ProcedureError(reasons.robot_absent(parameters.channel))
 
 
-def _start_session(parameters: LinkParameters, session: Session) -> Script[Info]:
+def _start_session(parameters: LinkParameters, session: Session) -> procedure.Script[frames.Info]:
     problem = reasons.robot_absent(parameters.channel)
     for number in range(_MAX_ATTEMPTS):
         # An artificial clock, strictly increasing: no command is sent in this session.
         hello = session.hello(1000 * number)
         answer = yield from _transact(parameters, hello, frames.INFO)
-        if isinstance(answer, Info):
+        if isinstance(answer, frames.Info):
             problem = session.accept(answer)
             if not problem:
                 return answer
-    raise ProcedureError(problem)
+    raise procedure.ProcedureError(problem)
 
 
-def _read_parameter(parameters: LinkParameters, session: int, number: int) -> Script[Param]:
+def _read_parameter(
+    parameters: LinkParameters, session: int, number: int
+) -> procedure.Script[frames.Param]:
     for seq in range(_MAX_ATTEMPTS):
-        answer = yield from _transact(parameters, ParamGet(session, seq, number), frames.STATE)
-        if isinstance(answer, Param) and (answer.id, answer.seq) == (number, seq):
+        answer = yield from _transact(
+            parameters, frames.ParamGet(session, seq, number), frames.STATE
+        )
+        if isinstance(answer, frames.Param) and (answer.id, answer.seq) == (number, seq):
             return answer
-    raise ProcedureError('the robot stopped answering: is another host connected to it?')
+    raise procedure.ProcedureError('the robot stopped answering: is another host connected to it?')
 
 
 def format_robot_info(robot: RobotInfo, parameters: LinkParameters) -> str:
@@ -131,8 +118,8 @@ def format_robot_info(robot: RobotInfo, parameters: LinkParameters) -> str:
     return '\n'.join(lines)
 
 
-def _format_parameter(value: Param, target: int | None) -> str:
-    known: Sequence[frames.BoardParameter] = BOARD_PARAMETERS
+def _format_parameter(value: frames.Param, target: int | None) -> str:
+    known: Sequence[frames.BoardParameter] = frames.BOARD_PARAMETERS
     row = known[value.id] if value.id < len(known) else None
     name, unit = (row.name, row.unit) if row else (f'number {value.id}', '')
     bounds = 'fixed' if row and row.read_only else f'{value.low} to {value.high}'

@@ -17,25 +17,8 @@ import struct
 from typing import Any, NamedTuple
 
 from t3mpc_ros.radio.protocol import frames
-from t3mpc_ros.radio.protocol.frames import (
-    CALIBRATION_RECORD,
-    PART_SIZE,
-    Record,
-    RecordPart,
-    Samples,
-    Sense,
-    Store,
-)
 from t3mpc_ros.radio.protocol.framing import crc16
-from t3mpc_ros.radio.tool.procedure import (
-    OLD_FIRMWARE,
-    Pause,
-    ProcedureError,
-    Request,
-    Script,
-    request_reply,
-    wait_for_board,
-)
+from t3mpc_ros.radio.tool import procedure
 from t3mpc_ros.robot.calibration import Calibration, DividerCorrection, Estimate, SharpCurve
 
 RATES = ('250k', '1M', '2M')
@@ -243,9 +226,9 @@ def _unpack(name: str, layout: struct.Struct, number: int, body: bytes) -> tuple
     return layout.unpack(body)
 
 
-def unknown_record(error: ValueError) -> ProcedureError:
+def unknown_record(error: ValueError) -> procedure.ProcedureError:
     """Return the error of a valid record that cannot be decoded: the firmware is newer."""
-    return ProcedureError(
+    return procedure.ProcedureError(
         f'the robot holds a record that this host does not know ({error}): update the host'
     )
 
@@ -285,11 +268,11 @@ def _encode_curve(name: str, curve: SharpCurve | None) -> bytes:
 # -- scripts --------------------------------------------------------------------------------------
 
 
-def read_calibration() -> Script[Calibration]:
+def read_calibration() -> procedure.Script[Calibration]:
     """Return the calibration of the robot, all None if it was never calibrated."""
-    stored = yield from read_record(CALIBRATION_RECORD)
+    stored = yield from read_record(frames.CALIBRATION_RECORD)
     if stored.state == frames.SETTINGS_DAMAGED:
-        raise ProcedureError(
+        raise procedure.ProcedureError(
             'the calibration of the robot is damaged, so it accepts no session: write it again'
         )
     try:
@@ -298,7 +281,7 @@ def read_calibration() -> Script[Calibration]:
         raise unknown_record(error) from error
 
 
-def write_calibration(calibration: Calibration) -> Script[Calibration]:
+def write_calibration(calibration: Calibration) -> procedure.Script[Calibration]:
     """Store a calibration in both copies; return what the robot now holds, rounded to its units.
 
     It replaces the old one completely: to change a value, write ``read_calibration()`` with it
@@ -306,53 +289,55 @@ def write_calibration(calibration: Calibration) -> Script[Calibration]:
     stand still, with its drivers off.
     """
     body = encode_calibration(calibration)
-    return decode_calibration((yield from write_record(CALIBRATION_RECORD, body)))
+    return decode_calibration((yield from write_record(frames.CALIBRATION_RECORD, body)))
 
 
-def read_samples() -> Script[Samples]:
+def read_samples() -> procedure.Script[frames.Samples]:
     """Return the newest raw samples of distance sensors, battery and inertial sensor."""
-    return (yield from request_reply(Sense(0), Samples))
+    return (yield from procedure.request_reply(frames.Sense(0), frames.Samples))
 
 
-def range_counts(samples: Samples) -> tuple[int, ...]:
+def range_counts(samples: frames.Samples) -> tuple[int, ...]:
     """Return the counts of the eight distance sensors, in the order of STATE."""
     return struct.unpack('<8H', samples.ranges)
 
 
-def read_counts(samples: int) -> Script[list[tuple[int, ...]]]:
+def read_counts(samples: int) -> procedure.Script[list[tuple[int, ...]]]:
     """Return samples of the raw counts: eight distance sensors and, last, the battery."""
-    yield from wait_for_board()
+    yield from procedure.wait_for_board()
     counts = []
     for _ in range(samples):
         sample = yield from read_samples()
         counts.append((*range_counts(sample), sample.battery))
-        yield Pause(_SAMPLE_PERIOD)
+        yield procedure.Pause(_SAMPLE_PERIOD)
     return counts
 
 
-def read_record(record: int) -> Script[Stored]:
+def read_record(record: int) -> procedure.Script[Stored]:
     """Return a record, after the board has answered."""
-    yield from wait_for_board()
+    yield from procedure.wait_for_board()
     return (yield from _read_parts(record))
 
 
-def write_record(record: int, body: bytes) -> Script[bytes]:
+def write_record(record: int, body: bytes) -> procedure.Script[bytes]:
     """Stage and store a record; return its content. A lost answer is harmless: it is read back."""
-    yield from wait_for_board()
+    yield from procedure.wait_for_board()
     rc = frames.FAILED
     for _ in range(_MAX_ATTEMPTS):
-        for part in range(-(-len(body) // PART_SIZE)):
-            data = body[part * PART_SIZE :][:PART_SIZE].ljust(PART_SIZE, b'\0')
-            yield from request_part(Record(0, record, part, data))
-        response = yield Request(Store(0, record, crc16(body)), _WRITE_TIMEOUT)
-        if isinstance(response.reply, RecordPart):
+        for part in range(-(-len(body) // frames.PART_SIZE)):
+            data = body[part * frames.PART_SIZE :][: frames.PART_SIZE].ljust(
+                frames.PART_SIZE, b'\0'
+            )
+            yield from request_part(frames.Record(0, record, part, data))
+        response = yield procedure.Request(frames.Store(0, record, crc16(body)), _WRITE_TIMEOUT)
+        if isinstance(response.reply, frames.RecordPart):
             rc = response.reply.rc
             if rc in _REASONS:
-                raise ProcedureError(_REASONS[rc])
+                raise procedure.ProcedureError(_REASONS[rc])
         stored = yield from _read_parts(record)
         if stored.state == frames.SETTINGS_GOOD and stored.body == body:
             return stored.body
-    raise ProcedureError('the robot does not confirm the record: is the cable good?')
+    raise procedure.ProcedureError('the robot does not confirm the record: is the cable good?')
 
 
 _REASONS = {
@@ -368,17 +353,17 @@ _REASONS = {
 }
 
 
-def _read_parts(record: int) -> Script[Stored]:
-    first = yield from request_part(Record(0, record, 0))
+def _read_parts(record: int) -> procedure.Script[Stored]:
+    first = yield from request_part(frames.Record(0, record, 0))
     body = first.data
-    for part in range(1, -(-first.size // PART_SIZE)):
-        body += (yield from request_part(Record(0, record, part))).data
+    for part in range(1, -(-first.size // frames.PART_SIZE)):
+        body += (yield from request_part(frames.Record(0, record, part))).data
     return Stored(first.state, body[: first.size])
 
 
-def request_part(request: Record) -> Script[RecordPart]:
+def request_part(request: frames.Record) -> procedure.Script[frames.RecordPart]:
     """Return the answer to a RECORD, or raise ProcedureError."""
-    reply = yield from request_reply(request, RecordPart)
+    reply = yield from procedure.request_reply(request, frames.RecordPart)
     if reply.rc != frames.OK:
-        raise ProcedureError(OLD_FIRMWARE)
+        raise procedure.ProcedureError(procedure.OLD_FIRMWARE)
     return reply

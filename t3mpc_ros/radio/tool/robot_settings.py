@@ -8,18 +8,8 @@ from typing import Any, NamedTuple
 from t3mpc_ros.parameters.yaml_files import parameter_file
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD
+from t3mpc_ros.radio.tool import robot_records
 from t3mpc_ros.radio.tool.procedure import Script
-from t3mpc_ros.radio.tool.robot_records import (
-    RobotSettings,
-    Stored,
-    check_settings,
-    decode_settings,
-    encode_settings,
-    is_valid,
-    read_record,
-    unknown_record,
-    write_record,
-)
 
 SETTINGS_TEXTS = (
     'settings stored in both copies',
@@ -48,13 +38,13 @@ class StoredSettings(NamedTuple):
 
     state: int
     """SETTINGS_GOOD, …"""
-    settings: RobotSettings
+    settings: robot_records.RobotSettings
     """The defaults if the robot has none."""
 
     @property
     def valid(self) -> bool:
         """Whether the robot holds them."""
-        return is_valid(self.state)
+        return robot_records.is_valid(self.state)
 
 
 class Difference(NamedTuple):
@@ -76,12 +66,12 @@ def draw_address(entropy: Callable[[int], bytes]) -> bytes:
 
 def read_settings() -> Script[StoredSettings]:
     """Return the settings of the robot."""
-    return _decode((yield from read_record(SETTINGS_RECORD)))
+    return _decode((yield from robot_records.read_record(SETTINGS_RECORD)))
 
 
 def change_settings(
     stored: StoredSettings, changes: Mapping[str, object], entropy: Callable[[int], bytes]
-) -> RobotSettings:
+) -> robot_records.RobotSettings:
     """Return the settings with changes, by field name.
 
     A robot without settings gets a random address, so that two robots never obey one host by
@@ -90,17 +80,21 @@ def change_settings(
     settings = stored.settings._replace(**changes)  # type: ignore[arg-type]
     if not stored.valid and 'address' not in changes:
         settings = settings._replace(address=draw_address(entropy))
-    check_settings(settings)
+    robot_records.check_settings(settings)
     return settings
 
 
-def write_settings(settings: RobotSettings) -> Script[StoredSettings]:
+def write_settings(settings: robot_records.RobotSettings) -> Script[StoredSettings]:
     """Store settings in both copies; return what the robot holds."""
-    body = yield from write_record(SETTINGS_RECORD, encode_settings(settings))
-    return _decode(Stored(frames.SETTINGS_GOOD, body))
+    body = yield from robot_records.write_record(
+        SETTINGS_RECORD, robot_records.encode_settings(settings)
+    )
+    return _decode(robot_records.Stored(frames.SETTINGS_GOOD, body))
 
 
-def differences(old: RobotSettings, new: RobotSettings) -> list[Difference]:
+def differences(
+    old: robot_records.RobotSettings, new: robot_records.RobotSettings
+) -> list[Difference]:
     """Return the settings that differ; the sensors one by one."""
     pairs = [(name, getattr(old, name), getattr(new, name)) for name in old._fields[:-1]]
     pairs += [
@@ -129,7 +123,7 @@ def format_settings(stored: StoredSettings) -> str:
     return '\n'.join(lines)
 
 
-def settings_file(settings: RobotSettings) -> str:
+def settings_file(settings: robot_records.RobotSettings) -> str:
     """Return a ROS parameter file: the link parameters of the host, and all other settings."""
     values: dict[str, object] = settings._asdict()
     values |= {'address': settings.address.hex(), 'sensors': list(settings.sensors)}
@@ -138,7 +132,7 @@ def settings_file(settings: RobotSettings) -> str:
     return parameter_file(title, {'/**': {'link': link}, _BOARD: values})
 
 
-def settings_of_file(content: object) -> RobotSettings:
+def settings_of_file(content: object) -> robot_records.RobotSettings:
     """Return the settings of a file of :func:`settings_file`, parsed as YAML."""
     values: dict[str, Any] = {}
     try:
@@ -152,29 +146,29 @@ def settings_of_file(content: object) -> RobotSettings:
             f'must be a file of t3mpc robot setup --save, with link below /**, and {_BOARD}'
         ) from error
     unknown, missing = (
-        set(values) - set(RobotSettings._fields),
-        set(RobotSettings._fields) - set(values),
+        set(values) - set(robot_records.RobotSettings._fields),
+        set(robot_records.RobotSettings._fields) - set(values),
     )
     if unknown or missing:
         names = ', '.join(sorted(unknown or missing))
         raise SettingsFileError(f'{"has unknown" if unknown else "lacks the"} settings: {names}')
-    settings = RobotSettings(**values)
-    for name, kind in RobotSettings.__annotations__.items():
+    settings = robot_records.RobotSettings(**values)
+    for name, kind in robot_records.RobotSettings.__annotations__.items():
         value = getattr(settings, name)
         if kind in (int, bool) and type(value) is not kind:
             raise SettingsFileError(f'{name} must be of type {kind.__name__}: got {value!r}')
     try:
-        check_settings(settings)
+        robot_records.check_settings(settings)
     except (TypeError, ValueError) as error:
         raise SettingsFileError(str(error)) from error
     return settings
 
 
-def _decode(stored: Stored) -> StoredSettings:
+def _decode(stored: robot_records.Stored) -> StoredSettings:
     try:
-        return StoredSettings(stored.state, decode_settings(stored.body))
+        return StoredSettings(stored.state, robot_records.decode_settings(stored.body))
     except ValueError as error:
-        raise unknown_record(error) from error
+        raise robot_records.unknown_record(error) from error
 
 
 def _text(value: object) -> str:
