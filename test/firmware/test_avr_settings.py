@@ -24,19 +24,6 @@ from support.long_tests import few_of
 from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.protocol import frames
-from t3mpc_ros.radio.protocol.frames import (
-    OK,
-    PART_SIZE,
-    SETTINGS_RECORD,
-    Configure,
-    Info,
-    Ping,
-    Poll,
-    Pong,
-    Record,
-    StatusFlag,
-    Store,
-)
 from t3mpc_ros.radio.protocol.framing import crc16
 from t3mpc_ros.radio.tool.robot_records import RobotSettings, decode_settings, encode_settings
 
@@ -50,14 +37,21 @@ WRITING = 0.3
 def store(boards: Boards, settings: RobotSettings, seconds: float = WRITING) -> list[Any]:
     """Stage and store settings; return the answers to STORE within a time."""
     body = encode_settings(settings)
-    for part, data in enumerate((body[:PART_SIZE], body[PART_SIZE:].ljust(PART_SIZE, b'\0'))):
-        assert request(boards, Record(2, SETTINGS_RECORD, part, data))[0].rc == OK
-    return request(boards, Store(2, SETTINGS_RECORD, crc16(body)), seconds)
+    for part, data in enumerate(
+        (body[: frames.PART_SIZE], body[frames.PART_SIZE :].ljust(frames.PART_SIZE, b'\0'))
+    ):
+        assert (
+            request(boards, frames.Record(2, frames.SETTINGS_RECORD, part, data))[0].rc
+            == frames.OK
+        )
+    return request(boards, frames.Store(2, frames.SETTINGS_RECORD, crc16(body)), seconds)
 
 
 def read(boards: Boards) -> tuple[int, RobotSettings]:
     """Return state and values of the settings."""
-    first, second = (request(boards, Record(1, SETTINGS_RECORD, part))[0] for part in (0, 1))
+    first, second = (
+        request(boards, frames.Record(1, frames.SETTINGS_RECORD, part))[0] for part in (0, 1)
+    )
     return first.state, decode_settings((first.data + second.data)[: first.size])
 
 
@@ -67,12 +61,12 @@ def copy_of(settings: RobotSettings) -> bytes:
 
 def tune(boards: Boards, channel: int, address: bytes) -> None:
     """Configure the radio of the dongle."""
-    wanted = Configure(1, channel, 1, 3, 1, 4, address)
+    wanted = frames.Configure(1, channel, 1, 3, 1, 4, address)
     assert boards.ask(wanted)[1:-1] == wanted[1:]
 
 
 def read_info(boards: Boards) -> Any:
-    return boards.request(Poll(0, 0, 2), Poll(0, 0, 2))
+    return boards.request(frames.Poll(0, 0, 2), frames.Poll(0, 0, 2))
 
 
 def test_an_erased_robot_moves_only_after_its_settings() -> None:
@@ -81,17 +75,17 @@ def test_an_erased_robot_moves_only_after_its_settings() -> None:
         boards.run(0.13)
         assert boards.hello().session == 0
         for _ in range(10):
-            assert boards.drive(4000, 4000).status == StatusFlag.NO_SESSION
+            assert boards.drive(4000, 4000).status == frames.StatusFlag.NO_SESSION
         assert not boards.call('powered')
         assert read_info(boards).settings == frames.SETTINGS_MISSING
-        (pong,) = request(boards, Ping(1, b'ping'))
+        (pong,) = request(boards, frames.Ping(1, b'ping'))
         assert (pong.settings, pong.channel) == (frames.SETTINGS_MISSING, 82)
         (stored,) = store(boards, NEW)
-        assert (stored.id, stored.rc, stored.state) == (2, OK, frames.SETTINGS_GOOD)
+        assert (stored.id, stored.rc, stored.state) == (2, frames.OK, frames.SETTINGS_GOOD)
         copy = copy_of(NEW)
         assert [boards.eeprom(at, len(copy)) for at in SETTINGS_ADDRESSES] == [copy, copy]
         # The radio follows at once: nothing answers at the old place.
-        assert boards.request(Poll(0, 0, 0)) is None
+        assert boards.request(frames.Poll(0, 0, 0)) is None
         tune(boards, NEW.channel, NEW.address)
         info = boards.hello()
         assert (info.session, info.microsteps) == (boards.session, 8)
@@ -102,7 +96,7 @@ def test_an_erased_robot_moves_only_after_its_settings() -> None:
         boards.call('reset', ROBOT)
         boards.run(0.15)
         assert boards.hello().microsteps == 8
-        (pong,) = request(boards, Ping(3, b'ping'))
+        (pong,) = request(boards, frames.Ping(3, b'ping'))
         assert pong[-4:-1] == (frames.SETTINGS_GOOD, NEW.channel, NEW.address)
 
 
@@ -142,7 +136,7 @@ def test_damaged_settings_lock_the_robot() -> None:
         boards.store(at, bytes(damaged))
     boards.run(0.13)
     assert boards.hello().session == 0
-    assert drive(boards, 0.3, 4000, 4000).status == StatusFlag.NO_SESSION
+    assert drive(boards, 0.3, 4000, 4000).status == frames.StatusFlag.NO_SESSION
     assert boards.pulses() == (0, 0)
     assert read_info(boards).settings == frames.SETTINGS_DAMAGED
     boards.close()
@@ -179,10 +173,10 @@ def test_both_boards_report_their_build() -> None:
     number, _ = make(FIRMWARE / 'build')
     boards = Boards()
     boards.start()
-    info, (pong,) = read_info(boards), request(boards, Ping(1, b'ping'))
-    assert isinstance(info, Info)
-    reply = boards.ask(Ping(2, b'ping'))
-    assert isinstance(reply, Pong)
+    info, (pong,) = read_info(boards), request(boards, frames.Ping(1, b'ping'))
+    assert isinstance(info, frames.Info)
+    reply = boards.ask(frames.Ping(2, b'ping'))
+    assert isinstance(reply, frames.Pong)
     assert {info.build, pong.build, reply.build} == {int(number, 16)}
     assert (reply.channel, reply.address) == (82, b'T3MPC')
     boards.close()

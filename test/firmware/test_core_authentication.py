@@ -7,20 +7,7 @@ import ctypes
 import random
 import struct
 
-from support.firmware_core import (
-    CLEAR,
-    ENABLED,
-    ESTOP,
-    INFO_SIZE,
-    KEY,
-    LATCHED,
-    MAX_SPEED,
-    MOVING,
-    NO_SESSION,
-    OK,
-    SESSION,
-    Robot,
-)
+from support import firmware_core as core
 
 from t3mpc_ros.radio.protocol.authentication import siphash
 
@@ -30,10 +17,10 @@ BOOTS_ADDRESS = 32
 def test_a_key_at_one_end_only_is_rejected_and_reported(library, robot, keyed):
     unsigned = struct.pack('<BBBB', 0x24, 7, 0, 0)
     info = keyed.request(unsigned)
-    assert (info[0], info[1], len(info)) == (0x23, SESSION, INFO_SIZE + 8)
+    assert (info[0], info[1], len(info)) == (0x23, core.SESSION, core.INFO_SIZE + 8)
     signed = struct.pack('<BBBBI', 0x24, 7, 0, 1, 0) + bytes(8)
-    info = robot.request(signed + siphash(KEY, signed))
-    assert (info[0], info[1], len(info)) == (0x23, SESSION, INFO_SIZE)
+    info = robot.request(signed + siphash(core.KEY, signed))
+    assert (info[0], info[1], len(info)) == (0x23, core.SESSION, core.INFO_SIZE)
     assert keyed.counters()['bad_session'] == robot.counters()['bad_session'] == 1
     keyed.session_key = b''
     keyed.drive(5000, 5000, 100_000)
@@ -45,11 +32,11 @@ def test_a_key_at_one_end_only_is_rejected_and_reported(library, robot, keyed):
 
 def test_a_signed_session_drives_and_writes_parameters(keyed):
     keyed.drive(5000, 5000, 1_000_000)
-    assert keyed.status == ENABLED | MOVING
+    assert keyed.status == core.ENABLED | core.MOVING
     keyed.run(20_000)
-    assert keyed.set(MAX_SPEED, 3000) == (OK, 3000)
+    assert keyed.set(core.MAX_SPEED, 3000) == (core.OK, 3000)
     keyed.run(20_000)
-    assert keyed.act(2, seq=1)[4] == OK
+    assert keyed.act(2, seq=1)[4] == core.OK
     keyed.drive(5000, 5000, 500_000)
     assert keyed.speeds == (3.0, 3.0)
     assert keyed.counters()['bad_session'] == 0
@@ -58,13 +45,13 @@ def test_a_signed_session_drives_and_writes_parameters(keyed):
 def test_a_new_hello_draws_a_nonce_and_a_repeated_one_does_not(keyed):
     first = keyed.hello()
     keyed.drive(5000, 5000, 500_000)
-    assert keyed.hello()[INFO_SIZE:] == first[INFO_SIZE:]
-    assert keyed.status == ENABLED | MOVING
+    assert keyed.hello()[core.INFO_SIZE :] == first[core.INFO_SIZE :]
+    assert keyed.status == core.ENABLED | core.MOVING
     keyed.drive(5000, 5000, 100_000)
-    assert keyed.status == ENABLED | MOVING
-    seen = {first[INFO_SIZE:]}
+    assert keyed.status == core.ENABLED | core.MOVING
+    seen = {first[core.INFO_SIZE :]}
     for index in range(200):
-        seen.add(keyed.hello(nonce=index.to_bytes(8, 'big'))[INFO_SIZE:])
+        seen.add(keyed.hello(nonce=index.to_bytes(8, 'big'))[core.INFO_SIZE :])
         if index % 20 == 0:
             keyed.call('boot', 1, 0)  # same time, empty RAM
     assert len(seen) == 201
@@ -76,7 +63,7 @@ def test_a_nonce_of_the_robot_is_no_tag_of_a_hello(library):
     The robot draws its nonce from its counters and clock, 16 bytes as many as a HELLO has before
     its tag: some values of the counter of boots are the beginning of a HELLO.
     """
-    robot = Robot(library, KEY)
+    robot = core.Robot(library, core.KEY)
     session, first_noise = 0x5B, 1013904223
     boots = 0x0100_0014 | session << 8
     record = struct.pack('<I', boots - 1)
@@ -87,33 +74,33 @@ def test_a_nonce_of_the_robot_is_no_tag_of_a_hello(library):
     robot.run(1000)
     forged = struct.pack('<IIII', boots, 1, robot.now, first_noise)
     info = robot.hello()
-    assert info[1] == SESSION
-    assert robot.request(forged + info[INFO_SIZE:])[1] == SESSION
+    assert info[1] == core.SESSION
+    assert robot.request(forged + info[core.INFO_SIZE :])[1] == core.SESSION
 
 
 def test_a_damaged_key_locks_the_robot(library):
     for address in range(8, 26):
-        robot = Robot(library, KEY)
+        robot = core.Robot(library, core.KEY)
         robot.call('poke_eeprom', ctypes.c_uint8(address), ctypes.c_uint8(0x55))
         robot.call('boot', 1, 0)
         info = robot.hello()
-        assert (info[1], len(info)) == (0, INFO_SIZE + 8)
+        assert (info[1], len(info)) == (0, core.INFO_SIZE + 8)
         robot.key, robot.session_key = b'', b''
         assert robot.hello()[1] == 0
         robot.drive(5000, 5000, 100_000)
-        assert robot.status == NO_SESSION
+        assert robot.status == core.NO_SESSION
 
 
 def test_a_key_can_be_removed(library):
-    robot = Robot(library, KEY)
+    robot = core.Robot(library, core.KEY)
     robot.call('store_key', None)
     robot.call('boot', 1, 0)
     robot.key = b''
-    assert robot.hello()[1] == SESSION
+    assert robot.hello()[1] == core.SESSION
 
 
 def test_signed_clock_may_wrap_but_not_decrease(library):
-    robot = Robot(library, KEY)
+    robot = core.Robot(library, core.KEY)
     robot.run(1000)
     robot.delay = robot.now + 5_000_000  # the clock of the host wraps 5 s from now
     robot.hello()
@@ -124,7 +111,7 @@ def test_signed_clock_may_wrap_but_not_decrease(library):
         accepted.append(robot.command(1000, 1000, epoch=epoch))
         robot.send(accepted[-1])
     assert robot.counters()['bad_session'] == 0
-    assert robot.status == ENABLED | MOVING
+    assert robot.status == core.ENABLED | core.MOVING
     for frame in accepted:
         robot.send(frame)
     assert robot.counters()['bad_session'] == 500
@@ -158,7 +145,7 @@ def test_no_forged_replayed_or_altered_frame_is_executed(library):
     frame clears it again.
     """
     generator = random.Random(5)
-    robot = Robot(library, KEY)
+    robot = core.Robot(library, core.KEY)
     robot.run(1000)
     recorded = []
     for nonce in (bytes(8), bytes(range(8))):
@@ -166,13 +153,13 @@ def test_no_forged_replayed_or_altered_frame_is_executed(library):
         for index in range(100):
             robot.run(20_000)
             if index % 10 == 9:
-                body = struct.pack('<BBBBi', 0x23, SESSION, 9, 0, 5000 + index)
+                body = struct.pack('<BBBBi', 0x23, core.SESSION, 9, 0, 5000 + index)
             else:
                 body = None
             frame = robot.sign(body) if body else robot.command(3000, -3000)
             robot.send(frame)
             recorded.append(frame)
-    assert robot.get(MAX_SPEED) == (OK, 5099)
+    assert robot.get(core.MAX_SPEED) == (core.OK, 5099)
     robot.send(robot.command(0, 0, flags=0))
     robot.run(1_000_000)
     assert robot.status == 0
@@ -180,15 +167,15 @@ def test_no_forged_replayed_or_altered_frame_is_executed(library):
     for _ in range(100_000):
         frame = damage(generator, recorded)
         robot.send(frame)
-        if frame[0] in (0x11, 0x21) and frame[3] & ESTOP:
+        if frame[0] in (0x11, 0x21) and frame[3] & core.ESTOP:
             stops += 1
-            assert robot.status == LATCHED
+            assert robot.status == core.LATCHED
             robot.run(1000)
-            robot.send(robot.command(flags=CLEAR))
+            robot.send(robot.command(flags=core.CLEAR))
         assert robot.status == 0, frame.hex()
         robot.run(400)
     assert robot.pulses == pulses
-    assert robot.get(MAX_SPEED) == (OK, 5099)
+    assert robot.get(core.MAX_SPEED) == (core.OK, 5099)
     assert stops > 100
     robot.drive(3000, 3000, 100_000)
-    assert robot.status == ENABLED | MOVING
+    assert robot.status == core.ENABLED | core.MOVING

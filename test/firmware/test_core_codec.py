@@ -8,17 +8,7 @@ import random
 import struct
 
 import pytest
-from support.firmware_core import (
-    OK,
-    SESSION,
-    UNKNOWN,
-    Decoder,
-    Dongle,
-    Robot,
-    c_decode,
-    c_encode,
-    c_encode_frame,
-)
+from support import firmware_core as core
 from support.long_tests import few_of
 
 from t3mpc_ros.radio.protocol.authentication import siphash
@@ -46,8 +36,8 @@ def test_encoded_frames_equal_the_reference(library):
     generator = random.Random(2)
     for size in (*range(1, 79), *generator.choices(range(1, 79), k=2000)):
         frame = bytes(generator.choices((0, 1, 0xFF, generator.randrange(256)), k=size))
-        assert c_encode_frame(library, frame) == encode_frame(frame)
-    assert c_encode_frame(library, b'') == c_encode_frame(library, bytes(79)) == b''
+        assert core.c_encode_frame(library, frame) == encode_frame(frame)
+    assert core.c_encode_frame(library, b'') == core.c_encode_frame(library, bytes(79)) == b''
 
 
 @pytest.mark.parametrize('seed', few_of(range(40), 4))
@@ -70,7 +60,7 @@ def test_decoder_equals_the_reference_on_a_damaged_stream(library, seed):
             wire = wire or bytearray(1)
         stream += wire
     stream += b'\0'
-    decoder = Decoder(library)
+    decoder = core.Decoder(library)
     reference = FrameDecoder()
     assert decoder.feed(bytes(stream)) == reference.feed(bytes(stream))
     counts = reference.counts
@@ -116,7 +106,7 @@ def test_clock_is_exact_around_a_timer_overflow(library):
 
 
 def test_transaction_with_the_golden_result(library):
-    dongle = Dongle(library)
+    dongle = core.Dongle(library)
     dongle.run(123_456_000 - 3000)
     dongle.call('bytes', TX_WIRE, ctypes.c_uint32(len(TX_WIRE)))
     assert dongle.sent() == COMMAND
@@ -137,7 +127,7 @@ DOWN_NAMES = {'flags': 'what', 'id': 'what', 'verb': 'what'}
 def test_golden_downlink_payloads_are_decoded(library, golden):
     for vector in golden['down']:
         data, fields = bytes.fromhex(vector['bytes']), vector['fields']
-        fault, packet = c_decode(library, data)
+        fault, packet = core.c_decode(library, data)
         assert fault == 0, vector['name']
         for name, value in fields.items():
             if name in ('nonce', 'tag'):
@@ -152,7 +142,7 @@ def test_golden_uplink_payloads_are_encoded(library, golden):
         numbers, fields = [], vector['fields']
         for value in fields.values():
             numbers += [value] if isinstance(value, int) else bytes.fromhex(value)
-        written = c_encode(library, kinds[vector['kind']], numbers, bool(fields.get('nonce')))
+        written = core.c_encode(library, kinds[vector['kind']], numbers, bool(fields.get('nonce')))
         assert written.hex() == vector['bytes'], vector['name']
 
 
@@ -161,9 +151,9 @@ def test_golden_malformed_frames_are_rejected(library, golden):
     for vector in golden['rejected']:
         data = bytes.fromhex(vector['bytes'])
         if vector['direction'] == 'down':
-            assert c_decode(library, data)[0] == faults[vector['fault']], vector
+            assert core.c_decode(library, data)[0] == faults[vector['fault']], vector
         elif vector['direction'] == 'to_dongle' and data:
-            dongle = Dongle(library)
+            dongle = core.Dongle(library)
             dongle.write(data)
             code = 1 if vector['fault'] == 'kind' else 2
             assert dongle.frames() == [bytes([0x8F, code, data[0]])], vector
@@ -172,35 +162,35 @@ def test_golden_malformed_frames_are_rejected(library, golden):
 
 def test_golden_encodings_and_parameters(library, golden):
     for vector in golden['wire']:
-        assert c_encode_frame(library, bytes.fromhex(vector['bytes'])).hex() == vector['wire']
-    robot = Robot(library)
+        assert core.c_encode_frame(library, bytes.fromhex(vector['bytes'])).hex() == vector['wire']
+    robot = core.Robot(library)
     robot.hello()
     for row in golden['constants']['parameters']:
-        answer = robot.request(bytes([0x22, SESSION, 0, row['id']]))
+        answer = robot.request(bytes([0x22, core.SESSION, 0, row['id']]))
         value, low, high = struct.unpack_from('<iii', answer, 5)
         assert (answer[4], value, low, high) == (0, row['default'], row['low'], row['high'])
 
 
 def test_golden_console_frames(library, golden):
     for vector in golden['to_board']:
-        robot = Robot(library)
+        robot = core.Robot(library)
         robot.run(1000)
         (reply,) = robot.console(bytes.fromhex(vector['bytes']), 5000)
         frame = bytes.fromhex(vector['bytes'])
-        assert c_encode_frame(library, frame).hex() == vector['wire']
+        assert core.c_encode_frame(library, frame).hex() == vector['wire']
         if frame[0] == 3:
             assert reply[:6] == b'\x83' + frame[1:]
         elif frame[0] == 7:  # nothing is staged
-            assert reply[:3] == bytes([0x86, frame[1], UNKNOWN])
+            assert reply[:3] == bytes([0x86, frame[1], core.UNKNOWN])
         elif frame[0] == 8:
             assert reply[:2] == bytes([0x88, frame[1]])
         else:
-            assert reply[:3] == bytes([frame[0] | 0x80, frame[1], OK])
+            assert reply[:3] == bytes([frame[0] | 0x80, frame[1], core.OK])
     for row in golden['key_checks']:
-        robot = Robot(library, bytes.fromhex(row['key']))
+        robot = core.Robot(library, bytes.fromhex(row['key']))
         assert robot.console(b'\x04\x09') == [b'\x84\x09\0\1' + struct.pack('<I', row['check'])]
     for vector in golden['rejected']:
         data = bytes.fromhex(vector['bytes'])
         if vector['direction'] == 'to_board':
             code = 1 if vector['fault'] == 'kind' else 2
-            assert Robot(library).console(data) == [bytes([0x8F, code, data[0]])], vector
+            assert core.Robot(library).console(data) == [bytes([0x8F, code, data[0]])], vector

@@ -6,24 +6,7 @@ import ctypes
 import struct
 
 import pytest
-from support.firmware_core import (
-    CLEAR,
-    CUTOFF,
-    DECELERATION,
-    ENABLE,
-    ENABLED,
-    ESTOP,
-    EXPIRED,
-    KEY,
-    LATCHED,
-    LOW_BATTERY,
-    MAX_SPEED,
-    MOVING,
-    NO_SESSION,
-    OK,
-    SESSION,
-    Robot,
-)
+from support import firmware_core as core
 
 from t3mpc_ros.radio.protocol.frames import RefusalReason
 
@@ -32,18 +15,18 @@ PRESS, RELEASE = 5_200, 50_200
 
 
 def test_nothing_moves_before_hello_and_enable(library):
-    robot = Robot(library)
+    robot = core.Robot(library)
     assert not robot.call('powered')
     for session in range(256):
         robot.drive(5000, 5000, 20_000, session=session)
-    assert robot.status & NO_SESSION
+    assert robot.status & core.NO_SESSION
     robot.hello()
     robot.drive(5000, 5000, 500_000, flags=0)
     assert robot.status == 0
     assert not robot.call('powered')
     assert robot.pulses == (0, 0)
     robot.drive(5000, 5000, 500_000)
-    assert robot.status == ENABLED | MOVING
+    assert robot.status == core.ENABLED | core.MOVING
     assert robot.speeds == (5.0, 5.0)
     assert robot.pulses[0] > 500
 
@@ -58,7 +41,7 @@ def test_hello_starts_a_session_at_rest_and_keeps_the_counters(robot):
     assert robot.status == 0
     assert not robot.call('powered')
     assert robot.steps > steps
-    robot.drive(5000, 5000, 100_000, session=SESSION)
+    robot.drive(5000, 5000, 100_000, session=core.SESSION)
     assert robot.speeds == (0.0, 0.0)
 
 
@@ -67,19 +50,19 @@ def test_ttl_expiry_ramps_down_and_sets_the_flag(slow_ramps):
     slow_ramps.send(slow_ramps.command(4500, 4500, ttl=20))
     slow_ramps.run(199_000)
     assert slow_ramps.speeds == (4.5, 4.5)
-    assert slow_ramps.status == ENABLED | MOVING
+    assert slow_ramps.status == core.ENABLED | core.MOVING
     slow_ramps.run(2_000)
-    assert slow_ramps.status == ENABLED | MOVING | EXPIRED
+    assert slow_ramps.status == core.ENABLED | core.MOVING | core.EXPIRED
     slow_ramps.run(74_000)
     # Half of 4.5 rad/s at 30 rad/s².
     assert slow_ramps.speeds == pytest.approx((2.25, 2.25), abs=0.07)
     slow_ramps.run(76_500)
     assert slow_ramps.speeds == (0.0, 0.0)
-    assert slow_ramps.status == ENABLED | EXPIRED
+    assert slow_ramps.status == core.ENABLED | core.EXPIRED
     assert slow_ramps.call('powered')  # holding torque
     assert slow_ramps.counters()['expired'] == 1
     slow_ramps.drive(1000, 1000, 20_000)
-    assert slow_ramps.status == ENABLED | MOVING
+    assert slow_ramps.status == core.ENABLED | core.MOVING
 
 
 def rest_time(robot, ttl):
@@ -88,7 +71,7 @@ def rest_time(robot, ttl):
     robot.send(robot.command(10_000, 10_000, ttl=ttl))
     assert robot.speeds == (10.0, 10.0)
     elapsed = 0
-    while robot.status & MOVING:
+    while robot.status & core.MOVING:
         robot.run(1000)
         elapsed += 1000
     return elapsed / 1e6
@@ -110,16 +93,16 @@ def test_stop_time_is_ttl_plus_ramp(robot, ttl, deceleration, limit):
     Standstill within 0.45 s requires 41 rad/s² at a TTL of 200 ms, and 52 rad/s² at the largest
     TTL that the robot accepts.
     """
-    assert robot.get(DECELERATION) == (OK, 60_000)
-    assert robot.set(DECELERATION, deceleration) == (OK, deceleration)
+    assert robot.get(core.DECELERATION) == (core.OK, 60_000)
+    assert robot.set(core.DECELERATION, deceleration) == (core.OK, deceleration)
     assert limit - 0.01 < rest_time(robot, ttl) <= limit
 
 
 def test_an_emergency_stop_is_not_weakened_by_a_parameter(robot):
     """It used the deceleration that a host may set: from 10 rad/s it took 100 s at the lowest."""
-    assert robot.set(DECELERATION, 100) == (OK, 100)
+    assert robot.set(core.DECELERATION, 100) == (core.OK, 100)
     robot.drive(10_000, 10_000, 2_000_000)
-    robot.send(robot.command(flags=ESTOP))
+    robot.send(robot.command(flags=core.ESTOP))
     robot.run(170_000)
     assert robot.speeds == (0.0, 0.0)
 
@@ -127,15 +110,15 @@ def test_an_emergency_stop_is_not_weakened_by_a_parameter(robot):
 def test_the_robot_limits_the_ttl(robot):
     robot.send(robot.command(1000, 1000, ttl=255))
     robot.run(249_000)
-    assert not robot.status & EXPIRED
+    assert not robot.status & core.EXPIRED
     robot.run(2_000)
-    assert robot.status & EXPIRED
+    assert robot.status & core.EXPIRED
 
 
 def test_a_ttl_of_zero_stops_without_the_expiry_flag(robot):
     robot.drive(5000, 5000, 500_000)
     robot.drive(5000, 5000, 500_000, ttl=0)
-    assert robot.status == ENABLED
+    assert robot.status == core.ENABLED
     assert robot.counters()['expired'] == 0
 
 
@@ -148,7 +131,7 @@ def test_only_newer_sequence_numbers_count(robot):
             before = robot.counters()['duplicates']
             robot.send(robot.command(3000, 3000, seq=(last + difference) % 256))
             robot.run(2000)
-            moved = bool(robot.status & MOVING)
+            moved = bool(robot.status & core.MOVING)
             assert moved == (1 <= difference <= 127), (last, difference)
             assert robot.counters()['duplicates'] - before == (not moved)
 
@@ -158,61 +141,63 @@ def test_a_repeated_command_does_not_extend_its_ttl(robot):
     for _ in range(30):
         robot.send(frame)
         robot.run(10_000)
-    assert robot.status & EXPIRED
+    assert robot.status & core.EXPIRED
 
 
 def test_frames_of_another_session_are_counted_and_ignored(robot):
-    for session in set(range(256)) - {SESSION}:
+    for session in set(range(256)) - {core.SESSION}:
         robot.drive(5000, 5000, 20_000, session=session)
     assert robot.pulses == (0, 0)
     assert robot.counters()['bad_session'] == 255
-    assert robot.request(struct.pack('<BBBBi', 0x23, 3, 9, MAX_SPEED, 1))[0] == 0x21
-    assert robot.get(MAX_SPEED) == (OK, 10_000)
+    assert robot.request(struct.pack('<BBBBi', 0x23, 3, 9, core.MAX_SPEED, 1))[0] == 0x21
+    assert robot.get(core.MAX_SPEED) == (core.OK, 10_000)
 
 
-@pytest.mark.parametrize('session', [0, 1, SESSION, 255])
-@pytest.mark.parametrize('flags', [ESTOP, ESTOP | ENABLE, ESTOP | CLEAR, 7, 0xFF])
+@pytest.mark.parametrize('session', [0, 1, core.SESSION, 255])
+@pytest.mark.parametrize(
+    'flags', [core.ESTOP, core.ESTOP | core.ENABLE, core.ESTOP | core.CLEAR, 7, 0xFF]
+)
 def test_an_emergency_stop_is_accepted_from_any_sender(robot, session, flags):
     robot.drive(5000, 5000, 500_000)
     robot.send(robot.command(5000, 5000, flags, seq=0, session=session, echo_us=0))
     robot.run(1000)
-    assert robot.status & LATCHED
+    assert robot.status & core.LATCHED
     robot.drive(5000, 5000, 400_000)
-    assert robot.status == LATCHED
+    assert robot.status == core.LATCHED
     assert robot.speeds == (0.0, 0.0)
     robot.hello(session=5)
     robot.drive(5000, 5000, 100_000, session=5)
-    assert robot.status == LATCHED
+    assert robot.status == core.LATCHED
 
 
 def test_only_a_valid_clear_of_the_session_clears_the_estop(robot):
-    robot.send(robot.command(flags=ESTOP))
+    robot.send(robot.command(flags=core.ESTOP))
     for rejected in (
         {'flags': 0},
-        {'flags': CLEAR | ENABLE},
-        {'flags': CLEAR | ESTOP},
-        {'flags': CLEAR, 'left': 1},
-        {'flags': CLEAR, 'right': -1},
-        {'flags': CLEAR, 'session': 3},
-        {'flags': CLEAR, 'seq': robot.seq},
-        {'flags': CLEAR, 'echo_us': (robot.now - 1_000_000) % (1 << 32)},
+        {'flags': core.CLEAR | core.ENABLE},
+        {'flags': core.CLEAR | core.ESTOP},
+        {'flags': core.CLEAR, 'left': 1},
+        {'flags': core.CLEAR, 'right': -1},
+        {'flags': core.CLEAR, 'session': 3},
+        {'flags': core.CLEAR, 'seq': robot.seq},
+        {'flags': core.CLEAR, 'echo_us': (robot.now - 1_000_000) % (1 << 32)},
     ):
         robot.send(robot.command(**rejected))
         robot.run(20_000)
-        assert robot.status & LATCHED, rejected
+        assert robot.status & core.LATCHED, rejected
     robot.call('press', ctypes.c_bool(True))
-    robot.send(robot.command(flags=CLEAR))
-    assert robot.status & LATCHED
+    robot.send(robot.command(flags=core.CLEAR))
+    assert robot.status & core.LATCHED
     robot.run(PRESS)
     robot.call('press', ctypes.c_bool(False))
     robot.run(RELEASE - 1000)
-    robot.send(robot.command(flags=CLEAR))
-    assert robot.status & LATCHED
+    robot.send(robot.command(flags=core.CLEAR))
+    assert robot.status & core.LATCHED
     robot.run(1000)
-    robot.send(robot.command(flags=CLEAR))
+    robot.send(robot.command(flags=core.CLEAR))
     assert robot.status == 0
     robot.drive(1000, 1000, 200_000)
-    assert robot.status == ENABLED | MOVING
+    assert robot.status == core.ENABLED | core.MOVING
 
 
 @pytest.mark.parametrize('pressed', [PRESS // 2, PRESS])
@@ -224,10 +209,10 @@ def test_the_button_latches_after_its_debounce_time_only(robot, pressed):
         robot.run(pressed)
         robot.call('press', ctypes.c_bool(False))
         robot.run(1000)
-    latched = robot.status & LATCHED
+    latched = robot.status & core.LATCHED
     assert bool(latched) == (pressed == PRESS)
     robot.drive(5000, 5000, 500_000)
-    assert robot.status == (LATCHED if latched else ENABLED | MOVING)
+    assert robot.status == (core.LATCHED if latched else core.ENABLED | core.MOVING)
     assert robot.call('powered') == (not latched)
 
 
@@ -245,28 +230,28 @@ def test_a_dip_of_the_supply_is_no_low_battery(robot):
     supply(robot, 11_000, 500_000)
     for _ in range(10):
         supply(robot, 8_000, 60_000)
-        assert not robot.status & LOW_BATTERY
+        assert not robot.status & core.LOW_BATTERY
         supply(robot, 11_000, 940_000)
-    assert robot.status == ENABLED | MOVING
+    assert robot.status == core.ENABLED | core.MOVING
 
 
 def test_an_empty_battery_stops_the_robot_until_charged(robot):
     supply(robot, 11_000, 500_000)
     supply(robot, 9_500, 5_000_000)
-    assert robot.status == ENABLED | MOVING | LOW_BATTERY
+    assert robot.status == core.ENABLED | core.MOVING | core.LOW_BATTERY
     supply(robot, 8_500, 5_000_000)
-    assert robot.status == LOW_BATTERY
+    assert robot.status == core.LOW_BATTERY
     assert not robot.call('powered')
     supply(robot, 9_900, 5_000_000)  # without load the voltage rises
-    assert robot.status == LOW_BATTERY
+    assert robot.status == core.LOW_BATTERY
     supply(robot, 10_500, 5_000_000)
-    assert robot.status == ENABLED | MOVING
+    assert robot.status == core.ENABLED | core.MOVING
     robot.call('set_adc', 8, ctypes.c_uint16(0))  # nothing is connected
     robot.drive(3000, 3000, 1_000_000)
-    assert robot.status == ENABLED | MOVING
-    assert robot.set(CUTOFF, 0)[0] == OK
+    assert robot.status == core.ENABLED | core.MOVING
+    assert robot.set(core.CUTOFF, 0)[0] == core.OK
     supply(robot, 5_000, 5_000_000)
-    assert robot.status == ENABLED | MOVING | LOW_BATTERY
+    assert robot.status == core.ENABLED | core.MOVING | core.LOW_BATTERY
 
 
 # -- echoes ---------------------------------------------------------------------------------------
@@ -275,24 +260,24 @@ def test_an_empty_battery_stops_the_robot_until_charged(robot):
 def test_golden_echoes_shorten_the_ttl_or_refuse_the_command(library, golden):
     """A CMD is followed for its TTL, less what its echo is older than 50 ms."""
     for row in golden['echoes']:
-        robot = Robot(library, time=(row['received_us'] - 10_000) % (1 << 32))
+        robot = core.Robot(library, time=(row['received_us'] - 10_000) % (1 << 32))
         robot.run(1000)
         robot.hello()
         robot.run((row['received_us'] - robot.now) % (1 << 32))
         robot.send(robot.command(3000, 3000, ttl=row['ttl'], echo_us=row['echo_us']))
         follows, name = row['follows_us'], row['name']
-        refused = robot.call('status') & ENABLED == 0
+        refused = robot.call('status') & core.ENABLED == 0
         assert refused == (follows is None), name
         if follows:
             # The main loop sees the end of the TTL up to 200 us later.
             robot.run(max(follows - 1000, 0))
-            assert not robot.status & EXPIRED or follows < 1000, name
+            assert not robot.status & core.EXPIRED or follows < 1000, name
             robot.run(min(follows, 1000) + 400)
-            assert robot.status & EXPIRED, name
+            assert robot.status & core.EXPIRED, name
         elif follows is None:
             reason, refused_bytes = robot.refusal()
             assert reason is RefusalReason.STALE, name
-            assert refused_bytes == bytes([0x21, SESSION, robot.seq]), name
+            assert refused_bytes == bytes([0x21, core.SESSION, robot.seq]), name
 
 
 @pytest.mark.parametrize('silence', [0.3, 6.0, 100.0, 1500.0])
@@ -307,7 +292,7 @@ def test_commands_held_and_released_at_once_are_refused(robot, silence):
     assert robot.counters()['stale'] == 15
     assert robot.pulses == (0, 0)
     robot.drive(5000, 5000, 40_000)
-    assert robot.status & MOVING
+    assert robot.status & core.MOVING
 
 
 @pytest.mark.parametrize('growth', [1, 5, 20, 100])
@@ -352,7 +337,7 @@ def test_a_refused_command_uses_no_sequence_number(robot):
     assert (state[2], state[22:24]) == (0, b'\xff\xff')
     robot.seq = 0
     robot.drive(1000, 1000, 20_000)
-    assert robot.status == ENABLED | MOVING
+    assert robot.status == core.ENABLED | core.MOVING
 
 
 # -- refusals -------------------------------------------------------------------------------------
@@ -366,7 +351,7 @@ def test_each_refusal_is_reported_with_its_reason(library, robot, keyed):
         (robot, b'\x11' + moving[1:], reason.VERSION),
         (robot, moving[:-1], reason.FORM),
         (robot, b'\x2f' + moving[1:], reason.FORM),
-        (robot, robot.command(session=SESSION + 1), reason.SESSION),
+        (robot, robot.command(session=core.SESSION + 1), reason.SESSION),
         (robot, moving + bytes(12), reason.SIGNED),
         (robot, robot.command(seq=0, echo_us=stale), reason.STALE),
         (robot, b'\x24' + moving[1:2] + b'\7\1' + bytes(20), reason.SIGNED),
@@ -374,21 +359,21 @@ def test_each_refusal_is_reported_with_its_reason(library, robot, keyed):
         (keyed, keyed.command()[:-1] + b'?', reason.TAG),
         (keyed, b'\x24' + moving[1:2] + b'\7\1' + bytes(20), reason.TAG),
         (keyed, b'\x24' + moving[1:2] + b'\7\0', reason.UNSIGNED),
-        (Robot(library), moving, reason.SESSION),
-        (Robot(library, erased=True), b'\x24\5\6\0', reason.SETTINGS),
+        (core.Robot(library), moving, reason.SESSION),
+        (core.Robot(library, erased=True), b'\x24\5\6\0', reason.SETTINGS),
     ]
     for made, data, expected in refused:
         made.run(1000)
         made.send(data)
         assert made.refusal() == (expected, data[:3]), data.hex()
         assert made.request(b'\x25\0\0\2')[12] == expected
-        assert not made.status & MOVING
+        assert not made.status & core.MOVING
     robot.send(moving)
     robot.send(moving)
     assert robot.refusal() == (reason.SEQUENCE, moving[:3])
     robot.hello(session=9)
     assert robot.refusal()[0] is reason.NONE
-    locked = Robot(library, KEY)
+    locked = core.Robot(library, core.KEY)
     locked.call('poke_eeprom', 26, 0)
     locked.call('boot', 1, 0)
     locked.run(1000)
@@ -396,10 +381,10 @@ def test_each_refusal_is_reported_with_its_reason(library, robot, keyed):
     assert locked.refusal() == (reason.KEY, b'\x24\5\6')
 
 
-@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+@pytest.mark.parametrize('key', [b'', core.KEY], ids=['open', 'keyed'])
 def test_a_host_of_another_version_learns_that_of_the_robot(library, golden, key):
     """It is refused, in an INFO that it can read; the session goes on."""
-    robot = Robot(library, key)
+    robot = core.Robot(library, key)
     robot.run(1000)
     robot.hello()
     for row in golden['foreign']:
@@ -408,26 +393,26 @@ def test_a_host_of_another_version_learns_that_of_the_robot(library, golden, key
         answer = robot.request(data)
         assert answer[0] == int(row['answer'], 16), row['name']
         assert robot.refusal() == (RefusalReason.VERSION, data[:3])
-        assert robot.status == ENABLED | MOVING
+        assert robot.status == core.ENABLED | core.MOVING
         if answer[0] & 15 == 3:
             assert len(answer) == (32 if key else 24)
-            assert answer[1:4] == bytes([SESSION, row['seq'], 2]), row['name']
+            assert answer[1:4] == bytes([core.SESSION, row['seq'], 2]), row['name']
             # What a host of version 1 checks before the version: settings and channel.
             assert answer[13] <= 3
             assert answer[14] <= 125
-    stop = bytes([0x11, 0, 0, ESTOP]) + bytes(10)
+    stop = bytes([0x11, 0, 0, core.ESTOP]) + bytes(10)
     robot.send(stop)
-    assert robot.status & LATCHED
+    assert robot.status & core.LATCHED
 
 
 def test_a_session_ends_after_half_an_hour_of_silence(robot):
     """Beyond 35 minutes the sign of a difference of 32-bit clocks is ambiguous."""
     robot.drive(1000, 1000, 100_000)
     robot.run(1_799_000_000)
-    assert not robot.status & NO_SESSION
+    assert not robot.status & core.NO_SESSION
     robot.run(2_000_000)
-    assert robot.status == NO_SESSION | EXPIRED
+    assert robot.status == core.NO_SESSION | core.EXPIRED
     robot.drive(1000, 1000, 100_000)
-    assert robot.status == NO_SESSION | EXPIRED
+    assert robot.status == core.NO_SESSION | core.EXPIRED
     robot.hello()
     assert robot.status == 0

@@ -5,17 +5,7 @@
 import ctypes
 
 import pytest
-from support.firmware_core import (
-    BUSY,
-    ENABLED,
-    FAILED,
-    KEY,
-    LATCHED,
-    NO_SESSION,
-    OK,
-    SESSION,
-    Robot,
-)
+from support import firmware_core as core
 
 from t3mpc_ros.emulator.robot_board import CELL_US
 from t3mpc_ros.radio.protocol.authentication import key_check
@@ -36,7 +26,7 @@ KEY_US = 45 * CELL_US
 
 def made(library, key=b'', erased=False):
     """Return a robot that writes its EEPROM as slowly as a real one."""
-    robot = Robot(library, key, erased=erased)
+    robot = core.Robot(library, key, erased=erased)
     robot.call('set_cell_us', ctypes.c_uint32(CELL_US))
     robot.run(200_000)  # it writes its log and, with a key, the counter of boots
     return robot
@@ -56,23 +46,23 @@ def lose_power(robot):
 def begins_session(robot, key):
     """Return whether a host with this key can begin a session."""
     robot.key, robot.session_key = key, b''
-    return robot.hello()[1] == SESSION
+    return robot.hello()[1] == core.SESSION
 
 
 def test_a_key_from_the_console_locks_out_other_hosts_at_once(library):
     robot = made(library)
-    assert request(robot, Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
-    assert request(robot, Key(2, KEY)) == []
-    assert request(robot, Key(3, OTHER)) == [KeyState(3, BUSY, KEY_DAMAGED, 0)]
+    assert request(robot, Key(1)) == [KeyState(1, core.OK, NO_KEY, 0)]
+    assert request(robot, Key(2, core.KEY)) == []
+    assert request(robot, Key(3, OTHER)) == [KeyState(3, core.BUSY, KEY_DAMAGED, 0)]
     assert not begins_session(robot, b'')
     robot.run(KEY_US)
-    assert request(robot, Key(4))[0] == KeyState(2, OK, KEY_HELD, key_check(KEY))
+    assert request(robot, Key(4))[0] == KeyState(2, core.OK, KEY_HELD, key_check(core.KEY))
     assert not begins_session(robot, b'')
     assert not begins_session(robot, OTHER)
-    assert begins_session(robot, KEY)
+    assert begins_session(robot, core.KEY)
     lose_power(robot)
-    assert request(robot, Key(4)) == [KeyState(4, OK, KEY_HELD, key_check(KEY))]
-    assert request(robot, Key(5, bytes(16)), KEY_US) == [KeyState(5, OK, NO_KEY, 0)]
+    assert request(robot, Key(4)) == [KeyState(4, core.OK, KEY_HELD, key_check(core.KEY))]
+    assert request(robot, Key(5, bytes(16)), KEY_US) == [KeyState(5, core.OK, NO_KEY, 0)]
     assert begins_session(robot, b'')
 
 
@@ -80,21 +70,23 @@ def test_no_key_is_written_while_the_drivers_have_power(library):
     robot = made(library)
     robot.hello()
     robot.send(robot.command(3000, 3000, ttl=5))
-    busy = KeyState(1, BUSY, NO_KEY, 0)
-    assert request(robot, Key(1, KEY), 400) == [busy]
+    busy = KeyState(1, core.BUSY, NO_KEY, 0)
+    assert request(robot, Key(1, core.KEY), 400) == [busy]
     robot.run(20_000)
-    assert request(robot, Key(1, KEY)) == [busy]
+    assert request(robot, Key(1, core.KEY)) == [busy]
     robot.run(1_000_000)  # the TTL has expired, the drivers are on
     assert robot.speeds == (0.0, 0.0)
-    assert robot.status & ENABLED
-    assert request(robot, Key(1, KEY)) == [busy]
+    assert robot.status & core.ENABLED
+    assert request(robot, Key(1, core.KEY)) == [busy]
     robot.send(robot.command(flags=0))
     robot.run(1000)
-    assert request(robot, Key(1, KEY), KEY_US) == [KeyState(1, OK, KEY_HELD, key_check(KEY))]
-    assert robot.status & NO_SESSION
+    assert request(robot, Key(1, core.KEY), KEY_US) == [
+        KeyState(1, core.OK, KEY_HELD, key_check(core.KEY))
+    ]
+    assert robot.status & core.NO_SESSION
 
 
-@pytest.mark.parametrize('before', [b'', KEY], ids=['none', 'another'])
+@pytest.mark.parametrize('before', [b'', core.KEY], ids=['none', 'another'])
 @pytest.mark.parametrize('after', [bytes(16), OTHER], ids=['none', 'one'])
 def test_power_loss_leaves_the_old_key_the_new_key_or_a_lock(library, before, after):
     """Power fails at every cell; a locked robot stops on ESTOP, and accepts a new key."""
@@ -104,18 +96,18 @@ def test_power_loss_leaves_the_old_key_the_new_key_or_a_lock(library, before, af
         request(robot, Key(1, after), cut_us)
         lose_power(robot)
         ((number, rc, state, check),) = request(robot, Key(2))
-        assert (number, rc) == (2, OK)
+        assert (number, rc) == (2, core.OK)
         kept = check == key_check(before) if before else state == NO_KEY
         changed = check == key_check(after) if any(after) else state == NO_KEY
         assert kept or changed or state == KEY_DAMAGED
         states.add('kept' if kept else 'changed' if changed else 'damaged')
         if state == KEY_DAMAGED:
-            assert not any(begins_session(robot, key) for key in (b'', KEY, OTHER))
+            assert not any(begins_session(robot, key) for key in (b'', core.KEY, OTHER))
             robot.session_key = b''
             robot.send(robot.command(flags=2))
-            assert robot.status == LATCHED | NO_SESSION
-            expected = KeyState(3, OK, KEY_HELD, key_check(KEY))
-            assert request(robot, Key(3, KEY), KEY_US) == [expected]
+            assert robot.status == core.LATCHED | core.NO_SESSION
+            expected = KeyState(3, core.OK, KEY_HELD, key_check(core.KEY))
+            assert request(robot, Key(3, core.KEY), KEY_US) == [expected]
     assert states == (
         {'kept', 'damaged', 'changed'} if before or any(after) else {'kept'} | states
     )
@@ -134,5 +126,5 @@ def test_frames_for_a_dongle_are_refused(library):
 def test_a_worn_cell_is_reported_and_locks_the_robot(library, address):
     robot = made(library)
     robot.call('wear', ctypes.c_uint8(address), ctypes.c_bool(True))
-    assert request(robot, Key(1, KEY), KEY_US) == [KeyState(1, FAILED, KEY_DAMAGED, 0)]
+    assert request(robot, Key(1, core.KEY), KEY_US) == [KeyState(1, core.FAILED, KEY_DAMAGED, 0)]
     assert not begins_session(robot, b'')

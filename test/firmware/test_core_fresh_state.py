@@ -16,32 +16,14 @@ import struct
 import subprocess
 
 import pytest
-from support.firmware_core import (
-    CLEAR,
-    COUNTERS,
-    ENABLE,
-    ENABLED,
-    ESTOP,
-    FIRMWARE,
-    IDLE_OFF,
-    KEY,
-    Dongle,
-    Robot,
-)
+from support import firmware_core as core
 from support.missing_tools import find, needs
 
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import CALIBRATION_RECORD, SETTINGS_RECORD, Key
-from t3mpc_ros.radio.tool.robot_records import (
-    Calibration,
-    DividerCorrection,
-    RobotSettings,
-    SharpCurve,
-    encode_calibration,
-    encode_settings,
-)
+from t3mpc_ros.radio.tool import robot_records
 
-HEADERS = '\n'.join(path.read_text() for path in sorted((FIRMWARE / 'core').glob('*.h')))
+HEADERS = '\n'.join(path.read_text() for path in sorted((core.FIRMWARE / 'core').glob('*.h')))
 STRUCTS = dict(re.findall(r'^struct (t3_\w+) \{\n(.*?)^\};', HEADERS, re.DOTALL | re.MULTILINE))
 POINTERS = ('robot.port', 'console.port', 'console.robot', 'dongle.port')
 
@@ -75,10 +57,16 @@ def layout(library, tmp_path_factory):
         )
         source = folder / f'{board}.c'
         source.write_text(
-            f'#include <stddef.h>\n#include "{FIRMWARE}/host/t3_host_{board}.c"\n'
+            f'#include <stddef.h>\n#include "{core.FIRMWARE}/host/t3_host_{board}.c"\n'
             f'const size_t layout[][2] = {{{rows}}};\n'
         )
-        command = [compiler, '-shared', '-fPIC', f'-I{FIRMWARE}/core', f'-I{FIRMWARE}/host']
+        command = [
+            compiler,
+            '-shared',
+            '-fPIC',
+            f'-I{core.FIRMWARE}/core',
+            f'-I{core.FIRMWARE}/host',
+        ]
         subprocess.run([*command, '-o', source.with_suffix('.so'), source], check=True)
         made = ctypes.CDLL(str(source.with_suffix('.so')), mode=os.RTLD_LAZY)
         table = (ctypes.c_size_t * 2 * len(paths)).in_dll(made, 'layout')
@@ -105,7 +93,7 @@ def unlike(one, other, layout, kept=()):
 
 def like(robot, library, key=b''):
     """Return a board with the memory cells and the hardware of another one, not booted again."""
-    made = Robot(library, key)
+    made = core.Robot(library, key)
     for address in range(1024):
         made.call(
             'poke_eeprom', ctypes.c_uint16(address), robot.call('cell', ctypes.c_uint16(address))
@@ -131,7 +119,9 @@ def use(robot, r):
                 )
             )
         elif act == 3:
-            robot.send(robot.command(0, 0, flags=r.choice((ESTOP, CLEAR, 0, ENABLE))))
+            robot.send(
+                robot.command(0, 0, flags=r.choice((core.ESTOP, core.CLEAR, 0, core.ENABLE)))
+            )
         elif act == 4:
             robot.call('press', ctypes.c_bool(r.random() < 0.3))
             robot.run(r.choice((2000, 7000, 60_000)))
@@ -165,10 +155,10 @@ def come_to_rest(robot):
     robot.run(2_000_000)
 
 
-@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+@pytest.mark.parametrize('key', [b'', core.KEY], ids=['open', 'keyed'])
 @pytest.mark.parametrize('seed', range(3))
 def test_a_booted_robot_is_as_new(library, layout, key, seed):
-    used = Robot(library, key)
+    used = core.Robot(library, key)
     use(used, random.Random(seed))
     come_to_rest(used)
     new = like(used, library, key)
@@ -183,7 +173,7 @@ def test_a_booted_robot_is_as_new(library, layout, key, seed):
 
 
 CLEARED = (
-    *(f'counters.{name}' for name in COUNTERS),
+    *(f'counters.{name}' for name in core.COUNTERS),
     *('refusal', 'refused'),
 )
 """What CLEAR_COUNTERS clears."""
@@ -208,11 +198,11 @@ KEPT_IN_A_SESSION = (
 """What a host that comes later must see, and nonces, no two of which are alike."""
 
 
-@pytest.mark.parametrize('key', [b'', KEY], ids=['open', 'keyed'])
+@pytest.mark.parametrize('key', [b'', core.KEY], ids=['open', 'keyed'])
 @pytest.mark.parametrize('seed', range(3))
 def test_a_new_session_begins_as_the_first_one(library, layout, key, seed):
     """An action of the session before, of the same number, is no repetition."""
-    used, new = Robot(library, key), Robot(library, key)
+    used, new = core.Robot(library, key), core.Robot(library, key)
     used.run(1000)
     used.hello()
     if key:  # the clock of the host wraps within the session
@@ -221,7 +211,7 @@ def test_a_new_session_begins_as_the_first_one(library, layout, key, seed):
     use(used, random.Random(seed))
     come_to_rest(used)
     used.hello()
-    used.send(used.command(0, 0, flags=CLEAR))
+    used.send(used.command(0, 0, flags=core.CLEAR))
     used.send(b'\xff')
     used.run(1000)
     used.act(2, 1)
@@ -237,16 +227,18 @@ def test_a_new_session_begins_as_the_first_one(library, layout, key, seed):
     assert used.steps[0] == 0
 
 
-CURVE = SharpCurve(0.3, 0.02, 0.05, 0.003)
-CALIBRATION = Calibration(divider=DividerCorrection(0.05, -0.1, 0.02), curves=8 * (CURVE,))
+CURVE = robot_records.SharpCurve(0.3, 0.02, 0.05, 0.003)
+CALIBRATION = robot_records.Calibration(
+    divider=robot_records.DividerCorrection(0.05, -0.1, 0.02), curves=8 * (CURVE,)
+)
 CHANGES = {
-    'divider': RobotSettings(divider=7.5),
-    'direction': RobotSettings(invert_left=True),
-    'steps': RobotSettings(microsteps=32, steps_per_turn=400),
-    'radio': RobotSettings(rate='250k', channel=7, address=b'12345'),
-    'sensors': RobotSettings(sensors=('GP2Y0A41',) * 8),
+    'divider': robot_records.RobotSettings(divider=7.5),
+    'direction': robot_records.RobotSettings(invert_left=True),
+    'steps': robot_records.RobotSettings(microsteps=32, steps_per_turn=400),
+    'radio': robot_records.RobotSettings(rate='250k', channel=7, address=b'12345'),
+    'sensors': robot_records.RobotSettings(sensors=('GP2Y0A41',) * 8),
     'calibration': CALIBRATION,
-    'key': Key(2, KEY),
+    'key': Key(2, core.KEY),
     'no key': Key(2, bytes(16)),
 }
 
@@ -255,17 +247,17 @@ def change(robot, what):
     """Store a record or a key over USB."""
     if isinstance(what, Key):
         robot.console(encode(what))
-    elif isinstance(what, Calibration):
-        robot.store(CALIBRATION_RECORD, encode_calibration(what))
+    elif isinstance(what, robot_records.Calibration):
+        robot.store(CALIBRATION_RECORD, robot_records.encode_calibration(what))
     else:
-        robot.store(SETTINGS_RECORD, encode_settings(what))
+        robot.store(SETTINGS_RECORD, robot_records.encode_settings(what))
     robot.run(700_000)
 
 
 @pytest.mark.parametrize('what', CHANGES.values(), ids=CHANGES)
 def test_stored_records_are_in_effect_as_after_a_boot(library, layout, what):
     """The battery of the divider before was filtered into that of the new one."""
-    used, new = Robot(library), Robot(library)
+    used, new = core.Robot(library), core.Robot(library)
     for each in (used, new):
         for channel in range(9):
             each.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(400))
@@ -282,7 +274,7 @@ def test_stored_records_are_in_effect_as_after_a_boot(library, layout, what):
 
 @pytest.mark.parametrize('seed', range(3))
 def test_a_booted_dongle_is_as_new(library, layout, seed):
-    used, new = Dongle(library), Dongle(library)
+    used, new = core.Dongle(library), core.Dongle(library)
     r = random.Random(seed)
     for _ in range(30):
         frame = bytes([1, r.randrange(256), r.randrange(20), 3]) + r.randbytes(r.choice((3, 6)))
@@ -302,7 +294,7 @@ def test_a_booted_dongle_is_as_new(library, layout, seed):
 
 
 def test_a_transaction_of_the_dongle_leaves_nothing_to_the_next(library, layout):
-    used, new = Dongle(library), Dongle(library)
+    used, new = core.Dongle(library), core.Dongle(library)
     used.write(bytes([1, 5, 2, 3]) + b'abcdef')
     used.reply(b'a payload')
     used.run(1000)
@@ -321,17 +313,17 @@ def test_a_transaction_of_the_dongle_leaves_nothing_to_the_next(library, layout)
 
 def test_a_released_emergency_stop_leaves_a_robot_at_rest(library, layout):
     """Released, the robot is as after any command to stand, and the command before is gone."""
-    used, new = Robot(library), Robot(library)
+    used, new = core.Robot(library), core.Robot(library)
     for each in (used, new):
         each.run(1000)
         each.hello()
         each.drive(4000, 4000, 300_000)
-    used.send(used.command(4000, 4000, flags=ESTOP))
+    used.send(used.command(4000, 4000, flags=core.ESTOP))
     used.run(1_000_000)
     new.send(new.command(0, 0, flags=0))
     new.run(1_000_000)
     for each in (used, new):
-        each.send(each.command(0, 0, flags=CLEAR))
+        each.send(each.command(0, 0, flags=core.CLEAR))
         each.run(100_000)
     assert not unlike(used, new, layout, ('robot.steps', 'robot.rest_us', 'console'))
 
@@ -355,15 +347,15 @@ def pass_through(robot):
     drive(400_000, 30_000, 5000)  # scaled down
     drive(400_000, 0, 0)
     wait(400_000)
-    robot.send(robot.command(0, 0, flags=ESTOP))
+    robot.send(robot.command(0, 0, flags=core.ESTOP))
     wait(2_400_000)
-    robot.send(robot.command(0, 0, flags=CLEAR))
+    robot.send(robot.command(0, 0, flags=core.CLEAR))
     drive(200_000, 4000, -4000)
     robot.call('press', ctypes.c_bool(True))
     wait(400_000)
     robot.call('press', ctypes.c_bool(False))
     wait(400_000)
-    robot.send(robot.command(0, 0, flags=CLEAR))
+    robot.send(robot.command(0, 0, flags=core.CLEAR))
     for channel, count in ((8, 350), (8, 0xFFFF)):  # an empty battery, and none
         robot.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(count))
         drive(1_200_000, 4000, 4000)
@@ -377,10 +369,10 @@ def pass_through(robot):
 
 def test_each_state_is_the_same_when_it_is_entered_again(library):
     """A robot that had once been idle lost its power as soon as it came to rest again."""
-    robot = Robot(library)
+    robot = core.Robot(library)
     robot.run(1_200_000)
     robot.hello()
-    robot.set(IDLE_OFF, 600)
+    robot.set(core.IDLE_OFF, 600)
     robot.run(-robot.now % 2_000_000)
     first = pass_through(robot)
     robot.run(-robot.now % 2_000_000)
@@ -388,7 +380,7 @@ def test_each_state_is_the_same_when_it_is_entered_again(library):
     rests = [
         after
         for before, after in itertools.pairwise(first)
-        if any(before[1]) and not any(after[1]) and after[0] & ENABLED
+        if any(before[1]) and not any(after[1]) and after[0] & core.ENABLED
     ]
     assert len(rests) >= 2
     assert all(powered for _, _, powered, _ in rests)

@@ -7,21 +7,7 @@ import math
 import struct
 
 import pytest
-from support.firmware_core import (
-    DECELERATION,
-    ENABLED,
-    EXPIRED,
-    IDLE_OFF,
-    INVERT,
-    LIMITED,
-    MAX_SPEED,
-    MICROSTEPS,
-    MOVING,
-    OK,
-    READ_ONLY,
-    STEP,
-    Robot,
-)
+from support import firmware_core as core
 
 
 def test_wheel_speed_is_exact_at_10_rad_per_s(robot):
@@ -29,7 +15,7 @@ def test_wheel_speed_is_exact_at_10_rad_per_s(robot):
     before = robot.pulses
     robot.drive(10_000, -10_000, 10_000_000)
     left, right = (
-        (after - earlier) * STEP / 10.0
+        (after - earlier) * core.STEP / 10.0
         for earlier, after in zip(before, robot.pulses, strict=True)
     )
     assert left == pytest.approx(10.0, abs=0.0003)
@@ -42,8 +28,8 @@ def test_wheel_speed_is_exact_at_low_speed(robot):
     before = robot.pulses
     robot.drive(1, -3, 100_000_000)
     assert [after - earlier for earlier, after in zip(before, robot.pulses, strict=True)] == [
-        pytest.approx(0.1 / STEP, abs=1),
-        pytest.approx(-0.3 / STEP, abs=1),
+        pytest.approx(0.1 / core.STEP, abs=1),
+        pytest.approx(-0.3 / core.STEP, abs=1),
     ]
 
 
@@ -56,16 +42,16 @@ def test_speed_crosses_zero_without_a_jump(robot):
         for _ in range(20):
             place += robot.speeds[0] * 1e-3
             robot.run(1000)
-        assert abs(robot.steps[0] - place / STEP) <= 2.0, index
+        assert abs(robot.steps[0] - place / core.STEP) <= 2.0, index
     assert robot.steps == robot.pulses
     assert max(robot.pulses) - min(robot.pulses) < 3
     assert robot.call('hasty_pulses') == 0  # DIR is stable before every STEP
 
 
 def test_step_rate_is_limited_to_10_000_per_second(robot):
-    assert robot.set(MAX_SPEED, 19_600) == (OK, 19_600)
+    assert robot.set(core.MAX_SPEED, 19_600) == (core.OK, 19_600)
     robot.drive(32_767, -32_768, 2_000_000)
-    assert robot.status & LIMITED
+    assert robot.status & core.LIMITED
     before = robot.pulses
     robot.drive(32_767, -32_768, 1_000_000)
     rates = [after - earlier for earlier, after in zip(before, robot.pulses, strict=True)]
@@ -76,15 +62,15 @@ def test_step_rate_is_limited_to_10_000_per_second(robot):
 @pytest.mark.parametrize('microsteps', [1, 8, 32, 256])
 @pytest.mark.parametrize('reboot', [False, True])
 def test_microsteps_of_the_settings_keep_the_speed(library, microsteps, reboot):
-    robot = Robot(library)
+    robot = core.Robot(library)
     robot.run(1000)
     robot.hello()
-    assert robot.settings(82, microsteps)[0] == OK
+    assert robot.settings(82, microsteps)[0] == core.OK
     if reboot:
         robot.call('boot', 1, 0)
     info = robot.hello()
     assert struct.unpack_from('<H', info, 10) == (microsteps,)
-    assert robot.set(MICROSTEPS, microsteps) == (READ_ONLY, microsteps)
+    assert robot.set(core.MICROSTEPS, microsteps) == (core.READ_ONLY, microsteps)
     robot.drive(10_000, 5_000, 1_000_000)
     before = robot.pulses
     robot.drive(10_000, 5_000, 1_000_000)
@@ -92,14 +78,14 @@ def test_microsteps_of_the_settings_keep_the_speed(library, microsteps, reboot):
     wanted = min(10.0 * 200 * microsteps / math.tau, 10_000.0)
     assert rates == [pytest.approx(wanted, abs=20), pytest.approx(wanted / 2, abs=10)]
     assert rates[0] <= 10_000
-    assert bool(robot.status & LIMITED) == (microsteps > 31)
+    assert bool(robot.status & core.LIMITED) == (microsteps > 31)
 
 
 @pytest.mark.parametrize(
     'inverted, signs', [(0, (1, 1)), (1, (-1, 1)), (2, (1, -1)), (3, (-1, -1))]
 )
 def test_an_inverted_wheel_turns_backwards_and_counts_forwards(robot, inverted, signs):
-    assert robot.set(INVERT, inverted) == (OK, inverted)
+    assert robot.set(core.INVERT, inverted) == (core.OK, inverted)
     robot.drive(3000, 2000, 500_000)
     assert min(robot.steps) > 100
     assert robot.pulses == tuple(
@@ -121,7 +107,7 @@ def test_one_factor_keeps_the_curvature_in_every_ramp(slow_ramps, left, right):
         check()
     slow_ramps.run(200_000)
     rates = []
-    while slow_ramps.status & MOVING:
+    while slow_ramps.status & core.MOVING:
         before = max(map(abs, check()))
         slow_ramps.run(10_000)
         rates.append(before - max(map(abs, slow_ramps.speeds)))
@@ -147,7 +133,7 @@ def test_opposite_speed_changes_use_the_smaller_rate(slow_ramps):
     slow_ramps.drive(1000, 9000, 1_000_000)
     slow_ramps.drive(9000, 1000, 100_000)
     assert slow_ramps.speeds == pytest.approx((2.5, 7.5), abs=0.03)
-    assert slow_ramps.set(DECELERATION, 5000) == (OK, 5000)
+    assert slow_ramps.set(core.DECELERATION, 5000) == (core.OK, 5000)
     slow_ramps.drive(1000, 9000, 2_000_000)
     slow_ramps.drive(9000, 1000, 100_000)
     assert slow_ramps.speeds == pytest.approx((1.5, 8.5), abs=0.03)
@@ -161,23 +147,23 @@ def test_a_stalled_main_loop_causes_no_speed_jump(slow_ramps):
     slow_ramps.call('stall', ctypes.c_uint32(500_000))
     slow_ramps.run(400)
     assert 0.0 < before - slow_ramps.speeds[0] <= 0.61  # 20 ms at 30 rad/s²
-    assert slow_ramps.status == ENABLED | MOVING | EXPIRED
+    assert slow_ramps.status == core.ENABLED | core.MOVING | core.EXPIRED
 
 
 def test_a_command_beyond_the_limit_is_scaled_as_a_whole(robot):
-    assert robot.set(MAX_SPEED, 4000) == (OK, 4000)
+    assert robot.set(core.MAX_SPEED, 4000) == (core.OK, 4000)
     robot.drive(8000, -2000, 1_000_000)
     assert robot.speeds == (4.0, -1.0)
-    assert robot.status & LIMITED
+    assert robot.status & core.LIMITED
     robot.drive(4000, -1000, 20_000)
-    assert not robot.status & LIMITED
-    assert robot.set(MAX_SPEED, 0) == (OK, 0)
+    assert not robot.status & core.LIMITED
+    assert robot.set(core.MAX_SPEED, 0) == (core.OK, 0)
     robot.drive(8000, -2000, 1_000_000)
     assert robot.speeds == (0.0, 0.0)
 
 
 def test_drivers_switch_off_when_idle_and_on_before_a_step(robot):
-    assert robot.set(IDLE_OFF, 1000) == (OK, 1000)
+    assert robot.set(core.IDLE_OFF, 1000) == (core.OK, 1000)
     robot.drive(1000, 1000, 500_000)
     robot.drive(0, 0, 900_000)
     assert robot.call('powered')
@@ -190,20 +176,20 @@ def test_drivers_switch_off_when_idle_and_on_before_a_step(robot):
 
 def test_clock_wrap_after_hours_at_rest_has_no_effect(robot):
     """2**32 us later an old time stamp equals now, for the idle time and the command age."""
-    assert robot.set(IDLE_OFF, 1000) == (OK, 1000)
+    assert robot.set(core.IDLE_OFF, 1000) == (core.OK, 1000)
     robot.send(robot.command(0, 0))
     sent = 1 << 32
     for _ in range(4):
         robot.run(1_000_000_000)
         sent -= 1_000_000_000
-        assert robot.get(MAX_SPEED)[0] == OK  # keeps the session
+        assert robot.get(core.MAX_SPEED)[0] == core.OK  # keeps the session
         sent -= 1000
     robot.run(sent - 300_000)
     for _ in range(20):
         robot.run(100_000)
         assert not robot.call('powered')
         assert robot.reply()[22:24] == b'\xff\xff'
-    assert robot.status == ENABLED | EXPIRED
+    assert robot.status == core.ENABLED | core.EXPIRED
 
 
 def test_drivers_keep_their_power_until_a_ramp_has_ended(slow_ramps):
@@ -227,14 +213,14 @@ def test_clock_wrap_of_any_width_has_no_effect(robot, wrap, before):
     robot.poke(wrap - before)
     robot.send(robot.command(5000, 5000))
     robot.run(190_000)
-    assert robot.status == ENABLED | MOVING
+    assert robot.status == core.ENABLED | core.MOVING
     assert robot.speeds == (5.0, 5.0)
     robot.run(190_000)
-    assert robot.status == ENABLED | EXPIRED
+    assert robot.status == core.ENABLED | core.EXPIRED
     assert robot.steps == robot.pulses
     assert robot.counters()['stale'] == 0
     robot.drive(5000, 5000, 100_000)
-    assert robot.status == ENABLED | MOVING
+    assert robot.status == core.ENABLED | core.MOVING
 
 
 def test_counters_wrap_at_32_bits(robot):

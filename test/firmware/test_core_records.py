@@ -6,20 +6,7 @@ import ctypes
 import struct
 
 import pytest
-from support.firmware_core import (
-    ADDRESS,
-    BUSY,
-    ENABLED,
-    FAILED,
-    INVERT,
-    LATCHED,
-    NO_SESSION,
-    OK,
-    RANGE,
-    STEPS_PER_REV,
-    UNKNOWN,
-    Robot,
-)
+from support import firmware_core as core
 
 from t3mpc_ros.emulator.robot_board import CELL_US
 from t3mpc_ros.radio.protocol.frames import (
@@ -79,11 +66,11 @@ def test_a_write_torn_at_any_byte_leaves_no_mixture(library, name, before):
     found = set()
     cuts = 0
     while True:
-        robot = Robot(library, erased=before == 'nothing')
+        robot = core.Robot(library, erased=before == 'nothing')
         if before == 'nothing' and record == CALIBRATION_RECORD:
             robot.store(SETTINGS_RECORD, OLD_SETTINGS)
         if before != 'nothing':
-            assert robot.store(record, old) == OK
+            assert robot.store(record, old) == core.OK
         robot.reset(CELL_US)
         if before.endswith('damaged'):
             copy = copies[before == 'second damaged']
@@ -109,8 +96,8 @@ def test_a_write_torn_at_any_byte_leaves_no_mixture(library, name, before):
         robot.run(700_000)
         assert robot.record(record) == (SETTINGS_GOOD if state in USABLE else state, body)
         cuts += 1
-        assert result in (None, OK)
-        if result == OK:
+        assert result in (None, core.OK)
+        if result == core.OK:
             break
     changed = sum(a != b for a, b in zip(old, new, strict=True))
     assert cuts > 2 * changed  # each of them was cut
@@ -123,15 +110,15 @@ def test_a_write_torn_at_any_byte_leaves_no_mixture(library, name, before):
 def test_a_worn_cell_locks_the_robot(library, name, worn):
     record, old, new, copies = RECORDS[name]
     for at in (*range(0, len(old) + 2, 5), len(old) + 1):
-        robot = Robot(library)
-        assert robot.store(record, old) == OK
+        robot = core.Robot(library)
+        assert robot.store(record, old) == core.OK
         expected = new + crc16(new).to_bytes(2, 'little')
         before = old + crc16(old).to_bytes(2, 'little')
         for number in worn:
             robot.call('wear', ctypes.c_uint16(copies[number] + at), ctypes.c_bool(True))
         if at and expected[at] == before[at]:
             continue
-        assert robot.store(record, new) == FAILED
+        assert robot.store(record, new) == core.FAILED
         assert robot.record(record) == (SETTINGS_DAMAGED, old)
         assert not robot.moves()
 
@@ -140,13 +127,13 @@ def test_settings_of_version_1_are_refused_with_their_own_state(library):
     """They lack what the robot now needs; 16 microsteps for jumpers of 8 are double speed."""
     body = bytes([1, 100, 8, 0]) + b'\xc2\x5a\x33\xa6\xe1'
     for address in (40, 56):
-        robot = Robot(library, erased=True)
+        robot = core.Robot(library, erased=True)
         robot.poke_eeprom(address, body + crc16(body).to_bytes(2, 'little'))
         robot.reset()
         assert robot.record(SETTINGS_RECORD) == (SETTINGS_OLD, OLD_SETTINGS)
         assert robot.identity()[0] == SETTINGS_OLD
         assert not robot.moves()
-        assert robot.store(SETTINGS_RECORD, NEW_SETTINGS) == OK
+        assert robot.store(SETTINGS_RECORD, NEW_SETTINGS) == core.OK
         assert robot.moves()
 
 
@@ -156,11 +143,11 @@ def test_only_whole_and_possible_records_are_stored(robot):
     def store(record, crc):
         return robot.console(struct.pack('<BBBH', 7, 9, record, crc))[0][2]
 
-    assert store(SETTINGS_RECORD, crc16(NEW_SETTINGS) ^ 1) == UNKNOWN
-    assert store(CALIBRATION_RECORD, crc16(NEW_SETTINGS)) == UNKNOWN
-    assert store(9, 0) == UNKNOWN
-    assert robot.console(bytes([6, 9, 9, 0]))[0][2] == UNKNOWN
-    assert robot.console(bytes([6, 9, 0, 2]))[0][2] == UNKNOWN
+    assert store(SETTINGS_RECORD, crc16(NEW_SETTINGS) ^ 1) == core.UNKNOWN
+    assert store(CALIBRATION_RECORD, crc16(NEW_SETTINGS)) == core.UNKNOWN
+    assert store(9, 0) == core.UNKNOWN
+    assert robot.console(bytes([6, 9, 9, 0]))[0][2] == core.UNKNOWN
+    assert robot.console(bytes([6, 9, 0, 2]))[0][2] == core.UNKNOWN
     for record, good, values in (
         (SETTINGS_RECORD, NEW_SETTINGS, {0: 1, 1: 126, 2: 3, 9: 3, 10: 4, 12: 99, 13: 4, 16: 3}),
         (CALIBRATION_RECORD, NEW_CALIBRATION, {0: 2, 4: 99, 5: 0, 14: 0x7F, 19: 0, 25: 0, 28: 99}),
@@ -170,10 +157,10 @@ def test_only_whole_and_possible_records_are_stored(robot):
             bad[at] = value
             if at in (5, 19, 25):
                 bad[at + 1] = value  # a value without an uncertainty
-            assert robot.store(record, bytes(bad), 1000) == RANGE, at
+            assert robot.store(record, bytes(bad), 1000) == core.RANGE, at
     assert robot.status == 0  # the session continues
     robot.drive(1000, 1000, 100_000)
-    assert robot.store(CALIBRATION_RECORD, NEW_CALIBRATION, 1000) == BUSY
+    assert robot.store(CALIBRATION_RECORD, NEW_CALIBRATION, 1000) == core.BUSY
     assert robot.record(CALIBRATION_RECORD) == (SETTINGS_MISSING, NO_CALIBRATION)
 
 
@@ -183,11 +170,11 @@ def test_the_robot_uses_its_settings_and_calibration(robot):
     robot.call('set_adc', ctypes.c_uint8(8), ctypes.c_uint16(800))
     settings = RobotSettings(microsteps=8, steps_per_turn=400, invert_left=True, divider=3.0)
     settings = settings._replace(sensors=('none', 'GP2Y0A41', *6 * ('GP2Y0A21',)))
-    assert robot.store(SETTINGS_RECORD, encode_settings(settings)) == OK
-    assert robot.status & NO_SESSION
+    assert robot.store(SETTINGS_RECORD, encode_settings(settings)) == core.OK
+    assert robot.status & core.NO_SESSION
     robot.run(1_000_000)
     robot.hello()
-    assert robot.get(STEPS_PER_REV) == (OK, 400)
+    assert robot.get(core.STEPS_PER_REV) == (core.OK, 400)
     aux = robot.request(bytes([0x25, 0, 0, 1]))
     nominal = 800 / 1024 * 5000 * 3
     assert struct.unpack_from('<H', aux, 4)[0] == pytest.approx(nominal, abs=8)
@@ -197,7 +184,7 @@ def test_the_robot_uses_its_settings_and_calibration(robot):
     assert robot.steps[0] == -left  # counted in the direction of the command
     # The parameter of the session acts against the settings.
     robot.drive(0, 0, 300_000)
-    assert robot.set(INVERT, 3) == (OK, 3)
+    assert robot.set(core.INVERT, 3) == (core.OK, 3)
     before = robot.pulses
     robot.drive(4000, 4000, 500_000)
     assert robot.pulses[0] > before[0]
@@ -214,7 +201,7 @@ def test_the_robot_uses_its_settings_and_calibration(robot):
     calibration = Calibration(
         divider=DividerCorrection(0.05, -0.1, 0.02), curves=(*7 * (None,), CURVE)
     )
-    assert robot.store(CALIBRATION_RECORD, encode_calibration(calibration)) == OK
+    assert robot.store(CALIBRATION_RECORD, encode_calibration(calibration)) == core.OK
     robot.run(1_000_000)
     state = robot.request(bytes([0x25, 0, 0, 0]))
     expected[7] = round(200 * (0.3 / (volts - 0.05) - 0.02))
@@ -225,51 +212,53 @@ def test_the_robot_uses_its_settings_and_calibration(robot):
     assert struct.unpack_from('<9H', samples, 2) == (*8 * (200,), 800)
 
 
-DEFAULTS, OTHERS = (82, 16, ADDRESS), (100, 32, bytes.fromhex('c25a33a6e1'))
+DEFAULTS, OTHERS = (82, 16, core.ADDRESS), (100, 32, bytes.fromhex('c25a33a6e1'))
 """Channel, microsteps and address."""
 
 
 def test_two_robots_without_settings_follow_no_command(library):
     """Both once obeyed the first host on the default channel."""
     for _ in range(2):
-        robot = Robot(library, erased=True)
+        robot = core.Robot(library, erased=True)
         robot.run(1000)
         assert robot.hello()[1] == 0
         robot.drive(5000, 5000, 1_000_000)
-        assert robot.status == NO_SESSION
+        assert robot.status == core.NO_SESSION
         assert robot.pulses == (0, 0)
         assert not robot.call('powered')
         assert robot.identity() == (SETTINGS_MISSING, *DEFAULTS)
         assert robot.counters()['bad_session'] > 50
         robot.send(robot.command(flags=2))  # ESTOP
-        assert robot.status & LATCHED
+        assert robot.status & core.LATCHED
 
 
 def test_pong_and_info_hold_channel_address_and_build(library, robot):
     (pong,) = robot.console(b'\x03\x01ping')
-    assert pong[21:] == bytes([SETTINGS_GOOD, 82]) + ADDRESS + bytes(4)
-    assert robot.request(b'\x25\0\0\2')[13:24] == bytes([SETTINGS_GOOD, 82]) + ADDRESS + bytes(4)
-    (pong,) = Robot(library, erased=True).console(b'\x03\x01ping')
+    assert pong[21:] == bytes([SETTINGS_GOOD, 82]) + core.ADDRESS + bytes(4)
+    assert robot.request(b'\x25\0\0\2')[13:24] == bytes(
+        [SETTINGS_GOOD, 82]
+    ) + core.ADDRESS + bytes(4)
+    (pong,) = core.Robot(library, erased=True).console(b'\x03\x01ping')
     assert pong[21] == SETTINGS_MISSING
 
 
 def test_settings_are_written_only_at_rest_with_drivers_off(robot):
     for values in (
-        (82, 0, ADDRESS),
-        (82, 512, ADDRESS),
+        (82, 0, core.ADDRESS),
+        (82, 512, core.ADDRESS),
         (82, 16, bytes(5)),
         (82, 16, b'\xff' * 5),
     ):
-        assert robot.settings(*values) == (RANGE, SETTINGS_GOOD, *DEFAULTS)
+        assert robot.settings(*values) == (core.RANGE, SETTINGS_GOOD, *DEFAULTS)
     robot.drive(3000, 3000, 200_000)
-    assert robot.settings(*OTHERS, us=1000) == (BUSY, SETTINGS_GOOD, *DEFAULTS)
+    assert robot.settings(*OTHERS, us=1000) == (core.BUSY, SETTINGS_GOOD, *DEFAULTS)
     robot.drive(0, 0, 400_000)
     assert robot.call('powered')
-    assert robot.settings(*OTHERS, us=1000) == (BUSY, SETTINGS_GOOD, *DEFAULTS)
-    assert robot.status == ENABLED
+    assert robot.settings(*OTHERS, us=1000) == (core.BUSY, SETTINGS_GOOD, *DEFAULTS)
+    assert robot.status == core.ENABLED
     robot.send(robot.command(flags=0))
     robot.run(2000)
     steps = robot.steps
-    assert robot.settings(*OTHERS) == (OK, SETTINGS_GOOD, *OTHERS)
-    assert robot.status & NO_SESSION
+    assert robot.settings(*OTHERS) == (core.OK, SETTINGS_GOOD, *OTHERS)
+    assert robot.status & core.NO_SESSION
     assert robot.steps == steps

@@ -6,106 +6,85 @@ import ctypes
 import struct
 
 import pytest
-from support.firmware_core import (
-    ACCELERATION,
-    BATTERY_LOW,
-    BUSY,
-    CUTOFF,
-    DECELERATION,
-    ESTOP,
-    GYRO_RANGE,
-    IDLE_OFF,
-    IMU_FAULT,
-    INVERT,
-    LOW_BATTERY,
-    MAX_SPEED,
-    MICROSTEPS,
-    OK,
-    RANGE,
-    READ_ONLY,
-    SESSION,
-    STEPS_PER_REV,
-    TTL_MAX,
-    UNKNOWN,
-)
+from support import firmware_core as core
 
 from t3mpc_ros.robot.sensor_conversions import encode_range
 from t3mpc_ros.simulation.sensors import range_sensor
 
 BOUNDS = {
-    MAX_SPEED: (0, 19_600),
-    ACCELERATION: (100, 100_000),
-    DECELERATION: (100, 200_000),
-    TTL_MAX: (20, 500),
-    BATTERY_LOW: (0, 30_000),
-    CUTOFF: (0, 30_000),
-    IDLE_OFF: (0, 600_000),
-    INVERT: (0, 3),
+    core.MAX_SPEED: (0, 19_600),
+    core.ACCELERATION: (100, 100_000),
+    core.DECELERATION: (100, 200_000),
+    core.TTL_MAX: (20, 500),
+    core.BATTERY_LOW: (0, 30_000),
+    core.CUTOFF: (0, 30_000),
+    core.IDLE_OFF: (0, 600_000),
+    core.INVERT: (0, 3),
 }
 
 
 @pytest.mark.parametrize('number', BOUNDS)
 def test_parameters_keep_their_bounds(robot, number):
     low, high = BOUNDS[number]
-    assert robot.set(number, low) == (OK, low)
-    assert robot.set(number, high) == (OK, high)
+    assert robot.set(number, low) == (core.OK, low)
+    assert robot.set(number, high) == (core.OK, high)
     for value in (low - 1, high + 1, -(1 << 31), (1 << 31) - 1):
-        assert robot.set(number, value) == (RANGE, high)
-    assert robot.get(number) == (OK, high)
-    reply = robot.request(bytes([0x22, SESSION, 44, number]))
+        assert robot.set(number, value) == (core.RANGE, high)
+    assert robot.get(number) == (core.OK, high)
+    reply = robot.request(bytes([0x22, core.SESSION, 44, number]))
     assert reply[2] == 44
     assert struct.unpack_from('<ii', reply, 9) == (low, high)
 
 
 def test_read_only_and_unknown_parameters_are_rejected(robot):
-    assert robot.set(STEPS_PER_REV, 400) == (READ_ONLY, 200)
-    assert robot.set(GYRO_RANGE, 250) == (READ_ONLY, 500)
-    assert robot.set(MICROSTEPS, 8) == (READ_ONLY, 16)
+    assert robot.set(core.STEPS_PER_REV, 400) == (core.READ_ONLY, 200)
+    assert robot.set(core.GYRO_RANGE, 250) == (core.READ_ONLY, 500)
+    assert robot.set(core.MICROSTEPS, 8) == (core.READ_ONLY, 16)
     for number in (11, 12, 128, 255):
-        assert robot.set(number, 1) == (UNKNOWN, 0)
-        assert robot.get(number) == (UNKNOWN, 0)
+        assert robot.set(number, 1) == (core.UNKNOWN, 0)
+        assert robot.get(number) == (core.UNKNOWN, 0)
 
 
 def test_the_direction_changes_only_at_rest(robot):
     robot.drive(1000, 1000, 100_000)
-    assert robot.set(INVERT, 2) == (BUSY, 0)
-    assert robot.set(INVERT, 0) == (OK, 0)  # rewritten by the host after a reconnection
+    assert robot.set(core.INVERT, 2) == (core.BUSY, 0)
+    assert robot.set(core.INVERT, 0) == (core.OK, 0)  # rewritten by the host after a reconnection
     robot.drive(0, 0, 300_000)
-    assert robot.set(INVERT, 2) == (OK, 2)
+    assert robot.set(core.INVERT, 2) == (core.OK, 2)
 
 
 def test_odometry_is_reset_only_at_rest(robot):
     robot.drive(1000, 1000, 500_000)
-    assert robot.act(1, seq=1) == bytes([0x24, SESSION, 1, 1, BUSY])
+    assert robot.act(1, seq=1) == bytes([0x24, core.SESSION, 1, 1, core.BUSY])
     robot.drive(0, 0, 300_000)
     assert min(robot.steps) > 100
-    assert robot.act(1, seq=2) == bytes([0x24, SESSION, 2, 1, OK])
+    assert robot.act(1, seq=2) == bytes([0x24, core.SESSION, 2, 1, core.OK])
     assert robot.steps == (0, 0)
-    assert robot.act(3, seq=3) == bytes([0x24, SESSION, 3, 3, UNKNOWN])
+    assert robot.act(3, seq=3) == bytes([0x24, core.SESSION, 3, 3, core.UNKNOWN])
 
 
 def test_a_repeated_action_is_acknowledged_but_runs_once(robot):
     """The reply was lost, the host repeats the request, the robot has moved meanwhile."""
-    assert robot.act(1, seq=7)[4] == OK
+    assert robot.act(1, seq=7)[4] == core.OK
     robot.drive(1000, 1000, 500_000)
     robot.drive(0, 0, 300_000)
     steps = robot.steps
-    assert robot.act(1, seq=7)[4] == OK
+    assert robot.act(1, seq=7)[4] == core.OK
     assert robot.steps == steps
-    assert robot.act(1, seq=8)[4] == OK
+    assert robot.act(1, seq=8)[4] == core.OK
     assert robot.steps == (0, 0)
 
 
 def test_reply_to_each_kind_of_packet(robot):
     kinds = {
         'CMD': (robot.command(), 0x21),
-        'PARAM_GET': (bytes([0x22, SESSION, 1, 0]), 0x22),
-        'PARAM_SET': (struct.pack('<BBBBi', 0x23, SESSION, 1, 0, 1), 0x22),
+        'PARAM_GET': (bytes([0x22, core.SESSION, 1, 0]), 0x22),
+        'PARAM_SET': (struct.pack('<BBBBi', 0x23, core.SESSION, 1, 0, 1), 0x22),
         'POLL state': (b'\x25\0\1\0', 0x21),
         'POLL aux': (b'\x25\0\1\1', 0x25),
         'POLL info': (b'\x25\0\1\2', 0x23),
-        'ACTION': (struct.pack('<BBBBH', 0x26, SESSION, 1, 2, 0), 0x24),
-        'HELLO': (bytes([0x24, SESSION, 1, 0]), 0x23),
+        'ACTION': (struct.pack('<BBBBH', 0x26, core.SESSION, 1, 2, 0), 0x24),
+        'HELLO': (bytes([0x24, core.SESSION, 1, 0]), 0x23),
         'other session': (bytes([0x22, 3, 1, 0]), 0x21),
         'other version': (b'\x35\0\1\1', 0x21),
         'nothing': (b'', 0x21),
@@ -114,7 +93,7 @@ def test_reply_to_each_kind_of_packet(robot):
         reply = robot.request(data)
         assert reply[0] == head, name
         if name in ('CMD', 'PARAM_GET', 'PARAM_SET', 'POLL info', 'ACTION', 'HELLO'):
-            assert reply[1] == SESSION
+            assert reply[1] == core.SESSION
     assert len(robot.reply()) == 32
 
 
@@ -164,19 +143,19 @@ def test_state_contains_the_sensor_readings(robot):
     robot.run(100_000)  # the first measurement
     aux = robot.request(b'\x25\0\0\1')
     assert struct.unpack_from('<Hhhhh', aux, 4) == (10_195, -4000, 8192, -12, 13)
-    assert robot.status & LOW_BATTERY
-    assert robot.set(BATTERY_LOW, 10_000)[0] == OK
-    assert not robot.status & LOW_BATTERY
+    assert robot.status & core.LOW_BATTERY
+    assert robot.set(core.BATTERY_LOW, 10_000)[0] == core.OK
+    assert not robot.status & core.LOW_BATTERY
     robot.call('set_imu', ctypes.c_bool(False), seven)
     state = robot.request(b'\x25\0\0\0')
-    assert state[3] & IMU_FAULT
+    assert state[3] & core.IMU_FAULT
     assert state[16:22] == bytes(6)
 
 
 def test_an_oversized_payload_is_ignored(robot):
     """A crafted packet makes some nRF24 report widths above 32."""
     for size in range(33, 256):
-        robot.send((robot.command(5000, 5000, ESTOP) + bytes(300))[:size])
+        robot.send((robot.command(5000, 5000, core.ESTOP) + bytes(300))[:size])
     robot.run(20_000)
     assert robot.status == 0
     assert robot.counters()['malformed'] == 223

@@ -9,31 +9,22 @@ import random
 import pytest
 
 from t3mpc_ros.radio.protocol import codec, frames
-from t3mpc_ros.radio.protocol.codec import (
-    decode_downlink,
-    decode_from_board,
-    decode_from_dongle,
-    decode_to_board,
-    decode_to_dongle,
-    decode_uplink,
-    encode,
-)
 from t3mpc_ros.radio.protocol.frames import FrameError, FrameErrorKind
 from t3mpc_ros.radio.protocol.framing import encode_frame
 
 GOLDEN = Path(__file__).parents[1] / 'golden'
 VECTORS = json.loads((GOLDEN / 'radio_vectors.json').read_text())
 DECODERS = {
-    'down': decode_downlink,
-    'up': decode_uplink,
-    'to_dongle': decode_to_dongle,
-    'from_dongle': decode_from_dongle,
-    'to_board': decode_to_board,
-    'from_board': decode_from_board,
+    'down': codec.decode_downlink,
+    'up': codec.decode_uplink,
+    'to_dongle': codec.decode_to_dongle,
+    'from_dongle': codec.decode_from_dongle,
+    'to_board': codec.decode_to_board,
+    'from_board': codec.decode_from_board,
 }
 ROWS = [(way, row) for way in DECODERS for row in VECTORS[way]]
 WAYS = {
-    decode_downlink: (
+    codec.decode_downlink: (
         frames.Command,
         frames.ParamGet,
         frames.ParamSet,
@@ -41,17 +32,17 @@ WAYS = {
         frames.Poll,
         frames.Action,
     ),
-    decode_uplink: (frames.State, frames.Param, frames.Info, frames.Ack, frames.Aux),
-    decode_to_dongle: (frames.Transmit, frames.Configure, frames.Ping),
-    decode_from_dongle: (frames.Result, frames.Configured, frames.Pong, frames.Refusal),
-    decode_to_board: (
+    codec.decode_uplink: (frames.State, frames.Param, frames.Info, frames.Ack, frames.Aux),
+    codec.decode_to_dongle: (frames.Transmit, frames.Configure, frames.Ping),
+    codec.decode_from_dongle: (frames.Result, frames.Configured, frames.Pong, frames.Refusal),
+    codec.decode_to_board: (
         frames.Ping,
         frames.Key,
         frames.Record,
         frames.Store,
         frames.Sense,
     ),
-    decode_from_board: (
+    codec.decode_from_board: (
         frames.Pong,
         frames.KeyState,
         frames.RecordPart,
@@ -114,18 +105,20 @@ def some(kind, source, extreme=None):
 
 def test_frames_of_the_specification_byte_for_byte():
     command = frames.Command(0x5A, 7, frames.CommandFlag.ENABLE, 20, 5000, -2500, 123456789)
-    data = encode(command)
+    data = codec.encode(command)
     assert data == bytes.fromhex('215a0701140088133cf615cd5b07')
-    sent = encode(frames.Transmit(0x2A, 6, data, encode(frames.Poll(0x5A, 7, frames.STATE))))
+    sent = codec.encode(
+        frames.Transmit(0x2A, 6, data, codec.encode(frames.Poll(0x5A, 7, frames.STATE)))
+    )
     assert encode_frame(sent).hex() == '0a012a060e215a0701140c88133cf615cd5b07255a0703585400'
     state = frames.State(
         0x5A, 7, 3, 123456789, 1000, -1000, -131, 164, 0, 76, bytes.fromhex('a0fe013c00145078')
     )
-    assert encode(state).hex() == (
+    assert codec.encode(state).hex() == (
         '215a070315cd5b07e803000018fcffff7dffa40000004c00a0fe013c00145078'
     )
-    result = frames.Result(0x2A, 0x03, 0x13, 0x075BCA00, encode(state))
-    assert encode_frame(encode(result)).hex() == (
+    result = frames.Result(0x2A, 0x03, 0x13, 0x075BCA00, codec.encode(state))
+    assert encode_frame(codec.encode(result)).hex() == (
         '05812a03130eca5b07215a070315cd5b07e803010818fcffff7dffa40101024c05a0fe013c061450787a7e00'
     )
     assert codec.decode_exchange_status(0x13) == (True, True, False, False, 1)
@@ -145,7 +138,7 @@ def test_constants_equal_the_golden_ones():
 @pytest.mark.parametrize('way, row', ROWS, ids=[f'{way}-{row["name"]}' for way, row in ROWS])
 def test_golden_vectors_both_ways(way, row):
     frame, data = frame_of(row), bytes.fromhex(row['bytes'])
-    assert encode(frame) == data
+    assert codec.encode(frame) == data
     decoded = DECODERS[way](data)
     assert decoded == frame
     assert type(decoded) is type(frame)
@@ -169,10 +162,10 @@ def test_every_field_survives_the_round_trip(kind, decode):
     source = random.Random(7)
     for extreme in [0, 1, *200 * [None]]:
         frame = some(kind, source, extreme)
-        data = encode(frame)
+        data = codec.encode(frame)
         again = decode(data)
         assert again == frame
-        assert encode(again) == data
+        assert codec.encode(again) == data
 
 
 @pytest.mark.parametrize('kind, decode', KINDS)
@@ -188,14 +181,14 @@ def test_encoding_errors_name_the_field(kind, decode):
             if value in (b'', bytes(0)) and name == kind._fields[-1]:
                 continue
             with pytest.raises(FrameError, match=rf'\.{name} must be .*: got'):
-                encode(good._replace(**{name: value}))
+                codec.encode(good._replace(**{name: value}))
 
 
 @pytest.mark.parametrize('kind, decode', KINDS)
 def test_truncated_and_extended_frames_are_rejected(kind, decode):
     source = random.Random(9)
     for _ in range(20):
-        data = encode(some(kind, source))
+        data = codec.encode(some(kind, source))
         if kind is frames.Transmit:
             # The variable end has no length field: the CRC of the line protects it.
             shortest = 4 + data[3]
@@ -205,7 +198,7 @@ def test_truncated_and_extended_frames_are_rejected(kind, decode):
             shortest = len(data)
         for size in range(shortest):
             if size == SHORTER.get(kind):
-                assert encode(decode(data[:size])) == data[:size]
+                assert codec.encode(decode(data[:size])) == data[:size]
                 continue
             with pytest.raises(FrameError) as error:
                 decode(data[:size])
@@ -222,7 +215,7 @@ def test_every_bit_flip_is_rejected_or_decoded_completely(kind, decode):
     """A radio payload has no CRC: an accepted one must encode to the same bytes."""
     source = random.Random(10)
     for _ in range(10):
-        data = encode(some(kind, source))
+        data = codec.encode(some(kind, source))
         for bit in range(8 * len(data)):
             flipped = bytearray(data)
             flipped[bit // 8] ^= 1 << bit % 8
@@ -230,14 +223,14 @@ def test_every_bit_flip_is_rejected_or_decoded_completely(kind, decode):
                 frame = decode(bytes(flipped))
             except FrameError:
                 continue
-            assert encode(frame) == flipped
+            assert codec.encode(frame) == flipped
             assert frame != decode(data) or type(frame) is not kind
 
 
 @pytest.mark.parametrize('decode', list(WAYS))
 def test_random_bytes_are_rejected_or_decoded_completely(decode):
     source = random.Random(11)
-    whole = [encode(some(kind, source)) for kind in WAYS[decode]]
+    whole = [codec.encode(some(kind, source)) for kind in WAYS[decode]]
     decoded = 0
     for _ in range(4000):
         data = source.randbytes(source.randint(0, 80))
@@ -251,14 +244,14 @@ def test_random_bytes_are_rejected_or_decoded_completely(decode):
         except FrameError:
             continue
         decoded += 1
-        assert encode(frame) == data
+        assert codec.encode(frame) == data
     assert decoded > 10
 
 
 def test_payloads_longer_than_32_bytes_are_rejected():
     """A payload width above 32 bytes is a known buffer overrun of the radio chip."""
     for size in range(33, 256):
-        for decode in (decode_downlink, decode_uplink):
+        for decode in (codec.decode_downlink, codec.decode_uplink):
             for head in (b'\x21', b'\x23', b'\x24'):
                 with pytest.raises(FrameError, match='1 to 32 bytes'):
                     decode(head + bytes(size - 1))
@@ -266,7 +259,7 @@ def test_payloads_longer_than_32_bytes_are_rejected():
 
 def test_wrong_version_and_wrong_kind_are_distinguished():
     for head in range(256):
-        for decode in (decode_downlink, decode_uplink):
+        for decode in (codec.decode_downlink, codec.decode_uplink):
             with pytest.raises(FrameError) as error:
                 decode(bytes([head, 0, 0]))
             assert (error.value.kind is FrameErrorKind.VERSION) == (head >> 4 != frames.VERSION)
@@ -274,9 +267,9 @@ def test_wrong_version_and_wrong_kind_are_distinguished():
 
 def test_a_field_of_signed_frames_is_not_dropped_silently():
     with pytest.raises(FrameError, match=r'PARAM_SET.host_us must be 0 without tag: got 5'):
-        encode(frames.ParamSet(1, 2, 3, 4, host_us=5))
+        codec.encode(frames.ParamSet(1, 2, 3, 4, host_us=5))
     with pytest.raises(FrameError, match=r'HELLO.nonce must be b.. without tag'):
-        encode(frames.Hello(1, 2, nonce=bytes(8)))
+        codec.encode(frames.Hello(1, 2, nonce=bytes(8)))
 
 
 def test_an_inconsistent_result_is_rejected():
@@ -284,7 +277,7 @@ def test_an_inconsistent_result_is_rejected():
     for first in range(256):
         for payload in (b'', b'\1'):
             try:
-                encode(frames.Result(0, first, 0, 0, payload))
+                codec.encode(frames.Result(0, first, 0, 0, payload))
             except FrameError:
                 continue
             good += 1

@@ -16,33 +16,17 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_from_board, encode
 from t3mpc_ros.radio.protocol.frames import Configured, Pong, Refusal
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
+from t3mpc_ros.radio.tool import robot_records
 from t3mpc_ros.radio.tool.procedure import Procedure
-from t3mpc_ros.radio.tool.robot_records import (
-    Calibration,
-    DividerCorrection,
-    Estimate,
-    RobotSettings,
-    SharpCurve,
-    decode_calibration,
-    decode_settings,
-    encode_calibration,
-    encode_settings,
-    range_counts,
-    read_calibration,
-    read_record,
-    read_samples,
-    write_calibration,
-    write_record,
-)
 
 VECTORS = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
-CURVES = (SharpCurve(0.28, 0.02, 0.05, 0.003), *7 * (None,))
-CALIBRATION = Calibration(
-    Estimate(0.03512, 2e-5),
-    Estimate(0.2012, 1.3e-4),
-    Estimate(1.0123, 2e-4),
-    Estimate(-0.01, 1e-4),
-    DividerCorrection(-0.013, 0.02, 0.01),
+CURVES = (robot_records.SharpCurve(0.28, 0.02, 0.05, 0.003), *7 * (None,))
+CALIBRATION = robot_records.Calibration(
+    robot_records.Estimate(0.03512, 2e-5),
+    robot_records.Estimate(0.2012, 1.3e-4),
+    robot_records.Estimate(1.0123, 2e-4),
+    robot_records.Estimate(-0.01, 1e-4),
+    robot_records.DividerCorrection(-0.013, 0.02, 0.01),
     CURVES,
 )
 
@@ -84,21 +68,21 @@ def test_records_of_the_specification_byte_for_byte():
     golden = dict(VECTORS['records']['settings'])
     body = bytes.fromhex(golden.pop('bytes'))
     golden |= {'address': bytes.fromhex(golden['address']), 'sensors': tuple(golden['sensors'])}
-    assert encode_settings(RobotSettings(**golden)) == body
-    assert decode_settings(body) == RobotSettings(**golden)
+    assert robot_records.encode_settings(robot_records.RobotSettings(**golden)) == body
+    assert robot_records.decode_settings(body) == robot_records.RobotSettings(**golden)
     golden = VECTORS['records']['calibration']
     body = bytes.fromhex(golden['bytes'])
     names = 'wheel_radius', 'track', 'gyro_scale', 'gyro_bias'
-    calibration = Calibration(
-        *(Estimate(*golden[name]) for name in names),
-        DividerCorrection(*golden['divider']),
-        tuple(curve and SharpCurve(*curve) for curve in golden['curves']),
+    calibration = robot_records.Calibration(
+        *(robot_records.Estimate(*golden[name]) for name in names),
+        robot_records.DividerCorrection(*golden['divider']),
+        tuple(curve and robot_records.SharpCurve(*curve) for curve in golden['curves']),
     )
     assert calibration == CALIBRATION
-    assert encode_calibration(calibration) == body
+    assert robot_records.encode_calibration(calibration) == body
     # What is read and written again does not drift, and no uncertainty shrinks.
-    again = decode_calibration(body)
-    assert encode_calibration(again) == body
+    again = robot_records.decode_calibration(body)
+    assert robot_records.encode_calibration(again) == body
     assert again.gyro_bias.uncertainty >= CALIBRATION.gyro_bias.uncertainty
 
 
@@ -106,8 +90,10 @@ def test_uncertainties_are_never_stored_as_smaller_or_as_none():
     source = random.Random(3)
     for _ in range(500):
         uncertainty = 10 ** source.uniform(-12, -3)
-        estimate = Estimate(source.uniform(0.02, 0.05), uncertainty)
-        stored = decode_calibration(encode_calibration(Calibration(wheel_radius=estimate)))
+        estimate = robot_records.Estimate(source.uniform(0.02, 0.05), uncertainty)
+        stored = robot_records.decode_calibration(
+            robot_records.encode_calibration(robot_records.Calibration(wheel_radius=estimate))
+        )
         assert stored.wheel_radius.value == pytest.approx(estimate.value, abs=5.1e-8)
         assert uncertainty * (1 - 1e-6) <= stored.wheel_radius.uncertainty <= uncertainty + 1e-7
 
@@ -115,20 +101,26 @@ def test_uncertainties_are_never_stored_as_smaller_or_as_none():
 @pytest.mark.parametrize(
     'change, words',
     [
-        ({'wheel_radius': Estimate(0.0, 1e-5)}, r'wheel_radius must be from 0\.001 to 10'),
-        ({'wheel_radius': Estimate(float('nan'), 1e-5)}, 'wheel_radius must be'),
-        ({'track': Estimate(0.2, 0.0)}, r'track\.uncertainty must be above 0'),
-        ({'track': Estimate(0.2, 0.1)}, r'track\.uncertainty must be above 0'),
-        ({'gyro_scale': Estimate(1.3, 1e-3)}, 'gyro_scale must be from 0.8 to 1.2'),
-        ({'gyro_bias': Estimate(1.0, 1e-3)}, 'gyro_bias must be'),
-        ({'divider': DividerCorrection(0.0, 40.0, 0.1)}, r'divider\.offset must be'),
+        (
+            {'wheel_radius': robot_records.Estimate(0.0, 1e-5)},
+            r'wheel_radius must be from 0\.001 to 10',
+        ),
+        ({'wheel_radius': robot_records.Estimate(float('nan'), 1e-5)}, 'wheel_radius must be'),
+        ({'track': robot_records.Estimate(0.2, 0.0)}, r'track\.uncertainty must be above 0'),
+        ({'track': robot_records.Estimate(0.2, 0.1)}, r'track\.uncertainty must be above 0'),
+        ({'gyro_scale': robot_records.Estimate(1.3, 1e-3)}, 'gyro_scale must be from 0.8 to 1.2'),
+        ({'gyro_bias': robot_records.Estimate(1.0, 1e-3)}, 'gyro_bias must be'),
+        ({'divider': robot_records.DividerCorrection(0.0, 40.0, 0.1)}, r'divider\.offset must be'),
         ({'curves': ()}, 'curves must be 8'),
-        ({'curves': (*CURVES[:7], SharpCurve(2.0, 0.0, 0.0, 0.01))}, r'curves\[7\]\.scale'),
+        (
+            {'curves': (*CURVES[:7], robot_records.SharpCurve(2.0, 0.0, 0.0, 0.01))},
+            r'curves\[7\]\.scale',
+        ),
     ],
 )
 def test_values_that_do_not_fit_are_rejected_before_sending(change, words):
     with pytest.raises(ValueError, match=words):
-        next(write_calibration(CALIBRATION._replace(**change)))
+        next(robot_records.write_calibration(CALIBRATION._replace(**change)))
 
 
 @pytest.mark.parametrize('loss', [0.0, 0.1])
@@ -136,19 +128,21 @@ def test_calibration_survives_reset_and_lost_frames(library, loss):
     robot = Robot(library)
     robot.call('set_cell_us', ctypes.c_uint32(3400))
     cable = Cable(robot, loss)
-    assert cable.run(read_calibration()) == Calibration()
-    stored = cable.run(write_calibration(CALIBRATION))
-    assert encode_calibration(stored) == encode_calibration(CALIBRATION)
+    assert cable.run(robot_records.read_calibration()) == robot_records.Calibration()
+    stored = cable.run(robot_records.write_calibration(CALIBRATION))
+    assert robot_records.encode_calibration(stored) == robot_records.encode_calibration(
+        CALIBRATION
+    )
     robot.call('boot', 4, ctypes.c_uint32(0))
-    assert cable.run(read_calibration()) == stored
+    assert cable.run(robot_records.read_calibration()) == stored
     # A value is changed with the others kept.
     changed = stored._replace(gyro_bias=None)
-    assert cable.run(write_calibration(changed)) == changed
-    settings = RobotSettings(channel=100, sensors=8 * ('none',))
-    body = encode_settings(settings)
-    assert cable.run(write_record(frames.SETTINGS_RECORD, body)) == body
-    record = cable.run(read_record(frames.SETTINGS_RECORD))
-    assert (record.valid, decode_settings(record.body)) == (True, settings)
+    assert cable.run(robot_records.write_calibration(changed)) == changed
+    settings = robot_records.RobotSettings(channel=100, sensors=8 * ('none',))
+    body = robot_records.encode_settings(settings)
+    assert cable.run(robot_records.write_record(frames.SETTINGS_RECORD, body)) == body
+    record = cable.run(robot_records.read_record(frames.SETTINGS_RECORD))
+    assert (record.valid, robot_records.decode_settings(record.body)) == (True, settings)
 
 
 def test_damage_and_bad_timing_have_a_remedy(library):
@@ -156,14 +150,14 @@ def test_damage_and_bad_timing_have_a_remedy(library):
     cable = Cable(robot)
     robot.hello()
     robot.drive(1000, 1000, 40_000)
-    assert 'stop the bridge' in cable.run(write_calibration(CALIBRATION))
+    assert 'stop the bridge' in cable.run(robot_records.write_calibration(CALIBRATION))
     robot.run(1_000_000)
     for copy in (104, 192):
         robot.call('poke_eeprom', ctypes.c_uint16(copy + 3), ctypes.c_uint8(0))
     robot.call('boot', 4, ctypes.c_uint32(0))
-    assert 'damaged' in cable.run(read_calibration())
+    assert 'damaged' in cable.run(robot_records.read_calibration())
     robot.call('wear', ctypes.c_uint16(110), ctypes.c_bool(True))
-    assert 'worn out' in cable.run(write_calibration(CALIBRATION))
+    assert 'worn out' in cable.run(robot_records.write_calibration(CALIBRATION))
 
 
 def test_raw_samples(library):
@@ -173,16 +167,16 @@ def test_raw_samples(library):
     registers = (ctypes.c_int16 * 7)(1, -2, 16384, 0, 4, 5, -6)
     robot.call('set_imu', ctypes.c_bool(True), registers)
     cable = Cable(robot)
-    samples = cable.run(read_samples())
-    assert range_counts(samples) == tuple(range(0, 800, 100))
+    samples = cable.run(robot_records.read_samples())
+    assert robot_records.range_counts(samples) == tuple(range(0, 800, 100))
     assert samples[2:] == (800, 1, -2, 16384, 4, 5, -6)
     robot.call('set_imu', ctypes.c_bool(False), registers)
-    assert cable.run(read_samples())[3:] == (0, 0, 0, 0, 0, 0)
+    assert cable.run(robot_records.read_samples())[3:] == (0, 0, 0, 0, 0, 0)
 
 
 @pytest.mark.parametrize('dongle', [True, False])
 def test_dongle_and_old_firmware_are_distinguished(dongle):
-    task = Procedure(read_calibration(), decode_from_board)
+    task = Procedure(robot_records.read_calibration(), decode_from_board)
     task.port_opened(0)
     decoder = FrameDecoder()
     received = b''

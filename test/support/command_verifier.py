@@ -2,13 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rules of a session at the robot, for scripted robots."""
 
-from t3mpc_ros.radio.protocol.authentication import (
-    NONCE_SIZE,
-    SignedFrame,
-    frame_tag,
-    hello_tag,
-    session_key,
-)
+from t3mpc_ros.radio.protocol import authentication
 from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Hello, RefusalReason
 
 
@@ -20,7 +14,7 @@ class CommandVerifier:
         self.session = 0
         self._session_key = b''
         self._host_nonce = b''
-        self.nonce = bytes(NONCE_SIZE) if key else b''
+        self.nonce = bytes(authentication.NONCE_SIZE) if key else b''
         """Nonce of the robot for INFO: zeros before the first HELLO; empty without a key."""
         self._last = (0, 0)
 
@@ -33,17 +27,17 @@ class CommandVerifier:
         if bool(self._key) != bool(hello.tag):
             return RefusalReason.SIGNED if hello.tag else RefusalReason.UNSIGNED
         if self._key:
-            if hello.tag != hello_tag(self._key, hello):
+            if hello.tag != authentication.hello_tag(self._key, hello):
                 return RefusalReason.TAG
             if hello.nonce == self._host_nonce:
                 return RefusalReason.NONE
-            self._session_key = session_key(self._key, hello.nonce, fresh_nonce)
+            self._session_key = authentication.session_key(self._key, hello.nonce, fresh_nonce)
             self._host_nonce, self.nonce = hello.nonce, fresh_nonce
             self._last = (0, hello.host_us)
         self.session = hello.session
         return RefusalReason.NONE
 
-    def verify(self, frame: SignedFrame) -> RefusalReason:
+    def verify(self, frame: authentication.SignedFrame) -> RefusalReason:
         """Return the reason for refusing a frame; a valid one invalidates itself and older ones.
 
         A CMD with ESTOP is always valid; its other fields count only if :meth:`accept` accepts it.
@@ -52,7 +46,7 @@ class CommandVerifier:
         estop = isinstance(frame, Command) and frame.flags & CommandFlag.ESTOP
         return RefusalReason.NONE if estop else why
 
-    def accept(self, frame: SignedFrame) -> RefusalReason:
+    def accept(self, frame: authentication.SignedFrame) -> RefusalReason:
         """Return why a frame is not part of the session; a valid one advances the replay counter.
 
         This includes a validly signed ESTOP, so that an ESTOP repeated for hours keeps the epoch.
@@ -67,7 +61,7 @@ class CommandVerifier:
         epoch, last = self._last
         if frame.host_us < last:
             epoch += 1
-        expected = frame_tag(frame, self._session_key, epoch)
+        expected = authentication.frame_tag(frame, self._session_key, epoch)
         if frame.host_us == last or expected != frame.tag:
             return RefusalReason.TAG
         self._last = (epoch, frame.host_us)
