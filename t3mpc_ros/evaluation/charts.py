@@ -20,6 +20,8 @@ TICK = 1e-5
 PRECISION = 14
 """Bits of the mantissa that are kept, a relative error of 3e-5: the others do not compress."""
 
+LineStyle = Literal['line', 'steps', 'points']
+
 
 @dataclass(frozen=True, slots=True)
 class Line:
@@ -32,7 +34,7 @@ class Line:
     """s, ascending"""
     value: Array
     dash: tuple[int, ...] = ()
-    style: Literal['line', 'steps', 'points'] = 'line'
+    style: LineStyle = 'line'
 
 
 @dataclass(frozen=True, slots=True)

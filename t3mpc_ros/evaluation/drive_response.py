@@ -92,7 +92,7 @@ def fit_response(command: Series, motion: Series, name: str) -> ResponseFit | No
     if count < shifts + FEWEST:
         return None
     grid = start + step * np.arange(count)
-    u = command[name][np.maximum(np.searchsorted(command.time, grid, 'right') - 1, 0)]
+    u = command.held(name, grid)
     y = np.interp(grid, motion.time, motion[name])
     u, y = u - u.mean(), y - y[shifts:].mean()
     if not (np.ptp(u) > 1e-6 and np.ptp(y) > 1e-9):
@@ -148,16 +148,6 @@ def _best(u: Array, y: Array, step: float, shifts: int, lags: list[float]) -> Re
     return found
 
 
-def predicted(fit: ResponseFit, command: Series, name: str, time: Array) -> Array:
-    """Return the speed that the fit predicts at evenly spaced ``time``, in its unit."""
-    late = time - fit.dead_time
-    u = command[name][np.maximum(np.searchsorted(command.time, late, 'right') - 1, 0)]
-    out = np.empty(u.size)
-    step = float(time[1] - time[0])
-    lag_behind(u, np.full(u.size, math.exp(-step / fit.lag) if fit.lag > 0.0 else 0.0), out)
-    return fit.gain * out
-
-
 class WheelData(NamedTuple):
     """Commands and measured speeds of both wheels."""
 
@@ -188,6 +178,13 @@ class WheelFit(NamedTuple):
     def cost(self) -> float:
         """Sum of squared errors, (rad/s)²."""
         return float((self.residuals**2).sum())
+
+
+def predicted(fit: ResponseFit, command: Series, name: str, time: Array) -> Array:
+    """Return the speed that the fit predicts, in its unit, shape (n,)."""
+    data = WheelData(command.time, command[name][np.newaxis], time, np.empty((1, 0)), 0.0)
+    found: Array = fit.gain * respond(data, fit.dead_time, max(fit.lag, 1e-9))[0]
+    return found
 
 
 def respond(data: WheelData, dead_time: float, lag: float) -> Array:

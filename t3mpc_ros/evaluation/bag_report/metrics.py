@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.evaluation.bag_report.continuity import within_gaps
 from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics, link_metrics
 from t3mpc_ros.evaluation.bag_report.response import responses
-from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
+from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, moves
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit
@@ -90,7 +90,7 @@ def driving(run: Run) -> tuple[float, float]:
     command = run.motions.get(COMMAND)
     if command is None:
         return -math.inf, math.inf
-    moving = command.time[(command['linear'] != 0.0) | (command['angular'] != 0.0)]
+    moving = command.time[moves(command)]
     return (float(moving[0]), float(moving[-1])) if moving.size else (math.inf, -math.inf)
 
 

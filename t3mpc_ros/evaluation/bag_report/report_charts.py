@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Charts of the bag report in page order, each with a sentence on what is seen in it."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
@@ -25,8 +25,8 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     tracking_error,
 )
 from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
-from t3mpc_ros.evaluation.charts import Chart, Curve, Line, Plane, thinned
-from t3mpc_ros.evaluation.drive_response import ResponseFit, busiest, predicted
+from t3mpc_ros.evaluation.charts import Chart, Curve, Line, LineStyle, Plane, thinned
+from t3mpc_ros.evaluation.drive_response import busiest, predicted
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import world_outline
@@ -44,23 +44,21 @@ COLOURS = {TRUTH: 'truth', ODOMETRY: 'right', REFERENCE: 'reference', COMMAND: '
 DASHES = {REFERENCE: (6, 4), COMMAND: (2, 3)}
 TERM_COLOURS = ('c1', 'c2', 'c3', 'c4', 'c5', 'ink')
 TERM_DASHES = ((), (6, 3), (2, 3), (8, 3, 2, 3), (1, 4), (4, 2))
+WHEEL_DASHES: Mapping[str, tuple[int, ...]] = {'right': (), 'left': (6, 3)}
 DETAIL = 4.0
 """Time in which the fitted response is shown, s: where the command varies most."""
 
 
 def line(
-    label: str, colour: str, series: Series, name: str = 'value', *, style: str = 'line',
+    label: str, colour: str, series: Series, name: str = 'value', *, style: LineStyle = 'line',
     dash: tuple[int, ...] = (), scale: float = 1.0,
 ) -> Line:  # fmt: skip
     """Return one quantity of a series, interrupted at its gaps."""
     time, value = thinned(series.time, scale * series[name])
-    found = gaps(series.time)
-    if found:
-        middles = np.array([0.5 * (low + high) for low, high in found])
-        rows = np.searchsorted(time, middles)
-        time, value = np.insert(time, rows, middles), np.insert(value, rows, np.nan)
-    kind: dict[str, Any] = {'style': style}
-    return Line(label, colour, time, value, dash, **kind)
+    middles = np.array([0.5 * (low + high) for low, high in gaps(series.time)])
+    rows = np.searchsorted(time, middles)
+    time, value = np.insert(time, rows, middles), np.insert(value, rows, np.nan)
+    return Line(label, colour, time, value, dash, style)
 
 
 def is_long(series: Series | None) -> TypeGuard[Series]:
@@ -73,13 +71,6 @@ def _extent(values: Array, unit: str) -> str:
     if not known.size:
         return 'unknown'
     return f'from {format_number(known.min())} to {format_number(known.max())} {unit}'
-
-
-def _largest(series: Series, name: str, mask: NDArray[np.bool_], unit: str) -> str:
-    """Return the largest size of a quantity where ``mask`` is true, and its time."""
-    size = np.where(mask & np.isfinite(series[name]), np.abs(series[name]), -1.0)
-    row = int(np.argmax(size))
-    return f'{format_number(size[row])} {unit} at {series.time[row]:.1f} s'
 
 
 def tracking(run: Run, metrics: ReportMetrics) -> Shown:
@@ -108,21 +99,19 @@ def error(run: Run, metrics: ReportMetrics) -> Shown:
     if not is_long(series):
         return
     moving = driven(series.time, run)
-    lines: list[Line] = []
-    seen: list[str] = []
-    for colour, (name, title, _, unit) in zip(('right', 'left'), run.channels, strict=True):
-        dash = (6, 3) if colour == 'left' else ()
-        found = metrics.wheels[name]
+    lines, seen = [], []
+    for wheel, (name, title, _, unit) in zip(WHEELS, run.channels, strict=True):
+        found, text = metrics.wheels[name], UNMEASURED
         if moving.any():
+            size = np.where(moving & np.isfinite(series[name]), np.abs(series[name]), -1.0)
+            row = int(np.argmax(size))
             text = (
-                f'{title.capitalize()}: RMSE {format_number(found.overall.rmse)} {unit} while '
-                f'driven, {format_number(found.settled.rmse)} {unit} settled; the largest error '
-                f'is {_largest(series, name, moving, unit)}.'
+                f'RMSE {format_number(found.overall.rmse)} {unit} while driven, '
+                f'{format_number(found.settled.rmse)} {unit} settled; the largest error is '
+                f'{format_number(size[row])} {unit} at {series.time[row]:.1f} s'
             )
-        else:
-            text = f'{title.capitalize()}: {UNMEASURED}.'
-        lines.append(line(title, colour, series, name, dash=dash))
-        seen.append(text)
+        lines.append(line(title, wheel, series, name, dash=WHEEL_DASHES[wheel]))
+        seen.append(f'{title.capitalize()}: {text}.')
     if run.channels[0].unit == run.channels[1].unit:
         yield Chart('Error', run.channels[0].unit, lines, ' '.join(seen))
         return
@@ -184,20 +173,15 @@ def response(run: Run, metrics: ReportMetrics) -> Shown:
         seen = 'No clear response of the speed to the command was found.'
         if fit is not None and fit.clear:
             start, end = busiest(command, motion, name, DETAIL)
-            lines.append(_fitted(fit, command, name, start, end))
+            time = np.arange(max(start - 10.0, command.time[0]), end, 0.005)
+            value, near = predicted(fit, command, name, time), time >= start
+            lines.append(Line('fit', 'c4', time[near], value[near], (4, 2)))
             seen = (
                 f'The robot responds {1e3 * (fit.dead_time + fit.lag):.0f} ms late: dead time '
                 f'{1e3 * fit.dead_time:.0f} ms, lag {1e3 * fit.lag:.0f} ms, gain {fit.gain:.3g}. '
                 f'The fit is drawn from {start:.1f} to {end:.1f} s, where the command varies most.'
             )
         yield Chart(f'Response, {title}', unit, lines, seen)
-
-
-def _fitted(fit: ResponseFit, command: Series, name: str, start: float, end: float) -> Line:
-    time = np.arange(max(start - 10.0, command.time[0]), end, 0.005)
-    value = predicted(fit, command, name, time) if time.size > 1 else np.zeros(time.size)
-    near = time >= start
-    return Line('fit', 'c4', time[near], value[near], (4, 2))
 
 
 def terms(run: Run, metrics: ReportMetrics) -> Shown:
@@ -272,7 +256,7 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
     if is_long(reference):
         first = min(int(np.searchsorted(base.time, reference.time[0])), len(base) - 1)
         x, y = path_of(reference, (base['x'][first], base['y'][first], base['yaw'][first]))
-        curves.insert(0, _curve(REFERENCE, reference, x, y, ()))
+        curves.insert(0, _curve(REFERENCE, reference, x, y))
     for times, colour in (
         (run.switches, 'reference'),
         (np.array([stop.start for stop in metrics.verdict.stops]), 'stopped'),
@@ -294,7 +278,7 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
 
 
 def _curve(
-    name: str, motion: Series, x: Array, y: Array, breaks: NDArray[np.int64] | tuple[()]
+    name: str, motion: Series, x: Array, y: Array, breaks: Sequence[int] | NDArray[np.int64] = ()
 ) -> Curve:
     """Return a curve, interrupted before the rows ``breaks`` and at the gaps of the motion."""
     torn = [int(np.searchsorted(motion.time, high)) for _, high in gaps(motion.time)]
@@ -412,7 +396,7 @@ def _by_wheel(run: Run, name: str) -> dict[str, Series]:
 
 def _wheel_lines(found: Mapping[str, Series]) -> list[Line]:
     return [
-        line(f'{wheel} wheel', wheel, series, dash=() if wheel == 'right' else (6, 3))
+        line(f'{wheel} wheel', wheel, series, dash=WHEEL_DASHES[wheel])
         for wheel, series in found.items()
     ]
 

@@ -142,7 +142,9 @@ def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
         blocks.append(Items([[each] for each in remarks], 'side'))
     blocks.append(Contents())
     blocks += _sections(run, figures, first=True)
-    blocks += [Heading('Events'), _timeline(run, figures)]
+    events = _events(run, figures)
+    quiet = Paragraph('No switch, no stop, no warning.', 'quiet')
+    blocks += [Heading('Events'), Timeline(events) if events else quiet]
     if run.ours or figures.measured:
         blocks += [Heading('Tracking error'), *_errors(run)]
     blocks += _response(run, figures)
@@ -204,11 +206,6 @@ def _remarks(run: Run) -> list[str]:
             names.append(f'controller/* ({len(scalars)} topics)')
         notes.append(f'Not in the bag, or without a message: {", ".join(names)}.')
     return notes
-
-
-def _timeline(run: Run, figures: ReportMetrics) -> Block:
-    events = _events(run, figures)
-    return Timeline(events) if events else Paragraph('No switch, no stop, no warning.', 'quiet')
 
 
 def _events(run: Run, figures: ReportMetrics) -> list[tuple[float, str, str]]:

@@ -83,9 +83,9 @@ def motion_summary(run: Run) -> MotionSummary | None:
     command = run.motions.get(COMMAND)
     if command is not None and len(command):
         commanded = np.zeros(time.size, dtype=np.bool_)
-        rows = np.searchsorted(command.time, time, 'right') - 1
         for name, least in STILL.items():
-            commanded |= (rows >= 0) & (np.abs(command[name][np.maximum(rows, 0)]) > 2.0 * least)
+            commanded |= np.abs(command.held(name, time)) > 2.0 * least
+        commanded &= time >= command.time[0]
         disobeyed = step * sum(int(np.count_nonzero(commanded[low:high])) for low, high in spans)
     return MotionSummary(
         distance=float(np.abs(linear[known]).sum() * step),

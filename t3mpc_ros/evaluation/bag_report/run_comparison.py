@@ -266,19 +266,40 @@ def _shifted(each: ComparedRun, series: Series) -> Series:
     return Series(series.time - each.start, series.values)
 
 
-_Looks = list[tuple[ComparedRun, str, tuple[int, ...]]]
-"""Runs with their colours and dashes."""
+OVERLAID: tuple[tuple[str, str, Callable[[Run], Series | None]], ...] = (
+    ('Tracking errors', 'Error', lambda run: tracking_error(run, run.measured)),
+    ('Speeds', 'Speeds', lambda run: run.motions.get(run.measured)),
+    ('Commands', 'Commands', lambda run: run.motions.get(COMMAND)),
+)
+"""Heading, title of each chart, and what it shows of each run."""
 
 
 def _charts(runs: Sequence[ComparedRun]) -> Iterator[Block]:
     """Yield the overlaid charts, with the time since the first command to move."""
-    channels = [c for c in runs[0].run.channels if all(c in each.run.channels for each in runs)]
+    first = runs[0]
+    channels = [c for c in first.run.channels if all(c in each.run.channels for each in runs)]
     looks = list(zip(runs, TERM_COLOURS, TERM_DASHES, strict=False))
-    for heading, charts in (
-        ('Tracking errors', _error_charts(looks, channels)),
-        ('Speeds', _motion_charts('Speeds', looks, channels, lambda each: each.run.measured)),
-        ('Commands', _motion_charts('Commands', looks, channels, lambda each: COMMAND)),
-    ):
+    reference = first.run.motions.get(REFERENCE)
+    for heading, title, pick in OVERLAID:
+        found = [
+            (each.label, colour, _shifted(each, series), dash)
+            for each, colour, dash in looks
+            if is_long(series := pick(each.run))
+        ]
+        charts = []
+        for channel in channels:
+            lines = [line(*look, channel.name, dash=dash) for *look, dash in found]
+            seen = f'{channel.title.capitalize()} of {len(runs)} runs over each other.'
+            if title == 'Error':
+                sizes = (each.metrics.wheels[channel.name].settled.rmse for each in runs)
+                named = zip(runs, map(format_number, sizes), strict=True)
+                text = ', '.join(f'{each.label} {size}' for each, size in named)
+                seen = f'Settled RMSE: {text} {channel.unit}.'
+            elif is_long(reference):
+                label, shown = f'reference of {first.label}', _shifted(first, reference)
+                lines.append(line(label, 'reference', shown, channel.name, dash=(6, 4)))
+            if lines:
+                charts.append(Chart(f'{title}, {channel.title}', channel.unit, lines, seen))
         if charts:
             yield from (Heading(heading), Group(charts, 'div', 'charts'), _TIME)
     curves = [
@@ -289,51 +310,6 @@ def _charts(runs: Sequence[ComparedRun]) -> Iterator[Block]:
     if curves:
         ends = ', '.join(f'{c.label} at {c.x[-1]:.2f}, {c.y[-1]:.2f} m' for c in curves)
         yield from (Heading('Paths'), Plane('Floor', 'm', curves, f'Ends: {ends}.'))
-
-
-def _error_charts(looks: _Looks, channels: Sequence[Channel]) -> list[Chart]:
-    """Return the tracking errors of all runs, one chart for each channel."""
-    errors = [tracking_error(each.run, each.run.measured) for each, *_ in looks]
-    charts = []
-    for channel in channels:
-        lines = [
-            line(each.label, colour, _shifted(each, found), channel.name, dash=dash)
-            for (each, colour, dash), found in zip(looks, errors, strict=True)
-            if is_long(found)
-        ]
-        if lines:
-            text = ', '.join(
-                f'{each.label} {format_number(each.metrics.wheels[channel.name].settled.rmse)}'
-                for each, *_ in looks
-            )
-            seen = f'Settled RMSE: {text} {channel.unit}.'
-            charts.append(Chart(f'Error, {channel.title}', channel.unit, lines, seen))
-    return charts
-
-
-def _motion_charts(
-    heading: str,
-    looks: _Looks,
-    channels: Sequence[Channel],
-    pick: Callable[[ComparedRun], str],
-) -> list[Chart]:
-    """Return a motion of all runs, and the reference of the first, one chart a channel."""
-    first, charts = looks[0][0], []
-    reference = first.run.motions.get(REFERENCE)
-    for channel in channels:
-        lines = [
-            line(each.label, colour, _shifted(each, motion), channel.name, dash=dash)
-            for each, colour, dash in looks
-            if is_long(motion := each.run.motions.get(pick(each)))
-        ]
-        if is_long(reference):
-            label = f'reference of {first.label}'
-            shown = _shifted(first, reference)
-            lines.append(line(label, 'reference', shown, channel.name, dash=(6, 4)))
-        if lines:
-            seen = f'{channel.title.capitalize()} of {len(looks)} runs over each other.'
-            charts.append(Chart(f'{heading}, {channel.title}', channel.unit, lines, seen))
-    return charts
 
 
 _TIME = Paragraph(

@@ -8,6 +8,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from t3mpc_ros.bag.columns import CDR_LAYOUTS, TopicColumns, read_columns
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
@@ -89,10 +90,21 @@ class Series:
     def __len__(self) -> int:
         return int(self.time.size)
 
+    def held(self, name: str, time: Array) -> Array:
+        """Return the last value up to each time, before the first one that; shape (n,)."""
+        rows = np.searchsorted(self.time, time, 'right') - 1
+        return self.values[name][np.maximum(rows, 0)]
+
     def between(self, low: float, high: float) -> 'Series':
         """Return the samples from ``low`` to ``high``, s."""
         part = slice(*np.searchsorted(self.time, [low, np.nextafter(high, np.inf)]).tolist())
         return Series(self.time[part], {name: each[part] for name, each in self.values.items()})
+
+
+def moves(command: Series) -> NDArray[np.bool_]:
+    """Return which commands are other than zero, shape (n,)."""
+    moving: NDArray[np.bool_] = (command['linear'] != 0.0) | (command['angular'] != 0.0)
+    return moving
 
 
 @dataclass(frozen=True)

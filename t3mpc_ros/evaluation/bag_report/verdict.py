@@ -7,9 +7,8 @@ import math
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
+from t3mpc_ros.evaluation.bag_report.run_data import Run, moves
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 
@@ -168,8 +167,8 @@ def judge(
         return Verdict(damage, judged=False, damage=damage, lacking=lacking)
     if not drive[0] < drive[1]:
         return Verdict((*damage, 'the robot was never driven'), damage=damage)
-    command, length = run.motions[COMMAND], drive[1] - drive[0]
-    stopped = stopped_time(command, *drive)
+    length = drive[1] - drive[0]
+    stops, stopped = find_stops(run, *drive)
     on_path = share_on_path(run, drive) if run.follows_path else None
     problems = []
     if on_path is None and stopped > MAX_STOPPED * length:
@@ -188,8 +187,7 @@ def judge(
     if slow and problems:
         # By itself it does not spoil the numbers.
         problems.insert(0, 'the machine was too slow')
-    stops, lost = find_stops(run, command, *drive), missing > MAX_MISSING
-    found = (*problems, *damage)
+    found, lost = (*problems, *damage), missing > MAX_MISSING
     return Verdict(found, stopped, stops, slow, lost, damage=damage, on_path=on_path)
 
 
@@ -229,37 +227,22 @@ def _speed_problems(run: Run, rmse: float, counted: float, length: float) -> lis
     return problems
 
 
-def _moving(command: Series) -> NDArray[np.bool_]:
-    moving: NDArray[np.bool_] = (command['linear'] != 0.0) | (command['angular'] != 0.0)
-    return moving
-
-
-def stopped_time(command: Series, first: float, last: float) -> float:
-    """Return the time from ``first`` to ``last`` in which the command was zero or timed out, s."""
-    inside = (command.time >= first) & (command.time <= last)
-    time, moving = command.time[inside], _moving(command)[inside]
+def find_stops(run: Run, first: float, last: float) -> tuple[tuple[Stop, ...], float]:
+    """Return the stops from ``first`` to ``last``, in order, and their time together, s."""
+    command = run.motions[COMMAND].between(first, last)
+    time, moving = command.time, moves(command)
     steps = np.diff(time)
-    late = np.maximum(steps - COMMAND_TIMEOUT, 0.0)
-    return float(np.where(moving[:-1], late, steps).sum())
-
-
-def find_stops(run: Run, command: Series, first: float, last: float) -> tuple[Stop, ...]:
-    """Return the stops from ``first`` to ``last`` with their reasons, in order."""
-    inside = (command.time >= first) & (command.time <= last)
-    time, moving = command.time[inside], _moving(command)[inside]
-    steps = np.diff(time)
+    waits = np.where(moving[:-1], np.maximum(steps - COMMAND_TIMEOUT, 0.0), steps)
     spans: list[tuple[float, float, bool]] = []
-    for k in np.flatnonzero(~moving[:-1] | (steps > COMMAND_TIMEOUT)).tolist():
+    for k in np.flatnonzero(waits > 0.0).tolist():
         start = float(time[k]) + (COMMAND_TIMEOUT if moving[k] else 0.0)
-        end = float(time[k + 1])
+        end, commanded = float(time[k + 1]), not moving[k]
         if spans and start <= spans[-1][1] + 1e-9:
-            before = spans.pop()
-            spans.append((before[0], end, before[2] or not moving[k]))
-        else:
-            spans.append((start, end, not moving[k]))
-    return tuple(
-        Stop(start, end, _reason(run, start, end), commanded) for start, end, commanded in spans
-    )
+            start, _, before = spans.pop()
+            commanded = commanded or before
+        spans.append((start, end, commanded))
+    stops = (Stop(start, end, _reason(run, start, end), each) for start, end, each in spans)
+    return tuple(stops), float(waits.sum())
 
 
 def _reason(run: Run, start: float, end: float) -> str:

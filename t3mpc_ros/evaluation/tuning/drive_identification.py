@@ -21,7 +21,7 @@ from t3mpc_ros.control.dead_time_estimator import (
     MIN_DEVIATION,
     MIN_NOISE_VARIANCE,
 )
-from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, load_run
+from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
 from t3mpc_ros.evaluation.drive_response import (
     DEAD_TIME,
     LAG,
@@ -111,7 +111,8 @@ def identify_drive(run: Run) -> IdentifiedDrive:
             'give --wheel-radius and --track'
         )
     command, motion = run.motions[COMMAND], run.motions[ODOMETRY]
-    start, end = max((busiest(command, motion, name, MAX_DURATION) for name in WHEELS), key=_span)
+    spans = [busiest(command, motion, name, MAX_DURATION) for name in WHEELS]
+    start, end = max(spans, key=np.ptp)
     if end - start < MIN_DURATION:
         raise IdentificationError(
             f'commands and odometry must overlap for at least {MIN_DURATION:g} s without a gap: '
@@ -119,7 +120,8 @@ def identify_drive(run: Run) -> IdentifiedDrive:
         )
     period = float(np.median(np.diff(motion.time)))
     used = (motion.time >= start) & (motion.time <= end)
-    variation = float(np.sqrt(_held(command, motion.time[used]).var(axis=1).mean()))
+    commanded = np.stack([command.held(name, motion.time[used]) for name in WHEELS])
+    variation = float(np.sqrt(commanded.var(axis=1).mean()))
     if not variation >= MIN_VARIATION:
         raise IdentificationError(
             f'the commanded wheel speeds must vary by at least {MIN_VARIATION:g} rad/s (standard '
@@ -144,15 +146,6 @@ def identify_drive(run: Run) -> IdentifiedDrive:
     )
     fits = [fit_wheels(each, delay) for each in (data, data._replace(window=0.0))]
     return _identified(fits, period, end - start, run.geometry)
-
-
-def _span(times: tuple[float, float]) -> float:
-    return times[1] - times[0]
-
-
-def _held(command: Series, time: Array) -> Array:
-    rows = np.maximum(np.searchsorted(command.time, time, 'right') - 1, 0)
-    return np.stack([command[name][rows] for name in WHEELS])
 
 
 def _identified(
