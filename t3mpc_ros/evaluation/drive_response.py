@@ -91,7 +91,7 @@ def fit_response(command: Series, motion: Series, name: str) -> ResponseFit | No
     shifts = int(LONGEST_DEAD_TIME / step) + 1
     if count < shifts + FEWEST:
         return None
-    grid = start + step * np.arange(count)
+    grid = start + step * np.arange(count, dtype=np.float64)
     u = command.held(name, grid)
     y = np.interp(grid, motion.time, motion[name])
     u, y = u - u.mean(), y - y[shifts:].mean()

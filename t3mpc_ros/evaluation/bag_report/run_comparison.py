@@ -288,7 +288,10 @@ def _charts(runs: Sequence[ComparedRun]) -> Iterator[Block]:
         ]
         charts = []
         for channel in channels:
-            lines = [line(*look, channel.name, dash=dash) for *look, dash in found]
+            lines = [
+                line(label, colour, series, channel.name, dash=dash)
+                for label, colour, series, dash in found
+            ]
             seen = f'{channel.title.capitalize()} of {len(runs)} runs over each other.'
             if title == 'Error':
                 sizes = (each.metrics.wheels[channel.name].settled.rmse for each in runs)

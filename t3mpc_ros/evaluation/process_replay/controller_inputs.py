@@ -4,8 +4,9 @@
 
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 import math
 from pathlib import Path
 import tempfile
@@ -96,7 +97,7 @@ class ControllerInputs:
     commands_ns: Integers
     """Receive time of the command of each row, 0 without one, shape (n,)."""
     start_ns: int
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
     """Remarks for the user."""
 
     @property
@@ -155,17 +156,30 @@ def inputs_of(
     by_name = {name: columns[full] for name, full in topics.items()}
     for name, full in initial.items():
         by_name[name] = with_initial_inputs(by_name[name], columns[full])
-    reader = _Reader(recording, by_name, revisions, default, model, notes)
-    sessions, time_ns, commands = reader.sessions()
-    recorded = reader.recorded_outputs(sessions, commands)
+    reader = _SessionReader(recording, by_name, revisions, default, model, notes)
+    rows, published, received = _journal(by_name[JOURNAL])
+    bounds = [0, *(np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1).tolist(), len(rows)]
+    sessions = tuple(
+        reader.session(rows[first:last], received[first:last], first)
+        for first, last in pairwise(bounds)
+    )
+    sent = by_name[COMMAND]
+    commands = commands_of(rows, published, sent.published_ns)
+    time = (published - recording.start_ns) / NANOSECONDS
+    without = np.flatnonzero(np.isin(rows[:, 1], COMMAND_EVENTS) & (commands < 0))
+    if without.size:
+        notes.append(
+            f'{without.size} commands of the controller, from {time[without[0]]:.3f} s to '
+            f'{time[without[-1]]:.3f} s, are not in the bag and not compared'
+        )
     return ControllerInputs(
         bag=bag,
         odometry=by_name[ODOMETRY],
         references=by_name[REFERENCE],
-        sessions=tuple(sessions),
-        time=(time_ns - recording.start_ns) / NANOSECONDS,
-        recorded=recorded,
-        commands_ns=np.where(commands >= 0, by_name[COMMAND].received_ns[commands], 0),
+        sessions=sessions,
+        time=time,
+        recorded=_recorded_outputs(by_name, rows[:, 1], published, commands),
+        commands_ns=np.where(commands >= 0, sent.received_ns[commands], 0),
         start_ns=recording.start_ns,
         notes=tuple(notes),
     )
@@ -241,8 +255,8 @@ def _names() -> frozenset[str]:
 
 
 @dataclass
-class _Reader:
-    """Assembles the sessions of the controller of one bag and reports losses."""
+class _SessionReader:
+    """Reads the sessions of the controller of one bag, and notes what is lost."""
 
     recording: BagReader
     columns: Mapping[str, TopicColumns]
@@ -250,57 +264,9 @@ class _Reader:
     default: ControllerParameters | None
     model: Mapping[str, Array] | None
     notes: list[str]
-    published: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Publication time of each row."""
 
-    def sessions(self) -> tuple[list[ControllerSession], Integers, Integers]:
-        """Return the sessions, the publication time of their rows, and the command of each row."""
-        journal = self.columns[JOURNAL]
-        # A previous session, latched by its publisher: in order of publication.
-        order = np.argsort(journal.published_ns, kind='stable')
-        rows, published = journal.integers[order], journal.published_ns[order]
-        fresh = np.concatenate([[True], np.diff(rows[:, 0]) != 0])  # duplicates after a restart
-        rows, published, received = (
-            rows[fresh],
-            published[fresh],
-            journal.received_ns[order][fresh],
-        )
-        self.published = published
-        bounds = [0, *(np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1).tolist(), len(rows)]
-        sessions = []
-        for first, last in zip(bounds, bounds[1:], strict=False):
-            sessions.append(self._session(rows[first:last], received[first:last], first))
-        commands = self.columns[COMMAND]
-        return sessions, published, commands_of(rows, published, commands.published_ns)
-
-    def recorded_outputs(
-        self, sessions: Sequence[ControllerSession], commands: Integers
-    ) -> dict[str, Array]:
-        """Return the recorded value of each field by row."""
-        events = np.concatenate([session.events for session in sessions])
-        recorded = {name: np.full(len(events), np.nan) for name in FIELDS}
-        there = commands >= 0
-        for i, name in enumerate(SPEEDS):
-            recorded[name][there] = self.columns[COMMAND].numbers[commands[there], i]
-        steps = events == Event.STEP
-        for name in SCALAR_NAMES:
-            column = self.columns.get(f'{CONTROLLER}/{name}')
-            if column is None or not len(column):
-                continue
-            # A step publishes its scalars after its row.
-            rows = np.searchsorted(self.published, column.published_ns, side='right') - 1
-            known = (rows >= 0) & steps[rows]
-            recorded[name][rows[known]] = column.numbers[known, 0]
-        without = np.flatnonzero(np.isin(events, COMMAND_EVENTS) & ~there)
-        if without.size:
-            span = (self.published[without[[0, -1]]] - self.recording.start_ns) / NANOSECONDS
-            self.notes.append(
-                f'{without.size} commands of the controller, from {span[0]:.3f} s to '
-                f'{span[1]:.3f} s, are not in the bag and not compared'
-            )
-        return recorded
-
-    def _session(self, rows: Integers, received: Integers, first: int) -> ControllerSession:
+    def session(self, rows: Integers, received: Integers, first: int) -> ControllerSession:
+        """Return the session of these rows of the journal, which were received then."""
         taken = match(rows, self.columns[ODOMETRY].stamps_ns, self.columns[REFERENCE].stamps_ns)
         for count, what in (
             (int(rows[0, 0]), 'events of the controller were before the recording'),
@@ -328,16 +294,18 @@ class _Reader:
             start = min(parameters)
             self.notes.append('the settings at the start are not in the bag, later ones are used')
             exact[:] = False
-        known = np.isin(rows[:, 4], list(parameters))
-        unknown = (rows[:, 1] == Event.CONFIGURE) & ~known
+        unknown = (rows[:, 1] == Event.CONFIGURE) & ~np.isin(rows[:, 4], list(parameters))
         if unknown.any():
             self.notes.append(
                 f'{np.count_nonzero(unknown)} changes of settings are not in the bag'
             )
             exact[np.flatnonzero(unknown)[0] :] = False
-        model = self._model_of(rows)
-        if model is None and (rows[:, 1] == Event.MODEL).any():
-            exact[: next(iter(np.flatnonzero(taken.restarts).tolist()), len(rows))] = False
+        checksums = rows[rows[:, 1] == Event.MODEL, 4]
+        model = self.model
+        if model is None and checksums.size:
+            model = self._model_of(int(checksums[0]))
+            if model is None:
+                exact[: next(iter(np.flatnonzero(taken.restarts).tolist()), len(rows))] = False
         return ControllerSession(first, rows, taken, exact, parameters, start, model)
 
     def _parameters_of(
@@ -350,8 +318,8 @@ class _Reader:
         starts = [i for i, entry in enumerate(self.revisions) if entry[1] == 0]
         before = [i for i in starts if self.revisions[i][0] <= received[-1]]
         begin = before[-1] if before else 0
-        later = [i for i in starts if i > begin]
-        own = self.revisions[begin : later[0] if later else len(self.revisions)]
+        end = next((i for i in starts if i > begin), len(self.revisions))
+        own = self.revisions[begin:end]
         found = {revision: _parameters(self.recording, values) for _, revision, values in own}
         changes = rows[rows[:, 1] == Event.CONFIGURE, 4]
         start = 0
@@ -359,30 +327,18 @@ class _Reader:
             start = int(changes[0]) - 1 if changes.size else max(found)
         return found, start
 
-    def _model_name(self) -> str:
-        """Return the path of the model file, as far as it is recorded."""
-        if self.revisions:
-            return str(self.revisions[0][2].get('model', ''))
-        tables = (
-            table
-            for title, table in self.recording.metadata_records.items()
-            if CONTROLLER in title
-        )
-        return next((table['model'] for table in tables if 'model' in table), '')
-
-    def _model_of(self, rows: Integers) -> Mapping[str, Array] | None:
-        """Return the initial model; None without one, or where it is lost."""
-        if self.model is not None:
-            return self.model
-        wanted = rows[rows[:, 1] == Event.MODEL, 4]
-        name = self._model_name()
-        if not wanted.size:
-            return None
+    def _model_of(self, checksum: int) -> Mapping[str, Array] | None:
+        """Return the initial model with this checksum; None where it is lost."""
+        records = self.recording.metadata_records
+        tables: list[Mapping[str, object]] = [self.revisions[0][2]] if self.revisions else [
+            table for title, table in records.items() if CONTROLLER in title
+        ]  # fmt: skip
+        name = str(next((table['model'] for table in tables if 'model' in table), ''))
         files = [item.data for item in self.recording.attachments().values()]
         if name and Path(name).is_file():
             files.append(Path(name).read_bytes())
         for content in files:
-            if zlib.crc32(content) == wanted[0]:
+            if zlib.crc32(content) == checksum:
                 with tempfile.NamedTemporaryFile(suffix='.npz') as file:
                     file.write(content)
                     file.flush()
@@ -392,6 +348,35 @@ class _Reader:
             'give it by --model'
         )
         return None
+
+
+def _journal(column: TopicColumns) -> tuple[Integers, Integers, Integers]:
+    """Return the rows of the journal, and when they were published and received."""
+    # A previous session, latched by its publisher: in order of publication.
+    order = np.argsort(column.published_ns, kind='stable')
+    rows = column.integers[order]
+    order = order[np.concatenate([[True], np.diff(rows[:, 0]) != 0])]  # twice after a restart
+    return column.integers[order], column.published_ns[order], column.received_ns[order]
+
+
+def _recorded_outputs(
+    columns: Mapping[str, TopicColumns], events: Integers, published: Integers, commands: Integers
+) -> dict[str, Array]:
+    """Return the recorded value of each field by row."""
+    recorded = {name: np.full(len(events), np.nan) for name in FIELDS}
+    there = commands >= 0
+    for i, name in enumerate(SPEEDS):
+        recorded[name][there] = columns[COMMAND].numbers[commands[there], i]
+    steps = events == Event.STEP
+    for name in SCALAR_NAMES:
+        column = columns.get(f'{CONTROLLER}/{name}')
+        if column is None or not len(column):
+            continue
+        # A step publishes its scalars after its row.
+        rows = np.searchsorted(published, column.published_ns, side='right') - 1
+        known = (rows >= 0) & steps[rows]
+        recorded[name][rows[known]] = column.numbers[known, 0]
+    return recorded
 
 
 def with_initial_inputs(received: TopicColumns, initial: TopicColumns) -> TopicColumns:

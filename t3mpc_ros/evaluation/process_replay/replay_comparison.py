@@ -13,7 +13,6 @@ from matplotlib.colors import ListedColormap
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.control.controller import ControllerParameters
 from t3mpc_ros.evaluation import plotting
 from t3mpc_ros.evaluation.plotting import COLOURS
 from t3mpc_ros.evaluation.process_replay.controller_inputs import (
@@ -170,10 +169,11 @@ def compare(
             f'{np.count_nonzero(~compared)} events, the first at {first:.3f} s, are left out: '
             'the inputs of the controller are not all in the bag'
         )
+    values, now = _recorded_values(inputs), again.parameters.to_dict()
     differing = [
-        f'{name} is {again.changed[name]}, recorded {_format_values(values)}'
-        for name, values in _recorded_values(inputs, again.changed).items()
-        if set(values) != {_plain(again.parameters.to_dict()[name])}
+        f'{name} is {value}, recorded {_format_values(values[name])}'
+        for name, value in again.changed.items()
+        if set(values[name]) != {_plain(now[name])}
     ]
     return compare_columns(
         inputs.time, inputs.recorded, again.fields, compared, tolerances, remarks, differing
@@ -187,7 +187,10 @@ def compare_bags(
 
     Events are matched by their number in the journal.
     """
-    keys = [_keys(inputs) for inputs in (one, other)]
+    keys = [
+        [(k, n) for k, each in enumerate(inputs.sessions) for n in each.rows[:, 0].tolist()]
+        for inputs in (one, other)
+    ]
     places = {key: row for row, key in enumerate(keys[1])}
     rows = np.array([places.get(key, -1) for key in keys[0]], dtype=np.int64)
     there = rows >= 0
@@ -204,9 +207,14 @@ def compare_bags(
     remarks = [f'{each.bag}: {note}' for each in (one, other) for note in each.notes]
     if missing := int(np.count_nonzero(~there)):
         remarks.append(f'{missing} of {rows.size} events of {one.bag} are not in {other.bag}')
-    return compare_columns(
-        one.time, recorded, computed, there, tolerances, remarks, _differing(one, other)
-    )
+    mine, its = _recorded_values(one), _recorded_values(other)
+    differing = [
+        f'{name} is {_format_values(its[name])} in {other.bag}, '
+        f'{_format_values(values)} in {one.bag}'
+        for name, values in mine.items()
+        if values != its[name]
+    ]
+    return compare_columns(one.time, recorded, computed, there, tolerances, remarks, differing)
 
 
 def compare_columns(
@@ -263,37 +271,14 @@ def _beyond(was: Array, now: Array, absolute: float, relative: float) -> Flags:
     return np.asarray(~near & ~np.isnan(was))
 
 
-def _keys(inputs: ControllerInputs) -> list[tuple[int, int]]:
-    """Return the session and the number of each event."""
-    return [
-        (start, number)
-        for start, session in enumerate(inputs.sessions)
-        for number in session.rows[:, 0].tolist()
-    ]
-
-
-def _recorded_values(
-    inputs: ControllerInputs, names: Mapping[str, object]
-) -> dict[str, list[object]]:
-    """Return the values of parameters over the run, in order."""
+def _recorded_values(inputs: ControllerInputs) -> dict[str, list[object]]:
+    """Return the values of each parameter over the run, in order."""
     tables = [
-        parameters for session in inputs.sessions for parameters in session.parameters.values()
+        each.to_dict() for session in inputs.sessions for each in session.parameters.values()
     ]
-    found: dict[str, list[object]] = {}
-    for name in names:
-        found[name] = list(dict.fromkeys(_plain(table.to_dict()[name]) for table in tables))
-    return found
-
-
-def _differing(one: ControllerInputs, other: ControllerInputs) -> list[str]:
-    names = {row.name: None for row in ControllerParameters.specs()}
-    mine, its = _recorded_values(one, names), _recorded_values(other, names)
-    return [
-        f'{name} is {_format_values(its[name])} in {other.bag}, '
-        f'{_format_values(mine[name])} in {one.bag}'
-        for name in names
-        if mine[name] != its[name]
-    ]
+    return {
+        name: list(dict.fromkeys(_plain(table[name]) for table in tables)) for name in tables[0]
+    }
 
 
 def _plain(value: object) -> object:
