@@ -18,6 +18,9 @@ from t3mpc_ros.mpc.predictive_controller import PredictiveParameters, learning_c
 from t3mpc_ros.mpc.predictor import Predictor
 from t3mpc_ros.mpc.pretraining import SampleTiming, nominal_step_response
 
+Segment = list[tuple[Array, Array]]
+"""Errors and moves of each wheel without a gap, newest first as in the Boltzmann machine."""
+
 
 @dataclass(frozen=True)
 class MoveEffect:
@@ -164,11 +167,7 @@ def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -
     loop = replace(predictive.nominal, feedback_gain=min(feedback_slope(parameters), 100.0))
     middle = max(predictive.horizon // 2, 1)
     nominal = nominal_step_response(loop, timing, middle)[-1]
-    # Newest first, as everywhere in the Boltzmann machine.
-    runs = [
-        (np.ascontiguousarray(errors[::-1, z]), np.ascontiguousarray(moves[::-1, z]))
-        for z in range(2)
-    ]
+    runs = _newest_first(errors, moves)
     effects = [
         estimate_move_effect(*run, predictive.delta_lags, predictive.move_lags, middle)
         for run in runs
@@ -204,7 +203,7 @@ def _machine(parameters: PredictiveParameters, generator: np.random.Generator) -
     return make_machine(shape, *scales, parameters.spread, generator)
 
 
-def stretches(errors: Array, moves: Array) -> list[list[tuple[Array, Array]]]:
+def stretches(errors: Array, moves: Array) -> list[Segment]:
     """Return the segments of a run without a gap, of at least :data:`JUDGED` periods.
 
     Of what :func:`periods` returns, (errors, moves) of each wheel, *newest first*.
@@ -212,15 +211,17 @@ def stretches(errors: Array, moves: Array) -> list[list[tuple[Array, Array]]]:
     gaps = np.flatnonzero(np.isnan(errors + moves).any(axis=1))
     edges = [-1, *gaps.tolist(), len(errors)]
     return [
-        [
-            (
-                np.ascontiguousarray(errors[low + 1 : high, z][::-1]),
-                np.ascontiguousarray(moves[low + 1 : high, z][::-1]),
-            )
-            for z in range(errors.shape[1])
-        ]
+        _newest_first(errors[low + 1 : high], moves[low + 1 : high])
         for low, high in pairwise(edges)
         if high - low > JUDGED
+    ]
+
+
+def _newest_first(errors: Array, moves: Array) -> Segment:
+    """Return both by wheel."""
+    return [
+        (np.ascontiguousarray(errors[::-1, z]), np.ascontiguousarray(moves[::-1, z]))
+        for z in range(errors.shape[1])
     ]
 
 
@@ -234,7 +235,7 @@ def skills(
     parameters: PredictiveParameters,
     span: float,
     weights: dict[str, Array],
-    parts: list[list[tuple[Array, Array]]],
+    parts: list[Segment],
 ) -> Array:
     """Return the skill of weights on a run: next step and middle of the horizon, (2, m).
 

@@ -8,13 +8,14 @@ import numpy as np
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.cases import NOMINAL
-from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired, rms
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
+from t3mpc_ros.evaluation.experiment import Run, print_report, run_experiment
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.method import MethodSpec, pretrain
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.record import RATE, Record
-from t3mpc_ros.evaluation.reporting import Table, progress_bar
+from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import (
     HELD_OUT_SEEDS,
     PLANT_OF,
@@ -26,9 +27,11 @@ from t3mpc_ros.evaluation.scenario import (
 from t3mpc_ros.evaluation.training.fit import periods, skills, stretches
 from t3mpc_ros.evaluation.training.recorded_runs import MIDDLE, NEXT_STEP, pair
 from t3mpc_ros.evaluation.training.training_data import TrainingData
+from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.mpc.predictive_controller import PredictiveController
 
+WITHOUT, WITH = 'without model', 'with model'
 EARLY = 10.0
 """Length of the initial phase, in which a model matters most, s."""
 
@@ -54,40 +57,46 @@ def origin(drive: str) -> Mapping[str, object]:
 def assess(drive: str, seeds: int, *, progress: bool = False) -> str:
     """Return a report on the model: runs on the first held-out seeds with it and without."""
     _, parameters = fit_simulated_runs(drive)
-    records: dict[str, list[Record]] = {'without model': [], 'with model': []}
-    with progress_bar(2 * seeds, show=progress) as bar:
-        for seed in HELD_OUT_SEEDS[:seeds]:
-            scenario = Scenario(
-                PLANT_OF[drive], NOMINAL, seed, PRETRAINING_DURATION, PRETRAINING_NOISE
-            )
-            for name, found in records.items():
-                trained = name == 'with model'
-                method = MethodSpec(FULL, ProposedController, parameters, pretrained=trained)
-                found.append(run(scenario, method))
-                bar.update()
-    early = [[early_rmse(record) for record in found] for found in records.values()]
-    late = [[record.rmse() for record in found] for found in records.values()]
-    rows = [
-        [name, *(f'{mean(values):.4f} ± {interval(values):.4f}' for values in both)]
-        for name, *both in zip(records, early, late, strict=True)
+    specs = {
+        name: MethodSpec(FULL, ProposedController, parameters, pretrained=name == WITH)
+        for name in (WITHOUT, WITH)
+    }
+    scenarios = [
+        Scenario(PLANT_OF[drive], NOMINAL, seed, PRETRAINING_DURATION, PRETRAINING_NOISE)
+        for seed in HELD_OUT_SEEDS[:seeds]
     ]
-    gains = [paired(after, before) for before, after in (early, late)]
-    rows.append(['difference', *(f'{gain.mean:+.4f} ± {gain.half:.4f}' for gain in gains)])
+    table = run_experiment(
+        [
+            Run((scenario, spec), {'model': name, 'seed': scenario.seed})
+            for scenario in scenarios
+            for name, spec in specs.items()
+        ],
+        measured_phases,
+        report=print_report if progress else None,
+    )
+    phases = 'early', 'late'
+    rows = []
+    for name in specs:
+        numbers = [table.values(phase, model=name) for phase in phases]
+        rows.append([name, *(f'{mean(each):.4f} ± {interval(each):.4f}' for each in numbers)])
+    gains = [table.difference(phase, {'model': WITH}, {'model': WITHOUT}) for phase in phases]
+    rows.append(['difference', *(f'{each.mean:+.4f} ± {each.half:.4f}' for each in gains if each)])
     what = f'RMSE (rad/s), seeds {HELD_OUT_SEEDS[0]} to {HELD_OUT_SEEDS[seeds - 1]}, mean ± 95 %'
     return '\n\n'.join(
         [
             f'Trained on runs of {PRETRAINING_DURATION:g} s with seeds '
             f'{", ".join(map(str, PRETRAINING_SEEDS))}: drive {drive}, noise '
             f'{PRETRAINING_NOISE:g} (rad/s)².',
-            _skill_table(drive, records['without model'][0]).markdown(),
+            _skill_table(drive, run(scenarios[0], specs[WITHOUT])).markdown(),
             Table('', (what, f'first {EARLY:g} s', 'from 3 s on'), rows).markdown(),
         ]
     )
 
 
-def early_rmse(record: Record) -> float:
-    """Return the tracking RMSE over both wheels in the initial phase, rad/s."""
-    return rms(record.error[record.time < EARLY])
+def measured_phases(job: Job) -> dict[str, float]:
+    """Return the tracking RMSE over both wheels in the initial phase and after 3 s, rad/s."""
+    record = run(*job)
+    return {'early': rms(record.error[record.time < EARLY]), 'late': record.rmse()}
 
 
 def _skill_table(drive: str, record: Record) -> Table:
