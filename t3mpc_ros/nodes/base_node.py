@@ -7,7 +7,7 @@ from contextlib import suppress
 from copy import copy
 from itertools import islice
 import sys
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import (
@@ -24,6 +24,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
+from std_srvs.srv import SetBool
 
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.parameters.table import ParameterError, Parameters, ParameterSpec, nearest_hint
@@ -61,15 +62,26 @@ class BaseNode(Node, Generic[P]):
     :meth:`produce_diagnostics` (status for ``/diagnostics`` at 1 Hz) and :meth:`on_shutdown`.
     """
 
-    def __init__(self, name: str, parameter_class: type[P], **kwargs: Any) -> None:
-        super().__init__(name, **kwargs)
+    parameter_class: ClassVar[type[Parameters]] = Parameters
+    configuration_errors: ClassVar[tuple[type[Exception], ...]] = ()
+    """Errors of :meth:`make` that name what the user has to change, beside ParameterError."""
+
+    @classmethod
+    def make(cls) -> 'list[BaseNode[Any]]':
+        """Return the nodes of a process of this executable."""
+        return [cls()]
+
+    def __init__(self, name: str, **options: Any) -> None:
+        super().__init__(name, **options)
+        self.hardware_id = 'none'
+        """Device that the diagnostics are about."""
         self.exit_code = 0
         """Exit code of the process; a value other than 0 ends the process."""
         self.start_warnings: list[str] = []
         """Warnings about the start of the process, repeated in the diagnostics."""
         self.exit_requested = False
         """Set to True to end the process with :attr:`exit_code`."""
-        self.parameters: P = declare_parameters(self, parameter_class)
+        self.parameters: P = declare_parameters(self, self.parameter_class)
         self.add_on_set_parameters_callback(self._validate)
         self.add_post_set_parameters_callback(self._apply)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.DIAGNOSTICS)
@@ -146,6 +158,19 @@ class BaseNode(Node, Generic[P]):
         self._matching.append(made)
         return made
 
+    def offer(self, kind: type, name: str, action: Callable[..., tuple[str, str]]) -> None:
+        """Offer a service of type Trigger or SetBool.
+
+        ``action``, which gets the value of a SetBool, returns why it failed, and what it did.
+        """
+
+        def answer(request: Any, response: Any) -> Any:
+            problem, done = action(request.data) if kind is SetBool else action()
+            response.success, response.message = not problem, problem or done
+            return response
+
+        self.create_service(kind, name, answer)
+
     def _with_overrides(
         self, topic: str, kind: qos.Kind, args: tuple[Any, ...], options: dict[str, Any]
     ) -> tuple[Any, ...]:
@@ -167,11 +192,6 @@ class BaseNode(Node, Generic[P]):
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return level, message and values for ``/diagnostics``."""
         return OK, 'running', {}
-
-    @property
-    def hardware_id(self) -> str:
-        """Device that the diagnostics are about, 'none' for a node without hardware."""
-        return 'none'
 
     def on_shutdown(self) -> None:
         """Stop the robot, publish final messages, close files."""

@@ -7,11 +7,8 @@ from typing import Any
 
 from t3mpc_ros.nodes.base_node import BaseNode
 from t3mpc_ros.nodes.qos import RCLError
-from t3mpc_ros.nodes.registry import node_module
+from t3mpc_ros.nodes.registry import node_class
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
-
-CONFIGURATION_ERRORS: tuple[type[Exception], ...] = ()
-"""Errors of :func:`make` other than :class:`ParameterError`; it converts those of the nodes."""
 
 
 @dataclass(frozen=True)
@@ -28,28 +25,31 @@ class ComposedParameters(Parameters):
 class ComposedNode(BaseNode[ComposedParameters]):
     """Node of the process itself: holds the list of nodes to run."""
 
+    parameter_class = ComposedParameters
+
     def __init__(self, **options: Any) -> None:
-        super().__init__('composed', ComposedParameters, **options)
+        super().__init__('composed', **options)
 
+    @classmethod
+    def make(cls) -> list[BaseNode[Any]]:
+        """Return the chosen nodes and the node of the process.
 
-def make() -> list[BaseNode]:
-    """Return the chosen nodes and the node of the process.
-
-    ParameterError also if two nodes use one topic with different types, which ROS does not allow
-    within a process.
-    """
-    process = ComposedNode()
-    nodes: list[BaseNode] = []
-    # The recorder last: its early subscriptions must not fix the type of a topic.
-    for name in sorted(process.parameters.nodes, key='recorder'.__eq__):
-        module = node_module(name)
-        try:
-            nodes += module.make()
-        except module.CONFIGURATION_ERRORS as error:
-            raise ParameterError(str(error)) from error
-        except RCLError as error:
-            raise ParameterError(
-                f'{name} cannot share a process with {", ".join(n.get_name() for n in nodes)}; '
-                f'set enable_stamped_cmd_vel to the same value for all ({error})'
-            ) from error
-    return [*nodes, process]
+        ParameterError also if two nodes use one topic with different types, which ROS does not
+        allow within a process.
+        """
+        process = cls()
+        nodes: list[BaseNode[Any]] = []
+        # The recorder last: its early subscriptions must not fix the type of a topic.
+        for name in sorted(process.parameters.nodes, key='recorder'.__eq__):
+            kind = node_class(name)
+            try:
+                nodes += kind.make()
+            except kind.configuration_errors as error:
+                raise ParameterError(str(error)) from error
+            except RCLError as error:
+                raise ParameterError(
+                    f'{name} cannot share a process with '
+                    f'{", ".join(each.get_name() for each in nodes)}; '
+                    f'set enable_stamped_cmd_vel to the same value for all ({error})'
+                ) from error
+        return [*nodes, process]

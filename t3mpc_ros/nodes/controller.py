@@ -40,9 +40,6 @@ from t3mpc_ros.nodes.base_node import (
 from t3mpc_ros.nodes.conversions import FrameParameters, age_problem, message_age_ns
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
-CONFIGURATION_ERRORS = (ModelError,)
-"""Errors of :func:`make` other than :class:`ParameterError`."""
-
 INITIAL_INPUT_TIME_NS = 10 * NANOSECONDS
 """Time from the first input for which inputs are republished on ``~/initial_inputs/*``."""
 WATCHDOG_PERIOD = 0.05
@@ -117,8 +114,11 @@ class InitialInputs:
 class ControllerNode(BaseNode[ControllerNodeParameters]):
     """Runs one control step per odometry message and publishes the command."""
 
+    parameter_class = ControllerNodeParameters
+    configuration_errors = (ModelError,)
+
     def __init__(self, **options: Any) -> None:
-        super().__init__('controller', ControllerNodeParameters, **options)
+        super().__init__('controller', **options)
         self.get_logger().info('initialising (the first start compiles the kernels, about 30 s)')
         self._controller = Controller(self.parameters, _obstacles(self.parameters))
         self._controller.warm_up()  # compile and pre-train here, not within a step
@@ -165,9 +165,9 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             if self.parameters.keep_out.enabled
             else []
         )
-        self.create_service(SetBool, '~/enable', self._on_enable)
-        self.create_service(Trigger, '~/reset', self._on_reset)
-        self.create_service(Trigger, '~/save_model', self._on_save_model)
+        self.offer(SetBool, '~/enable', self._enable)
+        self.offer(Trigger, '~/reset', self._reset)
+        self.offer(Trigger, '~/save_model', self._save_model)
         self.create_steady_timer(WATCHDOG_PERIOD, self._on_watchdog)
         if self.parameters.detect_cmd_vel_type:
             self.create_steady_timer(ADAPT_PERIOD, self._adapt_command_type)
@@ -295,33 +295,23 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             if math.isfinite(value) and publisher.get_subscription_count():
                 publisher.publish(Float64(data=value))
 
-    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._controller.enable(request.data)
-        self._publish_journal(self._journal.enable(request.data))
-        response.success = True
-        response.message = 'the robot may move' if request.data else 'the robot is stopped'
-        return response
+    def _enable(self, on: bool) -> tuple[str, str]:
+        self._controller.enable(on)
+        self._publish_journal(self._journal.enable(on))
+        return '', 'the robot may move' if on else 'the robot is stopped'
 
-    def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reset(self) -> tuple[str, str]:
         self._controller.reset()
         self._publish_journal(self._journal.reset())
-        response.success = True
-        response.message = 'learnt weights of this run are discarded'
-        return response
+        return '', 'learnt weights of this run are discarded'
 
-    def _on_save_model(
-        self, request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
+    def _save_model(self) -> tuple[str, str]:
         path = Path(self.parameters.model_output)
         try:
             save_model(path, self._controller.get_weights(), self.parameters.to_dict())
         except ModelError as error:
-            response.success = False
-            response.message = str(error)
-        else:
-            response.success = True
-            response.message = f'saved {path.resolve()}'
-        return response
+            return str(error), ''
+        return '', f'saved {path.resolve()}'
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the controller tracks the reference, or the reason of the stop."""
@@ -406,8 +396,3 @@ def _obstacles(parameters: ControllerNodeParameters) -> Obstacles:
         return load_world(parameters.keep_out.world).obstacles
     except WorldError as error:
         raise ParameterError(f'keep_out.world: {error}') from error
-
-
-def make() -> list[ControllerNode]:
-    """Return the nodes of this process."""
-    return [ControllerNode()]

@@ -7,28 +7,27 @@ without a traceback, so the signal handlers are installed first and slow imports
 functions.
 """
 
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 import os
 from pathlib import Path
 import sys
 import tempfile
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, TypeVar
 
 from t3mpc_ros.missing_library import remedy
-from t3mpc_ros.nodes.arguments import (
-    information,
-    parameter_file_problem,
-    unknown_arguments,
-    unmatched_files,
-)
-from t3mpc_ros.nodes.registry import node_module
+from t3mpc_ros.nodes import arguments
+from t3mpc_ros.nodes.registry import node_class
 from t3mpc_ros.stop_signal import StopSignal
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
+    from rclpy.node import Node
 
     from t3mpc_ros.nodes.base_node import BaseNode
+
+N = TypeVar('N', bound='Node')
 
 USAGE_ERROR = 2
 """Exit code for an unusable parameter, parameter file or command line."""
@@ -77,29 +76,30 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
 
     from t3mpc_ros.parameters.table import ParameterError
 
-    if problem := parameter_file_problem(argv):  # rcl would read them, too
+    if problem := arguments.parameter_file_problem(argv):  # rcl would read them, too
         return _usage_error(name, problem)
     try:
         words = remove_ros_args(list(argv))[1:]
-        if text := information(name, words):
+        if text := arguments.information(name, words):
             print(text)
             return 0
-        if problem := unknown_arguments(name, words):
+        if problem := arguments.unknown_arguments(name, words):
             return _usage_error(name, problem)
         init_ros(argv)
     except (RuntimeError, ValueError) as error:
         return _usage_error(name, f'invalid command line: {error}')
-    module = node_module(name)
+    kind = node_class(name)
     configuration_errors = (
         ParameterError,
         InvalidParameterTypeException,
         InvalidParameterValueException,
-        *module.CONFIGURATION_ERRORS,
+        *kind.configuration_errors,
     )
     nodes: Sequence[BaseNode] = ()
     try:
-        nodes = module.make()
-        for problem in unmatched_files(argv, [node.get_fully_qualified_name() for node in nodes]):
+        nodes = kind.make()
+        names = [node.get_fully_qualified_name() for node in nodes]
+        for problem in arguments.unmatched_files(argv, names):
             for node in nodes:
                 node.get_logger().warning(problem)
                 node.start_warnings.append(problem)
@@ -156,13 +156,29 @@ def _usage_error(name: str, problem: str) -> int:
     return USAGE_ERROR
 
 
-def init_ros(arguments: Sequence[str]) -> None:
+@contextmanager
+def own_context(make: 'Callable[[], N]') -> 'Iterator[N]':
+    """Return the node that ``make`` returns, in a context that ends with the ``with`` block."""
+    import rclpy
+
+    init_ros([])
+    try:
+        node = make()
+        try:
+            yield node
+        finally:
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
+def init_ros(words: Sequence[str]) -> None:
     """Initialise rclpy with the arguments of a command line, without its signal handlers."""
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
     provide_log_directory(os.environ)
-    rclpy.init(args=list(arguments), signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(args=list(words), signal_handler_options=SignalHandlerOptions.NO)
 
 
 def provide_log_directory(environment: MutableMapping[str, str]) -> None:

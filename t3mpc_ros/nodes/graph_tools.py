@@ -7,7 +7,7 @@ Words and output are those of ``ros2 topic``, ``ros2 param`` and ``ros2 service 
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 import math
 import time
 from typing import Any
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import SetBool
@@ -23,7 +22,7 @@ import yaml
 
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.conversions import message_class
-from t3mpc_ros.nodes.entry_point import init_ros
+from t3mpc_ros.nodes.entry_point import own_context
 from t3mpc_ros.nodes.remote_parameters import parameter_message, plain_value, refusal, type_text
 
 LISTING = 1.5
@@ -121,7 +120,7 @@ class Graph:
         """Return the full names of the other nodes."""
         self.discover()
         names = {
-            f'{where.rstrip("/")}/{name}'
+            qos.full_name(where, name)
             for name, where in self._node.get_node_names_and_namespaces()
         }
         return sorted(names - {self._node.get_fully_qualified_name()})
@@ -235,15 +234,9 @@ class Graph:
 @contextmanager
 def graph(stop: Callable[[], bool] = lambda: False) -> Iterator[Graph]:
     """Return a graph in a context of its own, which ends with the ``with`` block."""
-    init_ros([])
-    node = Node('t3mpc', start_parameter_services=False, enable_rosout=False)
-    opened = Graph(node, stop)
-    try:
-        yield opened
-    finally:
-        opened.close()
-        node.destroy_node()
-        rclpy.try_shutdown()
+    options = {'start_parameter_services': False, 'enable_rosout': False}
+    with own_context(lambda: Node('t3mpc', **options)) as node, closing(Graph(node, stop)) as made:
+        yield made
 
 
 def plain(message: Any) -> Any:

@@ -265,7 +265,7 @@ def command_publishers_problem(node: Node) -> str:
     own = {each.topic_name for each in (*node.subscriptions, *node.publishers)}
     if topic not in own:
         return ''
-    names = sorted(map(full_name, node.get_publishers_info_by_topic(topic)))
+    names = sorted(map(node_of, node.get_publishers_info_by_topic(topic)))
     return f'{topic} has {len(names)} publishers: {", ".join(names)}' if len(names) > 1 else ''
 
 
@@ -297,12 +297,17 @@ def _comparable(profile: QoSProfile) -> QoSProfile:
 
 def _mismatch(topic: str, peer: TopicEndpointInfo, reason: str) -> str:
     policies = reason.removeprefix('ERROR: ').strip('; ').replace('; ERROR:', ',')
-    return f'no message passes between {full_name(peer)} and this node on {topic}: {policies}'
+    return f'no message passes between {node_of(peer)} and this node on {topic}: {policies}'
 
 
-def full_name(info: TopicEndpointInfo) -> str:
+def full_name(namespace: str, name: str) -> str:
+    """Return the full name of a node."""
+    return f'{namespace.rstrip("/")}/{name}'
+
+
+def node_of(info: TopicEndpointInfo) -> str:
     """Return the full name of the node of an endpoint."""
-    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+    return full_name(info.node_namespace, info.node_name)
 
 
 RECORDERS = ('recorder', 'rosbag2_recorder')

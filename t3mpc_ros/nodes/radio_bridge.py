@@ -16,14 +16,11 @@ import select
 import threading
 from typing import Any, ClassVar
 
-from t3mpc_ros.geometry.kinematics import wheels_from_twist
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
-from t3mpc_ros.nodes import qos
-from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
-from t3mpc_ros.nodes.robot_commands import CommandSubscription, offer_services
+from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
+from t3mpc_ros.nodes.robot_node import RobotNode
 from t3mpc_ros.nodes.robot_topics import (
     RobotDescription,
-    RobotPublishers,
     RobotTopicParameters,
     count_variance,
     state_values,
@@ -37,15 +34,12 @@ from t3mpc_ros.radio.link.telemetry import MICROSTEPS, STEPS_PER_REV
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, read_key
 from t3mpc_ros.radio.radio_robot import RadioRobot, RadioRobotParameters
 from t3mpc_ros.radio.serial_port import PortError, SerialPort, find_ports
-from t3mpc_ros.robot.interface import RobotCommand, RobotState
+from t3mpc_ros.robot.interface import RobotState
 from t3mpc_ros.robot.sensor_conversions import (
     BatteryParameters,
     ImuParameters,
     RangeSensorParameters,
 )
-
-CONFIGURATION_ERRORS = (KeyFileError,)
-"""Errors of :func:`make` other than :class:`ParameterError`."""
 
 SHUTDOWN_TIMEOUT = 2.0
 """Maximum time to stop the robot and to disable its drives at shutdown, s."""
@@ -77,29 +71,22 @@ class RadioBridgeParameters(RobotTopicParameters, RadioRobotParameters):
     battery: BatteryParameters = group(BatteryParameters)
 
 
-class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
+class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
     """Sends commands to the robot and publishes its telemetry."""
 
+    parameter_class = RadioBridgeParameters
+    configuration_errors = (KeyFileError,)
+
     def __init__(self, **options: Any) -> None:
-        super().__init__('radio_bridge', RadioBridgeParameters, **options)
+        super().__init__('radio_bridge', **options)
         parameters = self.parameters
         key = read_key(Path(parameters.key_file)) if parameters.key_file else b''
-        self._lock = threading.Lock()
-        self._robot = RadioRobot(parameters, key)
+        self.hardware_id = parameters.port
         self._port: SerialPort | None = None
         self._path = parameters.port
         self._choice = 0
         """Number of the port to open next, among those of the pattern."""
-        self._logged_reason = 'starting'
-        self._robot_publishers = RobotPublishers(self, parameters, _robot_description(parameters))
-        self._commands = CommandSubscription(
-            self,
-            parameters.enable_stamped_cmd_vel,
-            lambda: self.parameters.limiter.command_timeout,
-            self._apply_command,
-            (self.now_ns, self.steady_ns),
-        )
-        offer_services(self, self._robot, self.steady_ns, self._lock)
+        self.connect(RadioRobot(parameters, key))
         self._wake_read, self._wake_write = os.pipe()
         self._port_thread = threading.Thread(target=self._serve_port, name='radio', daemon=True)
         self._port_thread.start()
@@ -108,16 +95,16 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
                 'no key_file: the link is not authenticated, any such radio can drive the robot'
             )
 
-    def on_parameters_changed(self, parameters: RadioBridgeParameters) -> None:
-        """Apply dynamic parameters to the robot and its messages."""
-        with self._lock:
-            self._robot.configure(parameters)
-        self._robot_publishers.configure(parameters, _robot_description(parameters))
+    def robot_ns(self) -> int:
+        """Return the time of the link, ns."""
+        return self.steady_ns()
 
-    def _apply_command(self, twist: BodyTwist, stamp_ns: int) -> str:
-        command = RobotCommand(wheels_from_twist(twist, self.parameters.geometry), stamp_ns)
-        with self._lock:
-            return self._robot.apply(command, self.steady_ns())
+    def describe(self, parameters: RadioBridgeParameters) -> RobotDescription:
+        """Return the properties of the real robot."""
+        rate = parameters.link.cycle_rate
+        variance = count_variance(math.tau / (STEPS_PER_REV * MICROSTEPS), 1.0 / rate)
+        sensors = parameters.imu, parameters.range_sensor, parameters.battery
+        return RobotDescription(rate, parameters.geometry, variance, sensors)
 
     # -- thread of the serial port ----------------------------------------------------------------
 
@@ -202,17 +189,7 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
         odometry = state.odometry._replace(stamp_ns=stamp_ns)
         self._robot_publishers.publish(state._replace(stamp_ns=stamp_ns, odometry=odometry))
 
-    def _log_reason(self, reason: str) -> None:
-        if reason != self._logged_reason:
-            self._logged_reason = reason
-            self.get_logger().info(reason or 'following commands')
-
     # -- diagnostics and shutdown -----------------------------------------------------------------
-
-    @property
-    def hardware_id(self) -> str:
-        """The serial port of the dongle."""
-        return self.parameters.port
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the robot follows commands, the reason if not, and the link quality."""
@@ -225,8 +202,7 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             'port': self._path,
             'link': link_state.value,
             'authenticated': authenticated,
-            'commands': self._commands.received,
-            'commands_rejected': self._commands.rejected,
+            **self._command_values(),
             **_link_values(quality),
             **state_values(state),
         }
@@ -234,9 +210,9 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             return ERROR, state.reason or link_state.value, values
         if quality.level is DiagnosticLevel.ERROR:
             return ERROR, quality.text, values
-        if problem := qos.command_type_problem(self, self._commands.message_type, publish=False):
+        if problem := self._command_type_problem():
             return WARN, problem, values
-        found = [*state_warnings(state, command_problem=self._commands.problem)]
+        found = [*state_warnings(state, command_problem=self._command_problem)]
         if quality.text:
             found.append(quality.text)
         if found:
@@ -255,14 +231,6 @@ class RadioBridgeNode(BaseNode[RadioBridgeParameters]):
             os.close(self._wake_write)
 
 
-def _robot_description(parameters: RadioBridgeParameters) -> RobotDescription:
-    """Return the properties of the real robot."""
-    rate = parameters.link.cycle_rate
-    variance = count_variance(math.tau / (STEPS_PER_REV * MICROSTEPS), 1.0 / rate)
-    sensors = parameters.imu, parameters.range_sensor, parameters.battery
-    return RobotDescription(rate, parameters.geometry, variance, sensors)
-
-
 def _link_values(quality: LinkQuality) -> Mapping[str, object]:
     """Return the link statistics by diagnostic key."""
     return {
@@ -279,8 +247,3 @@ def _link_values(quality: LinkQuality) -> Mapping[str, object]:
         'crc_errors': quality.host.crc_errors,
         'frame_errors': quality.host.frame_errors,
     }
-
-
-def make() -> list[RadioBridgeNode]:
-    """Return the nodes of this process."""
-    return [RadioBridgeNode()]

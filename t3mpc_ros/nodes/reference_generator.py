@@ -33,9 +33,6 @@ from t3mpc_ros.nodes.base_node import ACK_TIMEOUT, NO_CLOCK, OK, WARN, BaseNode
 from t3mpc_ros.nodes.conversions import FrameParameters
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
-CONFIGURATION_ERRORS: tuple[type[Exception], ...] = (PathError,)
-"""Errors of :func:`make` other than :class:`ParameterError`."""
-
 PATH_PERIOD = 0.1
 """Time between the poses of ``reference/path``, s."""
 SEED_BITS = 128
@@ -84,8 +81,11 @@ class ReferenceGeneratorParameters(PathReferenceParameters):
 class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
     """Publishes the reference on an exact time grid, stamped ahead by the lead time."""
 
+    parameter_class = ReferenceGeneratorParameters
+    configuration_errors = (PathError,)
+
     def __init__(self, **options: Any) -> None:
-        super().__init__('reference_generator', ReferenceGeneratorParameters, **options)
+        super().__init__('reference_generator', **options)
         parameters = self.parameters
         # A secret seed is never a parameter value, log text or diagnostic value: it determines
         # the path of the robot. The diagnostics hold its fingerprint, which the recorder stores.
@@ -125,8 +125,8 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             Int32MultiArray, 'reference/signals', qos.LATCHED
         )
         self._signals: tuple[int, ...] = ()
-        self.create_service(Trigger, '~/reseed', self._on_reseed)
-        self.create_service(SetBool, '~/pause', self._on_pause)
+        self.offer(Trigger, '~/reseed', self._reseed)
+        self.offer(SetBool, '~/pause', self._pause)
         self.create_steady_timer(1.0 / parameters.rate, self._on_timer)
         self.create_steady_timer(1.0, self._publish_path)
 
@@ -240,25 +240,20 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             self._path.header.stamp = self.get_clock().now().to_msg()
             self._path_publisher.publish(self._path)
 
-    def _on_reseed(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _reseed(self) -> tuple[str, str]:
         if self.parameters.source not in ('signals', 'portrait'):
-            response.message = f'source {self.parameters.source} has no seed'
-            return response
+            return f'source {self.parameters.source} has no seed', ''
         seed = self._next_seed()
-        response.success = True
-        response.message = 'the reference restarts with another seed'
         if isinstance(self._source, PortraitSource):
             self._source.reseed(seed)
-            response.message = 'the path continues with another seed'
-        elif self.parameters.source == 'signals':
+            return '', 'the path continues with another seed'
+        if self.parameters.source == 'signals':
             self._generator.reset(seed)
-        return response
+        return '', 'the reference restarts with another seed'
 
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._paused = request.data
-        response.success = True
-        response.message = 'reference paused' if request.data else 'reference resumed'
-        return response
+    def _pause(self, on: bool) -> tuple[str, str]:
+        self._paused = on
+        return '', 'reference paused' if on else 'reference resumed'
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return the state of the reference; a warning if samples were skipped."""
@@ -289,8 +284,3 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
 def _random_seed() -> int:
     """Return a seed from the operating system's random number generator."""
     return secrets.randbits(SEED_BITS)
-
-
-def make() -> list[ReferenceGeneratorNode]:
-    """Return the nodes of this process."""
-    return [ReferenceGeneratorNode()]

@@ -1,27 +1,26 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Registry of the nodes: module, parameter class and interface by executable name; docs tables.
+"""Registry of the nodes: class and interface by executable name; docs tables.
 
 Node modules are imported on request only: an entry point installs its signal handlers first, and
 one node does not load the code of the others.
 """
 
-from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
 import sys
-from types import ModuleType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
+    from t3mpc_ros.nodes.base_node import BaseNode
     from t3mpc_ros.parameters.table import Parameters
 
 
 class NodeInterface(NamedTuple):
     """Where a node stands, what it is for, its topics and services; ``*``: several names."""
 
-    parameters: str
-    """Its module below ``t3mpc_ros.nodes``, and the parameter class in it."""
+    place: str
+    """Its module below ``t3mpc_ros.nodes``, and its class."""
     summary: str
     subscribes: tuple[str, ...] = ()
     publishes: tuple[str, ...] = ()
@@ -33,14 +32,14 @@ _ROBOT_SERVICES = ('reset_odometry', 'e_stop')
 
 INTERFACES = {
     'reference_generator': NodeInterface(
-        'reference_generator:ReferenceGeneratorParameters',
+        'reference_generator:ReferenceGeneratorNode',
         'Publishes the reference: chaotic signals, a chaotic path, or a given path or twist.',
         subscribes=('odom', 'path', 'target_twist'),
         publishes=('reference', 'reference/path', 'reference/signals', '/diagnostics'),
         services=('~/reseed', '~/pause'),
     ),
     'controller': NodeInterface(
-        'controller:ControllerNodeParameters',
+        'controller:ControllerNode',
         'Tracks the reference with the odometry of a robot and publishes its velocity commands.',
         subscribes=('reference', 'odom', 'range/*'),
         publishes=(
@@ -58,28 +57,28 @@ INTERFACES = {
         services=('~/enable', '~/reset', '~/save_model'),
     ),
     'sim_robot': NodeInterface(
-        'sim_robot:SimRobotParameters',
+        'sim_robot:SimRobotNode',
         'Simulates the robot: executes velocity commands, publishes odometry and sensors.',
         subscribes=('cmd_vel',),
         publishes=(*_ROBOT_TOPICS, 'ground_truth/odom', '/clock', '/diagnostics'),
         services=(*_ROBOT_SERVICES, '~/set_pose', '~/step'),
     ),
     'radio_bridge': NodeInterface(
-        'radio_bridge:RadioBridgeParameters',
+        'radio_bridge:RadioBridgeNode',
         'Connects the real robot: sends velocity commands, publishes odometry and sensors.',
         subscribes=('cmd_vel',),
         publishes=(*_ROBOT_TOPICS, '/diagnostics'),
         services=_ROBOT_SERVICES,
     ),
     'recorder': NodeInterface(
-        'recorder.node:RecordingParameters',
+        'recorder.node:RecorderNode',
         'Records topics into an MCAP bag that rosbag2 reads.',
         subscribes=('*', '/diagnostics'),
         publishes=('/diagnostics',),
         services=('~/split_bagfile', '~/snapshot'),
     ),
     'player': NodeInterface(
-        'player.node:PlayerParameters',
+        'player.node:PlayerNode',
         'Publishes the messages of bags at the recorded times; storage.uris names the bags.',
         publishes=('*', '/clock', '/diagnostics'),
         services=(
@@ -92,7 +91,7 @@ INTERFACES = {
         ),
     ),
     'composed': NodeInterface(
-        'composed:ComposedParameters',
+        'composed:ComposedNode',
         'Runs the nodes that its parameter nodes lists in one process.',
         publishes=('/diagnostics',),
     ),
@@ -106,15 +105,15 @@ MARK = '<!-- generated from here on: python -m t3mpc_ros.nodes.registry docs/nod
 """First line of the generated part of ``docs/nodes.md``."""
 
 
-def node_module(node: str) -> ModuleType:
-    """Return the module of a node."""
-    return import_module(f't3mpc_ros.nodes.{INTERFACES[node].parameters.partition(":")[0]}')
+def node_class(node: str) -> 'type[BaseNode[Any]]':
+    """Return the class of a node."""
+    found: type[BaseNode[Any]] = resolve_name(f't3mpc_ros.nodes.{INTERFACES[node].place}')
+    return found
 
 
 def parameter_class(node: str) -> 'type[Parameters]':
     """Return the parameter class of a node."""
-    found: type[Parameters] = resolve_name(f't3mpc_ros.nodes.{INTERFACES[node].parameters}')
-    return found
+    return node_class(node).parameter_class
 
 
 def parameters_section() -> str:

@@ -16,6 +16,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.task import Future
 
+from t3mpc_ros.nodes.qos import full_name
+
 SERVICES = {
     'list_parameters': ListParameters,
     'describe_parameters': DescribeParameters,
@@ -34,6 +36,10 @@ class RemoteParameters:
 
     def __init__(self, node: Node, name: str) -> None:
         self.name = name
+        self.node_name = name.rpartition('/')[2]
+        """The name without its namespace."""
+        self.requested = False
+        """Whether :meth:`read` was called."""
         self._node = node
         self._clients: dict[str, Client] = {
             word: node.create_client(kind, f'{name}/{word}') for word, kind in SERVICES.items()
@@ -51,6 +57,7 @@ class RemoteParameters:
 
     def read(self, found: Callable[[Sequence[Mapping[str, Any]]], None]) -> None:
         """Request all parameters; ``found`` gets one row each, see :func:`parameter_row`."""
+        self.requested = True
 
         def listed(answer: Any) -> None:
             names = sorted(answer.result.names)
@@ -82,6 +89,49 @@ class RemoteParameters:
 
         request = SERVICES[word].Request(**fields)
         self._clients[word].call_async(request).add_done_callback(finish)
+
+
+class ParameterWatch:
+    """Reads the parameters of nodes of the graph, once after each start of a node.
+
+    ``wanted`` decides by name and namespace; ``found`` gets the parameters of a node and a row
+    of each.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        wanted: Callable[[str, str], bool],
+        found: Callable[[RemoteParameters, Sequence[Mapping[str, Any]]], None],
+    ) -> None:
+        self.nodes: dict[str, RemoteParameters] = {}
+        """Parameters of the nodes that are present, by full name."""
+        self._node = node
+        self._wanted = wanted
+        self._found = found
+
+    def update(self) -> list[RemoteParameters]:
+        """Request the parameters of new nodes; return those of the nodes that have left."""
+        present = {
+            full_name(namespace, name)
+            for name, namespace in self._node.get_node_names_and_namespaces()
+            if self._wanted(name, namespace)
+        }
+        left = [self.nodes.pop(name) for name in self.nodes.keys() - present]
+        for remote in left:
+            remote.destroy()
+        for name in sorted(present):
+            if name not in self.nodes:
+                self.nodes[name] = RemoteParameters(self._node, name)
+            remote = self.nodes[name]
+            if not remote.requested and remote.ready():
+                remote.read(partial(self._found, remote))
+        return left
+
+    def close(self) -> None:
+        """Ignore the answers that have not arrived."""
+        for remote in self.nodes.values():
+            remote.destroy()
 
 
 def refusal(answer: SetParameters.Response) -> str:

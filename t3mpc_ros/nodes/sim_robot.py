@@ -9,33 +9,23 @@ from typing import Any
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from t3mpc_ros.geometry.kinematics import wheels_from_twist
 from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, SimulatedTime
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose
+from t3mpc_ros.geometry.types import NANOSECONDS, Pose
 from t3mpc_ros.nodes import conversions, qos
-from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN, BaseNode
-from t3mpc_ros.nodes.robot_commands import CommandSubscription, offer_services
+from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN
+from t3mpc_ros.nodes.robot_node import RobotNode
 from t3mpc_ros.nodes.robot_topics import (
     RobotDescription,
-    RobotPublishers,
     RobotTopicParameters,
     count_variance,
     state_values,
     state_warnings,
 )
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
-from t3mpc_ros.robot.interface import RobotCommand, RobotState
-from t3mpc_ros.simulation.digital_twin import (
-    DigitalTwin,
-    DigitalTwinParameters,
-    TwinDiagnostics,
-    make_robot,
-)
+from t3mpc_ros.robot.interface import RobotState
+from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters, make_robot
 from t3mpc_ros.simulation.fault_injection import ScheduleError, active_faults
 from t3mpc_ros.simulation.world import WorldError
-
-CONFIGURATION_ERRORS = (WorldError, ScheduleError)
-"""Errors of :func:`make` other than :class:`ParameterError`."""
 
 MIN_TIMER_PERIOD, MAX_TIMER_PERIOD = 0.001, 0.05
 """Limits of the timer period, s."""
@@ -120,20 +110,26 @@ class SimRobotParameters(RobotTopicParameters, DigitalTwinParameters):
             )
 
 
-class SimRobotNode(BaseNode[SimRobotParameters]):
+class SimRobotNode(RobotNode[SimRobotParameters]):
     """Advances the simulated robot on an exact time grid and publishes its measurements.
 
     The time is that of the node, or with ``publish_clock`` simulated time with a real-time factor
     or single steps.
     """
 
+    parameter_class = SimRobotParameters
+    configuration_errors = (WorldError, ScheduleError)
+
     def __init__(self, **options: Any) -> None:
-        super().__init__('sim_robot', SimRobotParameters, **options)
+        super().__init__('sim_robot', **options)
         parameters = self.parameters
-        self._robot = make_robot(parameters)
-        if problem := self._set_pose():
-            raise ParameterError(f'initial_pose.x and initial_pose.y: {problem}')
-        self._robot.warm_up()  # compile here, not within a step
+        self.hardware_id = f'simulated robot {parameters.seed}'
+        robot = make_robot(parameters)
+        try:
+            robot.set_pose(parameters.pose)
+        except ValueError as error:
+            raise ParameterError(f'initial_pose.x and initial_pose.y: {error}') from error
+        robot.warm_up()  # compile here, not within a step
         self._scheduler = SampleScheduler(parameters.rate, slack=0.2 / parameters.rate)
         self._simulated_time = (
             SimulatedTime(parameters.rate, parameters.real_time_factor)
@@ -142,27 +138,16 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
         )
         self._real_time_factor = RealTimeFactor()
         self._state: RobotState | None = None
-        self._logged_reason = ''
-        self._robot_publishers = RobotPublishers(self, parameters, _robot_description(parameters))
+        self.connect(robot)
         if parameters.publish_clock:
             self._clock_publisher = self.create_publisher(Clock, '/clock', qos.LATEST)
-        self._commands = CommandSubscription(
-            self,
-            parameters.enable_stamped_cmd_vel,
-            lambda: self.parameters.limiter.command_timeout,
-            self._apply_command,
-            (self._robot_now_ns, self._robot_now_ns),
-            lambda: self._simulated_time is not None or self.get_clock().ros_time_is_active,
-        )
-        offer_services(self, self._robot, self._robot_now_ns)
-        self.create_service(Trigger, '~/set_pose', self._on_set_pose)
-        self.create_service(Trigger, '~/step', self._on_step)
+        self.offer(Trigger, '~/set_pose', self._set_pose)
+        self.offer(Trigger, '~/step', self._step)
         self._timer = self.create_steady_timer(self._timer_period(), self._on_timer)
 
     def on_parameters_changed(self, parameters: SimRobotParameters) -> None:
         """Apply dynamic parameters to the robot, its messages and the simulated time."""
-        self._robot.configure(parameters)
-        self._robot_publishers.configure(parameters, _robot_description(parameters))
+        super().on_parameters_changed(parameters)
         time, factor = self._simulated_time, parameters.real_time_factor
         if time is not None and factor != time.real_time_factor:
             time.set_real_time_factor(factor, self.steady_ns())
@@ -170,21 +155,39 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
             self._timer.timer_period_ns = round(self._timer_period() * NANOSECONDS)
             self._timer.reset()
 
+    def now_ns(self) -> int:
+        """Return the node's time, ns: the publisher of /clock does not wait for its messages."""
+        if self._simulated_time is None:
+            return super().now_ns()
+        return self._simulated_time.now_ns(self.steady_ns())
+
+    def has_simulated_time(self) -> bool:
+        """Return whether the time of the robot is no measure for the age of a message."""
+        return self._simulated_time is not None or self.get_clock().ros_time_is_active
+
+    def describe(self, parameters: SimRobotParameters) -> RobotDescription:
+        """Return the properties of the simulated robot."""
+        rate, variance = parameters.rate, parameters.noise.variance
+        if parameters.drive.kind == 'stepper':
+            variance += count_variance(parameters.motor.microstep, 1.0 / rate)
+            sensors = parameters.imu, parameters.range_sensor, parameters.battery
+        else:
+            sensors = None
+        return RobotDescription(
+            rate, parameters.geometry, variance, sensors, parameters.world_frame
+        )
+
     def _timer_period(self) -> float:
         rate = self.parameters.rate * self.parameters.real_time_factor
         return (
             min(max(1.0 / rate, MIN_TIMER_PERIOD), MAX_TIMER_PERIOD) if rate else MAX_TIMER_PERIOD
         )
 
-    def _apply_command(self, twist: BodyTwist, stamp_ns: int) -> str:
-        command = RobotCommand(wheels_from_twist(twist, self.parameters.geometry), stamp_ns)
-        return self._robot.apply(command, self._robot_now_ns())
-
     def _on_timer(self) -> None:
         if self._simulated_time is None:
             if not self.clock_started():
                 return
-            stamps = self._scheduler.due(self._robot_now_ns())
+            stamps = self._scheduler.due(self.now_ns())
         else:
             stamps = self._simulated_time.due(self.steady_ns())
             if not stamps and self._simulated_time.real_time_factor == 0.0:
@@ -200,69 +203,41 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
             if self._simulated_time is not None:
                 self._publish_clock()
             self._robot_publishers.publish(state)
-            if state.reason != self._logged_reason:
-                self._logged_reason = state.reason
-                self.get_logger().info(state.reason or 'following commands')
+            self._log_reason(state.reason)
 
     def _publish_clock(self) -> None:
         if self._state is not None:
             stamp = conversions.time_from_ns(self._state.stamp_ns)
             self._clock_publisher.publish(Clock(clock=stamp))
 
-    def _robot_now_ns(self) -> int:
-        # The publisher of /clock does not wait for its own message.
-        if self._simulated_time is None:
-            return self.now_ns()
-        return self._simulated_time.now_ns(self.steady_ns())
-
-    def _set_pose(self) -> str:
-        """Set the true pose to the initial pose; return why that is impossible, or nothing."""
-        try:
-            self._robot.set_pose(self.parameters.pose)
-        except ValueError as error:
-            return str(error)
-        return ''
-
-    def _on_set_pose(
-        self, request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        problem = self._set_pose()
+    def _set_pose(self) -> tuple[str, str]:
+        """Set the true pose to the initial pose."""
         pose = self.parameters.pose
-        response.success = not problem
-        response.message = problem or (
+        try:
+            self._robot.set_pose(pose)
+        except ValueError as error:
+            return str(error), ''
+        return '', (
             f'the robot is at x {pose.x:g} m, y {pose.y:g} m, yaw {pose.yaw:g} rad '
             '(parameters initial_pose.x, initial_pose.y, initial_pose.yaw)'
         )
-        return response
 
-    def _on_step(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _step(self) -> tuple[str, str]:
         time = self._simulated_time
         if time is None:
-            response.message = 'publish_clock must be true at start for single steps: got false'
-        elif time.real_time_factor != 0.0:
-            response.message = (
-                f'real_time_factor must be 0 for single steps: got {time.real_time_factor:g}'
-            )
-        else:
-            self._advance(time.step(self.parameters.step_periods))
-            response.success = True
-            response.message = f'simulated time {self._robot_now_ns() / NANOSECONDS:.9f} s'
-        return response
-
-    @property
-    def hardware_id(self) -> str:
-        """The simulated robot, with its seed."""
-        return f'simulated robot {self.parameters.seed}'
+            return 'publish_clock must be true at start for single steps: got false', ''
+        if (factor := time.real_time_factor) != 0.0:
+            return f'real_time_factor must be 0 for single steps: got {factor:g}', ''
+        self._advance(time.step(self.parameters.step_periods))
+        return '', f'simulated time {self.now_ns() / NANOSECONDS:.9f} s'
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the robot follows commands, or the reason of its standstill."""
-        state, twin = self._state, self._twin_diagnostics()
-        values: dict[str, object] = {
-            'commands': self._commands.received,
-            'commands_rejected': self._commands.rejected,
-        }
+        state, robot = self._state, self._robot
+        twin = robot.diagnostics if isinstance(robot, DigitalTwin) else None
+        values = dict(self._command_values())
         if self._simulated_time is None:
-            values['lateness_s'] = self._scheduler.lateness(self._robot_now_ns())
+            values['lateness_s'] = self._scheduler.lateness(self.now_ns())
             values['skipped_samples'] = self._scheduler.skipped
         if self._real_time_factor.value is not None:
             values['real_time_factor'] = self._real_time_factor.value
@@ -271,16 +246,13 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
         values |= state_values(state, twin)
         if state.status.estop:
             return ERROR, state.reason, values
-        if problem := qos.command_type_problem(self, self._commands.message_type, publish=False):
+        if problem := self._command_type_problem():
             return WARN, problem, values
         if overload := self._overload():
             return WARN, f'processor overloaded: {overload}', values
-        if found := state_warnings(state, twin, self._commands.problem):
+        if found := state_warnings(state, twin, self._command_problem):
             return WARN, '; '.join(found), values
         return OK, 'following commands', values
-
-    def _twin_diagnostics(self) -> TwinDiagnostics | None:
-        return self._robot.diagnostics if isinstance(self._robot, DigitalTwin) else None
 
     def _overload(self) -> str:
         if self._scheduler.skipped:
@@ -296,19 +268,4 @@ class SimRobotNode(BaseNode[SimRobotParameters]):
 
     def on_shutdown(self) -> None:
         """Stop the robot."""
-        self._robot.stop('the node is shut down', self._robot_now_ns())
-
-
-def _robot_description(parameters: SimRobotParameters) -> RobotDescription:
-    """Return the properties of the simulated robot."""
-    rate, variance = parameters.rate, parameters.noise.variance
-    if parameters.drive.kind != 'stepper':
-        return RobotDescription(rate, parameters.geometry, variance, None, parameters.world_frame)
-    variance += count_variance(parameters.motor.microstep, 1.0 / rate)
-    sensors = parameters.imu, parameters.range_sensor, parameters.battery
-    return RobotDescription(rate, parameters.geometry, variance, sensors, parameters.world_frame)
-
-
-def make() -> list[SimRobotNode]:
-    """Return the nodes of this process."""
-    return [SimRobotNode()]
+        self._robot.stop('the node is shut down', self.now_ns())

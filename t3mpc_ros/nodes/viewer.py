@@ -7,9 +7,9 @@ wait, so that two hundred messages a second cost about as much as twenty. Stream
 best effort, which every publisher offers.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 import math
 from queue import Empty, SimpleQueue
@@ -21,7 +21,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import Log, ParameterEvent
-import rclpy
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.logging_severity import LoggingSeverity
@@ -38,9 +37,9 @@ from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, State
 from t3mpc_ros.nodes import conversions
-from t3mpc_ros.nodes.entry_point import init_ros
-from t3mpc_ros.nodes.qos import PolledCallbackGroup, take_waiting
-from t3mpc_ros.nodes.remote_parameters import RemoteParameters, plain_value
+from t3mpc_ros.nodes.entry_point import own_context
+from t3mpc_ros.nodes.qos import PolledCallbackGroup, full_name, take_waiting
+from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters, plain_value
 from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 from t3mpc_ros.simulation.world import world_outline
@@ -97,8 +96,8 @@ class ViewNode(Node):
         self._geometry = WheelGeometry()
         self._origin_ns: int | None = None
         self._newest = 0.0
-        self._remote: dict[str, RemoteParameters] = {}
-        self._rows: dict[str, dict[str, dict[str, Any]]] = {}
+        self._remote = ParameterWatch(self, self._is_shown, self._on_parameters)
+        self._rows: dict[str, dict[str, Mapping[str, Any]]] = {}
         self._signals: tuple[int, ...] = ()
         self._faults = 'none'
         self._ranges = [math.nan] * len(RANGE_SENSORS)
@@ -259,26 +258,15 @@ class ViewNode(Node):
 
     def look_at_graph(self) -> None:
         """Find nodes that have come or gone, and the type of ``cmd_vel``."""
-        namespace = self.get_namespace()
-        present = {
-            name
-            for name, where in self.get_node_names_and_namespaces()
-            if where == namespace and name in LOOP_NODES
-        }
-        for name in self._remote.keys() - present:
-            self._remote.pop(name).destroy()
-            self._rows.pop(name, None)
-            self._sink.set(f'parameters/{name}', None)
-            self._sink.node_gone(name)
-        for name in sorted(present):
-            if name not in self._remote:
-                full = f'{namespace.rstrip("/")}/{name}'
-                self._remote[name] = RemoteParameters(self, full)
-            if name not in self._rows and self._remote[name].ready():
-                self._rows[name] = {}
-                self._remote[name].read(partial(self._on_parameters, name))
-        self._sink.set('nodes', sorted(present))
+        for remote in self._remote.update():
+            self._rows.pop(remote.node_name, None)
+            self._sink.set(f'parameters/{remote.node_name}', None)
+            self._sink.node_gone(remote.node_name)
+        self._sink.set('nodes', sorted(each.node_name for each in self._remote.nodes.values()))
         self._subscribe_command()
+
+    def _is_shown(self, name: str, namespace: str) -> bool:
+        return namespace == self.get_namespace() and name in LOOP_NODES
 
     def _subscribe_command(self) -> None:
         topic = self.resolve_topic_name('cmd_vel')
@@ -291,9 +279,9 @@ class ViewNode(Node):
                         self.destroy_subscription(source.subscription)
                     self._subscribe(kind, 'cmd_vel', self._on_command, depth=1)
 
-    def _on_parameters(self, name: str, rows: Sequence[dict[str, Any]]) -> None:
-        self._rows[name] = {row['name']: row for row in rows}
-        self._show_parameters(name)
+    def _on_parameters(self, remote: RemoteParameters, rows: Sequence[Mapping[str, Any]]) -> None:
+        self._rows[remote.node_name] = {row['name']: row for row in rows}
+        self._show_parameters(remote.node_name)
 
     def _show_parameters(self, name: str) -> None:
         rows = self._rows[name]
@@ -371,7 +359,8 @@ class ViewNode(Node):
 
     def _set_parameter(self, arguments: Mapping[str, Any], reply: 'Future[str]') -> None:
         node, name = (arguments.get(word) for word in ('node', 'name'))
-        if not isinstance(node, str) or not isinstance(name, str) or node not in self._remote:
+        remote = self._remote.nodes.get(full_name(self.get_namespace(), str(node)))
+        if not isinstance(node, str) or not isinstance(name, str) or remote is None:
             raise CommandFailedError(f'no node {node!r} with parameters is running')
 
         def answered(problem: str) -> None:
@@ -380,29 +369,24 @@ class ViewNode(Node):
             else:
                 reply.set_result(f'{name} is set')
 
-        self._remote[node].set(name, arguments.get('value'), answered)
+        remote.set(name, arguments.get('value'), answered)
 
 
-@contextmanager
-def view_node(sink: Any, namespace: str = '') -> Iterator[ViewNode]:
-    """Return a node in a context of its own, and end both after the ``with`` block.
+def view_node(sink: Any, namespace: str = '') -> AbstractContextManager[ViewNode]:
+    """Return a node in a context of its own, which both end after the ``with`` block.
 
-    ValueError for a namespace that is not valid in ROS.
+    ValueError there for a namespace that is not valid in ROS.
     """
-    init_ros([])
-    try:
+
+    def make() -> ViewNode:
         try:
-            node = ViewNode(sink, namespace)
+            return ViewNode(sink, namespace)
         except InvalidNamespaceException:
             raise ValueError(
                 f'namespace must be letters, digits, _ and / only: got {namespace!r}'
             ) from None
-        try:
-            yield node
-        finally:
-            node.destroy_node()
-    finally:
-        rclpy.try_shutdown()
+
+    return own_context(make)
 
 
 _CONDITIONS = ('normal', 'warning', 'stopped')

@@ -17,7 +17,7 @@ from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.entry_point import make_executor
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
-from t3mpc_ros.parameters.table import ParameterError, Parameters
+from t3mpc_ros.parameters.table import ParameterError
 
 pytestmark = pytest.mark.ros
 
@@ -127,7 +127,7 @@ def test_each_executor_calls_back_and_leaves_polled_messages(events, harness, mo
         monkeypatch.setitem(sys.modules, 'rclpy.experimental', None)
     executor = make_executor()
     assert isinstance(executor, SingleThreadedExecutor) != events
-    node = BaseNode('listener', Parameters)
+    node = BaseNode('listener')
     received = []
     node.create_matching_subscription(
         Twist, 'called', lambda *arguments: received.append(arguments), qos.STREAM

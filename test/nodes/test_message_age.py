@@ -74,7 +74,7 @@ def test_a_command_that_waited_is_rejected_by_the_bridge(harness, tmp_path, kind
     harness.spin_until(lambda: diagnostic(node, 'commands') == 1)
     assert diagnostic(node, 'commands_rejected') == 1
     assert node._robot.reason(node.steady_ns())
-    assert node._commands.problem.startswith('command is too old: 0.')
+    assert node._command_problem.startswith('command is too old: 0.')
 
 
 def test_a_command_from_the_future_is_rejected(harness, monkeypatch):

@@ -25,8 +25,8 @@ from t3mpc_ros.geometry.types import ORIGIN, BodyTwist
 from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN
 from t3mpc_ros.nodes.player.node import PlayerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
-from t3mpc_ros.nodes.recorder.metadata import ParameterCollector
 from t3mpc_ros.nodes.registry import NODES, parameter_class
+from t3mpc_ros.nodes.remote_parameters import ParameterWatch
 from t3mpc_ros.nodes.viewer import ViewNode
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.port_actions import LinkState
@@ -215,14 +215,13 @@ def test_a_service_called_twice_has_its_effect_once(name, service, kept, start):
 @pytest.mark.parametrize('name', ['sim_robot', 'radio_bridge'])
 def test_an_emergency_stop_lasts_until_its_release(name, start):
     node = start(name)
-    clock_ns = getattr(node, '_robot_now_ns', node.steady_ns)
     assert call(node, 'e_stop', data=False).message == 'no emergency stop is latched'
     for _ in range(2):
         assert call(node, 'e_stop', data=True).message == 'latched'
-        assert node._apply_command(BodyTwist(0.1, 0.0), clock_ns()).startswith('emerg')
+        assert node._apply_command(BodyTwist(0.1, 0.0), node.robot_ns()).startswith('emerg')
     answer = call(node, 'e_stop', data=False)
     assert (answer.success, answer.message) == (True, 'released')
-    assert node._apply_command(BodyTwist(0.1, 0.0), clock_ns()) == ''
+    assert node._apply_command(BodyTwist(0.1, 0.0), node.robot_ns()) == ''
     assert not call(node, 'e_stop', data=False).success
 
 
@@ -372,7 +371,7 @@ def test_levels_of_the_radio_bridge(start):
 def test_levels_of_the_recorder(start, harness, tmp_path):
     node = start('recorder')
     assert node.produce_diagnostics()[:2] == (OK, 'recording')
-    node._raw_subscriptions._lost['/a'] = 2
+    node._topics.lost['/a'] = 2
     lacks = 'the bag lacks 0 dropped and 2 lost messages'
     assert node.produce_diagnostics()[:2] == (WARN, lacks)
     node._snapshots.problem = 'no snapshot'
@@ -462,7 +461,7 @@ def test_a_node_that_has_left_is_gone_from_the_page(ros):
     assert ('set', 'parameters/controller', None) in calls
     assert calls[-1] == ('set', 'nodes', ['sim_robot'])
     # Of a node that comes back, the parameters are read again.
-    assert (*node._remote,) == ('sim_robot',)
+    assert (*node._remote.nodes,) == ('/sim_robot',)
     assert 'controller' not in node._rows
     node.destroy_node()
 
@@ -498,22 +497,22 @@ def test_parameters_are_read_once_for_each_start_of_a_node():
             requested.append(request) or SimpleNamespace(add_done_callback=waiting.append)
         ),
     )
-    collector = ParameterCollector(
+    watch = ParameterWatch(
         SimpleNamespace(
             get_node_names_and_namespaces=lambda: present,
-            get_namespace=lambda: '/',
             create_client=lambda kind, name: client,
             destroy_client=destroyed.append,
         ),
+        lambda name, namespace: name == 'controller',
         print,
     )
     for there, count in ((True, 1), (True, 1), (False, 1), (True, 2), (True, 2)):
         present[:] = [('controller', '/'), ('talker', '/')] if there else []
-        collector.request_new()
+        watch.update()
         assert len(requested) == count
     assert len(destroyed) == 4, 'the clients of the node that has left'
     # An answer that arrives after the end raised an error: its clients are destroyed.
-    collector.close()
+    watch.close()
     waiting[-1](SimpleNamespace(result=lambda: pytest.fail('an answer is used')))
 
 

@@ -182,7 +182,7 @@ def test_an_expected_latched_topic_is_recorded_from_its_start(harness, tmp_path)
     for number in range(5):
         journal.publish(Int64MultiArray(data=[number]))
     recorder = record(harness, tmp_path, 'controller/*')
-    early = recorder._raw_subscriptions.get('/controller/journal')
+    early = recorder._topics._subscriptions['/controller/journal']
     assert early.qos.durability == LATCHED.durability
     harness.spin_until(lambda: values(recorder)['messages'] == 5)
     harness.wait_for_subscriber(journal)
@@ -401,7 +401,7 @@ def test_parameters_of_a_restarted_node_are_recorded_again(harness, tmp_path):
     harness.spin_until(lambda: recorder._metadata.records.get('sim_robot', {}).get('seed') == '3')
     harness.remove(robot)
     harness.spin_until(lambda: 'sim_robot' not in recorder.get_node_names())
-    harness.spin_until(lambda: '/sim_robot' not in recorder._collector._requested)
+    harness.spin_until(lambda: '/sim_robot' not in recorder._parameter_watch.nodes)
     harness.add(SimRobotNode, seed=4)
     harness.spin_until(lambda: recorder._metadata.records['sim_robot']['seed'] == '4')
     harness.remove(recorder)

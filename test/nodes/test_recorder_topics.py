@@ -28,7 +28,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.base_node import ERROR, OK
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode
-from t3mpc_ros.nodes.recorder.subscriptions import FULL_DISCOVERY, TopicDiscovery
+from t3mpc_ros.nodes.recorder.subscriptions import FULL_DISCOVERY, TopicSubscriptions
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
 pytestmark = pytest.mark.ros
@@ -204,7 +204,7 @@ def test_publishers_are_queried_when_their_number_changes():
             return []
 
     graph = Graph()
-    discovery = TopicDiscovery(graph, TopicFilter(['/a']), None, None, None)
+    discovery = TopicSubscriptions(graph, TopicFilter(['/a']), print)
     for _ in range(FULL_DISCOVERY - 2):
         discovery.discover()
     assert graph.queries == 1

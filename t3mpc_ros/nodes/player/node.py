@@ -4,6 +4,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 import gc
 import sys
 import time
@@ -24,9 +25,6 @@ from t3mpc_ros.nodes.player.player_thread import PlayerThread
 from t3mpc_ros.nodes.player.publishers import CLOCK, TopicPublishers
 from t3mpc_ros.nodes.player.terminal import KeyboardHandler, ProgressLine
 from t3mpc_ros.parameters.table import ParameterError, parameter
-
-CONFIGURATION_ERRORS = (BagError,)
-"""Errors of :func:`make` other than :class:`ParameterError`."""
 
 SWITCH_INTERVAL = 0.0005
 """Thread switch interval of Python, s; with its default of 5 ms a due message waits that long for
@@ -92,8 +90,20 @@ class PlayerParameters(PlaybackParameters):
 class PlayerNode(BaseNode[PlayerParameters]):
     """Opens bags, creates their publishers and controls a :class:`PlayerThread`."""
 
+    parameter_class = PlayerParameters
+    configuration_errors = (BagError,)
+
+    @classmethod
+    def make(cls) -> list[BaseNode[Any]]:
+        """Return the node, in a process that is set up for exact times."""
+        sys.setswitchinterval(SWITCH_INTERVAL)
+        nodes = super().make()
+        # The present objects live until the end: the garbage collector need not visit them again.
+        gc.freeze()
+        return nodes
+
     def __init__(self, **options: Any) -> None:
-        super().__init__('player', PlayerParameters, **options)
+        super().__init__('player', **options)
         self._thread: PlayerThread | None = None
         self._reader: MergedReader | None = None
         self._keyboard: KeyboardHandler | None = None
@@ -115,7 +125,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
             'set_rate': self._set_rate,
         }
         for name, action in actions.items():
-            self.create_service(Trigger, f'~/{name}', self._service_callback(action))
+            self.offer(Trigger, f'~/{name}', partial(self._serve, action))
 
     def _open(self) -> None:
         parameters = self.parameters
@@ -320,23 +330,13 @@ class PlayerNode(BaseNode[PlayerParameters]):
 
     # -- services and keys ------------------------------------------------------------------------
 
-    def _service_callback(
-        self, action: Action
-    ) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
-        def callback(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            problem = self._control(action)
-            response.success = not problem
-            response.message = problem or self._status_text()
-            return response
-
-        return callback
-
-    def _status_text(self) -> str:
+    def _serve(self, action: Action) -> tuple[str, str]:
+        problem = self._control(action)
         if self._thread is None:
-            return NO_BAG
+            return problem, ''
         status = self._thread.status()
         position = (status.stamp_ns - self._first_ns) / NANOSECONDS
-        return f'{status.state} at {position:.3f} s, rate {status.rate:g}'
+        return problem, f'{status.state} at {position:.3f} s, rate {status.rate:g}'
 
     @property
     def _first_ns(self) -> int:
@@ -387,12 +387,3 @@ class PlayerNode(BaseNode[PlayerParameters]):
 
 def _toggle_paused(timeline: PlaybackTimeline, now_ns: int) -> None:
     (timeline.resume if timeline.paused else timeline.pause)(now_ns)
-
-
-def make() -> list[PlayerNode]:
-    """Return the nodes of this process."""
-    sys.setswitchinterval(SWITCH_INTERVAL)
-    nodes = [PlayerNode()]
-    # The present objects live until the end: the garbage collector need not visit them again.
-    gc.freeze()
-    return nodes

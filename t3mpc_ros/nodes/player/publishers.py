@@ -23,7 +23,7 @@ from t3mpc_ros.bag.qos import UNLIMITED, QosProfile, adapt_offer_to_recorded_off
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import conversions
-from t3mpc_ros.nodes.qos import RCLError, full_name
+from t3mpc_ros.nodes.qos import RCLError, node_of
 
 CLOCK = '/clock'
 ROBOT_NODES = ('radio_bridge', 'sim_robot')
@@ -108,7 +108,7 @@ class TopicPublishers:
                 continue
             for info in self._node.get_subscriptions_info_by_topic(publisher.topic_name):
                 if info.node_name in ROBOT_NODES:
-                    found[topic] = full_name(info)
+                    found[topic] = node_of(info)
         return found
 
     def other_publishers(self) -> dict[str, str]:
@@ -119,8 +119,8 @@ class TopicPublishers:
             if publisher.topic_name in SHARED_TOPICS:
                 continue
             for info in self._node.get_publishers_info_by_topic(publisher.topic_name):
-                if full_name(info) != own:
-                    found[topic] = full_name(info)
+                if node_of(info) != own:
+                    found[topic] = node_of(info)
         return found
 
     def wait_for_acked(self, timeout: float) -> None:

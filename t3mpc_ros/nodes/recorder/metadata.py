@@ -2,25 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metadata and attachments of a recording: provenance, parameters of the nodes, model files."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
-
-from rclpy.node import Node
 
 from t3mpc_ros.bag.mcap_file import Attachment
 from t3mpc_ros.bag.run.model_file import find_model
 from t3mpc_ros.bag.writer import AttachmentError, read_attachment
-from t3mpc_ros.nodes.registry import NODES
-from t3mpc_ros.nodes.remote_parameters import RemoteParameters
 from t3mpc_ros.parameters.provenance import provenance
 
 SEED_RECORD = 'seed_fingerprints'
 """Name of the metadata record with the seed fingerprint of each reference generator."""
-
-ParametersCallback = Callable[[str, str, Mapping[str, str]], None]
-"""Called with the name of a metadata record, the node's name, and its parameters as text."""
 
 
 class RecordingMetadata:
@@ -86,47 +77,6 @@ class RecordingMetadata:
 
     def _attach(self, item: Attachment, now_ns: int) -> None:
         self.attachments[item.name] = item, now_ns
-
-
-class ParameterCollector:
-    """Passes the parameters of the package's nodes to ``callback``, once per start of a node."""
-
-    def __init__(self, node: Node, callback: ParametersCallback) -> None:
-        self._node = node
-        self._callback = callback
-        self._remote: dict[str, RemoteParameters] = {}
-        self._requested: set[str] = set()
-
-    def request_new(self) -> None:
-        """Request the parameters of the nodes that are new in the graph."""
-        present = set()
-        for name, namespace in self._node.get_node_names_and_namespaces():
-            if name not in NODES:
-                continue
-            full_name = f'{namespace.rstrip("/")}/{name}'
-            present.add(full_name)
-            if full_name not in self._remote:
-                self._remote[full_name] = RemoteParameters(self._node, full_name)
-            if full_name not in self._requested and self._remote[full_name].ready():
-                self._requested.add(full_name)
-                # The nodes of other robots have the same names in other namespaces.
-                record = name if namespace == self._node.get_namespace() else full_name
-                found = partial(self._on_parameters, record, name, self._remote[full_name])
-                self._remote[full_name].read(found)
-        for left in self._remote.keys() - present:
-            self._remote.pop(left).destroy()
-        self._requested &= present
-
-    def close(self) -> None:
-        """Ignore the answers that have not arrived."""
-        for remote in self._remote.values():
-            remote.destroy()
-
-    def _on_parameters(
-        self, record: str, node: str, remote: RemoteParameters, rows: Sequence[Mapping[str, Any]]
-    ) -> None:
-        remote.destroy()
-        self._callback(record, node, {row['name']: str(row['value']) for row in rows})
 
 
 def _attachment_name(record: str, path: str) -> str:

@@ -6,7 +6,7 @@ A timer takes the messages of the subscriptions (:mod:`~t3mpc_ros.nodes.recorder
 a thread compresses and writes them (:mod:`~t3mpc_ros.bag.recording.writer_thread`).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -33,11 +33,10 @@ from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
-from t3mpc_ros.nodes.recorder.metadata import SEED_RECORD, ParameterCollector, RecordingMetadata
-from t3mpc_ros.nodes.recorder.subscriptions import RawSubscriptions, TopicDiscovery, offered_qos
-
-CONFIGURATION_ERRORS = (BagError,)
-"""Errors of :func:`make` other than :class:`ParameterError`."""
+from t3mpc_ros.nodes.recorder.metadata import SEED_RECORD, RecordingMetadata
+from t3mpc_ros.nodes.recorder.subscriptions import TopicSubscriptions, offered_qos
+from t3mpc_ros.nodes.registry import NODES
+from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters
 
 TAKE_PERIOD = 0.04
 """Time between two reads of the subscriptions, s; each queues up to 1000 messages meanwhile."""
@@ -52,8 +51,11 @@ SPLIT_TIMEOUT = 5.0
 class RecorderNode(BaseNode[RecordingParameters]):
     """Subscribes to the selected topics and writes their serialized messages to a bag."""
 
+    parameter_class = RecordingParameters
+    configuration_errors = (BagError,)
+
     def __init__(self, **options: Any) -> None:
-        super().__init__('recorder', RecordingParameters, **options)
+        super().__init__('recorder', **options)
         parameters = self.parameters
         self._folder = Path(parameters.uri or f'bag_{datetime.now():%Y_%m_%d-%H_%M_%S}').resolve()
         self._metadata = RecordingMetadata(
@@ -71,14 +73,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
         )
         self._snapshots = self._make_snapshot_writer() if parameters.snapshot_duration else None
         self._recorded_types: dict[str, str] = {}
-        self._raw_subscriptions = RawSubscriptions(self)
-        self._discovery = TopicDiscovery(
-            self,
-            self._make_topic_filter(),
-            self._raw_subscriptions,
-            self._take_messages,
-            self._recorded_types.__contains__,
-        )
+        self._topics = TopicSubscriptions(self, self._make_topic_filter(), self._take_messages)
         self._received = 0
         self._dropped_ns: int | None = None
         self._failure = ''
@@ -86,15 +81,17 @@ class RecorderNode(BaseNode[RecordingParameters]):
         self._rate_limiter = SnapshotRateLimiter(
             round(parameters.snapshot_min_interval * NANOSECONDS), parameters.snapshot_max_count
         )
-        self._discovery.subscribe_expected()
-        self._collector = ParameterCollector(self, self._on_node_parameters)
+        self._topics.subscribe_expected()
+        self._parameter_watch = ParameterWatch(
+            self, lambda name, _: name in NODES, self._on_node_parameters
+        )
         self.create_subscription(
             DiagnosticArray, '/diagnostics', self._on_diagnostics, qos.DIAGNOSTICS
         )
-        self.create_service(Trigger, '~/split_bagfile', self._on_split)
-        self.create_service(Trigger, '~/snapshot', self._on_snapshot)
-        self.create_steady_timer(DISCOVERY_PERIOD, self._discovery.discover)
-        self.create_steady_timer(DISCOVERY_PERIOD, self._collector.request_new)
+        self.offer(Trigger, '~/split_bagfile', self._split)
+        self.offer(Trigger, '~/snapshot', self._snapshot)
+        self.create_steady_timer(DISCOVERY_PERIOD, self._topics.discover)
+        self.create_steady_timer(DISCOVERY_PERIOD, self._parameter_watch.update)
         self.create_steady_timer(TAKE_PERIOD, self._take_messages)
         self.create_steady_timer(1.0, self._monitor_graph)
         self.get_logger().info(
@@ -154,14 +151,14 @@ class RecorderNode(BaseNode[RecordingParameters]):
     def _take_messages(self) -> None:
         if self._writer.failure and not self._failure:
             self._fail(self._writer.failure)
-        messages = self._raw_subscriptions.take_messages()
+        messages = self._topics.take_messages()
         if not messages or self._failure:
             return
         for topic in dict.fromkeys(message.topic for message in messages):
-            type_name = self._raw_subscriptions.type_name(topic)
+            type_name = self._topics.type_name(topic)
             if self._recorded_types.get(topic) != type_name:
                 self._add_topic(topic, type_name)
-        if excluded := self._discovery.excluded:
+        if excluded := self._topics.excluded:
             messages = [message for message in messages if message.topic not in excluded]
         if self._snapshots:
             self._snapshots.add(messages)
@@ -178,14 +175,14 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     def _add_topic(self, topic: str, type_name: str) -> None:
         if recorded := self._recorded_types.get(topic):
-            self._discovery.exclude(topic, f'it is recorded as {recorded}, not {type_name}')
+            self._topics.exclude(topic, f'it is recorded as {recorded}, not {type_name}')
             return
         publishers = self.get_publishers_info_by_topic(topic)
         metadata, latched = offered_qos(topic, type_name, publishers)
         try:
             self._definitions.schema(type_name)
         except UnknownTypeError as error:
-            self._discovery.exclude(topic, str(error))
+            self._topics.exclude(topic, str(error))
             return
         self._recorded_types[topic] = type_name
         name, profiles = metadata.name, metadata.offered_qos_profiles
@@ -209,7 +206,15 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     # -- metadata and attachments -----------------------------------------------------------------
 
-    def _on_node_parameters(self, record: str, node: str, values: Mapping[str, str]) -> None:
+    def _on_node_parameters(
+        self, remote: RemoteParameters, rows: Sequence[Mapping[str, Any]]
+    ) -> None:
+        remote.destroy()
+        node = remote.node_name
+        # The nodes of other robots have the same names in other namespaces.
+        own = remote.name == qos.full_name(self.get_namespace(), node)
+        record = node if own else remote.name
+        values = {row['name']: str(row['value']) for row in rows}
         files, problem = self._metadata.add_parameters(record, node, values, time.time_ns())
         if problem:
             self.get_logger().warning(f'the model of {record} is not attached: {problem}')
@@ -239,32 +244,24 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     # -- split and snapshot -----------------------------------------------------------------------
 
-    def _on_split(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _split(self) -> tuple[str, str]:
         self._take_messages()
         if not self._recording:
-            response.message = 'no recording to split: storage.snapshot_mode is set'
-            return response
+            return 'no recording to split: storage.snapshot_mode is set', ''
         self._write_losses()
         try:
             path = self._writer.submit(BagWriter.split).result(SPLIT_TIMEOUT)
         except BagError as error:
-            response.message = str(error)
+            return str(error), ''
         except TimeoutError:
-            response.message = f'no response of the disk for {SPLIT_TIMEOUT:g} s'
-        else:
-            response.success = True
-            response.message = f'continues in {path.name}'
-        return response
+            return f'no response of the disk for {SPLIT_TIMEOUT:g} s', ''
+        return '', f'continues in {path.name}'
 
-    def _on_snapshot(
-        self, request: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
+    def _snapshot(self) -> tuple[str, str]:
         try:
-            response.message = f'writing to {self._start_snapshot("requested")}'
-            response.success = True
+            return '', f'writing to {self._start_snapshot("requested")}'
         except BagError as error:
-            response.message = str(error)
-        return response
+            return str(error), ''
 
     def _on_fault(self, fault: NodeFault) -> None:
         reason = f'{fault.node}: {fault.reason}'
@@ -296,16 +293,15 @@ class RecorderNode(BaseNode[RecordingParameters]):
     # -- diagnostics and shutdown -----------------------------------------------------------------
 
     def _monitor_graph(self) -> None:
-        self._raw_subscriptions.count_lost()
+        self._topics.count_lost()
         self._write_losses()
         for fault in self._monitor.check_timeouts(self.steady_ns()):
             self._on_fault(fault)
 
     def _write_losses(self) -> None:
         """Write the loss record if it has changed: a killed recorder leaves it, too."""
-        subscriptions = self._raw_subscriptions
         table = message_loss_record(
-            self._writer.dropped, subscriptions.lost, subscriptions.undiscovered
+            self._writer.dropped, self._topics.lost, self._topics.undiscovered
         )
         if table != self._metadata.records.get(LOSSES):
             self._metadata.records[LOSSES] = table
@@ -313,7 +309,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the recording runs and is complete, with its place and size."""
-        lost = sum(self._raw_subscriptions.lost.values())
+        lost = self._topics.lost.total()
         dropped = sum(self._writer.dropped.values())
         values: dict[str, object] = {
             'folder': str(self._folder),
@@ -322,7 +318,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
             'topics': len(self._recorded_types),
             'dropped': dropped,
             'lost': lost,
-            'undiscovered': sum(self._raw_subscriptions.undiscovered.values()),
+            'undiscovered': self._topics.undiscovered.total(),
             'queue_bytes': self._writer.bytes,
             'snapshots': self._snapshots.completed if self._snapshots else 0,
         }
@@ -342,11 +338,10 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     def on_shutdown(self) -> None:
         """Write the received messages and close the bag."""
-        self._collector.close()
+        self._parameter_watch.close()
         try:
             self._take_messages()
-            self._raw_subscriptions.count_lost()
-            self._raw_subscriptions.close()
+            self._topics.close()
         finally:
             self._close()
 
@@ -356,8 +351,3 @@ class RecorderNode(BaseNode[RecordingParameters]):
         problem = self._writer.close()
         if problem and not self._failure:
             self._fail(problem)
-
-
-def make() -> list[RecorderNode]:
-    """Return the nodes of this process."""
-    return [RecorderNode()]

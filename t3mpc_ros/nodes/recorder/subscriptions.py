@@ -16,16 +16,14 @@ the time until it and the recorder have discovered each other, which takes up to
 machine: the sequence number of the first message received is one more than their number.
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
-from rclpy.event_handler import (
-    QoSSubscriptionEventType,
-    SubscriptionEventCallbacks,
-    UnsupportedEventTypeError,
-)
+from rclpy.event_handler import QoSSubscriptionEventType, UnsupportedEventTypeError
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -55,14 +53,14 @@ message. Of transient-local publishers the messages from before discovery, witho
 cannot be replayed, are received, too."""
 
 FULL_DISCOVERY = 10
-"""Calls of :meth:`TopicDiscovery.discover` after which all publishers are queried again."""
+"""Calls of :meth:`TopicSubscriptions.discover` after which all publishers are queried again."""
 
 _RECEIVE_TIME = attrgetter('received_ns')
 
 
 @dataclass
 class RawSubscription:
-    """A subscription to serialized messages, with its loss counters."""
+    """A subscription to serialized messages, with what is known about its losses."""
 
     type_name: str
     qos: QoSProfile
@@ -71,172 +69,41 @@ class RawSubscription:
     """Handle of the message-lost event; None if the middleware has none."""
     sequence: int | None = None
     """Publication sequence number of the last message."""
+    received: bool = False
+    """Whether there was a message of the topic."""
 
 
-class RawSubscriptions:
-    """The raw subscriptions of a recorder by topic."""
+class TopicSubscriptions:
+    """Raw subscriptions to the selected topics of the graph, with a QoS that fits all publishers.
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._group = PolledCallbackGroup()
-        self._subscriptions: dict[str, RawSubscription] = {}
-        self._lost: dict[str, int] = {}
-        self._undiscovered: dict[str, int] = {}
-
-    @property
-    def lost(self) -> dict[str, int]:
-        """Lost messages by topic, up to the last :meth:`count_lost`."""
-        return dict(self._lost)
-
-    @property
-    def undiscovered(self) -> dict[str, int]:
-        """Messages by topic that were published before their publisher was discovered."""
-        return dict(self._undiscovered)
-
-    def get(self, topic: str) -> RawSubscription | None:
-        """Return the subscription to a topic, None without one."""
-        return self._subscriptions.get(topic)
-
-    def type_name(self, topic: str) -> str:
-        """Return the message type of the subscription to a topic."""
-        return self._subscriptions[topic].type_name
-
-    def subscribe(self, topic: str, type_name: str, profile: QoSProfile) -> None:
-        """Subscribe to a topic, in place of the former subscription to it.
-
-        Raises ImportError without the message type, RCLError if this process uses another one.
-        """
-        message = conversions.message_class(type_name)
-        replaced = self._subscriptions.get(topic)
-        self.unsubscribe(topic)
-        subscription = self._node.create_subscription(
-            message,
-            topic,
-            unused_callback,
-            profile,
-            callback_group=self._group,
-            # Topic discovery finds incompatible offers in the graph and adapts the profile.
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
-            raw=True,
-        )
-        self._subscriptions[topic] = RawSubscription(
-            type_name,
-            profile,
-            subscription,
-            _lost_event(subscription),
-            replaced.sequence if replaced else None,
-        )
-
-    def unsubscribe(self, topic: str) -> None:
-        """Destroy the subscription to a topic with the messages still in its queue."""
-        if held := self._subscriptions.pop(topic, None):
-            self._count_lost(topic, held)
-            if held.lost_event is not None:
-                held.lost_event.destroy_when_not_in_use()
-            self._node.destroy_subscription(held.subscription)
-
-    def close(self) -> None:
-        """Destroy all subscriptions."""
-        for topic in list(self._subscriptions):
-            self.unsubscribe(topic)
-
-    def take_messages(self) -> list[SerializedMessage]:
-        """Return the messages received since the last call, in order of reception."""
-        found: list[SerializedMessage] = []
-        for topic, held in self._subscriptions.items():
-            handle, message_type = held.subscription.handle, held.subscription.msg_type
-            before = len(found)
-            with handle:
-                while (item := handle.take_message(message_type, True)) is not None:
-                    data, info = item
-                    sequence = info['publication_sequence_number']
-                    if len(found) == before:
-                        first = sequence
-                    found.append(
-                        SerializedMessage(
-                            topic,
-                            info['received_timestamp'],
-                            max(0, info['source_timestamp']),  # a foreign publisher sets it
-                            data,
-                        )
-                    )
-            if (count := len(found) - before) == 0:
-                continue
-            if count >= held.qos.depth:
-                self._add_lost(topic, self._replaced(held, first))
-            self._count_undiscovered(topic, held, first)
-            held.sequence = sequence
-        found.sort(key=_RECEIVE_TIME)
-        return found
-
-    def count_lost(self) -> None:
-        """Update the counters from the message-lost events."""
-        for topic, held in self._subscriptions.items():
-            self._count_lost(topic, held)
-
-    def _count_lost(self, topic: str, held: RawSubscription) -> None:
-        if held.lost_event is not None:
-            with held.lost_event:
-                self._add_lost(topic, held.lost_event.take_event().total_count_change)
-
-    def _add_lost(self, topic: str, count: int) -> None:
-        if count > 0:
-            self._lost[topic] = self._lost.get(topic, 0) + count
-
-    def _count_undiscovered(self, topic: str, held: RawSubscription, first: int | None) -> None:
-        """Count what was published before the first message of a new publisher.
-
-        Only one publisher at a time can be counted: each has its own sequence, and a message does
-        not identify it.
-        """
-        is_new = held.sequence is None or (first is not None and first <= held.sequence)
-        if is_new and first and first > 1 and held.subscription.get_publisher_count() <= 1:
-            self._undiscovered[topic] = self._undiscovered.get(topic, 0) + first - 1
-
-    @staticmethod
-    def _replaced(held: RawSubscription, first: int | None) -> int:
-        """Return the number of messages replaced in a full queue; 1 if it cannot be determined."""
-        if held.sequence is None or first is None or held.subscription.get_publisher_count() != 1:
-            return 1  # each publisher has its own sequence, and a message does not identify it
-        return max(0, first - held.sequence - 1)
-
-
-class TopicDiscovery:
-    """Finds the selected topics in the graph and subscribes with a QoS that fits all publishers.
-
-    ``take_messages`` is called before a subscription is replaced, so that no received message is
-    lost; ``recorded`` returns whether messages of a topic were recorded already.
+    ``record`` is called before a subscription is replaced, so that no received message is lost.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        topic_filter: TopicFilter,
-        subscriptions: RawSubscriptions,
-        take_messages: Callable[[], None],
-        recorded: Callable[[str], bool],
-    ) -> None:
-        self._node = node
-        self._topic_filter = topic_filter
-        self._subscriptions = subscriptions
-        self._take_messages = take_messages
-        self._recorded = recorded
-        self._calls = 0
-        self._publisher_counts: dict[str, int] = {}
+    def __init__(self, node: Node, topic_filter: TopicFilter, record: Callable[[], None]) -> None:
+        self.lost: Counter[str] = Counter()
+        """Lost messages by topic, up to the last :meth:`count_lost`."""
+        self.undiscovered: Counter[str] = Counter()
+        """Messages by topic that were published before their publisher was discovered."""
         self.excluded: set[str] = set()
         """Selected topics that cannot be recorded."""
+        self._node = node
+        self._topic_filter = topic_filter
+        self._record = record
+        self._group = PolledCallbackGroup()
+        self._subscriptions: dict[str, RawSubscription] = {}
+        self._calls = 0
+        self._publisher_counts: dict[str, int] = {}
+
+    # -- discovery --------------------------------------------------------------------------------
 
     def subscribe_expected(self) -> None:
         """Subscribe to the expected topics before they are published."""
         for name, (type_name, profile) in EXPECTED_TOPICS.items():
             topic = self._node.resolve_topic_name(name)
-            if not self._topic_filter.matches(topic, [type_name]):
-                continue
-            try:
-                self._subscriptions.subscribe(topic, type_name, profile)
-            except qos.RCLError:
-                # A node of this process uses another type; discovery finds its publisher.
-                continue
+            if self._topic_filter.matches(topic, [type_name]):
+                # A node of this process may use another type; discovery finds its publisher.
+                with suppress(qos.RCLError):
+                    self._subscribe(topic, type_name, profile)
 
     def discover(self) -> None:
         """Subscribe to the selected topics that have publishers.
@@ -262,7 +129,7 @@ class TopicDiscovery:
 
     def exclude(self, topic: str, reason: str) -> None:
         """Stop recording a topic, with a warning."""
-        self._subscriptions.unsubscribe(topic)
+        self._unsubscribe(topic)
         self.excluded.add(topic)
         self._node.get_logger().warning(f'{topic} is not recorded: {reason}')
 
@@ -272,22 +139,118 @@ class TopicDiscovery:
         profiles = [info.qos_profile for info in publishers]
         held = self._subscriptions.get(topic)
         request = qos.adapt_request_to_offers(profiles)
+        type_name = type_names[0]
         if held and held.type_name in type_names:
+            type_name = held.type_name
             # Only a transient-local subscription receives messages from before discovery; after
             # the first recorded message a new one would receive them twice.
             lacks_history = qos.is_transient_local(request) and not qos.is_transient_local(
                 held.qos
             )
             if qos.compatible_with_all(held.qos, profiles) and (
-                not lacks_history or self._recorded(topic)
+                not lacks_history or held.received
             ):
                 return
-        type_name = held.type_name if held and held.type_name in type_names else type_names[0]
-        self._take_messages()
+        self._record()
         try:
-            self._subscriptions.subscribe(topic, type_name, request)
+            self._subscribe(topic, type_name, request)
         except (ImportError, qos.RCLError) as error:
             self.exclude(topic, str(error))
+
+    def _subscribe(self, topic: str, type_name: str, profile: QoSProfile) -> None:
+        """Subscribe to a topic, in place of the former subscription to it.
+
+        Raises ImportError without the message type, RCLError if this process uses another one.
+        """
+        message = conversions.message_class(type_name)
+        replaced = self._subscriptions.get(topic)
+        self._unsubscribe(topic)
+        subscription = self._node.create_subscription(
+            message, topic, unused_callback, profile, callback_group=self._group, raw=True
+        )
+        made = RawSubscription(type_name, profile, subscription, _lost_event(subscription))
+        if replaced:
+            made.sequence, made.received = replaced.sequence, replaced.received
+        self._subscriptions[topic] = made
+
+    def _unsubscribe(self, topic: str) -> None:
+        """Destroy the subscription to a topic with the messages still in its queue."""
+        if held := self._subscriptions.pop(topic, None):
+            self._count_lost(topic, held)
+            if held.lost_event is not None:
+                held.lost_event.destroy_when_not_in_use()
+            self._node.destroy_subscription(held.subscription)
+
+    def close(self) -> None:
+        """Destroy all subscriptions."""
+        for topic in list(self._subscriptions):
+            self._unsubscribe(topic)
+
+    # -- messages ---------------------------------------------------------------------------------
+
+    def type_name(self, topic: str) -> str:
+        """Return the message type of the subscription to a topic."""
+        return self._subscriptions[topic].type_name
+
+    def take_messages(self) -> list[SerializedMessage]:
+        """Return the messages received since the last call, in order of reception."""
+        found: list[SerializedMessage] = []
+        for topic, held in self._subscriptions.items():
+            handle, message_type = held.subscription.handle, held.subscription.msg_type
+            before = len(found)
+            with handle:
+                while (item := handle.take_message(message_type, True)) is not None:
+                    data, info = item
+                    sequence = info['publication_sequence_number']
+                    if len(found) == before:
+                        first = sequence
+                    found.append(
+                        SerializedMessage(
+                            topic,
+                            info['received_timestamp'],
+                            max(0, info['source_timestamp']),  # a foreign publisher sets it
+                            data,
+                        )
+                    )
+            if (count := len(found) - before) == 0:
+                continue
+            if count >= held.qos.depth:
+                self._add_lost(topic, _replaced(held, first))
+            self._count_undiscovered(topic, held, first)
+            held.sequence, held.received = sequence, True
+        found.sort(key=_RECEIVE_TIME)
+        return found
+
+    def count_lost(self) -> None:
+        """Update the counters from the message-lost events."""
+        for topic, held in self._subscriptions.items():
+            self._count_lost(topic, held)
+
+    def _count_lost(self, topic: str, held: RawSubscription) -> None:
+        if held.lost_event is not None:
+            with held.lost_event:
+                self._add_lost(topic, held.lost_event.take_event().total_count_change)
+
+    def _add_lost(self, topic: str, count: int) -> None:
+        if count > 0:
+            self.lost[topic] += count
+
+    def _count_undiscovered(self, topic: str, held: RawSubscription, first: int | None) -> None:
+        """Count what was published before the first message of a new publisher.
+
+        Only one publisher at a time can be counted: each has its own sequence, and a message does
+        not identify it.
+        """
+        is_new = held.sequence is None or (first is not None and first <= held.sequence)
+        if is_new and first and first > 1 and held.subscription.get_publisher_count() <= 1:
+            self.undiscovered[topic] += first - 1
+
+
+def _replaced(held: RawSubscription, first: int | None) -> int:
+    """Return the number of messages replaced in a full queue; 1 if it cannot be determined."""
+    if held.sequence is None or first is None or held.subscription.get_publisher_count() != 1:
+        return 1  # each publisher has its own sequence, and a message does not identify it
+    return max(0, first - held.sequence - 1)
 
 
 def offered_qos(
