@@ -8,7 +8,6 @@ import re
 import textwrap
 
 from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
-from t3mpc_ros.version import VERSION
 
 ROS_ARGUMENTS = (
     ('-p NAME:=VALUE', 'set a parameter'),
@@ -19,13 +18,6 @@ ROS_ARGUMENTS = (
 """The usual arguments after ``--ros-args``."""
 
 _WIDTH = 99
-
-
-def information(node: str, words: Sequence[str]) -> str:
-    """Return the text that ``--help`` or ``--version`` asks for; empty without them."""
-    if {'-h', '--help'} & set(words):
-        return help_text(node)
-    return f't3mpc_ros {VERSION}' if '--version' in words else ''
 
 
 def unknown_arguments(node: str, words: Sequence[str]) -> str:

@@ -12,7 +12,6 @@ import zlib
 
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from rclpy.publisher import Publisher
 from sensor_msgs.msg import Range
 from std_msgs.msg import Float64, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
@@ -80,13 +79,6 @@ class InitialInputs:
 
     A recorder that discovers the controller late receives them and can replay the run from its
     beginning, while the input itself is volatile.
-
-    Parameters
-    ----------
-    node
-        Node that publishes.
-    name
-        Name of the input.
     """
 
     def __init__(self, node: BaseNode[ControllerNodeParameters], name: str) -> None:
@@ -141,9 +133,10 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._logged_reason = self._controller.status.reason
         self._command_type = TwistStamped if self.parameters.enable_stamped_cmd_vel else Twist
         self._command_publisher = self.create_publisher(self._command_type, 'cmd_vel', qos.COMMAND)
-        self._scalar_publishers = (
-            self._create_scalar_publishers() if self.parameters.terms_rate else {}
-        )
+        self._scalar_publishers = {
+            name: self.create_publisher(Float64, f'~/{name}', qos.SCALARS)
+            for name in (SCALAR_NAMES if self.parameters.terms_rate else ())
+        }
         self._frame_id = self.parameters.frames.prefixed(
             self.parameters.frame_id, self.get_namespace()
         )
@@ -234,7 +227,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._publish_journal(self._journal.step(measured.stamp_ns))
         self._initial_odometry.republish(message)
         self._steps += 1
-        if self._scalar_publishers and self._steps % self._steps_per_scalar() == 0:
+        if self._scalar_publishers:
             self._publish_scalars(status)
         self._log_reason(status)
 
@@ -280,15 +273,9 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             self._logged_reason = status.reason
             self.get_logger().info(status.reason.value)
 
-    def _steps_per_scalar(self) -> int:
-        return max(1, round(self.parameters.rate / self.parameters.terms_rate))
-
-    def _create_scalar_publishers(self) -> dict[str, Publisher]:
-        return {
-            name: self.create_publisher(Float64, f'~/{name}', qos.SCALARS) for name in SCALAR_NAMES
-        }
-
     def _publish_scalars(self, status: Status) -> None:
+        if self._steps % max(1, round(self.parameters.rate / self.parameters.terms_rate)):
+            return
         for name, value in zip(SCALAR_NAMES, status.scalars, strict=True):
             publisher = self._scalar_publishers[name]
             # The error is NaN while there is no reference.

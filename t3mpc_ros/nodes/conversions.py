@@ -24,7 +24,8 @@ MAX_CLOCK_LEAD_NS = NANOSECONDS // 20
 UNKNOWN_VARIANCE = 1e6
 """Variance of a quantity that is not measured, in any unit."""
 MIN_POSE_VARIANCE = 1e-6
-"""Least published variance of a pose: 1 mm and 1 mrad."""
+"""Least published variance of a pose: 1 mm and 1 mrad. After a reset the pose is exact by
+definition, but filters invert its covariance."""
 
 
 @dataclass(frozen=True)
@@ -104,15 +105,33 @@ def _layout(data: bytes | bytearray) -> tuple[str, int]:
 
 
 class SerializedOdometry:
-    """Serialized odometry messages that differ in their state only."""
+    """Serialized odometry messages of two frames that differ in state and covariances only.
 
-    def __init__(self, message: Odometry) -> None:
+    Construction and serialization of a message would take most of the time of a robot's step.
+    """
+
+    def __init__(self, frame: str, child: str) -> None:
+        self.frame, self.child = frame, child
+        message = Odometry(child_frame_id=child)
+        message.header.frame_id = frame
         self._data = bytearray(serialize_message(message))
         order, start = _layout(self._data)
         self._stamp = struct.Struct(f'{order}iI')
         self._pose = struct.Struct(f'{order}7d')
         self._twist = struct.Struct(f'{order}6d')
-        self._pose_start, self._twist_start = start, start + self._pose.size + 8 * 36
+        self._covariance = struct.Struct(f'{order}36d')
+        self._pose_start = start
+        self._pose_covariance = start + self._pose.size
+        self._twist_start = self._pose_covariance + self._covariance.size
+        self._twist_covariance = self._twist_start + self._twist.size
+
+    def set_pose_covariance(self, values: Sequence[float]) -> None:
+        """Set the 36 numbers of the covariance of the pose."""
+        self._covariance.pack_into(self._data, self._pose_covariance, *values)
+
+    def set_twist_covariance(self, values: Sequence[float]) -> None:
+        """Set the 36 numbers of the covariance of the twist."""
+        self._covariance.pack_into(self._data, self._twist_covariance, *values)
 
     def with_state(self, state: State) -> bytes:
         """Return the message with the stamp, the pose and the twist of ``state``."""
@@ -126,39 +145,18 @@ class SerializedOdometry:
         return bytes(self._data)
 
 
-def fill_odometry(message: Odometry, state: State) -> Odometry:
-    """Write a state into ``message``; messages are reused because construction is slow."""
-    message.header.stamp = time_from_ns(state.stamp_ns)
-    message.pose.pose.position.x = state.pose.x
-    message.pose.pose.position.y = state.pose.y
-    message.pose.pose.orientation.z = math.sin(0.5 * state.pose.yaw)
-    message.pose.pose.orientation.w = math.cos(0.5 * state.pose.yaw)
-    message.twist.twist.linear.x = state.twist.linear
-    message.twist.twist.angular.z = state.twist.angular
-    return message
-
-
-def pose_covariance(pose: Sequence[Sequence[float]]) -> list[float]:
-    """Return the 36 numbers for the covariance (3, 3) of a pose, without a variance of 0.
-
-    After a reset the pose is exact by definition, but filters invert its covariance.
-    """
-    full = planar_covariance(pose)
-    for i in (0, 1, 5):
-        full[7 * i] = max(full[7 * i], MIN_POSE_VARIANCE)
-    return full
-
-
-def planar_covariance(pose: Sequence[Sequence[float]]) -> list[float]:
+def planar_covariance(pose: Sequence[Sequence[float]], least: float = 0.0) -> list[float]:
     """Return the 36 numbers of a message for a covariance (3, 3) of x, y, yaw.
 
-    z, roll and pitch of a planar robot get :data:`UNKNOWN_VARIANCE`.
+    z, roll and pitch of a planar robot get :data:`UNKNOWN_VARIANCE`, the others at least
+    ``least``.
     """
     full = [0.0] * 36
     planar = (0, 1, 5)
     for row, i in enumerate(planar):
         for column, j in enumerate(planar):
             full[6 * i + j] = float(pose[row][column])
+        full[7 * i] = max(full[7 * i], least)
     for i in (2, 3, 4):
         full[7 * i] = UNKNOWN_VARIANCE
     return full

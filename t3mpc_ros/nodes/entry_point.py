@@ -20,6 +20,7 @@ from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.nodes import arguments
 from t3mpc_ros.nodes.registry import node_class
 from t3mpc_ros.stop_signal import StopSignal
+from t3mpc_ros.version import VERSION
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
@@ -80,8 +81,11 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
         return _usage_error(name, problem)
     try:
         words = remove_ros_args(list(argv))[1:]
-        if text := arguments.information(name, words):
-            print(text)
+        if {'-h', '--help'} & set(words):
+            print(arguments.help_text(name))
+            return 0
+        if '--version' in words:
+            print(f't3mpc_ros {VERSION}')
             return 0
         if problem := arguments.unknown_arguments(name, words):
             return _usage_error(name, problem)

@@ -168,21 +168,19 @@ def unused_callback(message: object) -> None:
     """Fill the mandatory callback argument of rclpy in a :class:`PolledCallbackGroup`."""
 
 
-class CallbackWithInfo:
-    """A callback that gets a message and its information, whichever executor calls it.
+def _with_info(callback: Callable[[Any, dict[str, Any]], None]) -> Callable[..., None]:
+    """Return a callback that gets a message and its information, whichever executor calls it.
 
     The events executor of rclpy 7.1 passes both as one tuple, the others as two arguments.
     """
 
-    __signature__ = inspect.signature(lambda message, info: None)
-
-    def __init__(self, callback: Callable[[Any, dict[str, Any]], None]) -> None:
-        self._callback = callback
-
-    def __call__(self, *received: Any) -> None:
-        """Pass message and information on."""
+    def called(*received: Any) -> None:
         message, info = received if len(received) == 2 else received[0]
-        self._callback(message, info)
+        callback(message, info)
+
+    # rclpy passes the information to callbacks of two arguments.
+    called.__signature__ = inspect.signature(lambda message, info: None)
+    return called
 
 
 class MatchingSubscription:
@@ -208,7 +206,7 @@ class MatchingSubscription:
         raw: bool = False,
     ) -> None:
         self._node = node
-        called = CallbackWithInfo(callback) if callback else unused_callback
+        called = _with_info(callback) if callback else unused_callback
         self._arguments = message, topic, called
         self._group = None if callback else PolledCallbackGroup()
         self._raw = raw

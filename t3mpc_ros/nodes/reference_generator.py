@@ -116,9 +116,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             for name in (parameters.frame_id, parameters.child_frame_id)
         )
         self._path.header.frame_id = frame
-        message = Odometry(child_frame_id=child)
-        message.header.frame_id = frame
-        self._serialized = conversions.SerializedOdometry(message)
+        self._serialized = conversions.SerializedOdometry(frame, child)
         self._reference_publisher = self.create_publisher(Odometry, 'reference', qos.STREAM)
         self._path_publisher = self.create_publisher(Path, 'reference/path', qos.LATCHED)
         self._signals_publisher = self.create_publisher(
@@ -201,39 +199,30 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             self._publish(stamp_ns + self._lead_ns)
 
     def _publish(self, stamp_ns: int) -> None:
-        twist = STANDSTILL
+        """Publish a sample, and keep some as the path driven so far."""
+        twist, count = STANDSTILL, None
         if self._source is not None:
             if not self._paused:
                 self._pose, twist = self._source.advance(self._path_clock.rate)
             self._path_clock.add_reference(stamp_ns, self._pose)
-            self._publish_state(State(stamp_ns, self._pose, twist))
-            return
-        if not self._paused:
+            self._samples = count = self._samples + 1
+        elif not self._paused:
             sample = self._generator.advance()
-            twist = sample.twist
+            twist, count = sample.twist, sample.index
             self._publish_signals((sample.mode, *sample.selected))
-            if sample.index % max(1, round(PATH_PERIOD * self.parameters.rate)) == 0:
-                self._append_to_path(State(stamp_ns, self._pose, twist))
         state = State(stamp_ns, self._pose, twist)
         self._reference_publisher.publish(self._serialized.with_state(state))
-        self._pose = advance_pose(self._pose, twist, 1.0 / self.parameters.rate)
-
-    def _publish_state(self, state: State) -> None:
-        """Publish a sample of a path, and keep some as the path driven so far."""
-        self._reference_publisher.publish(self._serialized.with_state(state))
-        self._samples += 1
-        if self._samples % max(1, round(PATH_PERIOD * self.parameters.rate)) == 0:
-            self._append_to_path(state)
+        if count is not None and count % max(1, round(PATH_PERIOD * self.parameters.rate)) == 0:
+            self._path.poses.append(conversions.pose_stamped(state, self._path.header.frame_id))
+            del self._path.poses[: -self.parameters.path_points]
+        if self._source is None:
+            self._pose = advance_pose(self._pose, twist, 1.0 / self.parameters.rate)
 
     def _publish_signals(self, signals: tuple[int, ...]) -> None:
         """Publish the mode and the numbers of its two signals when they change."""
         if signals != self._signals:
             self._signals = signals
             self._signals_publisher.publish(Int32MultiArray(data=list(signals)))
-
-    def _append_to_path(self, state: State) -> None:
-        self._path.poses.append(conversions.pose_stamped(state, self._path.header.frame_id))
-        del self._path.poses[: -self.parameters.path_points]
 
     def _publish_path(self) -> None:
         if self._path.poses:

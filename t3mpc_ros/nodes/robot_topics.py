@@ -104,12 +104,11 @@ class RobotPublishers:
         self._namespace = node.get_namespace()
         self._topic_parameters = parameters
         base = self._frame(parameters.base_frame_id)
-        self._odom_message = _odometry_message(self._frame(parameters.odom_frame_id), base)
+        odom = self._frame(parameters.odom_frame_id)
+        self._odom = conversions.SerializedOdometry(odom, base)
         self._odom_publisher = node.create_publisher(Odometry, 'odom', qos.STREAM)
         if robot.truth_frame:
-            self._truth = conversions.SerializedOdometry(
-                _odometry_message(robot.truth_frame, base)
-            )
+            self._truth = conversions.SerializedOdometry(robot.truth_frame, base)
             self._truth_publisher = node.create_publisher(
                 Odometry, 'ground_truth/odom', qos.STREAM
             )
@@ -163,19 +162,19 @@ class RobotPublishers:
 
     def _publish_motion(self, state: RobotState) -> None:
         parameters = self._topic_parameters
-        self._odom_message.pose.covariance = conversions.pose_covariance(state.covariance)
+        self._odom.set_pose_covariance(
+            conversions.planar_covariance(state.covariance, conversions.MIN_POSE_VARIANCE)
+        )
         if state.status.slipping is not self._slipping:
             self._slipping = state.status.slipping
-            self._odom_message.twist.covariance = self._twist_covariances[self._slipping]
-        self._odom_publisher.publish(conversions.fill_odometry(self._odom_message, state.odometry))
+            self._odom.set_twist_covariance(self._twist_covariances[self._slipping])
+        self._odom_publisher.publish(self._odom.with_state(state.odometry))
         if state.truth is not None:
             self._truth_publisher.publish(self._truth.with_state(state.truth))
         if self._broadcaster is not None:
-            message = self._odom_message
-            frames = message.header.frame_id, message.child_frame_id
-            odometry = state.odometry
+            stamp_ns, pose, _ = state.odometry
             self._broadcaster.sendTransform(
-                conversions.transform(odometry.stamp_ns, odometry.pose, *frames)
+                conversions.transform(stamp_ns, pose, self._odom.frame, self._odom.child)
             )
         if self._is_due(parameters.joint_rate):
             names = parameters.right_wheel_name, parameters.left_wheel_name
@@ -235,12 +234,6 @@ class RobotPublishers:
             )
             return None
         return getattr(tf2_ros, kind)(self._node)
-
-
-def _odometry_message(frame: str, child: str) -> Odometry:
-    message = Odometry(child_frame_id=child)
-    message.header.frame_id = frame
-    return message
 
 
 def imu_message(parameters: ImuParameters, frame: str) -> Imu:

@@ -4,6 +4,7 @@
 
 from collections import deque
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 import math
 from threading import Condition
 from typing import NamedTuple
@@ -80,9 +81,9 @@ class LiveData:
         """
         with self._changed:
             streams = {
-                name: _columns(new)
+                name: _columns(new[::-1])
                 for name, kept in self._streams.items()
-                if (new := _newer(kept, cursor))
+                if (new := list(takewhile(lambda each: each.number > cursor, reversed(kept))))
             }
             facts = {
                 name: value for name, (number, value) in self._facts.items() if number > cursor
@@ -100,15 +101,6 @@ class LiveData:
         self._number += 1
         self._changed.notify_all()
         return self._number
-
-
-def _newer(kept: deque[Sample], cursor: int) -> list[Sample]:
-    new = []
-    for sample in reversed(kept):
-        if sample.number <= cursor:
-            break
-        new.append(sample)
-    return new[::-1]
 
 
 def _columns(samples: Sequence[Sample]) -> Json:

@@ -110,6 +110,8 @@ def difference(one, other):
 
 DYNAMIC = [name for name in NODES if any(each.dynamic for each in parameter_class(name).specs())]
 PREDICTIVE = '_controller._tracker.law.predictive'
+SERIALIZED = '_robot_publishers._truth', '_robot_publishers._odom.'
+"""Serialized messages have padding of any value."""
 KEPT = {
     'controller': (
         '_journal',
@@ -119,9 +121,8 @@ KEPT = {
         '_controller.status.skill',
         PREDICTIVE,
     ),
-    # A serialized message has padding of any value.
-    'sim_robot': ('_robot.', '_real_time_factor', '_simulated_time', '_robot_publishers._truth'),
-    'radio_bridge': (),
+    'sim_robot': ('_robot.', '_real_time_factor', '_simulated_time', *SERIALIZED),
+    'radio_bridge': SERIALIZED,
     'player': ('_opened_ns', '_thread._timeline._anchor', '_thread._timeline._primed'),
 }
 """What depends on the time of the start, or counts changes."""

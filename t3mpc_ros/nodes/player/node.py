@@ -137,7 +137,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
         except ParameterError:
             reader.close()
             raise
-        self._reader = reader
+        self._reader, self._first_ns = reader, reader.start_ns
         publishes_clock = (
             parameters.clock_publish_frequency > 0.0 or parameters.clock_publish_on_topic_publish
         )
@@ -221,7 +221,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
 
     def on_parameters_changed(self, parameters: PlayerParameters) -> None:
         """Apply the rate."""
-        self._control(lambda timeline, now_ns: timeline.set_rate(now_ns, parameters.rate))
+        self._control(self._set_rate)
 
     def _monitor(self) -> None:
         thread = self._thread
@@ -338,11 +338,6 @@ class PlayerNode(BaseNode[PlayerParameters]):
         position = (status.stamp_ns - self._first_ns) / NANOSECONDS
         return problem, f'{status.state} at {position:.3f} s, rate {status.rate:g}'
 
-    @property
-    def _first_ns(self) -> int:
-        """Time of the first message of the bags, the origin of positions."""
-        return self._reader.start_ns if self._reader is not None else 0
-
     def _control(self, action: Action) -> str:
         return self._thread.control(action) if self._thread is not None else NO_BAG
 
@@ -360,20 +355,16 @@ class PlayerNode(BaseNode[PlayerParameters]):
     def _set_rate(self, timeline: PlaybackTimeline, now_ns: int) -> None:
         timeline.set_rate(now_ns, self.parameters.rate)
 
-    def _multiply_rate(self, factor: float) -> str:
-        rate = round(self.parameters.rate * factor, 6)
-        (result,) = self.set_parameters([Parameter('play.rate', value=rate)])
-        return '' if result.successful else str(result.reason)
-
     def _on_key(self, key: str) -> None:
         """Execute the action of a key in the thread of the executor."""
-        executor = self.executor
-        if executor is not None:
-            executor.create_task(self._execute_key, key)
+        if self.executor is not None:
+            self.executor.create_task(self._execute_key, key)
 
     def _execute_key(self, key: str) -> None:
         if key in RATE_KEYS:
-            problem = self._multiply_rate(RATE_KEYS[key])
+            rate = round(self.parameters.rate * RATE_KEYS[key], 6)
+            (result,) = self.set_parameters([Parameter('play.rate', value=rate)])
+            problem = '' if result.successful else str(result.reason)
         else:
             actions: dict[str, Action] = {
                 'space': _toggle_paused,

@@ -115,14 +115,14 @@ class ProgressLine:
 
     def __init__(self, stream: TextIO, begin_ns: int, end_ns: int) -> None:
         self._stream = stream
-        self._begin_ns, self._end_ns = begin_ns, end_ns
+        self._begin_ns = begin_ns
+        self._length = (end_ns - begin_ns) / NANOSECONDS
         self._shown = ''
-        self.visible = stream.isatty()
 
     def show(self, status: PlaybackStatus) -> None:
         """Write the status in place of the former one."""
-        text = format_status(status, self._begin_ns, self._end_ns)
-        if self.visible and text != self._shown:
+        text = self._text(status)
+        if text != self._shown and self._stream.isatty():
             self._stream.write(f'\r{text}\x1b[K')
             self._stream.flush()
             self._shown = text
@@ -134,14 +134,13 @@ class ProgressLine:
             self._stream.flush()
             self._shown = ''
 
-
-def format_status(status: PlaybackStatus, begin_ns: int, end_ns: int) -> str:
-    """Return state, progress bar, position, length, rate, remaining time and loop."""
-    length = (end_ns - begin_ns) / NANOSECONDS
-    position = (status.stamp_ns - begin_ns) / NANOSECONDS
-    filled = round(BAR_WIDTH * position / length) if length else BAR_WIDTH
-    loop = f'  loop {status.loops + 1}' if status.loops else ''
-    return (
-        f'{status.state:8s} [{"#" * filled:{BAR_WIDTH}s}] {position:8.2f} / {length:.2f} s  '
-        f'x{status.rate:.3g}  {status.remaining_ns / NANOSECONDS:.1f} s left{loop}'
-    )
+    def _text(self, status: PlaybackStatus) -> str:
+        """Return state, progress bar, position, length, rate, remaining time and loop."""
+        position = (status.stamp_ns - self._begin_ns) / NANOSECONDS
+        filled = round(BAR_WIDTH * position / self._length) if self._length else BAR_WIDTH
+        bar = f'{"#" * filled:{BAR_WIDTH}s}'
+        loop = f'  loop {status.loops + 1}' if status.loops else ''
+        return (
+            f'{status.state:8s} [{bar}] {position:8.2f} / {self._length:.2f} s  '
+            f'x{status.rate:.3g}  {status.remaining_ns / NANOSECONDS:.1f} s left{loop}'
+        )
