@@ -19,7 +19,7 @@ def harness(ros):
 
 @pytest.fixture
 def logged(capfd):
-    """Return a function that returns the lines with a text that nodes have logged so far.
+    """Return a function that returns the lines with a text that nodes have printed so far.
 
     Read from the terminal: a subscription to /rosout may miss what precedes its match.
     """
@@ -27,7 +27,7 @@ def logged(capfd):
 
     def logged(words):
         nonlocal text
-        text += capfd.readouterr().err
+        text += ''.join(capfd.readouterr())
         return [line for line in text.splitlines() if words in line]
 
     return logged

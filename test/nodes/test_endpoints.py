@@ -25,17 +25,19 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_OVERRIDE = 'qos_overrides./odom.{}.reliability:={}'
 
 
-def test_the_controller_receives_best_effort_inputs(harness):
+def test_best_effort_inputs_are_received_from_the_start_and_later(harness):
     """A reliable subscription does not receive them: TurtleBot 4 and micro-ROS were ignored."""
     controller = harness.add(ControllerNode)
     reference = harness.create_publisher(Odometry, 'reference', BEST_EFFORT)
-    odom = harness.create_publisher(Odometry, 'odom', BEST_EFFORT)
-    for publisher, lead_ns in ((reference, 400_000_000), (odom, 0)):
+    reliable = harness.create_publisher(Odometry, 'odom')
+    for publisher, lead_ns in ((reference, 400_000_000), (reliable, 0)):
         harness.publish_periodically(
             publisher, lambda lead=lead_ns: odometry(controller.now_ns() + lead, 0.05), 0.01
         )
-    harness.spin_until(lambda: diagnostic(controller, 'steps') > 0, 'no odometry received')
     harness.spin_until(lambda: reason(controller) == 'tracking', 'no reference received')
+    late = harness.create_publisher(Odometry, 'odom', BEST_EFFORT)
+    harness.spin_until(lambda: late.get_subscription_count() > 0, 'the publisher has no match')
+    assert reliable.get_subscription_count() > 0
 
 
 def test_a_robot_executes_best_effort_commands(harness):
@@ -45,24 +47,18 @@ def test_a_robot_executes_best_effort_commands(harness):
     harness.spin_until(lambda: diagnostic(robot, 'commands') > 0, 'no command received')
 
 
-def test_a_later_best_effort_publisher_is_received_as_well(harness):
-    controller = harness.add(ControllerNode)
-    reliable = harness.create_publisher(Odometry, 'odom')
-    harness.publish_periodically(reliable, lambda: odometry(controller.now_ns()), 0.01)
-    harness.spin_until(lambda: diagnostic(controller, 'steps') > 0)
-    late = harness.create_publisher(Odometry, 'odom', BEST_EFFORT)
-    harness.spin_until(lambda: late.get_subscription_count() > 0, 'the publisher has no match')
-    assert reliable.get_subscription_count() > 0
-
-
-@pytest.mark.parametrize('reliability', ['reliable', 'best_effort'])
-def test_overrides_of_the_user_are_the_qos_of_the_publisher(reliability, harness):
-    """They were accepted without effect."""
+def test_overrides_of_the_user_are_the_qos_of_the_publisher(harness, logged):
+    """They were accepted without effect; one without an endpoint is a warning."""
     offered = qos.STREAM.reliability
-    harness.add(SimRobotNode, ['-p', ODOM_OVERRIDE.format('publisher', reliability)])
+    overrides = [
+        ODOM_OVERRIDE.format(kind, 'best_effort') for kind in ('publisher', 'subscription')
+    ]
+    harness.add(SimRobotNode, [word for each in overrides for word in ('-p', each)])
     (offer,) = harness.probe.get_publishers_info_by_topic('/odom')
-    assert offer.qos_profile.reliability == ReliabilityPolicy[reliability.upper()]
+    assert offer.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
     assert qos.STREAM.reliability == offered, 'the profile of the other endpoints is unchanged'
+    words = 'qos_overrides./odom.subscription.reliability has no effect'
+    harness.spin_until(lambda: logged(words))
 
 
 def test_an_overridden_request_is_kept_and_its_mismatch_named(harness):
@@ -95,12 +91,6 @@ def test_a_subscriber_that_requests_too_much_is_named(harness):
 def test_an_invalid_override_is_rejected_with_the_reason(override, words, harness):
     with pytest.raises(ParameterError, match=words):
         harness.add(SimRobotNode, ['-p', f'qos_overrides./odom.{override}'])
-
-
-def test_an_override_without_endpoint_is_a_warning(harness, logged):
-    harness.add(SimRobotNode, ['-p', ODOM_OVERRIDE.format('subscription', 'reliable')])
-    words = 'qos_overrides./odom.subscription.reliability has no effect'
-    harness.spin_until(lambda: logged(words))
 
 
 @pytest.mark.parametrize('expected', [Twist, TwistStamped])

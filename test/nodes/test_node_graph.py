@@ -1,58 +1,45 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Nodes in one graph: message types, diagnostics, simulated time, namespaces."""
+"""Nodes in one graph: diagnostics and the mistakes they name, simulated time, names, frames."""
 
+import sys
 import time
+from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import Odometry, Path
+import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy
 from rosgraph_msgs.msg import Clock
-from support.ros_graph import NODE_CLASSES, diagnostic, is_ok, on_grid, reason, speed, stamp
+from sensor_msgs.msg import Imu, Range
+from support.ros_graph import (
+    LATCHED,
+    diagnostic,
+    is_ok,
+    odometry,
+    on_grid,
+    reason,
+    speed,
+    stamp,
+)
 
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import conversions
-from t3mpc_ros.nodes.base_node import OK, WARN
+from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
+from t3mpc_ros.nodes.conversions import FrameParameters
 from t3mpc_ros.nodes.recorder.node import RecorderNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
-from t3mpc_ros.nodes.registry import NODES
+from t3mpc_ros.nodes.registry import NODES, node_class
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
-
-pytestmark = pytest.mark.ros
-
-
-# -- mismatched message types ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize('stamped', [False, True])
-def test_another_type_on_cmd_vel_is_a_warning(stamped, harness):
-    """ROS 2 connects only endpoints of equal type and reports nothing about the others."""
-    robot = harness.add(SimRobotNode, enable_stamped_cmd_vel=stamped)
-    controller = harness.add(ControllerNode, enable_stamped_cmd_vel=stamped)
-    harness.add(ReferenceGeneratorNode)
-    harness.spin_until(
-        lambda: reason(controller) == 'tracking' and is_ok(robot, 'following commands')
-    )
-    other = Twist if stamped else TwistStamped
-    foreign = harness.foreign_node()
-    foreign.create_publisher(other, 'cmd_vel', 10)
-    foreign.create_subscription(other, 'cmd_vel', print, 10)
-
-    words = f' geometry_msgs/msg/{other.__name__} '
-    for node in (robot, controller):
-        harness.spin_until(lambda one=node: words in reason(one), f'{node.get_name()} warns')
-        status = harness.next_status(node.get_name())
-        assert status.level == WARN
-        assert words in status.message
-
 
 # -- diagnostics ----------------------------------------------------------------------------------
 
 
+@pytest.mark.ros
 @pytest.mark.timed
 def test_every_node_publishes_diagnostics_at_1_hz(harness, tmp_path):
     stamps = {}
@@ -62,10 +49,13 @@ def test_every_node_publishes_diagnostics_at_1_hz(harness, tmp_path):
         lambda m: stamps.setdefault(m.status[0].name, []).append(time.monotonic()),
         100,
     )
-    for name, kind in NODE_CLASSES.items():
-        if name != 'recorder':
-            harness.add(kind)
-    harness.add(RecorderNode, storage__uri=str(tmp_path / 'bag'))
+    given = {
+        'recorder': {'storage__uri': str(tmp_path / 'bag')},
+        'sim_robot': {'seed': 7},
+        'radio_bridge': {'port': '/dev/no_dongle'},
+    }
+    for name in sorted(NODES, key='recorder'.__eq__):
+        harness.add(node_class(name), **given.get(name, {}))
     harness.add(ComposedNode, namespace='two')
     harness.spin_until(lambda: stamps.keys() == {*NODES, 'two/composed'})
     harness.spin_until(lambda: all(len(times) >= 4 for times in stamps.values()))
@@ -81,14 +71,70 @@ def test_every_node_publishes_diagnostics_at_1_hz(harness, tmp_path):
     )
     for name in expected:
         status = harness.statuses(name)[-1]
-        assert status.level == OK
-        assert status.hardware_id
+        assert (status.level, status.hardware_id) == (OK, 'none')
         assert status.values
+    assert harness.statuses('sim_robot')[-1].hardware_id == 'simulated robot 7'
+    assert harness.statuses('radio_bridge')[-1].hardware_id == '/dev/no_dongle'
+
+
+def wait_for_warning(harness, name, words, levels=(WARN, ERROR)):
+    """Wait until the diagnostics of a node contain some words; they have one of the levels."""
+    harness.spin_until(lambda: words in harness.next_status(name).message, f'{name}: {words}')
+    assert harness.statuses(name)[-1].level in levels
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('stamped', [False, True])
+def test_another_type_on_cmd_vel_is_a_warning(stamped, harness):
+    """ROS 2 connects only endpoints of equal type and reports nothing about the others."""
+    robot = harness.add(SimRobotNode, enable_stamped_cmd_vel=stamped)
+    controller = harness.add(ControllerNode, enable_stamped_cmd_vel=stamped)
+    harness.add(ReferenceGeneratorNode)
+    harness.spin_until(
+        lambda: reason(controller) == 'tracking' and is_ok(robot, 'following commands')
+    )
+    other = Twist if stamped else TwistStamped
+    foreign = harness.foreign_node()
+    foreign.create_publisher(other, 'cmd_vel', 10)
+    foreign.create_subscription(other, 'cmd_vel', print, 10)
+    for node in (robot, controller):
+        words = f' geometry_msgs/msg/{other.__name__} '
+        wait_for_warning(harness, node.get_name(), words, [WARN])
+
+
+@pytest.mark.ros
+def test_odometry_of_another_clock_and_rate_is_named(harness):
+    """The robot followed a second late, with OK."""
+    controller = harness.add(ControllerNode)
+    for topic in ('odom', 'reference'):
+        publisher = harness.create_publisher(Odometry, topic)
+        harness.publish_periodically(
+            publisher, lambda: odometry(controller.now_ns() - NANOSECONDS, 0.05), 0.04
+        )
+    wait_for_warning(harness, 'controller', 'behind the clock of this node')
+    wait_for_warning(harness, 'controller', 'but rate is 100 Hz')
+
+
+@pytest.mark.ros
+def test_two_publishers_of_commands_are_named(harness):
+    harness.add(SimRobotNode)
+    harness.add(ControllerNode)
+    harness.create_publisher(Twist, 'cmd_vel')
+    for name in ('sim_robot', 'controller'):
+        wait_for_warning(harness, name, '/cmd_vel has 2 publishers: /controller, /probe')
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('kind, level', [(ControllerNode, WARN), (SimRobotNode, ERROR)])
+def test_simulated_time_without_a_clock_is_named(kind, level, harness):
+    node = harness.add(kind, use_sim_time=True)
+    wait_for_warning(harness, node.get_name(), 'no message on /clock yet', [level])
 
 
 # -- simulated time -------------------------------------------------------------------------------
 
 
+@pytest.mark.ros
 def test_the_loop_closes_in_simulated_time(harness):
     harness.add(SimRobotNode, publish_clock=True)
     controller = harness.add(ControllerNode, use_sim_time=True)
@@ -104,6 +150,7 @@ def test_the_loop_closes_in_simulated_time(harness):
     assert diagnostic(reference, 'skipped_samples') < 1000
 
 
+@pytest.mark.ros
 def test_tracking_resumes_after_the_clock_jumps_back(harness, tmp_path):
     """Before the first message on /clock the time of a node is 0, which must not start a grid."""
     clock = harness.create_publisher(Clock, '/clock')
@@ -138,27 +185,92 @@ def test_tracking_resumes_after_the_clock_jumps_back(harness, tmp_path):
     assert on_grid(odom[count:], 100)
 
 
-# -- durability -----------------------------------------------------------------------------------
+# -- names and frames -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    'kind, topic', [(SimRobotNode, '/odom'), (ReferenceGeneratorNode, '/reference')]
-)
-def test_late_subscribers_receive_no_old_messages(kind, topic, harness):
+@pytest.mark.ros
+def test_topics_can_be_remapped_and_keep_no_old_messages(harness):
     """Old odometry would look like a moving robot."""
-    harness.add(kind)
-    (offer,) = harness.probe.get_publishers_info_by_topic(topic)
-    assert offer.qos_profile.durability == DurabilityPolicy.VOLATILE
-
-
-# -- remapping ------------------------------------------------------------------------------------
-
-
-def test_topics_can_be_remapped(harness):
-    harness.add(SimRobotNode, ['-r', 'cmd_vel:=/steer', '-r', 'odom:=wheels/odom'])
-    controller = harness.add(ControllerNode, ['-r', 'cmd_vel:=/steer', '-r', 'odom:=wheels/odom'])
+    names = ['-r', 'cmd_vel:=/steer', '-r', 'odom:=wheels/odom']
+    harness.add(SimRobotNode, names)
+    controller = harness.add(ControllerNode, names)
     harness.add(ReferenceGeneratorNode)
     commands = harness.subscribe(Twist, '/steer')
     harness.spin_until(lambda: reason(controller) == 'tracking' and commands)
-    assert not harness.probe.get_publishers_info_by_topic('/cmd_vel')
-    assert not harness.probe.get_publishers_info_by_topic('/odom')
+    for topic in ('/wheels/odom', '/reference'):
+        (offer,) = harness.probe.get_publishers_info_by_topic(topic)
+        assert offer.qos_profile.durability == DurabilityPolicy.VOLATILE
+    for topic in ('/cmd_vel', '/odom'):
+        assert not harness.probe.get_publishers_info_by_topic(topic)
+
+
+@pytest.mark.parametrize(
+    'values, namespace, expected',
+    [
+        ({}, '/', 'odom'),
+        ({}, '/robot_1', 'robot_1/odom'),
+        ({}, '/fleet/robot_1', 'fleet/robot_1/odom'),
+        ({'tf_frame_prefix': 'left'}, '/', 'left/odom'),
+        ({'tf_frame_prefix': '/left/'}, '/robot_1', 'left/odom'),
+        ({'tf_frame_prefix_enable': False}, '/robot_1', 'odom'),
+    ],
+)
+def test_a_frame_is_prefixed_by_the_namespace(values, namespace, expected):
+    frames = FrameParameters.from_dict(values)
+    assert frames.prefixed('odom', namespace) == expected
+    assert frames.prefixed(expected, namespace) == expected, 'not twice'
+
+
+@pytest.mark.ros
+def test_the_frames_of_a_namespace_have_its_prefix(harness):
+    """Two robots published the transforms of one frame ``odom``."""
+    wanted = {
+        'odom': (Odometry, 'one/odom'),
+        'ground_truth/odom': (Odometry, 'map'),
+        'reference': (Odometry, 'one/odom'),
+        'cmd_vel': (TwistStamped, 'one/base_link'),
+        'imu/data_raw': (Imu, 'one/imu_link'),
+        'range/front_left': (Range, 'one/front_left_range_link'),
+    }
+    received = {name: harness.subscribe(kind, f'one/{name}') for name, (kind, _) in wanted.items()}
+    paths = harness.subscribe(Path, 'one/reference/path', LATCHED)
+    for kind in (SimRobotNode, ControllerNode):
+        harness.add(kind, namespace='one', enable_stamped_cmd_vel=True)
+    harness.add(ReferenceGeneratorNode, namespace='one')
+    harness.spin_until(lambda: all(received.values()) and paths)
+    for name, (kind, frame) in wanted.items():
+        message = received[name][-1]
+        assert message.header.frame_id == frame, name
+        if kind is Odometry:
+            assert message.child_frame_id == 'one/base_link', name
+    assert {paths[-1].header.frame_id, paths[-1].poses[-1].header.frame_id} == {'one/odom'}
+    # That of an exact pose was exactly 0, which filters cannot invert.
+    covariance = np.reshape(received['odom'][0].pose.covariance, (6, 6))
+    assert np.linalg.eigvalsh(covariance).min() > 1e-7
+
+
+@pytest.mark.ros
+def test_fixed_frames_have_the_names_of_the_messages(harness, monkeypatch):
+    """Ranges and accelerations came in frames that no transform led to."""
+    sent = []
+    broadcaster = SimpleNamespace(sendTransform=sent.append)
+    tf2_ros = SimpleNamespace(
+        StaticTransformBroadcaster=lambda node: broadcaster, TransformBroadcaster=None
+    )
+    monkeypatch.setitem(sys.modules, 'tf2_ros', tf2_ros)
+    mounted = {'range_sensor.half_length': 0.2, 'range_frame_prefix': 'sharp_'}
+    harness.add(SimRobotNode, namespace='one', enable_odom_tf=False, **mounted)
+    ranges = harness.subscribe(Range, 'one/range/rear_left')
+    imu = harness.subscribe(Imu, 'one/imu/data_raw')
+    harness.spin_until(lambda: ranges and imu)
+    (transforms,) = sent
+    found = {transform.child_frame_id: transform for transform in transforms}
+    assert {transform.header.frame_id for transform in transforms} == {'one/base_link'}
+    assert len(found) == 9
+    assert imu[-1].header.frame_id in found
+    rear = found[ranges[-1].header.frame_id].transform
+    assert rear.translation.x == -0.2
+    assert abs(rear.rotation.z) == pytest.approx(1.0), 'it looks backwards'
+    sent.clear()
+    harness.add(SimRobotNode, namespace='two', enable_odom_tf=False, enable_static_tf=False)
+    assert not sent

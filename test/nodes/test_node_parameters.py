@@ -8,12 +8,11 @@ from pathlib import Path
 
 import pytest
 from rclpy.parameter import Parameter
-from support.ros_graph import NODE_CLASSES
 import yaml
 
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode
-from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
+from t3mpc_ros.nodes.registry import INTERFACES, NODES, node_class, parameter_class
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 from t3mpc_ros.parameters.table import ParameterError
 
@@ -37,7 +36,7 @@ FROM_RCLPY = ('/rosout', '/parameter_events', '~/*parameter*', '~/get_type_descr
 def test_a_running_node_is_as_it_is_described(name, harness, tmp_path):
     """Its topics, services and parameters."""
     given = {'storage.uri': str(tmp_path / 'bag')} if name == 'recorder' else {}
-    node = harness.add(NODE_CLASSES[name], **given)
+    node = harness.add(node_class(name), **given)
     _check_interface(node, INTERFACES[name])
     rows = parameter_class(name).specs()
     assert rows
@@ -84,7 +83,7 @@ def _check_description(described, row):
 
 @pytest.mark.parametrize('name', ['controller', 'sim_robot'])
 def test_only_dynamic_parameters_can_be_set(name, harness):
-    node = harness.add(NODE_CLASSES[name])
+    node = harness.add(node_class(name))
     for row in parameter_class(name).specs():
         held = node.get_parameter(row.name)
         response = node.set_parameters([held])[0]
@@ -182,7 +181,7 @@ def test_each_yaml_reaches_its_node_with_and_without_a_namespace(name, harness, 
     files = ['--params-file', str(installed), '--params-file', str(changed)]
     given = {'storage.uri': str(tmp_path / 'bag')} if name == 'recorder' else {}
     for namespace in ('/', '/robot_1'):
-        node = harness.add(NODE_CLASSES[name], files, namespace=namespace, **given)
+        node = harness.add(node_class(name), files, namespace=namespace, **given)
         assert node.get_parameter(parameter).value == value
 
 

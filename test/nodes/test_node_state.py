@@ -6,6 +6,7 @@ from contextlib import suppress
 import json
 import os
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 from rclpy.parameter import Parameter
@@ -14,7 +15,6 @@ from support.bag_messages import STORE
 from support.file_watch import no_file_left_open
 from support.object_state import state
 from support.other_parameters import with_other_value
-from support.ros_graph import NODE_CLASSES
 
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.chaos.pose_reference import PortraitSource
@@ -25,7 +25,7 @@ from t3mpc_ros.geometry.types import ORIGIN, BodyTwist
 from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN
 from t3mpc_ros.nodes.player.node import PlayerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
-from t3mpc_ros.nodes.registry import NODES, parameter_class
+from t3mpc_ros.nodes.registry import NODES, node_class, parameter_class
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch
 from t3mpc_ros.nodes.viewer import ViewNode
 from t3mpc_ros.parameters.table import ParameterError
@@ -61,7 +61,7 @@ def start(harness, tmp_path, bag, monkeypatch):
     monkeypatch.setattr(RadioBridgeNode, '_serve_port', lambda node: None)
 
     def start(name, **parameters):
-        return harness.add(NODE_CLASSES[name], **(given.get(name, {}) | parameters))
+        return harness.add(node_class(name), **(given.get(name, {}) | parameters))
 
     return start
 
@@ -155,14 +155,6 @@ def test_a_changed_node_is_as_one_started_so(name, start, harness):
         assert robot._parameters == fresh._robot._parameters
 
 
-def test_the_timer_of_a_robot_follows_the_real_time_factor(start):
-    node = start('sim_robot')
-    for factor, period_ms in ((2.0, 5), (0.5, 20), (0.0, 50), (1.0, 10)):
-        changed(node, real_time_factor=factor)
-        assert node._timer.timer_period_ns == period_ms * 10**6
-        assert node._simulated_time.real_time_factor == factor
-
-
 def test_changed_parameters_are_published_with_their_revision(start):
     """A revision that came one change late was lost in what a busy machine skipped."""
     node = start('controller')
@@ -171,16 +163,13 @@ def test_changed_parameters_are_published_with_their_revision(start):
     for number, gain in enumerate((3.0, 4.0), 1):
         changed(node, **{'law.gain': gain})
         content = json.loads(revisions[-1].data)
-        assert content == {'revision': number, 'parameters': _listed(node.parameters)}
-        assert content['parameters']['law.gain'] == gain
+        listed = json.loads(json.dumps(node.parameters.to_dict()))
+        assert content == {'revision': number, 'parameters': listed}
+        assert listed['law.gain'] == gain
         assert rows[-1].data[1] == 4  # Event.CONFIGURE
         assert rows[-1].data[4] == number == len(revisions)
     changed(node, **{'law.gain': 4.0})
     assert len(revisions) == 2
-
-
-def _listed(parameters):
-    return json.loads(json.dumps(parameters.to_dict()))
 
 
 # -- services -------------------------------------------------------------------------------------
@@ -224,17 +213,6 @@ def test_an_emergency_stop_lasts_until_its_release(name, start):
     assert (answer.success, answer.message) == (True, 'released')
     assert node._apply_command(BodyTwist(0.1, 0.0), node.robot_ns()) == ''
     assert not call(node, 'e_stop', data=False).success
-
-
-def test_motion_enabled_again_is_as_before(start):
-    node = start('controller')
-    before = whole_state(node, ('_journal', '_Node__'))
-    call(node, '~/enable', data=False)
-    assert node._controller.status.reason is not Reason.TRACKING
-    assert difference(before, whole_state(node, ('_journal', '_Node__'))) != set()
-    call(node, '~/enable', data=True)
-    left = difference(before, whole_state(node, ('_journal', '_Node__')))
-    assert {path for path in left if 'status' not in path} == set()
 
 
 @pytest.mark.parametrize('source', ['signals', 'portrait'])
@@ -442,25 +420,19 @@ def test_a_warning_raises_the_level_to_a_warning_and_no_further(start):
 
 def test_a_node_that_has_left_is_gone_from_the_page(ros):
     """It stood on the page with its last report."""
-    calls = []
-
-    class Sink:
-        def __getattr__(self, name):
-            return lambda *values: calls.append((name, *values))
-
-    node = ViewNode(Sink())
-    present = ['controller', 'sim_robot']
+    sink, present = Mock(), ['controller', 'sim_robot']
+    node = ViewNode(sink)
     node.get_node_names_and_namespaces = lambda: [(each, '/') for each in present]
     for _ in range(2):
         node.look_at_graph()
     node._rows['controller'] = {'law.gain': {'name': 'law.gain', 'value': 1.0}}
-    assert [each for each in calls if each[0] == 'node_gone'] == []
+    assert not sink.node_gone.called
     present.remove('controller')
     for _ in range(2):
         node.look_at_graph()
-    assert [each for each in calls if each[0] == 'node_gone'] == [('node_gone', 'controller')]
-    assert ('set', 'parameters/controller', None) in calls
-    assert calls[-1] == ('set', 'nodes', ['sim_robot'])
+    sink.node_gone.assert_called_once_with('controller')
+    sink.set.assert_any_call('parameters/controller', None)
+    sink.set.assert_called_with('nodes', ['sim_robot'])
     # Of a node that comes back, the parameters are read again.
     assert (*node._remote.nodes,) == ('/sim_robot',)
     assert 'controller' not in node._rows
@@ -491,33 +463,16 @@ def test_a_player_that_cannot_start_has_no_bag_open(ros, tmp_path):
 
 
 def test_parameters_are_read_once_for_each_start_of_a_node():
-    present, requested, waiting, destroyed = [('controller', '/')], [], [], []
-    client = SimpleNamespace(
-        service_is_ready=lambda: True,
-        call_async=lambda request: (
-            requested.append(request) or SimpleNamespace(add_done_callback=waiting.append)
-        ),
-    )
-    watch = ParameterWatch(
-        SimpleNamespace(
-            get_node_names_and_namespaces=lambda: present,
-            create_client=lambda kind, name: client,
-            destroy_client=destroyed.append,
-        ),
-        lambda name, namespace: name == 'controller',
-        print,
-    )
+    node = Mock()
+    request = node.create_client.return_value.call_async
+    watch = ParameterWatch(node, lambda name, namespace: name == 'controller', print)
     for there, count in ((True, 1), (True, 1), (False, 1), (True, 2), (True, 2)):
-        present[:] = [('controller', '/'), ('talker', '/')] if there else []
+        present = [('controller', '/'), ('talker', '/')] if there else []
+        node.get_node_names_and_namespaces.return_value = present
         watch.update()
-        assert len(requested) == count
-    assert len(destroyed) == 4, 'the clients of the node that has left'
+        assert request.call_count == count
+    assert node.destroy_client.call_count == 4, 'the clients of the node that has left'
     # An answer that arrives after the end raised an error: its clients are destroyed.
     watch.close()
-    waiting[-1](SimpleNamespace(result=lambda: pytest.fail('an answer is used')))
-
-
-def test_a_recorder_knows_when_a_fingerprint_is_new(start):
-    node = start('recorder')
-    new = [node._metadata.add_seed('/a', text) for text in ('1', '1', '2', '2', '1')]
-    assert new == [True, False, True, False, True]
+    answered = request.return_value.add_done_callback.call_args[0][0]
+    answered(SimpleNamespace(result=lambda: pytest.fail('an answer is used')))

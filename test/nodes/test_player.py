@@ -126,23 +126,18 @@ def test_a_played_and_recorded_bag_has_the_same_bytes(given, harness, tmp_path):
 
 
 def test_a_late_subscriber_gets_the_latched_message(harness, tmp_path):
-    messages = [('/map', 0.0, String(data='old')), *texts(), ('/map', 0.3, String(data='new'))]
-    bag = write(tmp_path / 'bag', messages, {'/map': ONE_LATCHED})
-    player = play(harness, bag, play__subscriber_timeout=0.0, play__exit_at_end=False)
-    harness.spin_until(lambda: reason(player) == 'finished')
+    """Also one from before the start offset."""
+    maps = [('/map', at, String(data=data)) for at, data in ((0.0, 'old'), (0.18, 'new'))]
+    bag = write(tmp_path / 'bag', [*maps, *texts(20)], {'/map': ONE_LATCHED})
+    received = harness.subscribe(String, 'map', LATCHED), harness.subscribe(String, 'text')
+    given = {'play__start_offset': 0.1, 'play__playback_until': 0.2}
+    player = play(harness, bag, play__exit_at_end=False, **given)
+    harness.spin_until(lambda: len(received[1]) == 6 and reason(player) == 'finished')
     late = harness.subscribe(String, 'map', LATCHED)
     harness.spin_until(lambda: late)
-    assert [message.data for message in late] == ['new']
-
-
-def test_a_start_offset_publishes_earlier_latched_messages(harness, tmp_path):
-    messages = [('/map', 0.0, String(data='a map')), *texts(20)]
-    bag = write(tmp_path / 'bag', messages, {'/map': ONE_LATCHED})
-    received = harness.subscribe(String, 'map', LATCHED), harness.subscribe(String, 'text')
-    play(harness, bag, play__start_offset=0.1, play__playback_until=0.2)
-    harness.spin_until(lambda: len(received[1]) == 6)
-    assert [message.data for message in received[0]] == ['a map']
+    assert [message.data for message in received[0]] == ['old', 'new']
     assert [int(message.data) for message in received[1]] == [5, 6, 7, 8, 9, 10]
+    assert [message.data for message in late] == ['new']
 
 
 def test_qos_overrides_replace_the_recorded_qos(harness, tmp_path):
@@ -268,6 +263,9 @@ def test_services_pause_play_next_seek_and_set_the_rate(harness, tmp_path):
     assert response.message == 'the seek target must be from 0.000 to 19.990 s: got 20.000 s'
     assert 'playing' in call(harness, 'resume').message
     harness.spin_until(lambda: len(received) > 20)
+    assert (diagnostic_level(player), reason(player)) == (OK, 'playing')
+    assert 15.0 < diagnostic(player, 'position_s') < 19.99 == diagnostic(player, 'length_s')
+    assert diagnostic(player, 'latency_max_ms') > 0.0
     response = call(harness, 'play_next')
     assert not response.success
     assert 'must be paused' in response.message
@@ -283,23 +281,11 @@ def test_services_pause_play_next_seek_and_set_the_rate(harness, tmp_path):
 
 def test_without_a_bag_the_player_warns(harness):
     player = harness.add(PlayerNode)
-    status = harness.next_status('player')
-    assert (status.level, status.message) == (WARN, 'no bag is open: set storage.uris')
+    found = diagnostic_level(player), reason(player)
+    assert found == (WARN, 'no bag is open: set storage.uris')
     response = call(harness, 'resume')
-    assert (response.success, response.message) == (False, 'no bag is open: set storage.uris')
+    assert (response.success, response.message) == (False, found[1])
     assert not player.exit_requested
-
-
-def test_diagnostics_hold_position_and_latency(harness, tmp_path):
-    bag = write(tmp_path / 'bag', texts(500))
-    harness.subscribe(String, 'text')
-    player = play(harness, bag)
-    harness.spin_until(lambda: diagnostic(player, 'messages') > 10)
-    status = harness.next_status('player')
-    values = {entry.key: entry.value for entry in status.values}
-    assert (status.level, status.message) == (OK, 'playing')
-    assert 0.0 < float(values['position_s']) < 9.98 == float(values['length_s'])
-    assert float(values['latency_max_ms']) > 0.0
 
 
 @pytest.mark.parametrize('allowed', [True, False])
@@ -384,14 +370,13 @@ class Terminal:
 
     def until(self, pattern):
         """Read until the terminal shows ``pattern``; return the match, discard the text."""
-        wait_until(
-            lambda: re.search(pattern, self.text),
-            lambda: f'no {pattern} in {self.text!r}',
-            step=self._read,
-        )
+        self._wait_until(lambda: re.search(pattern, self.text))
         match = re.search(pattern, self.text)
         self.text = self.text[match.end() :]
         return match
+
+    def _wait_until(self, condition):
+        wait_until(condition, lambda: f'it shows {self.text!r}', step=self._read)
 
     def _read(self):
         if select.select([self.master], [], [], 0.05)[0]:
@@ -404,11 +389,7 @@ class Terminal:
         return termios.tcgetattr(self.slave)
 
     def wait(self):
-        wait_until(
-            lambda: self.process.poll() is not None,
-            lambda: f'it does not end: {self.text!r}',
-            step=self._read,
-        )
+        self._wait_until(lambda: self.process.poll() is not None)
         return self.process.returncode
 
     def close(self):
@@ -455,34 +436,31 @@ def test_keys_pause_play_next_and_change_the_rate(terminal, tmp_path):
     assert shell.settings() == shell.before
 
 
-def test_the_terminal_is_restored_after_a_signal(terminal, tmp_path):
-    bag = write(tmp_path / 'bag', texts(100, 0.1))
-    shell = terminal(f'storage.uris:=["{bag}"]', 'play.start_paused:=true')
-    shell.until('paused')
-    assert shell.settings() != shell.before
-    shell.process.send_signal(signal.SIGTERM)
-    assert shell.wait() == 0
-    assert shell.settings() == shell.before
-    assert 'Traceback' not in shell.text
+FAULT = (
+    'from t3mpc_ros.nodes.player.node import PlayerNode as node; '
+    'node._monitor = lambda self: 1 / (self._keyboard is None); '
+)
 
 
-def test_the_terminal_is_restored_at_the_end_of_the_bag(terminal, tmp_path):
-    bag = write(tmp_path / 'bag', texts(5))
-    shell = terminal(f'storage.uris:=["{bag}"]')
-    shell.until('5 messages, timing error at most')
-    assert shell.wait() == 0
-    assert shell.settings() == shell.before
-
-
-def test_the_terminal_is_restored_after_an_error(terminal, tmp_path):
-    bag = write(tmp_path / 'bag', texts(5))
-    fault = (
-        'from t3mpc_ros.nodes.player.node import PlayerNode as node; '
-        'node._monitor = lambda self: 1 / (self._keyboard is None); '
-    )
-    shell = terminal(f'storage.uris:=["{bag}"]', program=fault + PROGRAM)
-    assert shell.wait() == 1
-    assert 'ZeroDivisionError' in shell.text
+@pytest.mark.parametrize(
+    'count, program, sent, code, words',
+    [
+        (100, PROGRAM, signal.SIGTERM, 0, 'messages, timing error at most'),
+        (5, PROGRAM, None, 0, '5 messages, timing error at most'),
+        (5, FAULT + PROGRAM, None, 1, 'ZeroDivisionError'),
+    ],
+    ids=['signal', 'end', 'error'],
+)
+def test_the_terminal_is_restored(count, program, sent, code, words, terminal, tmp_path):
+    bag = write(tmp_path / 'bag', texts(count, 0.1))
+    shell = terminal(f'storage.uris:=["{bag}"]', program=program)
+    if sent is not None:
+        shell.until('playing')
+        assert shell.settings() != shell.before
+        shell.process.send_signal(sent)
+    assert shell.wait() == code
+    assert words in shell.text
+    assert code or 'Traceback' not in shell.text
     assert shell.settings() == shell.before
 
 
@@ -501,12 +479,5 @@ def test_without_a_terminal_the_player_plays_to_the_end(graph, tmp_path):
 
 
 def test_keys_are_parsed_from_any_input():
-    assert parse_keys(b' \x1b[A\x1bOB\x1b[C\x1b[D+-x\x1b[') == [
-        'space',
-        'up',
-        'down',
-        'right',
-        'left',
-        'up',
-        'down',
-    ]
+    keys = 'space up down right left up down'
+    assert parse_keys(b' \x1b[A\x1bOB\x1b[C\x1b[D+-x\x1b[') == keys.split()

@@ -15,17 +15,25 @@ import pytest
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Int32, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
-from support.ros_graph import LATCHED, CommandSource, diagnostic_level, reason, twist
+from support.ros_graph import (
+    LATCHED,
+    CommandSource,
+    diagnostic_level,
+    odometry,
+    reason,
+    record,
+    twist,
+)
 from support.waiting import wait_for_acknowledgement
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.run.model_file import find_model, load_model, save_model
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
+from t3mpc_ros.geometry.types import ORIGIN
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.recorder.metadata import SEED_RECORD, RecordingMetadata
-from t3mpc_ros.nodes.recorder.node import RecorderNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 from t3mpc_ros.parameters.table import ParameterError
@@ -33,10 +41,6 @@ from t3mpc_ros.parameters.table import ParameterError
 pytestmark = pytest.mark.ros
 
 DEEP = QoSProfile(depth=5000)
-
-
-def record(harness, folder, *topics, **more):
-    return harness.add(RecorderNode, storage__uri=str(folder), record__topics=list(topics), **more)
 
 
 def values(recorder):
@@ -236,14 +240,14 @@ def test_a_fault_starts_one_snapshot_with_its_reason(harness, logged, tmp_path):
     harness.wait_for_subscriber(text)
     harness.wait_for_subscriber(reports, 2)  # the probe subscribes, too
 
-    def report(level, reason, name='sim_robot'):
+    def report(level, reason, name='controller'):
         status = DiagnosticStatus(level=level, name=name, message=reason)
         reports.publish(DiagnosticArray(status=[status]))
         text.publish(String(data=reason))
 
     report(ERROR, 'no time yet')
     report(OK, 'following commands')
-    report(ERROR, 'not of this robot', name='other/sim_robot')
+    report(ERROR, 'not of this robot', name='other/controller')
     for _ in range(3):
         report(ERROR, 'e-stop latched')
     harness.spin_until(lambda: values(recorder)['snapshots'] == 1)
@@ -252,9 +256,9 @@ def test_a_fault_starts_one_snapshot_with_its_reason(harness, logged, tmp_path):
     harness.spin_until(lambda: logged('snapshot.min_interval'))
     harness.remove(recorder)
     (folder,) = snapshots(tmp_path)
-    assert 'sim-robot-e-stop-latched' in folder.name
+    assert 'controller-e-stop-latched' in folder.name
     with open_bag(folder) as recording:
-        assert recording.metadata_records['snapshot']['reason'] == 'sim_robot: e-stop latched'
+        assert recording.metadata_records['snapshot']['reason'] == 'controller: e-stop latched'
     assert 'following commands' in texts(folder)
 
 
@@ -282,23 +286,6 @@ def test_an_e_stop_of_the_own_robot_starts_a_snapshot(harness, tmp_path):
         assert recording.topics['/a/cmd_vel'].message_count > 10
         status = recording.metadata_records['snapshot']['reason']
     assert status == f'a/sim_robot: {reason(robots[0])}'
-
-
-def test_a_stop_of_the_controller_starts_a_snapshot(harness, tmp_path):
-    recorder = record(harness, tmp_path, 'odom', 'controller/*')
-    harness.add(SimRobotNode)
-    harness.add(ReferenceGeneratorNode)
-    controller = harness.add(ControllerNode)
-    harness.spin_until(lambda: any(s.level == OK for s in harness.statuses('controller')))
-    assert values(recorder)['snapshots'] == 0, 'no fault during discovery'
-    assert harness.call(SetBool, 'controller/enable', data=False).success
-    harness.spin_until(lambda: values(recorder)['snapshots'] == 1)
-    stopped = reason(controller)
-    harness.remove(recorder)
-    with open_bag(snapshots(tmp_path)[0]) as recording:
-        assert recording.metadata_records['snapshot']['reason'] == f'controller: {stopped}'
-        assert float(recording.metadata_records['controller']['rate']) == 100.0
-        assert '/controller/error/left' in recording.topics
 
 
 def test_snapshot_mode_writes_snapshots_only(harness, tmp_path):
@@ -380,11 +367,13 @@ def test_model_files_are_attached_to_every_file(harness, tmp_path):
     assert load_model(tmp_path / 'again.npz').keys() == load_model(model).keys()
 
 
-def test_a_model_is_attached_only_if_this_run_has_saved_it(tmp_path):
+def test_metadata_that_are_not_new_are_not_written_again(tmp_path):
     """What an earlier run left in its place is not what this controller has learnt."""
     output = tmp_path / 'learnt.npz'
     output.write_bytes(b'weights')
     metadata = RecordingMetadata([], 1000, True, 2_000_000_000)
+    new = [metadata.add_seed('/a', text) for text in '11221']
+    assert new == [True, False, True, False, True]
     metadata.add_parameters('controller', 'controller', {'model_output': str(output)}, 0)
     os.utime(output, (1, 1))
     assert metadata.saved_models(3_000_000_000) == []
@@ -427,32 +416,17 @@ def forms(seed):
     return [str(seed).encode(), f'{seed:x}'.encode(), f'{seed:X}'.encode(), *packed]
 
 
-class RobotAt:
-    """Publishes where the robot is, so that a path begins there."""
-
-    def __init__(self, harness):
-        self._publisher = harness.create_publisher(Odometry, 'odom')
-        self._message = Odometry()
-        self._message.pose.pose.orientation.w = 1.0
-
-    def report(self):
-        self._publisher.publish(self._message)
-        return True
-
-
 @pytest.mark.parametrize('source', ['signals', 'portrait'])
 def test_a_bag_holds_the_fingerprint_of_a_secret_seed_only(harness, tmp_path, source):
     topics = 'reference', 'reference/*', '/diagnostics', '/rosout', '/parameter_events'
     recorder = record(harness, tmp_path, *topics)
     chosen = {'source': source} if source == 'portrait' else {'secret_seed': True}
-    reference, robot = harness.add(ReferenceGeneratorNode, **chosen), RobotAt(harness)
+    reference = harness.add(ReferenceGeneratorNode, **chosen)
+    robot = harness.create_publisher(Odometry, 'odom')  # a path begins where the robot is
+    harness.publish_periodically(robot, lambda: odometry(0))
     seeds = [reference._seed]
     harness.spin_until(
-        lambda: (
-            robot.report()
-            and SEED_RECORD in recorder._metadata.records
-            and 'reference_generator' in recorder._metadata.records
-        )
+        lambda: {SEED_RECORD, 'reference_generator'} <= recorder._metadata.records.keys()
     )
     first = recorder._metadata.records[SEED_RECORD]['reference_generator']
     assert harness.call(Trigger, 'reference_generator/reseed').success
@@ -460,7 +434,7 @@ def test_a_bag_holds_the_fingerprint_of_a_secret_seed_only(harness, tmp_path, so
     harness.spin_until(
         lambda: recorder._metadata.records[SEED_RECORD]['reference_generator'] != first
     )
-    harness.spin_until(lambda: robot.report() and values(recorder)['messages'] > 100)
+    harness.spin_until(lambda: values(recorder)['messages'] > 100)
     harness.remove(recorder)
     assert all(seed.bit_length() > 64 for seed in seeds)
     assert seeds[0] != seeds[1]
@@ -477,27 +451,14 @@ def test_a_bag_holds_the_fingerprint_of_a_secret_seed_only(harness, tmp_path, so
 
 
 @pytest.mark.long
-def test_a_hundred_patrols_differ_and_no_bag_has_a_seed(harness, tmp_path):
-    topics = 'reference', 'reference/*', '/diagnostics', '/rosout', '/parameter_events'
-    robot, seeds, places = RobotAt(harness), set(), set()
-    for number in range(100):
-        folder = tmp_path / str(number)
-        recorder = record(harness, folder, *topics)
+def test_a_hundred_patrols_differ(harness):
+    seeds, places = set(), set()
+    for _ in range(100):
         reference = harness.add(ReferenceGeneratorNode, source='portrait')
-        harness.spin_until(
-            lambda recorder=recorder: (
-                robot.report()
-                and SEED_RECORD in recorder._metadata.records
-                and values(recorder)['messages'] > 50
-            )
-        )
-        seed = reference._seed
+        seeds.add(reference._seed)
+        source = reference._make_source(ORIGIN)
+        places.add([source.advance()[0][:2] for _ in range(500)][-1])
         harness.remove(reference)
-        harness.remove(recorder)
-        content = all_bytes(folder)
-        assert not [form for form in forms(seed) if form in content]
-        seeds.add(seed)
-        places.add([reference._source.advance()[0][:2] for _ in range(500)][-1])
     assert len(seeds) == len(places) == 100
 
 

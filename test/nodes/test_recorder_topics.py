@@ -17,6 +17,7 @@ from support.ros_graph import (
     diagnostic_level,
     is_ok,
     odometry,
+    record,
     twist,
 )
 from visualization_msgs.msg import Marker
@@ -27,7 +28,6 @@ from t3mpc_ros.bag.writer import BagWriter, DiskError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.base_node import ERROR, OK
 from t3mpc_ros.nodes.controller import ControllerNode
-from t3mpc_ros.nodes.recorder.node import RecorderNode
 from t3mpc_ros.nodes.recorder.subscriptions import FULL_DISCOVERY, TopicSubscriptions
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
@@ -38,15 +38,11 @@ def _count(harness, recorder, count):
     harness.spin_until(lambda: diagnostic(recorder, 'messages') >= count)
 
 
-def _recorder(harness, folder, *topics, **more):
-    return harness.add(RecorderNode, storage__uri=str(folder), record__topics=list(topics), **more)
-
-
 def test_a_type_that_is_not_installed_is_a_warning(harness, logged, tmp_path, monkeypatch):
     marker, message = harness.create_publisher(Marker, 'marker'), Marker()
     text = harness.create_publisher(String, 'text')
     monkeypatch.setitem(sys.modules, 'visualization_msgs.msg', None)
-    recorder = _recorder(harness, tmp_path, 'marker', 'text')
+    recorder = record(harness, tmp_path, 'marker', 'text')
     harness.wait_for_subscriber(text)
     harness.spin_until(lambda: logged('/marker is not recorded'))
     marker.publish(message)
@@ -62,83 +58,54 @@ def test_a_type_that_is_not_installed_is_a_warning(harness, logged, tmp_path, mo
 
 def test_best_effort_publishers_are_recorded(harness, tmp_path):
     """The early subscription to odometry is reliable and must adapt to a best-effort robot."""
-    recorder = _recorder(harness, tmp_path, 'odom', 'other')
-    weak = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-    publishers = (
-        harness.create_publisher(Odometry, 'odom', weak),
-        harness.create_publisher(Odometry, 'other', weak),
-    )
-    for publisher in publishers:
-        harness.wait_for_subscriber(publisher)
-        publisher.publish(odometry(NANOSECONDS, 0.25))
-    _count(harness, recorder, 2)
-    harness.remove(recorder)
-    with open_bag(tmp_path) as recording:
-        assert {name: topic.message_count for name, topic in recording.topics.items()} == {
-            '/odom': 1,
-            '/other': 1,
-        }
-        assert recording.series('/odom', {'v': 'twist.twist.linear.x'})['v'][0] == 0.25
-
-
-def test_a_second_best_effort_publisher_is_recorded(harness, tmp_path):
-    recorder = _recorder(harness, tmp_path, 'text')
-    strong = harness.connected_publisher(String, 'text')
-    strong.publish(String(data='strong'))
+    recorder = record(harness, tmp_path, 'odom', 'other')
+    strong = harness.connected_publisher(Odometry, 'odom')
+    strong.publish(odometry(NANOSECONDS, 0.25))
     _count(harness, recorder, 1)
-    weak = harness.create_publisher(
-        String, 'text', QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-    )
-    harness.wait_for_subscriber(weak)
-    harness.wait_for_subscriber(strong)
-    weak.publish(String(data='weak'))
-    strong.publish(String(data='strong again'))
-    _count(harness, recorder, 3)
+    weak = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publishers = [harness.create_publisher(Odometry, name, weak) for name in ('odom', 'other')]
+    for publisher in (*publishers, strong):
+        harness.wait_for_subscriber(publisher)
+        publisher.publish(odometry(NANOSECONDS, 0.5))
+    _count(harness, recorder, 4)
     harness.remove(recorder)
     with open_bag(tmp_path) as recording:
-        received = {message.data for _, message in recording.messages('/text')}
-    assert received == {'strong', 'weak', 'strong again'}
+        counts = {name: topic.message_count for name, topic in recording.topics.items()}
+        assert counts == {'/odom': 3, '/other': 1}
+        velocity = recording.series('/odom', {'v': 'twist.twist.linear.x'})['v']
+        assert velocity.tolist() == [0.25, 0.5, 0.5]
 
 
-def test_stamped_commands_are_recorded_with_their_type(harness, tmp_path):
+@pytest.mark.parametrize('changes', [False, True])
+def test_stamped_commands_are_recorded_unless_the_type_changes(changes, harness, logged, tmp_path):
     """The early subscription to cmd_vel has type Twist and must adapt to TwistStamped."""
-    recorder = _recorder(harness, tmp_path, 'cmd_vel')
+    recorder = record(harness, tmp_path, 'cmd_vel', 'text')
+    text = harness.connected_publisher(String, 'text')
+    if changes:
+        first = harness.connected_publisher(Twist, 'cmd_vel')
+        first.publish(twist(0.5))
+        _count(harness, recorder, 1)
+        harness.probe.destroy_publisher(first)
     commands = harness.foreign_node().create_publisher(TwistStamped, 'cmd_vel', 10)
     harness.wait_for_subscriber(commands)
     commands.publish(TwistStamped(twist=twist(0.5)))
-    _count(harness, recorder, 1)
-    harness.remove(recorder)
-    with open_bag(tmp_path) as recording:
-        assert recording.topics['/cmd_vel'].type_name == 'geometry_msgs/msg/TwistStamped'
-        assert recording.series('/cmd_vel', {'v': 'twist.linear.x'})['v'][0] == 0.5
-
-
-def test_a_type_change_of_a_topic_does_not_end_recording(harness, logged, tmp_path):
-    recorder = _recorder(harness, tmp_path, 'cmd_vel', 'text')
-    first = harness.create_publisher(Twist, 'cmd_vel')
-    text = harness.create_publisher(String, 'text')
-    harness.wait_for_subscriber(first)
-    harness.wait_for_subscriber(text)
-    first.publish(twist(0.5))
-    _count(harness, recorder, 1)
-    harness.probe.destroy_publisher(first)
-    second = harness.foreign_node().create_publisher(TwistStamped, 'cmd_vel', 10)
-    harness.wait_for_subscriber(second)
-    second.publish(TwistStamped())
-    harness.spin_until(lambda: logged('/cmd_vel is not recorded'))
+    if changes:
+        harness.spin_until(lambda: logged('/cmd_vel is not recorded'))
     text.publish(String(data='still here'))
     _count(harness, recorder, 2)
     assert diagnostic_level(recorder) == OK
     harness.remove(recorder)
     with open_bag(tmp_path) as recording:
-        assert recording.topics['/cmd_vel'].message_count == 1
-        assert recording.topics['/text'].message_count == 1
+        assert [each.message_count for each in recording.topics.values()] == [1, 1]
+        kind, field = ('Twist', '') if changes else ('TwistStamped', 'twist.')
+        assert recording.topics['/cmd_vel'].type_name == f'geometry_msgs/msg/{kind}'
+        assert recording.series('/cmd_vel', {'v': f'{field}linear.x'})['v'].tolist() == [0.5]
 
 
 def test_earlier_latched_messages_are_recorded(harness, tmp_path):
     latched = harness.create_publisher(String, 'map', LATCHED)
     latched.publish(String(data='once'))
-    recorder = _recorder(harness, tmp_path, 'map')
+    recorder = record(harness, tmp_path, 'map')
     _count(harness, recorder, 1)
     harness.remove(recorder)
     with open_bag(tmp_path) as recording:
@@ -146,7 +113,7 @@ def test_earlier_latched_messages_are_recorded(harness, tmp_path):
 
 
 def test_a_full_disk_ends_the_recording_only(harness, logged, tmp_path, monkeypatch):
-    recorder = _recorder(harness, tmp_path, 'odom')
+    recorder = record(harness, tmp_path, 'odom')
     robot = harness.add(SimRobotNode)
     odom = harness.subscribe(Odometry, 'odom')
     source = CommandSource(harness)
@@ -174,7 +141,7 @@ def test_a_full_disk_ends_the_recording_only(harness, logged, tmp_path, monkeypa
 
 def test_parameters_are_recorded_by_namespace(harness, tmp_path):
     """Two controllers have the same name in two namespaces."""
-    recorder = _recorder(harness, tmp_path, 'odom', namespace='a')
+    recorder = record(harness, tmp_path, 'odom', namespace='a')
     harness.add(ControllerNode, namespace='a', law__gain=3.0)
     harness.add(ControllerNode, namespace='b', law__gain=4.0)
     harness.spin_until(

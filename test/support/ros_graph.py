@@ -16,25 +16,10 @@ from support.waiting import wait_until
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.base_node import OK
-from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.entry_point import make_executor
-from t3mpc_ros.nodes.player.node import PlayerNode
-from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.recorder.node import RecorderNode
-from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
-
-NODE_CLASSES = {
-    'reference_generator': ReferenceGeneratorNode,
-    'controller': ControllerNode,
-    'sim_robot': SimRobotNode,
-    'radio_bridge': RadioBridgeNode,
-    'recorder': RecorderNode,
-    'player': PlayerNode,
-    'composed': ComposedNode,
-}
-"""Classes of all nodes by executable."""
 
 LATCHED = QoSProfile(
     depth=1000,
@@ -178,6 +163,12 @@ def driving_robot(harness, linear):
     source.message = twist(linear)
     harness.spin_until(lambda: odom and speed(odom[-1]) > 0.9 * linear, 'the robot drives')
     return robot, odom, source
+
+
+def record(harness, folder, *topics, **parameters):
+    """Return a recorder of some topics."""
+    parameters |= {'storage__uri': str(folder), 'record__topics': list(topics)}
+    return harness.add(RecorderNode, **parameters)
 
 
 class ControllerHarness:
