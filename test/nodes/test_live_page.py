@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live page of a running graph in a headless browser, as a person uses it."""
 
-from pathlib import Path
-
 import pytest
 from support.browser import SIZES, Browser
 
@@ -51,7 +49,7 @@ def newest(browser, stream='odometry'):
     return browser.run(f'return streams.{stream}.time.at(-1)')
 
 
-def test_a_person_watches_and_commands_a_robot(page, browser, processes, tmp_path):
+def test_a_person_watches_and_commands_a_robot(page, browser, processes):
     from selenium.webdriver import ActionChains, Keys
 
     # A moving value.
@@ -133,29 +131,3 @@ def test_a_person_watches_and_commands_a_robot(page, browser, processes, tmp_pat
 
     assert [text for text in browser.errors() if 'ERR_CONNECTION_REFUSED' not in text] == []
     assert {url for url in browser.requests() if not url.startswith((page, 'data:'))} == set()
-
-
-def test_a_page_of_another_origin_commands_nothing(page, browser, tmp_path):
-    """A page that the user has open beside it, on a server or a file of somebody else."""
-    token = browser.run('return token')
-    foreign = Path(tmp_path) / 'foreign.html'
-    foreign.write_text('<!doctype html><title>foreign</title>')
-    browser.driver.get(foreign.as_uri())
-    browser.driver.set_script_timeout(20)
-    for mode in ('cors', 'no-cors'):
-        result = browser.driver.execute_async_script(
-            """
-            const [url, token, mode, done] = arguments;
-            const body = JSON.stringify({command: 'e_stop', arguments: {on: true}});
-            const headers = mode === 'cors' ? {'X-Token': token} : {};
-            fetch(`${url}command`, {method: 'POST', body, headers, mode})
-              .then((answer) => done(`${answer.status}`), () => done('refused'));
-            """,
-            page,
-            token,
-            mode,
-        )
-        assert result in ('refused', '0', '403')
-    browser.driver.get(page)
-    browser.wait_for_headline('Tracking', 'Driving')
-    assert browser.run("return events.every((each) => !each.text.startsWith('e_stop'))")

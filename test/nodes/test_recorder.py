@@ -146,6 +146,7 @@ def test_messages_from_before_the_discovery_are_counted(harness, tmp_path):
     assert values(recorder)['undiscovered'] == 37
     assert (values(recorder)['lost'], diagnostic_level(recorder)) == (0, OK)
     harness.remove(recorder)
+    assert texts(tmp_path, '/latched') == list(map(str, range(37))), 'all that is kept'
     with open_bag(tmp_path) as recording:
         losses = recording.metadata_records['losses']
     assert {key: value for key, value in losses.items() if '/' in key} == {
@@ -306,11 +307,8 @@ def test_snapshot_mode_writes_snapshots_only(harness, tmp_path):
     assert list(tmp_path.glob('*.mcap')) == []
     assert texts(snapshots(tmp_path)[0]) == ['kept']
     assert diagnostic_level(recorder) == OK
-
-
-def test_snapshots_can_be_turned_off(harness, tmp_path):
-    record(harness, tmp_path, 'text', storage__snapshot_duration=0.0)
-    response = harness.call(Trigger, 'recorder/snapshot')
+    record(harness, tmp_path / 'off', 'text', namespace='off', storage__snapshot_duration=0.0)
+    response = harness.call(Trigger, 'off/recorder/snapshot')
     assert not response.success
     assert 'storage.snapshot_duration must be above 0' in response.message
 

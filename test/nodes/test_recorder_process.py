@@ -1,28 +1,34 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder as a process: load, SIGKILL, signals, and a file size limit."""
+"""The recorder as a process: load, SIGKILL at random times, signals, and a file size limit."""
 
+from concurrent.futures import ThreadPoolExecutor
+import os
 import random
 import resource
 import signal
+from threading import Event, Thread
 import time
 
 import pytest
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
 from std_msgs.msg import Float64MultiArray
 from support.bag_files import kept_messages
 from support.long_tests import few_of
-from support.waiting import wait_for_acknowledgement, wait_until
+from support.waiting import Processes, wait_for_acknowledgement, wait_until
 
 from bench.recorder_load import run
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery import recover_bag
 from t3mpc_ros.cli.process_group import ProcessError
+from t3mpc_ros.geometry.types import NANOSECONDS
 
 pytestmark = [pytest.mark.ros, pytest.mark.timed]
 
-DEEP = QoSProfile(depth=5000)
+SLOTS = 5
+"""Recorders at a time."""
 
 
 def test_two_thousand_messages_a_second_are_all_recorded(processes, tmp_path):
@@ -36,34 +42,54 @@ def test_two_thousand_messages_a_second_are_all_recorded(processes, tmp_path):
 
 
 class NumberPublisher:
-    """Publishes numbers from this process to a recorder in another one."""
+    """Publishes numbers from this process to recorders in other ones."""
 
-    def __init__(self, topic='number'):
+    def __init__(self):
         self._node = Node('publisher')
-        self._publisher = self._node.create_publisher(Float64MultiArray, topic, DEEP)
+        self._publisher = self._node.create_publisher(
+            Float64MultiArray, 'number', QoSProfile(depth=5000)
+        )
         self._random = random.Random(1)
+        self._end = Event()
+        self._thread = Thread(target=self._publish_until_the_end)
         self.ballast = 0
         """Incompressible random numbers appended to each message."""
         self.sent = []
-        """Time of publication of each number, ns since 1970."""
+        """Time of publication of each number, ns since 1970, and its serialized message."""
 
-    def wait_for_recorder(self):
-        wait_until(self._publisher.get_subscription_count, 'no recorder')
+    def wait_for_recorder(self, namespace='/'):
+        def subscribes():
+            found = self._node.get_subscriptions_info_by_topic('/number')
+            return namespace in {info.node_namespace for info in found}
+
+        wait_until(subscribes, 'no recorder')
+        wait_until(self._publisher.get_subscription_count, 'no match')
 
     def publish(self, count, period=0.01):
-        for _ in range(count):
-            self.sent.append(time.time_ns())
-            number = float(len(self.sent) - 1)
-            self._publisher.publish(Float64MultiArray(data=[number, *self._ballast()]))
-            time.sleep(period)
+        start = time.monotonic()
+        for number in range(count):
+            numbers = [self._random.random() for _ in range(self.ballast)]
+            message = Float64MultiArray(data=[float(len(self.sent)), *numbers])
+            data = serialize_message(message)
+            self.sent.append((time.time_ns(), data))
+            self._publisher.publish(data)
+            time.sleep(max(0.0, start + (number + 1) * period - time.monotonic()))
 
-    def _ballast(self):
-        return [self._random.random() for _ in range(self.ballast)]
+    def start(self):
+        """Publish from a thread of its own from now on."""
+        self._thread.start()
+
+    def _publish_until_the_end(self):
+        while not self._end.is_set():
+            self.publish(10)
 
     def wait_for_acknowledgement(self):
         wait_for_acknowledgement(self._publisher)
 
     def close(self):
+        self._end.set()
+        if self._thread.is_alive():
+            self._thread.join()
         self._node.destroy_node()
 
 
@@ -74,16 +100,68 @@ def publisher(ros):
     made.close()
 
 
-def start(processes, folder, **more):
-    processes.start(
-        'recorder', parameters={'storage.uri': str(folder), 'record.topics': ['number'], **more}
-    )
+def start(processes, folder, *arguments, **more):
+    parameters = {'storage.uri': str(folder), 'record.topics': ['/number'], **more}
+    processes.start('recorder', *arguments, parameters=parameters)
     processes.wait_ready('recorder')
 
 
 def numbers(path):
     with open_bag(path) as recording:
         return recording.series('/number', {'n': 'data[0]'})['n'].astype(int).tolist()
+
+
+def kill_in_sequence(folder, slot, publisher, turns):
+    """Start recorders one after the other and kill each after a random time.
+
+    Return the bag of each, and the times of its subscription and its end, ns.
+    """
+    rng = random.Random(100 + slot)
+    result = []
+    for turn in range(turns):
+        name = f'slot_{slot}_{turn}'
+        processes = Processes(folder / f'log_{name}', os.environ)
+        try:
+            start(processes, folder / name, '--ros-args', '-r', f'__ns:=/{name}')
+            publisher.wait_for_recorder(f'/{name}')
+            subscribed_ns = time.time_ns()
+            time.sleep(rng.uniform(2.0, 5.0))
+            killed_ns = time.time_ns()
+        finally:
+            processes.kill('recorder')
+        result.append((folder / name, subscribed_ns, killed_ns))
+    return result
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('turns', few_of([1, 4]))
+def test_a_kill_loses_at_most_one_second(turns, publisher, tmp_path):
+    publisher.start()
+    with ThreadPoolExecutor(SLOTS) as pool:
+        slots = [
+            pool.submit(kill_in_sequence, tmp_path, slot, publisher, turns)
+            for slot in range(SLOTS)
+        ]
+        kills = [one for slot in slots for one in slot.result()]
+    assert len(kills) == SLOTS * turns
+    times, payloads = zip(*publisher.sent, strict=True)
+    losses = []
+    for bag, subscribed_ns, killed_ns in kills:
+        output = bag.with_suffix('.new')
+        result = recover_bag(bag, output)
+        assert not result.clean  # the file of a killed recorder has no footer
+        with open_bag(output) as recording:
+            assert recording.message_count == result.kept > 0
+            kept = [bytes(message.data) for message in recording.serialized_messages(['/number'])]
+        first = payloads.index(kept[0])
+        last = first + len(kept)
+        # In order, without a gap, and byte for byte equal.
+        assert kept == list(payloads[first:last])
+        assert times[first] < subscribed_ns + NANOSECONDS
+        lost_ns = killed_ns - times[last] if last < len(times) else 0
+        losses.append(max(0, lost_ns) / NANOSECONDS)
+    print('seconds lost:', ', '.join(f'{loss:.2f}' for loss in sorted(losses)))
+    assert max(losses) <= 1.0
 
 
 def test_a_recorder_killed_after_a_pause_has_lost_nothing(processes, publisher, tmp_path):

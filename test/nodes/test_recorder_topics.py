@@ -11,7 +11,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support.ros_graph import (
-    LATCHED,
     CommandSource,
     diagnostic,
     diagnostic_level,
@@ -100,16 +99,6 @@ def test_stamped_commands_are_recorded_unless_the_type_changes(changes, harness,
         kind, field = ('Twist', '') if changes else ('TwistStamped', 'twist.')
         assert recording.topics['/cmd_vel'].type_name == f'geometry_msgs/msg/{kind}'
         assert recording.series('/cmd_vel', {'v': f'{field}linear.x'})['v'].tolist() == [0.5]
-
-
-def test_earlier_latched_messages_are_recorded(harness, tmp_path):
-    latched = harness.create_publisher(String, 'map', LATCHED)
-    latched.publish(String(data='once'))
-    recorder = record(harness, tmp_path, 'map')
-    _count(harness, recorder, 1)
-    harness.remove(recorder)
-    with open_bag(tmp_path) as recording:
-        assert [message.data for _, message in recording.messages('/map')] == ['once']
 
 
 def test_a_full_disk_ends_the_recording_only(harness, logged, tmp_path, monkeypatch):

@@ -28,6 +28,16 @@ from t3mpc_ros.cli.process_group import executable
 HELPER = 't3mpc_ros.nodes.launch_files'
 
 
+CLASSES = {
+    'launch': ['LaunchDescription', 'LaunchContext'],
+    'launch.actions': ['DeclareLaunchArgument', 'OpaqueFunction'],
+    'launch_ros': [],
+    'launch_ros.actions': ['Node'],
+    'launch_ros.parameter_descriptions': ['ParameterValue'],
+}
+"""Classes of the launch packages, which the substitutes replace."""
+
+
 class Recorded:
     """Replaces a class of the launch packages; stores the arguments."""
 
@@ -36,35 +46,12 @@ class Recorded:
         self.named = named
 
 
-class DeclareLaunchArgument(Recorded):
-    """An argument of a launch file."""
-
-
-class OpaqueFunction(Recorded):
-    """Makes nodes from the values of the arguments."""
-
-
-CLASSES = {
-    'launch': {
-        'LaunchDescription': type('LaunchDescription', (Recorded,), {}),
-        'LaunchContext': type('LaunchContext', (Recorded,), {}),
-    },
-    'launch.actions': {
-        'DeclareLaunchArgument': DeclareLaunchArgument,
-        'OpaqueFunction': OpaqueFunction,
-    },
-    'launch_ros': {},
-    'launch_ros.actions': {'Node': type('Node', (Recorded,), {})},
-    'launch_ros.parameter_descriptions': {'ParameterValue': type('Value', (Recorded,), {})},
-}
-
-
 @contextmanager
 def _substitutes(share):
     modules = {}
     for name, classes in CLASSES.items():
         modules[name] = types.ModuleType(name)
-        vars(modules[name]).update(classes)
+        vars(modules[name]).update({each: type(each, (Recorded,), {}) for each in classes})
     with mock.patch.dict(sys.modules, modules):
         sys.modules.pop(HELPER, None)
         found = packages.get_package_share_directory
@@ -129,7 +116,7 @@ def arguments_of(file, share=None):
     return {
         item.arguments[0]: (item.named['default_value'], item.named.get('choices'))
         for item in _items(file, share)
-        if isinstance(item, DeclareLaunchArgument)
+        if 'default_value' in item.named
     }
 
 
@@ -139,23 +126,16 @@ def _items(file, share):
 
 
 def nodes_of(file, given=None, share=None):
-    """Return the nodes of a launch file.
+    """Return the nodes of a launch file for given arguments.
 
-    Parameters
-    ----------
-    file
-        The launch file.
-    given
-        Launch arguments, as texts.
-    share
-        Share directory of the package; None: of the installed one.
+    ``share`` is the share directory of the package; None: that of the installed one.
     """
     given = dict(given or {})
     items = _items(file, share)
     with _substitutes(share):
         values = {}
         for item in items:
-            if isinstance(item, DeclareLaunchArgument):
+            if 'default_value' in item.named:
                 name = item.arguments[0]
                 values[name] = given.pop(name, item.named['default_value'])
                 assert values[name] in item.named.get('choices', [values[name]]), name
@@ -164,7 +144,7 @@ def nodes_of(file, given=None, share=None):
         made = [
             node
             for item in items
-            if isinstance(item, OpaqueFunction)
+            if 'function' in item.named
             for node in item.named['function'](context)
         ]
     for node in made:
