@@ -25,7 +25,7 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 ODOM_OVERRIDE = 'qos_overrides./odom.{}.reliability:={}'
 
 
-def test_best_effort_inputs_are_received_from_the_start_and_later(harness):
+def test_best_effort_inputs_are_received_early_and_late(harness):
     """A reliable subscription does not receive them: TurtleBot 4 and micro-ROS were ignored."""
     controller = harness.add(ControllerNode)
     reference = harness.create_publisher(Odometry, 'reference', BEST_EFFORT)

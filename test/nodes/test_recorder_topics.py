@@ -76,7 +76,7 @@ def test_best_effort_publishers_are_recorded(harness, tmp_path):
 
 
 @pytest.mark.parametrize('changes', [False, True])
-def test_stamped_commands_are_recorded_unless_the_type_changes(changes, harness, logged, tmp_path):
+def test_stamped_commands_are_recorded_unless_a_type_changes(changes, harness, logged, tmp_path):
     """The early subscription to cmd_vel has type Twist and must adapt to TwistStamped."""
     recorder = record(harness, tmp_path, 'cmd_vel', 'text')
     text = harness.connected_publisher(String, 'text')

@@ -80,7 +80,7 @@ def wait_for_subscribers(harness, robot, *topics):
 # -- sensors --------------------------------------------------------------------------------------
 
 
-def test_sensor_messages_match_the_robot_state_at_their_rates(harness):
+def test_sensor_messages_match_the_state_at_their_rates(harness):
     """In a corner of the room, 0.3 m from the wall in front.
 
     In steps: a running robot on a busy machine publishes faster than the executor, which takes
@@ -216,7 +216,7 @@ def test_the_paper_plant_rejects_worlds_and_faults(given):
 # -- initial pose ---------------------------------------------------------------------------------
 
 
-def test_the_initial_pose_is_the_true_one_unless_within_a_wall(harness):
+def test_the_initial_pose_is_true_unless_within_a_wall(harness):
     truth = harness.subscribe(Odometry, 'ground_truth/odom')
     odom = harness.subscribe(Odometry, 'odom')
     robot = harness.add(
