@@ -64,14 +64,13 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
 def run(options: argparse.Namespace) -> int:
     """Print the tables and return 0."""
     from t3mpc_ros.evaluation import comparison_page
-    from t3mpc_ros.evaluation.api.run_executors import workers_for
-    from t3mpc_ros.evaluation.comparison import compare
+    from t3mpc_ros.evaluation.comparison import run_plan
     from t3mpc_ros.evaluation.experiment import print_report
 
     plan = _plan(options)
     run_options.prepare_outputs(options)
     with run_options.executor_of(options) as executor:
-        results = compare(plan, workers_for(executor, plan.runs()), print_report)
+        results = run_plan(plan, executor, print_report)
     print(comparison_page.markdown(plan, results))
     run_options.write_outputs(
         options,

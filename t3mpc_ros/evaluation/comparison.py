@@ -3,8 +3,8 @@
 """Comparison of methods: a plan of cases, methods and seeds, and its experiment."""
 
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from typing import Any
 
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.loop import Method
@@ -56,8 +56,6 @@ class ComparisonPlan:
         return found
 
 
-def compare(
-    plan: ComparisonPlan, workers: int | Executor = 1, report: Report | None = None
-) -> ResultTable:
-    """Return the metrics of every run of a plan; ``workers`` as for :class:`WorkerPool`."""
+def run_plan(plan: ComparisonPlan, workers: Any = 1, report: Report | None = None) -> ResultTable:
+    """Return the metrics of every run of a plan; ``workers`` as for :func:`.workers_for`."""
     return run_experiment(plan.runs(), workers=workers, report=report)

@@ -11,8 +11,8 @@ import numpy as np
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
 from t3mpc_ros.evaluation.comparison import ComparisonPlan
 from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean
+from t3mpc_ros.evaluation.drivers import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.method import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, TWIN_ADVANCE
 from t3mpc_ros.evaluation.metrics import (
     DRIFT,

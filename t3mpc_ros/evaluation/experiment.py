@@ -7,8 +7,8 @@ on other machines, and returns a :class:`ResultTable`, from which means, paired 
 and pages are made.
 """
 
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 import hashlib
@@ -24,8 +24,9 @@ import numpy as np
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.metrics import Numbers, measure
+from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
-from t3mpc_ros.evaluation.workers import Job, JobError, WorkerPool, map_jobs
+from t3mpc_ros.evaluation.workers import Job, JobError, WorkerPool, map_jobs, workers_for
 from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.version import VERSION
 
@@ -111,7 +112,7 @@ def measured_run(job: Job) -> Numbers:
 def run_experiment(
     runs: Sequence[Run],
     task: Callable[[Any], Mapping[str, Any]] = measured_run,
-    workers: int | Executor = 1,
+    workers: Any = 1,
     *,
     store: Path | None = None,
     fresh: bool = False,
@@ -128,7 +129,7 @@ def run_experiment(
     task
         Makes the numbers of a job, plain data by name; a function of a module.
     workers
-        As for :class:`WorkerPool`.
+        As for :func:`.workers_for`.
     store, fresh
         File of the runs, and whether those that it holds are thrown away.
     report
@@ -143,32 +144,56 @@ def run_experiment(
     """
     if store is None:
         jobs = [run.job for run in runs]
-        found = map_jobs(task, jobs, workers, progress=report is not None)
-        return ResultTable(
-            [{**run.fields, **numbers} for run, numbers in zip(runs, found, strict=True)]
-        )
+        made = map_jobs(task, jobs, workers_for(workers, jobs), progress=report is not None)
+        return ResultTable([{**run.fields, **row} for run, row in zip(runs, made, strict=True)])
     by_key = {run.key: run.job for run in runs}
     if len(by_key) < len(runs) or '' in by_key:
         raise ValueError('runs must have different keys')
-    file = ResultFile(store, fresh=fresh)
-    for left in reversed(range(RESTARTS + 1)):
-        try:
-            kept = file.complete(by_key, lambda jobs: _made(task, jobs, workers), report)
-            break
-        except JobError as error:
-            if not (left and isinstance(error.__cause__, BrokenExecutor)):
-                raise
-            if report is not None:
-                report('a worker process was lost; its runs are begun again')
+    with ResultFile(store, fresh=fresh) as file:
+        kept = _complete(file, by_key, task, workers, report)
     return ResultTable([{**run.fields, **kept[run.key]} for run in runs], by_key.keys())
 
 
-def _made(
-    task: Callable[[Any], Mapping[str, Any]], jobs: Sequence[Any], workers: int | Executor
-) -> Iterator[tuple[int, Row]]:
-    with WorkerPool(workers) as pool:
-        for index, numbers in pool.map(task, jobs):
-            yield index, dict(numbers)
+def _complete(
+    file: ResultFile,
+    jobs: Mapping[str, Any],
+    task: Callable[[Any], Mapping[str, Any]],
+    workers: Any,
+    report: Report | None,
+) -> dict[str, Row]:
+    """Return the row of every job; those that the file lacks are made, and added to it at once."""
+    write = report or (lambda text: None)
+    known = file.read()
+    found = {key: known[key] for key in jobs if key in known}
+    text = f'{len(jobs)} runs; {len(found)} are there already, {len(jobs) - len(found)} to do'
+    if others := len(known) - len(found):
+        text += f'; {others} of other versions, settings or extents are left alone'
+    if file.unreadable:
+        text += f'; {file.unreadable} lines that are torn or of an older version are skipped'
+    write(text)
+    restarts = RESTARTS
+    try:
+        while missing := [key for key in jobs if key not in found]:
+            todo = [jobs[key] for key in missing]
+            pool = WorkerPool(workers_for(workers, todo))
+            try:
+                with pool, progress_bar(len(todo), show=report is not None) as bar:
+                    for index, numbers in pool.map(task, todo):
+                        found[missing[index]] = row = dict(numbers)
+                        file.add(missing[index], row)
+                        bar.update()
+            except JobError as error:
+                restarts -= 1
+                if restarts < 0 or not isinstance(error.__cause__, BrokenExecutor):
+                    raise
+                write('a worker process was lost; its runs are begun again')
+    except BaseException:
+        write(
+            f'{len(found)} of {len(jobs)} runs are kept in {file.path}: '
+            'the same command goes on from there'
+        )
+        raise
+    return found
 
 
 def print_report(line: str) -> None:
@@ -193,8 +218,8 @@ def digest(*parts: Any) -> str:
 _IRRELEVANT_SOURCES = (
     'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'evaluation/bag_report/',
     'evaluation/process_replay/', 'evaluation/comparison',
-    'evaluation/claim.py', 'evaluation/fault_page.py', 'evaluation/plotting.py',
-    'evaluation/reporting.py', 'evaluation/result_file.py', 'evaluation/paper/',
+    'evaluation/fault_page.py', 'evaluation/plotting.py', 'evaluation/reporting.py',
+    'evaluation/result_file.py', 'evaluation/paper/',
     'evaluation/patrol/patrol_page.py', 'evaluation/patrol/patrol_figures.py',
     'evaluation/patrol/tracking_page.py',
 )  # fmt: skip

@@ -1,8 +1,8 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Finished runs in a file of JSON lines, and the runs that it lacks."""
+"""Finished runs in a file of JSON lines."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping
 import contextlib
 import fcntl
 from io import TextIOWrapper
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Self
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.evaluation.reporting import progress_bar
 
 Row = dict[str, Any]
 """Plain data by name."""
@@ -92,63 +91,6 @@ class ResultFile:
                 write_atomically(self.path, ''.join(starmap(_line, others.items())))
             else:
                 self.path.unlink()
-
-    def complete(
-        self,
-        jobs: Mapping[str, Any],
-        make: Callable[[Sequence[Any]], Iterable[tuple[int, Row]]],
-        report: Callable[[str], None] | None = None,
-    ) -> dict[str, Row]:
-        """Return the row of every job, in any order; those that the file holds are not made again.
-
-        What is made is added to the file at once, so that a set of runs that is stopped goes on
-        where it was. The answer does not depend on what was there.
-
-        Parameters
-        ----------
-        make
-            Gets the missing jobs; yields (index, row) in any order.
-        report
-            Receives messages; with None there is no progress line either.
-
-        Raises
-        ------
-        RuntimeError
-            Another process writes to the file, or a run never came back.
-        """
-        write = report or (lambda text: None)
-        with self:
-            known = self.read()
-            found = {key: known[key] for key in jobs if key in known}
-            missing = [key for key in jobs if key not in found]
-            write(self._resume_message(len(jobs), len(found), len(known) - len(found)))
-            try:
-                with contextlib.ExitStack() as stack:
-                    bar = stack.enter_context(progress_bar(len(missing), show=report is not None))
-                    runs = make([jobs[key] for key in missing]) if missing else ()
-                    if close := getattr(runs, 'close', None):
-                        stack.callback(close)  # its processes end with this loop, however it ends
-                    for index, row in runs:
-                        self.add(missing[index], row)
-                        found[missing[index]] = row
-                        bar.update()
-            except BaseException:
-                write(
-                    f'{len(found)} of {len(jobs)} runs are kept in {self.path}: '
-                    'the same command goes on from there'
-                )
-                raise
-        if len(found) != len(jobs):
-            raise RuntimeError(f'{len(jobs) - len(found)} runs never came back')
-        return found
-
-    def _resume_message(self, total: int, found: int, others: int) -> str:
-        text = f'{total} runs; {found} are there already, {total - found} to do'
-        if others:
-            text += f'; {others} of other versions, settings or extents are left alone'
-        if self.unreadable:
-            text += f'; {self.unreadable} lines that are torn or of an older version are skipped'
-        return text
 
 
 def _line(key: str, row: Mapping[str, Any]) -> str:

@@ -10,30 +10,27 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 import multiprocessing
 import os
-from typing import Any, Protocol, Self, TypeVar
+import pickle
+import sys
+from typing import Any, Self, TypeVar
 
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
 from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
+from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.loop import Method, run
-from t3mpc_ros.evaluation.method import MethodSpec
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.stop_signal import end_with_parent
 
+LOST_PROCESS = (
+    'a worker process ended before its work was done; a script that uses several processes must '
+    "begin its work with: if __name__ == '__main__':"
+)
 T = TypeVar('T')
 
 
-class Named(Protocol):
-    """What a job is done with."""
-
-    @property
-    def name(self) -> str:
-        """Name in tables and errors."""
-        ...
-
-
-J = TypeVar('J', bound=tuple[Any, Named])
 Job = tuple[Scenario, Method]
+"""What the task of a job gets; the name of the second part is that of the job in errors."""
 
 
 class JobError(RuntimeError):
@@ -73,7 +70,7 @@ class WorkerPool:
             self._pool.shutdown(cancel_futures=True)
         self._pool = None
 
-    def map(self, task: Callable[[J], T], jobs: Iterable[J]) -> Iterator[tuple[int, T]]:
+    def map(self, task: Callable[[Any], T], jobs: Iterable[Any]) -> Iterator[tuple[int, T]]:
         """Yield (index of the job, ``task`` of it) as the jobs are finished.
 
         ``task`` is a function of a module.
@@ -91,7 +88,7 @@ class WorkerPool:
                     raise _job_error(job, error) from error
                 yield index, result
             return
-        begun: dict[Future[T], tuple[int, J]] = {}
+        begun: dict[Future[T], tuple[int, Any]] = {}
         try:
             for index, job in enumerate(jobs):
                 try:
@@ -110,8 +107,8 @@ class WorkerPool:
 
 
 def map_jobs(
-    task: Callable[[J], T],
-    jobs: Sequence[J],
+    task: Callable[[Any], T],
+    jobs: Sequence[Any],
     workers: int | Executor = 1,
     *,
     progress: bool = False,
@@ -125,7 +122,7 @@ def map_jobs(
     return [found[index] for index in range(len(jobs))]
 
 
-def _job_error(job: tuple[Any, Named], error: BaseException) -> JobError:
+def _job_error(job: tuple[Any, Any], error: BaseException) -> JobError:
     scenario, method = job
     return JobError(f'{method.name} on {scenario} failed: {error!r}')
 
@@ -141,3 +138,51 @@ def warm_up() -> None:
     for robot in PLANTS:
         scenario = Scenario(robot, NOMINAL, 1, 0.05)
         run(scenario, MethodSpec('warm up', FeedForward, FeedForwardParameters()))
+
+
+def workers_for(executor: Any, jobs: Sequence[Any]) -> int | Executor:
+    """Return who makes runs: a number of processes, or an executor.
+
+    ``executor`` is one, a Dask client, a number of processes, or None for one on each processor.
+    One run, and runs of an interactive session, which other processes cannot import, are made
+    in this process unless an executor is given.
+
+    Raises
+    ------
+    ValueError
+        It is no executor, or the runs cannot be sent to other processes.
+    """
+    if isinstance(executor, Executor):
+        return executor
+    if callable(make := getattr(executor, 'get_executor', None)):  # a Dask client
+        found = make(pure=False)
+        assert isinstance(found, Executor)
+        return found
+    if executor is not None and (isinstance(executor, bool) or not isinstance(executor, int)):
+        raise ValueError(
+            'executor must be None, a number of processes, a concurrent.futures.Executor or a '
+            f'Dask client: got {executor!r}'
+        )
+    if executor is not None and executor < 1:
+        raise ValueError(f'executor must be at least 1 process: got {executor}')
+    if getattr(multiprocessing.process.current_process(), '_inheriting', False):
+        # The program of a worker process runs this script again: it would start workers for ever.
+        raise SystemExit(f'error: {LOST_PROCESS}')
+    if executor == 1 or len(jobs) < 2:
+        return 1
+    count = executor or len(os.sched_getaffinity(0))
+    if executor is None and not hasattr(sys.modules['__main__'], '__file__'):
+        return 1
+    if count > 1:
+        _check_picklable(jobs[0])
+    return min(count, len(jobs))
+
+
+def _check_picklable(job: Any) -> None:
+    try:
+        pickle.dumps(job)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise ValueError(
+            'controller, plant and noise must be defined at the top level of a file to be sent to '
+            f'other processes; use executor=1 to stay in this one: got {error}'
+        ) from None

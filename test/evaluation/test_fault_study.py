@@ -13,6 +13,7 @@ from support.long_tests import few_of
 
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation import fault_study
+from t3mpc_ros.evaluation.drivers import NodeMethod
 from t3mpc_ros.evaluation.fault_page import (
     BEGIN_MARK,
     END_MARK,
@@ -34,7 +35,6 @@ from t3mpc_ros.evaluation.fault_study import (
     undisturbed,
 )
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.method import NodeMethod
 from t3mpc_ros.evaluation.scenario import (
     KINDS,
     OwnParts,

@@ -15,8 +15,8 @@ from t3mpc_ros.evaluation import drivers
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.cases import CASES, PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired, student_quantile
+from t3mpc_ros.evaluation.drivers import MadeMethod, MethodSpec
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.method import MadeMethod, MethodSpec
 from t3mpc_ros.evaluation.record import RATE
 from t3mpc_ros.evaluation.scenario import (
     HELD_OUT_SEEDS,

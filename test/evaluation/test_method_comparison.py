@@ -22,7 +22,7 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
     ProportionalIntegralParameters,
 )
 from t3mpc_ros.evaluation.cases import NOMINAL, cases_for
-from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, compare
+from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, run_plan
 from t3mpc_ros.evaluation.comparison_page import (
     BETTER,
     INCONCLUSIVE,
@@ -33,10 +33,9 @@ from t3mpc_ros.evaluation.comparison_page import (
     record,
     verdict,
 )
-from t3mpc_ros.evaluation.drivers import MethodDriver, NodeDriver
+from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeDriver
 from t3mpc_ros.evaluation.experiment import ResultTable, measured_run
 from t3mpc_ros.evaluation.loop import run, run_loop
-from t3mpc_ros.evaluation.method import MethodSpec
 from t3mpc_ros.evaluation.methods import (
     FEED_FORWARD,
     FULL,
@@ -377,7 +376,7 @@ class Diverging:
 def test_a_seed_that_diverges_makes_every_mean_diverge(first):
     """Its missing metrics once ended the JSON, or left means over the other seeds beside it."""
     plan = plan_of('twin', FEED_FORWARD, seeds=(first, 3 - first), diverging=Diverging())
-    results = compare(plan)
+    results = run_plan(plan)
     for metric in (SETTLED, DRIFT, YAW_RATE, STOPPED):
         assert len(results.values(metric.name, controller='diverging')) == 2
     row = next(
@@ -411,7 +410,7 @@ def test_the_body_decides_where_it_is_not_known():
 @pytest.mark.parametrize('robot', ['servo', 'torque'])
 def test_the_plant_of_the_paper_is_compared_too(robot):
     plan = plan_of(robot, FEED_FORWARD, PI, seeds=(201,), duration=2.0)
-    results = compare(plan)
+    results = run_plan(plan)
     assert results.values('controller') == [FEED_FORWARD, PI]
     (row,) = results.where(controller=PI, case='nominal')
     numbers = measured_run((Scenario(robot, 'nominal', 201, 2.0), methods_for(robot)[PI]))

@@ -145,7 +145,7 @@ def test_messages_that_were_overtaken_are_counted(monkeypatch):
             super().__init__(*arguments)
             made.append(self)
 
-    monkeypatch.setattr('t3mpc_ros.evaluation.method.Controller', Counted)
+    monkeypatch.setattr('t3mpc_ros.evaluation.drivers.Controller', Counted)
     run(monkeypatch, FULL, swapped(20))
     assert made[0].ignored_odometry == int(DURATION * 100) // 20 - 1
     made[0].reset()

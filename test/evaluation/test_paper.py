@@ -18,12 +18,11 @@ from scipy import stats
 from support.records import record_of
 from support.unrendered import unrendered  # noqa: F401 - a fixture
 
-from t3mpc_ros.evaluation.claim import Claim
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
 from t3mpc_ros.evaluation.paper import figure_runs, study
-from t3mpc_ros.evaluation.paper.claims import ALONE, INTENDED, all_claims, markdown
+from t3mpc_ros.evaluation.paper.claims import ALONE, INTENDED, Claim, all_claims, markdown
 from t3mpc_ros.evaluation.paper.figure_runs import (
     explained,
     follows_claim,

@@ -100,11 +100,6 @@ def test_a_folder_in_place_of_the_file_is_an_error_with_a_remedy(tmp_path):
         table(tmp_path)
 
 
-def test_runs_that_never_come_back_are_an_error(tmp_path):
-    with pytest.raises(RuntimeError, match='never came back'):
-        ResultFile(tmp_path / 'r').complete({'key': 1}, lambda jobs: iter(()))
-
-
 def test_runs_without_different_keys_are_refused(tmp_path):
     for key in ('', 'key 1'):
         with pytest.raises(ValueError, match='different keys'):

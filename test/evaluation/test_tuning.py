@@ -14,8 +14,8 @@ import pytest
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
+from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.loop import run as closed_loop_run
-from t3mpc_ros.evaluation.method import MethodSpec
 from t3mpc_ros.evaluation.methods import method_definitions, methods
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.cma_search import search_best

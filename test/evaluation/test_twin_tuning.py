@@ -11,8 +11,8 @@ import pytest
 from t3mpc_ros.control.controller import StepperControllerParameters
 from t3mpc_ros.evaluation.baselines.feedback_control import ProportionalIntegralParameters
 from t3mpc_ros.evaluation.confidence_intervals import Difference
+from t3mpc_ros.evaluation.drivers import NodeMethod
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.method import NodeMethod
 from t3mpc_ros.evaluation.methods import EXACT_MODEL, FULL, method_definitions, methods_for
 from t3mpc_ros.evaluation.metrics import OVERALL, VARIATION, measure
 from t3mpc_ros.evaluation.record import rolling_speeds

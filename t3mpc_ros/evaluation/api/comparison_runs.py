@@ -12,12 +12,10 @@ from typing import Any
 from t3mpc_ros.evaluation.api.controllers import as_controllers
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.run_executors import workers_for
 from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
 from t3mpc_ros.evaluation.api.table_files import columns_of, write_csv, write_parquet
 from t3mpc_ros.evaluation.cases import NOMINAL
-from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan
-from t3mpc_ros.evaluation.comparison import compare as run_plan
+from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, run_plan
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.experiment import ResultTable, print_report
 from t3mpc_ros.evaluation.metrics import METRICS, Metric
@@ -146,8 +144,7 @@ def compare(
     """
     scenario = own_scenario(plant, reference, noise, faults, duration)
     plan = make_plan(controllers, seeds, cases, scenario)
-    workers = workers_for(executor, plan.runs())
-    return Comparison(plan, run_plan(plan, workers, print_report if progress else None))
+    return Comparison(plan, run_plan(plan, executor, print_report if progress else None))
 
 
 def make_plan(

@@ -17,7 +17,6 @@ from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds, chosen_cases
 from t3mpc_ros.evaluation.api.controllers import as_controllers
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.run_executors import workers_for
 from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence, sentence
 from t3mpc_ros.evaluation.api.table_files import columns_of, write_csv, write_parquet
 from t3mpc_ros.evaluation.cases import NOMINAL
@@ -173,12 +172,11 @@ def sweep(
     }
     runs = make_runs(controllers, parameters, checked_seeds(seeds), cases, setting)
     path = _checked_path(output)
-    workers = workers_for(executor, runs)
     report = print_report if progress else None
     if path is None:
-        rows = list(run_experiment(runs, numbers_or_error, workers, report=report))
+        rows = list(run_experiment(runs, numbers_or_error, executor, report=report))
     else:
-        rows = _run_to_file(path, runs, workers, report)
+        rows = _run_to_file(path, runs, executor, report)
     if all(errors := [row[ERROR] for row in rows]):
         raise ScriptError(f'every run failed: {errors[0]}')
     return Sweep(rows, tuple(parameters), path)
@@ -289,7 +287,7 @@ def _checked_path(output: str | os.PathLike[str] | None) -> Path | None:
 
 
 def _run_to_file(
-    path: Path, runs: Sequence[Run], workers: int | Executor, report: Report | None
+    path: Path, runs: Sequence[Run], workers: Any, report: Report | None
 ) -> list[Row]:
     """Run what the file and its journal lack, write the file, and remove them from the journal."""
     stored = _read(path)

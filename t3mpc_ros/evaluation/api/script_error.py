@@ -20,12 +20,6 @@ class ScriptError(ValueError):
     """
 
 
-LOST_PROCESS = (
-    'a worker process ended before its work was done; a script that uses several processes must '
-    "begin its work with: if __name__ == '__main__':"
-)
-
-
 def one_sentence(function: Callable[P, R]) -> Callable[P, R]:
     """Return the function with its errors as :class:`ScriptError`, of one sentence each."""
 
@@ -47,6 +41,8 @@ def sentence(error: BaseException) -> str:
     """Return what went wrong in one sentence: the text of the error, or that of its origin."""
     cause = error.__cause__
     if isinstance(cause, BrokenExecutor) or isinstance(error, BrokenExecutor):
+        from t3mpc_ros.evaluation.workers import LOST_PROCESS
+
         return LOST_PROCESS
     if isinstance(cause, ScriptError):
         return str(cause)

@@ -12,7 +12,6 @@ import numpy as np
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.cases import NOMINAL
-from t3mpc_ros.evaluation.claim import Claim
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.metrics import START
@@ -25,7 +24,7 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
     simulate_open_loop,
     torque_robot,
 )
-from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD
+from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD, Claim
 from t3mpc_ros.evaluation.paper.results import Results, rank
 from t3mpc_ros.evaluation.paper.study import (
     PAPER_NOISE,

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from t3mpc_ros.evaluation.claim import Claim
 from t3mpc_ros.evaluation.paper import paper_figures
+from t3mpc_ros.evaluation.paper.claims import Claim
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.results import Results
 from t3mpc_ros.evaluation.paper.study import WITHOUT

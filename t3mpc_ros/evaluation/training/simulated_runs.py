@@ -9,9 +9,9 @@ import numpy as np
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
+from t3mpc_ros.evaluation.drivers import MethodSpec, pretrain
 from t3mpc_ros.evaluation.experiment import Run, print_report, run_experiment
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.method import MethodSpec, pretrain
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.record import RATE, Record
