@@ -72,13 +72,6 @@ def student_quantile(degrees: int, confidence: float = 0.95) -> float:
 
     falls with theta: A is concave, so Newton's steps from zero rise to the root and never
     pass it.
-
-    Parameters
-    ----------
-    degrees
-        Degrees of freedom n, at least 1.
-    confidence
-        Above 0 and below 1.
     """
     if degrees < 1:
         raise ValueError(f'degrees must be at least 1: got {degrees}')

@@ -48,17 +48,8 @@ from t3mpc_ros.simulation.plant_robot import Signals
 class NodeDriver:
     """The controller of the node, with the reference :data:`LEAD` ahead.
 
-    Parameters
-    ----------
-    controller, geometry
-        A new controller, and the robot that it assumes.
-    course
-        Reference wheel speeds (rad/s) of each period, shape (n, 2), up to the lead beyond the run.
-
-    Raises
-    ------
-    ValueError
-        The controller has another rate than the loop.
+    ``geometry`` is that of the robot which the controller assumes; ``course`` has the reference
+    wheel speeds (rad/s) of each period, shape (n, 2), up to the lead beyond the run.
     """
 
     def __init__(self, controller: Controller, geometry: WheelGeometry, course: Array) -> None:
@@ -200,15 +191,7 @@ class MethodDriver:
         self.reason = '' if enabled else Reason.DISABLED.value
 
     def step(self, state: RobotState) -> RobotCommand:
-        """Return the command that follows from a report of the robot.
-
-        NaN if the method's answer is not finite.
-
-        Raises
-        ------
-        ValueError
-            The method returns something other than two accelerations.
-        """
+        """Return the command that follows from a report; NaN if the answer is not finite."""
         if not self._enabled:
             return RobotCommand(ZERO_WHEEL_SPEEDS, state.stamp_ns)
         k = round(state.stamp_ns * RATE / NANOSECONDS)
@@ -236,7 +219,7 @@ class MethodDriver:
         self._reference = observed_reference(
             self._scenario.reference(),
             self._scenario.steps,
-            self._scenario.preview_rows(seam.dead_time),
+            self._scenario.kind.preview_rows(seam.dead_time),
             seam.dead_time,
             preview=controller.preview,
         )
@@ -279,7 +262,7 @@ class MethodDriver:
         seam = self._actuation
         seam.observe(measured, elapsed * self._model.period)
         now, following, future = self._reference.at(k, self._late)
-        asked = controller.step(
+        return controller.step(
             Observation(
                 seam.predicted,
                 seam.disturbance,
@@ -291,13 +274,6 @@ class MethodDriver:
                 self._late,
             )
         )
-        if not (isinstance(asked, np.ndarray) and asked.shape == (2,)):
-            what = f'shape {asked.shape}' if isinstance(asked, np.ndarray) else repr(asked)
-            raise ValueError(
-                f'step() of {type(controller).__name__} must return a numpy array of shape (2,), '
-                f'the accelerations of the right and the left wheel: got {what}'
-            )
-        return asked
 
     def _limited_torque(self, asked: Array) -> tuple[Array, bool]:
         """Return accelerations that a torque drive can give, and whether they were cut."""
@@ -328,6 +304,8 @@ class MethodSpec:
     parameters: Parameters
     pretrained: bool = False
     """Whether a method with adaptation starts from the weights of :func:`pretrain`."""
+    baseline: bool = True
+    """Whether it is a baseline, not a stage of the proposed controller."""
 
     def __post_init__(self) -> None:
         expected = self.controller_type.parameters_type
@@ -345,6 +323,12 @@ class MethodSpec:
                 pretrain(self.controller_type, self.parameters, nominal_model.drive)
             )
         return controller
+
+    @property
+    def preview(self) -> bool:
+        """Whether it has preview."""
+        chosen = self.parameters.to_dict().get('jump_transition.preview')
+        return self.controller_type.preview if chosen is None else chosen is True
 
     def driver(self, scenario: Scenario) -> MethodDriver:
         """Return a new driver for a run."""

@@ -63,14 +63,17 @@ class ResultTable(Sequence[Row]):
     def __getitem__(self, index: Any) -> Any:
         return self.rows[index]
 
+    def groups(self, *columns: str) -> dict[tuple[Hashable, ...], list[Row]]:
+        """Return the rows by their values in some columns."""
+        if columns not in self._groups:
+            groups = self._groups[columns] = {}
+            for row in self.rows:
+                groups.setdefault(tuple(row.get(name) for name in columns), []).append(row)
+        return self._groups[columns]
+
     def where(self, **wanted: Hashable) -> list[Row]:
         """Return the rows with these values, in their order."""
-        names = tuple(sorted(wanted))
-        if names not in self._groups:
-            groups = self._groups[names] = {}
-            for row in self.rows:
-                groups.setdefault(tuple(row.get(name) for name in names), []).append(row)
-        return self._groups[names].get(tuple(wanted[name] for name in names), [])
+        return self.groups(*wanted).get(tuple(wanted.values()), [])
 
     def values(self, column: str, **wanted: Hashable) -> list[Any]:
         """Return a column of those rows that have it."""
@@ -86,11 +89,6 @@ class ResultTable(Sequence[Row]):
         """Return how much larger a metric is in the rows of ``first`` than in those of ``second``.
 
         Rows are paired by their seed; None where one of both was not measured.
-
-        Raises
-        ------
-        ValueError
-            They do not have the same seeds.
         """
         one, other = (
             {row[pair]: row[metric] for row in self.where(**wanted) if metric in row}
@@ -124,23 +122,9 @@ def run_experiment(
     made again, and each that is made is added to it at once, so that an experiment that was
     interrupted goes on where it was.
 
-    Parameters
-    ----------
-    task
-        Makes the numbers of a job, plain data by name; a function of a module.
-    workers
-        As for :func:`.workers_for`.
-    store, fresh
-        File of the runs, and whether those that it holds are thrown away.
-    report
-        Receives messages; with None there is no progress line either.
-
-    Raises
-    ------
-    JobError
-        A run raised an exception.
-    RuntimeError
-        Another process writes to the file.
+    ``task``, a function of a module, makes the numbers of a job, plain data by name; ``workers``
+    are those of :func:`.workers_for`; ``store`` is the file, with ``fresh`` emptied before;
+    ``report`` receives messages, with None there is no progress line either.
     """
     if store is None:
         jobs = [run.job for run in runs]

@@ -99,20 +99,9 @@ def run_loop(
 ) -> Record:
     """Return the record of a driver and a robot; equal arguments give equal records, bit for bit.
 
-    The columns of the reference are the caller's.
-
-    Parameters
-    ----------
-    robot, driver
-        New ones.
-    periods
-        How many, :data:`RATE` a second.
-    start, pauses
-        Time until which the driver is disabled, and times at which a person disables it, s.
-    links, seed
-        Faults of the reports on their way to the driver, and the seed of their numbers.
-    latency_ns
-        Time from the arrival of a report to the departure of the command.
+    Robot and driver are new; the columns of the reference are the caller's. The driver is disabled
+    until ``start``, and in the ``pauses`` (s) of a person. ``links`` and their ``seed`` are those
+    of the reports; ``latency_ns`` is from the arrival of a report to the departure of the command.
     """
     reports = ReportLink(links, seed, periods / RATE)
     paused = [(0.0, start), *pauses]

@@ -3,7 +3,6 @@
 """Table of compared methods: the baselines, and the proposed controller with its ablations."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 
@@ -92,16 +91,6 @@ the wheel speeds. The compensator is that of the yaw error (E21), with the autho
 without the body correction, neither acts."""
 
 
-@dataclass(frozen=True, slots=True)
-class ComparedMethod(MethodSpec):
-    """A compared method with its class in the tables."""
-
-    baseline: bool = True
-    """Whether it is a baseline, not a stage of the proposed controller."""
-    preview: bool = False
-    """Whether it has preview."""
-
-
 def require_libraries(names: Iterable[str]) -> None:
     """Raise ModuleNotFoundError if one of these methods needs a library that is not installed."""
     if any(name.startswith(NMPC) for name in names):
@@ -188,44 +177,34 @@ def proposed_parameters() -> dict[str, Parameters]:
     return {'torque': torque, 'velocity': velocity}
 
 
-def methods(drive: str, store: TunedParameters | None = None) -> dict[str, ComparedMethod]:
+def methods(drive: str, store: TunedParameters | None = None) -> dict[str, MethodSpec]:
     """Return every compared method by name, with its tuned parameters.
 
-    Raises
-    ------
-    StoreError
-        A method was not tuned in this drive, what is stored does not fit it any more, or the
-        methods were not tuned with equal effort.
+    StoreError: a method was not tuned in this drive, what is stored does not fit it any more, or
+    the methods were not tuned with equal effort.
     """
     tuned = TunedParameters.load(PACKAGED_FILE) if store is None else store
     tuned.check_equal()
-    found: dict[str, ComparedMethod] = {}
+    found: dict[str, MethodSpec] = {}
     for each in method_definitions():
         parameters = tuned.applied(each.name, drive, each.start[drive])
         if each.name == FULL:
             found |= _proposed_methods(parameters)
             continue
-        previews = bool(each.controller_type.preview)
-        found[each.name] = ComparedMethod(
-            each.name, each.controller_type, parameters, True, True, previews
-        )
+        found[each.name] = MethodSpec(each.name, each.controller_type, parameters, True)
     for name in ('linear MPC preview', NMPC):
         if name in found:
             wrong, exact = found[name], f'{name}{EXACT_MODEL}'
             parameters = wrong.parameters.with_values({'model_error': 1.0})
-            found[exact] = ComparedMethod(
-                exact, wrong.controller_type, parameters, True, True, True
-            )
+            found[exact] = MethodSpec(exact, wrong.controller_type, parameters, True)
     return found
 
 
-def _proposed_methods(full: Parameters) -> dict[str, ComparedMethod]:
-    found = {}
-    for name, changes in {**STAGES, **WITHOUT}.items():
-        parameters = full.with_values(changes)
-        previews = parameters.to_dict()['jump_transition.preview'] is True
-        found[name] = ComparedMethod(name, ProposedController, parameters, True, False, previews)
-    return found
+def _proposed_methods(full: Parameters) -> dict[str, MethodSpec]:
+    return {
+        name: MethodSpec(name, ProposedController, full.with_values(changes), True, baseline=False)
+        for name, changes in {**STAGES, **WITHOUT}.items()
+    }
 
 
 @cache
@@ -248,7 +227,7 @@ def feed_forward_parameters(robot: str) -> FeedForwardParameters:
 
 
 def _twin_methods(
-    table: Mapping[str, ComparedMethod], forward: MethodSpec
+    table: Mapping[str, MethodSpec], forward: MethodSpec
 ) -> Mapping[str, MethodSpec | NodeMethod]:
     """Return the methods on the twin.
 

@@ -69,11 +69,6 @@ class ProposedController(BaselineController):
         self.terms = self._tracker.law.terms
         """The law's terms of the last step, rows as in ``TERM_NAMES``, rad/s², shape (5, 2)."""
 
-    @property
-    def skill(self) -> Array:
-        """Skill of the predictor in the middle of its horizon, shape (2,)."""
-        return self._tracker.law.predictive.skill
-
     def get_weights(self) -> dict[str, Array]:
         """Return fuzzy coefficients and predictor weights, as a model file keeps them."""
         return self._tracker.law.get_weights()

@@ -76,6 +76,10 @@ class SampledReference:
     switched: NDArray[np.bool_]
     """Whether this is the first sample of a new mode, shape (n + m,)"""
 
+    def __post_init__(self) -> None:
+        for values in (self.time, self.speeds, self.rate, self.modes, self.switched):
+            values.setflags(write=False)
+
 
 class PlantSource(Protocol):
     """A plant of a script, as plain data."""
@@ -126,26 +130,19 @@ class Scenario:
     Two scenarios with the same robot and seed have the same reference, and the same numbers drawn
     for disturbance and noise, whatever else differs: methods and cases are compared pair by pair.
 
-    Parameters
-    ----------
-    robot, case, seed
-        One of :data:`ROBOTS`, one of its cases, and the seed of reference and robot.
-    duration
-        s; the twin stands for the first 1.5 s.
-    noise
-        Variance of the measured wheel speeds, (rad/s)², which every method knows.
-    gyro
-        Whether the baselines take the yaw rate from the odometry with its gyro in every case.
-    own
-        Parts of a script.
     """
 
     robot: str
+    """One of :data:`ROBOTS`."""
     case: str
     seed: int
+    """Of reference and robot."""
     duration: float = 60.0
+    """s; the twin stands for the first 1.5 s."""
     noise: float = 0.04
+    """Variance of the measured wheel speeds, (rad/s)², which every method knows."""
     gyro: bool = False
+    """Whether the baselines take the yaw rate from the odometry with its gyro in every case."""
     own: OwnParts = NO_PARTS
 
     def __post_init__(self) -> None:
@@ -242,19 +239,9 @@ class Scenario:
             acceleration = isotropic_acceleration(self.limits, robot.geometry)
         return NominalModel(self.kind.drive, 1.0 / RATE, robot.drive.lag, acceleration, robot)
 
-    def preview_rows(self, dead_time: float) -> int:
-        """Return how many periods of the reference preview gives, from the dead time (s) on."""
-        return self.kind.preview_rows(dead_time)
-
     def true_robot(self) -> PaperRobotParameters:
         """Return the true robot, as it is when the run begins."""
         return self.kind.true_robot(self).with_values(self.own.robot_parameters)
-
-    def stated_gyro_tolerance(self) -> float:
-        """Return the relative scale error of the gyro that the twin states."""
-        robot = self.true_robot()
-        assert isinstance(robot, DigitalTwinParameters)
-        return max(robot.odometry.gyro_scale_tolerance, robot.imu.gyro_scale_error)
 
     def simulation(self) -> SimulatedRobot:
         """Return the robot of a new run."""
@@ -283,13 +270,7 @@ class RobotKind:
         return ReferenceParameters.from_dict({'rate': RATE, 'amplitude': amplitude, 'seed': seed})
 
     def controller_parameters(self, scenario: Scenario) -> ControllerParameters:
-        """Return the parameters of the controller of the node.
-
-        Raises
-        ------
-        ValueError
-            The robot has no pose, which that controller needs.
-        """
+        """Return the parameters of the controller of the node, which needs a robot with a pose."""
         raise ValueError(f'the controller of the node drives the twin alone: got {scenario}')
 
     def limits(self, scenario: Scenario) -> LimitParameters:
@@ -309,7 +290,7 @@ class RobotKind:
         return SpeedFilterParameters.from_dict({'noise_variance': float(scenario.noise), **values})
 
     def preview_rows(self, dead_time: float) -> int:
-        """Return how many periods of the reference preview gives."""
+        """Return how many periods of the reference preview gives, from the dead time (s) on."""
         return round(LEAD * RATE)
 
     def true_robot(self, scenario: Scenario) -> PaperRobotParameters:
@@ -370,10 +351,13 @@ class TwinKind(RobotKind):
         """Return the parameters of the controller node for the twin, with the known values."""
         dead_time = scenario.parts.changes.get('drive.dead_time') if scenario.parts.known else None
         values = {} if dead_time is None else {'speed_filter.dead_time': dead_time}
+        robot = scenario.true_robot()
+        assert isinstance(robot, DigitalTwinParameters)
+        stated = max(robot.odometry.gyro_scale_tolerance, robot.imu.gyro_scale_error)
         return StepperControllerParameters().with_values(
             {
                 'speed_filter.noise_variance': float(scenario.noise),
-                'body.gyro_scale_tolerance': scenario.stated_gyro_tolerance(),
+                'body.gyro_scale_tolerance': stated,
                 **values,
             }
         )
@@ -462,22 +446,14 @@ KINDS: Mapping[str, RobotKind] = {
 def sample_reference(parameters: ReferenceParameters, rows: int) -> SampledReference:
     """Return the first ``rows`` samples of a reference; its rate must be :data:`RATE`."""
     chaos = ChaoticReference(parameters, WheelGeometry())
-    run = SampledReference(
+    samples = [chaos.advance() for _ in range(rows)]
+    return SampledReference(
         time=np.arange(rows) / RATE,
-        speeds=np.empty((rows, 2)),
-        rate=np.empty((rows, 2)),
-        modes=np.empty(rows, dtype=np.int64),
-        switched=np.empty(rows, dtype=np.bool_),
+        speeds=np.array([sample.wheels for sample in samples]),
+        rate=np.array([sample.rate for sample in samples]),
+        modes=np.array([sample.mode for sample in samples], dtype=np.int64),
+        switched=np.array([sample.switched for sample in samples], dtype=np.bool_),
     )
-    for k in range(rows):
-        sample = chaos.advance()
-        run.speeds[k] = sample.wheels
-        run.rate[k] = sample.rate
-        run.modes[k] = sample.mode
-        run.switched[k] = sample.switched
-    for values in (run.time, run.speeds, run.rate, run.modes, run.switched):
-        values.setflags(write=False)
-    return run
 
 
 def sampled_speeds(speeds: Array) -> SampledReference:

@@ -3,7 +3,7 @@
 """Faults of the links between robot and controller: messages that are lost or late."""
 
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 
@@ -43,24 +43,12 @@ JITTER = LinkFaults(command_delay=(0.0, 0.02), odometry_delay=(0.0, 0.01))
 OVERLOAD = LinkFaults(
     command_delay=(0.02, 0.12), odometry_delay=(0.02, 0.12), begin=0.5, lasting=4.0
 )
-LINK_TEXTS: Mapping[LinkFaults, str] = {
-    DROPOUTS: '10 % of the commands and 10 % of the measurements are lost',
-    JITTER: 'each command is up to 20 ms late, and each measurement up to 10 ms',
-    OVERLOAD: 'for 4 s from half of the run on, each command and each measurement is 20 to 120 ms '
-    'late',
-}
-"""What these faults are, in words."""
 
 
 class ReportLink:
     """Reports of a robot on their way to the driver; they arrive in order.
 
-    Parameters
-    ----------
-    faults, seed
-        What is lost or late; equal seeds draw equal numbers, whatever is sent.
-    duration
-        Of the run, s.
+    Equal seeds draw equal numbers, whatever is sent; ``duration`` is that of the run, s.
     """
 
     def __init__(self, faults: LinkFaults, seed: int, duration: float) -> None:

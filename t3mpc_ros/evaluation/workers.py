@@ -40,13 +40,8 @@ class JobError(RuntimeError):
 class WorkerPool:
     """Executor that runs jobs, kept warm from one batch to the next.
 
-    Jobs share nothing, so results do not depend on who works. To be used in a ``with`` statement.
-
-    Parameters
-    ----------
-    workers
-        How many processes of this machine; one is this process itself. Or an executor, here or on
-        other machines, which the caller ends.
+    Jobs share nothing, so results do not depend on who works. ``workers`` are so many processes of
+    this machine, one is this process itself; or an executor, which the caller ends.
     """
 
     def __init__(self, workers: int | Executor) -> None:
@@ -73,12 +68,8 @@ class WorkerPool:
     def map(self, task: Callable[[Any], T], jobs: Iterable[Any]) -> Iterator[tuple[int, T]]:
         """Yield (index of the job, ``task`` of it) as the jobs are finished.
 
-        ``task`` is a function of a module.
-
-        Raises
-        ------
-        JobError
-            A run raised an exception; the jobs not begun are dropped.
+        ``task`` is a function of a module. JobError: it raised an exception; the jobs not begun
+        are dropped.
         """
         if self._pool is None:
             for index, job in enumerate(jobs):
@@ -146,11 +137,6 @@ def workers_for(executor: Any, jobs: Sequence[Any]) -> int | Executor:
     ``executor`` is one, a Dask client, a number of processes, or None for one on each processor.
     One run, and runs of an interactive session, which other processes cannot import, are made
     in this process unless an executor is given.
-
-    Raises
-    ------
-    ValueError
-        It is no executor, or the runs cannot be sent to other processes.
     """
     if isinstance(executor, Executor):
         return executor

@@ -528,13 +528,6 @@ def test_what_does_not_fit_the_loop_is_refused(monkeypatch):
     ):
         MethodSpec('P', Proportional, scenario.limits)
 
-    class Scalar(Proportional):
-        def step(self, observation):
-            return np.zeros(3)
-
-    with pytest.raises(ValueError, match=r'shape \(2,\), .*: got shape \(3,\)'):
-        noted(Scalar, scenario)
-
 
 # -- many runs --------------------------------------------------------------------------------
 
@@ -704,17 +697,3 @@ def test_a_method_that_does_not_learn_needs_no_pretraining():
         MethodSpec('P', Proportional, ProportionalParameters(), True)(nominal_model).get_weights()
         == {}
     )
-
-
-class Listing(Proportional):
-    """A method that returns a list."""
-
-    def step(self, observation):
-        return super().step(observation).tolist()
-
-
-def test_a_method_that_returns_a_list_gets_a_clear_error():
-    """It ended in ``'list' object has no attribute 'tolist'``."""
-    method = MethodSpec('listing', Listing, ProportionalParameters())
-    with pytest.raises(ValueError, match=r'step\(\) of Listing must return a numpy array .* \['):
-        run(Scenario('servo', 'nominal', 5, 1.0, noise=0.0), method)

@@ -213,7 +213,7 @@ def test_a_random_predictor_has_no_skill_and_the_taught_one_has():
             scenario.nominal_model(),
         )
         run(scenario, MadeMethod(method))
-        skills[random] = method.skill
+        skills[random] = method._tracker.law.predictive.skill
     assert skills[False].min() > 0.5
     assert skills[True].max() < 0.0
 

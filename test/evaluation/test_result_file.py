@@ -126,7 +126,6 @@ def test_digests_differ_by_each_part_of_a_method():
         'parameters': method.parameters.with_values({'gain': 7.0}),
         'pretrained': False,
         'baseline': False,
-        'preview': True,
     }
     assert {*changes} == {*method.__dataclass_fields__}
     found = [digest(method)]

@@ -150,13 +150,7 @@ def compare(
 def make_plan(
     controllers: Any, seeds: Iterable[int], cases: str | Sequence[str], scenario: Scenario
 ) -> ComparisonPlan:
-    """Return what is compared with the first of some controllers.
-
-    Raises
-    ------
-    ValueError
-        An unknown name, a bad seed, or two controllers of one name.
-    """
+    """Return what is compared with the first of some controllers."""
     methods = [each.method(scenario.robot) for each in as_controllers(controllers)]
     names = [method.name for method in methods]
     if repeated := sorted({name for name in names if names.count(name) > 1}):

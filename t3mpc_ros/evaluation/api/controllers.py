@@ -89,13 +89,7 @@ class Controller:
 
 
 def loaded(spec: str) -> Any:
-    """Return the class, function or object that ``file.py:Name`` is.
-
-    Raises
-    ------
-    ScriptError
-        There is no such file or name, or the file cannot be run.
-    """
+    """Return the class, function or object that ``file.py:Name`` is."""
     if FILE_SEPARATOR not in spec:
         raise ScriptError(f'must be FILE.py:NAME: got {spec}')
     return FileController.load(spec).resolve()
@@ -281,13 +275,7 @@ class OwnController(BaselineController):
         self._steps = 0
 
     def step(self, observation: Observation) -> Array:
-        """Return u, rad/s², shape (2,).
-
-        Raises
-        ------
-        ScriptError
-            The step raised an error, or returned something else.
-        """
+        """Return u, rad/s², shape (2,)."""
         try:
             asked = self._step(observation)
         except Exception as error:

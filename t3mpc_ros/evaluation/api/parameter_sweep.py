@@ -23,6 +23,7 @@ from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.experiment import (
     Report,
+    ResultTable,
     Run,
     digest,
     measured_run,
@@ -71,19 +72,11 @@ class Sweep:
         """Return a metric in Markdown: mean and 95 % interval over the seeds of each cell."""
         chosen = find_metric(metric)
         names = ('controller', *self.parameters, 'case')
-        cells: dict[tuple[Any, ...], list[float]] = {}
-        for row in self.rows:
-            cells.setdefault(tuple(row[n] for n in names), []).append(
-                row.get(chosen.name, math.nan)
-            )
-        lines = [
-            (
-                *(str(value) for value in cell),
-                str(len(values)),
-                format_interval(mean(values), interval(values), '', chosen.digits),
-            )
-            for cell, values in cells.items()
-        ]
+        lines = []
+        for cell, rows in ResultTable(self.rows).groups(*names).items():
+            values = [row.get(chosen.name, math.nan) for row in rows]
+            text = format_interval(mean(values), interval(values), '', chosen.digits)
+            lines.append((*map(str, cell), str(len(values)), text))
         head = (*names, 'seeds', f'{chosen.heading}, {chosen.unit}')
         return Table('', head, lines, text=1 + len(self.parameters) + 1).markdown()
 
@@ -102,10 +95,10 @@ class Sweep:
 
         (name,) = find_names('parameter', [parameter], self.parameters)
         wanted = find_metric(metric)
-        lines: dict[str, dict[float, list[float]]] = {}
-        for row in self.rows:
-            line = lines.setdefault(str(row['controller']), {})
-            line.setdefault(row[name], []).append(row.get(wanted.name, math.nan))
+        lines: dict[str, dict[Any, list[float]]] = {}
+        for (line, value), rows in ResultTable(self.rows).groups('controller', name).items():
+            numbers = [row.get(wanted.name, math.nan) for row in rows]
+            lines.setdefault(str(line), {})[value] = numbers
         label = f'{wanted.heading} / ({wanted.unit})'
         return drawn(lambda: sweep_figure(lines, name, label), path)
 

@@ -4,6 +4,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 import math
 from typing import Any
 
@@ -134,9 +135,47 @@ class OdePlant:
         """Name in errors."""
         return str(getattr(self.right_hand_side, '__name__', 'right_hand_side'))
 
-    def simulation(self) -> 'OdeSimulation':
+    def simulation(self) -> 'OwnSimulation':
         """Return the plant at its start, after one call of each function."""
-        return OdeSimulation(self)
+        advanced = partial(self._advanced, plant_parameters(self).step)
+        found = OwnSimulation(self, self.states, advanced, self._wheels)
+        self._slope(0.0, found.state, np.zeros(2))
+        self._wheels(0.0, found.state)
+        return found
+
+    def _advanced(self, h: float, t: float, x: Array, u: Array) -> Array:
+        first = self._slope(t, x, u)
+        second = self._slope(t + 0.5 * h, x + 0.5 * h * first, u)
+        third = self._slope(t + 0.5 * h, x + 0.5 * h * second, u)
+        fourth = self._slope(t + h, x + h * third, u)
+        found: Array = x + h / 6.0 * (first + 2.0 * (second + third) + fourth)
+        return found
+
+    def _slope(self, time: float, state: Array, u: Array) -> Array:
+        found = _called(time, 'right_hand_side', self.right_hand_side, time, state, u)
+        if found.shape != state.shape:
+            raise ScriptError(
+                f'{self.name} must return {state.size} numbers, one for each state: got the shape '
+                f'{found.shape}'
+            )
+        return found
+
+    def _wheels(self, time: float, state: Array) -> Array:
+        if self.output is None:
+            return state[:2]
+        found = _called(time, 'output', self.output, state)
+        if found.shape != (2,):
+            raise ScriptError(f'output must return two wheel speeds: got the shape {found.shape}')
+        return found
+
+
+def _called(time: float, what: str, function: Callable[..., Any], *arguments: Any) -> Array:
+    try:
+        return np.asarray(function(*arguments), dtype=np.float64)
+    except Exception as error:
+        raise ScriptError(
+            f'{what} of the plant raised {described(error)}, at {time:.3f} s'
+        ) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,23 +223,47 @@ class StateSpace:
         """Name in errors."""
         return 'state space'
 
-    def simulation(self) -> 'LinearSimulation':
+    def simulation(self) -> 'OwnSimulation':
         """Return the plant at its start."""
-        return LinearSimulation(self)
+        a, b, output = self.matrices()
+        size = len(a)
+        both = np.zeros((size + 2, size + 2))
+        both[:size] = np.hstack([a, b]) * plant_parameters(self).step
+        held = matrix_exponential(both)
+        transition, driven = held[:size, :size], held[:size, size:]
+        return OwnSimulation(
+            self, size, lambda _, x, u: transition @ x + driven @ u, lambda _, x: output @ x
+        )
+
+
+def plant_parameters(plant: OdePlant | StateSpace) -> PaperRobotParameters:
+    """Return the parameters of the robot that controllers assume of a plant."""
+    if plant.drive not in DRIVES:
+        raise ScriptError(f'drive must be one of {", ".join(DRIVES)}: got {plant.drive!r}')
+    return plant.robot.plant_parameters(plant.drive)
 
 
 class OwnSimulation:
-    """State of a plant of one's own, behind its dead time."""
+    """State of a plant of one's own, behind its dead time.
 
-    def __init__(self, plant: OdePlant | StateSpace, size: int) -> None:
-        if plant.drive not in DRIVES:
-            raise ScriptError(f'drive must be one of {", ".join(DRIVES)}: got {plant.drive!r}')
+    ``advanced`` gets time (s), state and u, and returns the state a step later; ``output`` gets
+    time and state, and returns the wheel speeds (rad/s).
+    """
+
+    def __init__(
+        self,
+        plant: OdePlant | StateSpace,
+        size: int,
+        advanced: Callable[[float, Array, Array], Array],
+        output: Callable[[float, Array], Array],
+    ) -> None:
+        self._advanced, self._output = advanced, output
         self.state = np.zeros(size)
         if plant.initial is not None:
             self.state = numbers('initial', plant.initial, f'({size},)')
         if self.state.shape != (size,):
             raise ScriptError(f'initial must have the shape ({size},): got {self.state.shape}')
-        parameters = plant.robot.plant_parameters(plant.drive)
+        parameters = plant_parameters(plant)
         self.step = parameters.step
         delay = parameters.drive.dead_time if plant.drive == 'velocity' else 0.0
         self._waiting = [np.zeros(2)] * round(delay / self.step)
@@ -216,7 +279,8 @@ class OwnSimulation:
         """Wheel speeds, rad/s, right first; NaN once the state is not finite."""
         if not np.isfinite(self.state).all():
             return math.nan, math.nan
-        return self._wheels()
+        right, left = self._output(self.time, self.state).tolist()
+        return right, left
 
     def configure(self, parameters: PaperRobotParameters) -> None:
         """Keep the plant: it has no parameters of the package's robot."""
@@ -228,85 +292,13 @@ class OwnSimulation:
             for _ in range(count):
                 self._waiting.append(sent)
                 if np.isfinite(self.state).all():
-                    self.state = self._advanced(self._waiting[0])
+                    self.state = self._advanced(self.time, self.state, self._waiting[0])
                 del self._waiting[0]
                 self._steps += 1
 
     def measure(self, dt: float) -> tuple[float, float]:
         """Return the wheel speeds, rad/s: the noise is added outside."""
         return self.wheels
-
-    def _wheels(self) -> tuple[float, float]:
-        raise NotImplementedError
-
-    def _advanced(self, u: Array) -> Array:
-        raise NotImplementedError
-
-
-class OdeSimulation(OwnSimulation):
-    """State of an :class:`OdePlant`."""
-
-    def __init__(self, plant: OdePlant) -> None:
-        super().__init__(plant, plant.states)
-        self._plant = plant
-        self._slope(0.0, self.state, np.zeros(2))
-        self._wheels()
-
-    def _advanced(self, u: Array) -> Array:
-        t, h, x = self.time, self.step, self.state
-        first = self._slope(t, x, u)
-        second = self._slope(t + 0.5 * h, x + 0.5 * h * first, u)
-        third = self._slope(t + 0.5 * h, x + 0.5 * h * second, u)
-        fourth = self._slope(t + h, x + h * third, u)
-        found: Array = x + h / 6.0 * (first + 2.0 * (second + third) + fourth)
-        return found
-
-    def _slope(self, time: float, state: Array, u: Array) -> Array:
-        found = self._called('right_hand_side', self._plant.right_hand_side, time, state, u)
-        if found.shape != state.shape:
-            raise ScriptError(
-                f'{self._plant.name} must return {state.size} numbers, one for each state: got '
-                f'the shape {found.shape}'
-            )
-        return found
-
-    def _wheels(self) -> tuple[float, float]:
-        if self._plant.output is None:
-            right, left = self.state[:2].tolist()
-            return right, left
-        found = self._called('output', self._plant.output, self.state)
-        if found.shape != (2,):
-            raise ScriptError(f'output must return two wheel speeds: got the shape {found.shape}')
-        return float(found[0]), float(found[1])
-
-    def _called(self, what: str, function: Callable[..., Any], *arguments: Any) -> Array:
-        try:
-            return np.asarray(function(*arguments), dtype=np.float64)
-        except Exception as error:
-            raise ScriptError(
-                f'{what} of the plant raised {described(error)}, at {self.time:.3f} s'
-            ) from None
-
-
-class LinearSimulation(OwnSimulation):
-    """State of a :class:`StateSpace` plant."""
-
-    def __init__(self, plant: StateSpace) -> None:
-        a, b, self._output = plant.matrices()
-        size = len(a)
-        super().__init__(plant, size)
-        both = np.zeros((size + 2, size + 2))
-        both[:size] = np.hstack([a, b]) * self.step
-        held = matrix_exponential(both)
-        self._transition, self._input = held[:size, :size], held[:size, size:]
-
-    def _advanced(self, u: Array) -> Array:
-        found: Array = self._transition @ self.state + self._input @ u
-        return found
-
-    def _wheels(self) -> tuple[float, float]:
-        right, left = (self._output @ self.state).tolist()
-        return right, left
 
 
 @dataclass(frozen=True)
@@ -340,26 +332,14 @@ class NoiseLaw:
 
 
 class LawNoise:
-    """Noise drawn by a law.
-
-    Parameters
-    ----------
-    law, seed
-        The law, and the seed of its generator.
-    """
+    """Noise drawn by a law."""
 
     def __init__(self, law: NoiseLaw, seed: int) -> None:
         self._law = law
         self._generator = np.random.default_rng((seed, 5))
 
     def measure(self, wheels: WheelSpeeds, time: float) -> WheelSpeeds:
-        """Return wheel speeds (rad/s) with noise at a time (s).
-
-        Raises
-        ------
-        ScriptError
-            The law raised an exception, or returned something else than two finite numbers.
-        """
+        """Return wheel speeds (rad/s) with noise at a time (s)."""
         time, true = round(time, 9), np.array(wheels)  # a law may compare the time
         try:
             noise = np.asarray(self._law.draw(self._generator, time, true), dtype=np.float64)

@@ -102,18 +102,8 @@ def _natural_spline(knots: Array, values: Array, at: Array) -> Array:
     return found
 
 
-Source = ArrayLike | str | os.PathLike[str] | Waypoints | Callable[[float], Any]
-"""What can be given as a reference."""
-
-
 def sampled(source: Any, duration: float, geometry: WheelGeometry) -> SampledReference:
-    """Return a reference of one's own, sampled for ``duration`` seconds and one more.
-
-    Raises
-    ------
-    ScriptError
-        It has another shape, or a number that is not finite.
-    """
+    """Return a reference of one's own, sampled for ``duration`` seconds and one more."""
     rows = round(duration * RATE) + round(RATE)
     time = np.arange(rows) / RATE
     if isinstance(source, Waypoints):
@@ -126,10 +116,7 @@ def sampled(source: Any, duration: float, geometry: WheelGeometry) -> SampledRef
         speeds = _held(numbers('reference', source, '(n, 2)'), rows)
     switched = jumps(speeds)
     modes = np.cumsum(switched, dtype=np.int64)
-    found = SampledReference(time, speeds, _slopes(speeds, switched), modes, switched)
-    for values in (found.time, found.speeds, found.rate, found.modes, found.switched):
-        values.setflags(write=False)
-    return found
+    return SampledReference(time, speeds, _slopes(speeds, switched), modes, switched)
 
 
 def numbers(name: str, given: Any, shape: str) -> Array:

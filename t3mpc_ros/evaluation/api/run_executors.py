@@ -11,15 +11,7 @@ from t3mpc_ros.evaluation.api.script_error import ScriptError
 
 @contextmanager
 def cluster(address: str, timeout: float = 10.0) -> Iterator[Executor]:
-    """Enter the executor of a Dask scheduler at an address, tcp://HOST:PORT.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        dask.distributed is not installed.
-    ScriptError
-        No scheduler answers within ``timeout`` s.
-    """
+    """Enter the executor of a Dask scheduler, tcp://HOST:PORT, that answers within some s."""
     import distributed
 
     try:

@@ -58,7 +58,7 @@ class RunResult:
     @property
     def error(self) -> Array:
         """True wheel speeds less the reference, rad/s, shape (n, 2)."""
-        return _pair(self.columns, 'speed') - _pair(self.columns, 'reference')
+        return self.record.error
 
     @one_sentence
     def rmse(self, after: float = START) -> float:
@@ -162,25 +162,15 @@ def simulate(
 
 
 def _columns(record: Record) -> dict[str, Array]:
-    arrays = {
-        'reference': record.reference,
-        'measured': record['measured'],
-        'speed': record.speeds,
-        'command': record['sent'],
+    names = {
+        'reference': 'reference',
+        'measured': 'measured',
+        'speed': 'speeds',
+        'command': 'sent',
     }
-    found = {'time': record.time} | _sides(arrays)
+    found = {'time': record.time}
+    for name, column in names.items():
+        found |= {f'{name}_{side}': record[column][:, i] for i, side in enumerate(SIDES)}
     if 'truth' in record.columns:
         found |= {name: record['truth'][:, i] for i, name in enumerate(('x', 'y', 'yaw'))}
     return found
-
-
-def _sides(arrays: Mapping[str, Array]) -> dict[str, Array]:
-    return {
-        f'{name}_{side}': values[:, i]
-        for name, values in arrays.items()
-        for i, side in enumerate(SIDES)
-    }
-
-
-def _pair(columns: Mapping[str, Array], name: str) -> Array:
-    return np.column_stack([columns[f'{name}_{side}'] for side in SIDES])

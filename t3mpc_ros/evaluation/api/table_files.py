@@ -32,13 +32,7 @@ def write_csv(path: str | os.PathLike[str], columns: Columns) -> Path:
 def write_parquet(
     path: str | os.PathLike[str], columns: Columns, details: Mapping[str, str] | None = None
 ) -> Path:
-    """Write columns as one Parquet file, with version, commit and ``details`` in its metadata.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        pyarrow is not installed.
-    """
+    """Write columns as one Parquet file, with version, commit and ``details`` in its metadata."""
     import pyarrow
     import pyarrow.parquet
 

@@ -60,6 +60,10 @@ ALONE = (
 """The same of what is left out, and never added."""
 
 
+class NotMeasuredError(LookupError):
+    """A claim asks for runs that were not made."""
+
+
 class Finding(NamedTuple):
     """What the runs say about a claim."""
 
@@ -94,14 +98,16 @@ class Claim:
             return 'inconclusive' if self.inconclusive else 'not measured'
         return 'held' if self.held else 'not held'
 
-    def decided(self, finding: Finding | None, *, complete: bool) -> Self:
-        """Return the claim with its verdict; without a finding it was not measured.
+    def decided(self, find: Callable[[], Finding], *, complete: bool) -> Self:
+        """Return the claim with its verdict.
 
         With ``complete``, where as much was measured as the claim is about, its criterion decides.
         Otherwise the claim is inconclusive, unless all its parts are satisfied beyond doubt, one
         of them is not, or a run diverged.
         """
-        if finding is None:
+        try:
+            finding = find()
+        except NotMeasuredError:
             return self
         margins = finding.margins
         sure = (
@@ -125,18 +131,21 @@ class Claim:
         return found
 
 
-Query = Callable[..., Finding | None]
-"""Asks the runs about a claim; None where something was not measured."""
+Query = Callable[..., Finding]
+"""Asks the runs about a claim."""
 
 
 def all_claims(runs: ResultTable, estimated: Sequence[EstimationResult]) -> list[Claim]:
     """Return all claims with their verdicts: of this package, then of the paper."""
     complete = {*runs.unique('seed')} >= {*HELD_OUT_SEEDS}
     complete &= all(duration >= DURATION for duration in runs.unique('duration'))
-    found = [claim.decided(query(runs), complete=complete) for claim, query in definitions()]
+    found = [
+        claim.decided(partial(query, runs), complete=complete) for claim, query in definitions()
+    ]
     complete &= all(len(each.speed) >= ESTIMATION_SEEDS for each in estimated)
     return found + [
-        claim.decided(query(estimated), complete=complete) for claim, query in OF_ESTIMATION
+        claim.decided(partial(query, estimated), complete=complete)
+        for claim, query in OF_ESTIMATION
     ]
 
 
@@ -248,13 +257,11 @@ def _of_drives(
 
 def share_of_best(
     runs: ResultTable, drive: str, noise: float, limit: float, preview: bool | None = None
-) -> Finding | None:
+) -> Finding:
     """Compare RMSE with a share of the best baseline's."""
     full = by_seed(runs, FULL, drive, noise)
     others = baselines(runs, drive, noise, exact=False, preview=preview)
     best = best_of(others)
-    if full is None or best is None:
-        return None
     own, least = mean(full), mean(others[best])
     share = own / least
     text = f'{_rmse(own)} against {_rmse(least)} of {best}, the best of {len(others)}'
@@ -265,7 +272,7 @@ def share_of_best(
 
 def against_preview(
     runs: ResultTable, drive: str, cases: Sequence[str], *, exact: bool
-) -> Finding | None:
+) -> Finding:
     """Compare RMSE with that of the best baseline with preview, within the paired interval."""
     held, words, margins = True, [], []
     numbers: dict[str, object] = {}
@@ -273,8 +280,6 @@ def against_preview(
         full = by_seed(runs, FULL, drive, PAPER_NOISE, case)
         others = baselines(runs, drive, PAPER_NOISE, case, exact=exact, preview=True)
         best = best_of(others)
-        if full is None or best is None:
-            return None
         own, least = mean(full), mean(others[best])
         margins.append(margin := paired(others[best], full))
         half = margin.half if math.isfinite(margin.half) else 0.0
@@ -284,14 +289,10 @@ def against_preview(
     return Finding(held, '; '.join(words), numbers, margins)
 
 
-def lowers_rmse(
-    runs: ResultTable, first: str, second: str, drive: str, case: str
-) -> Finding | None:
+def lowers_rmse(runs: ResultTable, first: str, second: str, drive: str, case: str) -> Finding:
     """Compare two methods on the same seeds: the whole interval is below zero."""
     lower = by_seed(runs, first, drive, PAPER_NOISE, case)
     higher = by_seed(runs, second, drive, PAPER_NOISE, case)
-    if lower is None or higher is None:
-        return None
     margin = paired(higher, lower)
     difference, ci95 = paired(lower, higher)
     seeds = len(lower)
@@ -306,24 +307,19 @@ def lowers_rmse(
     )
 
 
-def no_larger_than_pi(runs: ResultTable, drive: str) -> Finding | None:
+def no_larger_than_pi(runs: ResultTable, drive: str) -> Finding:
     """Compare RMSE without noise with that of PI with feed-forward."""
     full = by_seed(runs, FULL, drive, 0.0)
     others = baselines(runs, drive, 0.0)
     pi = best_of({name: each for name, each in others.items() if re.match(r'(?i)pi\b', name)})
-    if full is None or pi is None:
-        return None
     own, other = mean(full), mean(others[pi])
     text = f'{_rmse(own)} against {_rmse(other)} of {pi}'
     return Finding(own <= other, text, {'full': own, 'pi': other}, [paired(others[pi], full)])
 
 
-def smallest_growth(runs: ResultTable, drive: str) -> Finding | None:
+def smallest_growth(runs: ResultTable, drive: str) -> Finding:
     """Compare what the noise adds to RMSE with what it adds to that of any baseline, in rad/s."""
-    others = growths(runs, drive)
-    full = others.pop(FULL, None)
-    if full is None or not others:
-        return None
+    full, others = growths(runs, drive)
     added = {name: each.last - each.first for name, each in others.items()}
     least = min(added, key=lambda name: added[name])
     own = full.last - full.first
@@ -335,32 +331,25 @@ def smallest_growth(runs: ResultTable, drive: str) -> Finding | None:
     )
 
 
-def settled_share(runs: ResultTable, drive: str, limit: float) -> Finding | None:
+def settled_share(runs: ResultTable, drive: str, limit: float) -> Finding:
     """Compare the settled RMSE without noise with a limit."""
     settled = by_seed(runs, FULL, drive, 0.0, column='settled')
-    if settled is None:
-        return None
     own = mean(settled)
     text = f'{_rmse(own)}, {100.0 * (own / REFERENCE_SPREAD):.1f} %'
     margins = [paired(np.full(settled.shape, limit), settled)]
     return Finding(own <= limit, text, {'settled': own, 'limit': limit}, margins)
 
 
-def grows_slightly(runs: ResultTable, drive: str) -> Finding | None:
+def grows_slightly(runs: ResultTable, drive: str) -> Finding:
     """Compare the growth of RMSE with noise with :data:`SLIGHTLY`."""
-    full = growths(runs, drive).get(FULL)
-    if full is None:
-        return None
+    full, _ = growths(runs, drive)
     growth, margin = full.share, paired(np.zeros(full.seeds), full.beyond(SLIGHTLY))
     return Finding(growth <= SLIGHTLY, f'{100 * growth:+.0f} %', {'growth': growth}, [margin])
 
 
-def others_grow(runs: ResultTable, drive: str) -> Finding | None:
+def others_grow(runs: ResultTable, drive: str) -> Finding:
     """Compare the growth of every baseline's RMSE with noise with half of it."""
-    others = growths(runs, drive)
-    others.pop(FULL, None)
-    if not others:
-        return None
+    _, others = growths(runs, drive)
     shares = {name: each.share for name, each in others.items()}
     low, high = (pick(shares, key=lambda name: shares[name]) for pick in (min, max))
     return Finding(
@@ -371,13 +360,13 @@ def others_grow(runs: ResultTable, drive: str) -> Finding | None:
     )
 
 
-def calm_control(runs: ResultTable, drive: str) -> Finding | None:
+def calm_control(runs: ResultTable, drive: str) -> Finding:
     """Compare the total variation of the effort with that of the median baseline."""
     full = by_seed(runs, FULL, drive, PAPER_NOISE, column='chatter')
     found = baselines(runs, drive, PAPER_NOISE, column='chatter')
     others = {name: each for name, each in found.items() if math.isfinite(mean(each))}
-    if full is None or not others:
-        return None
+    if not others:
+        raise NotMeasuredError
     own, means = mean(full), [mean(each) for each in others.values()]
     middle = median(means)
     return Finding(
@@ -396,10 +385,12 @@ def by_seed(
     noise: float,
     case: str = NOMINAL,
     column: str = 'rmse',
-) -> Array | None:
-    """Return a number of each seed, None when it was not measured."""
+) -> Array:
+    """Return a number of each seed."""
     found = runs.values(column, controller=controller, drive=drive, noise=noise, case=case)
-    return np.array(found) if found else None
+    if not found:
+        raise NotMeasuredError
+    return np.array(found)
 
 
 def baselines(
@@ -420,11 +411,13 @@ def baselines(
     return {name: np.array(values) for name, values in found.items()}
 
 
-def best_of(candidates: Mapping[str, Array]) -> str | None:
-    """Return the name with the smallest finite mean, None when there is none."""
+def best_of(candidates: Mapping[str, Array]) -> str:
+    """Return the name with the smallest finite mean."""
     means = {name: mean(values) for name, values in candidates.items()}
     known = [name for name in means if math.isfinite(means[name])]
-    return min(known, key=lambda name: means[name], default=None)
+    if not known:
+        raise NotMeasuredError
+    return min(known, key=lambda name: means[name])
 
 
 class Growth(NamedTuple):
@@ -453,19 +446,19 @@ class Growth(NamedTuple):
         return growth
 
 
-def growths(runs: ResultTable, drive: str) -> dict[str, Growth]:
-    """Return the growth of the baselines and of the full controller."""
+def growths(runs: ResultTable, drive: str) -> tuple[Growth, dict[str, Growth]]:
+    """Return the growth of the full controller, and of the baselines."""
     starts = baselines(runs, drive, 0.0, exact=False)
-    full = by_seed(runs, FULL, drive, 0.0)
-    if full is not None:
-        starts[FULL] = full
     found = {}
-    for name, first in starts.items():
+    for name, first in {**starts, FULL: by_seed(runs, FULL, drive, 0.0)}.items():
         last = by_seed(runs, name, drive, LOUDEST)
-        if last is not None and math.isfinite(mean(first)):
+        if math.isfinite(mean(first)):
             end = mean(last) if math.isfinite(mean(last)) else math.inf
             found[name] = Growth(mean(first), end, (first, last))
-    return found
+    full = found.pop(FULL, None)
+    if full is None or not found:
+        raise NotMeasuredError
+    return full, found
 
 
 def _rmse(value: float) -> str:
@@ -475,11 +468,9 @@ def _rmse(value: float) -> str:
 # -- the fuzzy system without a controller, (86) --------------------------------------------------
 
 
-def half_of_others(estimated: Sequence[EstimationResult]) -> Finding | None:
+def half_of_others(estimated: Sequence[EstimationResult]) -> Finding:
     """Compare type 3 at the paper's noise with half of the best of the others."""
     speeds = _estimated(estimated, (PAPER_NOISE,))
-    if speeds is None:
-        return None
     ours, *others = KINDS
     means = {kind: mean(speeds[kind, PAPER_NOISE]) for kind in KINDS}
     best = min(others, key=lambda kind: means[kind])
@@ -492,11 +483,9 @@ def half_of_others(estimated: Sequence[EstimationResult]) -> Finding | None:
     )
 
 
-def slight_growth(estimated: Sequence[EstimationResult]) -> Finding | None:
+def slight_growth(estimated: Sequence[EstimationResult]) -> Finding:
     """Compare the growth with noise of each kind."""
     speeds = _estimated(estimated, (0.0, LOUDEST))
-    if speeds is None:
-        return None
     ours, *others = KINDS
     ends = {kind: (speeds[kind, 0.0], speeds[kind, LOUDEST]) for kind in KINDS}
     grown = {kind: mean(last) / mean(first) - 1.0 for kind, (first, last) in ends.items()}
@@ -514,10 +503,12 @@ def slight_growth(estimated: Sequence[EstimationResult]) -> Finding | None:
 
 def _estimated(
     estimated: Sequence[EstimationResult], noises: Sequence[float]
-) -> dict[tuple[str, float], Array] | None:
-    """Return the RMSE of each seed by kind and noise, None when one was not measured."""
+) -> dict[tuple[str, float], Array]:
+    """Return the RMSE of each seed by kind and noise."""
     found = {(each.kind, each.noise_variance): np.array(each.speed) for each in estimated}
-    return found if {(kind, noise) for kind in KINDS for noise in noises} <= {*found} else None
+    if not {(kind, noise) for kind in KINDS for noise in noises} <= {*found}:
+        raise NotMeasuredError
+    return found
 
 
 OF_ESTIMATION: Sequence[tuple[Claim, Query]] = (

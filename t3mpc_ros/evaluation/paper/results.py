@@ -35,11 +35,8 @@ class Results:
     """
 
     def __init__(self, runs: ResultTable) -> None:
-        groups: dict[tuple[object, ...], list[Row]] = {}
-        for row in runs:
-            groups.setdefault(tuple(row[name] for name in _GROUP), []).append(row)
         self.runs = runs
-        self.means = ResultTable([_mean_row(rows) for rows in groups.values()])
+        self.means = ResultTable([_mean_row(rows) for rows in runs.groups(*_GROUP).values()])
         self.added = self._differences(list(zip(STAGES[1:], STAGES[:-1], strict=True)))
         self.lost = self._differences([(each, STAGES[-1]) for each in WITHOUT.values()])
 
@@ -72,9 +69,8 @@ class Results:
         return [row for row in rows if row['baseline'] or row['controller'] == FULL]
 
     def _differences(self, pairs: Sequence[tuple[str, str]]) -> ResultTable:
-        situations = dict.fromkeys(tuple(row[name] for name in SITUATION) for row in self.means)
         found = []
-        for values in situations:
+        for values in self.means.groups(*SITUATION):
             situation = dict(zip(SITUATION, values, strict=True))
             for first, second in pairs:
                 sides = ({'controller': name, **situation} for name in (first, second))

@@ -9,10 +9,11 @@ import math
 import numpy as np
 
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
+from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.experiment import Run, digest
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import STAGES as METHOD_STAGES
-from t3mpc_ros.evaluation.methods import ComparedMethod, methods
+from t3mpc_ros.evaluation.methods import methods
 from t3mpc_ros.evaluation.metrics import START
 from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, KINDS, PLANT_OF, Scenario
@@ -127,7 +128,7 @@ def study_scenario(drive: str, noise: float, case: str, seed: int, duration: flo
     return Scenario(PLANT_OF[drive], case, seed, duration, noise)
 
 
-def _situations(extent: Extent) -> Iterator[tuple[ComparedMethod, str, float, str]]:
+def _situations(extent: Extent) -> Iterator[tuple[MethodSpec, str, float, str]]:
     for drive in DRIVES:
         for case in extent.cases:
             if PLANT_OF[drive] not in CASES[case].robots:
@@ -138,7 +139,7 @@ def _situations(extent: Extent) -> Iterator[tuple[ComparedMethod, str, float, st
                         yield method, drive, noise, case
 
 
-def _noises(extent: Extent, method: ComparedMethod, case: str) -> tuple[float, ...]:
+def _noises(extent: Extent, method: MethodSpec, case: str) -> tuple[float, ...]:
     """Return the noises at which a method runs a case."""
     if method.name in WITHOUT.values():
         wanted = case == NOMINAL or case in INTENDED_CASES.get(method.name, ())
