@@ -15,6 +15,7 @@ from geometry_msgs.msg import PoseStamped, Quaternion, TransformStamped, Twist, 
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import Parameters, parameter
@@ -56,6 +57,11 @@ def time_from_ns(stamp_ns: int) -> Time:
 def ns_from_time(stamp: Time) -> int:
     """Return the stamp of a message in nanoseconds."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def header(stamp_ns: int, frame: str = '') -> Header:
+    """Return the header of a message."""
+    return Header(stamp=time_from_ns(stamp_ns), frame_id=frame)
 
 
 def quaternion_from_yaw(yaw: float) -> Quaternion:
@@ -112,8 +118,7 @@ class SerializedOdometry:
 
     def __init__(self, frame: str, child: str) -> None:
         self.frame, self.child = frame, child
-        message = Odometry(child_frame_id=child)
-        message.header.frame_id = frame
+        message = Odometry(header=header(0, frame), child_frame_id=child)
         self._data = bytearray(serialize_message(message))
         order, start = _layout(self._data)
         self._stamp = struct.Struct(f'{order}iI')
@@ -193,17 +198,12 @@ def twist_from_body(twist: BodyTwist) -> Twist:
 
 def stamped_twist(twist: BodyTwist, stamp_ns: int, frame: str) -> TwistStamped:
     """Return a command as a message with a header."""
-    message = TwistStamped(twist=twist_from_body(twist))
-    message.header.stamp = time_from_ns(stamp_ns)
-    message.header.frame_id = frame
-    return message
+    return TwistStamped(header=header(stamp_ns, frame), twist=twist_from_body(twist))
 
 
 def pose_stamped(state: State, frame: str) -> PoseStamped:
     """Return the pose of a state as a message."""
-    message = PoseStamped()
-    message.header.stamp = time_from_ns(state.stamp_ns)
-    message.header.frame_id = frame
+    message = PoseStamped(header=header(state.stamp_ns, frame))
     message.pose.position.x = state.pose.x
     message.pose.position.y = state.pose.y
     message.pose.orientation = quaternion_from_yaw(state.pose.yaw)
@@ -214,9 +214,7 @@ def transform(
     stamp_ns: int, pose: Pose, frame: str, child: str, z: float = 0.0
 ) -> TransformStamped:
     """Return a pose at height ``z`` (m) as a transform from ``frame`` to ``child``."""
-    message = TransformStamped(child_frame_id=child)
-    message.header.stamp = time_from_ns(stamp_ns)
-    message.header.frame_id = frame
+    message = TransformStamped(header=header(stamp_ns, frame), child_frame_id=child)
     message.transform.translation.x = pose.x
     message.transform.translation.y = pose.y
     message.transform.translation.z = z
@@ -228,11 +226,12 @@ def joint_state(
     names: Sequence[str], angles: Sequence[float], speeds: Sequence[float], stamp_ns: int
 ) -> JointState:
     """Return wheel angles (rad) and speeds (rad/s) as a message."""
-    message = JointState(
-        name=list(names), position=list(map(float, angles)), velocity=list(map(float, speeds))
+    return JointState(
+        header=header(stamp_ns),
+        name=list(names),
+        position=list(map(float, angles)),
+        velocity=list(map(float, speeds)),
     )
-    message.header.stamp = time_from_ns(stamp_ns)
-    return message
 
 
 def message_age_ns(info: dict[str, Any]) -> int:

@@ -238,10 +238,10 @@ class MatchingSubscription:
 
     def take_waiting(self) -> list[Any]:
         """Return the messages that wait in the queue."""
-        return take_waiting(self.subscription, raw=self._raw)
+        return take_waiting(self.subscription)
 
 
-def take_waiting(subscription: Subscription, *, raw: bool = False) -> list[Any]:
+def take_waiting(subscription: Subscription) -> list[Any]:
     """Return the messages that wait in the queue of a subscription.
 
     The executor takes one message of a subscription per cycle: a queue that has filled while it
@@ -251,7 +251,7 @@ def take_waiting(subscription: Subscription, *, raw: bool = False) -> list[Any]:
     handle = subscription.handle
     with handle:
         while len(messages) < subscription.qos_profile.depth:
-            if (item := handle.take_message(subscription.msg_type, raw)) is None:
+            if (item := handle.take_message(subscription.msg_type, subscription.raw)) is None:
                 break
             messages.append(item[0])
     return messages

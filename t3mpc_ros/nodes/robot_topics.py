@@ -244,8 +244,7 @@ def imu_message(parameters: ImuParameters, frame: str) -> Imu:
     the variance of an unknown. The other variances are those of noise and quantisation, without
     bias and scale error.
     """
-    message = Imu()
-    message.header.frame_id = frame
+    message = Imu(header=conversions.header(0, frame))
     message.orientation_covariance[0] = -1.0
     message.linear_acceleration.z = GRAVITY
     rate = _noise_variance(math.radians(parameters.gyro_noise), parameters.rate_step, parameters)
@@ -270,15 +269,14 @@ def fill_imu(message: Imu, sample: ImuSample, stamp_ns: int) -> Imu:
 
 def range_message(parameters: RangeSensorParameters, frame: str) -> Range:
     """Return a Range message with the limits of the sensor, without a distance."""
-    message = Range(
+    return Range(
+        header=conversions.header(0, frame),
         radiation_type=Range.INFRARED,
         field_of_view=parameters.field_of_view,
         min_range=parameters.minimum,
         max_range=parameters.maximum,
         range=math.nan,
     )
-    message.header.frame_id = frame
-    return message
 
 
 def fill_range(message: Range, distance: float, stamp_ns: int, *, infinity: bool) -> Range:

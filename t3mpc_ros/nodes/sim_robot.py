@@ -75,11 +75,6 @@ class SimRobotParameters(RobotTopicParameters, DigitalTwinParameters):
         """Initial pose in the world."""
         return Pose(self.initial_pose.x, self.initial_pose.y, self.initial_pose.yaw)
 
-    @property
-    def step_periods(self) -> int:
-        """Number of periods that ``~/step`` advances."""
-        return max(1, round(self.step_time * self.rate))
-
     def check_consistency(self) -> None:
         """Raise :class:`ParameterError` for a drive that the node or the settings cannot use.
 
@@ -228,7 +223,8 @@ class SimRobotNode(RobotNode[SimRobotParameters]):
             return 'publish_clock must be true at start for single steps: got false', ''
         if (factor := time.real_time_factor) != 0.0:
             return f'real_time_factor must be 0 for single steps: got {factor:g}', ''
-        self._advance(time.step(self.parameters.step_periods))
+        periods = max(1, round(self.parameters.step_time * self.parameters.rate))
+        self._advance(time.step(periods))
         return '', f'simulated time {self.now_ns() / NANOSECONDS:.9f} s'
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:

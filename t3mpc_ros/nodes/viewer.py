@@ -15,7 +15,7 @@ import math
 from queue import Empty, SimpleQueue
 import struct
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistStamped
@@ -72,14 +72,6 @@ class CommandFailedError(RuntimeError):
     """A command that was not executed; the text says why and what to do."""
 
 
-class _Source(NamedTuple):
-    """A subscription and the method that takes its messages."""
-
-    subscription: Subscription
-    take: Callable[[Any], None]
-    raw: bool
-
-
 class ViewNode(Node):
     """Collects samples, facts and reports of the robot in a namespace, and executes commands.
 
@@ -105,7 +97,7 @@ class ViewNode(Node):
         self._command_clients = {
             name: self.create_client(kind, service) for name, (kind, service) in SERVICES.items()
         }
-        self._sources: dict[str, _Source] = {}
+        self._polled: dict[str, Subscription] = {}
         self._subscribe_all()
         sink.set('terms', list(TERM_NAMES))
         sink.set('mounts', sensor_mounts(RangeSensorParameters()).tolist())
@@ -134,9 +126,9 @@ class ViewNode(Node):
 
     def poll(self) -> None:
         """Take the messages that wait, and start the commands that wait."""
-        for source in list(self._sources.values()):
-            for message in take_waiting(source.subscription, raw=source.raw):
-                source.take(message)
+        for subscription in list(self._polled.values()):
+            for message in take_waiting(subscription):
+                subscription.callback(message)
         self._add_collected('ranges', self._ranges)
         self._add_collected('terms', self._terms)
         with suppress(Empty):
@@ -184,10 +176,9 @@ class ViewNode(Node):
             reliability=ReliabilityPolicy.RELIABLE if latched else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        subscription = self.create_subscription(
+        self._polled[topic] = self.create_subscription(
             kind, topic, take, profile, callback_group=self._group, raw=raw
         )
-        self._sources[topic] = _Source(subscription, take, raw)
 
     def _seconds(self, stamp_ns: int) -> float:
         if self._origin_ns is None:
@@ -273,10 +264,10 @@ class ViewNode(Node):
         offered = {info.topic_type for info in self.get_publishers_info_by_topic(topic)}
         for kind in (TwistStamped, Twist):
             if offered == {f'geometry_msgs/msg/{kind.__name__}'}:
-                source = self._sources.get('cmd_vel')
-                if source is None or source.subscription.msg_type is not kind:
-                    if source is not None:
-                        self.destroy_subscription(source.subscription)
+                present = self._polled.get('cmd_vel')
+                if present is None or present.msg_type is not kind:
+                    if present is not None:
+                        self.destroy_subscription(present)
                     self._subscribe(kind, 'cmd_vel', self._on_command, depth=1)
 
     def _on_parameters(self, remote: RemoteParameters, rows: Sequence[Mapping[str, Any]]) -> None:

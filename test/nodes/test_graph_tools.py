@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Topics, parameters, services and e-stop without a ROS installation."""
 
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from itertools import islice
 
 import pytest
@@ -20,34 +20,23 @@ from t3mpc_ros.nodes.sim_robot import SimRobotNode
 class Asked:
     """Asks the graph in a thread while the harness spins its nodes."""
 
-    def __init__(self, harness):
-        self._harness = harness
-        self._node = Node('asking')
-        self._graph = Graph(self._node)
+    def __init__(self, harness, graph):
+        self._harness, self._graph = harness, graph
 
     def __call__(self, method, *arguments):
-        with ThreadPoolExecutor(1) as pool:
-            reply = pool.submit(getattr(self._graph, method), *arguments)
-            self._harness.spin_until(reply.done)
-        return reply.result()
+        return self._harness.in_thread(getattr(self._graph, method), *arguments)
 
     def messages(self, topic, count):
-        with ThreadPoolExecutor(1) as pool:
-            found = filter(None, self._graph.messages(topic))
-            reply = pool.submit(lambda: list(islice(found, count)))
-            self._harness.spin_until(reply.done)
-        return reply.result()
-
-    def close(self):
-        self._graph.close()
-        self._node.destroy_node()
+        found = filter(None, self._graph.messages(topic))
+        return self._harness.in_thread(lambda: list(islice(found, count)))
 
 
 @pytest.fixture
 def asked(harness):
-    asked = Asked(harness)
-    yield asked
-    asked.close()
+    node = Node('asking')
+    with closing(Graph(node)) as graph:
+        yield Asked(harness, graph)
+    node.destroy_node()
 
 
 @pytest.fixture

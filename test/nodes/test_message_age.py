@@ -65,9 +65,8 @@ def test_a_command_that_waited_does_not_move_sim_robot(harness, simulated_time):
 @pytest.mark.parametrize('kind', [Twist, TwistStamped])
 def test_a_command_that_waited_is_rejected_by_the_bridge(harness, tmp_path, kind):
     stamped = kind is TwistStamped
-    node = harness.add(
-        RadioBridgeNode, port=str(tmp_path / 'none'), enable_stamped_cmd_vel=stamped
-    )
+    given = {'port': str(tmp_path / 'none'), 'enable_stamped_cmd_vel': stamped}
+    node = harness.add(RadioBridgeNode, **given)
     commands = harness.connected_publisher(kind, 'cmd_vel')
     commands.publish(TwistStamped(twist=twist(0.3)) if stamped else twist(0.3))
     suspend()

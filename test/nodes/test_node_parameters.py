@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 from rclpy.parameter import Parameter
+from support.ros_graph import record
 import yaml
 
 from t3mpc_ros.nodes.controller import ControllerNode
-from t3mpc_ros.nodes.recorder.node import RecorderNode
 from t3mpc_ros.nodes.registry import INTERFACES, NODES, node_class, parameter_class
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 from t3mpc_ros.parameters.table import ParameterError
@@ -130,10 +130,8 @@ def test_inconsistent_parameters_are_rejected_with_the_reason(harness):
 
 def test_integers_and_empty_lists_are_accepted_at_start(harness, tmp_path):
     controller = harness.add(ControllerNode, ['-p', 'law.gain:=5', '-p', 'rate:=50'])
-    assert controller.parameters.law.gain == 5.0
-    assert controller.get_parameter('rate').value == 50.0
-    recorder = harness.add(RecorderNode, storage__uri=str(tmp_path), record__topics=[])
-    assert recorder.parameters.topics == ()
+    assert (controller.parameters.law.gain, controller.get_parameter('rate').value) == (5.0, 50.0)
+    assert record(harness, tmp_path).parameters.topics == ()
 
 
 def test_an_unknown_parameter_is_rejected_with_a_suggestion(harness):

@@ -15,6 +15,7 @@ from support.bag_messages import STORE
 from support.file_watch import no_file_left_open
 from support.object_state import state
 from support.other_parameters import with_other_value
+from support.ros_graph import diagnostic_level
 
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.chaos.pose_reference import PortraitSource
@@ -259,6 +260,10 @@ def test_each_reseed_of_a_path_has_its_fingerprint(start):
 # -- diagnostics ----------------------------------------------------------------------------------
 
 
+def report(node):
+    return node.produce_diagnostics()[:2]
+
+
 class Instead:
     """An object with some of its attributes replaced."""
 
@@ -272,24 +277,24 @@ class Instead:
 
 def test_levels_of_the_controller(start):
     node = start('controller')
-    assert node.produce_diagnostics()[:2] == (WARN, 'stopped: no odometry')
+    assert report(node) == (WARN, 'stopped: no odometry')
     node._steps = 1
     controller = node._controller
     for reason in Reason:
         node._controller = Instead(controller, status=controller.status._replace(reason=reason))
         level = {Reason.TRACKING: OK, Reason.NOT_FOLLOWING: WARN}.get(reason, ERROR)
         text = reason.value if reason.moves else f'stopped: {reason.value}'
-        assert node.produce_diagnostics()[:2] == (level, text)
+        assert report(node) == (level, text)
     status = controller.status._replace(reason=Reason.TRACKING)
     for stuck, level in ((False, OK), (True, WARN)):
         keep_out = SimpleNamespace(activity=SimpleNamespace(stuck=stuck, value='what it does'))
         node._controller = Instead(controller, status=status, keep_out=keep_out)
-        assert node.produce_diagnostics()[0] == level
+        assert diagnostic_level(node) == level
     node._controller = Instead(controller, status=status)
     node._rejected_references = 1
-    assert node.produce_diagnostics()[0] == WARN
+    assert diagnostic_level(node) == WARN
     node._odometry_problem = 'is too old'
-    assert node.produce_diagnostics()[:2] == (ERROR, 'stopped: odom is too old')
+    assert report(node) == (ERROR, 'stopped: odom is too old')
 
 
 def robot_conditions(state):
@@ -312,19 +317,19 @@ def robot_conditions(state):
 
 def test_levels_of_the_simulated_robot(start):
     node = start('sim_robot')
-    assert node.produce_diagnostics()[:2] == (ERROR, NO_CLOCK)
+    assert report(node) == (ERROR, NO_CLOCK)
     for found, level in robot_conditions(node._robot.advance(10**7)):
         node._state = found
-        assert node.produce_diagnostics()[0] == level, found
+        assert diagnostic_level(node) == level, found
     node._state = robot_conditions(node._state)[0][0]
     node._scheduler = Instead(node._scheduler, skipped=1)
     text = 'processor overloaded: samples were skipped'
-    assert node.produce_diagnostics()[:2] == (WARN, text)
+    assert report(node) == (WARN, text)
 
 
 def test_levels_of_the_radio_bridge(start):
     node = start('radio_bridge')
-    assert node.produce_diagnostics()[0] == ERROR
+    assert diagnostic_level(node) == ERROR
     robot = node._robot
     link, quality = robot.link, robot.quality(0)._replace(level=DiagnosticLevel.OK, text='')
 
@@ -335,7 +340,7 @@ def test_levels_of_the_radio_bridge(start):
             advance=lambda now_ns: found,
             quality=lambda now_ns: quality,
         )
-        return node.produce_diagnostics()[0]
+        return diagnostic_level(node)
 
     (good, _), *_ = conditions = robot_conditions(robot.advance(0))
     assert [level(found) for found, _ in conditions] == [wanted for _, wanted in conditions]
@@ -349,53 +354,53 @@ def test_levels_of_the_radio_bridge(start):
 
 def test_levels_of_the_recorder(start, harness, tmp_path):
     node = start('recorder')
-    assert node.produce_diagnostics()[:2] == (OK, 'recording')
+    assert report(node) == (OK, 'recording')
     node._topics.lost['/a'] = 2
     lacks = 'the bag lacks 0 dropped and 2 lost messages'
-    assert node.produce_diagnostics()[:2] == (WARN, lacks)
+    assert report(node) == (WARN, lacks)
     node._snapshots.problem = 'no snapshot'
-    assert node.produce_diagnostics()[:2] == (WARN, 'no snapshot')
+    assert report(node) == (WARN, 'no snapshot')
     node._writer.dropped, node._dropped_ns = {'/a': 3}, node.steady_ns()
     slow = 'the disk is too slow: 3 messages dropped so far'
-    assert node.produce_diagnostics()[:2] == (ERROR, slow)
+    assert report(node) == (ERROR, slow)
     node._dropped_ns -= 3 * 10**9
     node._snapshots.problem = ''
-    assert node.produce_diagnostics()[0] == WARN
+    assert diagnostic_level(node) == WARN
     node._failure = 'the disk is full'
-    assert node.produce_diagnostics()[:2] == (ERROR, 'the disk is full')
+    assert report(node) == (ERROR, 'the disk is full')
     harness.remove(node)
     node = start('recorder', storage__snapshot_mode=True)
-    assert node.produce_diagnostics()[:2] == (OK, 'caching for snapshots')
+    assert report(node) == (OK, 'caching for snapshots')
     node._snapshots.problem = 'no snapshot'
-    assert node.produce_diagnostics()[:2] == (ERROR, 'no snapshot')
+    assert report(node) == (ERROR, 'no snapshot')
 
 
 def test_levels_of_the_player(start):
     assert start('player', storage__uris=[]).produce_diagnostics()[0] == WARN
     node = start('player')
-    assert node.produce_diagnostics()[:2] == (OK, 'waiting for subscribers')
+    assert report(node) == (OK, 'waiting for subscribers')
     node._started = True
-    assert node.produce_diagnostics()[:2] == (OK, 'paused')
+    assert report(node) == (OK, 'paused')
     node._other_publishers = {'/a': '/b'}
-    assert node.produce_diagnostics()[:2] == (WARN, 'also published by other nodes: /a')
+    assert report(node) == (WARN, 'also published by other nodes: /a')
     node._damaged = 3
-    assert node.produce_diagnostics()[:2] == (WARN, '3 messages of damaged chunks are not played')
+    assert report(node) == (WARN, '3 messages of damaged chunks are not played')
     node._thread.failure = 'the bag cannot be read'
-    assert node.produce_diagnostics()[:2] == (ERROR, 'the bag cannot be read')
+    assert report(node) == (ERROR, 'the bag cannot be read')
 
 
 def test_levels_of_the_reference_generator(start):
     node = start('reference_generator')
-    assert node.produce_diagnostics()[:2] == (OK, 'running')
+    assert report(node) == (OK, 'running')
     call(node, '~/pause', data=True)
-    assert node.produce_diagnostics()[:2] == (OK, 'paused')
+    assert report(node) == (OK, 'paused')
     call(node, '~/pause', data=False)
     node._path_clock.rate = 0.0
-    assert node.produce_diagnostics()[:2] == (OK, 'waiting for the robot')
+    assert report(node) == (OK, 'waiting for the robot')
     node._scheduler = Instead(node._scheduler, skipped=1)
-    assert node.produce_diagnostics()[0] == WARN
+    assert diagnostic_level(node) == WARN
     node.clock_started = lambda: False
-    assert node.produce_diagnostics()[:2] == (WARN, NO_CLOCK)
+    assert report(node) == (WARN, NO_CLOCK)
     path = start('reference_generator', source='topic')
     assert path.produce_diagnostics()[0] == WARN
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
-from support.ros_graph import LATCHED, diagnostic, on_grid, reason, speed, stamp
+from support.ros_graph import LATCHED, diagnostic, odometry, on_grid, reason, speed, stamp, twist
 
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
@@ -96,10 +96,9 @@ def test_reseed_changes_the_reference_and_hides_the_seed(harness, logged):
 PATH_LIMIT = 0.25
 
 
-def _odometry(x=0.5, y=-0.2):
-    message = Odometry()
-    message.pose.pose.position.x, message.pose.pose.position.y = x, y
-    message.pose.pose.orientation.w = 1.0
+def _odometry(stamp_ns=0):
+    message = odometry(stamp_ns)
+    message.pose.pose.position.x, message.pose.pose.position.y = 0.5, -0.2
     return message
 
 
@@ -111,7 +110,7 @@ def _drive(harness, topic, message, until, **parameters):
     inputs = None
     if isinstance(message, Path):
         harness.create_publisher(Path, topic, LATCHED).publish(message)
-    elif topic:
+    elif message is not None:
         inputs = harness.create_publisher(type(message), topic)
     harness.spin_until(lambda: places.get_subscription_count() > 0)
 
@@ -126,16 +125,26 @@ def _drive(harness, topic, message, until, **parameters):
     return reference, received
 
 
-@pytest.mark.parametrize('source', ['portrait', 'file'])
+@pytest.mark.parametrize('source', ['portrait', 'file', 'topic'])
 def test_a_path_begins_where_the_robot_is(harness, tmp_path, source):
     """The first sample is the pose of odom, at rest; speeds stay within the limits."""
     (tmp_path / 'path.csv').write_text('0,0\n3,0\n')
     given = {'path_file': str(tmp_path / 'path.csv')} if source == 'file' else {}
-    _, received = _drive(harness, '', None, lambda m: speed(m) > 0.1, source=source, **given)
-    first = received[0].pose.pose.position
+    message = None
+    if source == 'topic':
+        message = Path(poses=[PoseStamped(), PoseStamped()])
+        for x, pose in zip((0.5, 1.5), message.poses, strict=True):
+            pose.pose.position.x, pose.pose.position.y = x, -0.2
+    _, received = _drive(
+        harness, 'path', message, lambda m: speed(m) > 0.1, source=source, **given
+    )
+    first, last = (received[k].pose.pose.position for k in (0, -1))
     assert (first.x, first.y) == pytest.approx((0.5, -0.2), abs=1e-9)
     assert speed(received[0]) == 0.0
     assert max(map(speed, received)) <= PATH_LIMIT
+    if source == 'topic':
+        assert last.x > 0.5
+        assert last.y == pytest.approx(-0.2, abs=1e-6)
 
 
 @pytest.mark.parametrize('source', ['portrait', 'twist'])
@@ -145,14 +154,11 @@ def test_a_path_waits_for_a_robot_that_stands(harness, source):
     received = harness.subscribe(Odometry, 'reference')
     places = harness.create_publisher(Odometry, 'odom')
     twists = harness.create_publisher(Twist, 'target_twist')
-    twist, began = Twist(), []
-    twist.linear.x = 0.2
+    began = []
 
     def waits():
-        message = _odometry()
-        message.header.stamp = reference.get_clock().now().to_msg()
-        places.publish(message)
-        twists.publish(twist)
+        places.publish(_odometry(reference.now_ns()))
+        twists.publish(twist(0.2))
         began.extend(each for each in received[-1:] if speed(each) > 0.05)
         return began and speed(received[-1]) == 0.0
 
@@ -162,21 +168,11 @@ def test_a_path_waits_for_a_robot_that_stands(harness, source):
     assert reason(reference) == 'waiting for the robot'
 
 
-def test_a_path_message_is_followed(harness):
-    path = Path()
-    for x in (0.5, 1.5):
-        pose = PoseStamped()
-        pose.pose.position.x, pose.pose.position.y = x, -0.2
-        path.poses.append(pose)
-    _, received = _drive(harness, 'path', path, lambda m: speed(m) > 0.2, source='topic')
-    assert received[-1].pose.pose.position.x > 0.5
-    assert received[-1].pose.pose.position.y == pytest.approx(-0.2, abs=1e-6)
-
-
 def test_a_twist_message_is_followed_until_it_expires(harness):
-    twist = Twist()
-    twist.linear.x, twist.angular.z = 0.2, 0.4
-    _, received = _drive(harness, 'target_twist', twist, lambda m: speed(m) > 0.19, source='twist')
+    wanted = twist(0.2, 0.4)
+    _, received = _drive(
+        harness, 'target_twist', wanted, lambda m: speed(m) > 0.19, source='twist'
+    )
     assert received[-1].twist.twist.angular.z == pytest.approx(0.4, abs=0.02)
     harness.spin_until(lambda: speed(received[-1]) == 0.0)  # no more messages
 

@@ -2,8 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node of the live page: what it collects from a running robot, and its commands."""
 
-from concurrent.futures import ThreadPoolExecutor
-
 import pytest
 from support.ros_graph import CommandSource, twist
 
@@ -42,10 +40,8 @@ class Viewer:
         self.harness.spin_until(met)
 
     def command(self, name, /, **arguments):
-        with ThreadPoolExecutor(1) as pool:
-            reply = pool.submit(self.node.command, name, arguments)
-            self.spin_until(reply.done)
-        return reply.result()
+        command = self.node.command
+        return self.harness.in_thread(command, name, arguments, spin_until=self.spin_until)
 
     def parameter(self, name):
         rows = self.facts().get('parameters/sim_robot') or ()
@@ -102,6 +98,10 @@ def test_a_parameter_is_set_and_its_change_is_shown(viewer, robot, harness):
     viewer.spin_until(lambda: any(each['kind'] == 'fault' for each in viewer.changes()['events']))
 
 
+def setting(name, value):
+    return {'node': 'sim_robot', 'name': name, 'value': value}
+
+
 @pytest.mark.parametrize(
     ('name', 'arguments', 'words'),
     [
@@ -109,24 +109,12 @@ def test_a_parameter_is_set_and_its_change_is_shown(viewer, robot, harness):
         ('dance', {}, 'the commands are set, e_stop,'),
         ('reseed', {}, 'no node offers the service reference_generator/reseed'),
         ('set', {'node': 'x', 'name': 'y', 'value': 1}, "no node 'x'"),
-        ('set', {'node': 'sim_robot', 'name': 'y', 'value': 1}, 'has no parameter y'),
-        (
-            'set',
-            {'node': 'sim_robot', 'name': 'faults.command_loss', 'value': 'much'},
-            "faults.command_loss must be float: got 'much'",
-        ),
+        ('set', setting('y', 1), 'has no parameter y'),
+        ('set', setting('faults.command_loss', 'much'), "command_loss must be float: got 'much'"),
         # Neither reaches the serialization, which would end the node.
-        ('set', {'node': 'sim_robot', 'name': 'seed', 'value': 2**70}, 'seed must be int'),
-        (
-            'set',
-            {'node': 'sim_robot', 'name': 'disturbance.frequencies', 'value': ['a']},
-            'disturbance.frequencies must be list of float',
-        ),
-        (
-            'set',
-            {'node': 'sim_robot', 'name': 'faults.command_loss', 'value': 2.0},
-            'faults.command_loss',
-        ),
+        ('set', setting('seed', 2**70), 'seed must be int'),
+        ('set', setting('disturbance.frequencies', ['a']), 'frequencies must be list of float'),
+        ('set', setting('faults.command_loss', 2.0), 'faults.command_loss'),
     ],
 )
 def test_a_command_that_cannot_be_executed_has_a_reason(name, arguments, words, viewer):

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Harness for node tests: nodes of the package and a probe node in one executor over real DDS."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
@@ -79,6 +81,13 @@ class NodeHarness:
     def spin_until(self, condition, description=''):
         """Spin until ``condition`` holds."""
         wait_until(condition, description, step=lambda: self._executor.spin_once(timeout_sec=0.05))
+
+    def in_thread(self, function, *arguments, spin_until=None):
+        """Return the result of a function that waits for the nodes, which spin meanwhile."""
+        with ThreadPoolExecutor(1) as pool:
+            reply = pool.submit(function, *arguments)
+            (spin_until or self.spin_until)(reply.done)
+        return reply.result()
 
     def subscribe(self, message_type, topic, qos=100):
         """Return a list to which the messages of a topic are appended."""
