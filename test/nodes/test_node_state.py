@@ -28,7 +28,6 @@ from t3mpc_ros.nodes.player.node import PlayerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.registry import NODES, node_class, parameter_class
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch
-from t3mpc_ros.nodes.viewer import ViewNode
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.statistics import DiagnosticLevel
@@ -418,30 +417,6 @@ def test_a_warning_raises_the_level_to_a_warning_and_no_further(start):
         status = statuses[-1].status[0]
         wanted = 'something' if level == OK else 'text; something'
         assert (status.level, status.message) == (max(level, WARN), wanted)
-
-
-# -- live page ------------------------------------------------------------------------------------
-
-
-def test_a_node_that_has_left_is_gone_from_the_page(ros):
-    """It stood on the page with its last report."""
-    sink, present = Mock(), ['controller', 'sim_robot']
-    node = ViewNode(sink)
-    node.get_node_names_and_namespaces = lambda: [(each, '/') for each in present]
-    for _ in range(2):
-        node.look_at_graph()
-    node._rows['controller'] = {'law.gain': {'name': 'law.gain', 'value': 1.0}}
-    assert not sink.node_gone.called
-    present.remove('controller')
-    for _ in range(2):
-        node.look_at_graph()
-    sink.node_gone.assert_called_once_with('controller')
-    sink.set.assert_any_call('parameters/controller', None)
-    sink.set.assert_called_with('nodes', ['sim_robot'])
-    # Of a node that comes back, the parameters are read again.
-    assert (*node._remote.nodes,) == ('/sim_robot',)
-    assert 'controller' not in node._rows
-    node.destroy_node()
 
 
 # -- files ----------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The radio bridge node with a pseudo-terminal as its port and a scripted dongle."""
 
+from contextlib import closing
 import errno
 import os
 import select
@@ -15,7 +16,7 @@ import pytest
 from sensor_msgs.msg import BatteryState, Imu, JointState, Range
 from std_srvs.srv import SetBool
 from support.radio_bench import FakeDongle, FakeRobot
-from support.ros_graph import CommandSource, diagnostic, diagnostic_level, reason, twist
+from support.ros_graph import CommandSource, diagnostic, reason, twist
 
 from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
@@ -25,34 +26,29 @@ pytestmark = pytest.mark.ros
 
 
 class Plug:
-    """A dongle that can be unplugged and plugged in again."""
+    """A dongle behind a pseudo-terminal."""
 
     def __init__(self, path, key=b''):
         self.path = str(path)
         self.robot = FakeRobot(key)
         self.dongle = FakeDongle(self.robot)
-        self.in_port = False
-        self.put_in()
-
-    def put_in(self):
         self._master, slave = os.openpty()
         tty.setraw(slave)
         os.symlink(os.ttyname(slave), self.path)
         os.close(slave)
         self.dongle.restart(time.monotonic_ns())
-        self.in_port = True
+        self._in_port = True
         self._thread = threading.Thread(target=self._answer, daemon=True)
         self._thread.start()
 
-    def pull_out(self):
-        self.in_port = False
+    def close(self):
+        self._in_port = False
         self._thread.join()
-        os.unlink(self.path)
         os.close(self._master)
 
     def _answer(self):
         replies = []
-        while self.in_port:
+        while self._in_port:
             now_ns = time.monotonic_ns()
             while replies and replies[0][0] <= now_ns:
                 os.write(self._master, replies.pop(0)[1])
@@ -72,10 +68,8 @@ class Plug:
 
 @pytest.fixture
 def plug(tmp_path):
-    made = Plug(tmp_path / 'dongle')
-    yield made
-    if made.in_port:
-        made.pull_out()
+    with closing(Plug(tmp_path / 'dongle')) as made:
+        yield made
 
 
 def driving(harness, plug, linear=0.1):
@@ -116,17 +110,6 @@ def test_topics_are_those_of_sim_robot_without_truth(harness, plug):
     assert '/ground_truth/odom' not in topics
 
 
-def test_a_missing_dongle_is_reported_and_used_once_plugged_in(harness, plug):
-    plug.pull_out()
-    node = harness.add(RadioBridgeNode, port=plug.path)
-    harness.spin_until(
-        lambda: 'is the dongle plugged in?' in reason(node), 'the reason in the diagnostics'
-    )
-    assert diagnostic_level(node) == DiagnosticStatus.ERROR
-    plug.put_in()
-    harness.spin_until(lambda: diagnostic(node, 'link') == 'running', 'the link')
-
-
 def test_timeout_and_e_stop_stop_the_robot(harness, plug):
     node, source, _ = driving(harness, plug)
     source.message = None
@@ -165,13 +148,10 @@ def test_commands_are_signed_with_the_key(harness, tmp_path):
     path = tmp_path / 'key'
     path.write_text(key.hex())
     path.chmod(0o600)
-    plug = Plug(tmp_path / 'dongle', key)
-    try:
+    with closing(Plug(tmp_path / 'dongle', key)) as plug:
         node = harness.add(RadioBridgeNode, port=plug.path, key_file=str(path))
         source = CommandSource(harness)
         source.message = twist(0.1)
         harness.spin_until(lambda: max(plug.robot.speeds) > 2.0, 'the robot drives')
         harness.spin_until(lambda: reason(node) == 'following commands', 'status OK')
         assert diagnostic(node, 'authenticated') is True
-    finally:
-        plug.pull_out()

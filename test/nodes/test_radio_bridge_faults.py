@@ -15,10 +15,11 @@ import threading
 from nav_msgs.msg import Odometry
 import pytest
 from support.missing_tools import needs
-from support.ros_graph import CommandSource, diagnostic, reason, twist
+from support.ros_graph import CommandSource, diagnostic, diagnostic_level, reason, twist
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters, StopTimeMonitor
 from t3mpc_ros.emulator.pty_port import PtyPort, serve
+from t3mpc_ros.nodes.base_node import ERROR
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import Command, Poll, Transmit
@@ -148,6 +149,7 @@ def test_a_replugged_dongle_drives_within_a_second(harness, served):
     harness.spin_until(
         lambda: 'is the dongle plugged in?' in reason(node), 'the reason in the diagnostics'
     )
+    assert diagnostic_level(node) == ERROR
     harness.spin_until(
         lambda: board.back_ns and board.followed[-1][0] > board.back_ns,
         'commands after the reconnection',

@@ -135,8 +135,12 @@ def test_a_command_that_has_waited_too_long_is_not_executed(viewer, robot, monke
 def test_a_node_that_leaves_takes_its_parameters_along(viewer, robot, harness):
     harness.remove(robot)
     viewer.spin_until(lambda: not viewer.facts().get('parameters/sim_robot'))
+    assert viewer.facts()['nodes'] == []
+    assert 'sim_robot' not in viewer.run._reports, 'it stood on the page with its last report'
     with pytest.raises(CommandFailedError, match='no node offers the service e_stop'):
         viewer.command('e_stop', on=True)
+    harness.add(SimRobotNode)  # its parameters are read again
+    viewer.spin_until(lambda: viewer.parameter('wheel_radius'))
 
 
 def test_robots_of_other_namespaces_are_left_alone(robot, harness):

@@ -86,6 +86,11 @@ class PlayerParameters(PlaybackParameters):
         True, 'end the process at the end of the bag', name='play.exit_at_end'
     )
 
+    @property
+    def publishes_clock(self) -> bool:
+        """Whether the player publishes the time of the bag itself."""
+        return self.clock_publish_frequency > 0.0 or self.clock_publish_on_topic_publish
+
 
 class PlayerNode(BaseNode[PlayerParameters]):
     """Opens bags, creates their publishers and controls a :class:`PlayerThread`."""
@@ -138,16 +143,7 @@ class PlayerNode(BaseNode[PlayerParameters]):
             reader.close()
             raise
         self._reader, self._first_ns = reader, reader.start_ns
-        publishes_clock = (
-            parameters.clock_publish_frequency > 0.0 or parameters.clock_publish_on_topic_publish
-        )
-        self._topic_publishers = TopicPublishers(
-            self,
-            reader,
-            allow_commands=parameters.allow_commands,
-            publishes_clock=publishes_clock,
-            qos_overrides=overrides,
-        )
+        self._topic_publishers = TopicPublishers(self, reader, overrides)
         for topic, reason in self._topic_publishers.unusable.items():
             self.get_logger().error(f'{topic} is not played: {reason}')
         for topic, reason in self._topic_publishers.blocked.items():
@@ -162,7 +158,9 @@ class PlayerNode(BaseNode[PlayerParameters]):
             )
         if not reader.topics:
             self.get_logger().warning('the bags have no topic to play')
-        clock = self.create_publisher(Clock, CLOCK, qos.LATEST) if publishes_clock else None
+        clock = None
+        if parameters.publishes_clock:
+            clock = self.create_publisher(Clock, CLOCK, qos.LATEST)
         timeline = PlaybackTimeline(
             lambda at_ns: ReadAheadQueue(
                 reader.schedule(at_ns, begin_ns, end_ns, parameters.loop),

@@ -4,10 +4,10 @@
 
 from collections.abc import Mapping
 import time
+from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.exceptions import NameValidationException
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import (
     DurabilityPolicy,
@@ -23,6 +23,7 @@ from t3mpc_ros.bag.qos import UNLIMITED, QosProfile, adapt_offer_to_recorded_off
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes.base_node import BaseNode
 from t3mpc_ros.nodes.qos import RCLError, node_of
 
 CLOCK = '/clock'
@@ -33,25 +34,20 @@ SHARED_TOPICS = ('/diagnostics', '/rosout', '/parameter_events', '/tf', '/tf_sta
 
 
 class TopicPublishers:
-    """The publishers of the played topics; other topics are excluded from the reader.
+    """The publishers of a player's topics; other topics are excluded from the reader.
 
-    The rule on velocity commands applies to the names after the remapping of ``node``. With
-    ``publishes_clock`` the player publishes ``/clock`` itself. ``qos_overrides`` are by topic,
-    under the recorded or the new name.
+    The rule on velocity commands applies to the names after the remapping of the node.
+    ``qos_overrides`` are by topic, under the recorded or the new name.
     """
 
     def __init__(
         self,
-        node: Node,
+        node: BaseNode[Any],
         reader: MergedReader,
-        *,
-        allow_commands: bool,
-        publishes_clock: bool,
         qos_overrides: Mapping[str, QosProfile],
     ) -> None:
         self._node = node
-        self._allow_commands = allow_commands
-        self._publishes_clock = publishes_clock
+        self._allow_commands = node.parameters.allow_commands
         self._qos_overrides = qos_overrides
         self.by_topic: dict[str, Publisher] = {}
         self.unusable: dict[str, str] = {}
@@ -85,7 +81,7 @@ class TopicPublishers:
         track = reader.topics[topic]
         if track.serialization_format != 'cdr':
             raise BagError(f'its messages are {track.serialization_format}, not cdr')
-        if self._publishes_clock and self._node.resolve_topic_name(topic) == CLOCK:
+        if self._node.parameters.publishes_clock and self._node.resolve_topic_name(topic) == CLOCK:
             raise BagError('the player publishes its own clock (play.clock_publish_frequency)')
         names = [topic, *reader.recorded_names[topic]]
         overrides = [self._qos_overrides[name] for name in names if name in self._qos_overrides]
