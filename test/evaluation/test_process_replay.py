@@ -13,8 +13,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 from support.bag_files import copied_bag
+from support.bag_messages import START, odometry_message
 from support.golden_bags import (
     GOLDEN_SCENARIOS,
     ControllerBag,
@@ -22,6 +22,7 @@ from support.golden_bags import (
     run_golden_scenario,
 )
 from support.other_parameters import with_other_value
+from support.robot_bags import write_with_records
 
 from t3mpc_ros.bag.columns import read_columns
 from t3mpc_ros.bag.reader import open_bag
@@ -50,7 +51,7 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     compare_columns,
     write_divergence_figure,
 )
-from t3mpc_ros.evaluation.topic_roles import SCALARS
+from t3mpc_ros.evaluation.topic_roles import SCALARS, ReportOptions, choose_topics, find_topics
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.simulation.world import load_world
@@ -59,9 +60,6 @@ pytestmark = pytest.mark.slow
 
 GOLDEN = sorted((Path(__file__).parents[1] / 'golden').glob('*.mcap'))
 JOURNAL = '/controller/journal'
-START = 1_700_000_000_000_000_000
-"""Begin of the recorded runs, ns."""
-STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 def golden(stem):
@@ -182,12 +180,9 @@ def test_the_golden_runs_have_all_that_they_are_for(inputs, again):
 
 def test_equal_recipes_give_equal_bags(tmp_path):
     recipe = GOLDEN_SCENARIOS['stops']
-    columns = [
-        columns_of(run_golden_scenario(recipe, tmp_path / name), ['/cmd_vel'])
-        for name in ('one', 'other')
-    ]
-    one, other = (each['/cmd_vel'] for each in columns)
-    np.testing.assert_array_equal(one.numbers, other.numbers)
+    made = [run_golden_scenario(recipe, tmp_path / name) for name in ('one', 'other')]
+    one, other = (columns_of(each, ['/cmd_vel'])['/cmd_vel'].numbers for each in made)
+    np.testing.assert_array_equal(one, other)
     assert len(one) > 800
 
 
@@ -283,9 +278,16 @@ def test_a_tolerance_that_cannot_be_used_is_refused(arguments, words):
 # -- bags from which something is missing --------------------------------------------------------
 
 
-def test_a_bag_without_a_journal_is_refused(bag, tmp_path):
-    copy = without(bag, tmp_path / 'copy', lambda topic, _: topic == JOURNAL)
-    with pytest.raises(ReplayError, match='no journal of the controller .* record it, as the'):
+@pytest.mark.parametrize(
+    ('lost', 'words'),
+    [
+        (JOURNAL, 'no journal of the controller .* record it, as the'),
+        ('/cmd_vel', 'not in the bag: cmd_vel'),
+    ],
+)
+def test_a_bag_without_what_a_replay_needs_is_refused(lost, words, bag, tmp_path):
+    copy = without(bag, tmp_path / 'copy', lambda topic, _: topic == lost)
+    with pytest.raises(ReplayError, match=words):
         load_inputs(copy)
 
 
@@ -390,10 +392,56 @@ def test_settings_that_were_only_asked_for_by_the_recorder_do(bag, tmp_path):
     assert compare(inputs, replay_controller(inputs)).same
 
 
-def test_a_bag_without_commands_is_refused(bag, tmp_path):
-    copy = without(bag, tmp_path / 'copy', lambda topic, _: topic == '/cmd_vel')
-    with pytest.raises(ReplayError, match='not in the bag: cmd_vel'):
-        load_inputs(copy)
+def record_late(folder, lost, republished):
+    """Copy a golden bag as a recorder writes it that has discovered the inputs late.
+
+    Of each input it lacks the first messages, of which the controller has republished some.
+    """
+
+    def late(topic, k, received, published):
+        is_input = topic in ('/reference', '/odom')
+        if is_input and k < republished:
+            initial = f'/controller/initial_inputs{topic}'
+            yield initial, received + 1_000_000_000, published + 1000
+        if not is_input or k >= lost:
+            yield topic, received, published
+
+    return copied_bag(golden('switches'), folder, late)
+
+
+@pytest.mark.parametrize('lost, republished', [(0, 200), (150, 200), (150, 150)])
+def test_initial_inputs_complete_a_late_recording(lost, republished, tmp_path):
+    inputs, complete = (
+        load_inputs(record_late(tmp_path / 'bag', lost, republished)),
+        load_inputs(golden('switches')),
+    )
+    for name in ('odometry', 'references'):
+        one, other = getattr(inputs, name), getattr(complete, name)
+        np.testing.assert_array_equal(one.stamps_ns, other.stamps_ns)
+        np.testing.assert_array_equal(one.numbers, other.numbers)
+    assert inputs.notes == ()
+    assert inputs.exact.all()
+    outcome = compare(inputs, replay_controller(inputs), Tolerances(ELSEWHERE, ELSEWHERE))
+    assert outcome.same, outcome.table()
+
+
+@pytest.mark.parametrize('republished', [0, 100])
+def test_without_all_initial_inputs_a_late_recording_is_not_exact(republished, tmp_path):
+    inputs = load_inputs(record_late(tmp_path / 'bag', 150, republished))
+    complete = load_inputs(golden('switches'))
+    assert not inputs.exact.all()
+    assert len(inputs.odometry) == len(complete.odometry) - 150 + republished
+    assert any('odometry messages' in note for note in inputs.notes)
+
+
+def test_initial_inputs_are_no_topics_of_a_robot(tmp_path):
+    folder = record_late(tmp_path / 'bag', 0, 10)
+    with open_bag(folder) as recording:
+        assert '/controller/initial_inputs/odom' in recording.topics
+        assert find_topics(recording.topics)[1] == ('',)
+        choice = choose_topics(recording, ReportOptions())
+    assert choice.topics['odom'] == '/odom'
+    assert not any('initial_inputs' in note for note in choice.notes)
 
 
 # -- the journal and the model --------------------------------------------------------------------
@@ -600,33 +648,23 @@ def test_a_node_that_was_started_again_is_another_session(tmp_path):
 # -- which message was when -----------------------------------------------------------------------
 
 
-def journal_of(steps):
-    """Return rows for (stamp, references, newest)."""
-    return np.array([(k, 0, *step) for k, step in enumerate(steps)], dtype=np.int64)
-
-
-def test_references_only_the_recorder_received_are_not_passed():
-    taken = match(
-        journal_of([(1, 0, 0), (2, 2, 40), (3, 3, 50)]), np.arange(4), np.arange(0, 60, 10)
-    )
-    assert list(zip(taken.begin, taken.end, strict=True))[1:] == [(3, 5), (5, 6)]
+@pytest.mark.parametrize(
+    ('steps', 'stamps', 'begin', 'end'),
+    [
+        # References that only the recorder received are not passed.
+        ([(1, 0, 0), (2, 2, 40), (3, 3, 50)], [0, 10, 20, 30, 40, 50], [3, 5], [5, 6]),
+        # A source that starts again: the newest message is not the one with the latest stamp.
+        ([(1, 3, 30), (2, 4, 10), (3, 6, 30)], [10, 20, 30, 10, 20, 30], [3, 4], [4, 6]),
+        # The controller may get a reference after the recorder.
+        ([(1, 1, 10), (2, 1, 10), (3, 3, 30)], [10, 20, 30], [1, 1], [1, 3]),
+    ],
+)
+def test_a_step_passes_the_references_that_its_controller_had(steps, stamps, begin, end):
+    """The rows of the journal are (stamp, number of references, stamp of the newest)."""
+    rows = np.array([(k, 0, *step) for k, step in enumerate(steps)], dtype=np.int64)
+    taken = match(rows, np.arange(4), np.array(stamps))
+    assert (taken.begin[1:].tolist(), taken.end[1:].tolist()) == (begin, end)
     assert not taken.broken.any()
-
-
-def test_a_reference_source_that_starts_again_is_followed():
-    """Stamps go back: the newest message is not the one with the latest stamp."""
-    stamps = np.array([10, 20, 30, 10, 20, 30])
-    taken = match(journal_of([(1, 3, 30), (2, 4, 10), (3, 6, 30)]), np.arange(4), stamps)
-    assert taken.end.tolist() == [3, 4, 6]
-    assert not taken.broken.any()
-
-
-def test_the_controller_may_get_a_reference_after_the_recorder():
-    taken = match(
-        journal_of([(1, 1, 10), (2, 1, 10), (3, 3, 30)]), np.arange(4), np.array([10, 20, 30])
-    )
-    assert taken.begin.tolist() == [0, 1, 1]
-    assert taken.end.tolist() == [1, 1, 3]
 
 
 # -- reading in bulk ------------------------------------------------------------------------------
@@ -656,36 +694,16 @@ def test_bulk_reading_gives_what_a_deserialiser_gives(bag, tmp_path):
 
 
 def test_frames_of_any_length_are_read(tmp_path):
-    types = STORE.types
-    point, turn = types['geometry_msgs/msg/Point'], types['geometry_msgs/msg/Quaternion']
-    vector = types['geometry_msgs/msg/Vector3']
-    with BagWriter(tmp_path / 'bag', metadata_records={}) as writer:
-        writer.add_topic('/odom', 'nav_msgs/msg/Odometry')
-        for k in range(12):
-            message = types['nav_msgs/msg/Odometry'](
-                types['std_msgs/msg/Header'](
-                    types['builtin_interfaces/msg/Time'](k, 5), 'o' * (k % 7)
-                ),
-                'b' * (k % 5),
-                types['geometry_msgs/msg/PoseWithCovariance'](
-                    types['geometry_msgs/msg/Pose'](
-                        point(1.0 + k, 2.0, 3.0), turn(0.1, 0.2, 0.3, 0.4)
-                    ),
-                    np.arange(36.0),
-                ),
-                types['geometry_msgs/msg/TwistWithCovariance'](
-                    types['geometry_msgs/msg/Twist'](
-                        vector(5.0 + k, 6.0, 7.0), vector(8.0, 9.0, 10.0 + k)
-                    ),
-                    np.arange(36.0),
-                ),
-            )
-            data = bytes(STORE.serialize_cdr(message, message.__msgtype__))
-            writer.write('/odom', 100 + k, 50 + k, data)
-    column = columns_of(tmp_path / 'bag', ['/odom'])['/odom']
+    rows = []
+    for k in range(12):
+        message = odometry_message(
+            k * 10**9 + 5, (5.0 + k, 10.0 + k), (1.0 + k, 2.0, 0.0), 'b' * (k % 5)
+        )
+        message.header.frame_id = 'o' * (k % 7)
+        rows.append((0.01 * k, '/odom', message))
+    column = columns_of(write_with_records(tmp_path / 'bag', rows, {}), ['/odom'])['/odom']
     assert column.stamps_ns.tolist() == [k * 10**9 + 5 for k in range(12)]
-    assert column.published_ns.tolist() == list(range(50, 62))
-    wanted = [(1.0 + k, 2.0, 0.1, 0.2, 0.3, 0.4, 5.0 + k, 10.0 + k) for k in range(12)]
+    wanted = [(1.0 + k, 2.0, 0.0, 0.0, 0.0, 1.0, 5.0 + k, 10.0 + k) for k in range(12)]
     np.testing.assert_array_equal(column.numbers, wanted)
 
 
@@ -717,10 +735,8 @@ def test_a_bag_without_chunks_gives_the_same_numbers(bag, tmp_path):
     names = ['/odom', '/cmd_vel', JOURNAL]
     quick, slow = (columns_of(path, names) for path in (bag, copy))
     for name in names:
-        np.testing.assert_array_equal(quick[name].received_ns, slow[name].received_ns)
-        np.testing.assert_array_equal(quick[name].stamps_ns, slow[name].stamps_ns)
-        np.testing.assert_array_equal(quick[name].numbers, slow[name].numbers)
-        np.testing.assert_array_equal(quick[name].integers, slow[name].integers)
+        for one, other in zip(vars(quick[name]).values(), vars(slow[name]).values(), strict=True):
+            np.testing.assert_array_equal(one, other)
 
 
 def test_a_damaged_bag_is_refused_or_read_never_more(bag, tmp_path):

@@ -8,6 +8,7 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from support.bag_messages import START, STORE, odometry_message, twist_message
+from t3mpc_ros.bag.writer import BagWriter
 
 
 def write(folder, rows, plugin=StoragePlugin.MCAP):
@@ -22,6 +23,18 @@ def write(folder, rows, plugin=StoragePlugin.MCAP):
         data = STORE.serialize_cdr(message, kind)
         writer.write(connections[topic], START + round(received * 1e9), data)
     writer.close()
+    return folder
+
+
+def write_with_records(folder, rows, records, empty=()):
+    """Write rows beside metadata records, with the topics ``empty`` (name, type) besides."""
+    with BagWriter(folder, metadata_records=records) as bag:
+        kinds = {topic: message.__msgtype__ for _, topic, message in rows}
+        for topic, kind in {**dict(empty), **kinds}.items():
+            bag.add_topic(topic, kind)
+        for received, topic, message in sorted(rows, key=lambda row: row[0]):
+            stamp = START + round(received * 1e9)
+            bag.write(topic, stamp, stamp, bytes(STORE.serialize_cdr(message, kinds[topic])))
     return folder
 
 
