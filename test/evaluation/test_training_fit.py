@@ -164,32 +164,6 @@ def test_jumps_that_the_law_knows_are_no_errors(tmp_path):
 # -- what is learnt -----------------------------------------------------------------------------
 
 
-def predictor_of(learnt):
-    prefix = 'predictive.'
-    return {k.removeprefix(prefix): v for k, v in learnt.items() if k.startswith(prefix)}
-
-
-def test_a_predictor_from_a_bag_is_as_good_as_from_simulation(run, sampled):
-    """On the quarter that it has not seen; the training data are 120 s of three other runs."""
-    parameters = run.controller.parameters
-    errors, moves = sampled
-    cut = 3 * len(errors) // 4
-    unseen = stretches(errors[cut:], moves[cut:])
-    fit = fit_predictor(parameters, errors[:cut], moves[:cut])
-    assert 28.0 < fit.duration <= 30.0
-    own, pretrained, nominal = (
-        skills(parameters.predictive, 0.05, weights, unseen)
-        for weights in (
-            fit.weights,
-            predictor_of(fit_simulated_runs('velocity')[0]),
-            Controller(parameters).law.predictive.get_weights(),
-        )
-    )
-    assert own.min() > 0.5
-    assert np.all(own > 0.9 * pretrained)
-    assert np.all(own > nominal)
-
-
 def test_the_model_is_fitted_to_all_and_evaluated_by_folds(run, sampled, trained):
     """Each block with the model of the other four, so never with its own data."""
     parameters = run.controller.parameters
