@@ -4,7 +4,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeGuard
+from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -243,11 +243,8 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
     if not shown:
         return
     base, curves, marks = run.motions[run.measured], [], []
-    frame = _odometry_frame(run)
     for name, motion in shown.items():
-        x, y = motion['x'], motion['y']
-        if name == ODOMETRY:
-            x, y = _moved(frame, x, y)
+        x, y = _on_floor(run) if name == ODOMETRY else (motion['x'], motion['y'])
         positions = np.stack([x, y], axis=1)
         breaks = pose_jumps(motion.time, positions, motion['linear'], POSE_JUMP)
         curves.append(_curve(name, motion, x, y, breaks))
@@ -288,25 +285,22 @@ def _curve(
     return Curve(LABELS[name], COLOURS[name], time, x, y, DASHES.get(name, ()))
 
 
-def _odometry_frame(run: Run) -> tuple[float, float, float]:
-    """Return the pose of the odometry frame on the floor.
+def _on_floor(run: Run) -> tuple[Array, Array]:
+    """Return the positions of the odometry, with its frame laid on the first common true pose.
 
-    It is laid on the true pose at the first common instant: later, their distance is the drift.
+    Later, their distance is the drift.
     """
-    odometry, truth = run.motions.get(ODOMETRY), run.motions.get(TRUTH)
-    if odometry is None or truth is None:
-        return 0.0, 0.0, 0.0
+    odometry, truth = run.motions[ODOMETRY], run.motions.get(TRUTH)
+    x, y = odometry['x'], odometry['y']
+    if truth is None:
+        return x, y
     start = max(odometry.time[0], truth.time[0])
     i = min(int(np.searchsorted(odometry.time, start)), len(odometry) - 1)
     k = min(int(np.searchsorted(truth.time, start)), len(truth) - 1)
-    turn = float(truth['yaw'][k] - odometry['yaw'][i])
-    x, y = _moved((0.0, 0.0, turn), odometry['x'][i], odometry['y'][i])
-    return float(truth['x'][k] - x), float(truth['y'][k] - y), turn
-
-
-def _moved(frame: tuple[float, float, float], x: Any, y: Any) -> tuple[Any, Any]:
-    c, s = np.cos(frame[2]), np.sin(frame[2])
-    return frame[0] + c * x - s * y, frame[1] + s * x + c * y
+    turn = truth['yaw'][k] - odometry['yaw'][i]
+    x, y = x - x[i], y - y[i]
+    c, s = np.cos(turn), np.sin(turn)
+    return truth['x'][k] + c * x - s * y, truth['y'][k] + s * x + c * y
 
 
 def certificate(run: Run, metrics: ReportMetrics) -> Shown:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Data of a recorded run: motions, commands and control terms on one time axis."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
@@ -184,7 +184,8 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     topics = choice.topics
     notes = [*choice.notes]
     oddities, damage = _oddities_of_bag(recording, choice)
-    geometry = _geometry(recording.metadata_records, wanted, choice.ours, notes)
+    records = recording.metadata_records
+    geometry = _geometry(records, wanted, choice.ours, notes)
     columns = _columns(recording, topics.values())
     raw = {}
     for name, topic in topics.items():
@@ -208,10 +209,11 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
             motions[name] = _motion(table['stamp'] - clock.origin, table, geometry)
     oddities += _oddities_of_motions(topics, raw)
     diagnostics = read_diagnostics(recording, choice.namespaces[0])
+    expected = NAMES if choice.ours else (REFERENCE, ODOMETRY, COMMAND)
     return Run(
         duration=recording.duration,
         topics=topics,
-        absent=_absent({*topics, *scalars}, choice.ours),
+        absent=tuple(name for name in expected if name not in {*topics, *scalars}),
         namespaces=choice.namespaces,
         ours=choice.ours,
         geometry=geometry,
@@ -232,8 +234,8 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         oddities=tuple(dict.fromkeys(oddities)),
         remarks=tuple(notes),
         damage=tuple(damage),
-        world=recording.metadata_records.get('sim_robot', {}).get('world', ''),
-        follows_path=recorded_flag(recording, 'controller', 'pose.enabled'),
+        world=records.get('sim_robot', {}).get('world', ''),
+        follows_path=records.get('controller', {}).get('pose.enabled', '').lower() == 'true',
     )
 
 
@@ -471,11 +473,6 @@ def _switches(numbers: Mapping[str, Series], reference: Series | None) -> Array:
     return np.array(sorted(found), dtype=np.float64)
 
 
-def recorded_flag(recording: BagReader, node: str, name: str) -> bool:
-    """Return whether a recorded parameter of a node is true; False if it is not recorded."""
-    return recording.metadata_records.get(node, {}).get(name, '').lower() == 'true'
-
-
 def _geometry(
     metadata_records: Mapping[str, Mapping[str, str]],
     wanted: ReportOptions,
@@ -521,9 +518,3 @@ def _geometry(
         f'and {geometry.wheel_separation:g} m apart are assumed.'
     )
     return geometry
-
-
-def _absent(topics: Collection[str], ours: bool) -> tuple[str, ...]:
-    if not ours:
-        return tuple(name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics)
-    return tuple(name for name in NAMES if name not in topics)

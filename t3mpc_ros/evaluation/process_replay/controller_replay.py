@@ -16,14 +16,13 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     CONTROLLER,
     FIELDS,
     ControllerInputs,
-    ControllerSession,
     ReplayError,
     controller_record,
     inputs_of,
     motions,
 )
 from t3mpc_ros.geometry.arena import Obstacles
-from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, Array, BodyTwist, State
+from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, Array, BodyTwist
 from t3mpc_ros.simulation.world import WorldError, load_world
 
 SCALAR_RATE = 20.0
@@ -88,10 +87,31 @@ def replay_steps(
     """Process all events in their order; yield row, controller, command and status of outputs."""
     odometry, references = [*motions(inputs.odometry)], [*motions(inputs.references)]
     for session, controller in zip(inputs.sessions, controllers, strict=True):
-        for row, twist, status in _session_steps(
-            controller, session, changes or {}, odometry, references
+        taken = session.taken
+        consumed = np.stack([taken.odometry, taken.begin, taken.end], axis=1).tolist()
+        rows = zip(session.rows.tolist(), consumed, strict=True)
+        for row, ((_, event, stamp, _, value), (received, begin, end)) in enumerate(
+            rows, session.first
         ):
-            yield row, controller, twist, status
+            for reference in references[begin:end]:
+                controller.add_reference(reference)
+            if event == _STEP:
+                if received >= 0:
+                    yield row, controller, *controller.step(odometry[received])
+            elif event == Event.RANGE:
+                controller.add_range(stamp, reading_from_value(value))
+            elif event in (Event.ODOMETRY_TIMEOUT, Event.FINISH):
+                if event == Event.ODOMETRY_TIMEOUT:
+                    controller.check_odometry(None, 0)
+                yield row, controller, STANDSTILL, controller.status
+            elif event == Event.CONFIGURE:
+                if value in session.parameters:
+                    new = session.parameters[value].with_values(changes or {})
+                    controller.configure(new)
+            elif event in (Event.RESET, Event.ENABLE):
+                controller.enable(bool(value))
+                if event == Event.RESET:
+                    controller.reset()
 
 
 def make_controllers(
@@ -125,8 +145,7 @@ def recompute_scalars(
     """Return the scalars of a controller from its journal, and the inputs that they follow from.
 
     They are those that its node publishes, at its ``terms_rate``: by relative topic name, the
-    arrays that :meth:`BagReader.series` would return for the field ``value``, and ``exact``,
-    which is 1 where all inputs of the controller are in the bag, else 0.
+    arrays that :meth:`BagReader.series` would return for the field ``value``.
     """
     inputs = inputs_of(recording, namespace)
     result = replay_controller(inputs)
@@ -137,46 +156,10 @@ def recompute_scalars(
     rows = rows[inputs.commands_ns[rows] > 0]
     # A scalar is published right after the command of its step.
     received = (inputs.commands_ns[rows] - recording.start_ns) / NANOSECONDS
-    exact = inputs.exact[rows].astype(np.float64)
     found = {}
     for name in SCALAR_NAMES:
         values = result.fields[name][rows]
         known = np.isfinite(values)
         times = received[known]
-        table = {'received': times, 'stamp': times, 'value': values[known], 'exact': exact[known]}
-        found[f'{CONTROLLER}/{name}'] = table
+        found[f'{CONTROLLER}/{name}'] = {'received': times, 'stamp': times, 'value': values[known]}
     return found, inputs
-
-
-def _session_steps(
-    controller: Controller,
-    session: ControllerSession,
-    changes: Mapping[str, object],
-    odometry: Sequence[State],
-    references: Sequence[State],
-) -> Iterator[tuple[int, BodyTwist, Status]]:
-    """Process the events of one session in their order; yield row, command and status of each."""
-    taken = session.taken
-    inputs = np.stack([taken.odometry, taken.begin, taken.end], axis=1).tolist()
-    rows = zip(session.events.tolist(), session.rows[:, 4].tolist(), inputs, strict=True)
-    for row, (event, value, (received, begin, end)) in enumerate(rows, session.first):
-        for reference in references[begin:end]:
-            controller.add_reference(reference)
-        if event == _STEP:
-            if received >= 0:
-                yield row, *controller.step(odometry[received])
-        elif event == Event.RANGE:
-            controller.add_range(
-                int(session.rows[row - session.first, 2]), reading_from_value(value)
-            )
-        elif event in (Event.ODOMETRY_TIMEOUT, Event.FINISH):
-            if event == Event.ODOMETRY_TIMEOUT:
-                controller.check_odometry(None, 0)
-            yield row, STANDSTILL, controller.status
-        elif event == Event.CONFIGURE:
-            if value in session.parameters:
-                controller.configure(session.parameters[value].with_values(changes))
-        elif event in (Event.RESET, Event.ENABLE):
-            controller.enable(bool(value))
-            if event == Event.RESET:
-                controller.reset()
