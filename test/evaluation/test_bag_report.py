@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 from support.bag_messages import START, TYPES, diagnostics, header, odometry_message, twist_message
+from support.report_run import sections_of
 from support.robot_bags import following_rows, write
 import yaml
 
@@ -22,7 +23,6 @@ from t3mpc_ros.cli.main import main as t3mpc
 from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, parts
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTERS, link_metrics
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
-from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.response import motion_summary, smooth
 from t3mpc_ros.evaluation.bag_report.run_data import BY_BODY, BY_WHEEL, Series, load_run
 from t3mpc_ros.evaluation.drive_response import fit_response, predicted
@@ -107,12 +107,6 @@ def run_of(folder, wanted=None):
         return load_run(recording, wanted)
 
 
-def titles_of(page):
-    """Return the names of the sections with charts."""
-    found = re.findall(r'<h2[^>]*>([^<]*)</h2>\n<div class="charts">', page)
-    return {section.draw.__name__ for section in SECTIONS if section.title in found}
-
-
 def text_of(folder, capsys, *options):
     """Return what the program prints and the page says."""
     assert bag_main(['report', str(folder), '--output', str(folder.parent / 'out'), *options]) == 0
@@ -135,7 +129,7 @@ def test_a_bag_of_another_robot_has_a_report(rows, tmp_path, capsys, kind):
     said, page = text_of(folder, capsys)
     assert 'RMSE' not in said
     assert re.search(r'motion, forward / turning (29|30|31)\d / (29|30|31)\d ms;', said)
-    assert titles_of(page) == {'control', 'response', 'path', 'timing'}
+    assert set(sections_of(page)) == {'control', 'response', 'path', 'timing'}
     assert 'holds no wheel' in page
     assert 'Not in the bag, or without a message: reference.' in page
     assert 'controller/' not in page
@@ -226,7 +220,7 @@ def test_a_reference_may_be_named(rows, tmp_path, capsys):
     folder = write(tmp_path / 'bag', sorted([*rows, *wanted], key=lambda row: row[0]))
     said, page = text_of(folder, capsys, '--cmd-vel', '/cmd_vel', '--reference', '/plan/twist')
     assert 'RMSE while driven, forward / turning 0.' in said
-    assert {'tracking', 'error', 'portrait'} <= titles_of(page)
+    assert {'tracking', 'error', 'portrait'} <= set(sections_of(page))
     run = run_of(folder, ReportOptions(reference='/plan/twist'))
     np.testing.assert_allclose(
         run.motions[REFERENCE]['linear'], run.motions[COMMAND]['linear'], atol=1e-12
@@ -363,7 +357,7 @@ def test_the_figures_of_a_link_go_on_over_restarts(rows, tmp_path, capsys):
     printed, page = text_of(folder, capsys)
     assert f'cycles answered, radio_bridge {100.0 * found.answered:.1f} %' in printed
     assert '>Radio link</h2>' in page
-    assert 'link' in titles_of(page)
+    assert 'link' in sections_of(page)
     assert f'Least share of a report: {100.0 * np.nanmin(share):.1f} %.' in page
 
 

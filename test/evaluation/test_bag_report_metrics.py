@@ -21,7 +21,7 @@ from support.bag_messages import (
     odometry_message,
     twist_message,
 )
-from support.report_run import RUN
+from support.report_run import RUN, sections_of
 from support.robot_bags import write_with_records
 
 from t3mpc_ros.bag.reader import open_bag
@@ -165,13 +165,6 @@ class Page(HTMLParser):
 
     def text(self):
         return ' '.join(' '.join(self.texts).split())
-
-
-def sections_of(figures):
-    """Return the names of the sections with charts."""
-    page = figures.report.read_text(encoding='utf-8')
-    found = re.findall(r'<h2[^>]*>([^<]*)</h2>\n<div class="charts">', page)
-    return [section.draw.__name__ for section in SECTIONS if section.title in found]
 
 
 def page_of(figures):
@@ -419,7 +412,7 @@ def test_the_geometry_is_that_of_the_robot(tmp_path, metadata_records, expected,
 
 def test_the_page_is_whole_and_needs_nothing_from_outside(report):
     page = page_of(report)
-    assert len(sections_of(report)) == len(SECTIONS)
+    assert len(sections_of(report.report.read_text())) == len(SECTIONS)
     text = report.report.read_text()
     data = json.loads(re.search(r'id="data">(.*?)</script>', text)[1])
     assert {*data['charts'], *data['planes']} == set(page.charts)
@@ -439,7 +432,7 @@ def test_words_from_the_bag_cannot_become_markup(report):
 def test_the_report_goes_beside_the_bag_unless_told_otherwise(tmp_path):
     figures = report_of(tmp_path, [(0.1 * i, '/reference/signals', signals(i)) for i in range(5)])
     assert figures.report == tmp_path / 'report.html'
-    assert sections_of(figures) == ['switching']
+    assert sections_of(figures.report.read_text()) == ['switching']
     other = write_report(str(tmp_path / 'bag'), str(tmp_path / 'deep' / 'er'))
     assert other.report == tmp_path / 'deep' / 'er' / 'report.html'
     assert other.report.is_file()
@@ -451,7 +444,7 @@ def test_the_report_goes_beside_the_bag_unless_told_otherwise(tmp_path):
 def test_absent_topics_leave_out_their_figures_and_are_named(tmp_path):
     figures = report_of(tmp_path, until(4.0, 'reference/signals', 'diagnostics', *SCALARS))
     own = {'tracking', 'error', 'control', 'portrait', 'path', 'timing'}
-    assert set(sections_of(figures)) == {*own, 'response'}
+    assert set(sections_of(figures.report.read_text())) == {*own, 'response'}
     assert 'controller/estimate/right' in figures.absent
     text = page_of(figures).text()
     assert 'Not in the bag, or without a message: reference/signals, controller/' in text
@@ -488,7 +481,7 @@ def test_only_nonsense_is_reported_as_nothing(tmp_path):
         for t, topic, message in until(1.5, *SCALARS)
     ]
     figures = report_of(tmp_path, rows)
-    assert sections_of(figures) == ['control', 'switching']
+    assert sections_of(figures.report.read_text()) == ['control', 'switching']
     page_of(figures)
 
 

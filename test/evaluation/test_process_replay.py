@@ -159,22 +159,21 @@ def test_scalars_after_a_lost_input_are_called_approximate(bag, tmp_path):
     assert not any('journal' in note for note in run.notes)
 
 
-def test_golden_bags_are_there_and_small():
+def test_the_golden_runs_have_all_that_they_are_for(inputs, again):
     assert {path.stem for path in GOLDEN} == set(GOLDEN_SCENARIOS)
     assert all(path.stat().st_size < 300_000 for path in GOLDEN)
-
-
-def test_the_golden_runs_have_all_that_they_are_for(inputs, again):
-    assert {Reason.TRACKING, Reason.DISABLED, Reason.REFERENCE_STALE, Reason.NO_ODOMETRY} <= set(
-        again.reasons
-    )
-    assert {Reason.NO_REFERENCE, Reason.ODOMETRY_BAD} <= set(again.reasons)
-    changes = golden('changes')
-    changed = load_inputs(changes)
+    assert {*again.reasons} >= {
+        Reason.TRACKING, Reason.DISABLED, Reason.REFERENCE_STALE, Reason.NO_ODOMETRY,
+        Reason.NO_REFERENCE, Reason.ODOMETRY_BAD,
+    }  # fmt: skip
+    changed = load_inputs(golden('changes'))
     assert list(changed.events).count(Event.CONFIGURE) == 5
+    gains = {name: each.law.gain for name, each in changed.sessions[0].parameters.items()}
+    assert gains[0] != 20.0
+    assert gains[1] == gains[5] == 20.0
     assert Reason.NOT_FOLLOWING in replay_controller(changed).reasons
-    switches = golden('switches')
-    linear, angular = np.abs(np.diff(load_inputs(switches).references.numbers[:, 6:], axis=0)).T
+    references = load_inputs(golden('switches')).references.numbers
+    linear, angular = np.abs(np.diff(references[:, 6:], axis=0)).T
     assert np.count_nonzero((linear > 0.022) | (angular > 0.31)) >= 3, 'jumps as the track has it'
 
 
@@ -216,14 +215,6 @@ def test_the_same_settings_named_again_change_nothing(inputs):
 def test_a_setting_that_does_not_exist_is_refused(inputs):
     with pytest.raises(ParameterError, match='law.gian.*did you mean law.gain'):
         replay_controller(inputs, {'law.gian': 1.0})
-
-
-def test_live_settings_are_those_of_their_time():
-    path = golden('changes')
-    inputs = load_inputs(path)
-    found = {name: table.law.gain for name, table in inputs.sessions[0].parameters.items()}
-    assert found[0] != 20.0
-    assert found[1] == found[5] == 20.0
 
 
 # -- tolerances -----------------------------------------------------------------------------------
@@ -671,40 +662,32 @@ def test_a_step_passes_the_references_that_its_controller_had(steps, stamps, beg
 
 
 def test_bulk_reading_gives_what_a_deserialiser_gives(bag, tmp_path):
-    fields = {
-        0: 'pose.pose.position.x',
-        5: 'pose.pose.orientation.w',
-        6: 'twist.twist.linear.x',
-        7: 'twist.twist.angular.z',
-    }
-    columns = columns_of(bag, ['/odom', '/controller/error/right', JOURNAL])
-    with open_bag(bag) as recording:
-        slow = recording.series('/odom', {str(k): path for k, path in fields.items()})
-        numbers = recording.series('/controller/error/right', {'value': 'data'})
-        rows = [message.data for _, message in recording.messages(JOURNAL)]
-        start_ns = recording.start_ns
-    for k in fields:
-        np.testing.assert_array_equal(columns['/odom'].numbers[:, k], slow[str(k)])
-    received = (columns['/odom'].received_ns - start_ns) / 1e9
-    np.testing.assert_array_equal(received, slow['received'])
-    np.testing.assert_array_equal(
-        columns['/controller/error/right'].numbers[:, 0], numbers['value']
-    )
-    np.testing.assert_array_equal(columns[JOURNAL].integers, rows)
-
-
-def test_frames_of_any_length_are_read(tmp_path):
+    """Also with frames of any length, of which the places of all numbers depend."""
     rows = []
     for k in range(12):
-        message = odometry_message(
-            k * 10**9 + 5, (5.0 + k, 10.0 + k), (1.0 + k, 2.0, 0.0), 'b' * (k % 5)
-        )
+        twist, pose = (5.0 + k, 10.0 + k), (1.0 + k, 2.0 - k, 0.1 * k)
+        message = odometry_message(k * 10**9 + 5, twist, pose, 'b' * (k % 5))
         message.header.frame_id = 'o' * (k % 7)
         rows.append((0.01 * k, '/odom', message))
-    column = columns_of(write_with_records(tmp_path / 'bag', rows, {}), ['/odom'])['/odom']
-    assert column.stamps_ns.tolist() == [k * 10**9 + 5 for k in range(12)]
-    wanted = [(1.0 + k, 2.0, 0.0, 0.0, 0.0, 1.0, 5.0 + k, 10.0 + k) for k in range(12)]
-    np.testing.assert_array_equal(column.numbers, wanted)
+    made = write_with_records(tmp_path / 'bag', rows, {})
+    place, turn = 'pose.pose.position.', 'pose.pose.orientation.'
+    fields = {'0': f'{place}x', '1': f'{place}y', '4': f'{turn}z', '5': f'{turn}w',
+              '6': 'twist.twist.linear.x', '7': 'twist.twist.angular.z'}  # fmt: skip
+    for path in (made, bag):
+        column = columns_of(path, ['/odom'])['/odom']
+        with open_bag(path) as recording:
+            slow, start_ns = recording.series('/odom', fields), recording.start_ns
+        for k in fields:
+            np.testing.assert_array_equal(column.numbers[:, int(k)], slow[k])
+        np.testing.assert_array_equal((column.received_ns - start_ns) / 1e9, slow['received'])
+        np.testing.assert_array_equal((column.stamps_ns - start_ns) / 1e9, slow['stamp'])
+    name = '/controller/error/right'
+    columns = columns_of(bag, [name, JOURNAL])
+    with open_bag(bag) as recording:
+        numbers = recording.series(name, {'value': 'data'})['value']
+        journal = [message.data for _, message in recording.messages(JOURNAL)]
+    np.testing.assert_array_equal(columns[name].numbers[:, 0], numbers)
+    np.testing.assert_array_equal(columns[JOURNAL].integers, journal)
 
 
 @pytest.mark.parametrize('length', [3, 4, 30, 400])

@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run, ready for a report, of which no two quantities are equal."""
 
+import re
+
 import numpy as np
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.bag_report.link_history import LinkHistory
+from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.run_data import BY_WHEEL, SIGNAL_NAMES, Run, Series, Timing
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.kinematics import WheelGeometry
@@ -55,3 +58,9 @@ RUN = Run(
     switches=np.array([8.0]), lead=0.205, complaints=(), changes=(),
     links=(LinkHistory('radio', REPORTS, LINK),), oddities=(), remarks=(),
 )  # fmt: skip
+
+
+def sections_of(page):
+    """Return the names of the sections with charts of the page of a report."""
+    found = re.findall(r'<h2[^>]*>([^<]*)</h2>\n<div class="charts">', page)
+    return [section.draw.__name__ for section in SECTIONS if section.title in found]
