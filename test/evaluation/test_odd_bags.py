@@ -11,7 +11,7 @@ import re
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.convert import convert
 from rosbags.typesys import Stores, get_typestore
 from support.bag_messages import START, STORE, TYPES, diagnostics, odometry_message, twist_message
 from support.robot_bags import following_rows, write
@@ -360,29 +360,15 @@ def broken_metadata(folder):
 
 
 def ros1(folder):
-    store = get_typestore(Stores.ROS1_NOETIC)
+    source = write(folder.parent / 'ros2', ROWS)
     folder.mkdir()
-    with Ros1Writer(folder / 'run.bag') as writer:
-        connections = {}
-        for i, (received, topic, message) in enumerate(ROWS):
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
-            values = STORE.serialize_cdr(message, kind)
-            if topic != '/cmd_vel':
-                head = store.types['std_msgs/msg/Header']
-                time = store.types['builtin_interfaces/msg/Time']
-                stamp = message.header.stamp
-                made = store.types[kind](
-                    head(i, time(stamp.sec, stamp.nanosec), 'odom'),
-                    'base_link',
-                    message.pose,
-                    message.twist,
-                )
-            else:
-                made = store.deserialize_cdr(values, kind)
-            data = store.serialize_ros1(made, kind)
-            writer.write(connections[topic], START + round(received * 1e9), data)
+    all_of_it = {'exclude_topics': (), 'include_topics': (), 'exclude_msgtypes': (),
+                 'include_msgtypes': ()}  # fmt: skip
+    convert(
+        [source], folder / 'run.bag', dst_storage='', dst_version=0, compress=None,
+        compress_mode='', default_typestore=STORE, typestore=get_typestore(Stores.ROS1_NOETIC),
+        **all_of_it,
+    )  # fmt: skip
 
 
 DAMAGED_BAGS = {
