@@ -23,7 +23,7 @@ from t3mpc_ros.cli.main import main as t3mpc
 from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, parts
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTERS, link_metrics
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
-from t3mpc_ros.evaluation.bag_report.response import motion_summary, smooth
+from t3mpc_ros.evaluation.bag_report.motion import motion_rows, smooth
 from t3mpc_ros.evaluation.bag_report.run_data import BY_BODY, BY_WHEEL, Series, load_run
 from t3mpc_ros.evaluation.drive_response import fit_response, predicted
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, ReportOptions
@@ -287,23 +287,44 @@ def test_a_fast_robot_with_rare_messages_does_not_jump(speed):
 def test_way_and_stops_are_those_of_the_drive(rows, tmp_path):
     run = run_of(write(tmp_path / 'bag', rows))
     _, (seen_at, seen, _) = drive()
-    found = motion_summary(run)
-    way = np.trapezoid(np.abs(seen[:, 0]), seen_at)
-    assert found.distance == pytest.approx(way, rel=0.03)
-    assert found.fastest == pytest.approx(np.abs(seen[:, 0]).max(), rel=0.05)
-    pause = [stop for stop in found.stops if 19.0 < stop[0] < 23.0]
-    assert len(pause) == 1
-    assert pause[0][1] - pause[0][0] == pytest.approx(2.3, abs=0.5)
-    assert found.disobeyed < 0.6
+    found = dict(motion_rows(run))
+    way, turned = np.trapezoid(np.abs(seen), seen_at, axis=0)
+    numbers = {name: [*map(float, re.findall(r'[\d.]+', text))] for name, text in found.items()}
+    assert numbers['path length, forwards and backwards'] == [pytest.approx(way, rel=0.03)]
+    assert numbers['turning, both ways'] == [pytest.approx(turned, rel=0.03)]
+    mean, fastest = numbers['speed while moving, mean and largest']
+    (moving,) = numbers['time moving']
+    assert fastest == pytest.approx(np.abs(seen[:, 0]).max(), rel=0.05)
+    assert mean == pytest.approx(way / moving, rel=0.03)
+    times = np.reshape(numbers['standstill at'], (-1, 2))
+    (pause,) = times[(times[:, 0] > 19.0) & (times[:, 0] < 23.0)]
+    assert pause[1] - pause[0] == pytest.approx(2.3, abs=0.5)
+    count, stood, longest = numbers['stops']
+    assert (count, longest) == (len(times), pytest.approx(np.ptp(times, axis=1).max(), abs=0.11))
+    assert stood == pytest.approx(np.ptp(times, axis=1).sum(), abs=0.2)
+    assert stood + moving == pytest.approx(seen_at[-1], abs=0.5)
+    assert numbers['of that, motion was commanded'][0] < 0.6
+    # The units, and what is not known without a command.
+    assert [re.sub(r'[\d.]+', '#', text) for text in found.values()] == [
+        '# m', '# rad', '# and # m/s', '# s', '#, # s in all, the longest # s',
+        ', '.join(['# to #'] * len(times)) + ' s', '# s',
+    ]  # fmt: skip
+    alone = replace(run, motions={ODOMETRY: run.motions[ODOMETRY]})
+    assert dict(motion_rows(alone)).keys() == found.keys() - {'of that, motion was commanded'}
 
 
 def test_standstill_against_the_command_is_seen(rows, tmp_path):
+    """Also backwards: a robot that does not back out of a dock."""
     run = run_of(write(tmp_path / 'bag', rows))
-    motion = run.motions[ODOMETRY]
+    motion, command = run.motions[ODOMETRY], run.motions[COMMAND]
     moves = ~((motion.time > 25.0) & (motion.time < 30.0))
     stood = Series(motion.time, {name: moves * each for name, each in motion.values.items()})
-    found = motion_summary(replace(run, motions={**run.motions, ODOMETRY: stood}))
-    assert found.disobeyed == pytest.approx(4.9, abs=0.5)
+    for sign in (1.0, -1.0):
+        values = {name: sign * np.abs(each) for name, each in command.values.items()}
+        told = Series(command.time, values)
+        found = dict(motion_rows(replace(run, motions={COMMAND: told, ODOMETRY: stood})))
+        disobeyed = float(found['of that, motion was commanded'].split()[0])
+        assert disobeyed == pytest.approx(4.9, abs=0.5)
 
 
 def test_smoothing_keeps_the_speed_and_does_not_bridge_gaps():

@@ -4,15 +4,11 @@
 
 from dataclasses import replace
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from support.records import record_of
 
-from t3mpc_ros.evaluation.bag_report import report_page
-from t3mpc_ros.evaluation.bag_report.response import MotionSummary
-from t3mpc_ros.evaluation.bag_report.run_data import BY_WHEEL
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.metrics import METRICS, START, measure
@@ -29,7 +25,6 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
 )
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
-from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY
 from t3mpc_ros.geometry.kinematics import WheelGeometry, body_speeds
 
 
@@ -162,20 +157,3 @@ def test_tables_of_the_estimators():
     assert '| type1 | +0.3000 ± 0.0000 * | +0.6000 ± 0.0000 * |' in text
     assert f'| **type3** | 3.0000 ± {wide:.4f} | 5.0000 ± {wide:.4f} | +2.000 (+67 %) |' in text
     assert '(rad/s²)' in text
-
-
-def test_tables_of_motion(monkeypatch):
-    run = SimpleNamespace(
-        channels=BY_WHEEL, motions={COMMAND: 'command', ODOMETRY: 'motion'}, measured=ODOMETRY
-    )
-    summary = MotionSummary(12.0, 34.0, 0.56, 24.0, ((1.0, 2.5), (7.0, 7.5)), 0.75)
-    monkeypatch.setattr(report_page, 'motion_summary', lambda _: summary)
-    assert dict(report_page.motion_table(run).rows) == {
-        'path length, forwards and backwards': '12.0 m',
-        'turning, both ways': '34.0 rad',
-        'speed while moving, mean and largest': '0.500 and 0.560 m/s',
-        'time moving': '24.0 s',
-        'stops': '2, 2.0 s in all, the longest 1.5 s',
-        'standstill at': '1.0 to 2.5, 7.0 to 7.5 s',
-        'of that, motion was commanded': '0.8 s',
-    }

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report.continuity import within_gaps
 from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics, link_metrics
-from t3mpc_ros.evaluation.bag_report.response import responses
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, moves
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.drive_response import ResponseFit
+from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
 from t3mpc_ros.evaluation.record import away_from_switches
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
@@ -367,6 +366,15 @@ def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, Error
         )
         for wheel, *_ in run.channels
     }
+
+
+def responses(run: Run) -> Mapping[str, ResponseFit]:
+    """Return the fitted response of each channel that is identifiable."""
+    command, motion = run.motions.get(COMMAND), run.motions.get(run.measured)
+    if command is None or motion is None:
+        return {}
+    fits = {each.name: fit_response(command, motion, each.name) for each in run.channels}
+    return {name: fit for name, fit in fits.items() if fit is not None}
 
 
 def format_number(value: float) -> str:

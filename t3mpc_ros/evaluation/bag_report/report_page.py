@@ -22,9 +22,9 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     format_number,
     preview_before_switch,
 )
+from t3mpc_ros.evaluation.bag_report.motion import motion_rows
 from t3mpc_ros.evaluation.bag_report.patrol_section import patrol_blocks
 from t3mpc_ros.evaluation.bag_report.report_charts import LABELS, SECTIONS
-from t3mpc_ros.evaluation.bag_report.response import motion_summary
 from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
@@ -74,30 +74,6 @@ def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> Table:
         gain = format_number(fit.gain) if fit.clear else EMPTY_CELL
         rows.append([each.title, *numbers, gain, format_number(100.0 * max(fit.explained, 0.0))])
     return Table('', head, rows)
-
-
-def motion_table(run: Run) -> Table:
-    """Return path length, turning, stops and speeds; no row when they are unknown."""
-    found = motion_summary(run)
-    if found is None:
-        return Table('', ['quantity', 'value'], [])
-    longest = max((end - start for start, end in found.stops), default=0.0)
-    stood = sum(end - start for start, end in found.stops)
-    where = ', '.join(f'{start:.1f} to {end:.1f}' for start, end in found.stops[:5])
-    more = f', and {len(found.stops) - 5} more' if len(found.stops) > 5 else ''
-    mean = found.distance / found.moving if found.moving > 0.0 else 0.0
-    rows = [
-        ['path length, forwards and backwards', f'{format_number(found.distance)} m'],
-        ['turning, both ways', f'{format_number(found.turned)} rad'],
-        ['speed while moving, mean and largest', f'{mean:.3f} and {found.fastest:.3f} m/s'],
-        ['time moving', f'{found.moving:.1f} s'],
-        ['stops', f'{len(found.stops)}, {stood:.1f} s in all, the longest {longest:.1f} s'],
-    ]
-    if found.stops:
-        rows.append(['standstill at', f'{where}{more} s'])
-    if COMMAND in run.motions:
-        rows.append(['of that, motion was commanded', f'{found.disobeyed:.1f} s'])
-    return Table('', ['quantity', 'value'], rows)
 
 
 def link_table(links: Mapping[str, LinkMetrics]) -> Table:
@@ -274,7 +250,7 @@ def extents(run: Run) -> str:
 def _response(run: Run, figures: ReportMetrics) -> Iterator[Block]:
     """Yield the tables of response, motion and radio link, with their titles."""
     tables = [
-        ('Path and stops', motion_table(run)),
+        ('Path and stops', Table('', ['quantity', 'value'], motion_rows(run))),
         ('Radio link', link_table(figures.links)),
     ]
     if figures.responses:

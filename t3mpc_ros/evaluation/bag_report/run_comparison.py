@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,7 +26,7 @@ from t3mpc_ros.evaluation.bag_report.report_charts import TERM_COLOURS, TERM_DAS
 from t3mpc_ros.evaluation.bag_report.report_page import verdict_box
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, load_run
 from t3mpc_ros.evaluation.charts import Chart, Curve, Plane
-from t3mpc_ros.evaluation.confidence_intervals import interval, rms
+from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, rms
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
     Block,
@@ -74,8 +75,7 @@ class ComparedRun:
     parameters: Mapping[str, str]
 
 
-@dataclass(frozen=True)
-class ErrorDifference:
+class ErrorDifference(NamedTuple):
     """How much the mean squared settled error of a run differs from that of the first."""
 
     channel: Channel
@@ -87,18 +87,17 @@ class ErrorDifference:
     @property
     def verdict(self) -> str:
         """Whether the error is smaller or larger; inconclusive if the interval spans zero."""
-        if not abs(self.difference) > self.half:
+        if not Difference(self.difference, self.half).certain:
             return INCONCLUSIVE
         return BETTER if self.difference < 0.0 else WORSE
 
     def text(self) -> str:
         """Return the difference and its verdict as text."""
-        unit = f'({self.channel.unit})²'
         half = format_number(self.half) if math.isfinite(self.half) else 'unknown'
         difference = f'{self.difference:+.3g}' if math.isfinite(self.difference) else 'unknown'
         return (
-            f'{self.channel.title}: mean squared error {difference} ± {half} {unit}, '
-            f'{self.verdict}'
+            f'{self.channel.title}: mean squared error {difference} ± {half} '
+            f'({self.channel.unit})², {self.verdict}'
         )
 
 
@@ -121,12 +120,10 @@ def error_differences(first: Run, other: Run) -> list[ErrorDifference]:
     found = []
     for channel in other.channels:
         a, b = block_errors(first, channel.name), block_errors(other, channel.name)
-        if min(len(a), len(b)) < 1:
-            found.append(ErrorDifference(channel, math.nan, math.inf))
-            continue
         # Independent intervals, with the fewer degrees of freedom in each.
         half = math.hypot(interval(a), interval(b))
-        found.append(ErrorDifference(channel, float(np.mean(b) - np.mean(a)), half))
+        difference = float(np.mean(b) - np.mean(a)) if a and b else math.nan
+        found.append(ErrorDifference(channel, difference, half))
     return found
 
 
@@ -233,13 +230,12 @@ def _verdict(first: ComparedRun, other: ComparedRun) -> VerdictBox:
     if why := why_not_comparable(first, other):
         return VerdictBox('Not comparable', [f'{why[0].upper()}{why[1:]}.'], 'open', subject)
     found = error_differences(first.run, other.run)
-    verdicts = {each.verdict for each in found}
-    if verdicts in ({BETTER}, {BETTER, INCONCLUSIVE}):
+    verdicts = {each.verdict for each in found} - {INCONCLUSIVE}
+    headline, kind = 'Inconclusive', 'open'
+    if verdicts == {BETTER}:
         headline, kind = 'Smaller settled error', 'good'
-    elif verdicts in ({WORSE}, {WORSE, INCONCLUSIVE}):
+    elif verdicts == {WORSE}:
         headline, kind = 'Larger settled error', 'bad'
-    else:
-        headline, kind = 'Inconclusive', 'open'
     return VerdictBox(headline, [f'{each.text()}.' for each in found], kind, subject)
 
 

@@ -203,12 +203,10 @@ def _rounded_rate(rate: float) -> float:
     return whole if abs(rate - whole) <= 0.01 * rate else round(rate, 2)
 
 
-def fitting_parameters(drive: IdentifiedDrive, composition: str) -> ControllerParameters:
-    """Return the parameters of the controller for a drive, with the gain by the rule."""
-    return _resolved(drive, composition, drive.lag.value)
-
-
-def _resolved(drive: IdentifiedDrive, composition: str, lag: float) -> ControllerParameters:
+def fitting_parameters(
+    drive: IdentifiedDrive, composition: str, slower: float = 0.0
+) -> ControllerParameters:
+    """Return the parameters for a drive with a lag ``slower`` by some s; the gain by the rule."""
     parameters = StepperControllerParameters().with_values(
         {
             'rate': drive.rate,
@@ -216,7 +214,7 @@ def _resolved(drive: IdentifiedDrive, composition: str, lag: float) -> Controlle
             'wheel_separation': drive.geometry.wheel_separation,
             'composition': composition,
             'mean_speeds': drive.mean_speeds,
-            'speed_filter.lag': lag,
+            'speed_filter.lag': drive.lag.value + slower,
             'speed_filter.dead_time': drive.dead_time.value,
             'speed_filter.noise_variance': drive.noise_variance.value,
             'law.gain': 0.0,
@@ -228,7 +226,7 @@ def _resolved(drive: IdentifiedDrive, composition: str, lag: float) -> Controlle
 def drive_file(drive: IdentifiedDrive, composition: str, source: str) -> str:
     """Return the parameter file (YAML) of the controller for a drive; ``source`` names the bag."""
     values = fitting_parameters(drive, composition).to_dict()
-    slower = _resolved(drive, composition, drive.lag.value + drive.lag.uncertainty).to_dict()
+    slower = fitting_parameters(drive, composition, drive.lag.uncertainty).to_dict()
 
     def by_lag(name: str, unit: str) -> str:
         change = abs(float(str(slower[name])) - float(str(values[name])))
@@ -248,10 +246,9 @@ def drive_file(drive: IdentifiedDrive, composition: str, source: str) -> str:
         'law.gain': by_lag('law.gain', '1/s'),
         'law.smoothing': by_lag('law.smoothing', 'rad/s'),
     }
-    chosen = {name: values[name] for name in comments}
     rounded = {
-        name: float(f'{value:.5g}') if isinstance(value, float) else value
-        for name, value in chosen.items()
+        name: float(f'{value:.5g}') if isinstance(value := values[name], float) else value
+        for name in comments
     }
     title = (
         f'Drive identified from {source}: {drive.duration:.1f} s, '

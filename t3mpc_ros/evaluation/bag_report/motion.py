@@ -1,14 +1,11 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Motion of a robot: its responses to commands, path length, stops."""
-
-from collections.abc import Mapping
-from dataclasses import dataclass
+"""Motion of a robot in a report: path length, speeds, stops."""
 
 import numpy as np
 
+from t3mpc_ros.evaluation.bag_report.metrics import format_number
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
-from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
 from t3mpc_ros.evaluation.topic_roles import COMMAND
 from t3mpc_ros.geometry.types import Array
 
@@ -46,61 +43,47 @@ def smooth(series: Series, name: str) -> tuple[Array, Array]:
     return time, np.where(torn, np.nan, fitted)
 
 
-@dataclass(frozen=True)
-class MotionSummary:
-    """Summary of the motion; s, m and m/s."""
-
-    distance: float
-    """Path length, forwards or backwards."""
-    turned: float
-    """Sum of absolute turning, rad."""
-    fastest: float
-    """Largest smoothed speed."""
-    moving: float
-    """Time in motion."""
-    stops: tuple[tuple[float, float], ...]
-    """Start and end of each standstill of at least :data:`PAUSE`."""
-    disobeyed: float
-    """Part of that time in which motion was commanded."""
-
-
-def motion_summary(run: Run) -> MotionSummary | None:
-    """Return the summary of the measured motion; None when there are too few samples."""
-    motion = run.motions.get(run.measured)
+def motion_rows(run: Run) -> list[list[str]]:
+    """Return path length, turning, speeds and stops as rows; none when there are few samples."""
+    motion, command = run.motions.get(run.measured), run.motions.get(COMMAND)
     if motion is None:
-        return None
+        return []
     time, linear = smooth(motion, 'linear')
     _, angular = smooth(motion, 'angular')
     known = np.isfinite(linear)
     if not known.any():
-        return None
+        return []
     step = float(time[1] - time[0]) if time.size > 1 else 0.0
     still = known & (np.abs(linear) < STILL['linear']) & (np.abs(angular) < STILL['angular'])
     edges = np.flatnonzero(np.diff(np.concatenate([[0], still.astype(np.int8), [0]])))
-    spans = [(int(low), int(high)) for low, high in edges.reshape(-1, 2)]
-    spans = [(low, high) for low, high in spans if (high - low) * step >= PAUSE]
-    disobeyed = 0.0
-    command = run.motions.get(COMMAND)
-    if command is not None and len(command):
+    spans = [slice(*each) for each in edges.reshape(-1, 2).tolist()]
+    spans = [each for each in spans if (each.stop - each.start) * step >= PAUSE]
+    stops = [(float(time[each][0]), float(time[each][-1])) for each in spans]
+    lengths = [end - start for start, end in stops]
+    distance = float(np.abs(linear[known]).sum() * step)
+    moving = float(np.count_nonzero(known & ~still) * step)
+    mean, fastest = distance / moving if moving > 0.0 else 0.0, np.abs(linear[known]).max()
+    turned = float(np.abs(angular[known]).sum() * step)
+    rows = [
+        ['path length, forwards and backwards', f'{format_number(distance)} m'],
+        ['turning, both ways', f'{format_number(turned)} rad'],
+        ['speed while moving, mean and largest', f'{mean:.3f} and {fastest:.3f} m/s'],
+        ['time moving', f'{moving:.1f} s'],
+        [
+            'stops',
+            f'{len(stops)}, {sum(lengths):.1f} s in all, the longest '
+            f'{max(lengths, default=0.0):.1f} s',
+        ],
+    ]
+    if stops:
+        where = ', '.join(f'{start:.1f} to {end:.1f}' for start, end in stops[:5])
+        more = f', and {len(stops) - 5} more' if len(stops) > 5 else ''
+        rows.append(['standstill at', f'{where}{more} s'])
+    if command is not None:
         commanded = np.zeros(time.size, dtype=np.bool_)
         for name, least in STILL.items():
             commanded |= np.abs(command.held(name, time)) > 2.0 * least
         commanded &= time >= command.time[0]
-        disobeyed = step * sum(int(np.count_nonzero(commanded[low:high])) for low, high in spans)
-    return MotionSummary(
-        distance=float(np.abs(linear[known]).sum() * step),
-        turned=float(np.abs(angular[known]).sum() * step),
-        fastest=float(np.abs(linear[known]).max()),
-        moving=float(np.count_nonzero(known & ~still) * step),
-        stops=tuple((float(time[low]), float(time[high - 1])) for low, high in spans),
-        disobeyed=disobeyed,
-    )
-
-
-def responses(run: Run) -> Mapping[str, ResponseFit]:
-    """Return the fitted response of each channel that is identifiable."""
-    command, motion = run.motions.get(COMMAND), run.motions.get(run.measured)
-    if command is None or motion is None:
-        return {}
-    fits = {each.name: fit_response(command, motion, each.name) for each in run.channels}
-    return {name: fit for name, fit in fits.items() if fit is not None}
+        disobeyed = step * sum(int(np.count_nonzero(commanded[each])) for each in spans)
+        rows.append(['of that, motion was commanded', f'{disobeyed:.1f} s'])
+    return rows
