@@ -417,7 +417,7 @@ def test_initial_inputs_complete_a_late_recording(lost, republished, tmp_path):
 
 
 @pytest.mark.parametrize('republished', [0, 100])
-def test_without_all_initial_inputs_a_late_recording_is_not_exact(republished, tmp_path):
+def test_without_all_initial_inputs_a_recording_is_not_exact(republished, tmp_path):
     inputs = load_inputs(record_late(tmp_path / 'bag', 150, republished))
     complete = load_inputs(golden('switches'))
     assert not inputs.exact.all()
