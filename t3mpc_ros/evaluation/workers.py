@@ -160,15 +160,11 @@ def workers_for(executor: Any, jobs: Sequence[Any]) -> int | Executor:
     if executor is None and not hasattr(sys.modules['__main__'], '__file__'):
         return 1
     if count > 1:
-        _check_picklable(jobs[0])
+        try:
+            pickle.dumps(jobs[0])
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise ValueError(
+                'controller, plant and noise must be defined at the top level of a file to be '
+                f'sent to other processes; use executor=1 to stay in this one: got {error}'
+            ) from None
     return min(count, len(jobs))
-
-
-def _check_picklable(job: Any) -> None:
-    try:
-        pickle.dumps(job)
-    except (pickle.PicklingError, AttributeError, TypeError) as error:
-        raise ValueError(
-            'controller, plant and noise must be defined at the top level of a file to be sent to '
-            f'other processes; use executor=1 to stay in this one: got {error}'
-        ) from None

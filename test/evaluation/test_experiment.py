@@ -91,7 +91,9 @@ def test_runs_of_lost_workers_are_begun_again_three_times(losses, finished, tmp_
 
 def test_content_tells_equal_numbers_of_other_kinds_apart():
     values = [1, 1.0, True, '1', [1], (1, 2), {'1': 1}, None, Named, doubled]
+    values += [np.array([1.0, 2.0]), np.array([1.0, 2.5]), np.array([1, 2])]
     assert len({repr(content_of(value)) for value in values}) == len(values)
+    assert content_of(values[-1].copy()) == content_of(values[-1])
 
 
 def test_content_changes_with_every_field():

@@ -34,7 +34,9 @@ def sweep(folder, begun, monkeypatch):
 
     monkeypatch.setattr(parameter_sweep, 'measured_run', measured)
     path, values = folder / 'sweep.parquet', {'gain': [10.0, 20.0]}
-    return t3.sweep('ADRC', values, seeds=[1, 2], plant='servo', output=path, executor=1).rows
+    found = t3.sweep('ADRC', values, seeds=[1, 2], plant='servo', output=path, executor=1)
+    assert [*folder.iterdir()] == [path]
+    return found.rows
 
 
 def paper(folder, begun, monkeypatch):

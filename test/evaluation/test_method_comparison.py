@@ -137,18 +137,6 @@ def test_feed_forward_crosses_a_jump_half_way_by_its_ramp():
     assert middle == pytest.approx(1.495, abs=0.004)
 
 
-def test_feed_forward_uses_no_measurement():
-    wave = np.column_stack([np.sin(0.03 * np.arange(200)), np.cos(0.03 * np.arange(200))])
-    model = servo_model()
-    both = []
-    for speed in (0.0, 5.0):
-        forward, future = FeedForward(FeedForwardParameters(), model), wave[1:41]
-        chi = np.full(2, speed)
-        seen = Observation(chi, chi, future[0], future[1], chi, future)
-        both.append(chi + T * forward.step(seen) / model.share)
-    assert both[0] == pytest.approx(both[1], abs=1e-12)
-
-
 def test_lost_measurements_do_not_delay_the_ramp():
     """After a gap within a ramp the commands are those of the run without it."""
     reference = np.zeros((300, 2))

@@ -5,12 +5,10 @@
 from dataclasses import replace
 import math
 
-import numpy as np
 import pytest
 
 from t3mpc_ros.evaluation import experiment
 from t3mpc_ros.evaluation.experiment import Run, digest, run_experiment, source_digest
-from t3mpc_ros.evaluation.methods import methods
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.result_file import ResultFile
 
@@ -116,28 +114,6 @@ def test_progress_shows_pace_and_time_left(capsys):
     with progress_bar(2, show=False) as bar:
         bar.update()
     assert capsys.readouterr().err == ''
-
-
-def test_digests_differ_by_each_part_of_a_method():
-    method = methods('velocity')['ADRC']
-    changes = {
-        'name': 'n',
-        'controller_type': methods('velocity')['DMC'].controller_type,
-        'parameters': method.parameters.with_values({'gain': 7.0}),
-        'pretrained': False,
-        'baseline': False,
-    }
-    assert {*changes} == {*method.__dataclass_fields__}
-    found = [digest(method)]
-    for name, value in changes.items():
-        other = replace(method)
-        object.__setattr__(other, name, value)  # also a type that does not fit the parameters
-        found.append(digest(other))
-    arrays = np.array([1.0, 2.0]), np.array([1.0, 2.5]), np.array([1, 2])
-    found += [digest({'gains': each}) for each in arrays]
-    assert len({*found}) == len(found)
-    assert digest(replace(method)) == digest(method)
-    assert digest({'gains': arrays[0].copy()}) == digest({'gains': arrays[0]})
 
 
 def test_the_digest_covers_sources_that_change_a_run(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
+from functools import partial
 import hashlib
 import importlib.util
 import inspect
@@ -96,15 +97,9 @@ def loaded(spec: str) -> Any:
 
 
 def as_controllers(given: Any) -> list[Controller]:
-    """Return one controller, or each of a list or tuple, by :func:`as_controller`."""
-    return [
-        as_controller(each) for each in (given if isinstance(given, list | tuple) else [given])
-    ]
-
-
-def as_controller(given: Any) -> Controller:
-    """Return what a caller gave as a :class:`Controller`."""
-    return given if isinstance(given, Controller) else Controller(given)
+    """Return what a caller gave, one or a list or tuple, as :class:`Controller`."""
+    sources = given if isinstance(given, list | tuple) else [given]
+    return [each if isinstance(each, Controller) else Controller(each) for each in sources]
 
 
 def _plain_name(source: Any) -> str:
@@ -218,7 +213,7 @@ class OwnMethod:
             made = deepcopy(source)
             step = made.step
         else:
-            made, step = source, _with_settings(source, settings)
+            made, step = source, partial(source, **settings)
         return OwnController(self.name, step, made, nominal_model)
 
     def driver(self, scenario: Scenario) -> MethodDriver:
@@ -241,10 +236,6 @@ class OwnMethod:
         except Exception as error:
             raise ScriptError(f'{self.name} cannot be made: {described(error)}') from None
         return made.step, made
-
-
-def _with_settings(function: Callable[..., Any], settings: dict[str, Any]) -> Any:
-    return lambda observation: function(observation, **settings)
 
 
 @dataclass(frozen=True)

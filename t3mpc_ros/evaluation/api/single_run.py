@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.controllers import as_controller
+from t3mpc_ros.evaluation.api.controllers import as_controllers
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
@@ -149,7 +149,8 @@ def simulate(
         Wrong use, or a controller or plant that failed; the text says what and where.
     """
     scenario = own_scenario(plant, reference, noise, faults, duration, case=case, seed=seed)
-    method = as_controller(controller).method(scenario.robot)
+    (given,) = as_controllers([controller])
+    method = given.method(scenario.robot)
     record = run(scenario, method)
     if not record.finite:
         k = int(np.argmax(~np.isfinite(record.speeds).all(axis=1)))

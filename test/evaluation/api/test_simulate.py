@@ -203,12 +203,6 @@ def test_a_noise_law_replaces_the_white_noise_of_the_twin():
     assert np.std(noise[driven & (second > 0.505)]) == pytest.approx(1.0, rel=0.15)
 
 
-def test_faults_of_the_links_are_worse_than_none():
-    lost = t3.LinkFaults(command_loss=0.5, odometry_loss=0.3)
-    faulty = t3.simulate(Proportional, faults=lost, **SHORT)
-    assert faulty.rmse(1.0) > t3.simulate(Proportional, **SHORT).rmse(1.0)
-
-
 def test_the_twin_takes_reference_controller_and_faults():
     block = t3.FaultSchedule([t3.FaultEvent(3.0, 'wheel_blocked', 'right')])
     blocked = t3.simulate(Proportional, reference=_wave, faults=block, duration=6.0)

@@ -87,29 +87,6 @@ def test_a_run_that_fails_is_a_row_with_its_reason():
         t3.sweep(Proportional, {'gain': [2000.0]}, seeds=[1], executor=1, **SHORT)
 
 
-def test_an_interrupted_sweep_goes_on_where_it_was(tmp_path, counted, monkeypatch):
-    pytest.importorskip('pyarrow')
-    path = tmp_path / 'new' / 'sweep.parquet'
-    whole = t3.sweep(Proportional, GAINS, seeds=[1, 2], executor=1, **SHORT)
-    counted.clear()
-    measured = parameter_sweep.measured_run
-
-    def stops(job):
-        if len(counted) == 3:
-            raise KeyboardInterrupt
-        return measured(job)
-
-    monkeypatch.setattr(parameter_sweep, 'measured_run', stops)
-    with pytest.raises(KeyboardInterrupt):
-        t3.sweep(Proportional, GAINS, seeds=[1, 2], executor=1, output=path, **SHORT)
-    assert not path.exists()
-    monkeypatch.setattr(parameter_sweep, 'measured_run', measured)
-    again = t3.sweep(Proportional, GAINS, seeds=[1, 2], executor=1, output=path, **SHORT)
-    assert len(counted) == 4
-    assert _numbers(again) == _numbers(whole)
-    assert [each.name for each in path.parent.iterdir()] == ['sweep.parquet']
-
-
 def test_a_sweep_with_more_values_runs_only_these(tmp_path, counted):
     parquet = pytest.importorskip('pyarrow.parquet')
     path = tmp_path / 'sweep.parquet'
