@@ -4,7 +4,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 from t3mpc_ros.bag.mcap_file import RECEIVE_TIME, SerializedMessage
@@ -95,7 +94,7 @@ class MergedReader:
         the file. A file is not read before its start time is reached.
         """
         return merge_streams(
-            (max(file.start_ns + offset, start_ns), partial(self._shifted, file, offset, start_ns))
+            (max(file.start_ns + offset, start_ns), self._shifted(file, offset, start_ns))
             for file, offset in self._files
             if file.end_ns + offset >= start_ns
         )

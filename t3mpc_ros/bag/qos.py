@@ -19,7 +19,7 @@ import yaml
 
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml, shortened
+from t3mpc_ros.parameters.yaml_files import PlainDumper, YamlError, read_yaml, shortened
 
 UNLIMITED = 2**63 - 1
 """RMW_DURATION_INFINITE in nanoseconds: 9223372036 s and 854775807 ns."""
@@ -146,7 +146,7 @@ def dump_yaml(value: object) -> str:
     """Return ``value`` as block YAML in the given order, without anchors or folded lines."""
     return yaml.dump(
         value,
-        Dumper=_PlainDumper,
+        Dumper=PlainDumper,
         sort_keys=False,
         default_flow_style=False,
         allow_unicode=True,
@@ -209,13 +209,6 @@ def _override_profile(topic: str, policies: Any) -> QosProfile:
         return QosProfile.from_mapping({**default, **policies})
     except QosError as error:
         raise QosError(f'{topic}: {error}') from error
-
-
-class _PlainDumper(yaml.SafeDumper):
-    """YAML dumper without aliases: equal profiles are repeated instead of ``*id001``."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
 
 
 def _shortest(durations_ns: Iterable[int]) -> int:

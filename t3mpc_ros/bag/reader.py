@@ -4,7 +4,6 @@
 
 from array import array
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from functools import partial
 import heapq
 from operator import attrgetter
 from pathlib import Path
@@ -77,14 +76,6 @@ class RosbagsFile:
             for item, stamp_ns, data in self._reader.messages(selected, start_ns, last_ns):
                 yield SerializedMessage(item.topic, stamp_ns, stamp_ns, bytes(data))
 
-    def attachments(self) -> list[tuple[int, Attachment]]:
-        """Return no attachment: these formats have none."""
-        return []
-
-    def attachment_sizes(self) -> list[tuple[str, str, int]]:
-        """Return no attachment."""
-        return []
-
     def close(self) -> None:
         """Close the file; idempotent."""
         reader, self._reader = self._reader, None
@@ -140,9 +131,7 @@ class BagReader:
         self, topics: Collection[str] | None = None
     ) -> Iterator[SerializedMessage]:
         """Yield the serialized messages of ``topics``, or of all, in order of receipt."""
-        return merge_streams(
-            (file.start_ns, partial(file.messages, topics)) for file in self.files
-        )
+        return merge_streams((file.start_ns, file.messages(topics)) for file in self.files)
 
     def messages(self, topic: str) -> Iterator[tuple[float, Any]]:
         """Yield (received, decoded message) in order of receipt, s."""
@@ -198,7 +187,8 @@ class BagReader:
 
     def attachments(self) -> dict[str, Attachment]:
         """Return the attachments by name; the newest of each name."""
-        found = [pair for file in self.files for pair in file.attachments()]
+        files = [file for file in self.files if isinstance(file, McapFile)]
+        found = [pair for file in files for pair in file.attachments()]
         found.sort(key=lambda pair: pair[0])
         return {item.name: item for _, item in found}
 
@@ -277,33 +267,26 @@ def merge_topics(topics: Iterable[TopicInformation]) -> dict[str, TopicInformati
 
 
 def merge_streams(
-    streams: Iterable[tuple[int, Callable[[], Iterator[SerializedMessage]]]],
+    streams: Iterable[tuple[int, Iterator[SerializedMessage]]],
 ) -> Iterator[SerializedMessage]:
     """Merge sorted streams of messages by receive time; equal times keep the order of streams.
 
-    Each stream comes with a lower bound of its receive times, at which it is opened.
+    Each stream comes with a lower bound of its receive times, before which it is not read.
     """
-    waiting = sorted((start_ns, number, make) for number, (start_ns, make) in enumerate(streams))
-    waiting.reverse()
-    running: list[tuple[int, int, SerializedMessage, Iterator[SerializedMessage]]] = []
-    while waiting or running:
-        while waiting and (not running or waiting[-1][0] <= running[0][0]):
-            _, number, make = waiting.pop()
-            stream = make()
-            if (first := next(stream, None)) is not None:
-                heapq.heappush(running, (first.received_ns, number, first, stream))
-        if not running:
-            continue
-        if len(running) == 1 and not waiting:
-            yield running[0][2]
-            yield from running[0][3]
+    heap: list[tuple[int, int, SerializedMessage | None, Iterator[SerializedMessage]]]
+    heap = [(start_ns, number, None, stream) for number, (start_ns, stream) in enumerate(streams)]
+    heapq.heapify(heap)
+    while heap:
+        _, number, message, stream = heap[0]
+        if message is not None:
+            yield message
+        if len(heap) == 1:
+            yield from stream
             return
-        _, number, message, stream = running[0]
-        yield message
         if (following := next(stream, None)) is not None:
-            heapq.heapreplace(running, (following.received_ns, number, following, stream))
+            heapq.heapreplace(heap, (following.received_ns, number, following, stream))
         else:
-            heapq.heappop(running)
+            heapq.heappop(heap)
 
 
 def missing_sample_ratio(stamps: Array, rate: float) -> float:

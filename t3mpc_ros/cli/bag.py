@@ -12,6 +12,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
+from t3mpc_ros.bag.mcap_file import McapFile
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import BagReader, open_bag
@@ -106,6 +107,7 @@ def _info(bag: BagReader) -> dict[str, Any]:
         'attachments': [
             {'file': file.path.name, 'name': name, 'media_type': media_type, 'size': size}
             for file in bag.files
+            if isinstance(file, McapFile)
             for name, media_type, size in file.attachment_sizes()
         ],
         'rates': {topic.name: _rate(bag, topic) for topic in bag.topics.values()},
@@ -399,12 +401,7 @@ def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
     parser.add_argument(
         '--output', type=Path, metavar='DIR', help='write a bag of what was computed'
     )
-    parser.add_argument(
-        '--method',
-        action=RemovedOption,
-        nargs='?',
-        help=argparse.SUPPRESS,
-    )
+    parser.add_argument('--method', action=RemovedOption, nargs='?', help=argparse.SUPPRESS)
     add_input_options(parser)
     parser.set_defaults(run=run_replay)
 
@@ -500,12 +497,7 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
     parser.add_argument(
         '--picture', type=Path, metavar='FILE', help='draw the first divergence as PNG'
     )
-    parser.add_argument(
-        '--update-golden',
-        action=RemovedOption,
-        nargs='?',
-        help=argparse.SUPPRESS,
-    )
+    parser.add_argument('--update-golden', action=RemovedOption, nargs='?', help=argparse.SUPPRESS)
     add_input_options(parser)
     parser.set_defaults(run=run_compare)
 
@@ -522,7 +514,7 @@ def run_compare(options: argparse.Namespace) -> int:
         write_divergence_figure,
     )
 
-    tolerances = tolerances_from(options.abs, options.rel, options.fields)
+    tolerances = _tolerances(options)
     changes = parse_assignments(ControllerParameters, options.parameters)
     model = load_model(options.model) if options.model else None
     inputs = load_inputs(options.bag, options.namespace, model)
@@ -542,26 +534,20 @@ def run_compare(options: argparse.Namespace) -> int:
     return SAME if outcome.same else DIFFERS
 
 
-def tolerances_from(
-    absolute: float | None, relative: float | None, fields: Sequence[str]
-) -> 'Tolerances':
+def _tolerances(options: argparse.Namespace) -> 'Tolerances':
     """Return the tolerances given on the command line."""
-    from t3mpc_ros.evaluation.process_replay.replay_comparison import (
-        ABSOLUTE,
-        RELATIVE,
-        Tolerances,
-    )
+    from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances
 
     own = {}
-    for text in fields:
+    for text in options.fields:
         name, _, value = text.rpartition('=')
         try:
             own[name] = float(value)
         except ValueError:
             raise ValueError(f'--field must be FIELD=NUMBER: got {text!r}') from None
-    return Tolerances(
-        ABSOLUTE if absolute is None else absolute, RELATIVE if relative is None else relative, own
-    )
+    given = {'absolute': options.abs, 'relative': options.rel}
+    chosen = {name: value for name, value in given.items() if value is not None}
+    return Tolerances(**chosen, fields=own)
 
 
 def add_train_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:

@@ -14,7 +14,7 @@ from t3mpc_ros.cli.run_options import (
 )
 
 
-def add_outcomes_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
     """Add the subcommand ``faults``."""
     parser = commands.add_parser(
         'faults', help='drive the digital twin under every named fault, and say what comes of it'

@@ -22,7 +22,7 @@ WINDOW = 10_000
 """Number of messages over which a rate is averaged."""
 
 
-def add_parsers(commands: Any) -> None:
+def add_parser(commands: Any) -> None:
     """Add the subcommands for topics, parameters and services."""
     topic = commands.add_parser('topic', help='topics of the graph, as ros2 topic')
     words = topic.add_subparsers(dest='word', required=True, metavar='list|echo|hz')

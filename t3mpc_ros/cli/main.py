@@ -12,16 +12,8 @@ import sys
 from typing import TYPE_CHECKING
 import webbrowser
 
+from t3mpc_ros.cli import compare, faults, graph, paper, patrol, sweep, train, tune, view
 from t3mpc_ros.cli.command import ArgumentParser, reject_removed, run_command
-from t3mpc_ros.cli.compare import add_parser as add_compare
-from t3mpc_ros.cli.faults import add_outcomes_parser
-from t3mpc_ros.cli.graph import add_parsers as add_graph_parsers
-from t3mpc_ros.cli.paper import add_parser as add_paper
-from t3mpc_ros.cli.patrol import add_parser as add_patrol
-from t3mpc_ros.cli.sweep import add_parser as add_sweep
-from t3mpc_ros.cli.train import add_parser as add_train
-from t3mpc_ros.cli.tune import add_parser as add_tune
-from t3mpc_ros.cli.view import add_parser as add_view
 from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
 
@@ -258,16 +250,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     exponents.set_defaults(run=_exponents)
 
-    add_paper(commands)
-    add_compare(commands)
-    add_sweep(commands)
-    add_patrol(commands)
-    add_tune(commands)
-    add_train(commands)
-    add_outcomes_parser(commands)
-    add_view(commands)
-    add_graph_parsers(commands)
-
+    for module in (paper, compare, sweep, patrol, tune, train, faults, view, graph):
+        module.add_parser(commands)
     compiling = commands.add_parser('compile', help='compile every kernel into the cache')
     compiling.set_defaults(run=_compile)
     return parser

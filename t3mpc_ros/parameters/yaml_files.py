@@ -93,11 +93,16 @@ def parameter_file(
     return '\n'.join([*lines, ''])
 
 
-class _Dumper(yaml.SafeDumper):
-    """Writes what the parser of ROS reads: it knows no aliases, and 12345e6789 is a number."""
+class PlainDumper(yaml.SafeDumper):
+    """Repeats equal values in place of aliases, which the parser of ROS does not know."""
 
     def ignore_aliases(self, data: object) -> bool:
+        """Return True: no value has an alias."""
         return True
+
+
+class _Dumper(PlainDumper):
+    """Writes what the parser of ROS reads: to it 12345e6789 is a number."""
 
 
 def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
