@@ -52,7 +52,9 @@ def _view(options: argparse.Namespace) -> int:
             from t3mpc_ros.cli.recorded_run import recorded_run
 
             print(f'reading {options.bag}', file=sys.stderr, flush=True)
-            with PageServer(recorded_run(options.bag), None, options.port) as server:
+            with PageServer(
+                recorded_run(options.bag), None, options.port, time.monotonic
+            ) as server:
                 _announce(server, options)
                 while not stop():
                     time.sleep(0.1)
@@ -62,7 +64,7 @@ def _view(options: argparse.Namespace) -> int:
         run = LiveRun()
         with view_node(run, options.namespace) as node:
             command = None if options.read_only else node.command
-            with PageServer(run, command, options.port) as server:
+            with PageServer(run, command, options.port, time.monotonic) as server:
                 _announce(server, options)
                 node.spin(stop)
     return 0

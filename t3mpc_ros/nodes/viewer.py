@@ -297,14 +297,15 @@ class ViewNode(Node):
 
     # -- commands ---------------------------------------------------------------------------------
 
-    def command(self, name: str, arguments: Mapping[str, Any]) -> str:
+    def command(self, name: str, arguments: Mapping[str, Any], asked: float) -> str:
         """Execute a command from another thread while :meth:`spin` runs; return what was done.
 
-        ``set`` takes node, name and value of a parameter; the services in :data:`SERVICES` with
-        a SetBool take ``on``. CommandFailedError if it was refused, or without an answer.
+        ``asked`` is the steady time of the click, s: what is too late is refused. ``set`` takes
+        node, name and value of a parameter; the services in :data:`SERVICES` with a SetBool take
+        ``on``. CommandFailedError if it was refused, or without an answer.
         """
         reply: Future[str] = Future()
-        self._pending.put(partial(self._start, name, arguments, reply))
+        self._pending.put(partial(self._start, name, arguments, asked, reply))
         try:
             text = reply.result(REPLY_TIMEOUT)
         except TimeoutError:
@@ -314,10 +315,15 @@ class ViewNode(Node):
             ) from None
         return text
 
-    def _start(self, name: str, arguments: Mapping[str, Any], reply: 'Future[str]') -> None:
+    def _start(
+        self, name: str, arguments: Mapping[str, Any], asked: float, reply: 'Future[str]'
+    ) -> None:
         if not reply.set_running_or_notify_cancel():
             return
         try:
+            late = self._sink.refusal(name, arguments.get('on'), asked, time.monotonic())
+            if late:
+                raise CommandFailedError(late)
             if name == 'set':
                 self._set_parameter(arguments, reply)
             elif name in self._command_clients:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from itertools import takewhile
 import math
-from threading import Condition
+from threading import Lock
 from typing import NamedTuple
 
 Json = None | bool | int | float | str | Sequence['Json'] | Mapping[str, 'Json']
@@ -40,7 +40,7 @@ class LiveData:
 
     def __init__(self, span: float = SPAN, step: float = 0.0) -> None:
         self._span, self._step = span, step
-        self._changed = Condition()
+        self._lock = Lock()
         self._number = 0
         self._streams: dict[str, deque[Sample]] = {}
         self._facts: dict[str, tuple[int, Json]] = {}
@@ -52,7 +52,7 @@ class LiveData:
         Time goes back when a bag is played again, or a robot starts anew.
         """
         finite = tuple(float(value) if math.isfinite(value) else None for value in values)
-        with self._changed:
+        with self._lock:
             kept = self._streams.setdefault(stream, deque())
             if kept and 0.0 <= time - kept[-1].time < self._step:
                 return
@@ -64,13 +64,13 @@ class LiveData:
 
     def set(self, fact: str, value: Json) -> None:
         """Set a fact; readers get it if it has changed."""
-        with self._changed:
+        with self._lock:
             if fact not in self._facts or self._facts[fact][1] != value:
                 self._facts[fact] = self._next(), value
 
     def report(self, time: float, kind: str, text: str) -> None:
         """Add an event: ``switch``, ``fault``, ``stop``, ``command`` or ``note``, in one line."""
-        with self._changed:
+        with self._lock:
             self._events.append((self._next(), {'time': time, 'kind': kind, 'text': text}))
 
     def read(self, cursor: int) -> tuple[Mapping[str, Json], int]:
@@ -79,7 +79,7 @@ class LiveData:
         The keys are ``streams`` (for each its times and columns), ``facts`` and ``events``; one
         without content is left out.
         """
-        with self._changed:
+        with self._lock:
             streams = {
                 name: _columns(new[::-1])
                 for name, kept in self._streams.items()
@@ -92,14 +92,8 @@ class LiveData:
             found: dict[str, Json] = {'streams': streams, 'facts': facts, 'events': events}
             return {name: value for name, value in found.items() if value}, self._number
 
-    def wait(self, cursor: int, timeout: float) -> bool:
-        """Wait until something has changed since the cursor, at most ``timeout`` seconds."""
-        with self._changed:
-            return self._changed.wait_for(lambda: self._number > cursor, timeout)
-
     def _next(self) -> int:
         self._number += 1
-        self._changed.notify_all()
         return self._number
 
 

@@ -3,6 +3,7 @@
 """A run in real time: its data, what its nodes report, and the banner that says what it does."""
 
 from collections.abc import Mapping, Sequence
+import math
 from typing import Literal, NamedTuple
 
 from t3mpc_ros.view.live_data import STEP, LiveData
@@ -64,6 +65,12 @@ ODOMETRY = 'odometry'
 """Stream whose samples show that a robot is connected."""
 
 
+MAX_AGE = 3.0
+"""Age of a command up to which it is executed, s."""
+STOPS = (('e_stop', True), ('enable', False), ('pause', True))
+"""Commands that stop the robot, each with the value of its ``on``."""
+
+
 class LiveRun(LiveData):
     """LiveData of a run in real time; the facts include the banner.
 
@@ -78,6 +85,7 @@ class LiveRun(LiveData):
         self._last_odometry: float | None = None
         self._time = 0.0
         self._banner: Banner | None = None
+        self._newest_stop = -math.inf
 
     def add(self, stream: str, time: float, values: Sequence[float]) -> None:
         """Add a sample."""
@@ -110,3 +118,23 @@ class LiveRun(LiveData):
             self.report(self._time, 'stop', f'{shown.headline}{reason}')
         elif previous.kind in ('stopped', 'lost'):
             self.report(self._time, 'note', shown.headline)
+
+    def refusal(self, name: str, on: object, asked: float, now: float) -> str:
+        """Return why a command is not to be executed; '' for one that is.
+
+        ``asked`` is the time of the click and ``now`` the present one on the same clock, s. While
+        the program is suspended or the network stalls, clicks wait, and then arrive together and
+        in any order. A stop is executed whenever it arrives. Anything else is executed only while
+        it is recent, and never if it was asked for before the newest stop: a release that waited
+        must not undo the stop that a person asked for after it.
+        """
+        if (name, on) in STOPS:
+            self._newest_stop = max(self._newest_stop, min(asked, now))
+            return ''
+        if not now - MAX_AGE <= asked <= now + MAX_AGE:
+            return (
+                f'{name} was asked for more than {MAX_AGE:g} s ago and is not executed: ask again'
+            )
+        if asked <= self._newest_stop:
+            return f'{name} was asked for before the last stop and is not executed: ask again'
+        return ''

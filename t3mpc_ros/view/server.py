@@ -2,10 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Web server of the live page, for this machine only.
 
-The page reads ``/events``, a stream of server-sent events, and sends commands to ``/command``. A
-page of another origin can do neither: requests with a foreign ``Host`` are refused (a name that
-another site lets point to this machine), and so are commands with a foreign ``Origin`` or without
-the token that this start of the server has written into its own page.
+The page asks ``/events`` several times a second for what is new, and sends commands to
+``/command``. No request is kept waiting: a browser has six connections to a host, for all of its
+tabs together, and the e-stop needs one at any time. A page of another origin can do neither:
+requests with a foreign ``Host`` are refused (a name that another site lets point to this machine),
+and so are commands with a foreign ``Origin`` or without the token that this start of the server
+has written into its own page.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,8 +17,9 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 import json
+import math
 import secrets
-from threading import BoundedSemaphore, Event, Thread
+from threading import Thread
 from typing import Any, Self
 from urllib.parse import parse_qs, urlsplit
 
@@ -24,12 +27,6 @@ from t3mpc_ros.page.page_files import PAGE_FILES, page_file
 from t3mpc_ros.view.live_data import Json, LiveData
 
 ADDRESS = '127.0.0.1'
-PERIOD = 0.05
-"""Least time between two events of a stream, s."""
-HEARTBEAT = 1.0
-"""Longest time between two events of a stream, s: the page notices a lost connection."""
-MAX_READERS = 8
-"""Number of pages that may be open at once."""
 MAX_BODY = 4096
 """Largest command, bytes."""
 
@@ -46,8 +43,9 @@ _HEADERS = {
     'X-Content-Type-Options': 'nosniff',
 }
 
-Command = Callable[[str, Mapping[str, Json]], str]
-"""Executes a command: name and arguments; returns what was done, or raises RuntimeError."""
+Command = Callable[[str, Mapping[str, Json], float], str]
+"""Executes a command: name, arguments, and the time of the click on the steady clock of this
+program, s, -inf if the page does not know it; returns what was done, or raises RuntimeError."""
 
 
 class RefusedError(Exception):
@@ -62,15 +60,17 @@ class PageServer:
     """Serves the live page of one run, in threads of its own; a context manager.
 
     ``command`` runs in a thread of the server; None: the page shows only. ``port`` is a TCP port
-    on :data:`ADDRESS`, 0 a free one; OSError if it is in use.
+    on :data:`ADDRESS`, 0 a free one; OSError if it is in use. ``clock`` is the steady clock on
+    which the times of commands count, s.
     """
 
-    def __init__(self, data: LiveData, command: Command | None, port: int) -> None:
+    def __init__(
+        self, data: LiveData, command: Command | None, port: int, clock: Callable[[], float]
+    ) -> None:
         self.data = data
         self.command = command
+        self.clock = clock
         self.token = secrets.token_urlsafe(24)
-        self.readers = BoundedSemaphore(MAX_READERS)
-        self.closing = Event()
         try:
             self._server = _Server((ADDRESS, port), self)
         except OSError as error:
@@ -91,7 +91,6 @@ class PageServer:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.closing.set()
         self._server.shutdown()
         self._server.server_close()
 
@@ -99,6 +98,9 @@ class PageServer:
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
+    request_queue_size = (
+        128  # what a suspended program finds waiting; beyond it, a stop waits longer
+    )
 
     def __init__(self, address: tuple[str, int], page: PageServer) -> None:
         self.page = page
@@ -142,7 +144,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _get(self) -> None:
         page, url = self.server.page, urlsplit(self.path)
         if url.path == '/events':
-            self._stream(url.query)
+            self._events(url.query)
             return
         name = url.path.removeprefix('/') or 'view.html'
         if name not in _PAGE:
@@ -152,30 +154,16 @@ class _Handler(BaseHTTPRequestHandler):
             text = text.replace('{{ token }}', page.token if page.command else '')
         self._send(text, _TYPES[name[name.rindex('.') :]])
 
-    def _stream(self, query: str) -> None:
+    def _events(self, query: str) -> None:
+        """Send what is new since the last request of this page, and the time of this clock."""
         page = self.server.page
-        if not page.readers.acquire(blocking=False):
-            raise RefusedError(
-                HTTPStatus.SERVICE_UNAVAILABLE,
-                f'at most {MAX_READERS} pages may be open at once; close one',
-            )
-        try:
-            self._send_headers('text/event-stream', None)
-            self.close_connection = True
-            cursor = self._cursor(query)
-            while not page.closing.is_set():
-                page.data.wait(cursor, HEARTBEAT)
-                changes, cursor = page.data.read(cursor)
-                text = json.dumps(changes, separators=(',', ':'), allow_nan=False)
-                self.wfile.write(f'id: {page.token[:8]}-{cursor}\ndata: {text}\n\n'.encode())
-                self.wfile.flush()
-                page.closing.wait(PERIOD)
-        finally:
-            page.readers.release()
+        changes, cursor = page.data.read(self._cursor(query))
+        reply = {**changes, 'id': f'{page.token[:8]}-{cursor}', 'now': page.clock()}
+        self._send(json.dumps(reply, separators=(',', ':'), allow_nan=False), 'application/json')
 
     def _cursor(self, query: str) -> int:
         """Return the number up to which the page has read; 0 for a page of an earlier start."""
-        last = self.headers.get('Last-Event-ID') or parse_qs(query).get('last', [''])[0]
+        last = parse_qs(query).get('last', [''])[0]
         start, _, number = last.rpartition('-')  # the start may contain a hyphen, too
         return int(number) if start == self.server.page.token[:8] and number.isdecimal() else 0
 
@@ -187,16 +175,16 @@ class _Handler(BaseHTTPRequestHandler):
             raise RefusedError(
                 HTTPStatus.FORBIDDEN, 'this page was started with --read-only: commands are off'
             )
-        name, arguments = self._read_command(page)
+        command = self._read_command(page)
         try:
-            done = page.command(name, arguments)
+            done = page.command(*command)
         except RuntimeError as error:
             self._send(json.dumps({'error': str(error)}), 'application/json', HTTPStatus.CONFLICT)
         else:
             self._send(json.dumps({'done': done}), 'application/json')
 
-    def _read_command(self, page: PageServer) -> tuple[str, Mapping[str, Json]]:
-        """Return name and arguments of a command of this very page."""
+    def _read_command(self, page: PageServer) -> tuple[str, Mapping[str, Json], float]:
+        """Return name, arguments and time of a command of this very page."""
         origin = self.headers.get('Origin', f'http://{self.headers["Host"]}')
         if origin != f'http://{self.headers["Host"]}':
             raise RefusedError(HTTPStatus.FORBIDDEN, f'commands from {origin} are refused')
@@ -213,14 +201,15 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             content = json.loads(self.rfile.read(int(length)))
             name, arguments = content['command'], content.get('arguments', {})
-        except (ValueError, KeyError, TypeError, RecursionError):
+            asked = float(content.get('asked', -math.inf))
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             name = arguments = None
         if not isinstance(name, str) or not isinstance(arguments, dict):
             raise RefusedError(
                 HTTPStatus.BAD_REQUEST,
-                'a command must be {"command": NAME, "arguments": {…}} in JSON',
+                'a command must be {"command": NAME, "arguments": {…}, "asked": SECONDS} in JSON',
             )
-        return name, arguments
+        return name, arguments, asked
 
     def _send(self, text: str, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
         content = text.encode()

@@ -11,6 +11,7 @@ from pathlib import Path
 import pty
 import sys
 import threading
+import time
 
 import pytest
 from rosbags.rosbag2 import StoragePlugin
@@ -272,8 +273,8 @@ def _unplugged(*_):
 
 def a_page(folder):
     server._file.__wrapped__('view.html')
-    with server.PageServer(LiveData(), None, 0) as page, suppress(OSError):
-        server.PageServer(LiveData(), None, page.port)
+    with server.PageServer(LiveData(), None, 0, time.monotonic) as page, suppress(OSError):
+        server.PageServer(LiveData(), None, page.port, time.monotonic)
 
 
 def results(folder):

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node of the live page: what it collects from a running robot, and its commands."""
 
+import time
+
 import pytest
 from support.ros_graph import CommandSource, twist
 
@@ -39,9 +41,10 @@ class Viewer:
 
         self.harness.spin_until(met)
 
-    def command(self, name, /, **arguments):
+    def command(self, name, /, *, asked=None, **arguments):
         command = self.node.command
-        return self.harness.in_thread(command, name, arguments, spin_until=self.spin_until)
+        asked = time.monotonic() if asked is None else asked
+        return self.harness.in_thread(command, name, arguments, asked, spin_until=self.spin_until)
 
     def parameter(self, name):
         rows = self.facts().get('parameters/sim_robot') or ()
@@ -126,10 +129,18 @@ def test_a_command_that_has_waited_too_long_is_not_executed(viewer, robot, monke
     """A page whose program was suspended must not enable a robot much later."""
     monkeypatch.setattr('t3mpc_ros.nodes.viewer.REPLY_TIMEOUT', 0.01)
     with pytest.raises(CommandFailedError, match='no answer to e_stop'):
-        viewer.node.command('e_stop', {'on': True})  # nothing is polled meanwhile
+        viewer.node.command('e_stop', {'on': True}, 0.0)  # nothing is polled meanwhile
     monkeypatch.undo()
     with pytest.raises(CommandFailedError, match='no emergency stop is latched'):
         viewer.command('e_stop', on=False)
+
+
+def test_a_release_from_before_the_stop_is_refused(viewer, robot):
+    early = time.monotonic()
+    viewer.command('e_stop', on=True)
+    with pytest.raises(CommandFailedError, match='before the last stop'):
+        viewer.command('e_stop', on=False, asked=early)
+    assert robot._state.status.estop
 
 
 def test_a_node_that_leaves_takes_its_parameters_along(viewer, robot, harness):

@@ -4,13 +4,12 @@
 
 import json
 import math
-from threading import Thread
 
 import numpy as np
 import pytest
 
 from t3mpc_ros.view.live_data import MAX_EVENTS, SPAN, LiveData
-from t3mpc_ros.view.live_run import LOST, LiveRun, NodeReport, banner
+from t3mpc_ros.view.live_run import LOST, MAX_AGE, LiveRun, NodeReport, banner
 
 
 def test_readers_of_any_pace_get_every_sample_once_and_in_order():
@@ -74,17 +73,6 @@ def test_a_fact_is_read_again_only_when_it_has_changed():
     assert data.read(cursor)[0] == {}
     data.set('world', None)
     assert data.read(cursor)[0] == {'facts': {'world': None}}
-
-
-def test_a_reader_that_waits_wakes_with_the_next_change():
-    data = LiveData()
-    assert not data.wait(0, 0.01)
-    woken = []
-    reader = Thread(target=lambda: woken.append(data.wait(0, 30.0)))
-    reader.start()
-    data.add('a', 0.0, [1.0])
-    reader.join(30.0)
-    assert woken == [True]
 
 
 TRACKING = {'controller': NodeReport('tracking'), 'sim_robot': NodeReport('following commands')}
@@ -164,3 +152,41 @@ def test_the_report_of_a_node_that_has_left_is_discarded():
     run.node_gone('sim_robot')
     run.tick(0.0)
     assert run.read(0)[0]['facts']['banner']['kind'] == 'good'
+
+
+@pytest.mark.parametrize(
+    ('commands', 'executed'),
+    [
+        # name, on, time of the click, time of its arrival
+        ([('e_stop', False, 10.0, 10.1)], [True]),
+        ([('e_stop', False, 10.0, 10.1 + MAX_AGE)], [False]),
+        ([('reset', None, -math.inf, 10.0)], [False]),
+        ([('reset', None, math.nan, 10.0)], [False]),
+        ([('reset', None, 11.0 + MAX_AGE, 10.0)], [False]),
+        ([('e_stop', True, -math.inf, 10.0)], [True]),
+        ([('e_stop', True, 10.0, 99.0), ('enable', False, 0.0, 99.0)], [True, True]),
+        # A release and a stop wait together; whichever arrives last, the stop stays.
+        ([('e_stop', False, 10.0, 12.0), ('e_stop', True, 11.0, 12.0)], [True, True]),
+        ([('e_stop', True, 11.0, 12.0), ('e_stop', False, 10.0, 12.0)], [True, False]),
+        ([('enable', False, 11.0, 12.0), ('enable', True, 10.5, 12.0)], [True, False]),
+        ([('pause', True, 11.0, 12.0), ('pause', False, 11.0, 12.0)], [True, False]),
+        ([('e_stop', True, 11.0, 12.0), ('e_stop', False, 11.5, 12.0)], [True, True]),
+        # The clock of the page may be fast: what is asked for after the stop arrived counts.
+        ([('e_stop', True, 13.0, 12.0), ('e_stop', False, 12.5, 12.6)], [True, True]),
+        # An old stop that arrives once more undoes nothing that was asked for before it.
+        (
+            [
+                ('e_stop', True, 11.0, 11.1),
+                ('e_stop', False, 12.0, 12.1),
+                ('e_stop', True, 11.0, 12.2),
+                ('e_stop', False, 12.3, 12.4),
+            ],
+            [True, True, True, True],
+        ),
+    ],
+)
+def test_a_late_command_is_executed_if_it_stops(commands, executed):
+    run = LiveRun()
+    found = [run.refusal(*each) for each in commands]
+    assert [text == '' for text in found] == executed
+    assert all(text == '' or 'ask again' in text for text in found)

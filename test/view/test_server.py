@@ -5,12 +5,14 @@
 from contextlib import closing
 from http.client import HTTPConnection
 import json
+import math
 import re
+import time
 
 import pytest
 
 from t3mpc_ros.view.live_data import LiveData
-from t3mpc_ros.view.server import ADDRESS, MAX_BODY, MAX_READERS, PageServer
+from t3mpc_ros.view.server import ADDRESS, MAX_BODY, PageServer
 
 
 class Page:
@@ -37,28 +39,24 @@ class Page:
         return status, json.loads(text)
 
     def events(self, last=''):
-        """Yield id and content of each event from now on."""
-        with closing(HTTPConnection(ADDRESS, self.server.port, timeout=20)) as connection:
-            connection.request('GET', f'/events?last={last}', headers={'Host': self.host})
-            answer = connection.getresponse()
-            assert answer.status == 200
-            while line := answer.readline().decode():
-                if match := re.match(r'id: (.*)', line):
-                    content = answer.readline().decode().removeprefix('data: ')
-                    yield match[1], json.loads(content)
+        """Return the id and the news of an answer."""
+        status, _, text = self.request('GET', f'/events?last={last}')
+        assert status == 200
+        news = json.loads(text)
+        return news.pop('id'), news
 
 
 @pytest.fixture
 def page():
     done = []
 
-    def command(name, arguments):
+    def command(name, arguments, asked):
         if name == 'fail':
             raise RuntimeError('no node offers it')
-        done.append((name, arguments))
+        done.append((name, arguments, asked))
         return 'latched'
 
-    with PageServer(LiveData(), command, 0) as server:
+    with PageServer(LiveData(), command, 0, time.monotonic) as server:
         yield Page(server, done)
 
 
@@ -78,7 +76,9 @@ def test_page_and_scripts_are_served_and_nothing_else(page):
 
 def test_a_command_of_the_page_is_executed(page):
     assert page.command() == (200, {'done': 'latched'})
-    assert page.done == [('e_stop', {'on': True})]
+    assert page.done == [('e_stop', {'on': True}, -math.inf)]
+    assert page.command(b'{"command": "reset", "asked": 12.5}')[0] == 200
+    assert page.done[-1] == ('reset', {}, 12.5)
     assert page.command(b'{"command": "fail"}') == (409, {'error': 'no node offers it'})
 
 
@@ -109,7 +109,15 @@ def test_a_foreign_host_reads_nothing(page):
 
 @pytest.mark.parametrize(
     'body',
-    [b'', b'[]', b'{"command": 1}', b'{"command": "x", "arguments": 3}', b'[' * 3000, b'\xff'],
+    [
+        b'',
+        b'[]',
+        b'{"command": 1}',
+        b'{"command": "x", "arguments": 3}',
+        b'{"command": "x", "asked": "now"}',
+        b'[' * 3000,
+        b'\xff',
+    ],
 )
 def test_a_malformed_command_is_refused(body, page):
     status, answer = page.command(body)
@@ -118,7 +126,7 @@ def test_a_malformed_command_is_refused(body, page):
 
 
 def test_a_read_only_page_has_no_token_and_takes_no_command():
-    with PageServer(LiveData(), None, 0) as server:
+    with PageServer(LiveData(), None, 0, time.monotonic) as server:
         page = Page(server, [])
         assert server.token not in page.request('GET', '/')[2]
         status, answer = page.command()
@@ -131,41 +139,23 @@ def test_events_go_on_where_a_page_has_stopped(page, token):
     page.server.token = token
     data = page.server.data
     data.add('a', 0.0, [1.0])
-    last, content = next(page.events())
-    assert content['streams']['a']['values'] == [[1.0]]
+    last, news = page.events()
+    assert news['streams']['a']['values'] == [[1.0]]
     data.add('a', 1.0, [2.0])
-    assert next(page.events(last))[1]['streams']['a']['values'] == [[2.0]]
+    assert page.events(last)[1]['streams']['a']['values'] == [[2.0]]
     # The page of an earlier start has seen nothing of this one.
-    assert next(page.events('other-7'))[1]['streams']['a']['values'] == [[1.0, 2.0]]
+    assert page.events('other-7')[1]['streams']['a']['values'] == [[1.0, 2.0]]
 
 
-@pytest.mark.slow
-def test_an_idle_stream_has_a_heartbeat(page):
-    events = page.events()
-    assert [next(events)[1] for _ in range(2)] == [{}, {}]
-
-
-def test_one_page_too_many_is_refused(page):
-    page.server.data.add('a', 0.0, [1.0])
-    streams = [page.events() for _ in range(MAX_READERS)]
-    for stream in streams:
-        next(stream)
-    status, _, text = page.request('GET', '/events')
-    assert (status, 'close one' in text) == (503, True)
-
-
-def test_a_closed_page_makes_room_for_another(page):
-    """A page that is loaded again and again must not be refused after the eighth time."""
-    for _ in range(MAX_READERS):
-        stream = page.events()
-        page.server.data.set('page', id(stream))
-        next(stream)
-        stream.close()
-    # The server notices a closed connection when it writes to it, once a second at least.
-    for _ in range(MAX_READERS):
-        assert page.server.readers.acquire(timeout=20.0)
+def test_an_answer_without_news_comes_at_once_with_the_time(page):
+    """No request waits: of the six connections of a browser one must be free for a stop."""
+    before = time.monotonic()
+    last, news = page.events()
+    assert before <= news.pop('now') <= time.monotonic()
+    assert news == {}
+    assert page.events(last)[0] == last
 
 
 def test_a_port_in_use_is_an_error_with_a_remedy(page):
     with pytest.raises(OSError, match=r'port \d+ of 127.0.0.1 is not free .*--port'):
-        PageServer(LiveData(), None, page.server.port)
+        PageServer(LiveData(), None, page.server.port, time.monotonic)

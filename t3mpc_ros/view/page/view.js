@@ -1,11 +1,14 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// The live page: reads the stream of events, draws it, and sends commands.
+// The live page: asks for what is new, draws it, and sends commands.
 'use strict';
 
 const KEPT = 125; // s of samples of a live run
 const FRAME = 100; // ms between two pictures
-const SILENCE = 3500; // ms without an event after which the program counts as lost
+const POLL = 100; // ms between two requests, 2 s in a hidden tab
+const PATIENCE = 2000; // ms without an answer after which the program counts as lost
+const CONFIRM = 500; // ms within which a stop must be confirmed, and between two attempts
+const RELOAD = 30000; // ms for which a stop is asked for again after the page loads itself anew
 
 const place = (id) => document.getElementById(id);
 const token = document.querySelector('meta[name="token"]').content;
@@ -15,32 +18,40 @@ const streams = {}; // name -> {time: [], values: [[], …]}
 const facts = {};
 const events = [];
 let lastId = '';
-let lastEvent = performance.now();
-let source = null;
+let clock = null; // s to add to the time of the page for the clock of the program
 let connected = false;
+let stopping = ''; // why a stop is not confirmed yet
 let changed = true;
 let selection = null; // [from, to] while the charts do not follow the run
 let base = null; // pose of the odometry frame on the map
 let cursorTime = null;
 
-// -- stream --------------------------------------------------------------------------------------
+// -- news ----------------------------------------------------------------------------------------
 
-function connect() {
-  source?.close();
-  source = new EventSource(`events?last=${encodeURIComponent(lastId)}`);
-  source.onmessage = (message) => {
-    const [start] = message.lastEventId.split('-');
-    if (lastId && start !== lastId.split('-')[0]) location.reload(); // another start of the program
-    lastId = message.lastEventId;
-    lastEvent = performance.now();
-    setConnected(true);
-    take(JSON.parse(message.data));
-  };
-  source.onerror = () => {
-    source.close();
-    setConnected(false);
-    setTimeout(connect, 1000);
-  };
+const seconds = () => performance.now() / 1000;
+const pause = (time) => new Promise((resume) => { wake = resume; setTimeout(resume, time); });
+let wake = () => {};
+document.addEventListener('visibilitychange', () => wake());
+
+// Each request is answered at once: a connection that waited would be missing to the e-stop, as a
+// browser has six of them for all tabs.
+async function poll() {
+  for (;;) {
+    try {
+      const patience = AbortSignal.timeout(lastId ? PATIENCE : 30 * PATIENCE);
+      const reply = await fetch(`events?last=${encodeURIComponent(lastId)}`, { signal: patience });
+      const { id, now, ...news } = await reply.json();
+      const start = (text) => text.slice(0, text.lastIndexOf('-'));
+      if (lastId && start(id) !== start(lastId)) location.reload(); // another start of the program
+      lastId = id;
+      clock = Math.max(now - seconds(), (clock ?? -Infinity) - 1e-4); // the fastest answer
+      setConnected(true);
+      take(news);
+    } catch {
+      setConnected(false);
+    }
+    await pause(document.hidden ? 2000 : POLL);
+  }
 }
 
 function take(news) {
@@ -76,46 +87,85 @@ function setConnected(now) {
   showBanner();
 }
 
-setInterval(() => {
-  if (connected && performance.now() - lastEvent > SILENCE) setConnected(false);
-}, 500);
-
 // -- banner --------------------------------------------------------------------------------------
 
 function showBanner() {
-  const shown = connected ? facts.banner || { kind: 'lost', headline: 'Connected', detail: '' }
+  let shown = connected ? facts.banner || { kind: 'lost', headline: 'Connected', detail: '' }
     : { kind: 'lost', headline: 'This page has lost its program',
       detail: 'It connects again by itself as soon as t3mpc view runs.' };
+  if (stopping) {
+    shown = { kind: 'unconfirmed', headline: 'STOP NOT CONFIRMED: use the switch on the robot',
+      detail: `${stopping}; asking again` };
+  }
   place('banner').className = shown.kind;
   place('headline').textContent = shown.headline;
   place('detail').textContent = shown.detail;
   document.title = `${shown.headline} – t3mpc_ros`;
   place('release').hidden = readOnly || shown.headline !== 'E-STOP';
-  place('e-stop').disabled = readOnly || !connected;
+  place('e-stop').disabled = readOnly;
 }
 
 // -- commands ------------------------------------------------------------------------------------
+
+// Send a command; return what was done, or throw why not.
+async function send(name, args, asked, patience) {
+  const reply = await fetch('command', {
+    method: 'POST',
+    headers: { 'Content-Type': 'application/json', 'X-Token': token },
+    body: JSON.stringify({ command: name, arguments: args, asked: asked ?? undefined }),
+    signal: AbortSignal.timeout(patience),
+    priority: 'high',
+  });
+  const result = await reply.json();
+  if (!reply.ok) throw new Error(result.error);
+  return result.done;
+}
+
+const asked = () => clock === null ? null : clock + seconds();
 
 async function command(name, args = {}) {
   const answer = place('answer');
   answer.className = '';
   answer.textContent = `${name} …`;
   try {
-    const reply = await fetch('command', {
-      method: 'POST',
-      headers: { 'Content-Type': 'application/json', 'X-Token': token },
-      body: JSON.stringify({ command: name, arguments: args }),
-    });
-    const result = await reply.json();
-    if (!reply.ok) throw new Error(result.error);
-    answer.textContent = result.done;
+    answer.textContent = await send(name, args, asked(), 5000);
     return true;
   } catch (error) {
     answer.className = 'failed';
     answer.textContent = `not done: ${error.message}`;
-    if (name === 'e_stop' && args.on) place('detail').textContent = answer.textContent;
     return false;
   }
+}
+
+// Ask for a stop until it is confirmed. What asks may overlap: a stop may arrive twice.
+let attempts = null;
+
+async function emergencyStop() {
+  if (readOnly || attempts) return;
+  const time = asked();
+  attempts = setTimeout(() => unconfirmed('no answer yet'), CONFIRM);
+  sessionStorage.setItem('stop', Date.now());
+  for (;;) {
+    const next = new Promise((resume) => { setTimeout(resume, CONFIRM); });
+    try {
+      const done = await send('e_stop', { on: true }, time, 2 * CONFIRM);
+      place('answer').className = '';
+      place('answer').textContent = done;
+      break;
+    } catch (error) {
+      unconfirmed(error.name === 'TimeoutError' ? 'no answer' : error.message);
+    }
+    await next;
+  }
+  clearTimeout(attempts);
+  attempts = null;
+  sessionStorage.removeItem('stop');
+  unconfirmed('');
+}
+
+function unconfirmed(why) {
+  stopping = why;
+  showBanner();
 }
 
 const BUTTONS = [
@@ -137,11 +187,24 @@ function showButtons() {
   if (readOnly) place('answer').textContent = 'started with --read-only: commands are off';
 }
 
-place('e-stop').onclick = () => command('e_stop', { on: true });
+place('e-stop').onclick = emergencyStop;
 place('release').onclick = () => command('e_stop', { on: false });
+
+// The space bar stops wherever the focus is, but where a text is typed: before the focused element
+// gets it (a button would be pressed, a list opened), when it goes down and when it comes up.
+const isText = (target) => target.matches?.('input[type="text"], input[type="search"], textarea');
+const isStop = (key) => key.code === 'Space' && !readOnly && !facts.recording && !isText(key.target)
+  && !(key.ctrlKey || key.metaKey || key.altKey);
+for (const kind of ['keydown', 'keyup']) {
+  window.addEventListener(kind, (key) => {
+    if (!isStop(key)) return;
+    key.preventDefault();
+    key.stopPropagation();
+    if (kind === 'keydown' && !key.repeat) emergencyStop();
+  }, { capture: true });
+}
 document.addEventListener('keydown', (key) => {
   if (key.target.closest('input, select, button, textarea, summary') || key.ctrlKey || key.metaKey) return;
-  if (key.code === 'Space' && !readOnly) { key.preventDefault(); command('e_stop', { on: true }); }
   if (key.key === 'h') hold(selection ? null : visibleRange());
 });
 
@@ -416,4 +479,5 @@ setInterval(() => {
 theme.addEventListener('change', () => { changed = true; });
 
 showBanner();
-connect();
+poll();
+if (Date.now() - sessionStorage.getItem('stop') < RELOAD) emergencyStop(); // not confirmed before
