@@ -30,8 +30,6 @@ from t3mpc_ros.radio.tool import (
 )
 from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, ProcedureError, Script
 from t3mpc_ros.radio.tool.robot_records import (
-    POWERS,
-    RATES,
     SENSOR_COUNT,
     SENSORS,
     RobotSettings,
@@ -137,13 +135,13 @@ def _setup(options: argparse.Namespace, stop: StopSignal) -> int:
     if options.save is not None:
         if not stored.valid:
             raise ProcedureError('there are no settings to save: give the microsteps, or --load')
-        options.save.write_text(robot_settings.settings_file(stored.settings))
+        options.save.write_text(robot_settings.settings_file(stored.content))
         print(
             f'{options.save}: radio_bridge --ros-args --params-file {options.save}, '
             f't3mpc robot ping --params-file {options.save}'
         )
     if compared is not None:
-        rows = robot_settings.differences(stored.settings, compared)
+        rows = robot_settings.differences(stored.content, compared)
         print(robot_settings.format_differences(rows) or f'equal to {options.diff}')
         if rows:
             return EXIT_POOR
@@ -156,7 +154,7 @@ def _store_settings(
     options: argparse.Namespace,
     stop: StopSignal,
 ) -> StoredSettings:
-    rows = robot_settings.differences(stored.settings, wanted)
+    rows = robot_settings.differences(stored.content, wanted)
     if stored.state == frames.SETTINGS_GOOD and not rows:
         return stored
     if stored.valid:
@@ -190,7 +188,7 @@ def _ping(options: argparse.Namespace, stop: StopSignal) -> int:
 
 def _scan(options: argparse.Namespace, stop: StopSignal) -> int:
     parameters = _link_parameters(options)
-    rates = RATES if options.all_rates else (parameters.rate,)
+    rates = frames.RATES if options.all_rates else (parameters.rate,)
     interactive = sys.stderr.isatty()
 
     def progress(done: int, total: int, result: str) -> None:
@@ -423,8 +421,8 @@ def _add_settings_commands(
         help='10 hexadecimal digits; default: as stored, on a new board random',
     )
     add('--channel', type=_setting('channel', int), help='2400 MHz plus this')
-    add('--rate', choices=RATES, help='bit/s; 250k only with nRF24L01+ chips')
-    add('--power', choices=POWERS, help='of the transmitter of the robot, dBm')
+    add('--rate', choices=frames.RATES, help='bit/s; 250k only with nRF24L01+ chips')
+    add('--power', choices=frames.POWERS, help='of the transmitter of the robot, dBm')
     for name, convert, text in (
         ('microsteps', int, 'as set by the jumpers of the drivers'),
         ('steps_per_turn', int, 'full steps of a turn of the wheel'),

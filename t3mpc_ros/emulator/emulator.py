@@ -16,10 +16,9 @@ from t3mpc_ros.emulator.plant import Plant
 from t3mpc_ros.emulator.robot_board import RadioSettings, RobotBoard
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
-from t3mpc_ros.radio.protocol.frames import Command
+from t3mpc_ros.radio.protocol.frames import RATES, Command
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 
-_RATES = ('250k', '1M', '2M')
 _EXTERNAL_RESET, _BROWN_OUT_RESET = 2, 4
 """Reset flags as in the MCUSR register of an AVR."""
 _ROBOT_BOOT_LOADER_NS = NANOSECONDS
@@ -44,7 +43,7 @@ class EmulatorParameters(Parameters):
     channel: int = parameter(
         82, 'channel in the settings of the robot: 2400 MHz plus this', 'MHz', (0, 125)
     )
-    rate: str = parameter('1M', 'bit rate in the settings of the robot', choices=_RATES)
+    rate: str = parameter('1M', 'bit rate in the settings of the robot', choices=RATES)
 
     def check_consistency(self) -> None:
         """Raise ParameterError if the plant does not suit the board."""
@@ -80,7 +79,7 @@ class Emulator:
         self.faults = FaultInjection(lambda: self._events.now_ns, seed)
         self._clock_rate = 1.0 + parameters.robot_clock_error
         self.plant = Plant(parameters.twin, self._clock_rate)
-        rate = _RATES.index(parameters.rate)
+        rate = RATES.index(parameters.rate)
         self._channel = RadioChannel(
             self._events,
             RadioParameters(channel=parameters.channel, rate=rate),

@@ -16,14 +16,10 @@ class EventQueue:
     """Runs each callback at its time; callbacks of equal time run in the order of scheduling."""
 
     def __init__(self, now_ns: int) -> None:
-        self._now_ns = now_ns
+        self.now_ns = now_ns
+        """Time of the running callback, or the time up to which all callbacks have run."""
         self._events: list[tuple[int, int, Callback]] = []
         self._numbers = count()
-
-    @property
-    def now_ns(self) -> int:
-        """Time of the running callback, or the time up to which all callbacks have run."""
-        return self._now_ns
 
     @property
     def next_ns(self) -> int | None:
@@ -32,15 +28,15 @@ class EventQueue:
 
     def schedule(self, time_ns: int, callback: Callback) -> None:
         """Schedule a callback; a time in the past counts as now."""
-        heapq.heappush(self._events, (max(time_ns, self._now_ns), next(self._numbers), callback))
+        heapq.heappush(self._events, (max(time_ns, self.now_ns), next(self._numbers), callback))
 
     def schedule_after(self, delay_us: float, callback: Callback) -> None:
         """Schedule a callback ``delay_us`` from now."""
-        self.schedule(self._now_ns + round(delay_us * MICROSECOND), callback)
+        self.schedule(self.now_ns + round(delay_us * MICROSECOND), callback)
 
     def run_to(self, now_ns: int) -> None:
         """Run all callbacks due by ``now_ns``."""
         while self._events and self._events[0][0] <= now_ns:
-            self._now_ns, _, callback = heapq.heappop(self._events)
+            self.now_ns, _, callback = heapq.heappop(self._events)
             callback()
-        self._now_ns = max(self._now_ns, now_ns)
+        self.now_ns = max(self.now_ns, now_ns)

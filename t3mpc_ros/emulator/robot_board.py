@@ -87,7 +87,8 @@ class RobotBoard:
 
         ``reset_cause``: reset flags as in the MCUSR register of an AVR.
         """
-        self._now = 0
+        self.now_us = 0
+        """Time since boot, without the wrap to 32 bits."""
         self.sense()
         self._board.call('boot', reset_cause, 0)
         self._plant.boot(self._board.call('microsteps'))
@@ -95,11 +96,6 @@ class RobotBoard:
         self.on_settings(self.radio_settings)
 
     # -- state ------------------------------------------------------------------------------------
-
-    @property
-    def now_us(self) -> int:
-        """Time since boot, without the wrap to 32 bits."""
-        return self._now
 
     @property
     def session(self) -> int:
@@ -156,18 +152,18 @@ class RobotBoard:
 
     def run_to(self, time_us: int) -> None:
         """Advance board and plant to a time since boot."""
-        while self._now < time_us:
+        while self.now_us < time_us:
             # Without power the robot stands: its sensors need not be read at each sample.
             powered = self._motion.powered
             longest = self._plant.until_sample_us if powered else UNPOWERED_US
-            self._advance(min(time_us - self._now, longest))
+            self._advance(min(time_us - self.now_us, longest))
 
     def receive(self, data: bytes) -> None:
         """Process a payload that the radio receives now."""
         if self._board.call('packet', data, min(len(data), 0xFF)):
             command = decode_downlink(data)
             if isinstance(command, Command):
-                self.on_command(self._now, command)
+                self.on_command(self.now_us, command)
 
     def feed_console(self, data: bytes) -> None:
         """Process bytes that the USB console receives now."""
@@ -192,7 +188,7 @@ class RobotBoard:
         """Advance by this time, or to the next change of the motors' power or speed."""
         motion = self._motion
         passed = self._advance_core(us, self._by_reference)
-        self._now += passed
+        self.now_us += passed
         if self._plant.run(passed, motion.left, motion.right):
             self.sense()
         self._plant.set_motors(motion.powered, motion.turning)

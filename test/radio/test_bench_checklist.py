@@ -23,8 +23,7 @@ from t3mpc_ros.radio.tool.bench_checklist import (
     check_builds,
 )
 from t3mpc_ros.radio.tool.robot_log import LogEntry, LogKind
-from t3mpc_ros.radio.tool.robot_records import RobotSettings
-from t3mpc_ros.radio.tool.robot_settings import StoredSettings
+from t3mpc_ros.radio.tool.robot_records import RobotSettings, Stored
 from t3mpc_ros.robot.calibration import Calibration, DividerCorrection
 
 PONG = Pong(1, b'ping', 0, 2, 2, 0, 1, 0, 0, 0, 1, 0, 82, b'T3MPC', 7)
@@ -53,9 +52,8 @@ def samples(**changes):
 def findings(**changes):
     found = BoardFindings(
         PONG,
-        StoredSettings(frames.SETTINGS_GOOD, RobotSettings()),
-        frames.SETTINGS_MISSING,
-        Calibration(),
+        Stored(frames.SETTINGS_GOOD, RobotSettings()),
+        Stored(frames.SETTINGS_MISSING, Calibration()),
         (LogEntry(0, LogKind.BOOT, 0, 1), LogEntry(1, LogKind.BOOT, 0, 2)),
         samples(),
     )
@@ -73,6 +71,7 @@ def test_a_good_robot_passes():
 
 
 SETTINGS = RobotSettings()
+LOW_DIVIDER = Calibration(divider=DividerCorrection(-0.2, 0.0, 0.1))
 
 
 @pytest.mark.parametrize(
@@ -80,19 +79,19 @@ SETTINGS = RobotSettings()
     [
         ({'pong': PONG._replace(chip_ok=0)}, ['radio chip of the robot']),
         (
-            {'settings': StoredSettings(frames.SETTINGS_MISSING, SETTINGS)},
+            {'settings': Stored(frames.SETTINGS_MISSING, SETTINGS)},
             ['settings stored'],
         ),
         (
-            {'settings': StoredSettings(0, SETTINGS._replace(rate='250k'))},
+            {'settings': Stored(0, SETTINGS._replace(rate='250k'))},
             ['settings equal to those of the host'],
         ),
-        ({'calibration_state': frames.SETTINGS_DAMAGED}, ['calibration']),
+        ({'calibration': Stored(frames.SETTINGS_DAMAGED, Calibration())}, ['calibration']),
         ({'log': (LogEntry(0, LogKind.BOOT, 0, 8),)}, ['resets in the log']),
         ({'log': (LogEntry(0, LogKind.BOOT, 0, 4),)}, ['resets in the log']),
         ({'samples': samples(battery=0)}, ['battery']),
         ({'samples': samples(battery=480)}, ['battery']),
-        ({'calibration': Calibration(divider=DividerCorrection(-0.2, 0.0, 0.1))}, ['battery']),
+        ({'calibration': Stored(0, LOW_DIVIDER)}, ['battery']),
         ({'samples': samples(battery=0xFFFF)}, ['battery']),
         ({'samples': samples(imu=6 * [0])}, ['inertial sensor']),
         ({'samples': samples(imu=[0, 0, -16384, 0, 0, 1])}, ['gravity', 'noise of the rate']),
@@ -109,7 +108,7 @@ def test_each_defect_fails_its_own_line(changes, names):
 
 def test_a_sensor_that_is_not_there_is_not_missed():
     settings = SETTINGS._replace(sensors=('none', *7 * ('GP2Y0A21',)))
-    found = findings(settings=StoredSettings(0, settings), samples=samples(ranges=[0, *7 * [90]]))
+    found = findings(settings=Stored(0, settings), samples=samples(ranges=[0, *7 * [90]]))
     assert failed(found) == []
 
 

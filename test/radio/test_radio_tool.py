@@ -28,7 +28,7 @@ from t3mpc_ros.radio.tool import (
 from t3mpc_ros.radio.tool.channel_scan import ChannelResult
 from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, Procedure, ProcedureError
 from t3mpc_ros.radio.tool.robot_log import LogEntry, LogKind, format_log
-from t3mpc_ros.radio.tool.robot_records import POWERS, RATES, SENSORS, RobotSettings
+from t3mpc_ros.radio.tool.robot_records import SENSORS, RobotSettings
 
 KEY, OTHER = bytes(range(16)), bytes(range(1, 17))
 TURN = 3200
@@ -162,7 +162,7 @@ def test_a_new_robot_gets_a_random_address_and_keeps_it():
         addresses.add(settings.address)
         changed = write(bench, seed + 100, channel=100, microsteps=8)
         assert changed == settings._replace(channel=100, microsteps=8)
-        assert bench.at_robot(robot_settings.read_settings()).settings == changed
+        assert bench.at_robot(robot_settings.read_settings()).content == changed
     assert len(addresses) == 20
 
 
@@ -180,7 +180,7 @@ def test_settings_survive_a_restart_of_the_robot():
     bench = ToolBench(erased=True)
     settings = write(bench)
     bench.emulator.restart_robot()
-    assert bench.at_robot(robot_settings.read_settings()).settings == settings
+    assert bench.at_robot(robot_settings.read_settings()).content == settings
 
 
 def test_settings_are_never_sent_to_the_dongle():
@@ -209,8 +209,8 @@ def test_a_settings_file_holds_every_setting():
         settings = RobotSettings(
             robot_settings.draw_address(source.randbytes),
             source.randint(0, 125),
-            source.choice(RATES),
-            source.choice(POWERS),
+            source.choice(frames.RATES),
+            source.choice(frames.POWERS),
             1 << source.randint(0, 8),
             source.randint(20, 10_000),
             source.random() < 0.5,

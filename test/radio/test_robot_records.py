@@ -54,12 +54,12 @@ class Cable:
             received = b''
             for action in actions:
                 if isinstance(action, Write) and self.source.random() >= self.loss:
-                    self.robot.call('usb', action.data, ctypes.c_uint32(len(action.data)))
+                    self.robot.call('usb', action.data, len(action.data))
             while now_ns < wait.until_ns and not received:
                 self.robot.run(1000)
                 now_ns += 1_000_000
                 room = ctypes.create_string_buffer(4096)
-                size = self.robot.call('usb_take', room, ctypes.c_uint32(4096))
+                size = self.robot.call('usb_take', room, 4096)
                 received = room.raw[:size] if self.source.random() >= self.loss else b''
         return task.error or task.result
 
@@ -126,14 +126,14 @@ def test_values_that_do_not_fit_are_rejected_before_sending(change, words):
 @pytest.mark.parametrize('loss', [0.0, 0.1])
 def test_calibration_survives_reset_and_lost_frames(library, loss):
     robot = Robot(library)
-    robot.call('set_cell_us', ctypes.c_uint32(3400))
+    robot.call('set_cell_us', 3400)
     cable = Cable(robot, loss)
     assert cable.run(robot_records.read_calibration()) == robot_records.Calibration()
     stored = cable.run(robot_records.write_calibration(CALIBRATION))
     assert robot_records.encode_calibration(stored) == robot_records.encode_calibration(
         CALIBRATION
     )
-    robot.call('boot', 4, ctypes.c_uint32(0))
+    robot.call('boot', 4, 0)
     assert cable.run(robot_records.read_calibration()) == stored
     # A value is changed with the others kept.
     changed = stored._replace(gyro_bias=None)
@@ -142,7 +142,7 @@ def test_calibration_survives_reset_and_lost_frames(library, loss):
     body = robot_records.encode_settings(settings)
     assert cable.run(robot_records.write_record(frames.SETTINGS_RECORD, body)) == body
     record = cable.run(robot_records.read_record(frames.SETTINGS_RECORD))
-    assert (record.valid, robot_records.decode_settings(record.body)) == (True, settings)
+    assert (record.valid, robot_records.decode_settings(record.content)) == (True, settings)
 
 
 def test_damage_and_bad_timing_have_a_remedy(library):
@@ -153,24 +153,24 @@ def test_damage_and_bad_timing_have_a_remedy(library):
     assert 'stop the bridge' in cable.run(robot_records.write_calibration(CALIBRATION))
     robot.run(1_000_000)
     for copy in (104, 192):
-        robot.call('poke_eeprom', ctypes.c_uint16(copy + 3), ctypes.c_uint8(0))
-    robot.call('boot', 4, ctypes.c_uint32(0))
+        robot.call('poke_eeprom', copy + 3, 0)
+    robot.call('boot', 4, 0)
     assert 'damaged' in cable.run(robot_records.read_calibration())
-    robot.call('wear', ctypes.c_uint16(110), ctypes.c_bool(True))
+    robot.call('wear', 110, True)
     assert 'worn out' in cable.run(robot_records.write_calibration(CALIBRATION))
 
 
 def test_raw_samples(library):
     robot = Robot(library)
     for channel in range(9):
-        robot.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(100 * channel))
+        robot.call('set_adc', channel, 100 * channel)
     registers = (ctypes.c_int16 * 7)(1, -2, 16384, 0, 4, 5, -6)
-    robot.call('set_imu', ctypes.c_bool(True), registers)
+    robot.call('set_imu', True, registers)
     cable = Cable(robot)
     samples = cable.run(robot_records.read_samples())
     assert robot_records.range_counts(samples) == tuple(range(0, 800, 100))
     assert samples[2:] == (800, 1, -2, 16384, 4, 5, -6)
-    robot.call('set_imu', ctypes.c_bool(False), registers)
+    robot.call('set_imu', False, registers)
     assert cable.run(robot_records.read_samples())[3:] == (0, 0, 0, 0, 0, 0)
 
 

@@ -65,14 +65,8 @@ class Session:
         """Start the session with the INFO of the robot; return the problem if there is one."""
         if info.protocol != frames.VERSION:
             return reasons.robot_version(info.protocol)
-        if info.settings == frames.SETTINGS_MISSING:
-            return reasons.SETTINGS_MISSING
-        if info.settings == frames.SETTINGS_DAMAGED:
-            return reasons.SETTINGS_DAMAGED
-        if info.settings == frames.SETTINGS_OLD:
-            return reasons.SETTINGS_OLD
-        if info.settings == frames.CALIBRATION_DAMAGED:
-            return reasons.CALIBRATION_DAMAGED
+        if info.settings in reasons.SETTINGS:
+            return reasons.SETTINGS[info.settings]
         if self._key and not info.nonce:
             return reasons.ROBOT_KEY_MISSING
         if info.nonce and not self._key:

@@ -74,7 +74,8 @@ class ActiveSession:
         self._arbiter = arbiter
         self._statistics = statistics
         self._period_ns = round(NANOSECONDS / parameters.cycle_rate)
-        self._due_ns = now_ns
+        self.due_ns = now_ns
+        """Time of the next cycle."""
         self._aux_ns = self._ping_ns = now_ns
         self._cycles = 0
         self._accepted_ns = self._answered_ns = now_ns
@@ -85,11 +86,6 @@ class ActiveSession:
         self._stops: int | None = None
         self._stop_until_ns = 0
         self._disable_attempts = _DISABLE_COMMANDS
-
-    @property
-    def due_ns(self) -> int:
-        """Time of the next cycle."""
-        return self._due_ns
 
     def is_silent(self, now_ns: int) -> bool:
         """Return whether the robot has not answered for the time to live of a command."""
@@ -104,14 +100,14 @@ class ActiveSession:
         """Stop the robot from now on; setpoints are ignored."""
         if self._stops is None:
             self._stops, self._stop_until_ns = _MIN_STOP_COMMANDS, now_ns + _STOP_TIMEOUT_NS
-            self._due_ns = now_ns
+            self.due_ns = now_ns
 
     def next(self, now_ns: int) -> frames.Downlink | PingRequest | None:
         """Return the request to send now, if any; a POLL for STATE follows each payload."""
-        if now_ns < self._due_ns:
-            return self._next_request(now_ns) if self._due_ns - now_ns >= _MIN_IDLE_NS else None
+        if now_ns < self.due_ns:
+            return self._next_request(now_ns) if self.due_ns - now_ns >= _MIN_IDLE_NS else None
         # Late cycles are skipped.
-        self._due_ns = max(self._due_ns + self._period_ns, now_ns + self._period_ns // 2)
+        self.due_ns = max(self.due_ns + self._period_ns, now_ns + self._period_ns // 2)
         self._cycles += 1
         if self._period_ns < 2 * _MIN_IDLE_NS and self._cycles % _REQUEST_DECIMATION == 0:
             request = self._next_request(now_ns)
@@ -145,9 +141,9 @@ class ActiveSession:
         The robot refuses every command before it, for its echo.
         """
         if self.is_silent(result.returned_ns):
-            self._due_ns = self._accepted_ns = result.returned_ns
+            self.due_ns = self._accepted_ns = result.returned_ns
         elif isinstance(result.request, frames.Poll) and result.request.what == frames.STATE:
-            self._due_ns = result.returned_ns
+            self.due_ns = result.returned_ns
 
     def _next_request(self, now_ns: int) -> frames.Downlink | PingRequest | None:
         """Return the request that is due between cycles, if any."""

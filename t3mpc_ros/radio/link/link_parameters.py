@@ -7,10 +7,8 @@ from typing import ClassVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
-from t3mpc_ros.radio.protocol.frames import BOARD_PARAMETERS, Configure, Downlink, Hello
+from t3mpc_ros.radio.protocol import frames
 
-_RATES = ('250k', '1M', '2M')
-_POWERS = ('-18', '-12', '-6', '0')
 _GAP_UNIT = 250e-6
 _GAPS = {'250k': 2.75e-3, '1M': 1.5e-3, '2M': 1.75e-3}
 """s; at 250k acknowledgements are long, at 2M the tag check takes longer than 1.5 ms."""
@@ -83,7 +81,7 @@ class RobotParameters(Parameters):
         values['invert_wheels'] = self.invert_left + 2 * self.invert_right
         return {
             number: values[parameter.name]
-            for number, parameter in enumerate(BOARD_PARAMETERS)
+            for number, parameter in enumerate(frames.BOARD_PARAMETERS)
             if parameter.name in values
         }
 
@@ -100,9 +98,9 @@ class LinkParameters(Parameters):
         source='nRF24L01+ data sheet 1.0, 6.3',
     )
     rate: str = parameter(
-        '1M', 'air data rate, bit/s; 250k only with nRF24L01+ chips', choices=_RATES
+        '1M', 'air data rate, bit/s; 250k only with nRF24L01+ chips', choices=frames.RATES
     )
-    power: str = parameter('0', 'transmitter output power, dBm', choices=_POWERS)
+    power: str = parameter('0', 'transmitter output power, dBm', choices=frames.POWERS)
     retries: ClassVar[int] = 4
     """Retransmissions without an acknowledgement, 0.7 ms each: late commands are worthless."""
     address: str = parameter(
@@ -133,9 +131,9 @@ class LinkParameters(Parameters):
         """Gap between CMD and POLL, unit 250 us: the acknowledgement ends within it."""
         return round(_GAPS[self.rate] / _GAP_UNIT)
 
-    def gap_after(self, first: Downlink) -> int:
+    def gap_after(self, first: frames.Downlink) -> int:
         """Return the gap after a first packet; it is longer for a signed HELLO."""
-        signed = isinstance(first, Hello) and first.tag
+        signed = isinstance(first, frames.Hello) and first.tag
         return max(self.gap, round(_HELLO_GAP / _GAP_UNIT)) if signed else self.gap
 
     @property
@@ -143,15 +141,15 @@ class LinkParameters(Parameters):
         """TTL of a CMD, unit 10 ms."""
         return round(self.ttl * NANOSECONDS / TTL_UNIT_NS)
 
-    def configure(self, number: int) -> Configure:
+    def configure(self, number: int) -> frames.Configure:
         """Return the frame that configures the radio of the dongle."""
         # A shorter delay would cut off acknowledgements of 32 bytes (data sheet 7.4.2).
         delay = 5 if self.rate == '250k' else 1
-        return Configure(
+        return frames.Configure(
             number,
             self.channel,
-            _RATES.index(self.rate),
-            _POWERS.index(self.power),
+            frames.RATES.index(self.rate),
+            frames.POWERS.index(self.power),
             delay,
             self.retries,
             bytes.fromhex(self.address),

@@ -68,11 +68,6 @@ class TelemetryDecoder:
         self.configure(STEPS_PER_REV * MICROSTEPS, GYRO_RANGE)
 
     @property
-    def skew(self) -> float:
-        """Relative excess of a robot second over a host second."""
-        return self._clock.skew
-
-    @property
     def angles(self) -> WheelAngles:
         """Wheel angles since the first measurement."""
         return WheelAngles(

@@ -1,6 +1,6 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Transaction layer: one frame in pending to the dongle, and its reply or timeout."""
+"""Transaction layer: one frame in flight to the dongle, and its reply or timeout."""
 
 from typing import NamedTuple
 
@@ -48,11 +48,10 @@ class TransactionResult(NamedTuple):
 
 class _PendingRequest(NamedTuple):
     request: frames.Ping | frames.Configure | frames.Downlink
-    id: int
+    frame: frames.ToDongle
     sent_ns: int
     deadline_ns: int
     wire_bytes: int
-    payload_bytes: int
 
 
 class TransactionLayer:
@@ -75,11 +74,11 @@ class TransactionLayer:
 
     @property
     def deadline_ns(self) -> int | None:
-        """End of the reply timeout; None if no request is in pending."""
+        """End of the reply timeout; None if no request is in flight."""
         return None if self._pending is None else self._pending.deadline_ns
 
     def reset(self) -> None:
-        """Drop the request in pending, because the port was opened or closed."""
+        """Drop the request in flight, because the port was opened or closed."""
         self._decoder.reset()
         self._pending = None
         self._dongle = None
@@ -90,25 +89,24 @@ class TransactionLayer:
         self._id = self._id + 1 & 0xFF
         frame = frames.Ping(self._id, (now_ns // 1000 & 0xFFFFFFFF).to_bytes(4, 'little'))
         # The zero ends a partial frame that the dongle may have received.
-        return b'\0' + self._send(frame, encode(frame), 0, timeout_ns, now_ns)
+        return b'\0' + self._send(frame, frame, timeout_ns, now_ns)
 
     def configure(self, frame: frames.Configure, now_ns: int) -> bytes:
         """Return the bytes of a CFG."""
         self._id = self._id + 1 & 0xFF
         frame = frame._replace(id=self._id)
-        return self._send(frame, encode(frame), 0, _REPLY_TIMEOUT_NS, now_ns)
+        return self._send(frame, frame, _REPLY_TIMEOUT_NS, now_ns)
 
     def transact(
         self, first: frames.Downlink, second: frames.Poll, gap: int, now_ns: int
     ) -> bytes:
         """Return the bytes of a TX."""
         self._id = self._id + 1 & 0xFF
-        payload = encode(first)
-        frame = encode(frames.Transmit(self._id, gap, payload, encode(second)))
-        return self._send(first, frame, len(payload), _REPLY_TIMEOUT_NS, now_ns)
+        frame = frames.Transmit(self._id, gap, encode(first), encode(second))
+        return self._send(first, frame, _REPLY_TIMEOUT_NS, now_ns)
 
     def feed(self, data: bytes, now_ns: int) -> list[TransactionResult]:
-        """Return the result of the request in pending; replies to older ones are ignored."""
+        """Return the result of the request in flight; replies to older ones are ignored."""
         results = []
         for frame in self._decoder.feed(data):
             try:
@@ -117,14 +115,14 @@ class TransactionLayer:
                 self._statistics.malformed += 1
                 continue
             pending = self._pending
-            if pending is not None and _is_reply_to(reply, pending):
+            if pending is not None and frames.is_reply(reply, pending.frame):
                 self._pending = None
                 self.timeouts = 0
                 results.append(self._result(pending, reply, now_ns))
         return results
 
     def expire(self, now_ns: int) -> TransactionResult | None:
-        """Return the request in pending if its timeout has expired."""
+        """Return the request in flight if its timeout has expired."""
         pending = self._pending
         if pending is None or now_ns < pending.deadline_ns:
             return None
@@ -135,15 +133,12 @@ class TransactionLayer:
     def _send(
         self,
         request: frames.Ping | frames.Configure | frames.Downlink,
-        frame: bytes,
-        payload_bytes: int,
+        frame: frames.ToDongle,
         timeout_ns: int,
         now_ns: int,
     ) -> bytes:
-        wire = encode_frame(frame)
-        self._pending = _PendingRequest(
-            request, self._id, now_ns, now_ns + timeout_ns, len(wire), payload_bytes
-        )
+        wire = encode_frame(encode(frame))
+        self._pending = _PendingRequest(request, frame, now_ns, now_ns + timeout_ns, len(wire))
         return wire
 
     def _result(
@@ -167,8 +162,10 @@ class TransactionLayer:
                     if error.kind is frames.FrameErrorKind.VERSION:
                         foreign_version = reply.payload[0] >> 4
             prompt = not first.retransmissions and second.has_payload
-            if isinstance(pending.request, frames.Command) and prompt:
-                delay = forward_delay_ns(pending.wire_bytes, pending.payload_bytes)
+            sent = pending.frame
+            command = isinstance(pending.request, frames.Command)
+            if command and isinstance(sent, frames.Transmit) and prompt:
+                delay = forward_delay_ns(pending.wire_bytes, len(sent.first))
                 timing = CommandTiming(pending.sent_ns, delay)
         return TransactionResult(
             pending.request,
@@ -189,16 +186,3 @@ class TransactionLayer:
         elapsed_us = (now_ns - before[1]) // 1000
         error = wrapped_difference((before[0] + elapsed_us) % (1 << 32), dongle_us)
         return abs(error) > _MAX_CLOCK_ERROR_US + elapsed_us // 50
-
-
-def _is_reply_to(reply: frames.FromDongle, pending: _PendingRequest) -> bool:
-    """Return whether a reply answers the request in pending."""
-    if isinstance(reply, frames.Refusal):
-        return True  # without an id, but only one request is in pending
-    if isinstance(reply, frames.Pong):
-        return isinstance(pending.request, frames.Ping) and reply.echo == pending.request.echo
-    if isinstance(reply, frames.Configured):
-        return isinstance(pending.request, frames.Configure) and reply.id == pending.id
-    return (
-        not isinstance(pending.request, frames.Ping | frames.Configure) and reply.id == pending.id
-    )

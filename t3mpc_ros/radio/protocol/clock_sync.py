@@ -83,17 +83,13 @@ class ClockModel:
         self._samples.clear()
         self._origin_us = 0
         self._origin_ns = 0
-        self._skew = 0.0
+        self.skew = 0.0
+        """Relative excess of a robot second over a host second; 0 without samples."""
 
     @property
     def is_set(self) -> bool:
         """Whether at least one sample is available."""
         return bool(self._samples)
-
-    @property
-    def skew(self) -> float:
-        """Relative excess of a robot second over a host second; 0 without samples."""
-        return self._skew
 
     def add(self, robot_us: int, sent_ns: int, returned_ns: int, travel_ns: int) -> None:
         """Add a transaction whose first packet had no retransmission.
@@ -112,7 +108,7 @@ class ClockModel:
         if not self._samples:
             raise ValueError('clock model must have at least one transaction: got none')
         since = (robot_us - self._origin_us) * _MICROSECOND
-        return self._origin_ns + since + round(self._skew * since)
+        return self._origin_ns + since + round(self.skew * since)
 
     def _fit(self) -> None:
         last_us, last_ns, _ = self._samples[-1]
@@ -128,6 +124,6 @@ class ClockModel:
         x_mean, y_mean = float(x.mean()), float(y.mean())
         x -= x_mean
         skew = float(x @ (y - y_mean)) / (float(x @ x) + _SKEW_PRIOR_WEIGHT)
-        self._skew = min(max(skew, -_MAX_SKEW), _MAX_SKEW)
+        self.skew = min(max(skew, -_MAX_SKEW), _MAX_SKEW)
         self._origin_us = last_us
-        self._origin_ns = last_ns + round((y_mean - self._skew * x_mean) * NANOSECONDS)
+        self._origin_ns = last_ns + round((y_mean - self.skew * x_mean) * NANOSECONDS)

@@ -94,6 +94,10 @@ SETTINGS_RECORD, CALIBRATION_RECORD, LOG_RECORD = range(3)
 """Record of a RECORD or STORE; the log can only be read."""
 PART_SIZE = 16
 """Bytes of a part of a record."""
+RATES = ('250k', '1M', '2M')
+"""Air data rates, bit/s, by their number in CFG and in the settings."""
+POWERS = ('-18', '-12', '-6', '0')
+"""Output powers, dBm, likewise."""
 AGE_NONE = 0xFFFF
 """Age in a STATE before the first CMD of a session."""
 
@@ -455,6 +459,24 @@ FromDongle = Result | Configured | Pong | Refusal
 ToBoard = Ping | Key | Record | Store | Sense
 """Over the USB of the robot board, like the next."""
 FromBoard = Pong | KeyState | RecordPart | Samples | Refusal
+_REPLIES = {
+    Ping: Pong,
+    Configure: Configured,
+    Transmit: Result,
+    Key: KeyState,
+    Record: RecordPart,
+    Store: RecordPart,
+    Sense: Samples,
+}
+
+
+def is_reply(reply: FromDongle | FromBoard, request: ToDongle | ToBoard) -> bool:
+    """Return whether a USB frame answers a request, the only one in flight."""
+    if isinstance(reply, Refusal):
+        return True  # without an id
+    if not isinstance(reply, _REPLIES[type(request)]) or reply.id != request.id:
+        return False
+    return not isinstance(request, Ping) or getattr(reply, 'echo', b'') == request.echo
 
 
 # -- board parameters -----------------------------------------------------------------------------

@@ -125,9 +125,7 @@ class BoardFindings(NamedTuple):
 
     pong: Pong
     settings: StoredSettings
-    calibration_state: int
-    """SETTINGS_GOOD, …"""
-    calibration: Calibration
+    calibration: robot_records.Stored[Calibration]
     """All None unless the robot holds one."""
     log: tuple[LogEntry, ...]
     samples: tuple[Samples, ...]
@@ -139,16 +137,13 @@ def examine_board() -> Script[BoardFindings]:
     pong = yield from wait_for_board()
     settings = yield from read_settings()
     stored = yield from robot_records.read_record(CALIBRATION_RECORD)
-    try:
-        calibration = robot_records.decode_calibration(stored.body)
-    except ValueError as error:
-        raise robot_records.unknown_record(error) from error
+    calibration = stored.decoded(robot_records.decode_calibration)
     log = yield from read_log()
     samples = []
     for _ in range(SAMPLE_COUNT):
         samples.append((yield from robot_records.read_samples()))
         yield Pause(_SAMPLE_PERIOD)
-    return BoardFindings(pong, settings, stored.state, calibration, log, tuple(samples))
+    return BoardFindings(pong, settings, calibration, log, tuple(samples))
 
 
 def read_pong() -> Script[Pong]:
@@ -187,7 +182,7 @@ def check_board(found: BoardFindings, parameters: LinkParameters) -> list[Check]
             'wiring and supply of the radio; CSN, CE',
         ),
         *_check_settings(found, parameters),
-        _check_calibration(found.calibration_state, found.calibration),
+        _check_calibration(found.calibration),
         _check_log(found.log),
         _check_battery(found, parameters),
         *_check_imu(found.samples),
@@ -225,9 +220,9 @@ def _check_settings(found: BoardFindings, parameters: LinkParameters) -> list[Ch
     return checks
 
 
-def _check_calibration(state: int, found: Calibration) -> Check:
-    usable = robot_records.is_valid(state) or state == frames.SETTINGS_MISSING
-    if robot_records.is_valid(state):
+def _check_calibration(stored: robot_records.Stored[Calibration]) -> Check:
+    usable, found = stored.valid or stored.state == frames.SETTINGS_MISSING, stored.content
+    if stored.valid:
         parts = [name for name in found._fields[:-1] if getattr(found, name) is not None]
         curves = sum(curve is not None for curve in found.curves)
         value = ', '.join([*parts, f'{curves} curves'])
@@ -254,9 +249,9 @@ def _check_battery(found: BoardFindings, parameters: LinkParameters) -> Check:
     counts = [sample.battery for sample in found.samples]
     if any(count >= CONVERTER_COUNTS for count in counts):
         return Check(9, 'battery', FAIL, 'not measured', 'divider at A8')
-    voltage = nominal_battery_voltage(float(np.mean(counts)), found.settings.settings.divider)
-    if found.calibration.divider is not None:
-        voltage = found.calibration.divider.voltage(voltage)
+    voltage = nominal_battery_voltage(float(np.mean(counts)), found.settings.content.divider)
+    if (divider := found.calibration.content.divider) is not None:
+        voltage = divider.voltage(voltage)
     low = parameters.robot.battery_low
     value = f'{voltage:.1f} V' if voltage >= 1.0 else 'not connected'
     return _verdict(
@@ -292,7 +287,7 @@ def _check_ranges(found: BoardFindings) -> Check:
     counts = np.array([robot_records.range_counts(sample) for sample in found.samples])
     problems = []
     used = 0
-    for number, kind in enumerate(found.settings.settings.sensors):
+    for number, kind in enumerate(found.settings.content.sensors):
         if kind == 'none':
             continue
         used += 1

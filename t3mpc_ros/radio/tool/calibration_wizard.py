@@ -100,7 +100,7 @@ class CalibrationRobot:
         stored = self._at_board(robot_settings.read_settings())
         if not stored.valid:
             raise ProcedureError('the robot has no valid settings: t3mpc robot setup')
-        return stored.settings.divider
+        return stored.content.divider
 
     def store(self, found: calibration.Calibration) -> None:
         """Store a calibration in the robot, in place of the one that it has."""

@@ -178,7 +178,7 @@ class Procedure(Generic[Value]):
                 reply = self._decode(data)
             except frames.FrameError:
                 continue  # from another kind of board, or damaged with a valid CRC
-            if self._request is not None and _is_reply_to(reply, self._request):
+            if self._request is not None and frames.is_reply(reply, self._request):
                 self._resume(reply, now_ns)
         if self._open and not self.done and now_ns >= self._until_ns:
             self._resume(None, now_ns)
@@ -214,23 +214,6 @@ class Procedure(Generic[Value]):
         if not self.done:
             self.done, self.error = True, error
             self._actions.append(Close())
-
-
-def _is_reply_to(reply: ReplyFrame, request: RequestFrame) -> bool:
-    if isinstance(reply, frames.Refusal):
-        return True  # without an id, but only one request is in flight
-    kinds = {
-        frames.Ping: frames.Pong,
-        frames.Configure: frames.Configured,
-        frames.Transmit: frames.Result,
-        frames.Key: frames.KeyState,
-        frames.Record: frames.RecordPart,
-        frames.Store: frames.RecordPart,
-        frames.Sense: frames.Samples,
-    }
-    if not isinstance(reply, kinds[type(request)]) or reply.id != request.id:
-        return False
-    return not isinstance(request, frames.Ping) or getattr(reply, 'echo', b'') == request.echo
 
 
 def wait_for_board(absent: str = NO_BOARD) -> Script[frames.Pong]:

@@ -12,19 +12,16 @@ docs/radio.md has the layouts and units of the wire; this module has SI units.
     stored = run_script(write_calibration(found), '/dev/ttyACM0', interrupted, ROBOT_BOARD)
 """
 
+from collections.abc import Callable
 import math
 import struct
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.framing import crc16
 from t3mpc_ros.radio.tool import procedure
 from t3mpc_ros.robot.calibration import Calibration, DividerCorrection, Estimate, SharpCurve
 
-RATES = ('250k', '1M', '2M')
-"""Air data rates, bit/s, by their number on the wire."""
-POWERS = ('-18', '-12', '-6', '0')
-"""Output powers, dBm."""
 SENSORS = ('none', 'GP2Y0A21', 'GP2Y0A41')
 """Types of a distance sensor."""
 SENSOR_COUNT = 8
@@ -50,9 +47,9 @@ class RobotSettings(NamedTuple):
     channel: int = 82
     """2400 MHz plus this, 0 to 125."""
     rate: str = '1M'
-    """One of :data:`RATES`."""
+    """One of ``frames.RATES``."""
     power: str = '0'
-    """One of :data:`POWERS`."""
+    """One of ``frames.POWERS``."""
     microsteps: int = 16
     """Per full step, a power of two up to 256."""
     steps_per_turn: int = 200
@@ -66,23 +63,31 @@ class RobotSettings(NamedTuple):
     """One of :data:`SENSORS` each, in the order of STATE."""
 
 
-def is_valid(state: int) -> bool:
-    """Return whether a robot with a record in this state holds it: in one copy at least."""
-    return state in (frames.SETTINGS_GOOD, frames.SETTINGS_ONE_COPY)
+Content = TypeVar('Content')
+Decoded = TypeVar('Decoded')
 
 
-class Stored(NamedTuple):
+class Stored(NamedTuple, Generic[Content]):
     """A record of the robot."""
 
     state: int
     """SETTINGS_GOOD, …"""
-    body: bytes
-    """In effect; of the defaults unless ``state`` is SETTINGS_GOOD or SETTINGS_ONE_COPY."""
+    content: Content
+    """In effect; of the defaults unless :attr:`valid`."""
 
     @property
     def valid(self) -> bool:
-        """Whether the robot holds the record."""
-        return is_valid(self.state)
+        """Whether the robot holds the record, in one copy at least."""
+        return self.state in (frames.SETTINGS_GOOD, frames.SETTINGS_ONE_COPY)
+
+    def decoded(self, decode: Callable[[Content], Decoded]) -> 'Stored[Decoded]':
+        """Return the record decoded; ProcedureError: it is valid, but of a newer firmware."""
+        try:
+            return Stored(self.state, decode(self.content))
+        except ValueError as error:
+            raise procedure.ProcedureError(
+                f'the robot holds a record that this host does not know ({error}): update the host'
+            ) from error
 
 
 # -- layouts --------------------------------------------------------------------------------------
@@ -96,8 +101,8 @@ def encode_settings(settings: RobotSettings) -> bytes:
         settings.channel,
         settings.microsteps,
         settings.address,
-        RATES.index(settings.rate),
-        POWERS.index(settings.power),
+        frames.RATES.index(settings.rate),
+        frames.POWERS.index(settings.power),
         settings.steps_per_turn,
         settings.invert_left + 2 * settings.invert_right,
         round(1000.0 * settings.divider),
@@ -114,8 +119,8 @@ def check_settings(settings: RobotSettings) -> None:
             '10 hexadecimal digits, not of equal bytes',
         ),
         ('channel', 0 <= settings.channel <= 125, 'from 0 to 125'),
-        ('rate', settings.rate in RATES, f'one of {", ".join(RATES)}'),
-        ('power', settings.power in POWERS, f'one of {", ".join(POWERS)} dBm'),
+        ('rate', settings.rate in frames.RATES, f'one of {", ".join(frames.RATES)}'),
+        ('power', settings.power in frames.POWERS, f'one of {", ".join(frames.POWERS)} dBm'),
         (
             'microsteps',
             settings.microsteps in [1 << power for power in range(9)],
@@ -143,8 +148,8 @@ def decode_settings(body: bytes) -> RobotSettings:
     settings = RobotSettings(
         address,
         channel,
-        _choice(RATES, rate),
-        _choice(POWERS, power),
+        _choice(frames.RATES, rate),
+        _choice(frames.POWERS, power),
         microsteps,
         steps,
         bool(inverted & 1),
@@ -226,13 +231,6 @@ def _unpack(name: str, layout: struct.Struct, number: int, body: bytes) -> tuple
     return layout.unpack(body)
 
 
-def unknown_record(error: ValueError) -> procedure.ProcedureError:
-    """Return the error of a valid record that cannot be decoded: the firmware is newer."""
-    return procedure.ProcedureError(
-        f'the robot holds a record that this host does not know ({error}): update the host'
-    )
-
-
 def _choice(names: tuple[str, ...], number: int) -> str:
     return names[number] if number < len(names) else f'number {number}'
 
@@ -275,10 +273,7 @@ def read_calibration() -> procedure.Script[Calibration]:
         raise procedure.ProcedureError(
             'the calibration of the robot is damaged, so it accepts no session: write it again'
         )
-    try:
-        return decode_calibration(stored.body)
-    except ValueError as error:
-        raise unknown_record(error) from error
+    return stored.decoded(decode_calibration).content
 
 
 def write_calibration(calibration: Calibration) -> procedure.Script[Calibration]:
@@ -313,7 +308,7 @@ def read_counts(samples: int) -> procedure.Script[list[tuple[int, ...]]]:
     return counts
 
 
-def read_record(record: int) -> procedure.Script[Stored]:
+def read_record(record: int) -> procedure.Script[Stored[bytes]]:
     """Return a record, after the board has answered."""
     yield from procedure.wait_for_board()
     return (yield from _read_parts(record))
@@ -335,8 +330,8 @@ def write_record(record: int, body: bytes) -> procedure.Script[bytes]:
             if rc in _REASONS:
                 raise procedure.ProcedureError(_REASONS[rc])
         stored = yield from _read_parts(record)
-        if stored.state == frames.SETTINGS_GOOD and stored.body == body:
-            return stored.body
+        if stored.state == frames.SETTINGS_GOOD and stored.content == body:
+            return body
     raise procedure.ProcedureError('the robot does not confirm the record: is the cable good?')
 
 
@@ -353,7 +348,7 @@ _REASONS = {
 }
 
 
-def _read_parts(record: int) -> procedure.Script[Stored]:
+def _read_parts(record: int) -> procedure.Script[Stored[bytes]]:
     first = yield from request_part(frames.Record(0, record, 0))
     body = first.data
     for part in range(1, -(-first.size // frames.PART_SIZE)):

@@ -33,18 +33,7 @@ class SettingsFileError(Exception):
     """A file of settings cannot be read or written; the text contains the reason."""
 
 
-class StoredSettings(NamedTuple):
-    """Settings of the robot."""
-
-    state: int
-    """SETTINGS_GOOD, …"""
-    settings: robot_records.RobotSettings
-    """The defaults if the robot has none."""
-
-    @property
-    def valid(self) -> bool:
-        """Whether the robot holds them."""
-        return robot_records.is_valid(self.state)
+StoredSettings = robot_records.Stored[robot_records.RobotSettings]
 
 
 class Difference(NamedTuple):
@@ -66,7 +55,8 @@ def draw_address(entropy: Callable[[int], bytes]) -> bytes:
 
 def read_settings() -> Script[StoredSettings]:
     """Return the settings of the robot."""
-    return _decode((yield from robot_records.read_record(SETTINGS_RECORD)))
+    stored = yield from robot_records.read_record(SETTINGS_RECORD)
+    return stored.decoded(robot_records.decode_settings)
 
 
 def change_settings(
@@ -77,7 +67,7 @@ def change_settings(
     A robot without settings gets a random address, so that two robots never obey one host by
     accident.
     """
-    settings = stored.settings._replace(**changes)  # type: ignore[arg-type]
+    settings = stored.content._replace(**changes)  # type: ignore[arg-type]
     if not stored.valid and 'address' not in changes:
         settings = settings._replace(address=draw_address(entropy))
     robot_records.check_settings(settings)
@@ -89,7 +79,7 @@ def write_settings(settings: robot_records.RobotSettings) -> Script[StoredSettin
     body = yield from robot_records.write_record(
         SETTINGS_RECORD, robot_records.encode_settings(settings)
     )
-    return _decode(robot_records.Stored(frames.SETTINGS_GOOD, body))
+    return StoredSettings(frames.SETTINGS_GOOD, robot_records.decode_settings(body))
 
 
 def differences(
@@ -114,7 +104,7 @@ def format_settings(stored: StoredSettings) -> str:
     lines = [SETTINGS_TEXTS[stored.state]]
     if not stored.valid:
         return lines[0]
-    settings = stored.settings
+    settings = stored.content
     same = len(set(settings.sensors)) == 1
     for name in settings._fields[:-1]:
         lines.append(f'  {name:<15} {_text(getattr(settings, name))}')
@@ -162,13 +152,6 @@ def settings_of_file(content: object) -> robot_records.RobotSettings:
     except (TypeError, ValueError) as error:
         raise SettingsFileError(str(error)) from error
     return settings
-
-
-def _decode(stored: robot_records.Stored) -> StoredSettings:
-    try:
-        return StoredSettings(stored.state, robot_records.decode_settings(stored.body))
-    except ValueError as error:
-        raise robot_records.unknown_record(error) from error
 
 
 def _text(value: object) -> str:
