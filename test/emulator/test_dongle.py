@@ -5,14 +5,11 @@
 import pytest
 
 from t3mpc_ros.emulator.event_queue import EventQueue
-from t3mpc_ros.emulator.fault_injection import (
-    Fault,
-    FaultInjection,
-)
+from t3mpc_ros.emulator.fault_injection import Fault, FaultInjection
 from t3mpc_ros.emulator.link.dongle import Dongle
 from t3mpc_ros.emulator.link.radio_channel import RadioChannel, RadioParameters
 from t3mpc_ros.radio.protocol.codec import decode_from_dongle, encode
-from t3mpc_ros.radio.protocol.frames import Configure, Configured, Ping, Refusal, Result, Transmit
+from t3mpc_ros.radio.protocol.frames import Configure, Configured, Ping, Result, Transmit
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 
 MS = 1_000_000
@@ -149,33 +146,6 @@ def test_a_radio_with_another_configuration_gets_no_reply(changed):
     station.run(20_000)
     assert station.take_reply()[1][1] == 0x44
     assert len(station.received) == ('retry_delay' in changed)
-
-
-def test_nothing_is_queued():
-    station = Station()
-    station.write(Transmit(9, 6, CMD, POLL))
-    station.write(Transmit(10, 6, CMD))
-    assert station.take_reply()[1] == Refusal(3, 10)
-    station.write(Configure(11, *RadioParameters()))
-    assert station.take_reply()[1] == Refusal(3, 11)
-    station.write(Ping(12, b'ping'))
-    assert station.take_reply()[1].echo == b'ping'
-    station.run(20_000)
-    assert station.take_reply()[1].id == 9
-
-
-def test_a_malformed_frame_is_refused_or_counted():
-    station = Station()
-    station.write(b'\x05abc')
-    assert station.take_reply()[1] == Refusal(1, 5)
-    station.write(b'\x03abc')
-    assert station.take_reply()[1] == Refusal(2, 3)
-    station.write(b'\x01\x07\x00\x00')
-    assert station.take_reply()[1] == Refusal(2, 1)
-    station.dongle.feed(b'\x04abc\0\x01\0')
-    station.write(Ping(1, b'ping'))
-    pong = station.take_reply()[1]
-    assert (pong.crc_errors, pong.frame_errors) == (1, 1)
 
 
 def test_an_exchange_with_a_dead_chip_times_out():

@@ -3,7 +3,6 @@
 """Firmware core: signed sessions and attacks on them."""
 
 from binascii import crc_hqx
-import ctypes
 import random
 import struct
 
@@ -69,7 +68,7 @@ def test_a_nonce_of_the_robot_is_no_tag_of_a_hello(library):
     record = struct.pack('<I', boots - 1)
     record += crc_hqx(record, 0xFFFF).to_bytes(2, 'little')
     for at, byte in enumerate(record, BOOTS_ADDRESS):
-        robot.call('poke_eeprom', ctypes.c_uint8(at), ctypes.c_uint8(byte))
+        robot.call('poke_eeprom', at, byte)
     robot.call('boot', 4, 0)
     robot.run(1000)
     forged = struct.pack('<IIII', boots, 1, robot.now, first_noise)
@@ -81,7 +80,7 @@ def test_a_nonce_of_the_robot_is_no_tag_of_a_hello(library):
 def test_a_damaged_key_locks_the_robot(library):
     for address in range(8, 26):
         robot = core.Robot(library, core.KEY)
-        robot.call('poke_eeprom', ctypes.c_uint8(address), ctypes.c_uint8(0x55))
+        robot.call('poke_eeprom', address, 0x55)
         robot.call('boot', 1, 0)
         info = robot.hello()
         assert (info[1], len(info)) == (0, core.INFO_SIZE + 8)

@@ -73,7 +73,7 @@ def test_siphash_equals_that_of_the_host(library):
     room, generator = ctypes.create_string_buffer(8), random.Random(3)
     for size in (*range(64), 255):
         key, message = generator.randbytes(16), generator.randbytes(size)
-        library.t3_host_siphash(key, message, ctypes.c_uint8(size), room)
+        library.t3_host_siphash(key, message, size, room)
         assert room.raw == siphash(key, message)
 
 
@@ -96,9 +96,7 @@ def test_clock_is_exact_around_a_timer_overflow(library):
             # become pending right after the count was read.
             for pending in {False, timer < 25, timer == 49}:
                 base = start + 50 * (ticks - (1 if pending and timer < 25 else 0))
-                read = library.t3_host_time_us(
-                    ctypes.c_uint32(base), ctypes.c_uint8(timer), ctypes.c_bool(pending)
-                )
+                read = library.t3_host_time_us(base, timer, pending)
                 assert read == (start + true) % (1 << 32)
 
 
@@ -108,7 +106,7 @@ def test_clock_is_exact_around_a_timer_overflow(library):
 def test_transaction_with_the_golden_result(library):
     dongle = core.Dongle(library)
     dongle.run(123_456_000 - 3000)
-    dongle.call('bytes', TX_WIRE, ctypes.c_uint32(len(TX_WIRE)))
+    dongle.call('bytes', TX_WIRE, len(TX_WIRE))
     assert dongle.sent() == COMMAND
     dongle.run(1500)
     dongle.reply(bytes(32))

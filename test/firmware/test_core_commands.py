@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Firmware core: sessions, TTL, sequence numbers, emergency stop, echoes, refusals."""
 
-import ctypes
 import struct
 
 import pytest
@@ -185,11 +184,11 @@ def test_only_a_valid_clear_of_the_session_clears_the_estop(robot):
         robot.send(robot.command(**rejected))
         robot.run(20_000)
         assert robot.status & core.LATCHED, rejected
-    robot.call('press', ctypes.c_bool(True))
+    robot.call('press', True)
     robot.send(robot.command(flags=core.CLEAR))
     assert robot.status & core.LATCHED
     robot.run(PRESS)
-    robot.call('press', ctypes.c_bool(False))
+    robot.call('press', False)
     robot.run(RELEASE - 1000)
     robot.send(robot.command(flags=core.CLEAR))
     assert robot.status & core.LATCHED
@@ -205,9 +204,9 @@ def test_the_button_latches_after_its_debounce_time_only(robot, pressed):
     """A spike on its wire once stopped the robot for good."""
     robot.drive(5000, 5000, 500_000)
     for _ in range(20):
-        robot.call('press', ctypes.c_bool(True))
+        robot.call('press', True)
         robot.run(pressed)
-        robot.call('press', ctypes.c_bool(False))
+        robot.call('press', False)
         robot.run(1000)
     latched = robot.status & core.LATCHED
     assert bool(latched) == (pressed == PRESS)
@@ -221,7 +220,7 @@ def test_the_button_latches_after_its_debounce_time_only(robot, pressed):
 
 def supply(robot, millivolts, us):
     """Set the voltage of the battery for a time."""
-    robot.call('set_adc', 8, ctypes.c_uint16(millivolts * 1024 // 20_000))
+    robot.call('set_adc', 8, millivolts * 1024 // 20_000)
     robot.drive(3000, 3000, us)
 
 
@@ -246,7 +245,7 @@ def test_an_empty_battery_stops_the_robot_until_charged(robot):
     assert robot.status == core.LOW_BATTERY
     supply(robot, 10_500, 5_000_000)
     assert robot.status == core.ENABLED | core.MOVING
-    robot.call('set_adc', 8, ctypes.c_uint16(0))  # nothing is connected
+    robot.call('set_adc', 8, 0)  # nothing is connected
     robot.drive(3000, 3000, 1_000_000)
     assert robot.status == core.ENABLED | core.MOVING
     assert robot.set(core.CUTOFF, 0)[0] == core.OK

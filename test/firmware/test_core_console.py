@@ -27,7 +27,7 @@ KEY_US = 45 * CELL_US
 def made(library, key=b'', erased=False):
     """Return a robot that writes its EEPROM as slowly as a real one."""
     robot = core.Robot(library, key, erased=erased)
-    robot.call('set_cell_us', ctypes.c_uint32(CELL_US))
+    robot.call('set_cell_us', CELL_US)
     robot.run(200_000)  # it writes its log and, with a key, the counter of boots
     return robot
 
@@ -38,9 +38,9 @@ def request(robot, frame, us=1000):
 
 
 def lose_power(robot):
-    robot.call('boot', 4, ctypes.c_uint32(0))
+    robot.call('boot', 4, 0)
     robot.run(1000)
-    robot.call('usb_take', ctypes.create_string_buffer(4096), ctypes.c_uint32(4096))
+    robot.call('usb_take', ctypes.create_string_buffer(4096), 4096)
 
 
 def begins_session(robot, key):
@@ -125,6 +125,6 @@ def test_frames_for_a_dongle_are_refused(library):
 @pytest.mark.parametrize('address', [8, 20, 25, 26])
 def test_a_worn_cell_is_reported_and_locks_the_robot(library, address):
     robot = made(library)
-    robot.call('wear', ctypes.c_uint8(address), ctypes.c_bool(True))
+    robot.call('wear', address, True)
     assert request(robot, Key(1, core.KEY), KEY_US) == [KeyState(1, core.FAILED, KEY_DAMAGED, 0)]
     assert not begins_session(robot, b'')

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Firmware core of the dongle: transactions, radio configuration, errors."""
 
-import ctypes
 import struct
 
 import pytest
@@ -71,7 +70,7 @@ def test_nothing_is_queued(library):
 def test_a_dead_chip_times_out_and_is_configured_again(library):
     dongle = Dongle(library)
     dongle.write(tx(9, b'abc', b'def'))
-    dongle.call('set_chip', ctypes.c_bool(False))
+    dongle.call('set_chip', False)
     dongle.run(200_000)
     (result,) = dongle.frames()
     assert result[:4] == b'\x81\x09\x04\x08'
@@ -110,7 +109,7 @@ def test_radio_configuration_is_written_and_read_back(library):
 def test_pong_reports_the_errors_of_the_line(library):
     dongle = Dongle(library)
     dongle.run(5000)
-    dongle.call('bytes', b'\x01\x01\x00' + b'\x04abc\x00' + bytes(3), ctypes.c_uint32(11))
+    dongle.call('bytes', b'\x01\x01\x00' + b'\x04abc\x00' + bytes(3), 11)
     dongle.call('overrun')
     assert dongle.read() == b''  # no reply to an unreadable frame
     dongle.write(b'\x03\x07ping')

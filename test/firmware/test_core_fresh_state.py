@@ -95,9 +95,7 @@ def like(robot, library, key=b''):
     """Return a board with the memory cells and the hardware of another one, not booted again."""
     made = core.Robot(library, key)
     for address in range(1024):
-        made.call(
-            'poke_eeprom', ctypes.c_uint16(address), robot.call('cell', ctypes.c_uint16(address))
-        )
+        made.call('poke_eeprom', address, robot.call('cell', address))
     return made
 
 
@@ -123,12 +121,10 @@ def use(robot, r):
                 robot.command(0, 0, flags=r.choice((core.ESTOP, core.CLEAR, 0, core.ENABLE)))
             )
         elif act == 4:
-            robot.call('press', ctypes.c_bool(r.random() < 0.3))
+            robot.call('press', r.random() < 0.3)
             robot.run(r.choice((2000, 7000, 60_000)))
         elif act == 5:
-            robot.call(
-                'set_adc', ctypes.c_uint8(r.randrange(9)), ctypes.c_uint16(r.randrange(1024))
-            )
+            robot.call('set_adc', r.randrange(9), r.randrange(1024))
         elif act == 6:
             robot.send(r.randbytes(r.randrange(1, 33)))
         elif act == 7:
@@ -138,7 +134,7 @@ def use(robot, r):
         elif act == 8:
             robot.send(robot.command(3000, 1000, host_us=robot.host_us + (1 << 31)))
         elif act == 9:
-            robot.call('set_imu', ctypes.c_bool(r.random() < 0.5), (ctypes.c_int16 * 7)(*range(7)))
+            robot.call('set_imu', r.random() < 0.5, (ctypes.c_int16 * 7)(*range(7)))
         else:
             robot.send(robot.command(r.randrange(-9000, 9000), 5000, ttl=r.choice((0, 5, 20))))
         robot.run(r.choice((300, 5000, 150_000)))
@@ -148,10 +144,10 @@ def use(robot, r):
 
 def come_to_rest(robot):
     """Release what is pressed, measure nothing, and wait until nothing changes any more."""
-    robot.call('press', ctypes.c_bool(False))
+    robot.call('press', False)
     for channel in range(9):
-        robot.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(0xFFFF))
-    robot.call('set_imu', ctypes.c_bool(True), (ctypes.c_int16 * 7)())
+        robot.call('set_adc', channel, 0xFFFF)
+    robot.call('set_imu', True, (ctypes.c_int16 * 7)())
     robot.run(2_000_000)
 
 
@@ -165,8 +161,8 @@ def test_a_booted_robot_is_as_new(library, layout, key, seed):
     for each in (used, new):
         come_to_rest(new)
         each.run(-each.now % 200)  # to the same phase of the main loop
-        each.call('usb_take', ctypes.create_string_buffer(4096), ctypes.c_uint32(4096))
-        each.call('boot', ctypes.c_uint8(4), ctypes.c_uint32(77))
+        each.call('usb_take', ctypes.create_string_buffer(4096), 4096)
+        each.call('boot', 4, 77)
         each.seq, each.session_key, each.delay, each.echo_age = 0, b'', 1000, 1000
     assert not unlike(used, new, layout)
     assert use(used, random.Random(seed)) == use(new, random.Random(seed))
@@ -222,7 +218,7 @@ def test_a_new_session_begins_as_the_first_one(library, layout, key, seed):
         each.seq = 0
         each.hello(session=0x33, nonce=bytes(range(8)))
     assert not unlike(used, new, layout, TIMES + KEPT_IN_A_SESSION)
-    used.call('poke_steps', ctypes.c_uint8(0), ctypes.c_int32(500))
+    used.call('poke_steps', 0, 500)
     assert used.act(1, 1, session=0x33)[4:] == new.act(1, 1, session=0x33)[4:]
     assert used.steps[0] == 0
 
@@ -260,12 +256,12 @@ def test_stored_records_are_in_effect_as_after_a_boot(library, layout, what):
     used, new = core.Robot(library), core.Robot(library)
     for each in (used, new):
         for channel in range(9):
-            each.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(400))
+            each.call('set_adc', channel, 400)
         each.run(1_500_000)
         if what is CHANGES['no key']:
             change(each, CHANGES['key'])
         change(each, what)
-    new.call('boot', ctypes.c_uint8(4), ctypes.c_uint32(0))
+    new.call('boot', 4, 0)
     for each in (used, new):
         each.run(200_000)
     copies = 'robot.settings.copies', 'robot.calibration.copies', 'robot.session.boots'
@@ -285,10 +281,10 @@ def test_a_booted_dongle_is_as_new(library, layout, seed):
         )
         used.run(r.choice((100, 30_000)))
         used.reply(r.randbytes(r.randrange(33)), r.randrange(20), r.random() < 0.7)
-    used.call('bytes', b'\x05half', ctypes.c_uint32(5))
+    used.call('bytes', b'\x05half', 5)
     used.call('overrun')
     for each in (used, new):
-        each.call('boot', ctypes.c_uint8(8))
+        each.call('boot', 8)
         each.read()
     assert not unlike(used, new, layout)
 
@@ -351,16 +347,16 @@ def pass_through(robot):
     wait(2_400_000)
     robot.send(robot.command(0, 0, flags=core.CLEAR))
     drive(200_000, 4000, -4000)
-    robot.call('press', ctypes.c_bool(True))
+    robot.call('press', True)
     wait(400_000)
-    robot.call('press', ctypes.c_bool(False))
+    robot.call('press', False)
     wait(400_000)
     robot.send(robot.command(0, 0, flags=core.CLEAR))
     for channel, count in ((8, 350), (8, 0xFFFF)):  # an empty battery, and none
-        robot.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(count))
+        robot.call('set_adc', channel, count)
         drive(1_200_000, 4000, 4000)
     for answers in (False, True):
-        robot.call('set_imu', ctypes.c_bool(answers), (ctypes.c_int16 * 7)())
+        robot.call('set_imu', answers, (ctypes.c_int16 * 7)())
         drive(1_200_000, 1000, 1000)
     robot.send(robot.command(0, 0, flags=0))
     wait(4_000_000)

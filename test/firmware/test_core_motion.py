@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Firmware core: wheel speeds, ramps, driver power, and wraps of clocks and counters."""
 
-import ctypes
 import math
 import struct
 
@@ -144,7 +143,7 @@ def test_a_stalled_main_loop_causes_no_speed_jump(slow_ramps):
     slow_ramps.send(slow_ramps.command(0, 0))
     slow_ramps.run(2000)
     before = slow_ramps.speeds[0]
-    slow_ramps.call('stall', ctypes.c_uint32(500_000))
+    slow_ramps.call('stall', 500_000)
     slow_ramps.run(400)
     assert 0.0 < before - slow_ramps.speeds[0] <= 0.61  # 20 ms at 30 rad/s²
     assert slow_ramps.status == core.ENABLED | core.MOVING | core.EXPIRED

@@ -41,7 +41,7 @@ def test_no_damaged_frame_sends_or_configures_anything(library):
     tried = 0
     for frame in (transmit, configure):
         for wire in damaged(frame):
-            dongle.call('bytes', wire + b'\0', ctypes.c_uint32(len(wire) + 1))
+            dongle.call('bytes', wire + b'\0', len(wire) + 1)
             assert dongle.sent() == b''
             assert dongle.call('configured') == configured
             tried += 1
@@ -59,10 +59,10 @@ def test_no_damaged_frame_writes_a_key_or_settings(library):
     writes = robot.call('eeprom_writes')
     for frame in (encode(Key(9, KEY)), encode(Store(9, SETTINGS_RECORD, crc16(settings)))):
         for wire in damaged(frame):
-            robot.call('usb', wire + b'\0', ctypes.c_uint32(len(wire) + 1))
+            robot.call('usb', wire + b'\0', len(wire) + 1)
             robot.run(400)
             assert robot.call('eeprom_writes') == writes
-    robot.call('usb_take', ctypes.create_string_buffer(4096), ctypes.c_uint32(4096))
+    robot.call('usb_take', ctypes.create_string_buffer(4096), 4096)
     assert (robot.settings(), robot.console(b'\x04\x01')) == before
     assert robot.store(SETTINGS_RECORD, settings) == OK
     assert robot.settings()[2:] == (100, 16, ADDRESS[::-1])
@@ -82,7 +82,7 @@ def test_no_damaged_frame_writes_a_key_or_settings(library):
 )
 def test_each_counter_of_packets_wraps_alone(robot, name, packet):
     before = robot.counters()
-    send, size = robot.library.t3_host_robot_packet, ctypes.c_uint8(len(packet))
+    send, size = robot.library.t3_host_robot_packet, len(packet)
     for _ in range(1 << 16):
         send(robot._object, packet, size)
     after = robot.counters()
@@ -96,7 +96,7 @@ def test_no_nonce_repeats_when_the_counter_of_boots_wraps(library):
     record = struct.pack('<I', (1 << 32) - 3)
     record += crc_hqx(record, 0xFFFF).to_bytes(2, 'little')
     for at, byte in enumerate(record, BOOTS_ADDRESS):
-        robot.call('poke_eeprom', ctypes.c_uint8(at), ctypes.c_uint8(byte))
+        robot.call('poke_eeprom', at, byte)
     seen = set()
     for _ in range(6):
         robot.call('boot', 1, 0)
@@ -109,18 +109,18 @@ def test_no_nonce_repeats_when_the_counter_of_boots_wraps(library):
 def test_the_clock_of_the_dongle_wraps_within_a_gap(library):
     dongle = Dongle(library)
     start = (1 << 32) - 1000
-    dongle.call('tick', ctypes.c_uint32(start))
+    dongle.call('tick', start)
     dongle.write(encode(Transmit(9, 8, b'first', b'second')))
     assert dongle.sent() == b'first'
     dongle.reply(b'state')
     for us in (0, 999, 1999):
-        dongle.call('tick', ctypes.c_uint32((start + us) % (1 << 32)))
+        dongle.call('tick', (start + us) % (1 << 32))
         assert dongle.sent() == b''
-    dongle.call('tick', ctypes.c_uint32((start + 2000) % (1 << 32)))
+    dongle.call('tick', (start + 2000) % (1 << 32))
     assert dongle.sent() == b'second'
     for us in (2000, 151_999):
-        dongle.call('tick', ctypes.c_uint32((start + us) % (1 << 32)))
+        dongle.call('tick', (start + us) % (1 << 32))
         assert dongle.frames() == []
-    dongle.call('tick', ctypes.c_uint32((start + 152_000) % (1 << 32)))
+    dongle.call('tick', (start + 152_000) % (1 << 32))
     ((kind, number, first, second, *_),) = dongle.frames()
     assert (kind, number, first, second) == (0x81, 9, 3, 4)

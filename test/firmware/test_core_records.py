@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Firmware core: settings and calibration as records, torn at every byte; what the robot uses."""
 
-import ctypes
 import struct
 
 import pytest
@@ -115,7 +114,7 @@ def test_a_worn_cell_locks_the_robot(library, name, worn):
         expected = new + crc16(new).to_bytes(2, 'little')
         before = old + crc16(old).to_bytes(2, 'little')
         for number in worn:
-            robot.call('wear', ctypes.c_uint16(copies[number] + at), ctypes.c_bool(True))
+            robot.call('wear', copies[number] + at, True)
         if at and expected[at] == before[at]:
             continue
         assert robot.store(record, new) == core.FAILED
@@ -166,8 +165,8 @@ def test_only_whole_and_possible_records_are_stored(robot):
 
 def test_the_robot_uses_its_settings_and_calibration(robot):
     for channel in range(8):
-        robot.call('set_adc', ctypes.c_uint8(channel), ctypes.c_uint16(200))
-    robot.call('set_adc', ctypes.c_uint8(8), ctypes.c_uint16(800))
+        robot.call('set_adc', channel, 200)
+    robot.call('set_adc', 8, 800)
     settings = RobotSettings(microsteps=8, steps_per_turn=400, invert_left=True, divider=3.0)
     settings = settings._replace(sensors=('none', 'GP2Y0A41', *6 * ('GP2Y0A21',)))
     assert robot.store(SETTINGS_RECORD, encode_settings(settings)) == core.OK

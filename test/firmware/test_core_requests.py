@@ -127,9 +127,9 @@ def test_the_age_is_none_when_it_does_not_fit(robot):
 
 def test_state_contains_the_sensor_readings(robot):
     seven = (ctypes.c_int16 * 7)(164, -5, 8192, -4000, -12, 13, -131)
-    robot.call('set_imu', ctypes.c_bool(True), seven)
+    robot.call('set_imu', True, seven)
     for channel, count in enumerate((0xFFFF, 0xFFFE, 300, 150, 600, 60, 0, 1023)):
-        robot.call('set_adc', channel, ctypes.c_uint16(count))
+        robot.call('set_adc', channel, count)
     robot.run(10_000)  # one channel per millisecond
     state = robot.request(b'\x25\0\0\0')
     assert struct.unpack_from('<hhh', state, 16) == (-131, 164, -5)
@@ -139,14 +139,14 @@ def test_state_contains_the_sensor_readings(robot):
         for count in (300, 150)
     ]
     assert list(state[24:]) == [0, 255, *middle, 1, 254, 254, 255]
-    robot.call('set_adc', 8, ctypes.c_uint16(522))
+    robot.call('set_adc', 8, 522)
     robot.run(100_000)  # the first measurement
     aux = robot.request(b'\x25\0\0\1')
     assert struct.unpack_from('<Hhhhh', aux, 4) == (10_195, -4000, 8192, -12, 13)
     assert robot.status & core.LOW_BATTERY
     assert robot.set(core.BATTERY_LOW, 10_000)[0] == core.OK
     assert not robot.status & core.LOW_BATTERY
-    robot.call('set_imu', ctypes.c_bool(False), seven)
+    robot.call('set_imu', False, seven)
     state = robot.request(b'\x25\0\0\0')
     assert state[3] & core.IMU_FAULT
     assert state[16:22] == bytes(6)

@@ -50,7 +50,7 @@ def kinds(robot):
 
 
 def boot(robot, cause=4):
-    robot.call('boot', cause, ctypes.c_uint32(0))
+    robot.call('boot', cause, 0)
     robot.run(2000)
 
 
@@ -75,11 +75,11 @@ def test_a_fault_flashes_and_beeps_its_number(library, count):
     if count == 2:
         robot.send(robot.command(flags=2))
     elif count == 4:
-        robot.call('set_imu', ctypes.c_bool(False), registers)
+        robot.call('set_imu', False, registers)
     elif count == 5:
-        robot.call('set_chip', ctypes.c_bool(False))
+        robot.call('set_chip', False)
     elif count == 6:
-        robot.call('set_adc', ctypes.c_uint8(8), ctypes.c_uint16(500))
+        robot.call('set_adc', 8, 500)
     robot.run(BOOT_US)
     first = flashes(robot)
     assert first[0] == count
@@ -101,7 +101,7 @@ def test_every_fault_beeps_however_long_the_robot_has_stood(library):
 def test_a_low_battery_beeps_again(library):
     robot = Robot(library)
     robot.hello()
-    robot.call('set_adc', ctypes.c_uint8(8), ctypes.c_uint16(500))
+    robot.call('set_adc', 8, 500)
     robot.run(BOOT_US)
     beeps = [bool(level & BUZZER) for level in levels(robot, 20 * 31)]
     assert 12 <= sum(beeps) <= 18
@@ -110,7 +110,7 @@ def test_a_low_battery_beeps_again(library):
 
 def test_resets_and_faults_are_logged_once_a_boot(library):
     robot = Robot(library)
-    robot.call('set_cell_us', ctypes.c_uint32(CELL_US))
+    robot.call('set_cell_us', CELL_US)
     boot(robot, 8)
     for _ in range(3):
         robot.hello()
@@ -133,7 +133,7 @@ def test_only_a_much_longer_pass_is_logged_again(library):
     robot = Robot(library)
     robot.run(100_000)
     for us in (1500, 5000, 5500, 7000, 8000, 90_000, 90_000):
-        robot.call('stall', ctypes.c_uint32(us))
+        robot.call('stall', us)
         robot.run(100_000)
     passes = [entry.value for entry in log(robot) if entry.kind == LogKind.LOOP]
     assert passes == [pytest.approx(5000, abs=400), pytest.approx(8000, abs=400), 65_535]
@@ -141,7 +141,7 @@ def test_only_a_much_longer_pass_is_logged_again(library):
 
 def test_the_ring_keeps_the_newest_and_survives_torn_entries(library):
     robot = Robot(library)
-    robot.call('set_cell_us', ctypes.c_uint32(CELL_US))
+    robot.call('set_cell_us', CELL_US)
     for number in range(40):
         boot(robot)
         robot.run(100_000 if number % 3 else 20_000)  # every third is torn

@@ -43,6 +43,19 @@ def meet(key=KEY, host_us=1000, session=9, nonces=(b'HOSTHOST', b'ROBOTROB'), ve
     return Signer(session_key(key, nonces[0], verifier.nonce), host_us), verifier
 
 
+def test_all_64_vectors_of_the_reference_implementation():
+    key, tags = bytes.fromhex(GOLDEN['siphash']['key']), GOLDEN['siphash']['tags']
+    assert len(tags) == 64
+    for length, tag in enumerate(tags):
+        assert siphash(key, bytes(range(length))).hex() == tag
+
+
+@pytest.mark.parametrize('size', [0, 15, 17])
+def test_a_key_of_wrong_length_is_rejected(size):
+    with pytest.raises(ValueError, match=f'key must be 16 bytes long: got {size}'):
+        siphash(bytes(size), b'')
+
+
 def test_golden_session_step_by_step():
     verifier = CoreVerifier(bytes.fromhex(VECTORS['key']))
     for row in VECTORS['robot']:

@@ -2,54 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """RadioRobot in virtual time against a scripted dongle and robot."""
 
-import random
-
 import pytest
-from support.radio_bench import COMMAND_TIME, LinkBench
+from support.emulator_bench import RobotBench
+from support.radio_bench import FakeDongle, FakeRobot
 
 from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.radio_robot import RadioRobot, RadioRobotParameters
-from t3mpc_ros.robot.interface import RobotCommand, RobotInterface
+from t3mpc_ros.robot.interface import RobotInterface
 
 KEY = bytes(range(16))
 
 
-class RobotAsLink:
-    """Link interface of the bench that passes steps and commands through the robot."""
-
-    def __init__(self, host):
-        self.host = host
-        self.states = []
-
-    def step(self, now_ns, received):
-        actions = self.host.step(now_ns, received)
-        self.states += self.host.take_states()
-        return actions
-
-    def command(self, wheels, until_ns):
-        now_ns = until_ns - COMMAND_TIME
-        self.host.apply(RobotCommand(wheels, now_ns), now_ns)
-
-    def __getattr__(self, name):
-        return getattr(self.host.link, name)
-
-
-def bench(key=b'', seed=1, **changes):
-    made = LinkBench(key=key, seed=seed)
-    parameters = RadioRobotParameters.from_dict(
-        {name.replace('__', '.'): value for name, value in changes.items()}
-    )
-    made.host = RadioRobot(parameters, key, random.Random(seed).randbytes)
-    made.link = RobotAsLink(made.host)
-    return made
+def bench(key=b''):
+    """Return the host of the bridge at a scripted dongle and robot."""
+    return RobotBench(key=key, emulator=FakeDongle(FakeRobot(key)))
 
 
 def ramped(made, right, left, seconds):
     made.drive(right, left)
     made.run(seconds)
-    return made.link.states[-1]
+    return made.states[-1]
 
 
 def test_radio_robot_implements_the_robot_interface():
@@ -77,10 +51,10 @@ def test_states_are_returned_once_and_in_order():
     made = bench()
     made.connect()
     ramped(made, 2.0, 1.0, 2.0)
-    stamps = [state.stamp_ns for state in made.link.states]
+    stamps = [state.stamp_ns for state in made.states]
     assert stamps == sorted(set(stamps))
     assert len(stamps) == pytest.approx(100, abs=6)
-    assert made.host.take_states() == []
+    assert made.robot.take_states() == []
 
 
 def test_the_ramp_of_the_limiter_is_sent():
@@ -88,7 +62,7 @@ def test_the_ramp_of_the_limiter_is_sent():
     made.connect()
     made.drive(6.0, 6.0)
     made.run(0.5)
-    sent = [f.right / 1000.0 for _, f in made.robot.log if isinstance(f, frames.Command)]
+    sent = [f.right / 1000.0 for _, f in made.board.log if isinstance(f, frames.Command)]
     rises = [b - a for a, b in zip(sent, sent[1:], strict=False)]
     assert max(sent) == 6.0
     assert max(rises) <= 30.0 * 0.02 + 0.01
@@ -98,28 +72,28 @@ def test_a_restart_keeps_the_pose_and_resets_the_gyro_bias():
     made = bench()
     made.connect()
     made.run(2.5)  # calibration of the gyro bias at standstill
-    assert made.host._odometry.calibrated
+    assert made.robot._odometry.calibrated
     before = ramped(made, 4.0, 4.0, 2.0)
-    made.robot.boot(made.now_ns)
+    made.board.boot(made.now_ns)
     made.run(1.5)
-    after = made.link.states[-1]
+    after = made.states[-1]
     assert after.odometry.pose.x >= before.odometry.pose.x
     assert after.odometry.pose.x < before.odometry.pose.x + 0.3
-    assert made.host.link.robot_resets == 1
-    assert not made.host._odometry.calibrated
+    assert made.link.robot_resets == 1
+    assert not made.robot._odometry.calibrated
 
 
 def test_odometry_is_reset_at_standstill_only():
     made = bench()
     made.connect()
     ramped(made, 4.0, 4.0, 1.0)
-    assert made.host.reset_odometry(made.now_ns) == (
+    assert made.robot.reset_odometry(made.now_ns) == (
         'odometry cannot be reset while the robot moves'
     )
     made.drive(0.0, 0.0)
     made.run(1.0)
-    assert made.host.reset_odometry(made.now_ns) == ''
-    assert made.host.advance(made.now_ns).odometry.pose.x == 0.0
+    assert made.robot.reset_odometry(made.now_ns) == ''
+    assert made.robot.advance(made.now_ns).odometry.pose.x == 0.0
 
 
 @pytest.mark.parametrize(

@@ -252,7 +252,7 @@ def a_link(source):
         at[bench] = bench.now_ns
     numbers = (
         '_transactions._dongle',
-        '_transactions._pending.id',
+        '_transactions._pending.frame',
         '_transactions._pending.request',
     )
     yield used.link, fresh.link, (*LINK_KEPT, *numbers), at[used], at[fresh]

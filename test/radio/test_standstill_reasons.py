@@ -246,7 +246,10 @@ class UnusualRobot(FakeRobot):
         ({'drop': StatusFlag.ENABLED}, reasons.DRIVES_DISABLED),
         ({'protocol': 3}, reasons.robot_version(3)),
         ({'accepts': False}, reasons.refused('HELLO', 0)),
-        ({'settings': frames.SETTINGS_DAMAGED, 'accepts': False}, reasons.SETTINGS_DAMAGED),
+        (
+            {'settings': frames.SETTINGS_DAMAGED, 'accepts': False},
+            reasons.SETTINGS[frames.SETTINGS_DAMAGED],
+        ),
     ],
 )
 def test_an_unusual_robot_is_reported(odd, reason):
@@ -261,26 +264,18 @@ def test_an_unusual_robot_is_reported(odd, reason):
 
 def test_a_robot_of_version_1_is_reported():
     """It answers everything of another version with its STATE."""
-    bench = LinkBench()
-    transact = bench.dongle.transact
-
-    def older(frame, now_ns):
-        at, answer = transact(frame, now_ns)
-        return at, answer._replace(payload=b'\x11' + bytes(31)) if answer.payload else answer
-
-    bench.dongle.transact = older
+    bench, older = LinkBench(), b'\x11' + bytes(31)
+    bench.dongle.change = lambda reply: (
+        reply._replace(payload=older) if getattr(reply, 'payload', b'') else reply
+    )
     bench.run(1.0)
     assert bench.link.reason(bench.now_ns) == reasons.robot_version(1)
 
 
 def test_a_dongle_with_another_protocol_is_reported():
     bench = LinkBench()
-    reply = bench.dongle.reply
-
-    def newer(frame, now_ns):
-        at, answer = reply(frame, now_ns)
-        return at, answer._replace(protocol=3) if isinstance(answer, Pong) else answer
-
-    bench.dongle.reply = newer
+    bench.dongle.change = lambda reply: (
+        reply._replace(protocol=3) if isinstance(reply, Pong) else reply
+    )
     bench.run(1.0)
     assert bench.link.reason(bench.now_ns) == 'the dongle must speak protocol 2: it speaks 3'

@@ -7,6 +7,7 @@ SipHash of the host are the reference of those of the firmware.
 """
 
 import ctypes
+from functools import cache
 import math
 from pathlib import Path
 import struct
@@ -53,6 +54,7 @@ def run_make(folder, *words):
     return subprocess.run(command, capture_output=True, text=True)
 
 
+@cache
 def load_core():
     """Return the library of the emulator, with the functions that only tests use."""
     core = ctypes.CDLL(str(compile_library()))
@@ -133,7 +135,7 @@ class Robot(Part):
         self.echo_age = 1000  # us from the newest STATE of the host to reception
         if key:
             self.call('store_key', key)
-        self.call('boot', 4, ctypes.c_uint32(time))
+        self.call('boot', 4, time)
 
     @property
     def now(self):
@@ -161,25 +163,25 @@ class Robot(Part):
         return self.call('pulses', 0), self.call('pulses', 1)
 
     def run(self, us):
-        self.call('run', ctypes.c_uint32(us))
+        self.call('run', us)
 
     def reset(self, cell_us=0):
         """Reset the board; then its EEPROM takes a time for a cell."""
-        self.call('set_cell_us', ctypes.c_uint32(cell_us))
-        self.call('boot', 4, ctypes.c_uint32(0))
+        self.call('set_cell_us', cell_us)
+        self.call('boot', 4, 0)
         self.run(1000)
 
     def poke_eeprom(self, address, data):
         for at, value in enumerate(data, address):
-            self.call('poke_eeprom', ctypes.c_uint16(at), ctypes.c_uint8(value))
+            self.call('poke_eeprom', at, value)
 
     def poke(self, time):
         """Shift the clock of the robot and all its time stamps, not the clock of the host."""
         self.delay += time - self.now
-        self.call('poke_time', ctypes.c_uint32(time))
+        self.call('poke_time', time)
 
     def send(self, data):
-        self.call('packet', bytes(data), ctypes.c_uint8(len(data)))
+        self.call('packet', bytes(data), len(data))
 
     def reply(self):
         """Return the payload that the next exchange fetches."""
@@ -268,10 +270,10 @@ class Robot(Part):
     def console(self, frame, us=1000):
         """Send a frame to the USB console; return the replies within a time."""
         wire = encode_frame(frame)
-        self.call('usb', wire, ctypes.c_uint32(len(wire)))
+        self.call('usb', wire, len(wire))
         self.run(us)
         room = ctypes.create_string_buffer(4096)
-        size = self.call('usb_take', room, ctypes.c_uint32(4096))
+        size = self.call('usb_take', room, 4096)
         return FrameDecoder().feed(room.raw[:size])
 
     def settings(self, channel=None, microsteps=16, address=ADDRESS, us=700_000):
@@ -315,7 +317,10 @@ class Robot(Part):
 
 
 class CoreVerifier:
-    """The rules of a session in the core, with the interface of ``CommandVerifier``."""
+    """The rules of a session in the core.
+
+    Its methods return why a frame is refused, NONE for a valid one.
+    """
 
     def __init__(self, key=b''):
         self._robot = Robot(load_core(), key)
@@ -337,16 +342,19 @@ class CoreVerifier:
         return self._robot.refusal()[0] if refused else RefusalReason.NONE
 
     def begin_session(self, hello, fresh_nonce):
+        """Start the session of a HELLO; these 8 bytes become the nonce of the robot."""
         self._robot.call('force_nonce', fresh_nonce)
         return self.receive(encode(hello))
 
     def accept(self, frame):
+        """Return why a frame is not part of the session; a valid one advances the counter."""
         why = self.receive(encode(frame))
         # The session is checked first.
         late = (RefusalReason.SEQUENCE, RefusalReason.STALE)
         return RefusalReason.NONE if why in late else why
 
     def verify(self, frame):
+        """Return why a frame is not followed: an ESTOP always is."""
         why = self.accept(frame)
         estop = isinstance(frame, Command) and frame.flags & ESTOP
         return RefusalReason.NONE if estop else why
@@ -363,10 +371,10 @@ class Dongle(Part):
         super().__init__(library, 2)
 
     def write(self, frame):
-        self.call('bytes', encode_frame(frame), ctypes.c_uint32(len(encode_frame(frame))))
+        self.call('bytes', encode_frame(frame), len(encode_frame(frame)))
 
     def run(self, us):
-        self.call('run', ctypes.c_uint32(us))
+        self.call('run', us)
 
     def sent(self):
         room = ctypes.create_string_buffer(32)
@@ -374,17 +382,11 @@ class Dongle(Part):
         return room.raw[:size]
 
     def reply(self, payload=b'', retransmits=0, acknowledged=True):
-        self.call(
-            'answer',
-            ctypes.c_bool(acknowledged),
-            ctypes.c_uint8(retransmits),
-            payload,
-            ctypes.c_uint8(len(payload)),
-        )
+        self.call('answer', acknowledged, retransmits, payload, len(payload))
 
     def read(self):
         room = ctypes.create_string_buffer(4096)
-        size = self.call('take', room, ctypes.c_uint32(4096))
+        size = self.call('take', room, 4096)
         return room.raw[:size]
 
     def frames(self):
@@ -397,7 +399,7 @@ class Decoder(Part):
     def feed(self, data):
         found, room, size = [], ctypes.create_string_buffer(78), ctypes.c_uint8()
         while data:
-            taken = self.call('feed', data, ctypes.c_uint32(len(data)), room, ctypes.byref(size))
+            taken = self.call('feed', data, len(data), room, ctypes.byref(size))
             data = data[taken:]
             if size.value:
                 found.append(room.raw[: size.value])
@@ -411,18 +413,18 @@ class Decoder(Part):
 
 def c_encode_frame(library, frame):
     room = ctypes.create_string_buffer(82)
-    size = library.t3_host_to_wire(frame, ctypes.c_uint8(len(frame)), room)
+    size = library.t3_host_to_wire(frame, len(frame), room)
     return room.raw[:size]
 
 
 def c_decode(library, data):
     numbers = (ctypes.c_int64 * 12)()
-    fault = library.t3_host_decode(data, ctypes.c_uint8(len(data)), numbers)
+    fault = library.t3_host_decode(data, len(data), numbers)
     return fault, dict(zip((*PACKET, 'nonce', 'tag'), numbers, strict=True))
 
 
 def c_encode(library, kind, numbers, nonce=False):
     fields = (ctypes.c_int64 * 32)(*numbers)
     room = ctypes.create_string_buffer(32)
-    size = library.t3_host_encode(ctypes.c_uint8(kind), fields, ctypes.c_bool(nonce), room)
+    size = library.t3_host_encode(kind, fields, nonce, room)
     return room.raw[:size]

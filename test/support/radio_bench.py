@@ -5,8 +5,8 @@
 import math
 import random
 
-from support.command_verifier import CommandVerifier
 from support.emulator_bench import MS, START_NS, Bench
+from support.firmware_core import CoreVerifier
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_downlink, decode_to_dongle, encode
 from t3mpc_ros.radio.protocol.frames import (
@@ -17,7 +17,6 @@ from t3mpc_ros.radio.protocol.frames import (
 )
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 
-COMMAND_TIME = 250 * MS
 STEP = math.tau / 3200
 WRAP = 1 << 32
 
@@ -27,7 +26,7 @@ def signed32(value):
 
 
 class FakeRobot:
-    """Simplified rules of the robot: session, sequence, TTL, emergency stop, parameters.
+    """Simplified rules of the robot: sequence, TTL, emergency stop, parameters; real sessions.
 
     Wheels reach the commanded speed at once and keep it between packets.
     """
@@ -43,7 +42,7 @@ class FakeRobot:
 
     def boot(self, now_ns, clock_us=0, steps=(0, 0)):
         self.boots += 1
-        self.verifier = CommandVerifier(self.key)
+        self.verifier = CoreVerifier(self.key)
         self.booted_ns, self.clock_us = now_ns, clock_us
         self.steps = [float(steps[0]), float(steps[1])]
         self.parameters = [parameter.default for parameter in BOARD_PARAMETERS]
@@ -224,6 +223,8 @@ class FakeDongle:
         self.jitter_ns = 0
         self.requests = []
         self.boot_delay_ns = 0
+        self.change = lambda reply: reply
+        """Returns what is sent in place of a reply."""
         self.board, self.now_ns = robot, START_NS
         self.port_open, self.replies = True, []
         self.restart(0)
@@ -271,7 +272,7 @@ class FakeDongle:
                 self.drop_replies -= 1
                 continue
             at += self.source.randrange(self.jitter_ns + 1)
-            replies.append((at, encode_frame(encode(reply))))
+            replies.append((at, encode_frame(encode(self.change(reply)))))
         return replies
 
     def reply(self, frame, now_ns):
