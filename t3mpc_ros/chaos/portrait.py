@@ -28,9 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.reference import ReferenceParameters
-from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
-from t3mpc_ros.chaos.system import hyperchaotic_system
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters, group, parameter
@@ -100,7 +98,7 @@ class PortraitPath:
         """Where the path lies."""
         substeps = math.ceil(parameters.sample_step / system.solver_step * (1.0 - 1e-9))
         self._substeps = max(1, substeps)
-        self._solver = self._make_solver(parameters.sample_step / self._substeps)
+        self._solver = system.make_solver(self._solver_step)
         self._pairs = parameters.switching.pairs
         self._centres, self._widths = self._calibrate()
         reach = math.ceil(3.0 * parameters.smoothing / SPACING)
@@ -120,13 +118,7 @@ class PortraitPath:
 
         The seed is not published or logged.
         """
-        if seed < 0:
-            raise ValueError('seed must not be negative')  # without its value, which is secret
-        initial = np.array(self._system.initial)
-        if seed:
-            bound = self._system.perturbation
-            # Independent of the schedule's stream: public dwell times must not reveal this one.
-            initial += np.random.default_rng((seed, 1)).uniform(-bound, bound, initial.size)
+        initial = self._system.initial_state(seed)
         self._schedule = SwitchingSchedule(self._parameters.switching, seed)
         self._mirrors = np.random.default_rng((seed, 2))
         self._mirrored = self._mirrored_before = self._draw_mirror()
@@ -151,22 +143,12 @@ class PortraitPath:
     def _solver_step(self) -> float:
         return self._parameters.sample_step / self._substeps
 
-    def _make_solver(self, step: float) -> FractionalSolver:
-        system = self._system
-        return FractionalSolver(
-            hyperchaotic_system(orders=system.orders),
-            step,
-            np.array(system.initial),
-            system.memory_horizon,
-            system.memory_tolerance,
-        )
-
     def _calibrate(self) -> tuple[Array, Array]:
         """Return centres, shape (CENTRES, 4), and widths, shape (4,), of the distributions.
 
         The run is that of the unperturbed initial state, so it depends on no seed.
         """
-        solver = self._make_solver(CALIBRATION_STEP / 20.0)
+        solver = self._system.make_solver(CALIBRATION_STEP / 20.0)
         solver.advance(math.ceil(self._system.settle * 20.0 / CALIBRATION_STEP))
         states = np.empty((round(CALIBRATION_TIME / CALIBRATION_STEP), 4))
         for row in states:

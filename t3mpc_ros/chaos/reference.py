@@ -101,6 +101,27 @@ class ReferenceParameters(Parameters):
             if len(values) != 4:
                 raise ParameterError(f'{name} must have four values: got {len(values)}')
 
+    def make_solver(self, step: float) -> FractionalSolver:
+        """Return the solver of (85) with a step in seconds of system time."""
+        return FractionalSolver(
+            hyperchaotic_system(orders=self.orders),
+            step,
+            np.array(self.initial),
+            self.memory_horizon,
+            self.memory_tolerance,
+        )
+
+    def initial_state(self, seed: int) -> NDArray[np.float64]:
+        """Return the initial state of a seed of any length, shape (4,)."""
+        if seed < 0:
+            raise ValueError('seed must not be negative')  # without its value, which is secret
+        initial = np.array(self.initial)
+        if seed:
+            # Independent of the schedule's stream: public dwell times must not reveal this one.
+            generator = np.random.default_rng((seed, 1))
+            initial += generator.uniform(-self.perturbation, self.perturbation, initial.size)
+        return initial
+
     @property
     def steps_per_sample(self) -> int:
         """Number of solver steps per sample."""
@@ -144,13 +165,7 @@ class ChaoticReference:
         self._parameters = parameters
         self._geometry = geometry
         self._seed = parameters.seed
-        self._solver = FractionalSolver(
-            hyperchaotic_system(orders=parameters.orders),
-            parameters.step,
-            np.array(parameters.initial),
-            parameters.memory_horizon,
-            parameters.memory_tolerance,
-        )
+        self._solver = parameters.make_solver(parameters.step)
         self.reset()
 
     def reset(self, seed: int | None = None) -> None:
@@ -159,15 +174,9 @@ class ChaoticReference:
         The seed may have any length: with 128 random bits a run cannot be predicted. The seed is
         not published or logged.
         """
-        if seed is not None and seed < 0:
-            raise ValueError('seed must not be negative')  # without its value, which is secret
-        self._seed = self._seed if seed is None else seed
-        initial = np.array(self._parameters.initial)
-        if self._seed:
-            bound = self._parameters.perturbation
-            # Independent of the schedule's stream: public dwell times must not reveal this one.
-            generator = np.random.default_rng((self._seed, 1))
-            initial += generator.uniform(-bound, bound, initial.size)
+        seed = self._seed if seed is None else seed
+        initial = self._parameters.initial_state(seed)
+        self._seed = seed
         self._schedule = SwitchingSchedule(self._parameters.switching, self._seed)
         self._solver.reset(initial)
         self._solver.advance(math.ceil(self._parameters.settle / self._parameters.step))

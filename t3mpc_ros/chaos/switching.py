@@ -128,15 +128,6 @@ class SwitchingSchedule:
             blend_rate=6.0 * share * (1.0 - share) / span,
         )
 
-    def switches_until(self, time: float) -> list[float]:
-        """Return the times (s) of all switches up to and including ``time``, ascending."""
-        result = []
-        for dwell in self._walk():
-            if dwell.until > time:
-                break
-            result.append(dwell.until)
-        return result
-
     def _restart(self) -> None:
         self._dwells = self._walk()
         self._dwell = next(self._dwells)

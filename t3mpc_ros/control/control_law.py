@@ -120,12 +120,15 @@ class Nt3fsMpcParameters(Parameters):
     )
     law: LawParameters = group(LawParameters)
     jump_transition: JumpTransitionParameters = group(JumpTransitionParameters)
-    speed_filter: SpeedFilterParameters = group(SpeedFilterParameters)
+    # The ratio of disturbance and noise sets the filter: the noise is that of the robot.
+    speed_filter: SpeedFilterParameters = group(SpeedFilterParameters, fixed=('disturbance',))
     fuzzy: FuzzyParameters = group(
-        FuzzyParameters, fixed=('centre_exponent', 'footprint_of_uncertainty')
+        FuzzyParameters,
+        fixed=('centre_exponent', 'footprint_of_uncertainty', 'spread', 'slices'),
     )
+    # The ball bounds the coefficients; the other modifications are for comparisons.
     adaptation: AdaptationParameters = group(
-        AdaptationParameters, fixed=('sigma_modification', 'step_limit')
+        AdaptationParameters, fixed=('sigma_modification', 'dead_zone', 'step_limit')
     )
     friction: FrictionTermParameters = group(FrictionTermParameters)
     predictive: PredictiveParameters = group(PredictiveParameters)

@@ -110,9 +110,9 @@ class ControllerParameters(Nt3fsMpcParameters):
     command_shaper: CommandShaperParameters = group(
         CommandShaperParameters, straight_frequency=0.0, turning_frequency=0.0
     )
-    body: BodyCorrectionParameters = group(BodyCorrectionParameters)
+    body: BodyCorrectionParameters = group(BodyCorrectionParameters, fixed=('max_correction',))
     pose: PoseLoopParameters = group(PoseLoopParameters)
-    keep_out: KeepOutParameters = group(KeepOutParameters)
+    keep_out: KeepOutParameters = group(KeepOutParameters, fixed=('stuck_time',))
 
     def check_consistency(self) -> None:
         """Raise :class:`ParameterError` if the composition cannot treat jumps so."""
@@ -152,7 +152,9 @@ class StepperControllerParameters(ControllerParameters):
     estimate_dead_time: bool = with_default(ControllerParameters, 'estimate_dead_time', True)
     law: LawParameters = group(LawParameters, gain=0.0)
     # A rotor follows its field at once; the lag of 0.02 s is that of the velocity drive.
-    speed_filter: SpeedFilterParameters = group(SpeedFilterParameters, lag=0.003)
+    speed_filter: SpeedFilterParameters = group(
+        SpeedFilterParameters, fixed=('disturbance',), lag=0.003
+    )
     command_shaper: CommandShaperParameters = group(CommandShaperParameters)
 
 
@@ -227,7 +229,6 @@ class Controller:
             else None
         )
         """The keep-out, None unless it is enabled."""
-        self._place = ORIGIN
         self._tracker = SwitchingTracker(parameters.resolved(), 'velocity')
         self._period = 1.0 / parameters.rate
         self._period_ns = round(self._period * NANOSECONDS)
@@ -239,12 +240,6 @@ class Controller:
             self._period,
         )
         """Speed filter and last command; a replay sets the recorded commands here."""
-        self._dead_time_ns = round(self.actuation.dead_time * NANOSECONDS)
-        self.dead_time = self._make_dead_time_estimator()
-        """Estimate of the dead time."""
-        self.disturbed = False
-        """Whether the response is disturbed, so that nothing is learned from it."""
-        self._before_disturbance: tuple[Any, Any] | None = None
         self._shaper = CommandShaper(parameters.command_shaper, self._period)
         geometry = parameters.geometry
         self.body = BodyCorrection(
@@ -259,19 +254,30 @@ class Controller:
         self._watchdog = InputWatchdog(parameters.watchdog)
         self._response = ResponseMonitor(parameters.watchdog, self._period)
         self._trajectory = ReferenceTrajectory(_least_jump(parameters.limits))
-        self._snapshots: deque[tuple[Any, Any]] = deque(maxlen=SNAPSHOT_COUNT)
-        """Weights, oldest first."""
-        self._steps_since_snapshot = 0
         self._snapshot_steps = next(n for n in count(1) if n * self._period >= SNAPSHOT_PERIOD)
         self._jumps: list[Jump] = []
         self._announced: set[int] = set()
         self._moving = False
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin without odometry, and with the dead time of the parameters."""
+        self.dead_time = self._make_dead_time_estimator()
+        """Estimate of the dead time."""
+        self._set_dead_time(self.parameters.speed_filter.dead_time)
+        self.disturbed = False
+        """Whether the response is disturbed, so that nothing is learned from it."""
+        self._before_disturbance: tuple[Any, Any] | None = None
+        self._snapshots: deque[tuple[Any, Any]] = deque(maxlen=SNAPSHOT_COUNT)
+        """Weights, oldest first."""
+        self._steps_since_snapshot = 0
+        self._place = ORIGIN
         self._last_stamp_ns: int | None = None
         self.odometry_twist = OdometryTwist()
         """Whether the odometry has a twist."""
         self.ignored_odometry = 0
         """Number of messages that were ignored: repeated, or overtaken by a later one."""
-        self.status = self._make_status(0, Reason.NO_ODOMETRY, np.full(2, math.nan))
+        self.status = self._make_status(0, Reason.NO_ODOMETRY)
 
     @property
     def law(self) -> Nt3fsMpcController:
@@ -332,26 +338,17 @@ class Controller:
         self.law.reset_estimate()
         self.law.predictive.pretrain()
         self.body.reset()
-        self.dead_time = self._make_dead_time_estimator()
-        self.disturbed, self._before_disturbance = False, None
-        self._snapshots.clear()
-        self._set_dead_time(self.parameters.speed_filter.dead_time)
-        self._steps_since_snapshot = 0
         self._stop()
         self._response.reset()
         self.pose_controller.reset()
-        self._place = ORIGIN
-        self._last_stamp_ns = None
-        self.odometry_twist = OdometryTwist()
-        self.ignored_odometry = 0
-        self.status = self._make_status(0, Reason.NO_ODOMETRY, np.full(2, math.nan))
+        self._begin()
         if self.keep_out is not None:
             self.keep_out.reset()
 
     def add_range(self, sensor: int, reading: float) -> None:
         """Add a range reading (m, REP 117) of a sensor, taken at the pose of the last odometry."""
         if self.keep_out is not None and self._last_stamp_ns is not None:
-            self.keep_out.add_reading(sensor, reading, self._place)
+            self.keep_out.map.add_reading(sensor, reading, self._place)
 
     def add_reference(self, reference: State) -> bool:
         """Store a reference sample; return False if it is not finite and therefore ignored."""
@@ -365,8 +362,7 @@ class Controller:
             self._tracker.transition.withdraw(reference.stamp_ns)
         if self.parameters.pose.enabled:
             self._pose_reference.add(reference)
-        if trajectory.has_jumps:
-            self._jumps += trajectory.pop_jumps()
+        self._jumps += trajectory.pop_jumps()
         self._watchdog.reference_received()
         return True
 
@@ -424,7 +420,7 @@ class Controller:
             self._announce_jumps(stamp, plan_ns)
         acceleration = self._acceleration(plan_ns, odometry.pose.yaw, begin, end, dt)
         applied = actuation.send_acceleration(acceleration, dt).copy()
-        self._tracker.set_applied(applied, saturated=actuation.limited)
+        self.law.set_applied(applied, saturated=actuation.limited)
         self._response.add_command(*actuation.command.tolist())
         self._take_snapshot()
         self.status = self._make_status(stamp, reason, actuation.speeds - reference, applied)
@@ -540,9 +536,7 @@ class Controller:
         if not self._watchdog.odometry_timed_out(last_received_ns, now_ns):
             return False
         self._stop()
-        self.status = self._make_status(
-            self._last_stamp_ns or 0, Reason.NO_ODOMETRY, np.full(2, math.nan)
-        )
+        self.status = self._make_status(self._last_stamp_ns or 0, Reason.NO_ODOMETRY)
         return True
 
     def _command_unresponsive(self, odometry: State, elapsed: float) -> tuple[BodyTwist, Status]:
@@ -626,7 +620,7 @@ class Controller:
             if known and jump.stamp_ns not in self._announced:
                 self._announced.add(jump.stamp_ns)
                 after = self._trajectory.at(jump.stamp_ns)
-                slope = BodyTwist(0.0, 0.0) if after is None else after.rate
+                slope = STANDSTILL if after is None else after.rate
                 self._tracker.transition.announce(
                     jump.stamp_ns,
                     _as_array(wheels_from_twist(jump.change, geometry)),
@@ -652,15 +646,18 @@ class Controller:
         self._moving = False
 
     def _make_status(
-        self, stamp_ns: int, reason: Reason, error: Array, applied: Array | None = None
+        self,
+        stamp_ns: int,
+        reason: Reason,
+        error: Array | None = None,
+        applied: Array | None = None,
     ) -> Status:
         law = self.law
-        moves = applied is not None
         return Status(
             stamp_ns,
             reason,
-            error,
-            law.terms.copy() if moves else np.zeros_like(law.terms),
+            np.full(2, math.nan) if error is None else error,
+            np.zeros_like(law.terms) if applied is None else law.terms.copy(),
             np.zeros(2) if applied is None else applied,
             law.certificate,
             law.predictive.skill,
@@ -750,10 +747,6 @@ class SwitchingTracker:
         rate = (reference_next - soon - reference) / self._period
         return self.law.step(speeds, reference, rate, dt, change)
 
-    def set_applied(self, acceleration: Array, *, saturated: bool) -> None:
-        """Set the applied acceleration, see :meth:`Nt3fsMpcController.set_applied`."""
-        self.law.set_applied(acceleration, saturated=saturated)
-
 
 wheel_speeds = kernel(kinematics.wheel_speeds)
 
@@ -816,12 +809,7 @@ def sample_reference(
     result    : overwritten
     """
     speeds, reference, begin, end = result
-    radius, half, period, hold_ns = (
-        sampling.radius,
-        sampling.half,
-        sampling.period,
-        sampling.hold_ns,
-    )
+    period, hold_ns, preview, radius, half = sampling
     speeds[0], speeds[1] = wheel_speeds(linear, angular, radius, half)
     speed = max(abs(speeds[0]), abs(speeds[1]))
     first, last = trajectory.bounds[0], trajectory.bounds[1] - 1
@@ -832,7 +820,7 @@ def sample_reference(
         return False, speed, 0.0
     reference[0], reference[1] = wheel_speeds(v, w, radius, half)
     error = max(abs(speeds[0] - reference[0]), abs(speeds[1] - reference[1]))
-    if sampling.preview:
+    if preview:
         until_ns = effect_ns + round(period * NANOSECONDS)
         begin_ns = hold_newest(effect_ns, newest, hold_ns)
         end_ns = hold_newest(until_ns, newest, hold_ns)

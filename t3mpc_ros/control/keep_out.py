@@ -307,6 +307,14 @@ class KeepOutParameters(Parameters):
             )
 
 
+def has_moved(start: Pose | None, pose: Pose, distance: float, angle: float) -> bool:
+    """Return whether a pose is farther than a distance (m) or an angle (rad) from the start."""
+    return start is None or (
+        math.hypot(pose.x - start.x, pose.y - start.y) > distance
+        or abs(wrap_angle(pose.yaw - start.yaw)) > angle
+    )
+
+
 class Activity(enum.Enum):
     """What the keep-out does, in words for the diagnostics."""
 
@@ -365,10 +373,6 @@ class KeepOut:
         self._driven = 0.0
         self._pause = 0.0
 
-    def add_reading(self, sensor: int, reading: float, pose: Pose) -> None:
-        """Add a range reading (m, REP 117) taken at ``pose``."""
-        self.map.add_reading(sensor, reading, pose)
-
     def step(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist nearest to ``wanted``, or one that looks around.
 
@@ -382,27 +386,18 @@ class KeepOut:
             room = self.parameters.distance + self.parameters.ahead + 0.06
             self.map.mark_free(pose.x, pose.y, room)
             self._look_around(pose, math.pi)
-        if self._stands_still(elapsed):
+        if self._pause > 0.0:
+            # Commands have not moved the robot: it gets none for a while.
+            self._pause -= elapsed
+            self.changed, self.activity = True, Activity.STUCK_DRIVE
             return STANDSTILL
         permitted = self._reshaped(wanted, pose, elapsed)
         self._watch_drive(permitted, pose, elapsed)
         return permitted
 
-    def _stands_still(self, elapsed: float) -> bool:
-        """Whether the robot must not be commanded, because commands have not moved it."""
-        if self._pause <= 0.0:
-            return False
-        self._pause -= elapsed
-        self.changed, self.activity = True, Activity.STUCK_DRIVE
-        return True
-
     def _watch_drive(self, twist: BodyTwist, pose: Pose, elapsed: float) -> None:
         """Pause the commands when they have not moved the robot for DRIVE_TIMEOUT."""
-        anchor = self._anchor
-        moved = anchor is None or (
-            math.hypot(pose.x - anchor.x, pose.y - anchor.y) > 0.03
-            or abs(wrap_angle(pose.yaw - anchor.yaw)) > 0.15
-        )
+        moved = has_moved(self._anchor, pose, 0.03, 0.15)
         if moved or (abs(twist.linear) < 0.05 and abs(twist.angular) < 0.3):
             self._anchor, self._driven = pose, 0.0
             return
@@ -440,7 +435,9 @@ class KeepOut:
         ahead, left = velocity
         speed, wanted = math.hypot(ahead, left), math.atan2(left, ahead)
         angles = np.append(wanted, np.arange(DIRECTIONS) * (math.tau / DIRECTIONS))
-        free = angles[self._is_free(angles)]
+        is_free = np.empty(angles.size, dtype=np.bool_)
+        find_free(self._nearest, np.cos(angles), np.sin(angles), self.parameters.distance, is_free)
+        free = angles[is_free]
         if speed < 1e-6 or not free.size or free[0] == wanted:
             self._detour = None
             return velocity
@@ -451,13 +448,6 @@ class KeepOut:
         chosen = float(free[int(np.argmin(cost))])
         self._detour = pose.yaw + chosen
         return speed * math.cos(chosen), speed * math.sin(chosen)
-
-    def _is_free(self, angles: Array) -> NDArray[np.bool_]:
-        """Return which directions (rad, frame of the robot), shape (k,), are free."""
-        free = np.empty(angles.size, dtype=np.bool_)
-        distance = self.parameters.distance
-        find_free(self._nearest, np.cos(angles), np.sin(angles), distance, free)
-        return free
 
     def _permitted(self, wanted: BodyTwist) -> BodyTwist:
         """Return the permitted twist nearest to ``wanted``."""
@@ -502,19 +492,12 @@ class KeepOut:
         if (
             self._blocked_for > 0.2
             and self._blocked_by_unseen()
-            and self._has_moved_since_look(pose)
+            and has_moved(self._seen_from, pose, 0.04, 0.6)
         ):
             self._blocked_for = 0.0
             self._look_around(pose, self.parameters.scan_angle)
             return
         self._update_stuck(wanted, pose, elapsed)
-
-    def _has_moved_since_look(self, pose: Pose) -> bool:
-        seen = self._seen_from
-        if seen is None:
-            return True
-        moved = math.hypot(pose.x - seen.x, pose.y - seen.y)
-        return moved > 0.04 or abs(wrap_angle(pose.yaw - seen.yaw)) > 0.6
 
     def _blocked_by_unseen(self) -> bool:
         """Whether the nearest cell ahead is one that has not been seen."""
@@ -527,11 +510,7 @@ class KeepOut:
     def _update_stuck(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> None:
         """Count the time without progress of a robot that wants to move."""
         parameters = self.parameters
-        start = self._progress
-        moved = start is None or (
-            math.hypot(pose.x - start.x, pose.y - start.y) > parameters.stuck_distance
-            or abs(wrap_angle(pose.yaw - start.yaw)) > 1.0
-        )
+        moved = has_moved(self._progress, pose, parameters.stuck_distance, 1.0)
         if moved or abs(wanted.linear) < 0.02:
             self._progress, self._waited = pose, 0.0
             return

@@ -211,20 +211,16 @@ class ResponseMonitor:
             maxlen=max(1, round(parameters.response_window / period))
         )
         self._timeout_steps = max(1, round(parameters.response_timeout / period))
-        self._evidence = 0
+        self.evidence = 0
+        """Against the present decision."""
         self.responsive = True
         """Whether the robot follows commands."""
 
     def reset(self) -> None:
         """Clear the commands and assume a responsive robot."""
         self._commands.clear()
-        self._evidence = 0
+        self.evidence = 0
         self.responsive = True
-
-    @property
-    def counts(self) -> tuple[int, int]:
-        """Number of stored commands, and evidence against the present decision."""
-        return len(self._commands), self._evidence
 
     def add_command(self, right: float, left: float) -> None:
         """Store the wheel speeds commanded at this step, rad/s."""
@@ -238,7 +234,7 @@ class ResponseMonitor:
         newest = commands[-1]
         if self.responsive and max(abs(right - newest[0]), abs(left - newest[1])) <= bound:
             # A speed within the bound of one command is within the bound of their range.
-            self._evidence = 0
+            self.evidence = 0
             return True
         outside = standstill_outside = 0.0
         for measured, given in zip((right, left), zip(*commands, strict=True), strict=True):
@@ -246,13 +242,13 @@ class ResponseMonitor:
             outside = max(outside, measured - highest, lowest - measured)
             standstill_outside = max(standstill_outside, -highest, lowest)
         if (outside > bound) != self.responsive:
-            self._evidence = 0
+            self.evidence = 0
         elif self.responsive or standstill_outside > bound:
-            self._evidence += EVIDENCE_WEIGHT
+            self.evidence += EVIDENCE_WEIGHT
         else:
-            self._evidence += 1  # a standing robot fits these commands as well
-        if self._evidence >= EVIDENCE_WEIGHT * self._timeout_steps:
-            self.responsive, self._evidence = not self.responsive, 0
+            self.evidence += 1  # a standing robot fits these commands as well
+        if self.evidence >= EVIDENCE_WEIGHT * self._timeout_steps:
+            self.responsive, self.evidence = not self.responsive, 0
         return self.responsive
 
 

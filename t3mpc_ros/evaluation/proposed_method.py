@@ -108,7 +108,7 @@ class ProposedController(BaselineController):
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:
         """Take note of the u that the drive's limits let through."""
-        self._tracker.set_applied(acceleration, saturated=limited)
+        self._tracker.law.set_applied(acceleration, saturated=limited)
 
     def _announce_future_jump(self, instant_ns: int, future: Array, j: int) -> None:
         """Announce a jump at row j of the future, seen by the rows around it."""

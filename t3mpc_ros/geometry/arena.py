@@ -75,12 +75,6 @@ class Arena:
             high[rows] = np.maximum(high[rows], y.max(axis=0))
         return low, high
 
-    @property
-    def bounds(self) -> tuple[float, float, float, float]:
-        """Smallest x and y, largest x and y, m."""
-        low, high = self.corners.min(axis=0).tolist(), self.corners.max(axis=0).tolist()
-        return low[0], low[1], high[0], high[1]
-
     def from_unit_square(self, places: Array) -> Array:
         """Return the points (m) of places in the unit square, shape (n, 2); areas keep shares.
 

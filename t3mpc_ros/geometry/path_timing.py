@@ -137,15 +137,9 @@ class PathTiming:
     ) -> None:
         if not period > 0.0:
             raise ValueError(f'period must be positive: got {period} s')
+        shares = {name: SHARE * limit for name, limit in vars(limits).items()}
         self._limits = CurveLimits(
-            SHARE * limits.linear,
-            SHARE * limits.angular,
-            SHARE * limits.linear_acceleration,
-            SHARE * limits.angular_acceleration,
-            SHARE * limits.wheel_speed,
-            SHARE * limits.wheel_acceleration,
-            geometry.wheel_radius,
-            geometry.half_separation,
+            **shares, radius=geometry.wheel_radius, half_separation=geometry.half_separation
         )
         self._period = period
         self._curve = _CurveBuilder(start)

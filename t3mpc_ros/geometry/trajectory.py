@@ -102,11 +102,6 @@ class ReferenceTrajectory:
             self._add_jump(last)
         return True
 
-    @property
-    def has_jumps(self) -> bool:
-        """Whether :meth:`pop_jumps` returns any."""
-        return bool(self._jumps)
-
     def pop_jumps(self) -> list[Jump]:
         """Return the jumps added since the last call, oldest first."""
         jumps, self._jumps = self._jumps, []

@@ -236,7 +236,8 @@ class Signals(NamedTuple):
     applied_sums: Array
     """Sum of the v_p applied since the last sample, rad/s²."""
     applied: Array
-    """v_p applied in the present control period, rad/s²."""
+    """v_p applied in the present control period, rad/s², where a limit reduced it: the machine
+    learns from it, and the next change starts from it, limited to the range from zero to v."""
     v: Array
     """v_p (63), held between samples, rad/s²."""
     dither: Array
@@ -564,16 +565,6 @@ class PredictiveController:
                 {name: value[z] for name, value in weights.items()}, self._learning
             )
         self.reset()
-
-    def notify_applied(self, v_p: Array) -> None:
-        """Set the v_p (rad/s²) that was applied, when it differs from the last one returned.
-
-        The machine learns from the applied v_p. The next change starts from the applied v_p,
-        limited to the range from zero to the returned one.
-        """
-        if np.shape(v_p) != self.status.shape or not np.isfinite(v_p).all():
-            raise ValueError(f'v_p must be {self.status.size} finite numbers: got {v_p}')
-        self.signals.applied[:] = v_p
 
     def notify_jump(self, jump: Array) -> None:
         """Add a known jump of the error by ``jump`` (rad/s) at the next step.

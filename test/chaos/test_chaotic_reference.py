@@ -173,7 +173,7 @@ def test_switch_times_do_not_reveal_the_perturbation():
         reference.reset(seed)
         # Over 0.1 s the perturbation grows linearly: the shift is a combination of four draws.
         shifts.append(np.array(reference.advance().states) - base)
-        dwells.append(SwitchingSchedule(parameters.switching, seed).switches_until(20.0)[0])
+        dwells.append(SwitchingSchedule(parameters.switching, seed).at(0.0).until)
     # Remove the part of the dwell that a linear combination of the shifts explains.
     design = np.column_stack([np.ones(len(shifts)), np.array(shifts) * 1e6])
     centred = np.array(dwells) - np.mean(dwells)

@@ -323,7 +323,7 @@ def _ideal_run(steps, reference, parameters, disturbance=(0.0, 0.0), jumps=()):
         if any(k == round(100 * instant) - 1 for instant, _ in jumps):
             later = r  # the jump is not known yet
         u = tracker.step(k * PERIOD, chi, r, later, 0.01).copy()
-        tracker.set_applied(u, saturated=False)
+        tracker.law.set_applied(u, saturated=False)
         errors.append(chi - r)
         learning.append(law.fuzzy.coefficients.copy())
         chi = chi + 0.01 * (u + np.array(disturbance))

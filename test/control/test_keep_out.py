@@ -116,14 +116,14 @@ def test_robot_looks_before_it_enters_unseen_floor():
 def test_rays_clear_and_mark():
     """Floor up to a hit is free, the hit is occupied, and later rays beyond it clear it."""
     keep_out = KeepOut(PARAMETERS, LIMITS)
-    keep_out.add_reading(0, 0.5, ORIGIN)
+    keep_out.map.add_reading(0, 0.5, ORIGIN)
     assert _state(keep_out, 0.3, 0.05) == FREE
     assert _state(keep_out, 0.601, 0.051) == OCCUPIED
     assert _state(keep_out, 0.7, 0.05) == UNKNOWN
     for _ in range(6):
-        keep_out.add_reading(0, math.inf, ORIGIN)
+        keep_out.map.add_reading(0, math.inf, ORIGIN)
     assert _state(keep_out, 0.601, 0.051) == FREE
-    keep_out.add_reading(0, math.nan, ORIGIN)
+    keep_out.map.add_reading(0, math.nan, ORIGIN)
 
 
 def test_an_obstacle_seen_again_must_be_cleared_anew():
@@ -131,11 +131,11 @@ def test_an_obstacle_seen_again_must_be_cleared_anew():
     keep_out = KeepOut(PARAMETERS, LIMITS)
     pose = Pose(0.005, 0.0, 0.0)  # each ray passes once over the cell
     for _ in range(3):
-        keep_out.add_reading(0, 0.5, pose)
+        keep_out.map.add_reading(0, 0.5, pose)
         for _ in range(CLEARINGS - 1):
-            keep_out.add_reading(0, math.inf, pose)
+            keep_out.map.add_reading(0, math.inf, pose)
             assert _state(keep_out, 0.605, 0.05) == OCCUPIED
-    keep_out.add_reading(0, math.inf, pose)
+    keep_out.map.add_reading(0, math.inf, pose)
     assert _state(keep_out, 0.605, 0.05) == FREE
 
 
@@ -159,5 +159,5 @@ def test_a_reading_counts_at_the_pose_of_the_last_odometry():
         controller.step(State(stamp, pose, STANDSTILL))
     controller.add_range(0, 0.4)
     wanted = KeepOut(KeepOutParameters(), BodyTwist(0.35, 4.5))
-    wanted.add_reading(0, 0.4, place)
+    wanted.map.add_reading(0, 0.4, place)
     assert np.array_equal(controller.keep_out.map.grid.cells, wanted.map.grid.cells)

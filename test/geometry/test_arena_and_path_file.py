@@ -21,8 +21,7 @@ def test_uniform_square_is_uniform_in_arena(numbers):
     assert arena.contains(points, 1e-3).all()
     x, y = arena.corners.T
     area = 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
-    low = np.array(arena.bounds[:2])
-    size = np.array(arena.bounds[2:]) - low
+    low, size = arena.corners.min(axis=0), np.ptp(arena.corners, axis=0)
     grid = low + size * np.random.default_rng(2).uniform(0.0, 1.0, (40_000, 2))
     inside = arena.contains(grid)
     assert inside.mean() * size.prod() == pytest.approx(area, rel=0.02)

@@ -360,7 +360,7 @@ def test_it_learns_from_the_applied_v_p():
             v_p = controller.step(loop.error)
             applied = v_p * (k % 100 >= 50)  # the limit is active half of the time
             if notify:
-                controller.notify_applied(applied)
+                controller.signals.applied[:] = applied
             loop.step(applied, w, np.zeros(2))
         return np.mean(controller.responses.steps[:, 4])
 
@@ -379,7 +379,7 @@ def test_after_a_limit_changes_start_between_zero_and_v_p():
         for _ in range(50):
             v = controller.step(np.full(2, -0.5))
         assert np.all(v > 1.0)
-        controller.notify_applied(np.full(2, applied))
+        controller.signals.applied[:] = applied
         controller.configure(replace(DEFAULT, dv_max=1e-6))
         after = controller.step(np.full(2, -0.5))
         np.testing.assert_allclose(after, v if start is None else start, atol=1e-5)
@@ -438,8 +438,6 @@ def test_invalid_input_is_rejected_without_effect():
         controller.step(np.zeros(2), np.zeros((2, 10)))
     with pytest.raises(ValueError, match='jump'):
         controller.notify_jump(np.array([np.nan, 0.0]))
-    with pytest.raises(ValueError, match='v_p'):
-        controller.notify_applied(np.zeros(1))
     untouched = PredictiveController(DEFAULT, PERIOD, GAIN)
     disturbance = _levels(200, 14)
     np.testing.assert_array_equal(

@@ -112,12 +112,12 @@ def drive_response(monitor, r):
             command = pair(r)
         monitor.add_command(*command.tolist())
         measured = command if follows else np.zeros(2)
-        found.append((monitor.update(*measured.tolist()), monitor.counts))
+        found.append((monitor.update(*measured.tolist()), monitor.evidence))
     for _ in range(25):  # it ends with evidence against any decision
         monitor.add_command(9.0, 9.0)
         follows = monitor.responsive if _ < 19 else not monitor.responsive
         measured = (9.0, 9.0) if follows else (0.0, 0.0)
-        found.append((monitor.update(*measured), monitor.counts))
+        found.append((monitor.update(*measured), monitor.evidence))
     return found
 
 
@@ -139,7 +139,7 @@ def drive_keep_out(keep_out, r):
     """Drive towards walls, look around, be stuck, and fail to move."""
     found, at = [], pose(r, 0.1)
     for k in range(400):
-        keep_out.add_reading(
+        keep_out.map.add_reading(
             r.randrange(8), r.choice((0.3, 0.6, math.inf, -math.inf, math.nan)), at
         )
         twist = keep_out.step(BodyTwist(0.25, r.gauss(0.0, 0.3)), at, 0.05)
@@ -246,7 +246,7 @@ def drive_predictive(controller, r):
         found += [controller.skill, *map(np.copy, (*controller.signals, *controller.responses))]
         found += properties(controller, 'known_error', 'due', 'status')
         if r.random() < 0.1:
-            controller.notify_applied(0.5 * found[0])
+            controller.signals.applied[:] = 0.5 * found[0]
         if r.random() < 0.03:
             controller.notify_jump(pair(r, 3.0))
     return found
