@@ -39,10 +39,13 @@ class Servo:
         self.delay = round(dead_time / 0.001)
         self.commands = [np.zeros(2)] * (self.delay + 1)
         self.speeds = np.zeros(2)
+        self.fine = []
+        """Speeds of every millisecond, before its step."""
 
     def run(self, command):
         decay = math.exp(-0.001 / self.lag)
         for _ in range(10):
+            self.fine.append(self.speeds.copy())
             self.commands = [*self.commands[1:], command.copy()]
             goal = self.commands[0] + self.lag * self.disturbance
             self.speeds = goal + decay * (self.speeds - goal)
@@ -58,7 +61,6 @@ def test_e19_wheels_accelerate_by_u_after_the_dead_time(dead_time):
     """Chi is predicted for the instant of effect, and increases by T u within a period."""
     drive, servo = _drive(dead_time=dead_time), Servo(dead_time=dead_time)
     rng = np.random.default_rng(1)
-    fine = []
     expected = []
     for _ in range(60):
         drive.observe(servo.speeds, T)
@@ -66,15 +68,13 @@ def test_e19_wheels_accelerate_by_u_after_the_dead_time(dead_time):
         u = rng.uniform(-20.0, 20.0, 2)
         np.testing.assert_allclose(drive.send_acceleration(u), u, atol=1e-9)
         expected.append(drive.predicted + T * u)
-        for _ in range(10):  # response of the servo, in steps of 1 ms
-            fine.append(servo.speeds.copy())
-            servo.commands = [*servo.commands[1:], drive.command.copy()]
-            decay = math.exp(-0.001 / servo.lag)
-            servo.speeds = servo.commands[0] + decay * (servo.speeds - servo.commands[0])
+        servo.run(drive.command)
     delay = round(dead_time / 0.001)
     for k in range(2, 50):
-        np.testing.assert_allclose(fine[10 * k + delay], expected[2 * k], atol=1e-6)
-        np.testing.assert_allclose(fine[10 * (k + 1) + delay], expected[2 * k + 1], atol=1e-6)
+        np.testing.assert_allclose(servo.fine[10 * k + delay], expected[2 * k], atol=1e-6)
+        np.testing.assert_allclose(
+            servo.fine[10 * (k + 1) + delay], expected[2 * k + 1], atol=1e-6
+        )
 
 
 def test_with_the_servo_gain_the_measurement_cancels():

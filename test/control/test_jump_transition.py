@@ -60,7 +60,6 @@ def test_no_reachable_path_has_a_smaller_squared_error(slopes):
     jump, at, steps = 4.0, 40, 90
     r, reachable, _ = _transition(jump, slopes, known=0, at=at, steps=steps)
     sums = np.tril(np.ones((steps, steps)))
-    best = lsq_linear(sums, r[:, 0], bounds=(-A * T, A * T), tol=1e-12)
     # The start of the program is free, as that of the transition: its first step may jump to r.
     first = r[0, 0]
     best = lsq_linear(sums[:, 1:], r[:, 0] - first, bounds=(-A * T, A * T), tol=1e-12)

@@ -153,6 +153,19 @@ def response_monitor(**changes):
     return ResponseMonitor(table(**values), 0.01)
 
 
+def unresponsive_monitor(command=(3.0, 3.0), measured=(0.0, 0.0)):
+    monitor = response_monitor()
+    respond(monitor, 60, command, measured)
+    assert not monitor.responsive
+    return monitor
+
+
+def respond(monitor, steps, command, measured):
+    for _ in range(steps):
+        monitor.add_command(*command)
+        monitor.update(*measured)
+
+
 @pytest.mark.parametrize('delay', [0, 1, 5, 12])
 def test_a_delayed_and_noisy_robot_is_responsive(delay):
     """A delay of 0.12 s and noise of variance 0.1 are within the window and the bound."""
@@ -170,40 +183,24 @@ def test_a_standing_robot_is_unresponsive_after_the_timeout():
     monitor = response_monitor()
     steps = 0
     while monitor.responsive:
-        monitor.add_command(3.0, -3.0)
-        monitor.update(0.0, 0.0)
+        respond(monitor, 1, (3.0, -3.0), (0.0, 0.0))
         steps += 1
     assert steps * 0.01 == pytest.approx(0.15 + 0.1, abs=0.03)
 
 
 def test_one_unresponsive_wheel_is_enough():
-    monitor = response_monitor()
-    for _ in range(60):
-        monitor.add_command(3.0, 3.0)
-        monitor.update(3.0, 0.0)
-    assert not monitor.responsive
+    unresponsive_monitor(measured=(3.0, 0.0))
 
 
 def test_standing_at_a_zero_command_is_weak_evidence():
     """Zero crossings of the reference must not end the pause of the adaptation."""
-    monitor = response_monitor()
-    for _ in range(60):
-        monitor.add_command(3.0, 3.0)
-        monitor.update(0.0, 0.0)
-    assert not monitor.responsive
-    steps = 0
+    monitor, steps = unresponsive_monitor(), 0
     while not monitor.responsive:
-        monitor.add_command(0.2, 0.1)
-        monitor.update(0.0, 0.0)
+        respond(monitor, 1, (0.2, 0.1), (0.0, 0.0))
         steps += 1
     assert steps >= EVIDENCE_WEIGHT * 10  # 2 s; other samples need 0.1 s
-    again = response_monitor()
-    for _ in range(60):
-        again.add_command(3.0, 3.0)
-        again.update(0.0, 0.0)
-    for _ in range(11):
-        again.add_command(3.0, 3.0)
-        again.update(2.9, 3.1)
+    again = unresponsive_monitor()
+    respond(again, 11, (3.0, 3.0), (2.9, 3.1))
     assert again.responsive
 
 

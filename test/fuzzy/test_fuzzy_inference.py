@@ -100,17 +100,6 @@ def test_kernel_equals_whole_array_reference(inputs, per_input, slices):
         )
 
 
-def test_order_of_32_is_by_rule_slice_and_level():
-    sets = _random_sets(np.random.default_rng(4))
-    u = np.array([1.0, -2.0])
-    phi = compute_basis(u, sets)
-    for rule, j, level in itertools.product(range(9), range(4), range(2)):
-        one = np.zeros((2, 9, 4))
-        one[level, rule, j] = 1.0
-        expected = output_by_double_sum(u, sets, one[0], one[1])
-        assert phi[level * 36 + rule * 4 + j] == pytest.approx(expected, rel=1e-12)
-
-
 @pytest.mark.parametrize('fuzziness', [0.0, 0.283, 3.0])
 def test_type1_is_a_textbook_weighted_average(fuzziness):
     """The textbook form: product of grades, weighted average of one constant per rule.
@@ -189,21 +178,14 @@ def test_slices_without_footprint_change_nothing():
         assert full == pytest.approx(np.tile(constants, 2) @ compute_basis(u, type1), rel=1e-12)
 
 
-def test_singleton_limit_the_maximum_is_the_input():
-    sets = build_sets(Sets(input_fuzziness=0.0))
+def test_the_maxima_are_the_inputs_or_for_wide_ones_the_centres():
     u = np.array([3.3, -7.1])
-    found = np.empty(sets.widths.shape)
-    fuzzify(u, sets.centres, sets.nonsingleton_gain, found)
-    np.testing.assert_array_equal(
-        found, np.broadcast_to(u[:, None, None, None, None], found.shape)
-    )
-
-
-def test_wide_input_limit_the_maxima_are_the_centres():
-    sets = build_sets(Sets(input_fuzziness=100.0))
-    found = np.empty(sets.widths.shape)
-    fuzzify(np.array([3.3, -7.1]), sets.centres, sets.nonsingleton_gain, found)
-    assert np.abs(found - sets.centres[:, :, None, None, None]).max() < 1.0
+    for fuzziness, tolerance in ((0.0, 0.0), (100.0, 1.0)):
+        sets = build_sets(Sets(input_fuzziness=fuzziness))
+        found = np.empty(sets.widths.shape)
+        fuzzify(u, sets.centres, sets.nonsingleton_gain, found)
+        limit = sets.centres if fuzziness else u[:, None]
+        assert np.abs(found - limit[:, :, None, None, None]).max() <= tolerance
 
 
 def test_fuzzification_maximises_the_product_of_input_and_set():

@@ -44,6 +44,21 @@ def _random_curve(seed):
     return np.einsum('xkw,kwn->nx', generator.normal(0.0, 0.4, (2, 5, 2)), waves)
 
 
+def _largest_changes(linear, angular):
+    """Return speeds and largest changes in a period from rest: of v, omega and the wheels."""
+    wheels = linear + np.outer([1.0, -1.0], GEOMETRY.half_separation * angular)
+    speeds = linear, angular, wheels / GEOMETRY.wheel_radius
+    return [(np.abs(v).max(), np.abs(np.diff(v, prepend=0.0)).max()) for v in speeds]
+
+
+def _limits_of(limits):
+    return (
+        (limits.linear, limits.linear_acceleration),
+        (limits.angular, limits.angular_acceleration),
+        (limits.wheel_speed, limits.wheel_acceleration),
+    )
+
+
 PATHS = {
     'line': np.array([[0.0, 0.0], [2.0, 0.0]]),
     'square': SQUARE,
@@ -66,16 +81,10 @@ PATHS = {
 def test_timing_keeps_every_limit(name, limits):
     """Speeds, accelerations and those of both wheels, between any two samples."""
     path = time_path(PATHS[name], limits, GEOMETRY, PERIOD)
-    wheels = (
-        path.linear + np.outer([1.0, -1.0], GEOMETRY.half_separation * path.angular)
-    ) / GEOMETRY.wheel_radius
-    for values, speed, acceleration in (
-        (path.linear, limits.linear, limits.linear_acceleration),
-        (path.angular, limits.angular, limits.angular_acceleration),
-        (wheels, limits.wheel_speed, limits.wheel_acceleration),
-    ):
-        assert np.abs(values).max() <= speed
-        assert np.abs(np.diff(values)).max() <= acceleration * PERIOD
+    found = _largest_changes(path.linear, path.angular)
+    for (speed, change), (top, acceleration) in zip(found, _limits_of(limits), strict=True):
+        assert speed <= top
+        assert change <= acceleration * PERIOD
     assert (path.linear[[0, -1]] == 0.0).all()
     assert (path.angular[[0, -1]] == 0.0).all()
 
@@ -97,15 +106,9 @@ def test_a_path_that_waits_keeps_every_limit(name):
         rows.append((*pose, *twist))
         rates.append(timing.rate)
     x, y, yaw, linear, angular = np.array(rows).T
-    wheels = (
-        linear + np.outer([1.0, -1.0], GEOMETRY.half_separation * angular)
-    ) / GEOMETRY.wheel_radius
-    for values, acceleration in (
-        (linear, limits.linear_acceleration),
-        (angular, limits.angular_acceleration),
-        (wheels, limits.wheel_acceleration),
-    ):
-        assert np.abs(np.diff(values, prepend=0.0)).max() <= acceleration * PERIOD * (1 + 1e-9)
+    found = _largest_changes(linear, angular)
+    for (_, change), (_, acceleration) in zip(found, _limits_of(limits), strict=True):
+        assert change <= acceleration * PERIOD * (1 + 1e-9)
     assert min(rates) == 0.0
     assert max(rates) == 1.0
     # The twists are those of the poses, and the curve is that of a path that does not wait.

@@ -30,6 +30,7 @@ from t3mpc_ros.mpc.pretraining import (
 )
 
 TIMING = SampleTiming(0.01, 5, 5)
+EXCITATION = ExcitationParameters()
 HOW = LearningConstants(True, 1e-4, 0.05, 0.9975, 0.975, 0.99, 0.03, 0.05)
 
 
@@ -37,12 +38,16 @@ def _predictor(seed=0):
     generator = np.random.default_rng(seed)
     machine = make_machine(LayerSizes(4, 4, 12), 3.0, 20.0, 1.0, generator)
     runs = [
-        simulate_excitation(
-            NominalLoopParameters(), ExcitationParameters(), TIMING, 20.0, generator
-        )
+        simulate_excitation(NominalLoopParameters(), EXCITATION, TIMING, 20.0, generator)
         for _ in range(2)
     ]
     return Predictor(machine, 10, runs[1]), runs[0]
+
+
+def _fitted(excitation=EXCITATION):
+    predictor, run = _predictor()
+    predictor.fit(*run, excitation, 600.0, HOW)
+    return predictor, run
 
 
 def _feed(history, missed, persistence_mse, count):
@@ -88,8 +93,7 @@ def test_authority_is_smooth_and_needs_skill_and_sign():
 
 @pytest.mark.compiled
 def test_a_pretrained_machine_predicts_an_unseen_run():
-    predictor, run = _predictor()
-    predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
+    predictor, run = _fitted()
     assert skill_score(predictor.history, 0) > 0.5
     assert skill_score(predictor.history, 1) > 0.8
 
@@ -105,8 +109,7 @@ def test_an_untrained_machine_has_no_skill():
 
 @pytest.mark.compiled
 def test_offline_evaluation_changes_no_weights():
-    predictor, run = _predictor()
-    predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
+    predictor, run = _fitted()
     weights = predictor.get_weights()
     machine, history = predictor.state.machine, make_history(4, 4, 10)
     errors, moves = run
@@ -123,8 +126,7 @@ def test_offline_evaluation_changes_no_weights():
 @pytest.mark.compiled
 def test_residuals_compare_predictions_with_measurements():
     """The prediction over half a horizon uses the moves that were made since."""
-    predictor, run = _predictor()
-    predictor.fit(*run, ExcitationParameters(noise=0.0, disturbance=0.0), 600.0, HOW)
+    predictor, _ = _fitted(ExcitationParameters(noise=0.0, disturbance=0.0))
     generator = np.random.default_rng(3)
     quiet = ExcitationParameters(noise=0.0, disturbance=0.0, move_hold=0.05)
     errors, moves = simulate_excitation(NominalLoopParameters(), quiet, TIMING, 20.0, generator)
@@ -158,8 +160,7 @@ def test_a_prediction_uses_the_offset_of_its_time():
 
 @pytest.mark.compiled
 def test_an_error_beyond_the_range_is_not_learned():
-    predictor, run = _predictor()
-    predictor.fit(*run, ExcitationParameters(), 600.0, HOW)
+    predictor, run = _fitted()
     before = predictor.get_weights()
     observe(*predictor.state, 1e200, 0.0, True, True, HOW)
     for name, array in predictor.get_weights().items():

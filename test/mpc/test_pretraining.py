@@ -33,13 +33,24 @@ from t3mpc_ros.mpc.pretraining import (
 )
 
 TIMING = SampleTiming(0.01, 5, 5)
-
-
+NOMINAL, EXCITATION = NominalLoopParameters(), ExcitationParameters()
 SHAPE = LayerSizes(4, 4, 12)
 
 
 def _machine(seed=0, shape=SHAPE, spread=1.0):
     return make_machine(shape, 3.0, 20.0, spread, np.random.default_rng(seed))
+
+
+def _excited(generator, excitation=EXCITATION, loop=NOMINAL):
+    return simulate_excitation(loop, excitation, TIMING, 20.0, generator)
+
+
+def _missed(machine, errors, moves, rows=None):
+    """Yield the error of each prediction of a run, from the newest on, or of some rows."""
+    for i in range(errors.size - 5) if rows is None else rows:
+        machine.lags[:4] = errors[i + 1 : i + 5] / 3.0
+        machine.lags[4:] = moves[i + 1 : i + 5] / 20.0
+        yield errors[i] - predict_error(machine)
 
 
 def _slope(function, weights, step=1e-6):
@@ -127,19 +138,14 @@ def test_cd_steps_increase_the_exact_likelihood():
 
 def test_cd_epochs_reduce_the_reconstruction_error():
     machine = _machine()
-    errors, moves = simulate_excitation(
-        NominalLoopParameters(), ExcitationParameters(), TIMING, 20.0, np.random.default_rng(0)
-    )
+    errors, moves = _excited(np.random.default_rng(0))
     features = np.zeros((errors.size - 4, 12))
 
     def missed():
-        total = 0.0
-        for i in range(1, 2000, 7):
-            machine.lags[:4] = errors[i : i + 4] / 3.0
-            machine.lags[4:] = moves[i : i + 4] / 20.0
-            predict_error(machine)
-            total += np.sum((machine.lags - machine.eta1) ** 2)
-        return total
+        return sum(
+            np.sum((machine.lags - machine.eta1) ** 2)
+            for _ in _missed(machine, errors, moves, range(0, 1999, 7))
+        )
 
     figures = [missed()]
     for _ in range(3):
@@ -219,27 +225,16 @@ def test_rls_returns_to_the_pretraining_without_excitation():
 @pytest.mark.compiled
 def test_rls_adapts_faster_than_any_gradient_rate():
     """Lags of one slow signal are nearly parallel, which a scalar gamma cannot handle."""
-    excitation = ExcitationParameters()
-    before = simulate_excitation(
-        NominalLoopParameters(), excitation, TIMING, 20.0, np.random.default_rng(9)
-    )
-    after = simulate_excitation(
-        NominalLoopParameters(feedback_gain=3.0, lag=0.1),
-        excitation,
-        TIMING,
-        20.0,
-        np.random.default_rng(9),
-    )
+    before = _excited(np.random.default_rng(9))
+    other = NominalLoopParameters(feedback_gain=3.0, lag=0.1)
+    after = _excited(np.random.default_rng(9), loop=other)
 
     def missed(rule):
         machine, rls = _machine(), make_rls_state(12)
-        pretrain(machine, rls, *before, excitation, 20.0, 0.05)
+        pretrain(machine, rls, *before, EXCITATION, 20.0, 0.05)
         total = 0.0
-        for i in range(1000, 0, -1):
-            machine.lags[:4] = after[0][i : i + 4] / 3.0
-            machine.lags[4:] = after[1][i : i + 4] / 20.0
-            error = after[0][i - 1] - predict_error(machine)
-            total += error * error if i > 500 else 0.0
+        for i, error in enumerate(_missed(machine, *after, range(999, -1, -1))):
+            total += error * error if i < 500 else 0.0
             rule(machine, rls, error)
         return total
 
@@ -307,17 +302,10 @@ def test_random_levels_have_the_given_duration_and_range():
 
 
 def test_simulated_run_is_reproducible_and_nominal_at_rest():
-    first = simulate_excitation(
-        NominalLoopParameters(), ExcitationParameters(), TIMING, 20.0, np.random.default_rng(1)
-    )
-    again = simulate_excitation(
-        NominalLoopParameters(), ExcitationParameters(), TIMING, 20.0, np.random.default_rng(1)
-    )
+    first, again = (_excited(np.random.default_rng(1)) for _ in range(2))
     np.testing.assert_array_equal(first[0], again[0])
     quiet = ExcitationParameters(disturbance=0.0, noise=0.0, move_hold=3.0)
-    errors, moves = simulate_excitation(
-        NominalLoopParameters(), quiet, TIMING, 20.0, np.random.default_rng(2)
-    )
+    errors, moves = _excited(np.random.default_rng(2), quiet)
     held = np.array([np.ptp(moves[i + 1 : i + 41]) == 0.0 for i in range(moves.size - 41)])
     assert np.count_nonzero(held) > 100
     np.testing.assert_allclose(
@@ -329,24 +317,10 @@ def test_pretraining_predicts_an_unseen_run():
     machine, rls = _machine(), make_rls_state(12)
     generator = np.random.default_rng(12)
     excitation = ExcitationParameters(noise=0.0, disturbance=0.0)
-    pretrain(
-        machine,
-        rls,
-        *simulate_excitation(NominalLoopParameters(), excitation, TIMING, 20.0, generator),
-        excitation,
-        100.0,
-        0.05,
-    )
-    errors, moves = simulate_excitation(
-        NominalLoopParameters(), excitation, TIMING, 20.0, generator
-    )
-    missed, stayed = [], []
-    for i in range(errors.size - 5):
-        machine.lags[:4] = errors[i + 1 : i + 5] / 3.0
-        machine.lags[4:] = moves[i + 1 : i + 5] / 20.0
-        missed.append(errors[i] - predict_error(machine))
-        stayed.append(errors[i] - errors[i + 1])
-    assert np.var(missed) < 0.01 * np.var(stayed)
+    pretrain(machine, rls, *_excited(generator, excitation), excitation, 100.0, 0.05)
+    errors, moves = _excited(generator, excitation)
+    missed = list(_missed(machine, errors, moves))
+    assert np.var(missed) < 0.01 * np.var(np.diff(errors[: len(missed) + 1]))
     np.testing.assert_allclose(rls.anchor, machine.output_weights)
     np.testing.assert_allclose(rls.prior, rls.prior.T)
     assert np.all(np.linalg.eigvalsh(rls.prior) > 0.0)
@@ -366,19 +340,10 @@ def test_invalid_runs_are_rejected():
 def test_more_noise_than_in_pretraining_remains_bounded():
     machine, rls = _machine(), make_rls_state(12)
     generator = np.random.default_rng(13)
-    excitation = ExcitationParameters()
-    run = simulate_excitation(NominalLoopParameters(), excitation, TIMING, 20.0, generator)
-    pretrain(machine, rls, *run, excitation, 100.0, 0.05)
+    pretrain(machine, rls, *_excited(generator), EXCITATION, 100.0, 0.05)
     figures = []
     for noise in (0.0, 0.15, 1.0):
-        errors, moves = simulate_excitation(
-            NominalLoopParameters(), replace(excitation, noise=noise), TIMING, 20.0, generator
-        )
-        missed = []
-        for i in range(errors.size - 5):
-            machine.lags[:4] = errors[i + 1 : i + 5] / 3.0
-            machine.lags[4:] = moves[i + 1 : i + 5] / 20.0
-            missed.append(errors[i] - predict_error(machine))
-        figures.append(np.var(missed))
+        run = _excited(generator, replace(EXCITATION, noise=noise))
+        figures.append(np.var(list(_missed(machine, *run))))
     assert figures == sorted(figures)
     assert figures[-1] < 4.0 / 5.0 + figures[0]  # four times the variance of the sampled noise
