@@ -262,12 +262,6 @@ class BodyCorrection:
         return self._state.estimate.copy()
 
     @property
-    def deviations(self) -> Array:
-        """Standard deviations of :attr:`estimate`, shape (5,)."""
-        deviations: Array = np.sqrt(np.diagonal(self._state.covariance))
-        return deviations
-
-    @property
     def gyro_bias(self) -> float:
         """Estimated bias of the yaw rate of the odometry, rad/s."""
         return float(self._state.estimate[BIAS] * self._turn)
@@ -280,8 +274,9 @@ class BodyCorrection:
                 f'the yaw of odom turns by {bias:.3f} rad/s more than the wheels: bias of the '
                 'gyro; it is not followed; let the robot stand for two seconds'
             )
-        share, deviations = estimate[TURNING] + estimate[GYRO_SCALE], self.deviations
-        if abs(estimate[GYRO_SCALE]) > WARNED_SCALE and deviations[TURNING] > WARNED_DEVIATION:
+        share = estimate[TURNING] + estimate[GYRO_SCALE]
+        deviation = math.sqrt(self._state.covariance[TURNING, TURNING])
+        if abs(estimate[GYRO_SCALE]) > WARNED_SCALE and deviation > WARNED_DEVIATION:
             return (
                 f'the yaw of odom turns by {100.0 * share:.1f} % more than the wheels: scale of '
                 'the gyro, or wheel separation; calibrate the robot, or lower '

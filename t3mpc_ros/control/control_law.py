@@ -471,8 +471,8 @@ class Nt3fsMpcController:
     @property
     def ultimate_bound(self) -> float:
         """Radius (rad/s) of the ball in which the error ends by E14."""
-        law = self._parameters.law
-        return ultimate_bound(law.gain, self._bound(), law.smoothing)
+        gains = self._gains
+        return ultimate_bound(gains.gain, gains.bound, gains.smoothing)
 
     def step(
         self,
@@ -532,7 +532,7 @@ class Nt3fsMpcController:
             adapted=parameters.use_fuzzy and adaptation.enabled,
             integral_transfer=parameters.integral_transfer,
             gain=law.gain,
-            bound=self._bound(),
+            bound=parameters.compensated_bound if law.compensator else 0.0,
             smoothing=law.smoothing,
             fuzzy=self.fuzzy.gains,
             friction=self.fuzzy.gains._replace(
@@ -540,10 +540,6 @@ class Nt3fsMpcController:
             ),
             friction_width=parameters.friction.width,
         )
-
-    def _bound(self) -> float:
-        parameters = self._parameters
-        return parameters.compensated_bound if parameters.law.compensator else 0.0
 
 
 class LawGains(NamedTuple):

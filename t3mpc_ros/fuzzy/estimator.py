@@ -215,7 +215,7 @@ class FuzzyEstimator:
         """Compile the kernels now instead of in the first step, without changing the state."""
         phi, coefficients = self._phi.copy(), self._coefficients.copy()
         self.evaluate(np.zeros(self.sets.inputs))
-        self._adapt(np.zeros(coefficients.shape[0]), 0.0)
+        adapt(self._coefficients, self._phi, np.zeros(coefficients.shape[0]), 0.0, self.gains)
         self._phi[:], self._coefficients[:] = phi, coefficients
 
     def evaluate(self, inputs: Array) -> Array:
@@ -242,8 +242,14 @@ class FuzzyEstimator:
         """
         if not 0.0 <= dt < math.inf:
             raise ValueError(f'dt must be finite and not negative: got {dt} s')
-        if self.adaptation.enabled:
-            self._adapt(errors, dt)
+        values = np.ascontiguousarray(errors, dtype=np.float64)
+        if self.adaptation.enabled and (
+            values.shape != self._coefficients.shape[:1]
+            or not adapt(self._coefficients, self._phi, values, dt, self.gains)
+        ):
+            raise ValueError(
+                f'errors must be {len(self._coefficients)} finite numbers: got {errors}'
+            )
 
     @property
     def basis(self) -> Array:
@@ -271,15 +277,6 @@ class FuzzyEstimator:
                 f'coefficients must be finite: got {np.count_nonzero(~np.isfinite(table))} not'
             )
         self._coefficients[:] = table
-
-    def _adapt(self, errors: Array, dt: float) -> None:
-        values = np.ascontiguousarray(errors, dtype=np.float64)
-        if values.shape != self._coefficients.shape[:1] or not adapt(
-            self._coefficients, self._phi, values, dt, self.gains
-        ):
-            raise ValueError(
-                f'errors must be {len(self._coefficients)} finite numbers: got {errors}'
-            )
 
 
 def gamma_for(parameters: FuzzyParameters, normalised_gain: float) -> float:

@@ -152,9 +152,9 @@ class PathTiming:
         self._changes = (
             limits.linear_acceleration * period,
             limits.angular_acceleration * period,
-            limits.wheel_acceleration * period * geometry.wheel_radius,
+            *[limits.wheel_acceleration * period * geometry.wheel_radius] * 2,
         )
-        """Largest changes in a period: of v, of omega, of the speed of a wheel on the floor."""
+        """Largest changes in a period: of v, of omega, of the speed of each wheel on the floor."""
         self._half = geometry.half_separation
         self._twist = STANDSTILL
         self.rate = 1.0
@@ -223,20 +223,11 @@ class PathTiming:
         """Return the rate nearest to a wanted one that the limits allow after the last twist."""
         if wanted == self.rate:
             return wanted
-        lowest, highest, before = 0.0, 1.0, self._twist
-        half = self._half
-        for value, last, change in (
-            (planned.linear, before.linear, self._changes[0]),
-            (planned.angular, before.angular, self._changes[1]),
-            *(
-                (
-                    planned.linear + side * planned.angular,
-                    before.linear + side * before.angular,
-                    self._changes[2],
-                )
-                for side in (half, -half)
-            ),
-        ):
+        lowest, highest = 0.0, 1.0
+        speeds, last_speeds = (
+            (v, w, v + self._half * w, v - self._half * w) for v, w in (planned, self._twist)
+        )
+        for value, last, change in zip(speeds, last_speeds, self._changes, strict=True):
             if abs(value) > 1e-9:
                 ends = (last - change) / value, (last + change) / value
                 lowest, highest = max(lowest, min(ends)), min(highest, max(ends))

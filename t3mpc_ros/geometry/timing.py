@@ -79,18 +79,14 @@ class SimulatedTime:
         self._anchor = self._start_ns, 0
         """An instant of simulated time, and the steady clock's time of that instant."""
         self._anchored = False
-        self._real_time_factor = real_time_factor
-
-    @property
-    def real_time_factor(self) -> float:
-        """Requested number of simulated seconds per second."""
-        return self._real_time_factor
+        self.real_time_factor = real_time_factor
+        """Requested number of simulated seconds per second; see :meth:`set_real_time_factor`."""
 
     def set_real_time_factor(self, factor: float, steady_ns: int) -> None:
         """Change the real-time factor from now on; 0 stops the clock."""
         self._anchor = self.now_ns(steady_ns), steady_ns
         self._anchored = False
-        self._real_time_factor = factor
+        self.real_time_factor = factor
 
     def now_ns(self, steady_ns: int) -> int:
         """Return the simulated time when the steady clock is at ``steady_ns``."""
@@ -100,7 +96,7 @@ class SimulatedTime:
 
     def due(self, steady_ns: int) -> list[int]:
         """Return the stamps (ns) of the samples due now: the first at once, then each in turn."""
-        if self._real_time_factor == 0.0:
+        if self.real_time_factor == 0.0:
             return self.step(0) if self._next == 0 else []
         if not self._anchored:
             # The grid follows the timer: each call of a jittering timer then finds one sample.
@@ -120,8 +116,8 @@ class SimulatedTime:
         The first sample, at the start of the grid, is returned in addition to ``count``.
         ValueError: the clock is running.
         """
-        if self._real_time_factor != 0.0:
-            raise ValueError(f'real_time_factor must be 0 to step: got {self._real_time_factor:g}')
+        if self.real_time_factor != 0.0:
+            raise ValueError(f'real_time_factor must be 0 to step: got {self.real_time_factor:g}')
         last = max(self._next - 1, 0) + count
         stamps = [self._stamp(n) for n in range(self._next, last + 1)]
         self._next = last + 1
@@ -131,7 +127,7 @@ class SimulatedTime:
 
     def _unbounded_ns(self, steady_ns: int) -> int:
         instant, then = self._anchor
-        return instant + round((steady_ns - then) * self._real_time_factor)
+        return instant + round((steady_ns - then) * self.real_time_factor)
 
     def _stamp(self, n: int) -> int:
         return self._start_ns + round(n * self._period_ns)
