@@ -108,7 +108,7 @@ def _new_run(folder: Path) -> Path:
 
 
 def _estimation(options: argparse.Namespace) -> int:
-    from t3mpc_ros.evaluation.open_loop_estimation import compare
+    from t3mpc_ros.evaluation.open_loop_estimation import compare, records
     from t3mpc_ros.evaluation.paper.results import estimation
     from t3mpc_ros.evaluation.reporting import strict_json
 
@@ -117,8 +117,7 @@ def _estimation(options: argparse.Namespace) -> int:
     )
     print('\n\n'.join(table.markdown() for table in estimation(results)))
     if options.json:
-        text = strict_json([result.record() for result in results])
-        options.json.write_text(text, encoding='utf-8')
+        options.json.write_text(strict_json(records(results)), encoding='utf-8')
     return 0
 
 

@@ -21,6 +21,7 @@ import math
 import numpy as np
 
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
+from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
 from t3mpc_ros.fuzzy.inference import FuzzyParameters
@@ -59,32 +60,6 @@ class OpenLoopRun:
     def target(self) -> Array:
         """Target of g, chi' - u of (30) over each period, rad/s², shape (n - 1, 2)."""
         return np.diff(self.speeds, axis=0) / self.period - self.push[:-1]
-
-
-@dataclass(frozen=True, slots=True)
-class EstimationResult:
-    """Result of one kind at one noise over several seeds, after :data:`SETTLE`, both wheels."""
-
-    kind: str
-    noise_variance: float
-    speed: tuple[float, ...]
-    """RMSE of chi_hat against the true chi, one per seed, rad/s."""
-    unknown: tuple[float, ...]
-    """RMSE of g against chi' - u, one per seed, rad/s²."""
-
-    def record(self) -> dict[str, object]:
-        """Return the result as plain data."""
-        return {
-            'kind': self.kind,
-            'noise_variance': self.noise_variance,
-            'speed_mean': mean(self.speed),
-            'speed_ci95': interval(self.speed),
-            'speed': list(self.speed),
-            'unknown_mean': mean(self.unknown),
-            'unknown_ci95': interval(self.unknown),
-            'unknown': list(self.unknown),
-            'seeds': len(self.speed),
-        }
 
 
 def excitation(time: Array, seed: int) -> Array:
@@ -179,38 +154,45 @@ def compare(
     variances: Sequence[float] = VARIANCES,
     normalised_gain: float = NORMALISED_GAIN,
     progress: bool = False,
-) -> list[EstimationResult]:
-    """Return the results of every kind in (86) over ``seeds`` seeds from 1, on equal runs.
+) -> ResultTable:
+    """Return the errors in (86), on equal runs: a row for each kind, noise and seed from 1 on.
 
-    ``variances`` are those of the measured wheel speeds, (rad/s)²; ``normalised_gain`` is the mean
-    of gamma |Phi|² for every kind, 1/s².
+    ``speed`` is the RMSE of chi_hat against the true chi, rad/s, ``unknown`` that of g against
+    chi' - u, rad/s², both wheels after :data:`SETTLE`. ``variances`` are those of the measured
+    wheel speeds, (rad/s)²; ``normalised_gain`` is the mean of gamma |Phi|² for every kind, 1/s².
     """
     if duration <= SETTLE:
         raise ValueError(f'duration must be more than {SETTLE:g} s: got {duration}')
-    results = []
+    rows = []
     with progress_bar(len(variances) * seeds, show=progress) as bar:
         for variance in variances:
-            figures: dict[str, list[tuple[float, float]]] = {
-                name: [] for name in (*KINDS, NO_FUZZY_SYSTEM)
-            }
             for seed in range(1, seeds + 1):
                 run = simulate_open_loop(torque_robot(variance, seed), duration, seed)
-                for name, found in figures.items():
-                    found.append(_errors(run, name, variance, normalised_gain))
+                for kind in (*KINDS, NO_FUZZY_SYSTEM):
+                    fields = {'kind': kind, 'noise_variance': variance, 'seed': seed}
+                    rows.append(fields | _errors(run, kind, variance, normalised_gain))
                 bar.update()
-            for name, found in figures.items():
-                results.append(EstimationResult(name, variance, *zip(*found, strict=True)))
-    return results
+    return ResultTable(rows)
 
 
-def _errors(run: OpenLoopRun, name: str, variance: float, gain: float) -> tuple[float, float]:
-    """Return the RMSE of chi_hat (rad/s) and of g (rad/s²) of one estimator along a run."""
-    fuzzy = None if name == NO_FUZZY_SYSTEM else estimator(name, variance, gain)
+def _errors(run: OpenLoopRun, kind: str, variance: float, gain: float) -> dict[str, float]:
+    fuzzy = None if kind == NO_FUZZY_SYSTEM else estimator(kind, variance, gain)
     speeds, unknown = estimate(run, fuzzy)
     first = round(SETTLE / run.period)
-    return rms((speeds - run.speeds)[first:]), rms((unknown[:-1] - run.target)[first:])
+    return {
+        'speed': rms((speeds - run.speeds)[first:]),
+        'unknown': rms((unknown[:-1] - run.target)[first:]),
+    }
 
 
-def difference(result: EstimationResult, base: EstimationResult) -> tuple[float, ...]:
-    """Return how much more RMSE of chi_hat ``result`` has than ``base``, seed by seed, rad/s."""
-    return tuple(a - b for a, b in zip(result.speed, base.speed, strict=True))
+def records(results: ResultTable) -> list[dict[str, object]]:
+    """Return each kind at each noise as plain data: numbers of the seeds, mean and interval."""
+    found = []
+    for (kind, variance), rows in results.groups('kind', 'noise_variance').items():
+        record: dict[str, object] = {'kind': kind, 'noise_variance': variance}
+        for name in ('speed', 'unknown'):
+            values = [row[name] for row in rows]
+            record |= {f'{name}_mean': mean(values), f'{name}_ci95': interval(values)}
+            record[name] = values
+        found.append(record | {'seeds': len(rows)})
+    return found

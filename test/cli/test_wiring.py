@@ -25,6 +25,7 @@ from support.parsers import commands, options
 
 from t3mpc_ros.bag.recovery import RecoveryResult
 from t3mpc_ros.cli.main import main
+from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.nodes.registry import NODES, parameter_class
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import key_check
@@ -266,7 +267,7 @@ def link(path, *, key=True):
 
 TABLE = {
     'estimation': (
-        {'evaluation.open_loop_estimation.compare': []},
+        {'evaluation.open_loop_estimation.compare': ResultTable([])},
         {
             '--seeds 7': {'compare.seeds': 7},
             '--duration 9': {'compare.duration': 9.0},

@@ -20,7 +20,6 @@ from support.unrendered import unrendered  # noqa: F401 - a fixture
 
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL, methods
-from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
 from t3mpc_ros.evaluation.paper import figure_runs, study
 from t3mpc_ros.evaluation.paper.claims import ALONE, INTENDED, Claim, all_claims, markdown
 from t3mpc_ros.evaluation.paper.figure_runs import (
@@ -221,7 +220,7 @@ def test_a_diverged_run_shows_in_its_row_and_in_strict_json():
     assert row['finite'] is False
     assert row['rmse_mean'] is row['largest_error'] is None
     json.dumps(row, allow_nan=False)
-    assert '| **full** | diverged |' in markdown(all_tables(results, []), [])
+    assert '| **full** | diverged |' in markdown(all_tables(results, ResultTable([])), [])
 
 
 def test_a_single_seed_has_a_mean_without_an_interval():
@@ -244,7 +243,7 @@ def test_stage_differences_compare_measured_neighbours():
 
 def claims_of(entries, estimated=(), **numbers):
     """Return the claims on made-up runs by name."""
-    found = all_claims(table_of(entries, **numbers), estimated)
+    found = all_claims(table_of(entries, **numbers), ResultTable(estimated))
     assert all(claim.record()['verdict'] == claim.verdict for claim in found)
     return {claim.name: claim for claim in found}
 
@@ -353,9 +352,10 @@ def test_estimation_claims_of_the_paper(type3, half, slight):
     kinds = {'type3': type3, 'interval_type2': (0.1, 0.1, 0.3), 'type1': (0.1, 0.2, 0.3)}
     for count, verdicts in ((20, [half, slight]), (1, [None, None])):
         estimated = [
-            EstimationResult(kind, noise, (value,) * count, (1.0,) * count)
+            {'kind': kind, 'noise_variance': noise, 'seed': seed, 'speed': value}
             for kind, values in kinds.items()
             for noise, value in zip((0.0, 0.04, 0.1), values, strict=True)
+            for seed in range(count)
         ]
         found = claims_of(in_all('torque', 0.0, {FULL: (0.5,)}), estimated)
         names = 'estimation, half of the others', 'estimation, grows only slightly'
@@ -396,7 +396,7 @@ def test_one_seed_leaves_every_claim_inconclusive():
         [run.fields | dict(zip(NUMBERS, generator.uniform(0.01, 1.0, 4), strict=True))
          for run in runs]
     )  # fmt: skip
-    claims = all_claims(table, [])
+    claims = all_claims(table, ResultTable([]))
     assert {claim.verdict for claim in claims} == {'inconclusive', 'not measured'}
     assert re.match(r'0 held, 0 not held, [1-9]\d* inconclusive, ', counted(claims))
 

@@ -12,7 +12,6 @@ from support.records import record_of
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.metrics import METRICS, START, measure
-from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult
 from t3mpc_ros.evaluation.paper.results import Results, estimation
 from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolStudy
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
@@ -146,12 +145,14 @@ def test_the_table_of_a_replay_in_full():
 
 def test_tables_of_the_estimators():
     results = [
-        EstimationResult(kind, noise, (s, s + 0.1), (10 * s, 10 * s + 2))
+        {'kind': kind, 'noise_variance': noise, 'seed': seed}
+        | {'speed': s + 0.1 * seed, 'unknown': 10 * s + 2 * seed}
         for kind, s in (('type3', 0.2), ('type1', 0.5))
         for noise, s in ((0.01, s), (0.04, 2 * s))
+        for seed in range(2)
     ]
     half, wide = interval([0.0, 0.1]), interval([0.0, 2.0])
-    text = '\n'.join(table.markdown() for table in estimation(results))
+    text = '\n'.join(table.markdown() for table in estimation(ResultTable(results)))
     assert f'| **type3** | 0.2500 ± {half:.4f} | 0.4500 ± {half:.4f} | +0.200 (+80 %) |' in text
     assert f'| type1 | 0.5500 ± {half:.4f} | 1.0500 ± {half:.4f} | +0.500 (+91 %) |' in text
     assert '| type1 | +0.3000 ± 0.0000 * | +0.6000 ± 0.0000 * |' in text

@@ -7,7 +7,7 @@ claims decide only what their interval over the seeds leaves no doubt about; oth
 inconclusive.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 import math
@@ -22,7 +22,7 @@ from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import Difference, mean, paired
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import EXACT_MODEL, FULL
-from t3mpc_ros.evaluation.open_loop_estimation import KINDS, EstimationResult
+from t3mpc_ros.evaluation.open_loop_estimation import KINDS
 from t3mpc_ros.evaluation.paper.study import (
     DRIVES,
     DURATION,
@@ -135,14 +135,14 @@ Query = Callable[..., Finding]
 """Asks the runs about a claim."""
 
 
-def all_claims(runs: ResultTable, estimated: Sequence[EstimationResult]) -> list[Claim]:
+def all_claims(runs: ResultTable, estimated: ResultTable) -> list[Claim]:
     """Return all claims with their verdicts: of this package, then of the paper."""
     complete = {*runs.unique('seed')} >= {*HELD_OUT_SEEDS}
     complete &= all(duration >= DURATION for duration in runs.unique('duration'))
     found = [
         claim.decided(partial(query, runs), complete=complete) for claim, query in definitions()
     ]
-    complete &= all(len(each.speed) >= ESTIMATION_SEEDS for each in estimated)
+    complete &= len(estimated.unique('seed')) >= ESTIMATION_SEEDS
     return found + [
         claim.decided(partial(query, estimated), complete=complete)
         for claim, query in OF_ESTIMATION
@@ -387,7 +387,13 @@ def by_seed(
     column: str = 'rmse',
 ) -> Array:
     """Return a number of each seed."""
-    found = runs.values(column, controller=controller, drive=drive, noise=noise, case=case)
+    wanted = {'controller': controller, 'drive': drive, 'noise': noise, 'case': case}
+    return measured(runs, column, **wanted)
+
+
+def measured(runs: ResultTable, column: str, **wanted: Hashable) -> Array:
+    """Return a column of the rows with some values."""
+    found = runs.values(column, **wanted)
     if not found:
         raise NotMeasuredError
     return np.array(found)
@@ -468,26 +474,26 @@ def _rmse(value: float) -> str:
 # -- the fuzzy system without a controller, (86) --------------------------------------------------
 
 
-def half_of_others(estimated: Sequence[EstimationResult]) -> Finding:
+def half_of_others(estimated: ResultTable) -> Finding:
     """Compare type 3 at the paper's noise with half of the best of the others."""
-    speeds = _estimated(estimated, (PAPER_NOISE,))
+    speeds = _speeds(estimated, PAPER_NOISE)
     ours, *others = KINDS
-    means = {kind: mean(speeds[kind, PAPER_NOISE]) for kind in KINDS}
+    means = {kind: mean(values) for kind, values in speeds.items()}
     best = min(others, key=lambda kind: means[kind])
     own, other = means[ours], means[best]
     return Finding(
         own <= 0.5 * other,
         f'{own:.4f} rad/s against {other:.4f} of {best}: {own / other:.2f} of it',
         {'type3': own, 'best': best, 'share': own / other},
-        [paired(0.5 * speeds[best, PAPER_NOISE], speeds[ours, PAPER_NOISE])],
+        [paired(0.5 * speeds[best], speeds[ours])],
     )
 
 
-def slight_growth(estimated: Sequence[EstimationResult]) -> Finding:
+def slight_growth(estimated: ResultTable) -> Finding:
     """Compare the growth with noise of each kind."""
-    speeds = _estimated(estimated, (0.0, LOUDEST))
+    quiet, loud = (_speeds(estimated, noise) for noise in (0.0, LOUDEST))
     ours, *others = KINDS
-    ends = {kind: (speeds[kind, 0.0], speeds[kind, LOUDEST]) for kind in KINDS}
+    ends = {kind: (quiet[kind], loud[kind]) for kind in KINDS}
     grown = {kind: mean(last) / mean(first) - 1.0 for kind, (first, last) in ends.items()}
     first, last = ends[ours]
     return Finding(
@@ -501,14 +507,9 @@ def slight_growth(estimated: Sequence[EstimationResult]) -> Finding:
     )
 
 
-def _estimated(
-    estimated: Sequence[EstimationResult], noises: Sequence[float]
-) -> dict[tuple[str, float], Array]:
-    """Return the RMSE of each seed by kind and noise."""
-    found = {(each.kind, each.noise_variance): np.array(each.speed) for each in estimated}
-    if not {(kind, noise) for kind in KINDS for noise in noises} <= {*found}:
-        raise NotMeasuredError
-    return found
+def _speeds(estimated: ResultTable, noise: float) -> dict[str, Array]:
+    """Return the RMSE of each seed by kind."""
+    return {kind: measured(estimated, 'speed', kind=kind, noise_variance=noise) for kind in KINDS}
 
 
 OF_ESTIMATION: Sequence[tuple[Claim, Query]] = (

@@ -91,7 +91,7 @@ def reproduce(options: PaperOptions, report: Report | None = None) -> str:
         'exact_models': exact,
         'stage_differences': results.added.rows,
         'losses': results.lost.rows,
-        'estimation': [result.record() for result in estimated],
+        'estimation': open_loop_estimation.records(estimated),
         'claims': [claim.record() for claim in claims],
     }
     for path in (output / 'results.json', options.json):

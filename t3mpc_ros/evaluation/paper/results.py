@@ -2,14 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results of the paper's study: means with intervals, paired differences, and their tables."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 import math
 
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL
-from t3mpc_ros.evaluation.open_loop_estimation import EstimationResult, difference
 from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, STAGES, WITHOUT
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, format_interval
 from t3mpc_ros.evaluation.result_file import Row
@@ -193,39 +192,37 @@ def differences(
     return Table(text, ('', *shown), rows)
 
 
-def estimation(results: Sequence[EstimationResult]) -> list[Table]:
+def estimation(results: ResultTable) -> list[Table]:
     """Return the comparison of (86): RMSE of chi_hat, its excess over type 3, RMSE of g."""
-    by = {(result.kind, result.noise_variance): result for result in results}
-    kinds = list(dict.fromkeys(result.kind for result in results))
-    noises = list(dict.fromkeys(result.noise_variance for result in results))
+    kinds, noises = results.unique('kind'), results.unique('noise_variance')
     if not kinds:
         return []
 
-    def by_noise(title: str, values: Callable[[EstimationResult], Sequence[float]]) -> Table:
+    def by_noise(title: str, column: str) -> Table:
         rows = []
         for kind in kinds:
-            samples = [values(by[kind, noise]) for noise in noises]
+            samples = [results.values(column, kind=kind, noise_variance=each) for each in noises]
             cells = [format_interval(mean(each), interval(each), digits=4) for each in samples]
             rows.append((kind, *cells, _growth(mean(samples[0]), mean(samples[-1]))))
         return Table(title, ('kind', *_heads(noises), 'growth'), rows, ('type3',))
 
     more = []
-    for kind in kinds:
-        if kind != 'type3':
-            samples = [difference(by[kind, noise], by['type3', noise]) for noise in noises]
-            more.append((kind, *(_starred(mean(each), interval(each)) for each in samples)))
+    for kind in (each for each in kinds if each != 'type3'):
+        sides = [
+            [{'kind': each, 'noise_variance': noise} for each in (kind, 'type3')]
+            for noise in noises
+        ]
+        apart = [results.difference('speed', *each) for each in sides]
+        more.append((kind, *(_starred(*each) for each in apart if each)))
     title = 'The same, more than type3 with the same seeds (rad/s)'
     return [
-        by_noise(
-            'Estimation without a controller (86): RMSE of the speed (rad/s)',
-            lambda result: result.speed,
-        ),
+        by_noise('Estimation without a controller (86): RMSE of the speed (rad/s)', 'speed'),
         Table(title, ('kind', *_heads(noises)), more),
-        by_noise('RMSE of g against what it should be (rad/s²)', lambda result: result.unknown),
+        by_noise('RMSE of g against what it should be (rad/s²)', 'unknown'),
     ]
 
 
-def all_tables(results: Results, estimated: Sequence[EstimationResult]) -> dict[str, list[Table]]:
+def all_tables(results: Results, estimated: ResultTable) -> dict[str, list[Table]]:
     """Return all tables by their heading."""
     methods: list[Table | None] = []
     perturbed: list[Table | None] = []
