@@ -31,7 +31,6 @@ from t3mpc_ros.radio.tool.bench_checklist import (
     check_builds,
     check_link,
     examine_board,
-    read_pong,
 )
 from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, Board, ProcedureError, Script
 
@@ -71,7 +70,7 @@ def run_doctor(
     board = run(examine_board(), 'USB of the robot', ROBOT_BOARD)
     if board is not None:
         add(check_board(board, parameters))
-    dongle = run(read_pong(), 'dongle', DONGLE)
+    dongle = run(procedure.wait_for_board('no board answers on this port'), 'dongle', DONGLE)
     add([check_builds(dongle, board.pong if board is not None else None)])
     if dongle is not None:
         result = run(link_test.run_link_test(parameters, options.count), 'link', DONGLE)

@@ -152,13 +152,7 @@ def encode_range(distance: float) -> int:
 
 
 def decode_range(code: int) -> float:
-    """Return the reading (m, REP 117) of a range code; NaN for not measured and for a fault.
-
-    Raises
-    ------
-    ValueError
-        The code is not a byte.
-    """
+    """Return the reading (m, REP 117) of a range code, a byte; NaN: not measured, or a fault."""
     if not 0 <= code <= 255:
         raise ValueError(f'code must be from 0 to 255: got {code}')
     if code in (NOT_MEASURED, FAULT):

@@ -76,7 +76,7 @@ def frame_of(row):
 
 def columns(kind, signed):
     """Return name -> (code, low, high) of the fields of a frame with a fixed layout."""
-    form = codec._LAYOUTS[kind].forms[-1 if signed else 0]
+    form = codec._LAYOUTS[kind][-1 if signed else 0]
     return {field.name: field for field in form._fields if field.name in kind._fields}
 
 

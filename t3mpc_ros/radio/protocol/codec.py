@@ -55,9 +55,8 @@ def encode(
 
     FrameError: a value does not fit; the text names frame, field, bound and value.
     """
-    layout = _LAYOUTS[type(frame)]
     # The last field shows whether the optional end (nonce, tag, address) is present.
-    fixed = layout.forms[-1 if frame[-1] != b'' else 0].pack(frame)
+    fixed = _LAYOUTS[type(frame)][-1 if frame[-1] != b'' else 0].pack(frame)
     if isinstance(frame, frames.Transmit):
         _check_payloads(frame)
         return fixed + bytes([len(frame.first)]) + frame.first + frame.second
@@ -100,7 +99,7 @@ def decode_from_dongle(data: bytes) -> frames.FromDongle:
     """Return the USB frame from the dongle to the host, or raise FrameError."""
     if data[:1] != b'\x81':
         return _decode(data, _FROM_DONGLE)  # type: ignore[no-any-return]
-    form = _LAYOUTS[frames.Result].forms[0]
+    form = _LAYOUTS[frames.Result][0]
     frame: frames.Result = form.unpack(data[: form.size])._replace(payload=data[form.size :])
     _check_result_payload(frame)
     return frame
@@ -154,7 +153,7 @@ class _Form:
     """
 
     def __init__(self, kind: Any, name: str, head: int, fields: str) -> None:
-        self._kind, self._name, self._head = kind, name, head
+        self._kind, self.name, self._head = kind, name, head
         self._fields = []
         for text in fields.split(', '):
             field, code, *bounds = text.split()
@@ -168,7 +167,7 @@ class _Form:
         values = []
         for field in self._fields:
             value = getattr(frame, field.name, field.low)
-            field.check(self._name, value)
+            field.check(self.name, value)
             values.append(value)
         for name, default in self._kind._field_defaults.items():
             # A value outside this form would be lost.
@@ -177,7 +176,7 @@ class _Form:
                 if value != default:
                     raise frames.FrameError(
                         frames.FrameErrorKind.VALUE,
-                        f'{self._name}.{name} must be {default!r} without '
+                        f'{self.name}.{name} must be {default!r} without '
                         f'{self._kind._fields[-1]}: got {value!r}',
                     )
         return self._struct.pack(self._head, *values)
@@ -186,40 +185,34 @@ class _Form:
         if len(data) != self.size:
             raise frames.FrameError(
                 frames.FrameErrorKind.LENGTH,
-                f'{self._name} must be at least {self.size} bytes long: got {len(data)}',
+                f'{self.name} must be at least {self.size} bytes long: got {len(data)}',
             )
         values = {}
         for field, value in zip(self._fields, self._struct.unpack(data)[1:], strict=True):
-            field.check(self._name, value)
+            field.check(self.name, value)
             if field.name in self._kind._fields:
                 values[field.name] = value
         return self._kind(**values)
-
-
-class _Layout(NamedTuple):
-    name: str
-    forms: tuple[_Form, ...]
 
 
 _VARIABLE_FIELDS = ('first', 'second', 'payload')
 """Fields of TX and RESULT with variable length."""
 
 
-def _layout(kind: Any, name: str, head: int, fields: str, *longer: str) -> _Layout:
+def _layout(kind: Any, name: str, head: int, fields: str, *longer: str) -> tuple[_Form, ...]:
     forms = tuple(_Form(kind, name, head, text) for text in (fields, *longer))
-    layout = _Layout(name, forms)
-    _LAYOUTS[kind] = layout
-    return layout
+    _LAYOUTS[kind] = forms
+    return forms
 
 
-def _decode(data: bytes, table: dict[int, _Layout]) -> Any:
+def _decode(data: bytes, table: dict[int, tuple[_Form, ...]]) -> Any:
     if not data or len(data) > frames.PAYLOAD_LIMIT:
         raise frames.FrameError(
             frames.FrameErrorKind.LENGTH,
             f'a frame must have 1 to {frames.PAYLOAD_LIMIT} bytes: got {len(data)}',
         )
-    layout = table.get(data[0])
-    if layout is None:
+    forms = table.get(data[0])
+    if forms is None:
         if table in (_DOWNLINK, _UPLINK) and data[0] >> 4 != frames.VERSION:
             raise frames.FrameError(
                 frames.FrameErrorKind.VERSION,
@@ -228,12 +221,13 @@ def _decode(data: bytes, table: dict[int, _Layout]) -> Any:
         raise frames.FrameError(
             frames.FrameErrorKind.KIND, f'kind of frame must be known: got {data[0]:#04x}'
         )
-    for form in layout.forms:
+    for form in forms:
         if form.size == len(data):
             return form.unpack(data)
-    sizes = ' or '.join(str(form.size) for form in layout.forms)
+    sizes = ' or '.join(str(form.size) for form in forms)
     raise frames.FrameError(
-        frames.FrameErrorKind.LENGTH, f'{layout.name} must be {sizes} bytes long: got {len(data)}'
+        frames.FrameErrorKind.LENGTH,
+        f'{forms[0].name} must be {sizes} bytes long: got {len(data)}',
     )
 
 
@@ -259,7 +253,7 @@ def _check_result_payload(frame: frames.Result) -> None:
 
 # -- layouts --------------------------------------------------------------------------------------
 
-_LAYOUTS: dict[Any, _Layout] = {}
+_LAYOUTS: dict[Any, tuple[_Form, ...]] = {}
 _COMMAND = 'session B, seq B, flags B 0 7, ttl B, reserved B 0 0, left h, right h, echo_us I'
 _PARAM_SET, _ACTION = 'session B, seq B, id B, value i', 'session B, seq B, verb B, reserved H 0 0'
 _INFO = (

@@ -146,11 +146,6 @@ def examine_board() -> Script[BoardFindings]:
     return BoardFindings(pong, settings, calibration, log, tuple(samples))
 
 
-def read_pong() -> Script[Pong]:
-    """Return the PONG of the board at a port."""
-    return (yield from wait_for_board('no board answers on this port'))
-
-
 def check_link(result: link_test.LinkTestResult, parameters: LinkParameters) -> list[Check]:
     """Return the rows of the link test; a poor row passes, with its remedy."""
     checks = []

@@ -9,6 +9,7 @@ the robot without a yes to the question before it.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 import math
 from typing import NamedTuple, TypeVar
@@ -51,6 +52,7 @@ class Interrupted(Exception):
     """The user ends the wizard: Ctrl-C, or the end of the input."""
 
 
+@dataclass
 class CalibrationRobot:
     """The robot behind a dongle and, for raw counts, behind its own USB port, which may be empty.
 
@@ -59,37 +61,32 @@ class CalibrationRobot:
     reasons for waiting.
     """
 
-    def __init__(
-        self,
-        port: str,
-        robot_port: str,
-        parameters: LinkParameters,
-        key: bytes,
-        entropy: Callable[[int], bytes],
-        interrupted: Callable[[], bool],
-        report: Callable[[str], None],
-    ) -> None:
-        self.has_usb = bool(robot_port)
+    port: str
+    robot_port: str
+    parameters: LinkParameters
+    key: bytes
+    entropy: Callable[[int], bytes]
+    interrupted: Callable[[], bool]
+    report: Callable[[str], None]
+
+    def __post_init__(self) -> None:
+        self.has_usb = bool(self.robot_port)
         """Whether the USB port of the robot board is connected: raw counts."""
-        self._port = port
-        self._robot_port = robot_port
-        self._link = parameters, key, entropy
-        self._interrupted = interrupted
-        self._report = report
+        self._link = self.parameters, self.key, self.entropy
 
     def rest(self, seconds: float) -> calibration.Recording:
         """Return a recording of the robot at rest."""
-        return self._record(Rest(*self._link, seconds, self._report))
+        return self._record(Rest(*self._link, seconds, self.report))
 
     def drive(
         self, angles: WheelAngles, speed: float, rests: tuple[float, float]
     ) -> calibration.Recording:
         """Turn the wheels by angles (rad); return the recording with the rests around it."""
-        return self._record(Manoeuvre(*self._link, angles, speed, self._report, rests))
+        return self._record(Manoeuvre(*self._link, angles, speed, self.report, rests))
 
     def turn_by_hand(self, timeout: float, rests: tuple[float, float]) -> calibration.Recording:
         """Return the recording of a turn by hand between two rests."""
-        return self._record(HandTurn(*self._link, timeout, self._report, rests))
+        return self._record(HandTurn(*self._link, timeout, self.report, rests))
 
     def counts(self, samples: int) -> Sequence[tuple[int, ...]]:
         """Return raw counts: of the eight distance sensors and, last, of the battery."""
@@ -115,15 +112,15 @@ class CalibrationRobot:
 
     def _at_board(self, script: Script[Value]) -> Value:
         try:
-            return procedure.run_script(script, self._robot_port, self._interrupted, ROBOT_BOARD)
+            return procedure.run_script(script, self.robot_port, self.interrupted, ROBOT_BOARD)
         except ProcedureError as error:
-            if self._interrupted():
+            if self.interrupted():
                 raise Interrupted from error
             raise
 
     def _record(self, task: Manoeuvre) -> calibration.Recording:
-        procedure.run_at_port(task, self._port, self._interrupted)
-        if self._interrupted():
+        procedure.run_at_port(task, self.port, self.interrupted)
+        if self.interrupted():
             raise Interrupted
         if task.error:
             raise ProcedureError(task.error)

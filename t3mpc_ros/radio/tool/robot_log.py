@@ -33,6 +33,16 @@ class LogKind(IntEnum):
     LOOP = 8
 
 
+_TEXTS: dict[int, str] = {
+    LogKind.ESTOP: 'emergency stop',
+    LogKind.EXPIRED: 'stopped by itself: no command in time',
+    LogKind.IMU: 'the inertial sensor does not answer',
+    LogKind.RADIO: 'the radio chip does not answer',
+    LogKind.BATTERY: 'battery below its cut-off: {:.1f} V',
+    LogKind.LOOP: 'longest pass of the main loop: {:.1f} ms',
+}
+
+
 class LogEntry(NamedTuple):
     """An entry of the log."""
 
@@ -79,25 +89,11 @@ def format_log(entries: tuple[LogEntry, ...]) -> str:
 
 
 def _describe(entry: LogEntry) -> str:
-    value = entry.value
-    match entry.kind:
-        case LogKind.BOOT:
-            causes = [text for bit, text in enumerate(_RESETS) if value >> bit & 1]
-            return f'boot: {", ".join(causes) or "started by a boot loader"}'
-        case LogKind.ESTOP:
-            return 'emergency stop'
-        case LogKind.EXPIRED:
-            return 'stopped by itself: no command in time'
-        case LogKind.IMU:
-            return 'the inertial sensor does not answer'
-        case LogKind.RADIO:
-            return 'the radio chip does not answer'
-        case LogKind.BATTERY:
-            return f'battery below its cut-off: {value / 1000:.1f} V'
-        case LogKind.RECORDS:
-            known = value < len(SETTINGS_TEXTS)
-            return SETTINGS_TEXTS[value] if known else f'records in state {value}'
-        case LogKind.LOOP:
-            return f'longest pass of the main loop: {value / 1000:.1f} ms'
-        case _:
-            return f'unknown entry {entry.kind}: {value}'
+    kind, value = entry.kind, entry.value
+    if kind == LogKind.BOOT:
+        causes = [text for bit, text in enumerate(_RESETS) if value >> bit & 1]
+        return f'boot: {", ".join(causes) or "started by a boot loader"}'
+    if kind == LogKind.RECORDS:
+        known = value < len(SETTINGS_TEXTS)
+        return SETTINGS_TEXTS[value] if known else f'records in state {value}'
+    return _TEXTS.get(kind, f'unknown entry {kind}: {value}').format(value / 1000)
