@@ -126,10 +126,8 @@ def test_power_loss_during_a_write_leaves_no_mixture(cuts: list[float]) -> None:
     assert len(seen) == 2
 
 
-def test_damaged_settings_lock_the_robot() -> None:
+def test_damaged_settings_lock_the_robot(boards: Boards) -> None:
     """It once fell back to 16 microsteps: double speed with jumpers for 8."""
-    build()
-    boards = Boards()
     for at in SETTINGS_ADDRESSES:
         damaged = bytearray(settings_record(82, 8))
         damaged[2] ^= 0x18
@@ -139,7 +137,6 @@ def test_damaged_settings_lock_the_robot() -> None:
     assert drive(boards, 0.3, 4000, 4000).status == frames.StatusFlag.NO_SESSION
     assert boards.pulses() == (0, 0)
     assert read_info(boards).settings == frames.SETTINGS_DAMAGED
-    boards.close()
 
 
 def make(folder: Any, *options: str) -> tuple[str, dict[str, tuple[int, bytes]]]:
@@ -168,10 +165,8 @@ def test_a_build_follows_its_options(tmp_path: Any) -> None:
             make(tmp_path, wrong)
 
 
-def test_both_boards_report_their_build() -> None:
-    build()
+def test_both_boards_report_their_build(boards: Boards) -> None:
     number, _ = make(FIRMWARE / 'build')
-    boards = Boards()
     boards.start()
     info, (pong,) = read_info(boards), request(boards, frames.Ping(1, b'ping'))
     assert isinstance(info, frames.Info)
@@ -179,4 +174,3 @@ def test_both_boards_report_their_build() -> None:
     assert isinstance(reply, frames.Pong)
     assert {info.build, pong.build, reply.build} == {int(number, 16)}
     assert (reply.channel, reply.address) == (82, b'T3MPC')
-    boards.close()

@@ -16,15 +16,7 @@ HAND_RATE = 3.0
 
 
 class Person:
-    """Answers the questions of the wizard, with errors of the assumed size, and turns the robot.
-
-    Parameters
-    ----------
-    bench
-        The robot, and the ports of its boards.
-    seed
-        Of the errors.
-    """
+    """Answers the questions of the wizard, with errors of the assumed size; turns the robot."""
 
     def __init__(self, bench, seed=1):
         self.bench = bench
