@@ -13,7 +13,7 @@ import shutil
 
 import pytest
 from support import waiting
-from support.bag_messages import STORE, number, odometry_message
+from support.bag_messages import STORE, number, odometry_message, serialised
 from support.missing_tools import needs, skip
 
 from t3mpc_ros.bag.mcap_file import Attachment
@@ -63,10 +63,10 @@ def test_every_file_of_a_bag_is_read_and_decoded(tmp_path, check):
             now = START + i * STEP
             if i % 200 == 0:
                 paths.append(bag.split() if i else bag.path)
-            bag.write('/number', now, now - 5, bytes(STORE.serialize_cdr(number(i), NUMBER)))
+            bag.write('/number', now, now - 5, serialised(number(i)))
             if i % 3 == 0:
                 message = odometry_message(now, (0.1 * i, -0.2 * i), (1.5, -2.5, 0.0))
-                bag.write('/odom', now, now, bytes(STORE.serialize_cdr(message, ODOM)))
+                bag.write('/odom', now, now, serialised(message))
     found = check(*paths)
     assert [each['topics']['/number'] for each in found] == [200, 200, 200]
     assert [each['last']['/number']['data'] for each in found] == [199, 399, 599]

@@ -3,12 +3,13 @@
 """Topic filter, writer thread, split files, attachments, snapshots, monitor: in virtual time."""
 
 from pathlib import Path
+import random
 import threading
 
 from mcap.reader import make_reader
 import pytest
 from rosbags.rosbag2 import Reader
-from support.bag_files import kept_messages, metadata_of
+from support.bag_files import kept_messages, messages_of, metadata_of
 
 from t3mpc_ros.bag import writer
 from t3mpc_ros.bag.mcap_file import (
@@ -60,19 +61,8 @@ def message(topic, seconds, size=12, fill=1):
 
 def noise(seconds, size=2000):
     """Return an incompressible message."""
-    import random
-
     data = random.Random(seconds).randbytes(size)
     return message('/n', seconds)._replace(data=data)
-
-
-def read(path):
-    with path.open('rb') as file:
-        reader = make_reader(file, validate_crcs=True)
-        return [
-            SerializedMessage(channel.topic, item.log_time, item.publish_time, item.data)
-            for _, channel, item in reader.iter_messages()
-        ]
 
 
 def attachments(path):
@@ -341,7 +331,7 @@ def test_split_recording_is_complete_in_self_contained_files(tmp_path, options):
     bag.close()
     files = [folder / path for path in metadata_of(folder)['relative_file_paths']]
     assert len(files) >= 5
-    parts = [read(path) for path in files]
+    parts = [messages_of(path) for path in files]
     assert [item for part in parts for item in part] == written
     for path in files:
         assert read_mcap_file(path).metadata_records['controller'] == {'law.gain': '8.0'}
@@ -414,7 +404,7 @@ def test_attachment_is_read_back_with_media_type_and_time(tmp_path):
     assert (found.create_time, found.log_time) == (path.stat().st_mtime_ns, START)
     with open_bag(bag.path) as reader:
         assert reader.attachments() == {item.name: item}
-    assert len(read(bag.path)) == 1
+    assert len(messages_of(bag.path)) == 1
     with Reader(tmp_path / 'bag') as reader:
         assert reader.message_count == 1
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
-from support.bag_files import kept_messages, metadata_of, topics_of
-from support.bag_messages import START, STORE, number, odometry_message, twist_message
+from support.bag_files import kept_messages, messages_of, metadata_of, topics_of
+from support.bag_messages import START, STORE, number, odometry_message, serialised, twist_message
 import yaml
 
 from t3mpc_ros.bag import writer
@@ -37,10 +37,6 @@ def odometry(stamp_ns, linear, angular):
     message = odometry_message(stamp_ns, (linear, angular), (1.0, 2.0, 0.5))
     message.pose.covariance = message.twist.covariance = np.arange(36.0)
     return message
-
-
-def serialised(message):
-    return bytes(STORE.serialize_cdr(message, message.__msgtype__))
 
 
 def fill(bag, count=200, start=START, step=STEP):
@@ -65,10 +61,8 @@ def read_with_rosbags(folder):
         return [(item.topic, stamp, bytes(data)) for item, stamp, data in reader.messages()]
 
 
-def read_with_mcap(path):
-    with path.open('rb') as file:
-        reader = make_reader(file, validate_crcs=True)
-        return [(channel.topic, m.log_time, m.data) for _, channel, m in reader.iter_messages()]
+def read_with_mcap(path, read=messages_of):
+    return [(item.topic, item.received_ns, item.data) for item in read(path)]
 
 
 @pytest.fixture
@@ -280,9 +274,7 @@ def test_a_chunk_is_closed_by_time_as_well_as_by_size(folder):
     written = fill(bag, 200)  # two seconds
     torn = folder.parent / 'torn.mcap'
     torn.write_bytes(bag.path.read_bytes())  # content of the disk if the process is killed now
-    assert [(item.topic, item.received_ns, item.data) for item in kept_messages(torn)] == (
-        written[:300]
-    )
+    assert read_with_mcap(torn, kept_messages) == written[:300]
     bag.close()
 
 
@@ -364,8 +356,7 @@ def test_a_write_error_is_reported_once_and_chunks_are_kept(folder, monkeypatch)
         bag.close()
     bag.close()
     assert read_with_rosbags(folder) == []  # metadata.yaml lists complete files only
-    kept = [(item.topic, item.received_ns, item.data) for item in kept_messages(bag.path)]
-    assert kept == written
+    assert read_with_mcap(bag.path, kept_messages) == written
 
 
 def test_invalid_calls_raise_distinct_errors(folder):
@@ -384,11 +375,9 @@ def test_invalid_calls_raise_distinct_errors(folder):
     for stamp in (-1, 2**63):
         with pytest.raises(DataError, match='stamp'):
             bag.write('/n', stamp, START, b'')
-    for metadata_records in ({'a': {'b': 1}}, {'rosbag2': {}}):
+    for title, table in (('a', {'b': 1}), ('rosbag2', {})):
         with pytest.raises(DataError):
-            bag.add_metadata_record(
-                'a', metadata_records['a']
-            ) if 'a' in metadata_records else bag.add_metadata_record('rosbag2', {})
+            bag.add_metadata_record(title, table)
     bag.close()
     bag.close()
     with pytest.raises(BagError, match='closed'):

@@ -38,7 +38,17 @@ def kept_messages(path):
     with path.open('rb') as source:
         recover_file(source, output, path.name)
     output.seek(0)
-    reader = make_reader(output, validate_crcs=True)
+    return messages_in(output)
+
+
+def messages_of(path):
+    """Return the messages of a complete file, as the mcap library reads them."""
+    with path.open('rb') as file:
+        return messages_in(file)
+
+
+def messages_in(file):
+    reader = make_reader(file, validate_crcs=True)
     return [
         SerializedMessage(channel.topic, item.log_time, item.publish_time, item.data)
         for _, channel, item in reader.iter_messages()

@@ -14,6 +14,11 @@ TYPES = STORE.types
 START = 1_700_000_000_000_000_000
 
 
+def serialised(message):
+    """Return a message in CDR."""
+    return bytes(STORE.serialize_cdr(message, message.__msgtype__))
+
+
 def header(stamp_ns, frame='odom'):
     stamp = TYPES['builtin_interfaces/msg/Time'](stamp_ns // 10**9, stamp_ns % 10**9)
     return TYPES['std_msgs/msg/Header'](stamp, frame)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from support.bag_messages import START, STORE, odometry_message, twist_message
+from support.bag_messages import START, STORE, odometry_message, serialised, twist_message
 from t3mpc_ros.bag.writer import BagWriter
 
 
@@ -20,8 +20,7 @@ def write(folder, rows, plugin=StoragePlugin.MCAP):
         kind = message.__msgtype__
         if topic not in connections:
             connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-        data = STORE.serialize_cdr(message, kind)
-        writer.write(connections[topic], START + round(received * 1e9), data)
+        writer.write(connections[topic], START + round(received * 1e9), serialised(message))
     writer.close()
     return folder
 
