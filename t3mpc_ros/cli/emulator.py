@@ -27,19 +27,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         key = read_key(options.key) if options.key is not None else b''
-        parameters = _parameters(options)
+        values: dict[str, object] = {'twin.world': options.world, 'twin.seed': options.seed}
+        values |= parse_assignments(EmulatorParameters, options.set)
+        parameters = EmulatorParameters.from_dict(values)
         faults = [Fault('loss', 0.0, math.inf, options.loss)] if options.loss else []
         faults += map(parse_fault, options.fault)
         emulator = Emulator(parameters, key, options.seed, erased=options.erased)
         for fault in faults:
             emulator.schedule_fault(fault)
-    except (
-        FaultError,
-        FirmwareLibraryError,
-        KeyFileError,
-        ParameterError,
-        WorldError,
-    ) as error:
+    except (FaultError, FirmwareLibraryError, KeyFileError, ParameterError, WorldError) as error:
         return _fail(error)
     with StopSignal() as stop:
         _print('starting')
@@ -86,13 +82,6 @@ def _print(text: str) -> None:
 def _fail(error: Exception) -> int:
     print(f't3mpc emulator: {error}', file=sys.stderr)
     return 2
-
-
-def _parameters(options: argparse.Namespace) -> EmulatorParameters:
-    values: dict[str, object] = {'twin.world': options.world, 'twin.seed': options.seed}
-    return EmulatorParameters.from_dict(
-        values | parse_assignments(EmulatorParameters, options.set)
-    )
 
 
 def _parser() -> argparse.ArgumentParser:

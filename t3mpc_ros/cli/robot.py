@@ -39,15 +39,7 @@ from t3mpc_ros.radio.tool.robot_settings import SettingsFileError, StoredSetting
 from t3mpc_ros.stop_signal import StopSignal
 
 EXIT_OK, EXIT_POOR, EXIT_FAILED, EXIT_INTERRUPTED = 0, 1, 2, 130
-_SETTINGS = (
-    'address',
-    'rate',
-    'power',
-    'microsteps',
-    'steps_per_turn',
-    'divider',
-    'sensors',
-)
+_SETTINGS = 'address', 'rate', 'power', 'microsteps', 'steps_per_turn', 'divider', 'sensors'
 """Settings with an option of their name; none of them can be 0 or empty."""
 Value = TypeVar('Value')
 
