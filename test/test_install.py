@@ -2,22 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Installation with colcon: what a workspace contains, and that it runs."""
 
-from contextlib import ExitStack
 from fnmatch import fnmatch
 import functools
 import os
 from pathlib import Path
 import re
-import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from support.checkout import EXECUTABLES, clean_environment, copy_package
 from support.launch_files import nodes_of
 from support.long_tests import few_of
-from support.waiting import wait_for_end, wait_for_text
+from support.waiting import TIMEOUT, Processes
 import yaml
 
 from t3mpc_ros.nodes.registry import NODES
@@ -69,11 +66,6 @@ class Tree:
         )
         return dict(line.split('=', 1) for line in output.stdout.split('\0') if line)
 
-    def start(self, name, *arguments):
-        """Start an executable like ``ros2 run``, in the graph of the current test."""
-        graph = {k: v for k, v in os.environ.items() if k.startswith(('ROS_', 'FASTRTPS_'))}
-        return Process(self, name, arguments, self.environment | graph)
-
     def run(self, name, *arguments):
         return subprocess.run(
             [self.prefix / 'lib' / 't3mpc_ros' / name, *arguments],
@@ -82,42 +74,6 @@ class Tree:
             capture_output=True,
             text=True,
         )
-
-
-class Process:
-    """A running executable; as a context manager it is killed at the end."""
-
-    def __init__(self, tree, name, arguments, environment):
-        self._name = name
-        self._log = tree.scratch / f'{name}-{time.monotonic_ns()}.log'
-        with self._log.open('wb') as output:
-            self._process = subprocess.Popen(
-                [tree.prefix / 'lib' / 't3mpc_ros' / name, *arguments],
-                cwd=tree.scratch,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-            )
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        if self._process.poll() is None:
-            self._process.kill()
-        self._process.wait()
-
-    def output(self):
-        return self._log.read_text(errors='replace')
-
-    def wait_ready(self):
-        wait_for_text(self._process, self.output, f'{self._name} ready', 180.0)
-
-    def interrupt(self):
-        """Return the exit code after SIGINT."""
-        self._process.send_signal(signal.SIGINT)
-        return wait_for_end(self._process)
 
 
 @pytest.fixture(scope='module')
@@ -191,13 +147,20 @@ def test_a_sourced_workspace_runs_its_own_complete_code(tree):
 
 @pytest.mark.slow
 @pytest.mark.parametrize('tree', few_of(['copied', 'symlinked']), indirect=True)
-def test_every_installed_node_starts_and_exits_with_0(tree, graph):
-    with ExitStack() as stack:
-        nodes = [stack.enter_context(tree.start(name)) for name in NODES]
-        for node in nodes:
-            node.wait_ready()
-            assert node.interrupt() == 0, node.output()
-            assert 'Traceback' not in node.output()
+def test_every_installed_node_starts_and_exits_with_0(tree, graph, monkeypatch):
+    monkeypatch.setenv('AMENT_PREFIX_PATH', tree.environment['AMENT_PREFIX_PATH'])
+    monkeypatch.chdir(tree.scratch)
+    of_graph = {k: v for k, v in os.environ.items() if k.startswith(('ROS_', 'FASTRTPS_'))}
+    group = Processes(tree.scratch / 'log', tree.environment | of_graph)
+    try:
+        for name in NODES:
+            group.start(name)
+        for name in NODES:
+            group.wait_ready(name, 180.0)
+            assert group.stop(name, seconds=TIMEOUT) == 0, group.log(name).read_text()
+            assert 'Traceback' not in group.log(name).read_text()
+    finally:
+        group.end_all()
 
 
 @pytest.mark.slow

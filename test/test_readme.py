@@ -35,7 +35,6 @@ ROOT = Path(__file__).resolve().parent.parent
 DEMO = 'scripts/demo'
 BOARDS = 'scripts/run t3mpc emulator --link dongle --robot-link robot_usb --erased'
 
-# For each command: the additional arguments, and whether it runs until it is stopped.
 PARAMETERS, KEY_FILE = '--params-file robot.yaml', '-p key_file:=robot.key'
 SET = 'scripts/run t3mpc robot setup --port robot_usb --microsteps 16 --save robot.yaml --yes'
 EMULATOR = 'scripts/run t3mpc emulator --link dongle'
@@ -48,92 +47,66 @@ SWEEP = (
     '--output gains.parquet'
 )
 SHORTENED = {
-    DEMO: (['--duration', '8', '--headless', '--output', 'OUTPUT/run'], False),
-    'scripts/check': ([], False),
-    'scripts/run sim_robot --ros-args -p world:=room': ([], True),
-    'scripts/run sim_robot --ros-args -p world:=room -p faults.schedule:=rough_ride': ([], True),
-    'scripts/run t3mpc --help': ([], False),
-    'scripts/run t3mpc faults': (['brown_out', 'collision'], False),
-    'scripts/demo --patrol': (
-        ['--duration', '5', '--headless', '--output', 'OUTPUT/patrol'],
-        False,
-    ),
-    'scripts/demo --robot servo': (
-        ['--duration', '5', '--headless', '--output', 'OUTPUT/servo'],
-        False,
-    ),
-    'scripts/demo --robot emulator --loss 0.1': (
-        ['--duration', '5', '--headless', '--output', 'OUTPUT/emulator'],
-        False,
-    ),
-    'scripts/run controller --ros-args -p law.gain:=20.0': ([], True),
-    'scripts/run reference_generator --ros-args -p seed:=7': ([], True),
-    'scripts/run composed': (['--ros-args', '-p', 'storage.uri:=OUTPUT/bag'], True),
-    'scripts/demo --view': (['--duration', '8', '--headless', '--output', 'OUTPUT/view'], False),
-    'scripts/run t3mpc view': (['--headless', '--port', '0'], True),
-    'scripts/run t3mpc view --bag runs/latest/bag': (['--headless', '--port', '0'], True),
-    'scripts/run t3mpc patrol': (
-        ['--seeds', '101', '--minutes', '2.2', '--paths', 'Chen', '--output', 'OUTPUT/patrol'],
-        False,
-    ),
+    DEMO: '--duration 8 --headless --output OUTPUT/run',
+    'scripts/check': '',
+    'scripts/run sim_robot --ros-args -p world:=room': 'Ctrl-C',
+    'scripts/run sim_robot --ros-args -p world:=room -p faults.schedule:=rough_ride': 'Ctrl-C',
+    'scripts/run t3mpc --help': '',
+    'scripts/run t3mpc faults': 'brown_out collision',
+    'scripts/demo --patrol': '--duration 5 --headless --output OUTPUT/patrol',
+    'scripts/demo --robot servo': '--duration 5 --headless --output OUTPUT/servo',
+    'scripts/demo --robot emulator --loss 0.1': '--duration 5 --headless --output OUTPUT/emulator',
+    'scripts/run controller --ros-args -p law.gain:=20.0': 'Ctrl-C',
+    'scripts/run reference_generator --ros-args -p seed:=7': 'Ctrl-C',
+    'scripts/run composed': '--ros-args -p storage.uri:=OUTPUT/bag Ctrl-C',
+    'scripts/demo --view': '--duration 8 --headless --output OUTPUT/view',
+    'scripts/run t3mpc view': '--headless --port 0 Ctrl-C',
+    'scripts/run t3mpc view --bag runs/latest/bag': '--headless --port 0 Ctrl-C',
+    'scripts/run t3mpc patrol': '--seeds 101 --minutes 2.2 --paths Chen --output OUTPUT/patrol',
     'scripts/run t3mpc patrol --tracking': (
-        ['--seeds', '101', '--paths', 'recorded-path', '--output', 'OUTPUT/tracking'],
-        False,
+        '--seeds 101 --paths recorded-path --output OUTPUT/tracking'
     ),
-    'scripts/run t3mpc paper --quick': (['--seeds', '1', '--output', 'OUTPUT/paper'], False),
-    'scripts/run t3mpc compare': (
-        ['--seeds', '201', '--duration', '3', '--methods', 'full', '--cases', 'nominal'],
-        False,
-    ),
-    OWN: (['--seeds', '1', '--duration', '3'], False),
-    SWEEP: (['--seeds', '1', '--duration', '3'], False),
-    'scripts/run t3mpc tune': (
-        ['PI + feed-forward', '--evaluations', '2', '--output', 'OUTPUT/tuned.json'],
-        False,
-    ),
-    'scripts/run t3mpc train': (['--seeds', '1', '--output', 'OUTPUT/model.npz'], False),
-    'scripts/run t3mpc exponents': (['--duration', '20'], False),
-    'scripts/run t3mpc estimation': (['--seeds', '2'], False),
-    BOARDS: ([], True),
-    SET: ([], False),
-    'scripts/run t3mpc robot setup --port robot_usb --diff robot.yaml': ([], False),
+    'scripts/run t3mpc paper --quick': '--seeds 1 --output OUTPUT/paper',
+    'scripts/run t3mpc compare': '--seeds 201 --duration 3 --methods full --cases nominal',
+    OWN: '--seeds 1 --duration 3',
+    SWEEP: '--seeds 1 --duration 3',
+    'scripts/run t3mpc tune': '"PI + feed-forward" --evaluations 2 --output OUTPUT/tuned.json',
+    'scripts/run t3mpc train': '--seeds 1 --output OUTPUT/model.npz',
+    'scripts/run t3mpc exponents': '--duration 20',
+    'scripts/run t3mpc estimation': '--seeds 2',
+    BOARDS: 'Ctrl-C',
+    SET: '',
+    'scripts/run t3mpc robot setup --port robot_usb --diff robot.yaml': '',
     f'scripts/run t3mpc robot doctor --port dongle --robot-port robot_usb {PARAMETERS} '
-    '--no-questions': (['--count', '20', '--report', 'OUTPUT/doctor.html'], False),
-    'scripts/run t3mpc robot key create robot.key': ([], False),
-    'scripts/run t3mpc robot key write robot.key --port robot_usb': ([], False),
-    'scripts/run t3mpc robot ping --port dongle --params-file robot.yaml': ([], False),
-    f'scripts/run t3mpc robot jog left 1 --port dongle {PARAMETERS} --key robot.key --yes': (
-        [],
-        False,
-    ),
-    f'scripts/run radio_bridge --ros-args {PARAMETERS} -p port:=dongle {KEY_FILE}': ([], True),
-    'scripts/run t3mpc bag info runs/latest/bag': ([], False),
-    'scripts/run t3mpc bag report runs/latest/bag': (['--output', 'OUTPUT/report'], False),
-    'scripts/run t3mpc bag animate runs/latest/bag --output run.gif': (['--duration', '2'], False),
-    'scripts/run t3mpc bag replay runs/latest/bag': ([], False),
-    'scripts/run t3mpc bag replay runs/latest/bag --set law.gain=20.0': ([], False),
-    'scripts/run t3mpc bag compare runs/latest/bag --picture divergence.png': ([], False),
-    'scripts/run t3mpc bag recover runs/latest/bag --output recovered': ([], False),
-    'scripts/run player --ros-args -p storage.uris:=[runs/latest/bag]': (
-        ['-p', 'play.rate:=10.0'],
-        False,
-    ),
+    '--no-questions': '--count 20 --report OUTPUT/doctor.html',
+    'scripts/run t3mpc robot key create robot.key': '',
+    'scripts/run t3mpc robot key write robot.key --port robot_usb': '',
+    'scripts/run t3mpc robot ping --port dongle --params-file robot.yaml': '',
+    f'scripts/run t3mpc robot jog left 1 --port dongle {PARAMETERS} --key robot.key --yes': '',
+    f'scripts/run radio_bridge --ros-args {PARAMETERS} -p port:=dongle {KEY_FILE}': 'Ctrl-C',
+    'scripts/run t3mpc bag info runs/latest/bag': '',
+    'scripts/run t3mpc bag report runs/latest/bag': '--output OUTPUT/report',
+    'scripts/run t3mpc bag animate runs/latest/bag --output run.gif': '--duration 2',
+    'scripts/run t3mpc bag replay runs/latest/bag': '',
+    'scripts/run t3mpc bag replay runs/latest/bag --set law.gain=20.0': '',
+    'scripts/run t3mpc bag compare runs/latest/bag --picture divergence.png': '',
+    'scripts/run t3mpc bag recover runs/latest/bag --output recovered': '',
+    'scripts/run player --ros-args -p storage.uris:=[runs/latest/bag]': '-p play.rate:=10.0',
     "scripts/run player --ros-args -p storage.uris:='[run1, run2]' -p play.rate:=2.0 "
-    '-p play.start_offset:=10.0': ([], False),
+    '-p play.start_offset:=10.0': '',
     'scripts/run t3mpc bag report turtlebot_bag --odom /odom --cmd-vel /cmd_vel': (
-        ['--output', 'OUTPUT/turtlebot'],
-        False,
+        '--output OUTPUT/turtlebot'
     ),
-    'scripts/run t3mpc bag recover broken.mcap --output whole': ([], False),
-    'scripts/run recorder --ros-args -p storage.uri:=mybag': ([], True),
-    EMULATOR: ([], True),
-    BRIDGE: ([], True),
-    f'{EMULATOR} --loss 0.1 --world room': ([], True),
-    f'{EMULATOR} {FAULTS}': ([], True),
-    'scripts/run t3mpc robot key create secret.key': ([], False),
-    f'{EMULATOR} --key secret.key {CHANGES}': ([], True),
+    'scripts/run t3mpc bag recover broken.mcap --output whole': '',
+    'scripts/run recorder --ros-args -p storage.uri:=mybag': 'Ctrl-C',
+    EMULATOR: 'Ctrl-C',
+    BRIDGE: 'Ctrl-C',
+    f'{EMULATOR} --loss 0.1 --world room': 'Ctrl-C',
+    f'{EMULATOR} {FAULTS}': 'Ctrl-C',
+    'scripts/run t3mpc robot key create secret.key': '',
+    f'{EMULATOR} --key secret.key {CHANGES}': 'Ctrl-C',
 }
-
+"""Commands with additional arguments; those with Ctrl-C run until they are stopped."""
 
 FIRST = ('README.md', 'docs/tutorial.md')
 """Pages whose commands every check runs."""
@@ -155,7 +128,7 @@ def test_every_command_of_the_page_is_run_here(page):
 def test_blocks_can_be_pasted(page):
     """A command that runs until Ctrl-C ends its block: the next one needs another terminal."""
     for block in _blocks(page, 'console'):
-        assert [command for command in block[:-1] if SHORTENED[command][1]] == []
+        assert [command for command in block[:-1] if 'Ctrl-C' in SHORTENED[command]] == []
     kinds = set(re.findall(r'^ *```(\w*)$', (ROOT / page).read_text(), re.M)) - {''}
     assert kinds <= {'console', 'sh', 'python', 'yaml', 'mermaid', 'text'}
     # Commands in blocks that are only indented would be neither run nor parsed.
@@ -394,9 +367,9 @@ def _work(command, output, tmp_path):
     """Run a command, and stop one that does not end by itself; fail if it does."""
     if command == 'scripts/check':
         return  # it is what runs this test
-    extra, endless = SHORTENED[command]
+    extra, endless, _ = SHORTENED[command].partition('Ctrl-C')
     arguments = shlex.split(command.replace('runs/latest', 'run'))
-    arguments += [word.replace('OUTPUT', str(output)) for word in extra]
+    arguments += [word.replace('OUTPUT', str(output)) for word in shlex.split(extra)]
     _prepare_bags(command, output)
     log = tmp_path / 'output.txt'
     # The machine was too slow: for a demo, which says so, or for the round trip of a ping.

@@ -321,6 +321,24 @@ def test_channels_of_a_lost_first_chunk_are_found_in_the_summary(own):
     assert any('names are lost' in damage.reason for damage in outcome.damages)
 
 
+def test_a_damaged_chunk_of_a_file_without_index_is_a_loss(own):
+    """Between the places of an index nothing is lost; without index that says nothing."""
+    entry = make_reader(io.BytesIO(own)).get_summary().chunk_indexes[4]
+    damaged = bytearray(own[: end_of_data(own) + 13])
+    assert salvaged(bytes(damaged))[0].clean
+    damaged[entry.chunk_start_offset + entry.chunk_length - 1] ^= 1
+    outcome, _ = salvaged(bytes(damaged))
+    assert (outcome.ended, outcome.clean) == (True, False)
+
+
+@pytest.mark.parametrize('checked', [True, False])
+def test_messages_without_a_checksum_are_counted(checked):
+    outcome, _ = salvaged(foreign_file(enable_crcs=checked))
+    for topic in outcome.topics.values():
+        assert topic.kept > 0
+        assert topic.unchecked == (0 if checked else topic.kept)
+
+
 def test_zeros_at_the_end_are_no_records(own):
     """A power failure leaves a file with its full size but without its last blocks."""
     outcome, result = salvaged(own[:30_000] + bytes(40_000))

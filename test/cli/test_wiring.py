@@ -171,6 +171,12 @@ TRAIN = {
     'evaluation.training.recorded_runs.fit_bags': MODEL,
     'bag.run.model_file.save_model': None,
 }
+OF_BAGS = {
+    'bag': {'fit_bags.folders.1': 'bag'},
+    '--keep-predictor': {'fit_bags.keep_predictor': True},
+    '--folds 3': {'fit_bags.count': 3},
+    '--output new.npz': {'save_model.path': 'new.npz'},
+}
 FAULTS = {
     'evaluation.fault_study.study_faults': [],
     'evaluation.fault_page.console_text': '',
@@ -405,15 +411,7 @@ TABLE = {
             '--output new.npz': {'save_model.path': 'new.npz'},
         },
     ),
-    'train bag': (
-        TRAIN,
-        {
-            'bag': {'fit_bags.folders.1': 'bag'},
-            '--keep-predictor': {'fit_bags.keep_predictor': True},
-            '--folds 3': {'fit_bags.count': 3},
-            '--output new.npz': {'save_model.path': 'new.npz'},
-        },
-    ),
+    'train bag': (TRAIN, OF_BAGS),
     'faults': (
         FAULTS | SHARED,
         {
@@ -509,15 +507,7 @@ TABLE = {
             '--namespace r1': {'load_inputs.namespace': 'r1'},
         },
     ),
-    'bag train bag': (
-        TRAIN,
-        {
-            'bag': {'fit_bags.folders.1': 'bag'},
-            '--keep-predictor': {'fit_bags.keep_predictor': True},
-            '--folds 3': {'fit_bags.count': 3},
-            '--output new.npz': {'save_model.path': 'new.npz'},
-        },
-    ),
+    'bag train bag': (TRAIN, OF_BAGS),
     'emulator --link l': (
         EMULATOR,
         {
