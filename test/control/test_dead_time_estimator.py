@@ -225,6 +225,19 @@ def test_a_dead_time_beyond_the_grid_stays_at_its_end():
     assert MAX_DEAD_TIME - 0.01 < estimator.dead_time <= MAX_DEAD_TIME
 
 
+def test_a_reset_keeps_the_estimate_and_ends_the_disturbance():
+    drive = simulate(smooth_commands(20.0, 95), 0.04, 95)
+    estimator, _ = run(drive)
+    for k in range(50):
+        estimator.step(drive.measured[k] + 5.0 * (-1.0) ** k, drive.command[k], PERIOD)
+    assert estimator.estimate.disturbed
+    before = estimator.dead_time, estimator.standard_deviation, estimator.estimate.noise_ratio
+    estimator.reset(np.zeros(2))
+    assert not estimator.estimate.disturbed
+    after = estimator.dead_time, estimator.standard_deviation, estimator.estimate.noise_ratio
+    assert after == before
+
+
 def test_speeds_at_the_stamp_need_the_other_model():
     """The mean over a period is half a period older than the speed at its end."""
     command = smooth_commands(40.0, 97)
