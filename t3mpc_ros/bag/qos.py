@@ -19,7 +19,7 @@ import yaml
 
 from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.parameters.yaml_files import PlainDumper, YamlError, read_yaml, shortened
+from t3mpc_ros.parameters.yaml_files import PlainDumper, file_errors, read_yaml, shortened
 
 UNLIMITED = 2**63 - 1
 """RMW_DURATION_INFINITE in nanoseconds: 9223372036 s and 854775807 ns."""
@@ -182,10 +182,8 @@ def read_qos_overrides(path: Path | str) -> dict[str, QosProfile]:
     What ``ros2 bag`` does not accept raises :class:`QosError`.
     """
     path = Path(path).expanduser()
-    try:
+    with file_errors(path, QosError):
         content = read_yaml(path)
-    except YamlError as error:
-        raise QosError(f'{path} {error}') from error
     if not isinstance(content, dict):
         raise QosError(f'{path} must contain profiles by topic: got {type(content).__name__}')
     return {

@@ -14,7 +14,7 @@ from t3mpc_ros.cli import robot_calibrate
 from t3mpc_ros.cli.command import ArgumentParser, ask_line, check_writable
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.parameters.yaml_files import YamlError, read_yaml
+from t3mpc_ros.parameters.yaml_files import YamlError, file_errors, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
@@ -294,11 +294,10 @@ def _link_parameters(options: argparse.Namespace) -> LinkParameters:
 
 def _read_link_parameters(path: Path) -> dict[str, object]:
     """Return the parameters below ``link`` of a ROS parameter file, names with dots."""
-    try:
+    with file_errors(path, ParameterError):
         content: Any = read_yaml(path)
+    try:
         return dict(_flat_items(content['/**']['ros__parameters']['link']))
-    except YamlError as error:
-        raise ParameterError(f'{path} {error}') from error
     except (KeyError, TypeError, AttributeError) as error:
         raise ParameterError(
             f'{path} must be a parameter file of t3mpc robot setup, with link below /**'

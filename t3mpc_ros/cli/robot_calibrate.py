@@ -15,7 +15,7 @@ from t3mpc_ros.cli.command import ask_line, check_writable
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.parameters.yaml_files import YamlError, parameter_file, read_yaml
+from t3mpc_ros.parameters.yaml_files import file_errors, parameter_file, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.radio_robot import RadioRobotParameters
 from t3mpc_ros.radio.tool.calibration_wizard import (
@@ -92,12 +92,11 @@ def _rounded(value: float) -> float:
 
 def read_parameter_file(path: Path) -> tuple[Calibration, dict[str, object]]:
     """Return the calibration and the link parameters of a file of :func:`calibration_file`."""
-    try:
+    with file_errors(path, ParameterError):
         content: Any = read_yaml(path)
+    try:
         values = content['/**/radio_bridge']['ros__parameters']
         parameters = RadioRobotParameters.from_dict(values)
-    except YamlError as error:
-        raise ParameterError(f'{path} {error}') from error
     except (KeyError, TypeError) as error:
         raise ParameterError(
             f'{path} must be a parameter file of t3mpc robot calibrate, with calibration below '

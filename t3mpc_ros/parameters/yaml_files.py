@@ -33,7 +33,7 @@ class EntryError(ValueError):
 
 
 @contextmanager
-def file_errors(name: object, kind: type[ValueError]) -> Iterator[None]:
+def file_errors(name: object, kind: type[Exception]) -> Iterator[None]:
     """Raise errors of this module as ``kind``, with the name of the file in front."""
     try:
         yield
