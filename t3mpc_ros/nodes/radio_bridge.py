@@ -187,7 +187,7 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
         """Publish a state with stamps of the node's clock instead of the steady clock."""
         stamp_ns = state.stamp_ns + self.now_ns() - self.steady_ns()
         odometry = state.odometry._replace(stamp_ns=stamp_ns)
-        self._robot_publishers.publish(state._replace(stamp_ns=stamp_ns, odometry=odometry))
+        self.publish_state(state._replace(stamp_ns=stamp_ns, odometry=odometry))
 
     # -- diagnostics and shutdown -----------------------------------------------------------------
 

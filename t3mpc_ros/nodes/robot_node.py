@@ -3,18 +3,25 @@
 """What the simulated and the real robot have in common as nodes: commands, stops, states."""
 
 from collections.abc import Mapping
+import math
 import threading
 from typing import Any, TypeVar
 
 from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import BatteryState, Imu, JointState, Range
 from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.geometry.kinematics import wheels_from_twist
-from t3mpc_ros.geometry.types import BodyTwist
-from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.geometry.types import RANGE_SENSORS, BodyTwist, Pose
+from t3mpc_ros.nodes import conversions, qos, robot_topics
 from t3mpc_ros.nodes.base_node import BaseNode
-from t3mpc_ros.nodes.robot_topics import RobotDescription, RobotPublishers, RobotTopicParameters
-from t3mpc_ros.robot.interface import RobotCommand, RobotInterface
+from t3mpc_ros.nodes.robot_topics import RobotDescription, RobotTopicParameters
+from t3mpc_ros.robot.description import fixed_frames
+from t3mpc_ros.robot.interface import RobotCommand, RobotInterface, RobotState
+
+BATTERY_RATE = 1.0
+"""Rate of ``battery_state``, Hz."""
 
 P = TypeVar('P', bound=RobotTopicParameters)
 
@@ -37,9 +44,8 @@ class RobotNode(BaseNode[P]):
         self._logged_reason = ''
         stamped = self.parameters.enable_stamped_cmd_vel
         self._command_type = TwistStamped if stamped else Twist
-        self._robot_publishers = RobotPublishers(
-            self, self.parameters, self.describe(self.parameters)
-        )
+        self._description = self.describe(self.parameters)
+        self._create_publishers()
         self.create_matching_subscription(
             self._command_type, 'cmd_vel', self._on_command, qos.LATEST
         )
@@ -62,7 +68,10 @@ class RobotNode(BaseNode[P]):
         """Apply dynamic parameters to the robot and its messages."""
         with self._lock:
             self._robot.configure(parameters)
-        self._robot_publishers.configure(parameters, self.describe(parameters))
+        self._description = self.describe(parameters)
+        self._set_covariances()
+
+    # -- commands ---------------------------------------------------------------------------------
 
     def _on_command(self, message: Twist | TwistStamped, info: dict[str, Any]) -> None:
         """Execute a command unless it is too old; its stamp becomes one in robot time."""
@@ -113,3 +122,131 @@ class RobotNode(BaseNode[P]):
 
     def _command_type_problem(self) -> str:
         return qos.command_type_problem(self, self._command_type, publish=False)
+
+    # -- states -----------------------------------------------------------------------------------
+
+    def _create_publishers(self) -> None:
+        parameters, robot = self.parameters, self._description
+        self._published = 0
+        base = self._frame(parameters.base_frame_id)
+        odom = self._frame(parameters.odom_frame_id)
+        self._odom = conversions.SerializedOdometry(odom, base)
+        self._odom_publisher = self.create_publisher(Odometry, 'odom', qos.STREAM)
+        self._set_covariances()
+        if robot.truth_frame:
+            self._truth = conversions.SerializedOdometry(robot.truth_frame, base)
+            self._truth_publisher = self.create_publisher(
+                Odometry, 'ground_truth/odom', qos.STREAM
+            )
+        self._joint_publisher = self.create_publisher(JointState, 'joint_states', qos.SCALARS)
+        self._broadcaster = None
+        if parameters.enable_odom_tf:
+            self._broadcaster = self._make_broadcaster('TransformBroadcaster')
+        if robot.sensors is None:
+            return
+        _, range_sensor, battery = robot.sensors
+        self._imu_publisher = self.create_publisher(Imu, 'imu/data_raw', qos.STREAM)
+        self._battery_publisher = self.create_publisher(BatteryState, 'battery_state', qos.SCALARS)
+        self._battery_message = robot_topics.battery_message(battery)
+        self._ranges = []
+        for name in RANGE_SENSORS if parameters.range_rate else ():
+            frame = self._frame(parameters.frame_names.range_sensor(name))
+            message = robot_topics.range_message(range_sensor, frame)
+            publisher = self.create_publisher(Range, f'range/{name}', qos.SCALARS)
+            self._ranges.append((publisher, message))
+        if parameters.enable_static_tf:
+            self._publish_fixed_frames()
+
+    def _set_covariances(self) -> None:
+        geometry, variance = self._description.geometry, self._description.variance
+        self._twist_covariances = {
+            slipping: robot_topics.twist_covariance(geometry, math.inf if slipping else variance)
+            for slipping in (False, True)
+        }
+        self._slipping: bool | None = None
+        if self._description.sensors is not None:
+            frame = self._frame(self.parameters.imu_frame_id)
+            self._imu_message = robot_topics.imu_message(self._description.sensors[0], frame)
+
+    def _frame(self, name: str) -> str:
+        return self.parameters.prefixed(name, self.get_namespace())
+
+    def publish_state(self, state: RobotState) -> None:
+        """Publish one state, each topic at its rate."""
+        self._publish_motion(state)
+        if self._description.sensors is not None:
+            self._publish_sensors(state)
+        self._published += 1
+
+    def _publish_motion(self, state: RobotState) -> None:
+        self._odom.set_pose_covariance(
+            conversions.planar_covariance(state.covariance, conversions.MIN_POSE_VARIANCE)
+        )
+        if state.status.slipping is not self._slipping:
+            self._slipping = state.status.slipping
+            self._odom.set_twist_covariance(self._twist_covariances[self._slipping])
+        self._odom_publisher.publish(self._odom.with_state(state.odometry))
+        if state.truth is not None:
+            self._truth_publisher.publish(self._truth.with_state(state.truth))
+        if self._broadcaster is not None:
+            stamp_ns, pose, _ = state.odometry
+            self._broadcaster.sendTransform(
+                conversions.transform(stamp_ns, pose, self._odom.frame, self._odom.child)
+            )
+        if self._is_due(self.parameters.joint_rate):
+            names = self.parameters.right_wheel_name, self.parameters.left_wheel_name
+            self._joint_publisher.publish(
+                conversions.joint_state(names, state.angles, state.wheels, state.stamp_ns)
+            )
+
+    def _publish_sensors(self, state: RobotState) -> None:
+        stamp_ns = state.stamp_ns
+        if state.imu is not None:
+            self._imu_publisher.publish(
+                robot_topics.fill_imu(self._imu_message, state.imu, stamp_ns)
+            )
+        if self._is_due(self.parameters.range_rate):
+            infinity = self.parameters.range_infinity
+            for (publisher, message), distance in zip(self._ranges, state.ranges, strict=False):
+                if not math.isnan(distance):
+                    publisher.publish(
+                        robot_topics.fill_range(message, distance, stamp_ns, infinity=infinity)
+                    )
+        if state.battery is not None and self._is_due(BATTERY_RATE):
+            self._battery_publisher.publish(
+                robot_topics.fill_battery(self._battery_message, state.battery, stamp_ns)
+            )
+
+    def _is_due(self, rate: float) -> bool:
+        """Return whether a topic of ``rate`` (Hz) is published with the present state."""
+        return rate > 0.0 and self._published % max(1, round(self._description.rate / rate)) == 0
+
+    def _publish_fixed_frames(self) -> None:
+        """Publish the transforms of the sensors once; the topic is latched."""
+        self._static_broadcaster = self._make_broadcaster('StaticTransformBroadcaster')
+        if self._static_broadcaster is None:
+            return
+        names, stamp_ns = self.parameters.frame_names, self.get_clock().now().nanoseconds
+        _, range_sensor, _ = self._description.sensors
+        self._static_broadcaster.sendTransform(
+            [
+                conversions.transform(
+                    stamp_ns,
+                    Pose(frame.x, frame.y, frame.yaw),
+                    self._frame(names.base),
+                    self._frame(frame.name),
+                    frame.z,
+                )
+                for frame in fixed_frames(names, self._description.geometry, range_sensor)
+            ]
+        )
+
+    def _make_broadcaster(self, kind: str) -> Any:
+        try:
+            import tf2_ros
+        except ImportError:
+            self.get_logger().info(
+                'tf2_ros is not installed: no transform is published', once=True
+            )
+            return None
+        return getattr(tf2_ros, kind)(self)

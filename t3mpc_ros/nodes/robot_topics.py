@@ -1,22 +1,19 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Topics and diagnostics of the robot state, common to the simulated and the real robot."""
+"""Parameters, messages and diagnostics of a robot's topics, for the simulated and the real one."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from nav_msgs.msg import Odometry
-from rclpy.node import Node
-from sensor_msgs.msg import BatteryState, Imu, JointState, Range
+from sensor_msgs.msg import BatteryState, Imu, Range
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import RANGE_SENSORS, Pose
-from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.conversions import UNKNOWN_VARIANCE, FrameParameters
 from t3mpc_ros.parameters.table import parameter
-from t3mpc_ros.robot.description import FrameNames, fixed_frames
+from t3mpc_ros.robot.description import FrameNames
 from t3mpc_ros.robot.interface import BatteryReading, ImuSample, RobotState
 from t3mpc_ros.robot.sensor_conversions import (
     GRAVITY,
@@ -91,149 +88,6 @@ class RobotDescription(NamedTuple):
     """None: wheel encoders only."""
     truth_frame: str = ''
     """Frame of ground_truth/odom; empty: no ground truth."""
-
-
-class RobotPublishers:
-    """Publishes each robot state as odometry, joint states, sensor messages and a transform."""
-
-    def __init__(
-        self, node: Node, parameters: RobotTopicParameters, robot: RobotDescription
-    ) -> None:
-        self._node = node
-        self._published = 0
-        self._namespace = node.get_namespace()
-        self._topic_parameters = parameters
-        base = self._frame(parameters.base_frame_id)
-        odom = self._frame(parameters.odom_frame_id)
-        self._odom = conversions.SerializedOdometry(odom, base)
-        self._odom_publisher = node.create_publisher(Odometry, 'odom', qos.STREAM)
-        if robot.truth_frame:
-            self._truth = conversions.SerializedOdometry(robot.truth_frame, base)
-            self._truth_publisher = node.create_publisher(
-                Odometry, 'ground_truth/odom', qos.STREAM
-            )
-        self._joint_publisher = node.create_publisher(JointState, 'joint_states', qos.SCALARS)
-        self._broadcaster = (
-            self._make_broadcaster('TransformBroadcaster') if parameters.enable_odom_tf else None
-        )
-        self._has_sensors = robot.sensors is not None
-        if robot.sensors is not None:
-            imu, range_sensor, battery = robot.sensors
-            self._imu_publisher = node.create_publisher(Imu, 'imu/data_raw', qos.STREAM)
-            self._battery_publisher = node.create_publisher(
-                BatteryState, 'battery_state', qos.SCALARS
-            )
-            self._battery_message = battery_message(battery)
-            self._ranges = [
-                (
-                    node.create_publisher(Range, f'range/{name}', qos.SCALARS),
-                    range_message(
-                        range_sensor,
-                        self._frame(parameters.frame_names.range_sensor(name)),
-                    ),
-                )
-                for name in (RANGE_SENSORS if parameters.range_rate else ())
-            ]
-            if parameters.enable_static_tf:
-                self._publish_fixed_frames(robot.geometry, range_sensor)
-        self.configure(parameters, robot)
-
-    def configure(self, parameters: RobotTopicParameters, robot: RobotDescription) -> None:
-        """Apply parameters and recompute the covariances."""
-        self._topic_parameters, self._rate = parameters, robot.rate
-        if robot.sensors is not None:
-            imu = robot.sensors[0]
-            self._imu_message = imu_message(imu, self._frame(parameters.imu_frame_id))
-        self._twist_covariances = {
-            slipping: twist_covariance(robot.geometry, math.inf if slipping else robot.variance)
-            for slipping in (False, True)
-        }
-        self._slipping: bool | None = None
-
-    def _frame(self, name: str) -> str:
-        return self._topic_parameters.prefixed(name, self._namespace)
-
-    def publish(self, state: RobotState) -> None:
-        """Publish one state, each topic at its rate."""
-        self._publish_motion(state)
-        if self._has_sensors:
-            self._publish_sensors(state)
-        self._published += 1
-
-    def _publish_motion(self, state: RobotState) -> None:
-        parameters = self._topic_parameters
-        self._odom.set_pose_covariance(
-            conversions.planar_covariance(state.covariance, conversions.MIN_POSE_VARIANCE)
-        )
-        if state.status.slipping is not self._slipping:
-            self._slipping = state.status.slipping
-            self._odom.set_twist_covariance(self._twist_covariances[self._slipping])
-        self._odom_publisher.publish(self._odom.with_state(state.odometry))
-        if state.truth is not None:
-            self._truth_publisher.publish(self._truth.with_state(state.truth))
-        if self._broadcaster is not None:
-            stamp_ns, pose, _ = state.odometry
-            self._broadcaster.sendTransform(
-                conversions.transform(stamp_ns, pose, self._odom.frame, self._odom.child)
-            )
-        if self._is_due(parameters.joint_rate):
-            names = parameters.right_wheel_name, parameters.left_wheel_name
-            self._joint_publisher.publish(
-                conversions.joint_state(names, state.angles, state.wheels, state.stamp_ns)
-            )
-
-    def _publish_sensors(self, state: RobotState) -> None:
-        parameters = self._topic_parameters
-        if state.imu is not None:
-            self._imu_publisher.publish(fill_imu(self._imu_message, state.imu, state.stamp_ns))
-        if self._is_due(parameters.range_rate):
-            infinity = parameters.range_infinity
-            for (publisher, message), distance in zip(self._ranges, state.ranges, strict=False):
-                if not math.isnan(distance):
-                    publisher.publish(
-                        fill_range(message, distance, state.stamp_ns, infinity=infinity)
-                    )
-        if state.battery is not None and self._is_due(BATTERY_RATE):
-            self._battery_publisher.publish(
-                fill_battery(self._battery_message, state.battery, state.stamp_ns)
-            )
-
-    def _is_due(self, rate: float) -> bool:
-        """Return whether a topic of ``rate`` (Hz) is published with the present state."""
-        return rate > 0.0 and self._published % max(1, round(self._rate / rate)) == 0
-
-    def _publish_fixed_frames(
-        self, geometry: WheelGeometry, range_sensor: RangeSensorParameters
-    ) -> None:
-        """Publish the transforms of the sensors once; the topic is latched."""
-        self._static_broadcaster = self._make_broadcaster('StaticTransformBroadcaster')
-        if self._static_broadcaster is None:
-            return
-        names = self._topic_parameters.frame_names
-        base = self._frame(names.base)
-        stamp_ns = self._node.get_clock().now().nanoseconds
-        self._static_broadcaster.sendTransform(
-            [
-                conversions.transform(
-                    stamp_ns,
-                    Pose(frame.x, frame.y, frame.yaw),
-                    base,
-                    self._frame(frame.name),
-                    frame.z,
-                )
-                for frame in fixed_frames(names, geometry, range_sensor)
-            ]
-        )
-
-    def _make_broadcaster(self, kind: str) -> Any:
-        try:
-            import tf2_ros
-        except ImportError:
-            self._node.get_logger().info(
-                'tf2_ros is not installed: no transform is published', once=True
-            )
-            return None
-        return getattr(tf2_ros, kind)(self._node)
 
 
 def imu_message(parameters: ImuParameters, frame: str) -> Imu:

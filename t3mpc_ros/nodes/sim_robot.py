@@ -197,7 +197,7 @@ class SimRobotNode(RobotNode[SimRobotParameters]):
             self._state = state = self._robot.advance(stamp_ns)
             if self._simulated_time is not None:
                 self._publish_clock()
-            self._robot_publishers.publish(state)
+            self.publish_state(state)
             self._log_reason(state.reason)
 
     def _publish_clock(self) -> None:

@@ -110,7 +110,7 @@ def difference(one, other):
 
 DYNAMIC = [name for name in NODES if any(each.dynamic for each in parameter_class(name).specs())]
 PREDICTIVE = '_controller._tracker.law.predictive'
-SERIALIZED = '_robot_publishers._truth', '_robot_publishers._odom.'
+SERIALIZED = '_truth', '_odom.'
 """Serialized messages have padding of any value."""
 KEPT = {
     'controller': (

@@ -58,13 +58,13 @@ def change(harness, node, **values):
 def published_states(node):
     """Return a list of the last and all following states of a robot."""
     states = [] if node._state is None else [node._state]
-    publish = node._robot_publishers.publish
+    publish = node.publish_state
 
     def note(state):
         states.append(state)
         publish(state)
 
-    node._robot_publishers.publish = note
+    node.publish_state = note
     return states
 
 
