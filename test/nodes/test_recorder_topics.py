@@ -19,6 +19,7 @@ from support.ros_graph import (
     record,
     twist,
 )
+from support.waiting import wait_for_acknowledgement
 from visualization_msgs.msg import Marker
 
 from t3mpc_ros.bag.reader import open_bag
@@ -27,6 +28,7 @@ from t3mpc_ros.bag.writer import BagWriter, DiskError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.base_node import ERROR, OK
 from t3mpc_ros.nodes.controller import ControllerNode
+from t3mpc_ros.nodes.recorder.node import TAKE_PERIOD
 from t3mpc_ros.nodes.recorder.subscriptions import FULL_DISCOVERY, TopicSubscriptions
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
@@ -61,18 +63,25 @@ def test_best_effort_publishers_are_recorded(harness, tmp_path):
     strong = harness.connected_publisher(Odometry, 'odom')
     strong.publish(odometry(NANOSECONDS, 0.25))
     _count(harness, recorder, 1)
+    # What waits when the subscription is replaced is not lost.
+    period_ns = round(TAKE_PERIOD * NANOSECONDS)
+    (taking,) = (each for each in recorder.timers if each.timer_period_ns == period_ns)
+    taking.cancel()
+    strong.publish(odometry(NANOSECONDS, 0.25))
+    wait_for_acknowledgement(strong)
     weak = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
     publishers = [harness.create_publisher(Odometry, name, weak) for name in ('odom', 'other')]
     for publisher in (*publishers, strong):
         harness.wait_for_subscriber(publisher)
         publisher.publish(odometry(NANOSECONDS, 0.5))
-    _count(harness, recorder, 4)
+    taking.reset()
+    _count(harness, recorder, 5)
     harness.remove(recorder)
     with open_bag(tmp_path) as recording:
         counts = {name: topic.message_count for name, topic in recording.topics.items()}
-        assert counts == {'/odom': 3, '/other': 1}
+        assert counts == {'/odom': 4, '/other': 1}
         velocity = recording.series('/odom', {'v': 'twist.twist.linear.x'})['v']
-        assert velocity.tolist() == [0.25, 0.5, 0.5]
+        assert velocity.tolist() == [0.25, 0.25, 0.5, 0.5]
 
 
 @pytest.mark.parametrize('changes', [False, True])
