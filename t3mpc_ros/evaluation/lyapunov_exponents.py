@@ -26,20 +26,10 @@ def lyapunov_exponents(
     Gram-Schmidt); an exponent is the mean logarithmic growth of its diagonal entry of R. Their
     sum is the mean divergence of the flow: for (85) with E6 at order 1 the trace -38.
 
-    Parameters
-    ----------
-    system
-        Every order must be 1: a fractional system has no flow on its state alone.
-    initial
-        Shape (d,); ones by default.
-    duration
-        Seconds averaged over, after ``settle`` seconds to land on the attractor. For (85) 400 s
-        give the first exponent within 0.1 and the second within 0.2; 10 000 s give 2.29, 0.62,
-        0.00 and -40.92.
-    step
-        s.
-    interval
-        Steps between two orthonormalisations; short enough that vectors stay independent.
+    Every order must be 1: a fractional system has no flow on its state alone. ``initial``, shape
+    (d,), is ones by default; the average is over ``duration`` after ``settle``, to land on the
+    attractor, with steps of ``step``, all in s. For (85) 400 s give the first exponent within 0.1
+    and the second within 0.2; 10 000 s give 2.29, 0.62, 0.00 and -40.92.
     """
     if any(order != 1.0 for order in system.orders):
         raise ValueError(f'orders must all be 1: got {system.orders}')

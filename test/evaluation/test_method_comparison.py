@@ -186,6 +186,8 @@ def test_methods_are_paired():
     assert np.array_equal(mine.reference, other.reference)
     still = mine.rows(0.0, mine.start)
     assert np.array_equal(mine['measured'][still], other['measured'][still])
+    assert all(mine.driver_reasons[still])
+    assert not any(mine.driver_reasons[still.stop :])
     assert scenario.true_robot().noise.variance == 0.04
     _, another = twin('dropouts', seed=202)
     assert not np.array_equal(mine.reference, another.reference)
