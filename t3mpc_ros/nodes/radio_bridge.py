@@ -20,6 +20,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.robot_node import RobotNode
 from t3mpc_ros.nodes.robot_topics import (
+    FOLLOWING,
     RobotDescription,
     RobotTopicParameters,
     count_variance,
@@ -210,15 +211,12 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
             return ERROR, state.reason or link_state.value, values
         if quality.level is DiagnosticLevel.ERROR:
             return ERROR, quality.text, values
-        if problem := self._command_type_problem():
-            return WARN, problem, values
         found = [*state_warnings(state, command_problem=self._command_problem)]
-        if quality.text:
-            found.append(quality.text)
+        found += filter(None, (self._command_type_problem(), quality.text))
         if found:
             return WARN, '; '.join(found), values
         suffix = '' if authenticated else ', unauthenticated'
-        return OK, f'following commands{suffix}', values
+        return OK, f'{FOLLOWING}{suffix}', values
 
     def on_shutdown(self) -> None:
         """Stop the robot: three standstill commands, then disable its drives."""

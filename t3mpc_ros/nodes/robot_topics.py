@@ -202,6 +202,10 @@ def _diagonal(x: float, y: float, z: float) -> list[float]:
     return [x, 0.0, 0.0, 0.0, y, 0.0, 0.0, 0.0, z]
 
 
+FOLLOWING = 'following commands'
+"""Report of a robot with which nothing is wrong."""
+
+
 def state_warnings(
     state: RobotState, twin: TwinDiagnostics | None = None, command_problem: str = ''
 ) -> tuple[str, ...]:
@@ -230,7 +234,7 @@ def state_warnings(
 
 def state_values(state: RobotState, twin: TwinDiagnostics | None = None) -> Mapping[str, object]:
     """Return the status and the measured quantities of a robot state by diagnostic key."""
-    found: dict[str, object] = {**state.status._asdict()}
+    found: dict[str, object] = {'standstill': state.reason, **state.status._asdict()}
     if state.battery is not None:
         found['battery_v'] = state.battery.voltage
     if state.lost_steps is not None:

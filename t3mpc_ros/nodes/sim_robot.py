@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """``ros2 run t3mpc_ros sim_robot``: simulated robot with topics and services of the real one."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,7 @@ from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN
 from t3mpc_ros.nodes.robot_node import RobotNode
 from t3mpc_ros.nodes.robot_topics import (
+    FOLLOWING,
     RobotDescription,
     RobotTopicParameters,
     count_variance,
@@ -126,6 +127,7 @@ class SimRobotNode(RobotNode[SimRobotParameters]):
             raise ParameterError(f'initial_pose.x and initial_pose.y: {error}') from error
         robot.warm_up()  # compile here, not within a step
         self._scheduler = SampleScheduler(parameters.rate, slack=0.2 / parameters.rate)
+        self._reported_skipped = 0
         self._simulated_time = (
             SimulatedTime(parameters.rate, parameters.real_time_factor)
             if parameters.publish_clock
@@ -242,16 +244,20 @@ class SimRobotNode(RobotNode[SimRobotParameters]):
         values |= state_values(state, twin)
         if state.status.estop:
             return ERROR, state.reason, values
+        found = [*state_warnings(state, twin, self._command_problem), *self._host_warnings()]
+        return (WARN, '; '.join(found), values) if found else (OK, FOLLOWING, values)
+
+    def _host_warnings(self) -> Iterator[str]:
+        """Yield what is wrong outside of the robot now: it never hides why the robot stands."""
         if problem := self._command_type_problem():
-            return WARN, problem, values
+            yield problem
         if overload := self._overload():
-            return WARN, f'processor overloaded: {overload}', values
-        if found := state_warnings(state, twin, self._command_problem):
-            return WARN, '; '.join(found), values
-        return OK, 'following commands', values
+            yield f'processor overloaded: {overload}'
 
     def _overload(self) -> str:
-        if self._scheduler.skipped:
+        """Return how the processor is overloaded since the last report; '' if it is not."""
+        skipped, self._reported_skipped = self._reported_skipped, self._scheduler.skipped
+        if self._scheduler.skipped > skipped:
             return 'samples were skipped'
         time, factor = self._simulated_time, self._real_time_factor.value
         if (

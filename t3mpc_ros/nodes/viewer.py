@@ -223,9 +223,11 @@ class ViewNode(Node):
             if namespace != prefix or name not in LOOP_NODES:
                 continue
             level = int.from_bytes(status.level, 'little')
-            condition = _stop_condition(name, status.message) or _CONDITIONS[min(level, 2)]
-            self._sink.node_report(name, status.message, condition)
             values = {each.key: each.value for each in status.values}
+            condition = _stop_condition(name, status.message) or _CONDITIONS[min(level, 2)]
+            if values.get('standstill'):
+                condition = 'stopped'
+            self._sink.node_report(name, status.message, condition)
             if name in ROBOTS:
                 self._on_faults(values.get('faults', 'none'))
 

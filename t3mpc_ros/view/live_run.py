@@ -12,6 +12,8 @@ Condition = Literal['normal', 'warning', 'stopped']
 
 LOST = 1.5
 """Time without odometry after which the connection counts as lost, s."""
+ROBOTS = ('sim_robot', 'radio_bridge')
+"""Nodes that are a robot."""
 ESTOP = 'emergency stop'
 """Begin of the reason of a robot whose e-stop is latched."""
 
@@ -39,9 +41,11 @@ def banner(reports: Mapping[str, NodeReport], odometry_age: float | None) -> Ban
     """Return what a person has to know first.
 
     ``reports`` are the newest ones of the nodes; ``odometry_age`` is the time since the last
-    odometry, s, None before the first one.
+    odometry, s, None before the first one. The reason of the robot stands before those of the
+    other nodes: theirs often follow from it.
     """
-    worse = {name: each for name, each in reports.items() if each.condition != 'normal'}
+    order = sorted(reports, key=lambda name: name not in ROBOTS)
+    worse = {name: reports[name] for name in order if reports[name].condition != 'normal'}
     stops = {name: each for name, each in worse.items() if each.condition == 'stopped'}
     detail = '; '.join(f'{name}: {each.text}' for name, each in (stops or worse).items())
     if odometry_age is None:

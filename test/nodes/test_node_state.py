@@ -32,6 +32,7 @@ from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.statistics import DiagnosticLevel
 from t3mpc_ros.robot.interface import BatteryReading
+from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 
 pytestmark = pytest.mark.ros
 
@@ -324,6 +325,13 @@ def test_levels_of_the_simulated_robot(start):
     node._scheduler = Instead(node._scheduler, skipped=1)
     text = 'processor overloaded: samples were skipped'
     assert report(node) == (WARN, text)
+    # One skipped sample is no warning for ever, and never hides why the robot stands.
+    assert report(node) == (OK, 'following commands')
+    node._scheduler = Instead(node._scheduler, skipped=2)
+    node._state = node._state._replace(reason=SLIP_STOP_REASON)
+    assert report(node) == (WARN, f'{SLIP_STOP_REASON}; {text}')
+    values = dict(node.produce_diagnostics()[2])
+    assert values['standstill'] == SLIP_STOP_REASON
 
 
 def test_levels_of_the_radio_bridge(start):

@@ -7,6 +7,7 @@ import time
 import pytest
 from support.ros_graph import CommandSource, twist
 
+from t3mpc_ros.nodes.base_node import WARN
 from t3mpc_ros.nodes.remote_parameters import parameter_row
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
 from t3mpc_ros.nodes.viewer import CommandFailedError, ViewNode
@@ -92,6 +93,21 @@ def test_the_e_stop_latches_and_is_shown(viewer, robot):
     viewer.spin_until(lambda: viewer.facts()['banner']['headline'] != 'E-STOP')
     texts = [event['text'] for event in viewer.changes()['events']]
     assert {'e_stop on: latched', 'e_stop off: released'} <= set(texts)
+
+
+def test_a_robot_that_stands_latched_is_no_driving_robot(viewer, robot, harness):
+    """A blocked wheel was shown as *Driving, with a warning*, its reason hidden by another one."""
+    robot.produce_diagnostics = lambda: (
+        WARN,
+        'a wheel slips; processor overloaded: samples were skipped',
+        {'standstill': 'a wheel slips'},
+    )
+
+    def shown():
+        banner = viewer.facts()['banner']
+        return banner['headline'] == 'Stopped' and 'sim_robot: a wheel slips' in banner['detail']
+
+    viewer.spin_until(shown)
 
 
 def test_a_parameter_is_set_and_its_change_is_shown(viewer, robot, harness):

@@ -109,6 +109,15 @@ ESTOP = NodeReport('emergency stop: requested by service e_stop', 'stopped')
             0.1,
             ('stopped', 'Stopped', 'controller: no odometry'),
         ),
+        # A robot that stands for its own reason is stopped, whatever its level; that comes first.
+        (
+            {
+                'controller': NodeReport('no odometry', 'stopped'),
+                'sim_robot': NodeReport('a wheel slips', 'stopped'),
+            },
+            0.1,
+            ('stopped', 'Stopped', 'sim_robot: a wheel slips; controller: no odometry'),
+        ),
         # What follows from the stop is not its reason.
         (
             {'controller': NodeReport('does not follow', 'warning'), 'sim_robot': ESTOP},
