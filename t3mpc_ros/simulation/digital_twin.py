@@ -122,7 +122,7 @@ class DigitalTwinParameters(PaperRobotParameters):
             super().check_consistency()
             return
         load = self.load_with_faults(self.faults)
-        fastest = max_rate(self.motor, load, self.bumper, self.friction_factor)
+        fastest = max_rate(self.motor, load, self.bumper)
         if self.step * fastest > STABILITY_LIMIT:
             raise ParameterError(
                 f'substep must be at most {STABILITY_LIMIT / fastest:.2g} s with this motor, '

@@ -206,13 +206,10 @@ class FaultSchedule:
         after = bisect_right(self._changes, elapsed)
         self._since = self._changes[after - 1] if after > 0 else -math.inf
         self._until = self._changes[after] if after < len(self._changes) else math.inf
-        self._scripted = self._scripted_at(elapsed)
-        self._dynamic = None
-
-    def _scripted_at(self, elapsed: float) -> dict[str, Value]:
-        return {
+        self._scripted = {
             event.fault: event.value for start, end, event in self._spans if start <= elapsed < end
         }
+        self._dynamic = None
 
 
 def load_schedule(name_or_path: str | Path) -> FaultSchedule:

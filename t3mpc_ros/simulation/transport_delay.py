@@ -4,7 +4,6 @@
 
 import heapq
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,28 +14,13 @@ CAPACITY = 1000
 """Commands in transit at most: 2 s at 500 Hz."""
 
 
-class TransportCounts(NamedTuple):
-    """Number of commands by outcome.
-
-    ``sent`` is the sum of the others and of the commands in transit.
-    """
-
-    sent: int
-    arrived: int
-    lost: int
-    """At random."""
-    dropped: int
-    """The oldest commands beyond the capacity."""
-    cleared: int
-    """Those in transit when the delay was cleared, or its clock jumped back."""
-
-
 class TransportDelay:
     """Delays, reorders and loses commands; it never changes, duplicates or creates one.
 
     All times are those of one clock. When it jumps back, the commands in transit are dropped,
-    because their arrival time is undefined. Two numbers of its own generator are drawn for
-    each command whatever its outcome, so that a change of loss does not shift the delays.
+    because their arrival time is undefined; beyond :data:`CAPACITY` the oldest is dropped. Two
+    numbers of its own generator are drawn for each command whatever its outcome, so that a change
+    of loss does not shift the delays.
     """
 
     def __init__(self, generator: np.random.Generator) -> None:
@@ -44,7 +28,7 @@ class TransportDelay:
         self._in_transit: list[tuple[int, int, RobotCommand]] = []
         """A heap of (arrival, number, command); the number keeps ties in the order of sending."""
         self._clock_ns: int | None = None
-        self._sent = self._arrived = self._lost = self._dropped = self._cleared = 0
+        self._sent = 0
 
     def __len__(self) -> int:
         """Number of commands in transit."""
@@ -54,11 +38,6 @@ class TransportDelay:
     def next_ns(self) -> int | None:
         """Arrival time of the next command; None when none is in transit."""
         return self._in_transit[0][0] if self._in_transit else None
-
-    @property
-    def counts(self) -> TransportCounts:
-        """Number of commands by outcome so far."""
-        return TransportCounts(self._sent, self._arrived, self._lost, self._dropped, self._cleared)
 
     def send(
         self, command: RobotCommand, now_ns: int, delay_s: float, jitter_s: float, loss: float
@@ -78,11 +57,11 @@ class TransportDelay:
         loss_number, jitter_number = self._generator.random(), self._generator.random()
         self._sent += 1
         if loss_number < loss:
-            self._lost += 1
             return
         arrival_ns = now_ns + round((delay_s + jitter_s * jitter_number) * NANOSECONDS)
         if len(self._in_transit) >= CAPACITY:
-            self._drop_oldest()
+            self._in_transit.remove(min(self._in_transit, key=lambda entry: entry[1]))
+            heapq.heapify(self._in_transit)
         heapq.heappush(self._in_transit, (arrival_ns, self._sent, command))
 
     def arrived(self, now_ns: int) -> list[RobotCommand]:
@@ -94,19 +73,11 @@ class TransportDelay:
         commands = []
         while self._in_transit and self._in_transit[0][0] <= now_ns:
             commands.append(heapq.heappop(self._in_transit)[2])
-        self._arrived += len(commands)
         return commands
 
     def clear(self) -> None:
         """Drop the commands in transit, as a restart of the board does."""
-        self._cleared += len(self._in_transit)
         self._in_transit.clear()
-
-    def _drop_oldest(self) -> None:
-        oldest = min(self._in_transit, key=lambda entry: entry[1])
-        self._in_transit.remove(oldest)
-        heapq.heapify(self._in_transit)
-        self._dropped += 1
 
     def _check_clock(self, now_ns: int) -> None:
         if self._clock_ns is not None and now_ns < self._clock_ns:

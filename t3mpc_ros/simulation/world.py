@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -39,19 +39,6 @@ JOIN_TOLERANCE = 1e-4
 
 class WorldError(ValueError):
     """An invalid world; the text contains the file, the entry, the bound and the value."""
-
-
-class BoundingBox(NamedTuple):
-    """Smallest axis-aligned rectangle around all obstacles and patches."""
-
-    left: float
-    """m"""
-    bottom: float
-    """m"""
-    right: float
-    """m"""
-    top: float
-    """m"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,16 +83,14 @@ class World:
         inside = (2.0 * abs(along) <= self.boxes[:, 2]) & (2.0 * abs(across) <= self.boxes[:, 3])
         return not inside.any()
 
-    @property
-    def bounding_box(self) -> BoundingBox:
-        """Bounding box of all obstacles and patches; all zero for an empty world."""
+    def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Return the smallest and the largest x and y (m) of obstacles and patches, if any."""
         discs = np.vstack([self.circles, self.patches[:, :3]])
         corners = [self.segments.reshape(-1, 2)]
         corners += [discs[:, :2] + side * discs[:, 2:] for side in (-1.0, 1.0)]
         points = np.vstack(corners)
-        if not len(points):
-            return BoundingBox(0.0, 0.0, 0.0, 0.0)
-        return BoundingBox(*points.min(axis=0).tolist(), *points.max(axis=0).tolist())
+        low, high = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+        return (low[0], low[1]), (high[0], high[1])
 
 
 def recorded_world(name: str) -> World | None:

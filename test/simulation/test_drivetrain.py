@@ -326,7 +326,7 @@ def test_acceleration_is_limited_by_grip():
     for _ in range(30):
         robot.run(WheelSpeeds(12.0, 12.0), 120.0, VOLTS, calm(), 10)
     assert robot.lost_steps == (0, 0)
-    assert robot.sliding == (True, True)
+    assert np.all(np.array(robot.wheels) > robot.ground)  # both tyres slide
     expected = 0.1 * 9.81 * 0.3  # v = mu g t
     assert RADIUS * robot.ground.right == pytest.approx(expected, rel=0.02)
     assert robot.slid[0] > 0.05

@@ -85,13 +85,7 @@ def test_every_command_is_delivered_once_lost_or_in_transit():
                 assert transport.next_ns is None or transport.next_ns > now_ns
             last_ns = now_ns
         assert arrived <= sent  # as multisets: nothing created, changed or duplicated
-        counts = transport.counts
-        assert counts.sent == sent.total()
-        assert counts.arrived == arrived.total() > 20
-        assert counts.lost > 20
-        assert counts.sent == (
-            counts.arrived + counts.lost + counts.dropped + counts.cleared + len(transport)
-        )
+        assert arrived.total() > 20
 
 
 @pytest.mark.parametrize('loss', [0.01, 0.2, 0.7])
@@ -100,10 +94,8 @@ def test_losses_have_the_set_rate_and_are_independent(loss):
     transport, count = make_transport(2), 20_000
     lost = []
     for number in range(count):
-        before = transport.counts.lost
         transport.send(command(0), number, 0.0, 0.0, loss)
-        transport.arrived(number)
-        lost.append(transport.counts.lost > before)
+        lost.append(not transport.arrived(number))
     assert abs(sum(lost) - count * loss) < 4.0 * math.sqrt(count * loss * (1.0 - loss))
     twice = sum(one and other for one, other in zip(lost[::2], lost[1::2], strict=True))
     pairs, both = count // 2, loss * loss
@@ -151,13 +143,13 @@ def test_backward_time_jump_clears_the_queue():
         transport.send(command(1), 100, 1.0, 0.0, 0.0)
         ask(transport)
         assert transport.next_ns is None
-        assert transport.counts.cleared == 1
+        assert len(transport) == 0
         transport.send(command(3), 60, 0.0, 0.0, 0.0)  # and it continues from there
         assert transport.arrived(60) == [command(3)]
 
 
 @pytest.mark.slow
-def test_full_queue_drops_and_counts_the_oldest():
+def test_full_queue_drops_the_oldest():
     transport = make_transport(6)
     for number in range(3 * CAPACITY):
         transport.send(command(number, number), 0, 0.5, 0.5, 0.0)
@@ -167,7 +159,6 @@ def test_full_queue_drops_and_counts_the_oldest():
         (one,) = transport.arrived(instant)  # each at its own instant
         came.append(one)
     assert sorted(one.stamp_ns for one in came) == list(range(2 * CAPACITY, 3 * CAPACITY))
-    assert transport.counts == (3 * CAPACITY, CAPACITY, 0, 2 * CAPACITY, 0)
 
 
 @pytest.mark.parametrize(
@@ -185,4 +176,4 @@ def test_invalid_delay_or_loss_is_rejected(delay, jitter, loss):
     transport = make_transport()
     with pytest.raises(ValueError, match='must be'):
         transport.send(command(1), 0, delay, jitter, loss)
-    assert transport.counts.sent == 0
+    assert len(transport) == 0

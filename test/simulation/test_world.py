@@ -47,7 +47,7 @@ def test_documented_example_is_a_valid_world():
     assert world.segments.shape == (4 + 1 + 1 + 8, 4)
     assert world.circles.tolist() == [[-0.6, 0.9, 0.12]]
     assert world.patches.tolist() == [[0.4, -0.6, 0.3, 0.2]]
-    assert world.bounding_box == (-1.5, -1.0, 2.5, 2.0)
+    assert world.bounds() == ((-1.5, -1.0), (2.5, 2.0))
     assert world.is_free(0.0, 0.0, BUMPER)
     assert grip_at(0.4, -0.5, world.patches) == 0.2
     # Along the yaw of the first box its end is half its length away, across half its width.
@@ -79,15 +79,15 @@ def test_bundled_world_loads_and_is_free_at_the_origin(name):
         assert array.shape[1] == width
         assert array.dtype == np.float64
         assert array.flags.c_contiguous
-    left, bottom, right, top = world.bounding_box
+    across = math.dist(*world.bounds())
     for direction in np.linspace(-3.0, 3.0, 500).tolist():  # it is closed
         ray = cast_ray(0.0, 0.0, direction, world.segments, world.circles)
-        assert ray < math.hypot(right - left, top - bottom)
+        assert ray < across
 
 
 def test_room_has_the_documented_size_and_objects():
     world = load_world('room')
-    assert world.bounding_box == (-2.0, -1.5, 2.0, 1.5)
+    assert world.bounds() == ((-2.0, -1.5), (2.0, 1.5))
     assert [len(a) for a in (world.segments, world.boxes, world.circles, world.patches)] == [
         12,
         2,
@@ -102,7 +102,6 @@ def test_empty_name_is_the_empty_plain():
     assert world.circles.shape == (0, 3)
     assert world.patches.shape == (0, 4)
     assert world.is_free(1e6, -1e6, 100.0)
-    assert world.bounding_box == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_file_loads_by_path_and_is_named_after_it(tmp_path, monkeypatch):
@@ -112,7 +111,7 @@ def test_file_loads_by_path_and_is_named_after_it(tmp_path, monkeypatch):
         world = load_world(given)
         assert world.name == 'yard'
         assert world.circles.tolist() == [[1.0, 2.0, 0.5]]
-        assert world.bounding_box == (0.5, 1.5, 1.5, 2.5)
+        assert world.bounds() == ((0.5, 1.5), (1.5, 2.5))
     # A local file does not hide a bundled world, nor vice versa.
     monkeypatch.chdir(tmp_path)
     shutil.copy(path, 'room')

@@ -434,7 +434,7 @@ def drive_transport(delay, r):
         command = RobotCommand(WheelSpeeds(float(k), 0.0), now)
         delay.send(command, now, r.choice((0.0, 0.05, 20.0)), 0.02, 0.2)
         if r.random() < 0.2:
-            found += [delay.arrived(now), delay.next_ns, delay.counts[:4]]
+            found += [delay.arrived(now), delay.next_ns]
     delay.send(RobotCommand(WheelSpeeds(1.0, 0.0), now), now, 1.0, 0.0, 0.0)
     return found
 
@@ -578,7 +578,7 @@ def all_of(thing: object, *without: str) -> tuple[str, ...]:
     )
 
 
-COUNTS = '._arrived', '._lost', '._sent', '._dropped', '._generator'
+SENT = '._sent', '._generator'
 IMU_TUNING = '._colour', '._dt', '._walk_step'
 BODY = (
     *('._arrays.state', '._arrays.modes', '._arrays.totals', '._state', '._modes', '._now'),
@@ -870,7 +870,7 @@ FRESH = {
                 continued=(
                     *below('._drivetrain', BODY),
                     *('._imu._generator', '._channel._generator', '._channel._clock_ns'),
-                    *below('._channel', COUNTS[:3]),
+                    '._channel._sent',
                     *('._limiter._ramp', '._limiter._estop', '._limited_command'),
                     *(
                         '._odometry._pose',
@@ -882,7 +882,7 @@ FRESH = {
                     ),
                     *(f'._odometry._covariance[{k}]' for k in (0, 1, 2)),
                 ),
-                scratch=('._channel._cleared', *below('._imu', IMU_TUNING)),
+                scratch=below('._imu', IMU_TUNING),
             ),
         },
     ),
@@ -890,12 +890,8 @@ FRESH = {
         lambda: TransportDelay(np.random.default_rng(1)),
         drive_transport,
         {
-            'clear': Operation(
-                lambda d: d.clear(), kept=('._clock_ns', *COUNTS), scratch=('._cleared',)
-            ),
-            'jump back': Operation(
-                lambda d: (d.arrived(-1), d.arrived(-2)), kept=COUNTS, scratch=('._cleared',)
-            ),
+            'clear': Operation(lambda d: d.clear(), kept=('._clock_ns', *SENT)),
+            'jump back': Operation(lambda d: (d.arrived(-1), d.arrived(-2)), kept=SENT),
         },
     ),
     FaultSchedule: Stateful(
@@ -985,7 +981,7 @@ LATE = (
     '*._signals.bound',  # with the next torque
     '*._ramp.rate',  # with the next command
     *('*._dt', '*._colour', '*._walk_step'),  # with the next measurement
-    *('*._voltage', '._supply', '._reports'),  # with the next draw, and the next report
+    *('*.voltage', '._supply', '._reports'),  # with the next draw, and the next report
 )
 
 

@@ -100,8 +100,7 @@ def _grid(run: Run, x: Array, y: Array) -> tuple[CoverageGrid, str]:
     """Return the grid over the known room, else over what the robot drove, and which it is."""
     world = recorded_world(run.world) if run.measured == TRUTH else None
     if world is not None and len(world.segments):
-        box = world.bounding_box
-        grid = CoverageGrid((box.left, box.bottom), (box.right, box.top))
+        grid = CoverageGrid(*world.bounds())
         centres = grid.centres().tolist()
         blocked = np.array([[not world.is_free(a, b, BODY) for a, b in row] for row in centres])
         if not blocked.all():

@@ -129,17 +129,14 @@ class Drivetrain:
             work=np.zeros((4, 9)),
         )
         self._state, self._modes, self._field = self._arrays[:3]
+        self.filtered = self._arrays.filtered
+        """Both stages of the IMU filter for yaw rate, forward and sideways acceleration."""
         self._integrate_steps = TypedKernel(integrate_drivetrain)
         self._blocked = (False, False)
         self._multipliers = (1.0, 1.0)
         self._read()
 
     # -- state ------------------------------------------------------------------------------------
-
-    @property
-    def filtered(self) -> Array:
-        """Both stages of the IMU filter for yaw rate, forward and sideways acceleration."""
-        return self._arrays.filtered
 
     @property
     def pose(self) -> Pose:
@@ -209,18 +206,13 @@ class Drivetrain:
         """Largest contact force (N) of a wall so far."""
         return float(self._arrays.totals[3])
 
-    @property
-    def sliding(self) -> tuple[bool, bool]:
-        """Whether each tyre slides, right first."""
-        right, left = self._modes.tolist()
-        return right != ROLLING, left != ROLLING
-
     # -- inputs -----------------------------------------------------------------------------------
 
     def load(self, motor: StepperMotorParameters, load: Load) -> None:
         """Set motor and load from now on."""
+        body = load.body
         self._constants = DrivetrainConstants(
-            body_constants(load.body, load.geometry),
+            body_constants(body, load.geometry),
             friction_constants(load.friction, load.friction_factor),
             self._bumper.constants(),
             motor.constants(),
@@ -229,9 +221,9 @@ class Drivetrain:
             self.step,
             *load.radius_multipliers,
         )
-        weight = GRAVITY * load.body.total_mass * load.tyres.load_share
+        weight = GRAVITY * body.total_mass * load.tyres.load_share
         self._grip = 0.5 * load.tyres.grip * weight * load.grip_factor
-        own = load.body.wheel_inertia + motor.rotor_inertia
+        own = body.wheel_inertia + motor.rotor_inertia
         self._multipliers = right, left = load.radius_multipliers
         self._tyres: Array = np.array([own / right**2, own / left**2, self._grip, self._grip])
         for wheel, (was, now) in enumerate(zip(self._blocked, load.blocked, strict=True)):
@@ -324,9 +316,7 @@ class Drivetrain:
             self._now[2] = self._state[2] = wrap_angle(self._now[2])
 
 
-def max_rate(
-    motor: StepperMotorParameters, load: Load, bumper: BumperParameters, factor: float = 1.0
-) -> float:
+def max_rate(motor: StepperMotorParameters, load: Load, bumper: BumperParameters) -> float:
     """Return an upper bound (1/s) of the rates of the coupled equations.
 
     They are the oscillation of the rotor, which moves the wheel alone when the tyre slides, its
@@ -335,9 +325,8 @@ def max_rate(
     inertia = load.body.wheel_inertia + motor.rotor_inertia
     stiffness = motor.teeth * motor.torque_constant * motor.rated_current
     friction = load.friction
-    damping = motor.damping + factor * (
-        friction.viscous + friction.coulomb / friction.coulomb_width
-    )
+    steepest = friction.viscous + friction.coulomb / friction.coulomb_width
+    damping = motor.damping + load.friction_factor * steepest
     mass = load.body.total_mass
     return (
         math.sqrt(stiffness / inertia)

@@ -73,23 +73,13 @@ class SimulatedBattery:
         self.parameters = parameters
         self.charge = parameters.charge
         """Remaining charge, 0 to 1."""
-        self._low = self._collapsed = False
-        self.draw(0.0, 0.0)
-
-    @property
-    def voltage(self) -> float:
+        self.voltage = 0.0
         """Terminal voltage under the load of the last draw, V."""
-        return self._voltage
-
-    @property
-    def low(self) -> bool:
+        self.low = False
         """Whether the battery should be charged."""
-        return self._low
-
-    @property
-    def collapsed(self) -> bool:
+        self.collapsed = False
         """Whether the voltage is, or within the hysteresis was, too low for drivers and board."""
-        return self._collapsed
+        self.draw(0.0, 0.0)
 
     def draw(self, power: float, dt: float, sag: float = 0.0) -> BatteryReading:
         r"""Return voltage, current and charge after ``dt`` seconds of ``power`` (W) to the motors.
@@ -126,10 +116,8 @@ class SimulatedBattery:
                 # Empty within the step: the current is the mean over the step.
                 current = self.charge * full / dt
                 self.charge = 0.0
-        self._voltage = volts
+        self.voltage = volts
         back = parameters.hysteresis
-        self._low = volts < parameters.low_voltage + (back if self._low else 0.0)
-        self._collapsed = beyond or volts < parameters.brown_out + (
-            back if self._collapsed else 0.0
-        )
+        self.low = volts < parameters.low_voltage + (back if self.low else 0.0)
+        self.collapsed = beyond or volts < parameters.brown_out + (back if self.collapsed else 0.0)
         return BatteryReading(volts, current, self.charge)

@@ -117,18 +117,14 @@ class SimulatedImu:
         offset = self._parameters.gyro_offset * self._offset
         return (offset + self._walk) * _DEGREE + self._jump
 
-    @property
-    def counts(self) -> tuple[int, int, int]:
-        """Registers of the last measurement: yaw rate, forward and sideways acceleration."""
-        return self._counts
-
     def restart(self) -> None:
         """Power up again: draw a new zero-rate offset and clear the measurement."""
         self._offset: float = self._generator.uniform(-1.0, 1.0)
         self._walk = 0.0  # deg/s
         self._jump = 0.0  # rad/s
         self._noise = (0.0,) * 6
-        self._counts = (0, 0, 0)
+        self.counts = (0, 0, 0)
+        """Registers of the last measurement: yaw rate, forward and sideways acceleration."""
 
     def measure(self, filtered: Array, dt: float, bias_jump: float = 0.0) -> ImuSample:
         """Return the sample measured ``dt`` seconds after the last measurement.
@@ -162,7 +158,7 @@ class SimulatedImu:
         turn = round(min(max(z, _LOWEST), _HIGHEST))
         ahead = round(min(max(x, _LOWEST), _HIGHEST))
         aside = round(min(max(y, _LOWEST), _HIGHEST))
-        self._counts = turn, ahead, aside
+        self.counts = turn, ahead, aside
         return ImuSample(turn * rate_step, ahead * step, aside * step)
 
     def _tune(self, dt: float) -> None:

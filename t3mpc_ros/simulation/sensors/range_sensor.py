@@ -140,7 +140,14 @@ class SimulatedRangeSensors:
     @parameters.setter
     def parameters(self, parameters: SimulatedRangeSensorParameters) -> None:
         self._parameters = parameters
-        self._table = self._reading_per_count()
+        lowest, highest = parameters.minimum, parameters.maximum
+        self._table = [
+            _READINGS[
+                encode_range(distance_from_voltage(parameters.volts(count), lowest, highest))
+            ]
+            for count in range(parameters.adc_steps)
+        ]
+        """Reading (m) of the board for every count of its converter."""
 
     @property
     def periods(self) -> tuple[float, ...]:
@@ -182,14 +189,3 @@ class SimulatedRangeSensors:
         volts += parameters.voltage_noise * self._generator.standard_normal()
         self._counts[index] = count = parameters.count(volts)
         self._readings[index] = self._table[count]
-
-    def _reading_per_count(self) -> list[float]:
-        """Return the reading (m) of the board for every count of its converter."""
-        parameters = self._parameters
-        lowest, highest = parameters.minimum, parameters.maximum
-        return [
-            _READINGS[
-                encode_range(distance_from_voltage(parameters.volts(count), lowest, highest))
-            ]
-            for count in range(parameters.adc_steps)
-        ]
