@@ -25,7 +25,7 @@ from t3mpc_ros.parameters.table import ParameterError, find_names
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule, load_schedule
 from t3mpc_ros.simulation.plant.disturbances import MeasurementNoise
-from t3mpc_ros.simulation.plant.paper_plant import DisturbedPlant, PaperRobotParameters
+from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParameters
 from t3mpc_ros.simulation.plant_robot import (
     LinkDelay,
     NoisyPlant,
@@ -308,10 +308,10 @@ class RobotKind:
         parameters, own = scenario.true_robot(), scenario.own
         plant: Plant
         if own.noise is None:
-            plant = DisturbedPlant(parameters)
+            plant = PaperPlant(parameters)
         else:
             quiet = parameters.with_values({'noise.variance': 0.0})
-            inner = DisturbedPlant(quiet) if own.plant is None else own.plant.simulation()
+            inner = PaperPlant(quiet) if own.plant is None else own.plant.simulation()
             plant = NoisyPlant(inner, own.noise.simulation(parameters.seed))
         later = scenario.parts.later.get(scenario.robot)
         links = scenario.links

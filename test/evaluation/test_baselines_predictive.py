@@ -39,7 +39,6 @@ from t3mpc_ros.evaluation.baselines.predictive_baseline import (
     response_matrix,
     wheel_model,
 )
-from t3mpc_ros.simulation.plant.disturbances import Disturbance, DisturbanceParameters
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParameters
 
@@ -498,27 +497,20 @@ def test_period_of_the_model_is_that_of_the_simulated_robot(drive, factor):
             'drive.dead_time': 0.0,
             'drive.acceleration': 0.0,
             'disturbance.bound': 0.0,
+            'substep': PERIOD / 50,
         }
     )
     model = wheel_dynamics(_knowledge(drive, {}), factor, casadi)
     nominal = wheel_inertia(robot.body, robot.geometry)
     generator = np.random.default_rng(2)
-    disturbance = Disturbance(DisturbanceParameters(bound=0.0), generator)
     for _ in range(20):
         chi = generator.uniform(-6, 6, 2)
         command = generator.uniform(-30, 30, 2)
         told = nominal @ command if drive == 'torque' else chi + LAG * command
-        plant = PaperPlant(robot.drive, PERIOD / 50)
-        plant.load(
-            robot.drive,
-            (robot.body, robot.true_body),
-            robot.geometry,
-            robot.friction,
-            robot.friction_factor,
-        )
+        plant = PaperPlant(robot)
         plant._state[5:] = chi
         plant._arrays.limited[:] = told
-        plant.run(tuple(told), False, disturbance, 50)
+        plant.run(tuple(told), 50)
         given = command if drive == 'torque' else told
         reached = np.array(model(chi, given, np.zeros(2))[0]).ravel()
         assert reached == pytest.approx(np.array(plant.wheels), abs=5e-3)

@@ -32,7 +32,7 @@ from t3mpc_ros.evaluation.workers import JobError, WorkerPool
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
-from t3mpc_ros.simulation.plant.paper_plant import DisturbedPlant, PaperRobot, PaperRobotParameters
+from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobot, PaperRobotParameters
 
 pytestmark = pytest.mark.slow
 
@@ -138,7 +138,7 @@ def test_the_plant_of_the_loop_is_that_of_the_simulated_robot(drive, changes):
     parameters = PaperRobotParameters.from_dict({'drive.kind': drive, 'seed': 7, **changes})
     later = parameters.with_values({'mass_factor': 1.7, 'friction_factor': 0.5})
     steps, generator = 300, np.random.default_rng(1)
-    robot, plant = PaperRobot(parameters), DisturbedPlant(parameters)
+    robot, plant = PaperRobot(parameters), PaperPlant(parameters)
     state, measured = robot.advance(0), plant.measure(0.0)
     command = np.zeros(2)
     for k in range(steps):
@@ -157,9 +157,9 @@ def test_the_plant_of_the_loop_is_that_of_the_simulated_robot(drive, changes):
             state = robot.step(WheelSpeeds(*command.tolist()))
         plant.run(tuple(command.tolist()), parameters.substeps)
         measured = plant.measure(parameters.substeps * parameters.step)
-        assert plant.plant.wheels == state.true_wheels
-        assert plant.plant.pose == state.truth.pose
-    assert max(map(abs, plant.plant.wheels)) > 0.1  # it did move
+        assert plant.wheels == state.true_wheels
+        assert plant.pose == state.truth.pose
+    assert max(map(abs, plant.wheels)) > 0.1  # it did move
 
 
 # -- scenarios --------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ STILL = WheelSpeeds(0.0, 0.0)
 
 def parts_of(robot):
     """Return the random components of a robot by their class."""
-    parts = [*vars(robot).values(), *vars(getattr(robot, '_physics', robot)).values()]
+    parts = [*vars(robot).values(), *vars(getattr(robot, '_plant', robot)).values()]
     return {type(part): part for part in parts}
 
 

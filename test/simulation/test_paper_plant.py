@@ -113,13 +113,10 @@ def test_drive_limits_acceleration_with_one_factor():
         | {'drive.acceleration': 50.0, 'wheel.max_acceleration': 30.0}
         | {'wheel.stop_deceleration': 50.0, 'body.com_offset': 0.0}
     )
-    plant = PaperPlant(parameters.drive, parameters.step)
-    bodies = parameters.body, parameters.body
-    plant.load(parameters.drive, bodies, parameters.geometry, parameters.friction, 1.0)
-    calm = Disturbance(parameters.disturbance, np.random.default_rng(1))
+    plant = PaperPlant(parameters)
     wheels = []
     for _ in range(300):
-        plant.run((10.0, -5.0), False, calm, 1)
+        plant.run((10.0, -5.0), 1)
         wheels.append(plant.wheels)
     assert np.abs(np.diff(wheels, axis=0)).max() <= 50.0 * parameters.step * (1.0 + 1e-9)
     times = parameters.step * np.arange(1, 200)

@@ -163,12 +163,6 @@ class Disturbance:
         return disturbance_torque(0, time, signals), disturbance_torque(1, time, signals)
 
 
-def make_generators(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
-    """Return the random generators of the disturbance and of the noise of one robot."""
-    for_disturbance, for_noise = np.random.SeedSequence(seed).spawn(2)
-    return np.random.default_rng(for_disturbance), np.random.default_rng(for_noise)
-
-
 def reflect(value: float) -> float:
     """Return ``value`` reflected at -1 and 1 into [-1, 1]."""
     unfolded = (value + 1.0) % 4.0

@@ -28,7 +28,6 @@ from t3mpc_ros.simulation.plant.disturbances import (
     disturbance_torque,
     friction_constants,
     friction_torque,
-    make_generators,
 )
 from t3mpc_ros.simulation.plant.dynamics import (
     BodyParameters,
@@ -149,8 +148,7 @@ class PaperRobotParameters(Parameters):
 
     def check_consistency(self) -> None:
         """Raise ParameterError when the integration would be unstable, or stops too slow."""
-        bodies = self.body, self.true_body
-        fastest = max_rate(self.drive, bodies, self.geometry, self.friction, self.friction_factor)
+        fastest = max_rate(self)
         if self.step * fastest > STABILITY_LIMIT:
             raise ParameterError(
                 f'substep must be at most {STABILITY_LIMIT / fastest:.2g} s with this body, drive '
@@ -186,8 +184,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
             limiter,
         )
         self._odometry = WheelOdometry(parameters.odometry, parameters.geometry)
-        self._physics = DisturbedPlant(parameters)
-        self._plant = self._physics.plant
+        self._plant = PaperPlant(parameters)
         self._measured = interface.ZERO_WHEEL_SPEEDS
         self._torque = (0.0, 0.0)
         self._limited_command = self._limiter.advance(0, 0.0)
@@ -237,7 +234,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         parameters = self._parameters
         self._limiter.parameters = parameters.limiter
         self._odometry.parameters = parameters.odometry
-        self._physics.configure(parameters)
+        self._plant.configure(parameters)
 
     def _integrate(self, count: int) -> None:
         """Run ``count`` steps under one command."""
@@ -245,12 +242,12 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         braking = bool(self._limited_command.reason)
         torque_mode = self._parameters.drive.kind == 'torque' and not braking
         command = self._torque if torque_mode else self._limited_command.wheels
-        self._physics.run(command, count, braking=braking)
+        self._plant.run(command, count, braking=braking)
 
     def _measure(self) -> None:
         dt = (self._plant.steps_done - self._measured_at) * self._plant.step
         self._measured_at = self._plant.steps_done
-        before, now = self._measured, self._physics.measure(dt)
+        before, now = self._measured, self._plant.measure(dt)
         mean = WheelSpeeds(0.5 * (before.right + now.right), 0.5 * (before.left + now.left))
         self._odometry.update_from_speeds(mean, dt, self._parameters.noise.variance)
         self._measured = now
@@ -286,69 +283,35 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
         self._odometry.reset()
 
 
-class DisturbedPlant:
-    """The plant with its random disturbance and the noise of its measured speeds.
+class PaperPlant:
+    """Wheels, body and drive with random disturbance, and measured speeds with noise.
 
-    The physics of :class:`PaperRobot` without limiter, odometry and reports. Disturbance and noise
-    have separate random generators, which draw the same numbers whatever the parameters: changing
-    one does not shift the other.
+    The physics of :class:`PaperRobot` without limiter, odometry and reports: the arrays of
+    :func:`integrate_plant`. Disturbance and noise have separate random generators, which draw the
+    same numbers whatever the parameters: changing one does not shift the other. The dead time is
+    rounded to whole steps.
     """
 
     def __init__(self, parameters: PaperRobotParameters) -> None:
-        for_disturbance, for_noise = make_generators(parameters.seed)
-        self.plant = PaperPlant(parameters.drive, parameters.step)
-        self._disturbance = Disturbance(parameters.disturbance, for_disturbance)
-        self._noise = SpeedNoise(parameters.noise, for_noise)
-        self.configure(parameters)
-
-    @property
-    def wheels(self) -> WheelSpeeds:
-        """True wheel speeds chi."""
-        return self.plant.wheels
-
-    def configure(self, parameters: PaperRobotParameters) -> None:
-        """Continue with other dynamic parameters."""
-        self._disturbance.parameters = parameters.disturbance
-        self._noise.parameters = parameters.noise
-        self.plant.load(
-            parameters.drive,
-            (parameters.body, parameters.true_body),
-            parameters.geometry,
-            parameters.friction,
-            parameters.friction_factor,
+        for_disturbance, for_noise = np.random.SeedSequence(parameters.seed).spawn(2)
+        self._disturbance = Disturbance(
+            parameters.disturbance, np.random.default_rng(for_disturbance)
         )
-
-    def run(self, command: tuple[float, float], count: int, *, braking: bool = False) -> None:
-        """Integrate ``count`` steps under one command, see :meth:`PaperPlant.run`."""
-        self.plant.run(command, braking, self._disturbance, count)
-
-    def measure(self, dt: float) -> WheelSpeeds:
-        """Return chi with noise, and draw the disturbance, ``dt`` seconds after the last time."""
-        measured = self._noise.measure(self.plant.wheels)
-        self._disturbance.draw(dt)
-        return measured
-
-
-class PaperPlant:
-    """Wheels, body and drive: the arrays of :func:`integrate_plant`.
-
-    The dead time is rounded to whole steps (``step`` in s); :meth:`load` sets all parameters
-    but it and the kind.
-    """
-
-    def __init__(self, parameters: DriveParameters, step: float) -> None:
-        self.step = step
+        self._noise = SpeedNoise(parameters.noise, np.random.default_rng(for_noise))
+        self.step = parameters.step
+        """Length of an integration step, s."""
         self.steps_done = 0
         """Integration steps since the start: the time base of the disturbances."""
-        self._torque_mode = parameters.kind == 'torque'
+        self._torque_mode = parameters.drive.kind == 'torque'
         self._arrays = PlantArrays(
             state=np.zeros(7),
-            commands=np.zeros((round(parameters.dead_time / step), 2)),
+            commands=np.zeros((round(parameters.drive.dead_time / self.step), 2)),
             cursor=np.zeros(1, dtype=np.int64),
             limited=np.zeros(2),
             work=np.zeros((3, 7)),
         )
         self._state = self._arrays.state
+        self.configure(parameters)
 
     @property
     def pose(self) -> Pose:
@@ -370,29 +333,26 @@ class PaperPlant:
         """True wheel speeds chi."""
         return WheelSpeeds(float(self._state[5]), float(self._state[6]))
 
-    def load(
-        self,
-        parameters: DriveParameters,
-        bodies: tuple[BodyParameters, BodyParameters],
-        geometry: WheelGeometry,
-        friction: FrictionParameters,
-        friction_factor: float,
-    ) -> None:
-        """Set the constants from now on; ``bodies`` are the nominal and the true one."""
-        nominal, true = bodies
+    def configure(self, parameters: PaperRobotParameters) -> None:
+        """Continue with other dynamic parameters."""
+        self._disturbance.parameters = parameters.disturbance
+        self._noise.parameters = parameters.noise
+        drive, geometry = parameters.drive, parameters.geometry
+        diagonal, beside = wheel_inertia(parameters.body, geometry)[0].tolist()
         self._constants = PlantConstants(
-            drive_constants(parameters, nominal, geometry),
-            dynamics_vector(true, geometry),
-            friction_constants(friction, friction_factor),
+            DriveConstants(
+                diagonal,
+                beside,
+                drive.lag,
+                drive.acceleration,
+                drive.torque_limit,
+                drive.speed_ceiling,
+            ),
+            dynamics_vector(parameters.true_body, geometry),
+            friction_constants(parameters.friction, parameters.friction_factor),
         )
 
-    def run(
-        self,
-        command: tuple[float, float],
-        braking: bool,
-        disturbance: Disturbance,
-        count: int,
-    ) -> None:
+    def run(self, command: tuple[float, float], count: int, *, braking: bool = False) -> None:
         """Integrate ``count`` steps under one command, right first.
 
         Torques (N m) for a torque drive unless ``braking``, otherwise wheel speeds (rad/s).
@@ -403,13 +363,19 @@ class PaperPlant:
             command[0],
             command[1],
             self._constants,
-            disturbance.signals,
+            self._disturbance.signals,
             self.steps_done,
             count,
             self.step,
         )
         self._state[2] = wrap_angle(self._state[2])
         self.steps_done += count
+
+    def measure(self, dt: float) -> WheelSpeeds:
+        """Return chi with noise, and draw the disturbance, ``dt`` seconds after the last time."""
+        measured = self._noise.measure(self.wheels)
+        self._disturbance.draw(dt)
+        return measured
 
 
 class DriveConstants(NamedTuple):
@@ -453,36 +419,18 @@ class PlantArrays(NamedTuple):
     """Work space, shape (3, 7)."""
 
 
-def drive_constants(
-    parameters: DriveParameters, body: BodyParameters, geometry: WheelGeometry
-) -> DriveConstants:
-    """Return the drive constants of the kernels for the nominal body."""
-    diagonal, beside = wheel_inertia(body, geometry)[0].tolist()
-    return DriveConstants(
-        diagonal,
-        beside,
-        parameters.lag,
-        parameters.acceleration,
-        parameters.torque_limit,
-        parameters.speed_ceiling,
-    )
-
-
-def max_rate(
-    parameters: DriveParameters,
-    bodies: tuple[BodyParameters, BodyParameters],
-    geometry: WheelGeometry,
-    friction: FrictionParameters,
-    friction_factor: float,
-) -> float:
-    """Return an upper bound (1/s) of the decay rate of chi; see :meth:`PaperPlant.load`."""
+def max_rate(parameters: PaperRobotParameters) -> float:
+    """Return an upper bound (1/s) of the decay rate of chi."""
+    drive, friction, geometry = parameters.drive, parameters.friction, parameters.geometry
+    bodies = parameters.body, parameters.true_body
     nominal, true = (wheel_inertia(body, geometry) for body in bodies)
-    damping = friction_factor * (friction.viscous + friction.coulomb / friction.coulomb_width)
+    steepest = friction.viscous + friction.coulomb / friction.coulomb_width
+    damping = parameters.friction_factor * steepest
     turning = geometry.wheel_radius / geometry.half_separation
-    coupling = 2.0 * turning * parameters.speed_ceiling * abs(coriolis_factor(bodies[1], geometry))
+    coupling = 2.0 * turning * drive.speed_ceiling * abs(coriolis_factor(bodies[1], geometry))
     # Both matrices have the eigenvectors (1, 1), straight motion, and (1, -1), turning.
     rates = [
-        ((nominal[0, 0] + sign * nominal[0, 1]) / parameters.lag + damping + coupling)
+        ((nominal[0, 0] + sign * nominal[0, 1]) / drive.lag + damping + coupling)
         / (true[0, 0] + sign * true[0, 1])
         for sign in (1.0, -1.0)
     ]
