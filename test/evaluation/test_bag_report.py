@@ -262,14 +262,8 @@ def test_an_empty_bag_and_no_bag_are_errors(tmp_path, capsys):
 # -- gaps and jumps -----------------------------------------------------------------------------
 
 
-def test_a_jump_of_the_pose_is_listed():
+def test_parts_are_what_no_series_has_a_gap_in():
     time = 0.1 * np.arange(100)
-    places = np.stack([0.2 * time, np.zeros(100)], axis=1)
-    speeds = np.full(100, 0.2)
-    assert continuity_notes('/odom', time, time, places, speeds) == []
-    places[50:, 0] += 1e6
-    (jump,) = continuity_notes('/odom', time, time, places, speeds)
-    assert jump == 'The position of /odom jumps by 1e+06 m at 5.0 s.'
     assert parts(time, np.delete(time, np.s_[20:60])) == [(0.0, time[19]), (time[60], time[99])]
 
 

@@ -205,14 +205,11 @@ def test_a_gain_one_percent_off_is_found_and_named(inputs):
     assert outcome.first.field in outcome.verdict()
 
 
-def test_the_same_settings_named_again_change_nothing(inputs):
+def test_named_settings_must_exist_and_the_same_ones_change_nothing(inputs):
     gain = inputs.sessions[0].parameters[0].law.gain
     outcome = compare(inputs, replay_controller(inputs, {'law.gain': gain}))
     assert outcome.same
     assert outcome.parameters == ()
-
-
-def test_a_setting_that_does_not_exist_is_refused(inputs):
     with pytest.raises(ParameterError, match='law.gian.*did you mean law.gain'):
         replay_controller(inputs, {'law.gian': 1.0})
 
@@ -374,13 +371,6 @@ def test_what_is_lost_is_said_and_harms_nothing_before(stem, lost, words, kept, 
     assert not inputs.exact[exact:].any()
     if kept is None:
         assert compare(inputs, replay_controller(inputs)).same
-
-
-def test_settings_that_were_only_asked_for_by_the_recorder_do(bag, tmp_path):
-    inputs = load_inputs(
-        without(bag, tmp_path / 'copy', lambda topic, _: topic == '/controller/parameters')
-    )
-    assert compare(inputs, replay_controller(inputs)).same
 
 
 def record_late(folder, lost, republished):

@@ -312,11 +312,6 @@ def test_feedback_alone_does_not_show_the_effect():
 # -- what cannot be learnt ----------------------------------------------------------------------
 
 
-def test_too_little_movement_of_v_p_is_refused_with_its_size(calm):
-    with pytest.raises(TrainingError, match=r'moved by 0\.0\d+ rad/s².*predictive\.dither'):
-        fit_bags([calm])
-
-
 def test_the_coefficients_can_be_learnt_without_the_predictor(calm):
     kept = fit_bags([calm], keep_predictor=True)
     learnt = kept.learnt
@@ -331,37 +326,30 @@ def test_the_coefficients_can_be_learnt_without_the_predictor(calm):
     law.set_weights(learnt)
 
 
+def before(second, *without):
+    return lambda tape: tape.where(lambda t, topic, i: t < second and topic not in without)
+
+
+def of_another_controller(tape):
+    """Its commands do not come out of the replay: another version, or other parameters."""
+    return before(15.0, '/controller/parameters')(tape).changed(**{'law.gain': '20.0'})
+
+
 @pytest.mark.parametrize(
-    'drop, complaint',
+    ('change', 'keep_predictor', 'complaint'),
     [
-        ('/reference', 'not in the bag: reference'),
-        ('/odom', 'not in the bag: odom'),
-        ('/controller/journal', 'no journal of the controller'),
+        (before(0.5, '/reference'), False, 'not in the bag: reference'),
+        (before(0.5, '/odom'), False, 'not in the bag: odom'),
+        (before(0.5, '/controller/journal'), False, 'no journal of the controller'),
+        (before(12.0), False, r'without block 1 to learn from: .* 10 s of motion: got 7\.\d s'),
+        (before(3.0), True, r'at least 10 s of motion: got 2\.\d s'),
+        (of_another_controller, False, 'of 1500 commands come out of the replay'),
     ],
 )
-def test_missing_topics_are_named(run, tmp_path, drop, complaint):
-    kept = run.tape.where(lambda t, topic, i: t < 0.5 and topic != drop)
+def test_what_cannot_be_learnt_from_is_refused(change, keep_predictor, complaint, run, tmp_path):
+    folder = change(run.tape).write(tmp_path / 'bag')
     with pytest.raises(TrainingError, match=complaint):
-        load_training_data(kept.write(tmp_path / 'bag'))
-
-
-def test_too_short_a_run_is_refused_with_its_length(run, tmp_path):
-    folder = run.tape.where(lambda t, topic, i: t < 12.0).write(tmp_path / 'bag')
-    with pytest.raises(
-        TrainingError, match=r'without block 1 to learn from: .* 10 s of motion: got 7\.\d s'
-    ):
-        fit_bags([folder])
-    shorter = run.tape.where(lambda t, topic, i: t < 3.0).write(tmp_path / 'short')
-    with pytest.raises(TrainingError, match=r'at least 10 s of motion: got 2\.\d s'):
-        fit_bags([shorter], keep_predictor=True)
-
-
-def test_a_bag_of_another_controller_is_refused(run, tmp_path):
-    """Its commands do not come out of the replay: another version, or other parameters."""
-    tape = run.tape.where(lambda t, topic, i: t < 15.0 and topic != '/controller/parameters')
-    folder = tape.changed(**{'law.gain': '20.0'}).write(tmp_path / 'bag')
-    with pytest.raises(TrainingError, match='of 1500 commands come out of the replay'):
-        fit_bags([folder])
+        fit_bags([folder], keep_predictor=keep_predictor)
 
 
 def test_bags_that_do_not_belong_together_are_refused(calm, tmp_path):
@@ -373,6 +361,8 @@ def test_bags_that_do_not_belong_together_are_refused(calm, tmp_path):
         fit_bags([calm, other])
     with pytest.raises(TrainingError, match='composition must be paper: got body'):
         fit_bags([bag_of(composition='body')])
+    with pytest.raises(TrainingError, match=r'moved by 0\.0\d+ rad/s².*predictive\.dither'):
+        fit_bags([calm])  # too little of it
     with pytest.raises(TrainingError, match='at least one bag'):
         fit_bags([])
     with pytest.raises(BagError, match='there is no bag'):
