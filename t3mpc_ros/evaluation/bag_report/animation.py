@@ -23,7 +23,7 @@ from PIL import Image
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.evaluation.bag_report.metrics import tracking_error
 from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
-from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
+from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, load_run
 from t3mpc_ros.evaluation.plotting import COLOURS, STYLE, draw_world
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH, ReportError, ReportOptions
@@ -179,13 +179,13 @@ def _frames(
     ):
         figure = Figure(figsize=(7.6, 3.95), dpi=width / 7.6)
         canvas = FigureCanvasAgg(figure)
-        floor = _Floor(figure, run, times, ranges, world)
+        draw_floor = _floor(figure, run, times, ranges, world)
         lines = _panels(figure, run, times)
         canvas.draw()
         still = canvas.copy_from_bbox(figure.bbox)
         for now in times.tolist():
             canvas.restore_region(still)
-            floor.draw(now)
+            draw_floor(now)
             for line, time, value in lines:
                 rows = slice(int(np.searchsorted(time, now, side='right')))
                 line.set_data(time[rows], value[rows])
@@ -194,106 +194,72 @@ def _frames(
             on_frame()
 
 
-class _Floor:
-    """Walls, path, robot and range rays, seen from above."""
+def _floor(
+    figure: Any, run: Run, times: Array, ranges: RangeReadings | None, world: World | None
+) -> Callable[[float], None]:
+    """Draw the walls from above; return what draws path, robot and range rays at a time."""
+    motion, reference = run.motions[run.measured], run.motions.get(REFERENCE)
+    followed, yaws = followed_reference(run), np.unwrap(motion['yaw'])
+    axis = figure.add_axes((0.085, 0.1, 0.43, 0.83))
+    axis.set_aspect('equal')
+    shown = motion.between(times[0], times[-1])
+    points = np.column_stack([shown['x'], shown['y']])
+    if world is not None:
+        draw_world(axis, world)
+        points = np.vstack([points, world.segments.reshape(-1, 2)])
+    (left, bottom), (right, top) = points.min(axis=0) - 0.2, points.max(axis=0) + 0.2
+    axis.set(xlim=(left, right), ylim=(bottom, top), xlabel='x / m', ylabel='y / m')
+    blue, grey = COLOURS[run.measured], COLOURS[REFERENCE]
+    style = {'animated': True, 'zorder': 3}
+    line = axis.plot([], [], color=grey, linewidth=0.8, **style)[0]
+    trail = axis.plot([], [], color=blue, linewidth=2.0, **style)[0]
+    hit = axis.plot([], [], '.', color=_HIT, markersize=1.6, **style)[0]
+    rays = axis.add_collection(LineCollection([], colors=_RAY, linewidths=0.9, **style))
+    body = axis.add_patch(Circle((0.0, 0.0), 0.1, facecolor='white', edgecolor=blue, **style))
+    nose = axis.plot([], [], color=blue, linewidth=1.6, **style)[0]
+    hits: list[Array] = []
 
-    def __init__(
-        self,
-        figure: Any,
-        run: Run,
-        times: Array,
-        ranges: RangeReadings | None,
-        world: World | None,
-    ) -> None:
-        self._motion, self._ranges = run.motions[run.measured], ranges
-        self._begin = float(times[0])
-        self._yaw = np.unwrap(self._motion['yaw'])
-        self._followed = followed_reference(run)
-        self._reference = run.motions.get(REFERENCE)
-        self._hits: list[Array] = []
-        axis = self._axis = figure.add_axes((0.085, 0.1, 0.43, 0.83))
-        axis.set_aspect('equal')
-        axis.set(xlabel='x / m', ylabel='y / m')
-        if world is not None:
-            draw_world(axis, world)
-        self._frame_view(times, world)
-        blue = COLOURS[run.measured]
-        style = {'animated': True, 'zorder': 3}
-        self._line = axis.plot([], [], color=COLOURS[REFERENCE], linewidth=0.8, **style)[0]
-        self._trail = axis.plot([], [], color=blue, linewidth=2.0, **style)[0]
-        self._points = axis.plot([], [], '.', color=_HIT, markersize=1.6, **style)[0]
-        self._rays = LineCollection([], colors=_RAY, linewidths=0.9, **style)
-        axis.add_collection(self._rays)
-        self._body = Circle((0.0, 0.0), 0.1, facecolor='white', edgecolor=blue, **style)
-        axis.add_patch(self._body)
-        self._nose = axis.plot([], [], color=blue, linewidth=1.6, **style)[0]
-        self._moving = (
-            self._trail, self._line, self._points, self._rays, self._body, self._nose
-        )  # fmt: skip
-        self._legend(run)
+    # The legend has copies of the lines that are not animated.
+    entries = [(blue, f'robot ({"ground truth" if run.measured == TRUTH else "odometry"})')]
+    if reference is not None:
+        ahead = '' if followed is not None else f', next {AHEAD:g} s'
+        entries.append((grey, f'reference{ahead}'))
+    if ranges is not None:
+        entries.append((_RAY, 'range sensors'))
+    handles = [Line2D([], [], color=colour, linewidth=1.4) for colour, _ in entries]
+    place = {'loc': 'lower left', 'bbox_to_anchor': (0.0, 1.0), 'ncols': len(entries)}
+    spacing = {'borderaxespad': 0.1, 'handlelength': 1.2, 'columnspacing': 1.0}
+    axis.legend(handles, [text for _, text in entries], **place, **spacing)
 
-    def _legend(self, run: Run) -> None:
-        """Name the lines above the floor, with copies that are not animated."""
-        line = COLOURS[REFERENCE]
-        ahead = 'reference' if self._followed is not None else f'reference, next {AHEAD:g} s'
-        truth = ' (ground truth)' if run.measured == TRUTH else ' (odometry)'
-        entries = [(COLOURS[run.measured], f'robot{truth}')]
-        entries += [(line, ahead)] if self._reference is not None else []
-        entries += [(_RAY, 'range sensors')] if self._ranges is not None else []
-        handles = [Line2D([], [], color=colour, linewidth=1.4) for colour, _ in entries]
-        place = {'loc': 'lower left', 'bbox_to_anchor': (0.0, 1.0), 'ncols': len(entries)}
-        spacing = {'borderaxespad': 0.1, 'handlelength': 1.2, 'columnspacing': 1.0}
-        self._axis.legend(handles, [text for _, text in entries], **place, **spacing)
+    def draw(now: float) -> None:
+        columns = motion['x'], motion['y'], yaws
+        x, y, yaw = (float(np.interp(now, motion.time, each)) for each in columns)
+        rows = slice(*np.searchsorted(motion.time, (times[0], now)).tolist())
+        trail.set_data(np.append(motion['x'][rows], x), np.append(motion['y'][rows], y))
+        if followed is not None:
+            rows = slice(*np.searchsorted(followed.time, (times[0], now)).tolist())
+            line.set_data(followed['x'][rows], followed['y'][rows])
+        elif reference is not None:
+            line.set_data(*_led_from(reference.between(now, now + AHEAD), (x, y, yaw)))
+        if ranges is not None:
+            found = ranges.rays(now, (x, y, yaw))
+            rays.set_segments(list(found))
+            hits.extend(found[:, 1])
+            hit.set_data(*np.array(hits).reshape(-1, 2).T)
+        body.center = x, y
+        nose.set_data([x, x + 0.1 * math.cos(yaw)], [y, y + 0.1 * math.sin(yaw)])
+        for artist in (trail, line, hit, rays, body, nose):
+            axis.draw_artist(artist)
 
-    def _frame_view(self, times: Array, world: World | None) -> None:
-        shown = self._motion.between(times[0], times[-1])
-        points = [np.column_stack([shown['x'], shown['y']])]
-        if world is not None and len(world.segments):
-            points.append(world.segments.reshape(-1, 2))
-        low, high = np.vstack(points).min(axis=0) - 0.2, np.vstack(points).max(axis=0) + 0.2
-        self._axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    return draw
 
-    def _pose(self, now: float) -> tuple[float, float, float]:
-        time = self._motion.time
-        x, y = (float(np.interp(now, time, self._motion[axis])) for axis in 'xy')
-        return x, y, float(np.interp(now, time, self._yaw))
 
-    def draw(self, now: float) -> None:
-        """Draw the robot at ``now``, and what led there."""
-        pose = self._pose(now)
-        x, y, yaw = pose
-        time = self._motion.time
-        rows = slice(*np.searchsorted(time, (self._begin, now)).tolist())
-        self._trail.set_data(
-            np.append(self._motion['x'][rows], x), np.append(self._motion['y'][rows], y)
-        )
-        self._line.set_data(*self._reference_line(now, pose))
-        if self._ranges is not None:
-            rays = self._ranges.rays(now, pose)
-            self._rays.set_segments(list(rays))
-            self._hits += list(rays[:, 1])
-            self._points.set_data(*np.array(self._hits).reshape(-1, 2).T)
-        self._body.center = x, y
-        self._nose.set_data([x, x + 0.1 * math.cos(yaw)], [y, y + 0.1 * math.sin(yaw)])
-        for artist in self._moving:
-            self._axis.draw_artist(artist)
-
-    def _reference_line(self, now: float, pose: tuple[float, float, float]) -> tuple[Array, Array]:
-        """Return the path that is followed up to ``now``; else where the speeds lead from here."""
-        if self._followed is not None:
-            rows = slice(*np.searchsorted(self._followed.time, (self._begin, now)).tolist())
-            return self._followed['x'][rows], self._followed['y'][rows]
-        reference = self._reference
-        if reference is None:
-            return np.empty(0), np.empty(0)
-        rows = slice(*np.searchsorted(reference.time, (now, now + AHEAD)).tolist())
-        step = np.diff(reference.time[rows], append=reference.time[rows][-1:])
-        yaw = pose[2] + np.cumsum(reference['angular'][rows] * step)
-        run = reference['linear'][rows] * step
-        return (
-            pose[0] + np.cumsum(run * np.cos(yaw)),
-            pose[1] + np.cumsum(run * np.sin(yaw)),
-        )
+def _led_from(reference: Series, pose: tuple[float, float, float]) -> tuple[Array, Array]:
+    """Return the path from a pose on which the speeds of a reference lead, m."""
+    step = np.diff(reference.time, append=reference.time[-1:])
+    yaw = pose[2] + np.cumsum(reference['angular'] * step)
+    run = reference['linear'] * step
+    return pose[0] + np.cumsum(run * np.cos(yaw)), pose[1] + np.cumsum(run * np.sin(yaw))
 
 
 def _panels(figure: Any, run: Run, times: Array) -> list[tuple[Any, Array, Array]]:
