@@ -21,9 +21,9 @@ import numpy as np
 from PIL import Image
 
 from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.evaluation.bag_report.metrics import tracking_error
+from t3mpc_ros.evaluation.bag_report.metrics import path_of, tracking_error
 from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
-from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, load_run
+from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
 from t3mpc_ros.evaluation.plotting import COLOURS, STYLE, draw_world
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH, ReportError, ReportOptions
@@ -240,7 +240,7 @@ def _floor(
             rows = slice(*np.searchsorted(followed.time, (times[0], now)).tolist())
             line.set_data(followed['x'][rows], followed['y'][rows])
         elif reference is not None:
-            line.set_data(*_led_from(reference.between(now, now + AHEAD), (x, y, yaw)))
+            line.set_data(*path_of(reference.between(now, now + AHEAD), (x, y, yaw)))
         if ranges is not None:
             found = ranges.rays(now, (x, y, yaw))
             rays.set_segments(list(found))
@@ -252,14 +252,6 @@ def _floor(
             axis.draw_artist(artist)
 
     return draw
-
-
-def _led_from(reference: Series, pose: tuple[float, float, float]) -> tuple[Array, Array]:
-    """Return the path from a pose on which the speeds of a reference lead, m."""
-    step = np.diff(reference.time, append=reference.time[-1:])
-    yaw = pose[2] + np.cumsum(reference['angular'] * step)
-    run = reference['linear'] * step
-    return pose[0] + np.cumsum(run * np.cos(yaw)), pose[1] + np.cumsum(run * np.sin(yaw))
 
 
 def _panels(figure: Any, run: Run, times: Array) -> list[tuple[Any, Array, Array]]:
