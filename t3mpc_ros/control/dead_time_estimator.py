@@ -92,9 +92,10 @@ RETURN_TIME, RETURN_DIFFERENCE = 1.5, 0.008
 """The same (s) for a return to within some difference (s) of the configured dead time."""
 SUPPORT = 1.0
 """Likelihood ratio, 2 log, by which a block must prefer what the blocks before it show."""
-DRIFT_BOUND, DRIFT_MEMORY = 2.0, 0.25
-"""Likelihood ratio, 2 log, of the recent data above which the estimate may be about to drift, and
-the factor by which accepted data is then forgotten with each block."""
+DRIFT_BOUND, SERVO_DRIFT_BOUND, DRIFT_MEMORY = 2.0, 4.0, 0.25
+"""Likelihood ratio, 2 log, of the recent data above which the estimate may be about to drift, the
+same of a servo, whose disturbances are no white noise, and the factor by which accepted data is
+then forgotten with each block."""
 
 NOISE_QUANTILE = 5.0
 """Bound of the chi-square test, as a quantile of the normal distribution."""
@@ -303,7 +304,7 @@ def update_dead_time(
     enough |= estimate.block_disturbed or duration >= BLOCK_MAX_TIME
     enough |= estimate.deviation > IDENTIFIED_DEVIATION
     if enough and duration >= BLOCK_TIME:
-        assess_block(estimate)
+        assess_block(estimate, SERVO_DRIFT_BOUND if drive.friction else DRIFT_BOUND)
     return bool(estimate.disturbed)
 
 
@@ -461,7 +462,7 @@ def estimate_uncertainty(estimate: Any) -> float:
 
 
 @kernel
-def assess_block(estimate: Any) -> None:
+def assess_block(estimate: Any, drift_bound: float) -> None:
     """Accept or reject the data of the block, and begin another one."""
     block, recent = estimate.block, estimate.recent
     information = block.information / estimate.noise_ratio
@@ -471,7 +472,7 @@ def assess_block(estimate: Any) -> None:
     estimate.support = likelihood_ratio(estimate, recent)
     fits = not estimate.block_disturbed and estimate.support < BLOCK_BOUND
     if fits and likelihood_ratio(estimate, block) < BLOCK_BOUND:
-        accept_pending(estimate)
+        accept_pending(estimate, estimate.support > drift_bound)
     else:
         reject_block(estimate, information >= DRIVING_INFORMATION * block.duration)
     clear(block)
@@ -479,7 +480,7 @@ def assess_block(estimate: Any) -> None:
 
 
 @kernel
-def accept_pending(estimate: Any) -> None:
+def accept_pending(estimate: Any, drifts: bool) -> None:
     """Accept the block before this one, which is pending in its place."""
     pending = estimate.pending
     if estimate.deviation <= IDENTIFIED_DEVIATION:
@@ -487,7 +488,7 @@ def accept_pending(estimate: Any) -> None:
         total = estimate.noise_ratio * estimate.noise_count + pending.nis
         estimate.noise_ratio = max(total / count, 1.0)
         estimate.noise_count = min(count, NOISE_MAX_COUNT)
-    if estimate.support > DRIFT_BOUND and estimate.rejected.duration < BLOCK_TIME:
+    if drifts and estimate.rejected.duration < BLOCK_TIME:
         scale(estimate.accepted, DRIFT_MEMORY)
     add(estimate.accepted, pending)
     clear(pending)
