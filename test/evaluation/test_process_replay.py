@@ -205,7 +205,7 @@ def test_a_gain_one_percent_off_is_found_and_named(inputs):
     assert outcome.first.field in outcome.verdict()
 
 
-def test_named_settings_must_exist_and_the_same_ones_change_nothing(inputs):
+def test_named_settings_exist_and_the_same_change_nothing(inputs):
     gain = inputs.sessions[0].parameters[0].law.gain
     outcome = compare(inputs, replay_controller(inputs, {'law.gain': gain}))
     assert outcome.same

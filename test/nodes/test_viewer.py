@@ -95,7 +95,7 @@ def test_the_e_stop_latches_and_is_shown(viewer, robot):
     assert {'e_stop on: latched', 'e_stop off: released'} <= set(texts)
 
 
-def test_a_robot_that_stands_latched_is_no_driving_robot(viewer, robot, harness):
+def test_a_robot_that_stands_latched_is_shown_as_stopped(viewer, robot, harness):
     """A blocked wheel was shown as *Driving, with a warning*, its reason hidden by another one."""
     robot.produce_diagnostics = lambda: (
         WARN,
