@@ -12,33 +12,42 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
-from t3mpc_ros.evaluation.topic_roles import bag_display_name
-from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.evaluation.topic_roles import ReportOptions, bag_display_name
+from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.simulation.world import world_outline
 from t3mpc_ros.view.live_data import STEP, LiveData
 
 
-def recorded_run(bag: Path) -> LiveData:
-    """Return a recorded run as the page shows it."""
+def recorded_run(bag: Path, namespace: str | None = None) -> LiveData:
+    """Return the recorded run of a robot as the page shows it: of any robot with odometry.
+
+    ValueError without odometry.
+    """
     data = LiveData(math.inf, STEP)
     with open_bag(bag) as recording:
-        run = load_run(recording)
+        run = load_run(recording, ReportOptions(namespace))
         verdict = compute_metrics(run, Path(), recording.message_count).verdict
-    if run.geometry is None:
-        raise ValueError(
-            f'{bag} has no parameters of a robot: its wheel radius and separation are not known '
-            '(t3mpc bag report takes them as options)'
-        )
-    motion = ('right', 'left', 'x', 'y', 'yaw')
-    for stream, topic, names in (
-        ('odometry', 'odom', motion),
-        ('truth', 'ground_truth/odom', motion),
-        ('reference', 'reference', motion),
-        ('command', 'cmd_vel', motion[:2]),
-    ):
+        data.set('origin', recording.start_ns / NANOSECONDS)
+    if 'odom' not in run.motions:
+        raise ValueError(f'{bag} has no odometry to show; t3mpc bag info lists its topics')
+    channels = tuple(each.name for each in run.channels)
+    motion = (*channels, 'x', 'y', 'yaw')
+    shown = {
+        'odometry': ('odom', motion),
+        'truth': ('ground_truth/odom', motion),
+        'reference': ('reference', motion),
+        'command': ('cmd_vel', channels),
+    }
+    absent = [
+        'preview',
+        *(stream for stream, (topic, _) in shown.items() if topic not in run.motions),
+    ]
+    for stream, (topic, names) in shown.items():
         if topic in run.motions:
             series = run.motions[topic]
-            _add_columns(data, stream, series.time, [series[name] for name in names])
+            unknown = np.full(len(series), math.nan)  # a reference may have speeds only
+            columns = [series.values.get(name, unknown) for name in names]
+            _add_columns(data, stream, series.time, columns)
     terms = [
         run.numbers.get(f'controller/terms/{term}/{wheel}')
         for term in TERM_NAMES
@@ -52,18 +61,21 @@ def recorded_run(bag: Path) -> LiveData:
             for each in terms
         ]
         _add_columns(data, 'terms', first.time, columns)
+    else:
+        absent.append('terms')
     for time_of_switch in run.switches.tolist():
         data.report(time_of_switch, 'switch', 'switch of the reference')
     for when, _, node, text in run.complaints:
         data.report(when, 'note', f'{node}: {text}')
+    data.set('absent', absent)
+    data.set('channels', [[each.title.capitalize(), each.unit] for each in run.channels])
     data.set('terms', list(TERM_NAMES))
-    data.set(
-        'robot',
-        {
+    if run.geometry is not None:
+        size = {
             'wheel_radius': run.geometry.wheel_radius,
             'wheel_separation': 2.0 * run.geometry.half_separation,
-        },
-    )
+        }
+        data.set('robot', size)
     data.set('world', world_outline(run.world))
     data.set(
         'banner',

@@ -3,6 +3,8 @@
 """``t3mpc view``: a robot, or a recorded run, on a page in a browser of this machine."""
 
 import argparse
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 import sys
 import time
@@ -13,6 +15,8 @@ from t3mpc_ros.parameters.command_line import bounded_int
 from t3mpc_ros.stop_signal import StopSignal
 
 if TYPE_CHECKING:
+    from t3mpc_ros.nodes.viewer import ViewNode
+    from t3mpc_ros.view.live_run import LiveRun
     from t3mpc_ros.view.server import PageServer
 
 DEFAULT_PORT = 8765
@@ -38,6 +42,12 @@ def add_parser(commands: Any) -> None:
         help=f'TCP port on 127.0.0.1, 0: any free one (default {DEFAULT_PORT})',
     )
     parser.add_argument('--read-only', action='store_true', help='show only, take no commands')
+    parser.add_argument(
+        '--runs',
+        type=Path,
+        default=Path('runs'),
+        help='folder for what the page records (default: runs)',
+    )
     parser.add_argument('--headless', action='store_true', help='open no browser')
     parser.set_defaults(run=_view)
 
@@ -52,9 +62,8 @@ def _view(options: argparse.Namespace) -> int:
             from t3mpc_ros.cli.recorded_run import recorded_run
 
             print(f'reading {options.bag}', file=sys.stderr, flush=True)
-            with PageServer(
-                recorded_run(options.bag), None, options.port, time.monotonic
-            ) as server:
+            shown = recorded_run(options.bag, options.namespace or None)
+            with PageServer(shown, None, options.port, time.monotonic) as server:
                 _announce(server, options)
                 while not stop():
                     time.sleep(0.1)
@@ -63,11 +72,42 @@ def _view(options: argparse.Namespace) -> int:
 
         run = LiveRun()
         with view_node(run, options.namespace) as node:
-            command = None if options.read_only else node.command
-            with PageServer(run, command, options.port, time.monotonic) as server:
+            if options.read_only:
+                with PageServer(run, None, options.port, time.monotonic) as server:
+                    _announce(server, options)
+                    node.spin(stop)
+                return 0
+            with _commanded_page(run, node, options) as server:
                 _announce(server, options)
                 node.spin(stop)
     return 0
+
+
+@contextmanager
+def _commanded_page(
+    run: 'LiveRun', node: 'ViewNode', options: argparse.Namespace
+) -> 'Iterator[PageServer]':
+    """Yield a page whose commands the node executes, but for those of the recorder."""
+    from t3mpc_ros.cli.run_recorder import RunRecorder
+    from t3mpc_ros.view.server import PageServer
+
+    def command(name: str, arguments: Mapping[str, Any], asked: float) -> str:
+        if name != 'record':
+            done: str = node.command(name, arguments, asked)
+            return done
+        if late := run.refusal(name, arguments.get('on'), asked, time.monotonic()):
+            raise RuntimeError(late)
+        return recorder.switch(arguments.get('on'))
+
+    def show_report(file: Path) -> None:
+        server.report = file
+
+    recorder = RunRecorder(options.runs, options.namespace, run, show_report)
+    try:
+        with PageServer(run, command, options.port, time.monotonic) as server:
+            yield server
+    finally:
+        recorder.close()
 
 
 def _announce(server: 'PageServer', options: argparse.Namespace) -> None:

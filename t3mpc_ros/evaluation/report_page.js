@@ -5,7 +5,7 @@
 
 const TICK = 1e-5; // s
 const NEAR = 3; // s shown before and after an event
-const EVENTS = { switch: 'reference', stop: 'stopped', gap: 'left' }; // marked in the charts
+const EVENTS = { switch: 'switch', stop: 'stopped', gap: 'left' }; // marked in the charts
 
 const place = (id) => document.getElementById(id);
 const data = JSON.parse(place('data').textContent);
@@ -111,7 +111,6 @@ function drawPlanes(cursor) {
 async function start() {
   await unpack();
   charts = new ChartGroup(document.querySelector('main'), {
-    spanGaps: false,
     moved: (time) => {
       drawPlanes(time);
       show(time === null ? '' : `cursor at ${number(time, 2)} s`);

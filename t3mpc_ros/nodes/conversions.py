@@ -100,6 +100,15 @@ def state_from_odometry(data: bytes) -> State:
     )
 
 
+def twist_from_serialized(data: bytes) -> BodyTwist:
+    """Return :func:`body_twist` of a serialized Twist; struct.error if it is truncated."""
+    order = '<' if data[1] & 1 else '>'
+    linear, y, z, roll, pitch, angular = struct.unpack_from(f'{order}6d', data, 4)
+    if not all(map(math.isfinite, (y, z, roll, pitch))):
+        return BodyTwist(math.nan, math.nan)
+    return BodyTwist(linear, angular)
+
+
 def _layout(data: bytes | bytearray) -> tuple[str, int]:
     """Return the byte order of a serialized odometry message and the offset of its pose."""
     order = '<' if data[1] & 1 else '>'

@@ -247,13 +247,18 @@ def take_waiting(subscription: Subscription) -> list[Any]:
     The executor takes one message of a subscription per cycle: a queue that has filled while it
     was busy would otherwise stay full, and every message would wait as long.
     """
-    messages: list[Any] = []
+    return [message for message, _ in take_with_info(subscription)]
+
+
+def take_with_info(subscription: Subscription) -> list[tuple[Any, dict[str, Any]]]:
+    """Return the messages that wait, each with its information, as the time of its publication."""
+    messages: list[tuple[Any, dict[str, Any]]] = []
     handle = subscription.handle
     with handle:
         while len(messages) < subscription.qos_profile.depth:
             if (item := handle.take_message(subscription.msg_type, subscription.raw)) is None:
                 break
-            messages.append(item[0])
+            messages.append(item)
     return messages
 
 

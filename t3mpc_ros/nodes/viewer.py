@@ -7,6 +7,7 @@ wait, so that two hundred messages a second cost about as much as twenty. Stream
 best effort, which every publisher offers.
 """
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, suppress
@@ -38,7 +39,7 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, State
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.entry_point import own_context
-from t3mpc_ros.nodes.qos import PolledCallbackGroup, full_name, take_waiting
+from t3mpc_ros.nodes.qos import PolledCallbackGroup, full_name, take_with_info
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters, plain_value
 from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
@@ -54,6 +55,12 @@ ROBOTS = ('sim_robot', 'radio_bridge')
 """Nodes that are a robot."""
 LOOP_NODES = ('controller', *ROBOTS, 'reference_generator')
 """Nodes whose reports, parameters and services the page shows."""
+REFERENCES = 200
+"""Number of references whose times are kept: those of a second, and more."""
+SWITCH_TIMEOUT = 1.0
+"""Time after which a switch without a reference that follows it is reported all the same, s."""
+CLOCK_NS = 1_000_000_000 * NANOSECONDS
+"""Stamps beyond it, of 2001, are of a clock, not of a simulation that began at 0."""
 WARN = LoggingSeverity.WARN.value
 """Level of a log message from which on it is an event."""
 
@@ -88,6 +95,12 @@ class ViewNode(Node):
         self._geometry = WheelGeometry()
         self._origin_ns: int | None = None
         self._newest = 0.0
+        self._stamp_lead_ns = 0
+        """Time from the publication of the newest odometry to its stamp."""
+        self._sent_references: deque[tuple[int, float]] = deque(maxlen=REFERENCES)
+        """Times of publication, ns, and stamps, s, of the newest references."""
+        self._switches: list[tuple[int, str]] = []
+        """Time of publication, ns, and text of each switch whose reference has not come yet."""
         self._remote = ParameterWatch(self, self._is_shown, self._on_parameters)
         self._rows: dict[str, dict[str, Mapping[str, Any]]] = {}
         self._signals: tuple[int, ...] = ()
@@ -127,8 +140,9 @@ class ViewNode(Node):
     def poll(self) -> None:
         """Take the messages that wait, and start the commands that wait."""
         for subscription in list(self._polled.values()):
-            for message in take_waiting(subscription):
-                subscription.callback(message)
+            for message, info in take_with_info(subscription):
+                subscription.callback(message, int(info['source_timestamp']))
+        self._report_switches()
         self._add_collected('ranges', self._ranges)
         self._add_collected('terms', self._terms)
         with suppress(Empty):
@@ -165,7 +179,7 @@ class ViewNode(Node):
         self,
         kind: type,
         topic: str,
-        take: Callable[[Any], None],
+        take: Callable[[Any, int], None],
         *,
         depth: int = 20,
         raw: bool = False,
@@ -182,41 +196,79 @@ class ViewNode(Node):
 
     def _seconds(self, stamp_ns: int) -> float:
         if self._origin_ns is None:
-            self._origin_ns = stamp_ns
+            # A whole second, so that the times of the clock are round where those of the page are.
+            self._origin_ns = stamp_ns - stamp_ns % NANOSECONDS
+            if stamp_ns > CLOCK_NS:
+                self._sink.set('origin', self._origin_ns // NANOSECONDS)
         return (stamp_ns - self._origin_ns) / NANOSECONDS
 
-    def _on_state(self, stream: str, data: bytes) -> None:
+    def _time(self, sent_ns: int) -> float:
+        """Return the time of a message without stamp; some middleware has no time either."""
+        if self._origin_ns is None or sent_ns <= 0:
+            return self._newest
+        return self._seconds(sent_ns + self._stamp_lead_ns)
+
+    def _on_state(self, stream: str, data: bytes, sent_ns: int) -> None:
         try:
             state: State = conversions.state_from_odometry(data)
         except struct.error:  # a truncated message
             return
         seconds = self._seconds(state.stamp_ns)
         if stream == 'odometry':
-            self._newest = seconds
+            self._newest, self._stamp_lead_ns = seconds, state.stamp_ns - sent_ns
+        elif stream == 'reference':
+            self._sent_references.append((sent_ns, seconds))
         wheels = wheels_from_twist(state.twist, self._geometry)
         self._sink.add(stream, seconds, (*wheels, *state.pose))
 
-    def _on_command(self, message: Twist | TwistStamped) -> None:
-        twist = conversions.body_twist(getattr(message, 'twist', message))
-        if self._origin_ns is not None:
-            self._sink.add('command', self._newest, wheels_from_twist(twist, self._geometry))
+    def _on_command(self, message: bytes | TwistStamped, sent_ns: int) -> None:
+        if self._origin_ns is None:
+            return
+        try:
+            twist = (
+                conversions.twist_from_serialized(message)
+                if isinstance(message, bytes)
+                else conversions.body_twist(message.twist)
+            )
+        except struct.error:
+            return
+        wheels = wheels_from_twist(twist, self._geometry)
+        self._sink.add('command', self._time(sent_ns), wheels)
 
-    def _on_range(self, number: int, message: Range) -> None:
+    def _on_range(self, number: int, message: Range, sent_ns: int) -> None:
+        del sent_ns
         beyond = message.range > message.max_range  # infinite, or max_range as REP 117 allows
         self._ranges[number] = message.max_range if beyond else max(message.range, 0.0)
+        self._sink.set('reach', round(message.max_range, 3))
 
-    def _on_term(self, number: int, message: Float64) -> None:
+    def _on_term(self, number: int, message: Float64, sent_ns: int) -> None:
+        del sent_ns
         self._terms[number] = message.data
 
-    def _on_signals(self, message: Int32MultiArray) -> None:
+    def _on_signals(self, message: Int32MultiArray, sent_ns: int) -> None:
         signals = tuple(message.data)
         if self._signals and signals != self._signals and len(signals) == 3:
             mode, right, left = signals
             text = f'switch to mode {mode}: signals {right} and {left}'
-            self._sink.report(self._newest, 'switch', text)
+            self._switches.append((sent_ns, text))
         self._signals = signals
 
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+    def _report_switches(self) -> None:
+        """Report each switch with the stamp of the reference that was sent next, its first one.
+
+        The reference is sent ahead of its time, so the switch is later than its message.
+        """
+        while self._switches:
+            sent_ns, text = self._switches[0]
+            later = (time for sent, time in self._sent_references if sent >= sent_ns > 0)
+            if (time_of_switch := next(later, None)) is None:
+                if sent_ns > 0 and self._newest < self._time(sent_ns) + SWITCH_TIMEOUT:
+                    return
+                time_of_switch = self._time(sent_ns)
+            self._switches.pop(0)
+            self._sink.report(time_of_switch, 'switch', text)
+
+    def _on_diagnostics(self, message: DiagnosticArray, sent_ns: int) -> None:
         prefix = self.get_namespace().strip('/')
         for status in message.status:
             namespace, _, name = status.name.rpartition('/')
@@ -229,15 +281,15 @@ class ViewNode(Node):
                 condition = 'stopped'
             self._sink.node_report(name, status.message, condition)
             if name in ROBOTS:
-                self._on_faults(values.get('faults', 'none'))
+                self._on_faults(values.get('faults', 'none'), self._time(sent_ns))
 
-    def _on_faults(self, faults: str) -> None:
+    def _on_faults(self, faults: str, seconds: float) -> None:
         if faults != self._faults:
             text = 'faults end' if faults == 'none' else f'fault: {faults}'
-            self._sink.report(self._newest, 'fault', text)
+            self._sink.report(seconds, 'fault', text)
         self._faults = faults
 
-    def _on_log(self, message: Log) -> None:
+    def _on_log(self, message: Log, sent_ns: int) -> None:
         prefix = self.get_namespace().strip('/').replace('/', '.')
         namespace, _, name = message.name.rpartition('.')
         if namespace != prefix or name not in LOOP_NODES:
@@ -245,7 +297,7 @@ class ViewNode(Node):
         if condition := _stop_condition(name, message.msg):
             self._sink.node_report(name, message.msg, condition)
         elif message.level >= WARN:
-            self._sink.report(self._newest, 'note', f'{name}: {message.msg}')
+            self._sink.report(self._time(sent_ns), 'note', f'{name}: {message.msg}')
 
     # -- nodes and parameters ---------------------------------------------------------------------
 
@@ -270,7 +322,7 @@ class ViewNode(Node):
                 if present is None or present.msg_type is not kind:
                     if present is not None:
                         self.destroy_subscription(present)
-                    self._subscribe(kind, 'cmd_vel', self._on_command, depth=1)
+                    self._subscribe(kind, 'cmd_vel', self._on_command, raw=kind is Twist)
 
     def _on_parameters(self, remote: RemoteParameters, rows: Sequence[Mapping[str, Any]]) -> None:
         self._rows[remote.node_name] = {row['name']: row for row in rows}
@@ -286,14 +338,15 @@ class ViewNode(Node):
         if name == 'sim_robot' and (world := rows.get('world')):
             self._sink.set('world', world_outline(world['value']))
 
-    def _on_parameter_event(self, message: ParameterEvent) -> None:
+    def _on_parameter_event(self, message: ParameterEvent, sent_ns: int) -> None:
         namespace, _, name = message.node.rpartition('/')
         rows = self._rows.get(name) if namespace == self.get_namespace().rstrip('/') else None
         for changed in message.changed_parameters if rows else ():
             if rows and changed.name in rows:
                 value = plain_value(changed.value)
                 rows[changed.name] = {**rows[changed.name], 'value': value}
-                self._sink.report(self._newest, 'command', f'{name}: {changed.name} = {value}')
+                text = f'{name}: {changed.name} = {value}'
+                self._sink.report(self._time(sent_ns), 'parameter', text)
         if rows:
             self._show_parameters(name)
 

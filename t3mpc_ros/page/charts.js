@@ -32,31 +32,30 @@ function number(value, digits = 3) {
   return value === null || value === undefined ? '–' : value.toFixed(digits).replace('-', '−');
 }
 
-// Values of a column at other times, by linear interpolation; null outside.
-function interpolate(times, values, at) {
-  const result = new Array(at.length).fill(null);
-  let k = 0;
-  for (let i = 0; i < at.length; i++) {
-    while (k + 1 < times.length && times[k + 1] < at[i]) k++;
-    if (k + 1 >= times.length || at[i] < times[k]) continue;
-    const [a, b] = [values[k], values[k + 1]];
-    if (a === null || b === null) continue;
-    const part = (at[i] - times[k]) / (times[k + 1] - times[k] || 1);
-    result[i] = a + part * (b - a);
+// Row of the last time up to an instant, -1 before the first one.
+function rowAt(times, at) {
+  let [low, high] = [0, times.length];
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (times[middle] <= at) low = middle + 1; else high = middle;
   }
-  return result;
+  return low - 1;
 }
 
-// Charts over one time axis: a cursor, a selected span and the colours are common to all.
+const seconds = (time, digits = 2) => `${+time.toFixed(digits)} s`;
+
+// Charts over one time axis: a cursor, a selected span and the colours are common to all. A null
+// interrupts a line.
 class ChartGroup {
   // place: element that gets the charts; moved(time or null): called when the cursor moves;
-  // selected(from, to): called when a span is selected, (null) to undo it; spanGaps: whether a
-  // null is skipped, or seen as a gap.
-  constructor(place, { moved = () => {}, selected = () => {}, spanGaps = true } = {}) {
+  // selected(from, to): called when a span is selected, (null) to undo it; snap(time): the instant
+  // that the cursor shows there, else that of the nearest row; words(time): text of a time.
+  constructor(place, { moved = () => {}, selected = () => {}, snap = null, words = seconds } = {}) {
     this.place = place;
     this.moved = moved;
     this.selected = selected;
-    this.spanGaps = spanGaps;
+    this.snap = snap;
+    this.words = words;
     this.charts = [];
     this.key = `t3mpc-${Math.random()}`;
     this.marks = [];
@@ -76,7 +75,8 @@ class ChartGroup {
       this.place.append(element('figure', { className: 'chart' },
         element('h3', { textContent: `${title} (${unit})` }), plot, legend));
     }
-    const chart = { title, unit, series, plot, legend, data: [[], ...series.map(() => [])] };
+    const empty = [[], ...series.map(() => [])];
+    const chart = { title, unit, series, plot, legend, tables: [empty], data: empty, limits: null };
     chart.values = series.map((each) => {
       const value = element('b', { textContent: '–' });
       legend.append(element('span', {}, sample(each.colour, each.dash), `${each.label} `, value));
@@ -95,11 +95,13 @@ class ChartGroup {
     chart.uplot = new uPlot({
       width: Math.max(200, chart.plot.clientWidth), height: 160,
       legend: { show: false }, cursor: { sync: { key: this.key }, y: false, drag: { x: true, y: false }, points: { size: 6 } },
-      scales: { x: { time: false, range: (u, low, high) => this.range || [low, high] } },
-      axes: [{ ...axis, size: 30, values: (u, ticks) => ticks.map((each) => `${+each.toFixed(2)} s`) },
+      scales: { x: { time: false, range: (u, low, high) => this.range || [low, high] },
+        y: { range: (u, low, high) => chart.limits
+          || (low === null ? [low, high] : uPlot.rangeNum(low, high, 0.1, true)) } },
+      axes: [{ ...axis, size: 30, space: 70, values: (u, ticks) => ticks.map((each) => this.words(each)) },
         { ...axis, size: 52 }],
       series: [{}, ...chart.series.map((each) => ({ label: each.label, stroke: colour(each.colour),
-        dash: each.dash, width: 1.6, spanGaps: this.spanGaps, points: { show: false },
+        dash: each.dash, width: 1.6, points: { show: false },
         ...style(each.style, colour(each.colour)) }))],
       hooks: {
         setCursor: [(u) => this.showCursor(chart, u)],
@@ -116,9 +118,12 @@ class ChartGroup {
     chart.uplot.over.addEventListener('dblclick', () => this.selected(null));
   }
 
-  // tables: one [times, column, …] for each stream; columns in the order of the series.
-  set(chart, tables) {
+  // tables: one [times, column, …] for each stream; columns in the order of the series. limits:
+  // lowest and highest value that is shown, null for all of them.
+  set(chart, tables, limits = null) {
+    chart.tables = tables;
     chart.data = tables.length > 1 ? uPlot.join(tables) : tables[0];
+    chart.limits = limits;
   }
 
   // Draw all charts from one instant to another; null: everything.
@@ -126,7 +131,7 @@ class ChartGroup {
     this.range = range;
     for (const chart of this.charts) {
       chart.uplot.setData(chart.data);
-      if (chart.uplot.cursor.left < 0) this.showLast(chart);
+      this.showValues(chart);
     }
   }
 
@@ -146,24 +151,29 @@ class ChartGroup {
     context.restore();
   }
 
-  showCursor(chart, u) {
-    const row = u.cursor.idx;
-    if (row === null || row === undefined || u.cursor.left < 0) {
-      this.showLast(chart);
-      if (chart === this.charts[0]) this.moved(null);
-      return;
-    }
-    chart.series.forEach((each, i) => {
-      chart.values[i].textContent = number(nearest(chart.data[i + 1], row));
-    });
-    if (chart === this.charts[0]) this.moved(chart.data[0][row]);
+  // The instant that the cursor of a chart shows, null without one.
+  instant({ uplot: { cursor, data, posToVal } }) {
+    if (cursor.left < 0 || cursor.idx === null || cursor.idx === undefined) return null;
+    return this.snap ? this.snap(posToVal(cursor.left, 'x')) : data[0][cursor.idx];
   }
 
-  showLast(chart) {
-    chart.series.forEach((each, i) => {
-      const column = chart.data[i + 1];
-      chart.values[i].textContent = number(nearest(column, column.length - 1));
-    });
+  showCursor(chart, u) {
+    if (!chart.uplot) return; // while it is being made
+    this.showValues(chart);
+    if (chart === this.charts[0]) this.moved(this.instant(chart));
+  }
+
+  // The legend says where the lines are at the cursor: all of them at the same instant.
+  showValues(chart) {
+    const time = this.instant(chart);
+    const reach = 0.005 * (chart.uplot.scales.x.max - chart.uplot.scales.x.min);
+    let i = 0;
+    for (const [times, ...columns] of chart.tables) {
+      for (const column of columns) {
+        const value = time === null ? null : valueAt(times, column, time, chart.series[i].style, reach);
+        chart.values[i++].textContent = number(value);
+      }
+    }
   }
 
   // Put the cursor of all charts at an instant.
@@ -205,12 +215,19 @@ function style(name, stroke) {
   return {};
 }
 
-// The last value up to a row: joined streams have rows without a value.
-function nearest(column, row) {
-  for (let i = row; i >= 0 && i > row - 40; i--) {
-    if (column[i] !== null && column[i] !== undefined) return column[i];
+// Where a line of a style is at an instant; null where there is none. A point counts within reach.
+function valueAt(times, column, at, name, reach = 0) {
+  const row = rowAt(times, at);
+  const [before, after] = [column[row] ?? null, column[row + 1] ?? null];
+  if (name === 'points') {
+    const near = [row, row + 1].filter((each) => Math.abs(times[each] - at) <= reach)
+      .sort((a, b) => Math.abs(times[a] - at) - Math.abs(times[b] - at));
+    return near.length ? column[near[0]] ?? null : null;
   }
-  return null;
+  if (row < 0 || (row === times.length - 1 && times[row] < at)) return null;
+  if (name === 'steps' || times[row] === at) return before;
+  if (before === null || after === null) return null;
+  return before + ((at - times[row]) / (times[row + 1] - times[row])) * (after - before);
 }
 
 // Pose b as seen from the frame in which a is the origin, and back.
@@ -234,7 +251,8 @@ class Floor {
   }
 
   // scene: {world, paths: [{x, y, colour, dash}], marks: [[x, y, colour]], robot: [x, y, yaw] or
-  // null, mounts, ranges, track (m)}; NaN interrupts a path
+  // null, mounts: [[x, y, yaw]] of the range sensors, ranges, reach, track, wheel (radius) (m)};
+  // NaN interrupts a path
   draw(scene) {
     const canvas = this.canvas;
     const ratio = window.devicePixelRatio || 1;
@@ -319,23 +337,40 @@ class Floor {
     for (const [ax, ay, bx, by] of world.segments) line(context, ...at(ax, ay), ...at(bx, by));
   }
 
-  robot(context, { robot, mounts, ranges, track }, at, scale, ratio) {
-    context.strokeStyle = colour('ray');
-    context.lineWidth = 1.2 * ratio;
+  // The robot to scale, but never too small to be seen: body, wheels, sensors and their rays. A ray
+  // that meets nothing ends, dashed, at the reach of its sensor; one that does ends in a point.
+  robot(context, { robot, mounts, ranges, reach, track, wheel }, at, scale, ratio) {
+    const faces = mounts || [];
+    context.strokeStyle = context.fillStyle = colour('ray');
+    context.lineWidth = ratio;
     (ranges || []).forEach((distance, i) => {
-      if (distance === null || !mounts?.[i]) return;
-      const from = compose(robot, mounts[i]);
-      const to = compose(from, [distance, 0, 0]);
-      line(context, ...at(from[0], from[1]), ...at(to[0], to[1]));
+      if (distance === null || !faces[i]) return;
+      const from = compose(robot, faces[i]);
+      const free = reach !== undefined && distance >= reach;
+      const end = at(...compose(from, [free ? reach : distance, 0, 0]));
+      context.setLineDash(free ? [2 * ratio, 4 * ratio] : []);
+      line(context, ...at(from[0], from[1]), ...end);
+      if (!free) disc(context, ...end, 2.5 * ratio);
     });
-    const [x, y] = at(robot[0], robot[1]);
-    const radius = Math.max(6 * ratio, 0.6 * (track || 0.15) * scale);
-    context.fillStyle = colour('accent');
-    disc(context, x, y, radius);
-    const [hx, hy] = [x + 1.7 * radius * Math.cos(robot[2]), y - 1.7 * radius * Math.sin(robot[2])];
-    context.strokeStyle = colour('ink');
-    context.lineWidth = 3 * ratio;
-    line(context, x, y, hx, hy);
+    context.setLineDash([]);
+    const half = 0.5 * (track || 0.15);
+    const radius = wheel || 0.3 * half;
+    const ahead = faces.length ? Math.max(...faces.map(([x]) => x)) : half;
+    const size = Math.max(1, (9 * ratio) / (ahead * scale));
+    const point = (x, y) => at(...compose(robot, [size * x, size * y, 0]));
+    const shape = (corners, name) => {
+      context.fillStyle = colour(name);
+      context.beginPath();
+      corners.forEach((corner, i) => context[i ? 'lineTo' : 'moveTo'](...point(...corner)));
+      context.fill();
+    };
+    const box = (x, y, length, width) => [[x + length, y + width], [x + length, y - width],
+      [x - length, y - width], [x - length, y + width]];
+    shape(box(0, 0, ahead, 0.85 * half), 'odometry');
+    for (const side of [half, -half]) shape(box(0, side, radius, 0.12 * half), 'ink');
+    shape([[0.9 * ahead, 0], [0.3 * ahead, 0.4 * half], [0.3 * ahead, -0.4 * half]], 'paper');
+    context.fillStyle = colour('ray');
+    for (const [x, y] of faces) disc(context, ...point(x, y), 1.8 * ratio);
   }
 }
 

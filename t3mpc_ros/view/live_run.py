@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import math
 from typing import Literal, NamedTuple
 
-from t3mpc_ros.view.live_data import STEP, LiveData
+from t3mpc_ros.view.live_data import SPAN, STEP, LiveData
 
 Condition = Literal['normal', 'warning', 'stopped']
 
@@ -84,6 +84,7 @@ class LiveRun(LiveData):
 
     def __init__(self) -> None:
         super().__init__(step=STEP)
+        self.set('span', SPAN)
         self._reports: dict[str, NodeReport] = {}
         self._odometry_pending = False
         self._last_odometry: float | None = None

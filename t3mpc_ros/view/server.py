@@ -18,25 +18,34 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 import json
 import math
+from pathlib import Path
 import secrets
 from threading import Thread
 from typing import Any, Self
 from urllib.parse import parse_qs, urlsplit
 
 from t3mpc_ros.page.page_files import PAGE_FILES, page_file
-from t3mpc_ros.view.live_data import Json, LiveData
+from t3mpc_ros.view.live_data import Cursor, Json, LiveData
 
 ADDRESS = '127.0.0.1'
 MAX_BODY = 4096
 """Largest command, bytes."""
 
 _TYPES = {'.html': 'text/html', '.js': 'text/javascript', '.css': 'text/css'}
-_PAGE = ('view.html', 'view.js', 'view.css', *PAGE_FILES)
+_SCRIPTS = ('view.js', 'commands.js', 'parameters.js', 'pictures.js', 'events.js', 'share.js')
+_PAGE = ('view.html', 'view.css', *_SCRIPTS, *PAGE_FILES)
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
+)
+_ALONE = (
+    "sandbox allow-scripts allow-downloads; default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; base-uri 'none'"
+)
+"""A report has its scripts inside, made of what a bag says: its origin is none, and it asks for
+nothing."""
 _HEADERS = {
     'Cache-Control': 'no-store',
-    'Content-Security-Policy': "default-src 'none'; script-src 'self'; style-src 'self'; "
-    "connect-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; "
-    "form-action 'none'",
     'Cross-Origin-Opener-Policy': 'same-origin',
     'Cross-Origin-Resource-Policy': 'same-origin',
     'Referrer-Policy': 'no-referrer',
@@ -70,6 +79,8 @@ class PageServer:
         self.data = data
         self.command = command
         self.clock = clock
+        self.report: Path | None = None
+        """Newest report of a recording, served as ``/report``."""
         self.token = secrets.token_urlsafe(24)
         try:
             self._server = _Server((ADDRESS, port), self)
@@ -146,6 +157,9 @@ class _Handler(BaseHTTPRequestHandler):
         if url.path == '/events':
             self._events(url.query)
             return
+        if url.path == '/report' and page.report is not None and page.report.exists():
+            self._send(_text_of(page.report), 'text/html', policy=_ALONE)
+            return
         name = url.path.removeprefix('/') or 'view.html'
         if name not in _PAGE:
             raise RefusedError(HTTPStatus.NOT_FOUND, f'there is no {url.path}')
@@ -158,14 +172,16 @@ class _Handler(BaseHTTPRequestHandler):
         """Send what is new since the last request of this page, and the time of this clock."""
         page = self.server.page
         changes, cursor = page.data.read(self._cursor(query))
-        reply = {**changes, 'id': f'{page.token[:8]}-{cursor}', 'now': page.clock()}
+        place = f'{page.token[:8]}-{cursor.change}-{cursor.fact}'
+        reply = {**changes, 'id': place, 'now': page.clock()}
         self._send(json.dumps(reply, separators=(',', ':'), allow_nan=False), 'application/json')
 
-    def _cursor(self, query: str) -> int:
-        """Return the number up to which the page has read; 0 for a page of an earlier start."""
-        last = parse_qs(query).get('last', [''])[0]
-        start, _, number = last.rpartition('-')  # the start may contain a hyphen, too
-        return int(number) if start == self.server.page.token[:8] and number.isdecimal() else 0
+    def _cursor(self, query: str) -> Cursor:
+        """Return how far the page has read; a page of an earlier start has read nothing."""
+        start, *read = parse_qs(query).get('last', [''])[0].rsplit('-', 2)  # start may contain one
+        if start != self.server.page.token[:8] or len(read) != 2:
+            return Cursor()
+        return Cursor(*map(int, read)) if all(map(str.isdecimal, read)) else Cursor()
 
     def _post(self) -> None:
         page = self.server.page
@@ -211,23 +227,24 @@ class _Handler(BaseHTTPRequestHandler):
             )
         return name, arguments, asked
 
-    def _send(self, text: str, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
-        content = text.encode()
-        self._send_headers(f'{kind}; charset=utf-8', len(content), status)
-        self.wfile.write(content)
-
-    def _send_headers(
-        self, kind: str, length: int | None, status: HTTPStatus = HTTPStatus.OK
+    def _send(
+        self, text: str, kind: str, status: HTTPStatus = HTTPStatus.OK, policy: str = _POLICY
     ) -> None:
+        content = text.encode()
         self.send_response(status)
-        self.send_header('Content-Type', kind)
-        if length is None or self.close_connection:
+        self.send_header('Content-Type', f'{kind}; charset=utf-8')
+        if self.close_connection:
             self.send_header('Connection', 'close')
-        if length is not None:
-            self.send_header('Content-Length', str(length))
+        self.send_header('Content-Length', str(len(content)))
+        self.send_header('Content-Security-Policy', policy)
         for name, value in _HEADERS.items():
             self.send_header(name, value)
         self.end_headers()
+        self.wfile.write(content)
+
+
+def _text_of(file: Path) -> str:
+    return file.read_text(encoding='utf-8')
 
 
 @cache

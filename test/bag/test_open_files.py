@@ -273,6 +273,7 @@ def _unplugged(*_):
 
 def a_page(folder):
     server._file.__wrapped__('view.html')
+    server._text_of(Path(__file__))
     with server.PageServer(LiveData(), None, 0, time.monotonic) as page, suppress(OSError):
         server.PageServer(LiveData(), None, page.port, time.monotonic)
 

@@ -4,9 +4,14 @@
 
 import time
 
+from nav_msgs.msg import Odometry
+import numpy as np
 import pytest
+from std_msgs.msg import Header, Int32MultiArray
+from support.page_data import read_all
 from support.ros_graph import CommandSource, twist
 
+from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import WARN
 from t3mpc_ros.nodes.remote_parameters import parameter_row
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
@@ -14,6 +19,8 @@ from t3mpc_ros.nodes.viewer import CommandFailedError, ViewNode
 from t3mpc_ros.view.live_run import LiveRun
 
 pytestmark = pytest.mark.ros
+
+LEAD_NS = 400_000_000
 
 
 class Viewer:
@@ -27,7 +34,7 @@ class Viewer:
         self._now = 0.0
 
     def changes(self):
-        return self.run.read(0)[0]
+        return read_all(self.run)[0]
 
     def facts(self):
         return self.changes().get('facts', {})
@@ -83,6 +90,49 @@ def test_a_moving_robot_is_shown(viewer, harness):
     source.message = None
     viewer.spin_until(lambda: viewer.facts()['banner']['headline'] == 'Stopped')
     assert 'no command' in viewer.facts()['banner']['detail']
+
+
+def test_a_switch_has_the_time_of_the_reference_that_it_begins(viewer, harness):
+    """It was marked when its message arrived: as much too early as the reference is sent ahead."""
+    reference = harness.probe.create_publisher(Odometry, 'reference', qos.STREAM)
+    signals = harness.probe.create_publisher(Int32MultiArray, 'reference/signals', qos.LATCHED)
+    sent, switches = [], []
+
+    def send(mode, *, switch):
+        now = harness.probe.get_clock().now().nanoseconds
+        if switch:
+            signals.publish(Int32MultiArray(data=[mode, 1, 2]))
+            switches.append(now + LEAD_NS)
+        stamp = conversions.time_from_ns(now + LEAD_NS)
+        reference.publish(Odometry(header=Header(stamp=stamp)))
+        sent.append(now + LEAD_NS)
+
+    def found():
+        events = viewer.changes().get('events', ())
+        return [event['time'] for event in events if event['kind'] == 'switch']
+
+    for mode in range(5):
+        for k in range(4):
+            send(mode, switch=k == 2)
+            viewer.spin_until(lambda: len(viewer.node._sent_references) == len(sent))
+    viewer.spin_until(lambda: len(found()) == 4)  # the first mode is no switch
+    origin = viewer.facts()['origin']
+    expected = [(stamp - origin * 1_000_000_000) / 1e9 for stamp in switches[1:]]
+    assert found() == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_command_without_stamp_has_the_time_of_its_sending(viewer, harness):
+    """It had that of the newest odometry at the next poll: up to 50 ms off."""
+    source = CommandSource(harness)
+    source.message = twist(0.14)
+
+    def times():
+        return viewer.changes().get('streams', {}).get('command', {}).get('time', ())
+
+    viewer.spin_until(lambda: len(times()) > 30)
+    assert np.max(np.diff(times())) > 0.0
+    steps = np.diff(times())
+    assert np.median(steps) < 0.045, 'one command for each poll is shown'
 
 
 def test_the_e_stop_latches_and_is_shown(viewer, robot):
@@ -156,7 +206,7 @@ def test_a_release_from_before_the_stop_is_refused(viewer, robot):
     viewer.command('e_stop', on=True)
     with pytest.raises(CommandFailedError, match='before the last stop'):
         viewer.command('e_stop', on=False, asked=early)
-    assert robot._state.status.estop
+    viewer.spin_until(lambda: robot._state.status.estop)  # with its next step
 
 
 def test_a_node_that_leaves_takes_its_parameters_along(viewer, robot, harness):

@@ -7,15 +7,16 @@ import math
 
 import numpy as np
 import pytest
+from support.page_data import read_all
 
-from t3mpc_ros.view.live_data import MAX_EVENTS, SPAN, LiveData
+from t3mpc_ros.view.live_data import MAX_CHANGES, MAX_EVENTS, SPAN, Cursor, LiveData
 from t3mpc_ros.view.live_run import LOST, MAX_AGE, LiveRun, NodeReport, banner
 
 
 def test_readers_of_any_pace_get_every_sample_once_and_in_order():
     data = LiveData()
     generator = np.random.default_rng(1)
-    cursors, found = [0, 0, 0], [[], [], []]
+    cursors, found = [Cursor()] * 3, [[], [], []]
     for k in range(600):
         data.add('a' if k % 3 else 'b', 0.01 * k, [k, -k])
         for reader in np.flatnonzero(generator.random(3) < (1.0, 0.1, 0.01)):
@@ -26,7 +27,37 @@ def test_readers_of_any_pace_get_every_sample_once_and_in_order():
         for stream in data.read(cursors[reader])[0].get('streams', {}).values():
             found[reader] += stream['values'][0]
         assert sorted(found[reader]) == list(range(600))
-    assert data.read(600) == ({}, 600)
+    assert data.read(Cursor(600)) == ({}, Cursor(600))
+
+
+def test_no_answer_is_long_and_together_they_are_complete():
+    """A page that opens gets ten minutes: in one answer, the loop would wait for it."""
+    data = LiveData()
+    generator = np.random.default_rng(2)
+    kinds = generator.choice(
+        ['a', 'b', 'event', 'fact'], 3 * MAX_CHANGES, p=[0.5, 0.4, 0.08, 0.02]
+    )
+    for k, kind in enumerate(kinds):
+        if kind == 'event':
+            data.report(0.001 * k, 'note', str(k))
+        elif kind == 'fact':
+            data.set('newest', k)
+        else:
+            data.add(kind, 0.001 * k, [k])
+    cursor, sizes = Cursor(), []
+    while (answer := data.read(cursor))[1] != cursor:
+        news, cursor = answer
+        rows = [len(each['time']) for each in news.get('streams', {}).values()]
+        sizes.append(sum(rows) + len(news.get('events', ())))
+        assert news.get('more', False) == (cursor.change < np.count_nonzero(kinds != 'fact'))
+    assert max(sizes) <= MAX_CHANGES
+    assert len(sizes) == 3
+    found, _ = read_all(data)
+    for stream in 'ab':
+        assert found['streams'][stream]['values'][0] == np.flatnonzero(kinds == stream).tolist()
+    texts = [event['text'] for event in found['events']]
+    assert texts == [str(k) for k in np.flatnonzero(kinds == 'event')[-MAX_EVENTS:]]
+    assert found['facts'] == {'newest': np.flatnonzero(kinds == 'fact')[-1]}
 
 
 def test_what_is_kept_is_bounded():
@@ -36,7 +67,7 @@ def test_what_is_kept_is_bounded():
         data.report(float(k), 'note', str(k))
     for k in range(2 * MAX_EVENTS):
         data.report(0.0, 'note', str(k))
-    changes, _ = data.read(0)
+    changes, _ = read_all(data)
     times = changes['streams']['a']['time']
     assert (times[0], times[-1]) == (times[-1] - SPAN, 3 * round(SPAN) - 1)
     assert len(changes['events']) == MAX_EVENTS
@@ -46,7 +77,7 @@ def test_samples_between_two_steps_are_left_out():
     data = LiveData(step=0.019)
     for k in range(101):
         data.add('a', 0.01 * k, [k])
-    assert data.read(0)[0]['streams']['a']['values'] == [list(range(0, 101, 2))]
+    assert read_all(data)[0]['streams']['a']['values'] == [list(range(0, 101, 2))]
 
 
 def test_time_that_goes_back_starts_the_stream_anew():
@@ -54,20 +85,20 @@ def test_time_that_goes_back_starts_the_stream_anew():
     data = LiveData()
     for time in (5.0, 6.0, 0.0, 1.0):
         data.add('a', time, [time])
-    assert data.read(0)[0]['streams']['a']['time'] == [0.0, 1.0]
+    assert read_all(data)[0]['streams']['a']['time'] == [0.0, 1.0]
 
 
 def test_numbers_that_are_not_finite_become_null():
     data = LiveData()
     data.add('a', 0.0, [math.nan, math.inf, -math.inf, 1.0])
-    text = json.dumps(data.read(0)[0], allow_nan=False)
+    text = json.dumps(read_all(data)[0], allow_nan=False)
     assert json.loads(text)['streams']['a']['values'] == [[None], [None], [None], [1.0]]
 
 
 def test_a_fact_is_read_again_only_when_it_has_changed():
     data = LiveData()
     data.set('world', {'walls': [1]})
-    changes, cursor = data.read(0)
+    changes, cursor = data.read(Cursor())
     assert changes == {'facts': {'world': {'walls': [1]}}}
     data.set('world', {'walls': [1]})
     assert data.read(cursor)[0] == {}
@@ -143,7 +174,7 @@ def test_stops_and_their_ends_are_events():
             run.node_report('sim_robot', 'following commands', 'normal')
         run.tick(0.1 * k)
     run.tick(2.9 + LOST + 0.1)
-    events = run.read(0)[0]['events']
+    events = read_all(run)[0]['events']
     assert [(event['kind'], event['text'].split(':')[0]) for event in events] == [
         ('note', 'Tracking the reference'),
         ('stop', 'E-STOP'),
@@ -151,7 +182,7 @@ def test_stops_and_their_ends_are_events():
         ('stop', 'Connection lost'),
     ]
     assert events[1]['time'] == pytest.approx(1.0)
-    assert run.read(0)[0]['facts']['banner']['kind'] == 'lost'
+    assert read_all(run)[0]['facts']['banner']['kind'] == 'lost'
 
 
 def test_the_report_of_a_node_that_has_left_is_discarded():
@@ -160,7 +191,7 @@ def test_the_report_of_a_node_that_has_left_is_discarded():
     run.node_report('sim_robot', *ESTOP)
     run.node_gone('sim_robot')
     run.tick(0.0)
-    assert run.read(0)[0]['facts']['banner']['kind'] == 'good'
+    assert read_all(run)[0]['facts']['banner']['kind'] == 'good'
 
 
 @pytest.mark.parametrize(

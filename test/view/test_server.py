@@ -65,12 +65,14 @@ def test_page_and_scripts_are_served_and_nothing_else(page):
     assert status == 200
     assert page.server.token in text
     assert "default-src 'none'" in headers['Content-Security-Policy']
-    for name in re.findall(r'(?:src|href)="([^":]+)"', text):
+    names = {*re.findall(r'(?:src|href)="([^":]+)"', text)}
+    assert page.request('GET', '/report')[0] == 404, 'nothing has been recorded'
+    for name in names - {'report'}:
         assert page.request('GET', f'/{name}')[0] == 200, name
     for path in ('/server.py', '/../server.py', '/page/view.js', '/view.html/x', '/%2e%2e/x'):
         assert page.request('GET', path)[0] == 404, path
     # A page that works offline loads nothing from elsewhere.
-    for name in ('view.html', 'view.js', 'charts.js', 'view.css'):
+    for name in ('view.html', 'view.js', 'pictures.js', 'charts.js', 'view.css'):
         assert not re.search(r'https?://(?!www\.w3\.org)', page.request('GET', f'/{name}')[2])
 
 
@@ -144,7 +146,8 @@ def test_events_go_on_where_a_page_has_stopped(page, token):
     data.add('a', 1.0, [2.0])
     assert page.events(last)[1]['streams']['a']['values'] == [[2.0]]
     # The page of an earlier start has seen nothing of this one.
-    assert page.events('other-7')[1]['streams']['a']['values'] == [[1.0, 2.0]]
+    for other in ('other-7-0', f'{token[:8]}-7', f'{token[:8]}-x-0', '-', ''):
+        assert page.events(other)[1]['streams']['a']['values'] == [[1.0, 2.0]]
 
 
 def test_an_answer_without_news_comes_at_once_with_the_time(page):
@@ -154,6 +157,20 @@ def test_an_answer_without_news_comes_at_once_with_the_time(page):
     assert before <= news.pop('now') <= time.monotonic()
     assert news == {}
     assert page.events(last)[0] == last
+
+
+def test_a_report_is_served_alone_and_cannot_command(page, tmp_path):
+    """Its scripts are in it, made of what a bag says: a name there must not command a robot."""
+    page.server.report = tmp_path / 'report.html'
+    assert page.request('GET', '/report')[0] == 404
+    page.server.report.write_text('<p>good run')
+    status, headers, text = page.request('GET', '/report')
+    assert (status, text) == (200, '<p>good run')
+    policy = headers['Content-Security-Policy']
+    assert 'sandbox allow-scripts allow-downloads;' in policy  # its origin is null
+    assert 'connect-src' not in policy
+    assert "default-src 'none'" in policy
+    assert page.command(origin='null')[0] == 403
 
 
 def test_a_port_in_use_is_an_error_with_a_remedy(page):

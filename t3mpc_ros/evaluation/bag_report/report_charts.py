@@ -39,10 +39,10 @@ LABELS = {
     REFERENCE: 'reference',
     COMMAND: 'command',
 }
-COLOURS = {TRUTH: 'truth', ODOMETRY: 'right', REFERENCE: 'reference', COMMAND: 'left'}
+COLOURS = {TRUTH: 'truth', ODOMETRY: 'odometry', REFERENCE: 'reference', COMMAND: 'command'}
 """Variables of the style sheet by motion, the same in every chart."""
 DASHES = {REFERENCE: (6, 4), COMMAND: (2, 3)}
-TERM_COLOURS = ('c1', 'c2', 'c3', 'c4', 'c5', 'ink')
+TERM_COLOURS = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive', 'ink')
 TERM_DASHES = ((), (6, 3), (2, 3), (8, 3, 2, 3), (1, 4), (4, 2))
 WHEEL_DASHES: Mapping[str, tuple[int, ...]] = {'right': (), 'left': (6, 3)}
 DETAIL = 4.0

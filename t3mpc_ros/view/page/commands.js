@@ -1,0 +1,140 @@
+// Copyright 2026 The t3mpc_ros developers
+// SPDX-License-Identifier: Apache-2.0
+// The banner, the e-stop and the buttons of commands.
+'use strict';
+
+const CONFIRM = 500; // ms within which a stop must be confirmed, and between two attempts
+const RELOAD = 30000; // ms for which a stop is asked for again after the page loads itself anew
+
+let stopping = ''; // why a stop is not confirmed yet
+
+// -- banner --------------------------------------------------------------------------------------
+
+function showBanner() {
+  let shown = connected ? facts.banner || { kind: 'lost', headline: 'Connected', detail: '' }
+    : { kind: 'lost', headline: 'This page has lost its program',
+      detail: 'It connects again by itself as soon as t3mpc view runs.' };
+  if (stopping) {
+    shown = { kind: 'unconfirmed', headline: 'STOP NOT CONFIRMED: use the switch on the robot',
+      detail: `${stopping}; asking again` };
+  }
+  place('banner').className = shown.kind + (place('banner').matches('.expanded') ? ' expanded' : '');
+  place('headline').textContent = shown.headline;
+  place('detail').textContent = place('detail').title = shown.detail;
+  document.title = `${shown.headline} – t3mpc_ros`;
+  place('release').hidden = readOnly || shown.headline !== 'E-STOP';
+  place('e-stop').disabled = readOnly;
+}
+
+// -- commands ------------------------------------------------------------------------------------
+
+// Send a command; return what was done, or throw why not.
+async function send(name, args, asked, patience) {
+  const reply = await fetch('command', {
+    method: 'POST',
+    headers: { 'Content-Type': 'application/json', 'X-Token': token },
+    body: JSON.stringify({ command: name, arguments: args, asked: asked ?? undefined }),
+    signal: AbortSignal.timeout(patience),
+    priority: 'high',
+  });
+  const result = await reply.json();
+  if (!reply.ok) throw new Error(result.error);
+  return result.done;
+}
+
+const asked = () => clock === null ? null : clock + steady();
+
+async function command(name, args = {}, patience = 5000) {
+  const answer = place('answer');
+  answer.className = '';
+  answer.textContent = `${name} …`;
+  try {
+    answer.textContent = await send(name, args, asked(), patience);
+    return true;
+  } catch (error) {
+    answer.className = 'failed';
+    answer.textContent = `not done: ${error.message}`;
+    return false;
+  }
+}
+
+// Ask for a stop until it is confirmed. What asks may overlap: a stop may arrive twice.
+let attempts = null;
+
+async function emergencyStop() {
+  if (readOnly || attempts) return;
+  const time = asked();
+  attempts = setTimeout(() => unconfirmed('no answer yet'), CONFIRM);
+  sessionStorage.setItem('stop', Date.now());
+  for (;;) {
+    const next = new Promise((resume) => { setTimeout(resume, CONFIRM); });
+    try {
+      const done = await send('e_stop', { on: true }, time, 2 * CONFIRM);
+      place('answer').className = '';
+      place('answer').textContent = done;
+      break;
+    } catch (error) {
+      unconfirmed(error.name === 'TimeoutError' ? 'no answer' : error.message);
+    }
+    await next;
+  }
+  clearTimeout(attempts);
+  attempts = null;
+  sessionStorage.removeItem('stop');
+  unconfirmed('');
+}
+
+function unconfirmed(why) {
+  stopping = why;
+  showBanner();
+}
+
+const BUTTONS = [
+  ['controller', 'Enable', 'enable', { on: true }, 'Let the controller drive'],
+  ['controller', 'Disable', 'enable', { on: false }, 'Stop the robot; Enable drives on'],
+  ['controller', 'Reset controller', 'reset', {}, 'Discard what was learnt in this run'],
+  ['robot', 'Reset odometry', 'reset_odometry', {}, 'Set the odometry to the origin'],
+  ['reference_generator', 'Pause reference', 'pause', { on: true }, 'The reference rests'],
+  ['reference_generator', 'Resume reference', 'pause', { on: false }, 'The reference goes on'],
+  ['reference_generator', 'Reseed', 'reseed', {}, 'Another path, from a random seed'],
+];
+
+function showButtons() {
+  const nodes = new Set(facts.nodes);
+  if (nodes.has('sim_robot') || nodes.has('radio_bridge')) nodes.add('robot');
+  place('buttons').replaceChildren(...BUTTONS.filter(([node]) => nodes.has(node)).map(
+    ([, text, name, args, title]) => element('button', { type: 'button', textContent: text, title,
+      disabled: readOnly, onclick: () => command(name, args) })));
+  if (readOnly) place('answer').textContent = 'started with --read-only: commands are off';
+}
+
+// What the recorder does: it begins a bag, and ends it with a report.
+function showRecorder() {
+  const { state, text, report } = facts.recorder;
+  const begins = state === 'idle';
+  place('record-box').hidden = false;
+  place('record').textContent = begins ? 'Record' : 'End recording, draw report';
+  place('record').disabled = readOnly || !(begins || state === 'recording');
+  place('record').className = state === 'recording' ? 'recording' : '';
+  place('record-text').textContent = text;
+  place('report').hidden = !report;
+}
+
+place('record').onclick = () => command('record', { on: facts.recorder.state === 'idle' }, 90000);
+place('state').onclick = () => place('banner').classList.toggle('expanded'); // the whole reason, on a phone
+place('e-stop').onclick = emergencyStop;
+place('release').onclick = () => command('e_stop', { on: false });
+
+// The space bar stops wherever the focus is, but where a text is typed: before the focused element
+// gets it (a button would be pressed, a list opened), when it goes down and when it comes up.
+const isText = (target) => target.matches?.('input[type="text"], input[type="search"], textarea');
+const isStop = (key) => key.code === 'Space' && !readOnly && !facts.recording && !isText(key.target)
+  && !(key.ctrlKey || key.metaKey || key.altKey);
+for (const kind of ['keydown', 'keyup']) {
+  window.addEventListener(kind, (key) => {
+    if (!isStop(key)) return;
+    key.preventDefault();
+    key.stopPropagation();
+    if (kind === 'keydown' && !key.repeat) emergencyStop();
+  }, { capture: true });
+}

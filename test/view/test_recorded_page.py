@@ -1,0 +1,309 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The page of a recorded run in a headless browser: what it says is what the bag holds."""
+
+from pathlib import Path
+import time
+
+import numpy as np
+import pytest
+from support.bag_messages import START, TYPES, odometry_message, twist_message
+from support.browser import Browser
+from support.robot_bags import following_rows, write
+
+from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.cli.recorded_run import recorded_run
+from t3mpc_ros.evaluation.bag_report.run_data import load_run
+from t3mpc_ros.view.live_data import LiveData
+from t3mpc_ros.view.live_run import LiveRun
+from t3mpc_ros.view.server import PageServer
+
+pytestmark = pytest.mark.slow
+
+GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'
+LEGENDS = """
+charts.moveTo(arguments[0]);
+const shown = charts.charts.map((chart) => [chart.title, Object.fromEntries(chart.series.map(
+  ({label}, i) => [label, chart.values[i].textContent]))]);
+return [cursorTime, Object.fromEntries(shown)];
+"""
+
+
+@pytest.fixture(scope='module')
+def browser():
+    browser = Browser()
+    yield browser
+    browser.driver.quit()
+
+
+@pytest.fixture
+def show(browser):
+    """Return a function that opens the page of some data, and one that closes all of them."""
+    servers = []
+
+    def opened(data, command=None):
+        server = PageServer(data, command, 0, time.monotonic).__enter__()
+        servers.append(server)
+        browser.driver.get(server.url)
+        browser.show_as(1440, 1000)
+        browser.wait(lambda: browser.run('return connected && !changed'), 'nothing is drawn')
+        return server
+
+    yield opened
+    for server in servers:
+        server.__exit__()
+
+
+def value(text):
+    return None if text == '–' else float(text.replace('−', '-'))
+
+
+def legends(browser, at):
+    """Return the instant of the cursor and the numbers of all legends, by chart and line."""
+    instant, shown = browser.run(LEGENDS, at)
+    return instant, {
+        chart: {label: value(text) for label, text in lines.items()}
+        for chart, lines in shown.items()
+    }
+
+
+def test_the_legend_says_what_was_sent_for_the_cursor(browser, show):
+    """It showed the reference 0.4 s later than the measurement and the error beside it."""
+    with open_bag(GOLDEN) as recording:
+        run = load_run(recording)
+    odom, reference, command = (run.motions[each] for each in ('odom', 'reference', 'cmd_vel'))
+    show(recorded_run(GOLDEN))
+    # Without a cursor there is no instant, and no value.
+    shown = 'return charts.charts.flatMap(({values}) => values.map((each) => each.textContent))'
+    assert set(browser.run(shown)) == {'–'}
+    begin, end = max(odom.time[0], reference.time[0]), min(odom.time[-1], reference.time[-1])
+    generator = np.random.default_rng(29)
+    for at in generator.uniform(begin + 0.1, end - 0.1, 50).tolist():
+        instant, shown = legends(browser, at)
+        row = int(np.argmin(np.abs(odom.time - instant)))
+        assert odom.time[row] == pytest.approx(instant, abs=2e-5), 'not a measurement'
+        assert abs(instant - at) < 0.05
+        for wheel in ('right', 'left'):
+            lines = shown[f'{wheel.capitalize()} wheel']
+            measured = odom[wheel][row]
+            wanted = float(np.interp(instant, reference.time, reference[wheel]))
+            assert lines['odometry'] == pytest.approx(measured, abs=6e-4)
+            # Every second sample is shown: across a jump the line is 10 ms less steep.
+            near = np.abs(reference.time - instant) < 0.021
+            spread = np.ptp(reference[wheel][near])
+            assert lines['reference'] == pytest.approx(wanted, abs=6e-4 + (spread > 0.1) * spread)
+            # The legend agrees with itself to its last digit: one instant, no mixture.
+            error = lines['odometry'] - lines['reference']
+            assert shown['Error'][wheel] == pytest.approx(error, abs=1.6e-3)
+            sent = command[wheel][np.abs(command.time - instant) < 0.03]
+            assert sent.min() - 1e-3 <= lines['command'] <= sent.max() + 1e-3
+
+
+@pytest.fixture(scope='module')
+def switching(tmp_path_factory):
+    """A bag whose reference, sent 0.4 s ahead, jumps at 5 and at 10 s."""
+    kind = 'std_msgs/msg/Int32MultiArray'
+    layout = TYPES['std_msgs/msg/MultiArrayLayout']([], 0)
+    rows = []
+    for k in range(800):
+        at, mode = 0.02 * k, int(k >= 250) + int(k >= 500)
+        stamp = START + round(1e9 * at)
+        rows.append((at, '/odom', odometry_message(stamp, (0.1, 0.0), (0.1 * at, 0.0, 0.0))))
+        rows.append((at, '/cmd_vel', twist_message((0.1, 0.0))))
+        if k in (0, 250, 500):
+            data = TYPES[kind](layout, np.array([mode, 1, 2], np.int32))
+            rows.append((at - 0.4, '/reference/signals', data))
+        rows.append((at - 0.4, '/reference', odometry_message(stamp, (0.1 + 0.02 * mode, 0.0))))
+    rows = [(at + 0.5, *row) for at, *row in sorted(rows, key=lambda row: row[0])]
+    return write(tmp_path_factory.mktemp('switching') / 'bag', rows)
+
+
+def test_switches_are_marked_where_the_report_marks_them(browser, show, switching):
+    with open_bag(switching) as recording:
+        switches = load_run(recording).switches.tolist()
+    assert len(switches) == 2
+    show(recorded_run(switching))
+    assert browser.run('return charts.marks.map(({time}) => time)') == switches
+    assert browser.text('marks') == 'switch'
+
+
+def test_the_reference_that_is_not_due_yet_is_its_preview(browser, show):
+    """It was drawn as if the robot were late by the lead of the reference."""
+    data = LiveRun()
+    data.set('terms', [])
+    for k in range(200):
+        data.add('odometry', 0.02 * k, [1.0, 2.0, 0.0, 0.0, 0.0])
+        data.add('reference', 0.02 * k + 0.4, [0.02 * k + 0.4, 2.0, 0.0, 0.0, 0.0])
+    data.tick(0.0)
+    show(data)
+    found = browser.run("""
+        const {reference, preview} = shownStreams([0, 10]);
+        return [reference, preview].map(({time}) => [time[0], time.at(-1)]);
+    """)
+    assert found == [[0.4, 3.98], [3.98, 4.38]]
+    _, shown = legends(browser, 2.0)
+    assert shown['Right wheel']['reference'] == pytest.approx(2.0, abs=1e-3)
+    assert shown['Right wheel']['preview'] is None
+    assert shown['Error']['right'] == pytest.approx(-1.0, abs=1e-3)
+
+
+def test_a_gap_is_one_in_lines_and_legend(browser, show):
+    data = LiveRun()
+    data.set('terms', [])
+    for k in (*range(100), *range(300, 400)):
+        data.add('odometry', 0.02 * k, [1.0, 2.0, 0.0, 0.0, 0.0])
+        data.add('reference', 0.02 * k, [1.0, 2.0, 0.0, 0.0, 0.0])
+    data.tick(0.0)
+    show(data)
+    holes = browser.run("""
+        const [time, reference] = charts.charts[0].data;
+        return time.filter((at, i) => reference[i] === null);
+    """)
+    assert len(holes) == 1
+    assert 1.98 < holes[0] < 6.0
+    instant, shown = legends(browser, 3.0)
+    assert instant in (pytest.approx(1.98, abs=1e-3), pytest.approx(6.0, abs=1e-3))
+
+
+def test_a_bag_of_any_robot_with_odometry_is_shown(browser, show, tmp_path):
+    """Without the parameters of this package it was refused, with options that do not exist."""
+    rows = [row for row in following_rows() if row[1] in ('/odom', '/cmd_vel')]
+    bag = write(tmp_path / 'bag', rows)
+    data = recorded_run(bag)
+    show(data)
+    titles = browser.run('return charts.charts.map(({title, unit}) => `${title}, ${unit}`)')
+    assert titles == ['Forward speed, m/s', 'Turn rate, rad/s']
+    labels = browser.run('return charts.charts[0].series.map(({label}) => label)')
+    assert labels == ['odometry', 'command']
+    assert 'm/s and' in browser.text('pose')
+    assert browser.errors() == []
+
+
+def test_the_error_is_scaled_to_what_was_driven(browser, show):
+    """The half second after a stop made a line of the whole run."""
+    data = LiveRun()
+    data.set('terms', [])
+    generator = np.random.default_rng(5)
+    for k in range(1000):
+        at, drives = 0.02 * k, k < 900
+        error = 0.03 * generator.uniform(-1.0, 1.0) if drives else 5.0
+        data.add('reference', at, [4.0, 4.0, 0.0, 0.0, 0.0])
+        data.add('odometry', at, [4.0 + error, 4.0 + error, 0.0, 0.0, 0.0])
+        data.add('command', at, [4.0 * drives, 4.0 * drives])
+    data.tick(0.0)
+    show(data)
+    scale = 'const {min, max} = charts.charts[arguments[0]].uplot.scales.y; return [min, max]'
+    low, high = browser.run(scale, 2)
+    assert -0.06 < low < -0.02 < 0.02 < high < 0.06
+    assert browser.run(scale, 0)[1] > 8.9, 'the speeds are shown whole'
+
+
+def test_a_recording_is_played_and_events_lead_to_their_time(browser, show, switching):
+    show(recorded_run(switching))
+    begin, end = browser.run('return [begin(), newest()]')
+    browser.run("place('rate').value = '4'")
+    browser.find('play').click()
+    browser.wait(lambda: (browser.run('return playTime') or 0.0) > begin + 1.0, 'it does not play')
+    browser.find('play').click()
+    at = browser.run('return playTime')
+    pose = browser.text('pose')
+    assert begin < at < end
+    # The floor and the cursor are those of the instant; it stays.
+    browser.wait(lambda: browser.run('return charts.charts[0].uplot.cursor.left') > 0, 'no cursor')
+    assert browser.run('return playTime') == at
+    browser.run("place('seek').value = 1; place('seek').oninput()")
+    browser.wait(lambda: browser.text('pose') != pose, 'the robot has not moved')
+    assert browser.run('return playTime') == end
+    event = browser.select('#events .switch button')
+    event.click()
+    when = browser.run('return events.find(({kind}) => kind === "switch").time')
+    times = browser.run('return events.filter(({kind}) => kind === "switch").map((e) => e.time)')
+    browser.wait(lambda: browser.run('return playTime') in times, f'not at {when}')
+    span = 'return charts.range[1] - charts.range[0]'
+    browser.wait(lambda: browser.run(span) == pytest.approx(10.0), 'its time is not shown')
+
+
+def test_what_is_shown_is_saved_as_a_page_that_opens_alone(browser, show, tmp_path):
+    server = show(recorded_run(GOLDEN), lambda *_: 'done')
+    place = {'behavior': 'allow', 'downloadPath': str(tmp_path)}
+    browser.driver.execute_cdp_cmd('Browser.setDownloadBehavior', place)
+    browser.run('selection = [begin() + 2, begin() + 6]; changed = true')
+    low, high = browser.run('return selection')
+    browser.find('share').click()
+    browser.wait(lambda: [*tmp_path.glob('*.html')], 'no file')
+    (file,) = tmp_path.glob('*.html')
+    assert server.token not in file.read_text(), 'who has the file could command the robot'
+    expected = [legends(browser, at) for at in (low + 1.0, low + 2.5)]
+    server.__exit__()
+    browser.driver.get('about:blank')
+    browser.driver.get_log('browser')  # the page has lost its program
+    browser.driver.get_log('performance')
+    browser.driver.get(file.as_uri())
+    browser.wait(lambda: browser.run('return newest() !== undefined && !changed'), 'nothing')
+    begin, end = browser.run('return [begin(), newest()]')
+    assert (begin, end) == (pytest.approx(low, abs=0.03), pytest.approx(high, abs=0.03))
+    assert [legends(browser, at) for at in (low + 1.0, low + 2.5)] == expected
+    assert browser.errors() == []
+    assert [
+        url for url in browser.requests() if not url.startswith(('file:', 'data:', 'blob:'))
+    ] == []
+
+
+BANNERS = (
+    (
+        'Stopped',
+        'sim_robot: a wheel slips for longer than a second; controller: no reference ' * 3,
+    ),
+    ('STOP NOT CONFIRMED: use the switch on the robot', 'no answer; asking again'),
+    ('E-STOP', 'sim_robot: emergency stop: requested by service e_stop, latched'),
+)
+
+
+def test_the_banner_of_a_phone_leaves_room_for_the_rest(browser, show):
+    """With a reason of several lines it took 368 px."""
+    data = LiveData()
+    data.set('banner', {'kind': 'good', 'headline': 'Tracking the reference', 'detail': ''})
+    show(data, lambda *_: 'done')
+    browser.show_as(360, 800)
+    for headline, detail in BANNERS:
+        words = {'kind': 'stopped', 'headline': headline, 'detail': detail}
+        data.set('banner', words)
+        browser.wait(lambda words=words: browser.text('headline') == words['headline'], 'no news')
+        height = browser.run('return place("banner").getBoundingClientRect().height')
+        assert height <= 96, headline
+        shown = 'const e = place(arguments[0]); return e.scrollHeight - e.clientHeight'
+        assert browser.run(shown, 'headline') <= 1, 'the headline is cut off'
+        for button in ('e-stop', *(['release'] if headline == 'E-STOP' else [])):
+            box = browser.find(button).rect
+            assert box['y'] >= 0
+            assert box['y'] + box['height'] <= height
+            assert box['height'] >= 32
+    # The whole reason is a touch away.
+    data.set('banner', {'kind': 'stopped', 'headline': BANNERS[0][0], 'detail': BANNERS[0][1]})
+    browser.wait(lambda: browser.text('headline') == 'Stopped', 'no news')
+    cut = browser.run(shown, 'detail')
+    assert cut > 10
+    browser.find('state').click()
+    assert browser.run(shown, 'detail') <= 1
+
+
+def test_a_changed_parameter_is_compared_before_and_after(browser, show):
+    data = LiveRun()
+    data.set('terms', [])
+    for k in range(1100):
+        at = 0.02 * k
+        error = 0.2 if at < 10.5 else 0.05
+        data.add('reference', at, [4.0, 4.0, 0.0, 0.0, 0.0])
+        data.add('odometry', at, [4.0 + error, 4.0 - 2 * error, 0.0, 0.0, 0.0])
+        data.add('command', at, [4.0, 4.0])
+        if k == 525:
+            data.report(at, 'parameter', 'controller: law.gain = 8.0')
+        if k == 600:
+            data.tick(0.0)
+            show(data)
+            assert 'measures 10 s' in browser.text('changes')
+    browser.wait(lambda: 'RMSE' in browser.text('changes'), 'no comparison')
+    text = browser.text('changes')
+    assert 'law.gain = 8.0' in text
+    assert 'right: 0.2000 before, 0.05' in text
+    assert 'left: 0.4000 before, 0.10' in text
