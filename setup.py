@@ -143,7 +143,7 @@ setup(
     entry_points={
         'console_scripts': [
             *(f'{node} = {NAME}.nodes.entry_point:{node}' for node in NODES),
-            f't3mpc = {NAME}.cli.main:main',
+            f't3mpc = {NAME}.cli.executable:t3mpc',
         ],
     },
 )

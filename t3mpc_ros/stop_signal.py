@@ -1,23 +1,16 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""What ends a process: SIGINT, SIGTERM and SIGHUP as a flag that it polls, or its parent."""
+"""What ends a process: SIGINT, SIGTERM and SIGHUP as a flag that it polls.
 
-import ctypes
+The executables import this module first, and until then a signal ends them with a traceback: it
+imports nothing that Python has not loaded.
+"""
+
 import os
 import signal
 from types import FrameType
-from typing import Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_LIBC = ctypes.CDLL(None)
-_PR_SET_PDEATHSIG = 1
-
-
-def end_with_parent(parent: int) -> None:
-    """Let the kernel send SIGTERM to this process when its parent ends, whatever ends it."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM))
-    if os.getppid() != parent:  # it has ended already
-        os._exit(1)
 
 
 class StopSignal:
@@ -33,7 +26,7 @@ class StopSignal:
         """Return whether a signal was received."""
         return self.number != 0
 
-    def install(self) -> Self:
+    def install(self) -> 'StopSignal':
         """Install the handlers; a hangup that is ignored, as after nohup, stays ignored."""
         self._previous = {
             number: signal.signal(number, self._handle)

@@ -48,6 +48,29 @@ def test_a_signal_during_the_start_ends_the_process_with_code_0():
     assert subprocess.run([sys.executable, '-c', program], check=False).returncode == 0
 
 
+@pytest.mark.parametrize(('module', 'code'), [('nodes.entry_point', 0), ('cli.executable', 130)])
+def test_ctrl_c_while_an_executable_imports_is_quiet(module, code):
+    """It ended with a traceback of 34 lines."""
+    program = (
+        f'import sys; known = set(sys.modules); import t3mpc_ros.{module}\n'
+        "own = {name for name in sys.modules if name.startswith('t3mpc_ros')}\n"
+        "loaded = set(sys.modules) - known - own - {'signal', '__future__'}\n"
+        "assert loaded <= {'importlib', 'importlib._abc', 'typing', 'types', 'warnings',\n"
+        "    'collections.abc', 're', 'enum', 'functools'} | BARE, loaded\n"
+        'import os, signal; os.kill(os.getpid(), signal.SIGINT)\n'
+    )
+    # What the scripting interface needs before its names are used.
+    bare = subprocess.run(
+        [sys.executable, '-c', 'import sys, typing, importlib; print(set(sys.modules))'],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    program = program.replace('BARE', bare.strip())
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (code, '')
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
 def test_the_workers_of_a_killed_process_end_with_it(number, tmp_path):

@@ -29,6 +29,7 @@ PACKAGES = {
     'parameters': set(),
     'kernels': set(),
     'stop_signal': set(),
+    'parent_process': set(),
     'missing_library': set(),
     'atomic_file': set(),
     'version': set(),
@@ -42,10 +43,11 @@ PACKAGES = {
     'simulation': BASE | {'robot'},
     'radio': BASE | {'robot'},
     'emulator': BASE | {'robot', 'simulation', 'radio'},
-    'evaluation': CORE | {'page', 'atomic_file', 'stop_signal', 'missing_library'},
+    'evaluation': CORE
+    | {'page', 'atomic_file', 'stop_signal', 'parent_process', 'missing_library'},
     'nodes': CORE | {'radio', 'stop_signal', 'missing_library'},
     'cli': CORE
-    | {'radio', 'stop_signal', 'missing_library'}
+    | {'radio', 'stop_signal', 'parent_process', 'missing_library'}
     | {'emulator', 'evaluation', 'nodes', 'view'},
     'page': set(),
     'view': {'page'},
@@ -76,7 +78,7 @@ SHARED_BASENAMES = {
     'node': 'the node of a folder in nodes/',
     'qos': 'QoS profiles, in bags and of publishers and subscriptions',
 }
-MAX_CLOSURE = 40
+MAX_CLOSURE = 41
 """Maximum number of modules of the package that the controller node imports."""
 
 

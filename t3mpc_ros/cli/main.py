@@ -49,6 +49,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f'error: {problem}', file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print('stopped', file=sys.stderr)
+        return 130
 
 
 def _run(words: Sequence[str]) -> int:

@@ -12,7 +12,7 @@ import sys
 import sysconfig
 import time
 
-from t3mpc_ros.stop_signal import end_with_parent
+from t3mpc_ros.parent_process import end_with_parent
 
 READY_TIMEOUT = 1200.0
 """Maximum start of a node, s: a busy machine compiles the kernels for minutes."""

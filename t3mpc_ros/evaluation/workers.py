@@ -20,7 +20,7 @@ from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.loop import Method, run
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import Scenario
-from t3mpc_ros.stop_signal import end_with_parent
+from t3mpc_ros.parent_process import end_with_parent
 
 LOST_PROCESS = (
     'a worker process ended before its work was done; a script that uses several processes must '

@@ -3,11 +3,12 @@
 """Command line of the node executables: help, version, parameter files, rejection of the rest."""
 
 from collections.abc import Iterator, Sequence
-import difflib
+import enum
 import re
 import textwrap
 
 from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
+from t3mpc_ros.parameters.table import nearest_name
 
 ROS_ARGUMENTS = (
     ('-p NAME:=VALUE', 'set a parameter'),
@@ -34,10 +35,8 @@ def unknown_arguments(node: str, words: Sequence[str]) -> str:
 def _hint(node: str, word: str) -> str:
     """Return the parameter that an argument such as ``--gain`` may mean."""
     wanted = word.lstrip('-').partition('=')[0].rstrip(':').replace('-', '_')
-    names = [spec.name for spec in parameter_class(node).specs()]
-    by_leaf = {name.rpartition('.')[2]: name for name in reversed(names)}
-    near = difflib.get_close_matches(wanted, [*names, *by_leaf], n=1)
-    return f', for example -p {by_leaf.get(near[0], near[0])}:=...' if near else ''
+    near = nearest_name(wanted, [spec.name for spec in parameter_class(node).specs()])
+    return f', for example -p {near}:=...' if near else ''
 
 
 def help_text(node: str) -> str:
@@ -113,6 +112,38 @@ def _parameter_files(argv: Sequence[str]) -> list[str]:
     return [
         name for flag, name in zip(argv, list(argv)[1:], strict=False) if flag == '--params-file'
     ]
+
+
+class Origin(enum.IntEnum):
+    """Where the value of a parameter comes from; a larger one is meant more for this node."""
+
+    SHARED = 1
+    """The section of a parameter file for nodes of any name, as ``/**``."""
+    SECTION = 2
+    """The section of a parameter file for this node, or ``-p NODE:NAME:=VALUE``."""
+    OPTION = 3
+    """``-p NAME:=VALUE``: for all nodes of the process."""
+
+
+_OPTION = re.compile(r'(?:(?P<node>[^:=]+):)?(?P<name>[^:=]+):=')
+
+
+def parameter_origins(argv: Sequence[str], node: str) -> dict[str, Origin]:
+    """Return the origin of each parameter that a command line sets at ``/namespace/name``."""
+    found: dict[str, Origin] = {}
+
+    def add(name: str, origin: Origin) -> None:
+        found[name] = max(found.get(name, origin), origin)
+
+    for flag, word in zip(argv, list(argv)[1:], strict=False):
+        if flag in ('-p', '--param') and (given := _OPTION.match(word)):
+            add(given['name'], Origin.SECTION if given['node'] else Origin.OPTION)
+    for file in _parameter_files(argv):
+        for key, name, _ in _entries(file):
+            if _key_pattern(key).fullmatch(node):
+                shared = '*' in key.rpartition('/')[2]
+                add(name, Origin.SHARED if shared else Origin.SECTION)
+    return found
 
 
 def file_values(file: str, node: str) -> dict[str, object]:

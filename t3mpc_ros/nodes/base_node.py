@@ -2,9 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of the nodes: ROS parameters from a parameter class, diagnostics, shutdown hook."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
+import difflib
 from itertools import islice
 import sys
 from typing import Any, ClassVar, Generic, TypeVar
@@ -43,6 +44,9 @@ COMMON_TOPICS = ('/rosout', '/parameter_events', '/diagnostics')
 ADAPT_PERIOD = 0.5
 """Time between two comparisons of subscriptions with the offers of publishers, s."""
 
+TYPO_SIMILARITY = 0.8
+"""Similarity (difflib) from which a foreign name looks like a misspelt one of this node."""
+
 ACK_TIMEOUT = Duration(nanoseconds=200_000_000)
 """Maximum wait of :func:`publish_and_wait_for_acked`."""
 
@@ -67,12 +71,17 @@ class BaseNode(Node, Generic[P]):
     """Errors of :meth:`make` that name what the user has to change, beside ParameterError."""
 
     @classmethod
-    def make(cls) -> 'list[BaseNode[Any]]':
-        """Return the nodes of a process of this executable."""
-        return [cls()]
+    def make(cls, **options: Any) -> 'list[BaseNode[Any]]':
+        """Return the nodes of a process of this executable, made with options of rclpy.
 
-    def __init__(self, name: str, **options: Any) -> None:
+        ``cli_args`` is the command line: it tells an option for this node from a file for many.
+        """
+        return [cls(**options)]
+
+    def __init__(self, name: str, siblings: frozenset[str] = frozenset(), **options: Any) -> None:
+        """``siblings`` are the parameter names of the other nodes of the process."""
         super().__init__(name, **options)
+        self._siblings = siblings
         self.hardware_id = 'none'
         """Device that the diagnostics are about."""
         self.exit_code = 0
@@ -81,7 +90,7 @@ class BaseNode(Node, Generic[P]):
         """Warnings about the start of the process, repeated in the diagnostics."""
         self.exit_requested = False
         """Set to True to end the process with :attr:`exit_code`."""
-        self.parameters: P = declare_parameters(self, self.parameter_class)
+        self.parameters: P = self._declare_parameters(options.get('cli_args') or ())
         self.add_on_set_parameters_callback(self._validate)
         self.add_post_set_parameters_callback(self._apply)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.DIAGNOSTICS)
@@ -158,6 +167,11 @@ class BaseNode(Node, Generic[P]):
         self._matching.append(made)
         return made
 
+    def remove_matching_subscription(self, made: qos.MatchingSubscription) -> None:
+        """Destroy a subscription of :meth:`create_matching_subscription`."""
+        self._matching.remove(made)
+        self.destroy_subscription(made.subscription)
+
     def offer(self, kind: type, name: str, action: Callable[..., tuple[str, str]]) -> None:
         """Offer a service of type Trigger or SetBool.
 
@@ -185,6 +199,46 @@ class BaseNode(Node, Generic[P]):
     def _adapt_subscriptions(self) -> None:
         for subscription in self._matching:
             subscription.adapt()
+
+    def _declare_parameters(self, words: Sequence[str]) -> P:
+        """Return the parameters; ParameterError for a name meant for this node that it lacks."""
+        from t3mpc_ros.nodes.arguments import Origin, parameter_origins  # once per process
+
+        overrides = _overrides(self)
+        kind: type[P] = self.parameter_class
+        own = accepted_names(kind)
+        values = kind.from_dict({name: overrides[name] for name in overrides if name in own})
+        origins = parameter_origins(words, self.get_fully_qualified_name())
+        for name in overrides:
+            if name in own or name.split('.')[0] in _RCLPY_PARAMETERS:
+                continue
+            origin = origins.get(name, Origin.SECTION)
+            if origin is Origin.OPTION and name in self.names_of_siblings(values):
+                continue
+            self._handle_unknown(name, shared=origin is Origin.SHARED)
+        declare_parameters(self, values)
+        return values
+
+    def names_of_siblings(self, parameters: P) -> frozenset[str]:
+        """Return the parameter names of the other nodes of the process."""
+        return self._siblings
+
+    def _handle_unknown(self, name: str, *, shared: bool) -> None:
+        """Reject a name meant for this node; warn of one for all nodes that resembles its own."""
+        own = [spec.name for spec in self.parameter_class.specs()]
+        node = self.get_name()
+        if not shared:
+            owners = ' and '.join(_owners(name))
+            raise ParameterError(
+                f'{node} has no parameter {name}'
+                + (f' ({owners} has)' if owners else '')
+                + f'{nearest_hint(name, own)} (`ros2 param list /{node}` lists them)'
+            )
+        near = difflib.get_close_matches(name, own, n=1, cutoff=TYPO_SIMILARITY)
+        if near and not _owners(name):
+            text = f'{name} in a section for all nodes is ignored; did you mean {near[0]}?'
+            self.get_logger().warning(text)
+            self.start_warnings.append(text)
 
     def on_parameters_changed(self, parameters: P) -> None:
         """Apply changed dynamic parameters."""
@@ -267,28 +321,20 @@ def publish_and_wait_for_acked(publisher: Publisher, message: Any) -> None:
     publisher.wait_for_all_acked(ACK_TIMEOUT)
 
 
-def declare_parameters(node: Node, parameter_class: type[P]) -> P:
-    """Return the node's parameters: the overrides of the user on the defaults of the class.
+def declare_parameters(node: Node, parameters: Parameters) -> None:
+    """Declare every specification of ``parameters`` with its value.
 
-    Every specification becomes a ROS parameter with description, unit and range; those that are
-    not dynamic are read-only. ParameterError for an override that is unknown to this node (the
-    text has the nearest known name), of the wrong type or out of range (with bound and value).
+    A ROS parameter has description, unit and range; those that are not dynamic are read-only.
     """
-    overrides = _overrides(node)
-    specs = {spec.name: spec for spec in parameter_class.specs()}
-    _reject_unknown(node, overrides, specs)
-    own = specs.keys() | parameter_class.class_constants().keys()
-    parameters = parameter_class.from_dict({k: v for k, v in overrides.items() if k in own})
     values = parameters.to_dict()
-    for name, spec in specs.items():
+    for spec in parameters.specs():
+        value = values[spec.name]
         node.declare_parameter(
-            name,
-            list(values[name]) if spec.many else values[name],
+            spec.name,
+            list(value) if spec.many else value,
             parameter_descriptor(spec),
             ignore_override=True,
         )
-
-    return parameters
 
 
 def parameter_descriptor(spec: ParameterSpec) -> ParameterDescriptor:
@@ -325,29 +371,22 @@ def _overrides(node: Node) -> dict[str, object]:
     }
 
 
-def _reject_unknown(
-    node: Node, overrides: dict[str, object], specs: dict[str, ParameterSpec]
-) -> None:
-    for name in overrides:
-        if name in specs or name.split('.')[0] in _RCLPY_PARAMETERS or name in _names_of_nodes():
-            continue
-        raise ParameterError(
-            f'{node.get_name()} has no parameter {name}{nearest_hint(name, specs)} '
-            f'(`ros2 param list /{node.get_name()}` lists them)'
-        )
+def accepted_names(table: type[Parameters]) -> frozenset[str]:
+    """Return the names that a table accepts, former ones too."""
+    return frozenset(spec.name for spec in table.specs()) | table.class_constants().keys()
 
 
-def _names_of_nodes() -> frozenset[str]:
-    """Return the parameter names of all nodes: one file or command line may serve several."""
+def _owners(name: str) -> list[str]:
+    """Return the nodes of the package that have a parameter."""
     from t3mpc_ros.nodes.registry import NODES, parameter_class
 
-    names: set[str] = set()
+    found = []
     for node in NODES:
         # Only recorder and player need the bag libraries.
         with suppress(ModuleNotFoundError):
-            table = parameter_class(node)
-            names |= {spec.name for spec in table.specs()} | table.class_constants().keys()
-    return frozenset(names)
+            if name in accepted_names(parameter_class(node)):
+                found.append(node)
+    return found
 
 
 def _text(value: object) -> str:

@@ -5,9 +5,9 @@
 from dataclasses import dataclass
 from typing import Any
 
-from t3mpc_ros.nodes.base_node import BaseNode
+from t3mpc_ros.nodes.base_node import BaseNode, accepted_names
 from t3mpc_ros.nodes.qos import RCLError
-from t3mpc_ros.nodes.registry import node_class
+from t3mpc_ros.nodes.registry import node_class, parameter_class
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 
@@ -30,20 +30,26 @@ class ComposedNode(BaseNode[ComposedParameters]):
     def __init__(self, **options: Any) -> None:
         super().__init__('composed', **options)
 
+    def names_of_siblings(self, parameters: ComposedParameters) -> frozenset[str]:
+        """Return the parameter names of all nodes of the process."""
+        tables = (ComposedParameters, *map(parameter_class, parameters.nodes))
+        return frozenset().union(*map(accepted_names, tables))
+
     @classmethod
-    def make(cls) -> list[BaseNode[Any]]:
+    def make(cls, **options: Any) -> list[BaseNode[Any]]:
         """Return the chosen nodes and the node of the process.
 
         ParameterError also if two nodes use one topic with different types, which ROS does not
         allow within a process.
         """
-        process = cls()
+        process = cls(**options)
+        names = process.names_of_siblings(process.parameters)
         nodes: list[BaseNode[Any]] = []
         # The recorder last: its early subscriptions must not fix the type of a topic.
         for name in sorted(process.parameters.nodes, key='recorder'.__eq__):
             kind = node_class(name)
             try:
-                nodes += kind.make()
+                nodes += kind.make(siblings=names, **options)
             except kind.configuration_errors as error:
                 raise ParameterError(str(error)) from error
             except RCLError as error:

@@ -22,7 +22,7 @@ import yaml
 
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.conversions import message_class
-from t3mpc_ros.nodes.entry_point import own_context
+from t3mpc_ros.nodes.process import own_context
 from t3mpc_ros.nodes.remote_parameters import parameter_message, plain_value, refusal, type_text
 
 LISTING = 1.5

@@ -38,7 +38,7 @@ from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, State
 from t3mpc_ros.nodes import conversions
-from t3mpc_ros.nodes.entry_point import own_context
+from t3mpc_ros.nodes.process import own_context
 from t3mpc_ros.nodes.qos import PolledCallbackGroup, full_name, take_with_info
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters, plain_value
 from t3mpc_ros.robot.description import sensor_mounts

@@ -32,10 +32,23 @@ class ParameterError(ValueError):
     """An invalid parameter; the text contains its name, the bound and the value."""
 
 
+def nearest_name(name: str, known: Iterable[str]) -> str:
+    """Return the known name that is nearest to an unknown one, '' without one.
+
+    The last part of a dotted name is enough: ``rate`` is near to ``play.rate``.
+    """
+    names = list(known)
+    by_leaf = {each.rpartition('.')[2]: each for each in reversed(names)}
+    if name in by_leaf:
+        return by_leaf[name]
+    near = difflib.get_close_matches(name, [*names, *by_leaf], n=1)
+    return by_leaf.get(near[0], near[0]) if near else ''
+
+
 def nearest_hint(name: str, known: Iterable[str]) -> str:
     """Return a hint at the known name that is nearest to an unknown one, '' without one."""
-    near = difflib.get_close_matches(name, list(known), n=1)
-    return f'; did you mean {near[0]}?' if near else ''
+    near = nearest_name(name, known)
+    return f'; did you mean {near}?' if near else ''
 
 
 def number_hint(value: object) -> str:

@@ -36,7 +36,7 @@ def logged(capfd):
 @pytest.fixture
 def execute(graph, capfd):
     """Return a function that runs an executable in this process until its nodes have started."""
-    from t3mpc_ros.nodes.entry_point import run
+    from t3mpc_ros.nodes.process import run
 
     class Stop:
         exit_at_once = False

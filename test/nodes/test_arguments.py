@@ -10,8 +10,8 @@ import sys
 import pytest
 
 import t3mpc_ros
-from t3mpc_ros.nodes.arguments import unmatched_files
-from t3mpc_ros.nodes.entry_point import provide_log_directory
+from t3mpc_ros.nodes.arguments import Origin, parameter_origins, unmatched_files
+from t3mpc_ros.nodes.process import provide_log_directory
 from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
 
 
@@ -49,7 +49,60 @@ def test_a_parameter_file_without_effect_is_a_warning(execute, tmp_path):
     assert f'{file} sets nothing: its keys /contoller' in done.err
 
 
+ORIGINS = [
+    ('-p rate:=5', {'rate': Origin.OPTION}),
+    ('--param rate:=a:=b', {'rate': Origin.OPTION}),
+    ('-p controller:rate:=5', {'rate': Origin.SECTION}),
+    ('--params-file {}', {'a': Origin.SHARED, 'b.c': Origin.SHARED, 'rate': Origin.SECTION}),
+    ('--params-file {} -p a:=1', {'a': Origin.OPTION, 'b.c': 1, 'rate': 2}),
+    ('-p a:=1 --params-file {}', {'a': Origin.OPTION, 'b.c': 1, 'rate': 2}),
+    ('-r odom:=x', {}),
+]
+"""Arguments with a file, and where each parameter of the controller comes from."""
+
+
+@pytest.mark.parametrize('words, origins', ORIGINS)
+def test_the_origin_is_the_one_most_meant_for_the_node(words, origins, tmp_path):
+    file = tmp_path / 'own.yaml'
+    file.write_text(
+        '/**: {ros__parameters: {a: 1, b: {c: 2}}}\n'
+        '/**/controller: {ros__parameters: {rate: 5.0}}\n'
+        '/*: {ros__parameters: {rate: 4.0}}\n'
+        'sim_robot: {ros__parameters: {other: 5.0}}\n'
+    )
+    words = words.format(file).split()
+    assert parameter_origins(['x', '--ros-args', *words], '/controller') == origins
+
+
+SHARED = """\
+/**:
+  ros__parameters: {use_sim_time: false, rate: 50.0, robot_radius: 0.1, law.gian: 3.0, seed: 7}
+nav2_node:
+  ros__parameters: {law.gain: 1.0, anything: 2}
+"""
+
+
+@pytest.mark.ros
+def test_names_for_other_nodes_in_a_shared_file_are_ignored(execute, tmp_path):
+    """A foreign name under ``/**`` ended every node of the package, but no node of rclcpp."""
+    file = tmp_path / 'shared.yaml'
+    file.write_text(SHARED)
+    done = execute('controller', '--ros-args', '--params-file', str(file))
+    assert done.code == 0
+    warnings = [line for line in done.err.splitlines() if 'WARN' in line]
+    assert len(warnings) == 1, 'robot_radius and seed resemble nothing, or have an owner'
+    assert 'law.gian in a section for all nodes is ignored; did you mean law.gain?' in warnings[0]
+
+
 INVALID = [
+    ('player', '--ros-args -p rate:=2.0', 'no parameter rate', 'did you mean play.rate?'),
+    ('player', '--ros-args -p rate:=fast', 'no parameter rate', 'did you mean play.rate?'),
+    ('controller', '--ros-args -p seed:=1.5', 'no parameter seed', '(reference_generator and'),
+    ('recorder', '--ros-args -p rate:=5', 'no parameter rate', 'controller', 'sim_robot'),
+    ('controller', '--ros-args --params-file SECTION', 'no parameter seed'),
+    ('composed', '--ros-args -p play.rate:=2.0', 'no parameter play.rate (player has)'),
+    ('composed', '--ros-args -p nodes:=[controller] -p seed:=2', 'no parameter seed'),
+    ('composed', '--ros-args -p controller:seed:=2', 'controller has no parameter seed'),
     ('controller', '--gain 30', 'unknown arguments --gain 30', '-p law.gain:='),
     ('controller', 'law.gain:=30', 'law.gain:=30', '-p law.gain:='),
     ('player', 'mybag', 'unknown argument mybag', '-p NAME:=VALUE'),
@@ -86,6 +139,7 @@ INVALID = [
 @pytest.mark.parametrize('case', INVALID, ids=' '.join)
 def test_invalid_input_at_start_is_one_line_and_code_2(case, execute, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / 'SECTION').write_text('controller: {ros__parameters: {seed: 2}}')
     (tmp_path / 'BROKEN').write_text('controller:\n  ros__parameters: [1,\n')
     (tmp_path / 'FILE').write_text('a file where a folder is wanted')
     name, arguments, *words = case
@@ -142,7 +196,7 @@ def test_a_folder_that_cannot_be_written_is_replaced(given, replaced, tmp_path):
 @pytest.mark.slow
 def test_ros_starts_without_a_home_folder(tmp_path):
     """Every node said that its command line was invalid."""
-    code = 'from t3mpc_ros.nodes.entry_point import init_ros; init_ros([])'
+    code = 'from t3mpc_ros.nodes.process import init_ros; init_ros([])'
     environment = {k: v for k, v in os.environ.items() if k != 'ROS_LOG_DIR'}
     for home in (str(tmp_path), os.devnull):
         words = [sys.executable, '-c', code]

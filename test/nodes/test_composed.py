@@ -10,7 +10,7 @@ from support.waiting import wait_until
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.nodes.composed import ComposedNode
-from t3mpc_ros.nodes.entry_point import make_executor
+from t3mpc_ros.nodes.process import make_executor
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.parameters.table import ParameterError
 
@@ -24,8 +24,9 @@ def compose(graph, tmp_path):
 
     def make(*parameters):
         words = [f'storage.uri:={tmp_path}', *parameters]
-        rclpy.init(args=['--ros-args', *(word for item in words for word in ('-p', item))])
-        nodes.extend(ComposedNode.make())
+        words = ['--ros-args', *(word for item in words for word in ('-p', item))]
+        rclpy.init(args=words)
+        nodes.extend(ComposedNode.make(cli_args=words))
         return {node.get_name(): node for node in nodes}
 
     yield make

@@ -33,15 +33,17 @@ def without(monkeypatch, tmp_path):
     return remove
 
 
-def test_nodes_without_bags_need_no_bag_library(without, graph):
+def test_nodes_without_bags_need_no_bag_library(without, graph, tmp_path):
     """The parameters of other nodes, which a file may hold, were looked up in their modules."""
     without(*BAG_LIBRARIES)
+    file = tmp_path / 'shared.yaml'
+    file.write_text('/**: {ros__parameters: {play.rate: 1.0, publish_clok: false, law.gian: 1.0}}')
     start = (
-        'import sys; from t3mpc_ros.nodes.entry_point import run\n'
+        'import sys; from t3mpc_ros.nodes.process import run\n'
         'class Stop:\n'
         '    def __call__(self): return True\n'
         "for name in ('reference_generator', 'controller', 'sim_robot', 'radio_bridge'):\n"
-        "    assert run(name, Stop(), [name, '--ros-args', '-p', 'publish_clock:=false']) == 0\n"
+        f"    assert run(name, Stop(), [name, '--ros-args', '--params-file', '{file}']) == 0\n"
     )
     done = subprocess.run([sys.executable, '-c', start], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

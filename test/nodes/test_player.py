@@ -331,6 +331,29 @@ def test_a_damaged_bag_is_played_with_a_warning_and_a_count(harness, logged, tmp
 
 
 @pytest.mark.parametrize(
+    'kept, given, words',
+    [
+        (False, {}, 'nothing was played: all 200 messages are in damaged chunks'),
+        (True, {'play__topics_to_filter': ['none']}, 'no message in the topics and the time'),
+        (True, {'play__topic_remapping_options': ['text:=cmd_vel']}, 'may drive a robot'),
+        (True, {}, ''),
+    ],
+)
+def test_a_bag_that_plays_nothing_is_an_error(kept, given, words, harness, logged, tmp_path):
+    """0 of 1 200 messages ended with code 0."""
+    bag = write(tmp_path / 'bag', texts(200), chunk_bytes=1024)
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
+    with file.open('r+b') as content:
+        for chunk in () if kept else make_reader(content).get_summary().chunk_indexes:
+            content.seek(chunk.chunk_start_offset + chunk.chunk_length - 60)
+            content.write(bytes(60))
+    player = play(harness, bag, play__subscriber_timeout=0.0, **given)
+    harness.spin_until(lambda: player.exit_requested)
+    assert player.exit_code == bool(words)
+    assert [words in line for line in logged('nothing was played')] == [True] * bool(words)
+
+
+@pytest.mark.parametrize(
     'given, error, words',
     [
         ({'play__start_offset': 9.0}, ParameterError, 'at most .* 0.180 s: got 9 s'),

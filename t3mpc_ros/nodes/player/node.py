@@ -99,10 +99,10 @@ class PlayerNode(BaseNode[PlayerParameters]):
     configuration_errors = (BagError,)
 
     @classmethod
-    def make(cls) -> list[BaseNode[Any]]:
+    def make(cls, **options: Any) -> list[BaseNode[Any]]:
         """Return the node, in a process that is set up for exact times."""
         sys.setswitchinterval(SWITCH_INTERVAL)
-        nodes = super().make()
+        nodes = super().make(**options)
         # The present objects live until the end: the garbage collector need not visit them again.
         gc.freeze()
         return nodes
@@ -242,7 +242,19 @@ class PlayerNode(BaseNode[PlayerParameters]):
         elif status.finished and self.parameters.exit_at_end:
             self._ended = True
             self._topic_publishers.wait_for_acked(ACK_TIMEOUT)
+            if not thread.published:
+                self._warn_of_damage()
+                self.get_logger().error(f'nothing was played: {self._why_nothing()}')
+                self.exit_code = 1
             self.exit_requested = True
+
+    def _why_nothing(self) -> str:
+        topics = self._topic_publishers
+        if self._damaged:
+            return f'all {self._damaged} messages are in damaged chunks'
+        if excluded := {**topics.unusable, **topics.blocked}:
+            return '; '.join(f'{topic}: {reason}' for topic, reason in excluded.items())
+        return 'the bags have no message in the topics and the time to play'
 
     def _warn_of_damage(self) -> None:
         """Warn when further messages of damaged chunks are not played."""

@@ -1,0 +1,186 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The process of an executable: start of ROS, spin, shutdown, exit code."""
+
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from contextlib import contextmanager
+import os
+from pathlib import Path
+import sys
+import tempfile
+from typing import TYPE_CHECKING, NoReturn, TypeVar
+
+from t3mpc_ros.missing_library import remedy
+from t3mpc_ros.nodes import arguments
+from t3mpc_ros.nodes.registry import node_class
+from t3mpc_ros.stop_signal import StopSignal
+from t3mpc_ros.version import VERSION
+
+if TYPE_CHECKING:
+    from rclpy.executors import Executor
+    from rclpy.node import Node
+
+    from t3mpc_ros.nodes.base_node import BaseNode
+
+N = TypeVar('N', bound='Node')
+
+USAGE_ERROR = 2
+"""Exit code for an unusable parameter, parameter file or command line."""
+
+
+def main(name: str, stop: StopSignal) -> NoReturn:
+    """Run the executable of a node and end the process at once.
+
+    The robot is stopped and the files are closed when :func:`run` returns. The teardown of the
+    interpreter would take half a second more, in which launch sends SIGTERM on a busy machine.
+    """
+    try:
+        code = run(name, stop, sys.argv)
+    except ModuleNotFoundError as error:
+        if not (problem := remedy(error)):
+            raise
+        print(f'{name}: {problem}', file=sys.stderr, flush=True)
+        code = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
+    """Spin the nodes of an executable until a signal; return the exit code of the process.
+
+    0 after SIGINT, SIGTERM or SIGHUP, with the robot stopped, after a node has requested the
+    exit, and for ``--help`` and ``--version``; 2 for an unusable parameter, parameter file or
+    command line, with one line on standard error that names it and the reason.
+    """
+    import rclpy
+    from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.utilities import remove_ros_args
+
+    from t3mpc_ros.parameters.table import ParameterError
+
+    if problem := arguments.parameter_file_problem(argv):  # rcl would read them, too
+        return _usage_error(name, problem)
+    try:
+        words = remove_ros_args(list(argv))[1:]
+        if {'-h', '--help'} & set(words):
+            print(arguments.help_text(name))
+            return 0
+        if '--version' in words:
+            print(f't3mpc_ros {VERSION}')
+            return 0
+        if problem := arguments.unknown_arguments(name, words):
+            return _usage_error(name, problem)
+        init_ros(argv)
+    except (RuntimeError, ValueError) as error:
+        return _usage_error(name, f'invalid command line: {error}')
+    kind = node_class(name)
+    configuration_errors = (
+        ParameterError,
+        InvalidParameterTypeException,
+        InvalidParameterValueException,
+        *kind.configuration_errors,
+    )
+    nodes: Sequence[BaseNode] = ()
+    try:
+        nodes = kind.make(cli_args=list(argv))
+        names = [node.get_fully_qualified_name() for node in nodes]
+        for problem in arguments.unmatched_files(argv, names):
+            for node in nodes:
+                node.get_logger().warning(problem)
+                node.start_warnings.append(problem)
+        stop.exit_at_once = False
+        if not stop():
+            _spin(nodes, stop)
+    except configuration_errors as error:
+        return _usage_error(name, str(error))
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        stop.exit_at_once = False
+        for node in nodes:
+            node.on_shutdown()
+        for node in nodes:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return max((node.exit_code for node in nodes), default=0)
+
+
+def make_executor() -> 'Executor':
+    """Return the executor that takes the least processor time: events, as of rclpy 7.1.4.
+
+    A wait set is built anew for every message: a node that only echoes 100 messages a second takes
+    twice the time with it.
+    """
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor()
+    return EventsExecutor()
+
+
+def _spin(nodes: Sequence['BaseNode'], stop: StopSignal) -> None:
+    executor = make_executor()
+    for node in nodes:
+        executor.add_node(node)
+        node.get_logger().info(f'{node.get_name()} ready')
+    try:
+        # A Python signal handler runs only between two calls of the executor. Without a limit of
+        # time, the events executor of rclpy 7.1 does not wait but takes a whole core.
+        while not stop() and not any(node.exit_code or node.exit_requested for node in nodes):
+            executor.spin_once(timeout_sec=0.1)
+    finally:
+        for node in nodes:
+            executor.remove_node(node)
+        executor.shutdown()
+
+
+def _usage_error(name: str, problem: str) -> int:
+    print(f'{name}: {problem}', file=sys.stderr, flush=True)
+    return USAGE_ERROR
+
+
+@contextmanager
+def own_context(make: 'Callable[[], N]') -> 'Iterator[N]':
+    """Return the node that ``make`` returns, in a context that ends with the ``with`` block."""
+    import rclpy
+
+    init_ros([])
+    try:
+        node = make()
+        try:
+            yield node
+        finally:
+            node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
+def init_ros(words: Sequence[str]) -> None:
+    """Initialise rclpy with the arguments of a command line, without its signal handlers."""
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    provide_log_directory(os.environ)
+    rclpy.init(args=list(words), signal_handler_options=SignalHandlerOptions.NO)
+
+
+def provide_log_directory(environment: MutableMapping[str, str]) -> None:
+    """Set ``ROS_LOG_DIR`` to a temporary folder where ROS could not write its logs.
+
+    ROS writes them below ``ROS_HOME`` or ``~/.ros``; in a read-only home folder, as of a service
+    or a container, no node would start. A folder that the user has chosen is not replaced.
+    """
+    if environment.get('ROS_LOG_DIR'):
+        return
+    base = environment.get('ROS_HOME') or str(Path(environment.get('HOME', os.devnull), '.ros'))
+    try:
+        Path(base, 'log').mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=Path(base, 'log')):
+            pass
+    except OSError:
+        folder = Path(tempfile.gettempdir(), f't3mpc_ros-{os.getuid()}', 'log')
+        environment['ROS_LOG_DIR'] = str(folder)
