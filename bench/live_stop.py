@@ -99,7 +99,7 @@ def measure(page: WatchedPage, count: int) -> dict[str, list[tuple[float, str]]]
         time.sleep(5.0)
         os.kill(view, signal.SIGCONT)
         begun = time.monotonic()
-        page.wait(lambda: page.text('headline') == LATCHED, 'not latched')
+        page.wait_for_headline(LATCHED)
         resumed.append((1e3 * (time.monotonic() - begun), LATCHED))
         page.release()
     found['program suspended for 5 s'] = suspended

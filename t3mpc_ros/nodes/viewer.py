@@ -19,9 +19,11 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import Odometry
+from geometry_msgs.msg import Point, Pose, PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry, Path
+import numpy as np
 from rcl_interfaces.msg import Log, ParameterEvent
+from rclpy.duration import Duration
 from rclpy.exceptions import InvalidNamespaceException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.logging_severity import LoggingSeverity
@@ -36,6 +38,7 @@ from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
+from t3mpc_ros.geometry.path_timing import PathError, check_points
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, State
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.process import own_context
@@ -55,8 +58,12 @@ ROBOTS = ('sim_robot', 'radio_bridge')
 """Nodes that are a robot."""
 LOOP_NODES = ('controller', *ROBOTS, 'reference_generator')
 """Nodes whose reports, parameters and services the page shows."""
+DEPTH = 100
+"""Messages that wait for a poll at most: those of a second, if the machine is busy."""
 REFERENCES = 200
 """Number of references whose times are kept: those of a second, and more."""
+SAME_CLOCK_NS = 30 * NANOSECONDS
+"""Time between publication and stamp up to which both are of the same clock."""
 SWITCH_TIMEOUT = 1.0
 """Time after which a switch without a reference that follows it is reported all the same, s."""
 CLOCK_NS = 1_000_000_000 * NANOSECONDS
@@ -73,6 +80,15 @@ SERVICES: Mapping[str, tuple[type, str]] = {
     'reseed': (Trigger, 'reference_generator/reseed'),
 }
 """Commands that are a service: its type and name."""
+
+
+PATH = QoSProfile(
+    depth=1,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    lifespan=Duration(seconds=REPLY_TIMEOUT),
+)
+"""Profile of a path that was drawn, as who follows paths requests; a node that starts later must
+not drive along an old one."""
 
 
 class CommandFailedError(RuntimeError):
@@ -96,7 +112,7 @@ class ViewNode(Node):
         self._origin_ns: int | None = None
         self._newest = 0.0
         self._stamp_lead_ns = 0
-        """Time from the publication of the newest odometry to its stamp."""
+        """Lead of the clock of the stamps, of a simulation, over that of the publications."""
         self._sent_references: deque[tuple[int, float]] = deque(maxlen=REFERENCES)
         """Times of publication, ns, and stamps, s, of the newest references."""
         self._switches: list[tuple[int, str]] = []
@@ -110,6 +126,7 @@ class ViewNode(Node):
         self._command_clients = {
             name: self.create_client(kind, service) for name, (kind, service) in SERVICES.items()
         }
+        self._path_publisher = self.create_publisher(Path, 'path', PATH)
         self._polled: dict[str, Subscription] = {}
         self._subscribe_all()
         sink.set('terms', list(TERM_NAMES))
@@ -181,7 +198,7 @@ class ViewNode(Node):
         topic: str,
         take: Callable[[Any, int], None],
         *,
-        depth: int = 20,
+        depth: int = DEPTH,
         raw: bool = False,
         latched: bool = False,
     ) -> None:
@@ -215,7 +232,10 @@ class ViewNode(Node):
             return
         seconds = self._seconds(state.stamp_ns)
         if stream == 'odometry':
-            self._newest, self._stamp_lead_ns = seconds, state.stamp_ns - sent_ns
+            lead_ns = state.stamp_ns - sent_ns
+            # A robot that catches up stamps of the clock sends them late: that is no other clock.
+            self._stamp_lead_ns = lead_ns if abs(lead_ns) > SAME_CLOCK_NS else 0
+            self._newest = seconds
         elif stream == 'reference':
             self._sent_references.append((sent_ns, seconds))
         wheels = wheels_from_twist(state.twist, self._geometry)
@@ -381,13 +401,43 @@ class ViewNode(Node):
                 raise CommandFailedError(late)
             if name == 'set':
                 self._set_parameter(arguments, reply)
+            elif name == 'path':
+                reply.set_result(self._publish_path(arguments.get('points')))
             elif name in self._command_clients:
                 self._call_service(name, arguments, reply)
             else:
-                known = ', '.join(('set', *self._command_clients))
+                known = ', '.join(('set', 'path', *self._command_clients))
                 raise CommandFailedError(f'the commands are {known}: got {name}')
         except (CommandFailedError, ValueError) as error:
             reply.set_exception(CommandFailedError(str(error)))
+
+    def _publish_path(self, points: Any) -> str:
+        """Publish points (m, in the frame of the odometry) for a reference of source ``topic``."""
+        try:
+            places = np.array(points, dtype=np.float64)
+            check_points(places)
+            if not places.size:
+                raise PathError('points must not be empty')
+        except (PathError, TypeError, ValueError) as error:
+            raise CommandFailedError(f'path needs points, [[x, y], …] in m: {error}') from None
+        if not self._path_publisher.get_subscription_count():
+            raise CommandFailedError(
+                'no node follows a path: start reference_generator with source topic'
+            )
+        message = Path()
+        message.header.stamp = self.get_clock().now().to_msg()
+        frames = conversions.FrameParameters()
+        message.header.frame_id = frames.prefixed('odom', self.get_namespace())
+        message.poses = [
+            PoseStamped(header=message.header, pose=Pose(position=Point(x=float(x), y=float(y))))
+            for x, y in places
+        ]
+        self._path_publisher.publish(message)
+        text = f'path of {len(places)} points' if len(places) > 1 else 'goal'
+        x, y = places[-1]
+        text = f'{text} to x {x:.2f} m, y {y:.2f} m'
+        self._sink.report(self._newest, 'command', text)
+        return text
 
     def _call_service(self, name: str, arguments: Mapping[str, Any], reply: 'Future[str]') -> None:
         client, (kind, service) = self._command_clients[name], SERVICES[name]

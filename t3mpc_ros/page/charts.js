@@ -252,14 +252,14 @@ class Floor {
 
   // scene: {world, paths: [{x, y, colour, dash}], marks: [[x, y, colour]], robot: [x, y, yaw] or
   // null, mounts: [[x, y, yaw]] of the range sensors, ranges, reach, track, wheel (radius) (m)};
-  // NaN interrupts a path
+  // NaN interrupts a path; still: whether the view stays as it is
   draw(scene) {
     const canvas = this.canvas;
     const ratio = window.devicePixelRatio || 1;
     const size = Math.round(canvas.clientWidth * ratio);
     if (canvas.width !== size) canvas.width = canvas.height = size;
     const context = canvas.getContext('2d');
-    this.fit(scene);
+    if (!scene.still || !this.view) this.fit(scene);
     const [cx, cy, half] = this.view;
     const scale = size / (2 * half);
     const at = (x, y) => [(x - cx + half) * scale, (cy + half - y) * scale];
@@ -286,6 +286,13 @@ class Floor {
       disc(context, ...at(x, y), 4.5 * ratio);
     }
     if (scene.robot) this.robot(context, scene, at, scale, ratio);
+  }
+
+  // Place on the map of a pixel of the canvas, as of an event there.
+  placeAt(left, top) {
+    const [cx, cy, half] = this.view;
+    const share = (2 * half) / this.canvas.clientWidth;
+    return [cx - half + share * left, cy + half - share * top];
   }
 
   fit(scene) {

@@ -18,6 +18,8 @@ MAX_EVENTS = 500
 """Number of events that are kept."""
 STEP = 0.019
 """Least time between two samples that a page is shown, s: every second one at 100 Hz."""
+DISORDER = 0.5
+"""Time by which samples may arrive out of order, s: those without a stamp are timed by others."""
 MAX_CHANGES = 5000
 """Samples and events that one answer holds at most: a page that opens must not stop a loop."""
 DIGITS = 5
@@ -52,12 +54,13 @@ class LiveData:
     def add(self, stream: str, time: float, values: Sequence[float]) -> None:
         """Add a sample; what is older than the span, or newer than this sample, is dropped.
 
-        Time goes back when a bag is played again, or a robot starts anew.
+        Time goes back when a bag is played again, or a robot starts anew; a sample that is late
+        by less than :data:`DISORDER` is left out.
         """
         with self._lock:
             kept = self._streams.get(stream)
             since = time - kept.times[-1] if kept else -math.inf
-            if 0.0 <= since < self._step:
+            if -DISORDER < since < self._step:
                 return
             if kept is None or since < 0.0:
                 kept = self._streams[stream] = _Stream(len(values))
@@ -75,7 +78,8 @@ class LiveData:
     def report(self, time: float, kind: str, text: str) -> None:
         """Add an event in one line.
 
-        Its kind is ``switch``, ``fault``, ``stop``, ``parameter``, ``command`` or ``note``.
+        Its kind is ``switch``, ``fault``, ``stop``, ``resume`` (the end of a stop), ``parameter``,
+        ``command`` or ``note``.
         """
         with self._lock:
             self._number += 1

@@ -122,7 +122,7 @@ class LiveRun(LiveData):
             reason = f': {shown.detail}' if shown.detail else ''
             self.report(self._time, 'stop', f'{shown.headline}{reason}')
         elif previous.kind in ('stopped', 'lost'):
-            self.report(self._time, 'note', shown.headline)
+            self.report(self._time, 'resume', shown.headline)
 
     def refusal(self, name: str, on: object, asked: float, now: float) -> str:
         """Return why a command is not to be executed; '' for one that is.

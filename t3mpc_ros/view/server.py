@@ -32,7 +32,15 @@ MAX_BODY = 4096
 """Largest command, bytes."""
 
 _TYPES = {'.html': 'text/html', '.js': 'text/javascript', '.css': 'text/css'}
-_SCRIPTS = ('view.js', 'commands.js', 'parameters.js', 'pictures.js', 'events.js', 'share.js')
+_SCRIPTS = (
+    'view.js',
+    'commands.js',
+    'parameters.js',
+    'pictures.js',
+    'draw.js',
+    'events.js',
+    'share.js',
+)
 _PAGE = ('view.html', 'view.css', *_SCRIPTS, *PAGE_FILES)
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "

@@ -2,10 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The live page of a running graph in a headless browser, as a person uses it."""
 
+import numpy as np
 import pytest
 from support.browser import SIZES, Browser
+from support.page_data import check_legends
 
+from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.view import PAGE_AT
+from t3mpc_ros.evaluation.bag_report.run_data import load_run
+from t3mpc_ros.geometry.types import NANOSECONDS
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timed]
 
@@ -30,12 +35,13 @@ def browser():
 
 
 @pytest.fixture
-def page(processes, browser):
-    """Start graph and page, and open it."""
+def page(processes, browser, tmp_path):
+    """Start graph and page, and open it; it records into the folder of the test."""
     processes.start('sim_robot', parameters=ROBOT)
     processes.start('reference_generator')
     processes.start('controller')
-    processes.start('view', 'view', '--headless', '--port', '0', program='t3mpc')
+    options = '--headless', '--port', '0', '--runs', str(tmp_path)
+    processes.start('view', 'view', *options, program='t3mpc')
     processes.wait_for('view', '(stop with', 120.0)
     processes.wait_for('controller', 'tracking', 600.0)
     text = processes.log('view').read_text()
@@ -59,7 +65,7 @@ def test_a_person_watches_and_commands_a_robot(page, browser, processes):
 
     # The cursor of one chart moves in all of them, and shows its time.
     charts = browser.driver.find_elements('css selector', '.u-over')
-    assert len(charts) == 4
+    assert len(charts) == 5
     ActionChains(browser.driver).move_to_element(charts[0]).perform()
     browser.wait(lambda: 'cursor at' in browser.text('cursor-time'), 'no cursor')
     assert browser.run('return charts.charts.every((each) => each.uplot.cursor.left > 0)')
@@ -98,12 +104,14 @@ def test_a_person_watches_and_commands_a_robot(page, browser, processes):
 
     # Every control is reached with the keyboard.
     browser.find('e-stop').send_keys(Keys.TAB)
-    reached = set()
-    for _ in range(60):
+    reached, wanted = set(), {'span', 'hold', 'play', 'seek', 'record', 'search', 'events'}
+    for _ in range(200):
         active = browser.driver.switch_to.active_element
         reached.add(active.get_attribute('id') or active.text)
         active.send_keys(Keys.TAB)
-    assert {'span', 'hold', 'search', 'Enable', 'Reseed', 'events'} <= reached
+        if wanted | {'Enable', 'Reseed'} <= reached:
+            break
+    assert wanted | {'Enable', 'Reseed'} <= reached
 
     # Legible in every size and scheme.
     for scheme in ('light', 'dark'):
@@ -131,3 +139,41 @@ def test_a_person_watches_and_commands_a_robot(page, browser, processes):
 
     assert [text for text in browser.errors() if 'ERR_CONNECTION_REFUSED' not in text] == []
     assert {url for url in browser.requests() if not url.startswith((page, 'data:'))} == set()
+
+
+SWITCHES = "return events.filter(({kind}) => kind === 'switch').map(({time}) => time)"
+
+
+def test_a_recording_agrees_with_the_page_and_ends_in_a_report(page, browser, tmp_path):
+    """Legends mixed instants, and switches were marked 0.4 s before the report marks them."""
+    browser.show_as(1440, 1000)
+    browser.find('record').click()
+    browser.wait(lambda: browser.run('return facts.recorder.state') == 'recording', 'no recording')
+    begun, known = newest(browser), len(browser.run(SWITCHES))
+    browser.wait(lambda: len(browser.run(SWITCHES)) >= known + 2, 'no two switches')
+    marked = browser.run(SWITCHES)[known:]
+    browser.wait(lambda: newest(browser) > marked[-1] + 1.0, 'no new samples')
+    browser.find('hold').click()
+    ended = newest(browser)
+    browser.find('record').click()
+    browser.wait(lambda: browser.find('report').is_displayed(), 'no report')
+    (bag,) = tmp_path.glob('view_*/bag')
+    assert str(bag) in browser.text('record-text')
+    with open_bag(bag) as recording:
+        run = load_run(recording)
+        origin = recording.start_ns / NANOSECONDS - browser.run('return facts.origin')
+    browser.run('selection = arguments', begun, ended)
+    browser.run('changed = true')
+    browser.wait(lambda: not browser.run('return changed'), 'nothing is drawn')
+    span = begun + 0.5 - origin, ended - 0.5 - origin
+    check_legends(browser, run, 30, origin, span, delay=0.2)
+    for time in marked:
+        assert np.min(np.abs(run.switches + origin - time)) < 0.02
+
+    # The report opens beside the page, alone.
+    browser.find('report').click()
+    browser.wait(lambda: len(browser.driver.window_handles) == 2, 'no report')
+    browser.driver.switch_to.window(browser.driver.window_handles[1])
+    browser.wait(lambda: browser.run('return Boolean(span)'), 'the report is not drawn')
+    assert browser.run('return origin') == 'null'
+    assert browser.errors() == []

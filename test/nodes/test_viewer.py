@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node of the live page: what it collects from a running robot, and its commands."""
 
+from functools import partial
+import math
 import time
 
-from nav_msgs.msg import Odometry
-import numpy as np
+from nav_msgs.msg import Odometry, Path
 import pytest
+from rclpy.serialization import serialize_message
 from std_msgs.msg import Header, Int32MultiArray
 from support.page_data import read_all
 from support.ros_graph import CommandSource, twist
@@ -15,7 +17,7 @@ from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import WARN
 from t3mpc_ros.nodes.remote_parameters import parameter_row
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
-from t3mpc_ros.nodes.viewer import CommandFailedError, ViewNode
+from t3mpc_ros.nodes.viewer import REPLY_TIMEOUT, CommandFailedError, ViewNode
 from t3mpc_ros.view.live_run import LiveRun
 
 pytestmark = pytest.mark.ros
@@ -121,18 +123,26 @@ def test_a_switch_has_the_time_of_the_reference_that_it_begins(viewer, harness):
     assert found() == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_command_without_stamp_has_the_time_of_its_sending(viewer, harness):
+def test_a_command_without_stamp_has_the_time_of_its_sending(viewer):
     """It had that of the newest odometry at the next poll: up to 50 ms off."""
-    source = CommandSource(harness)
-    source.message = twist(0.14)
+    viewer.spin_until(lambda: 'odometry' in viewer.changes().get('streams', {}))
+    origin = viewer.facts()['origin'] * 1_000_000_000
+    sent = [origin + 5_000_000_000 + 30_000_000 * k for k in range(10)]
+    for sent_ns in sent:
+        viewer.node._on_command(serialize_message(twist(0.14)), sent_ns)
+    shown = viewer.changes()['streams']['command']
+    assert shown['time'] == pytest.approx([(each - origin) / 1e9 for each in sent], abs=1e-4)
+    assert shown['values'][0] == pytest.approx([4.0] * 10)
+    # A robot that was busy sends its newest stamp late: that moves no command.
+    viewer.node._on_state('odometry', odometry(sent[-1]), sent[-1] + 600_000_000)
+    viewer.node._on_command(serialize_message(twist(0.14)), sent[-1] + 30_000_000)
+    times = viewer.changes()['streams']['command']['time']
+    assert len(times) == 11
+    assert times[-1] - times[-2] == pytest.approx(0.03, abs=1e-4)
 
-    def times():
-        return viewer.changes().get('streams', {}).get('command', {}).get('time', ())
 
-    viewer.spin_until(lambda: len(times()) > 30)
-    assert np.max(np.diff(times())) > 0.0
-    steps = np.diff(times())
-    assert np.median(steps) < 0.045, 'one command for each poll is shown'
+def odometry(stamp_ns):
+    return serialize_message(Odometry(header=Header(stamp=conversions.time_from_ns(stamp_ns))))
 
 
 def test_the_e_stop_latches_and_is_shown(viewer, robot):
@@ -167,6 +177,34 @@ def test_a_parameter_is_set_and_its_change_is_shown(viewer, robot, harness):
     viewer.spin_until(lambda: any(each['kind'] == 'fault' for each in viewer.changes()['events']))
 
 
+def test_a_drawn_path_reaches_the_reference_and_no_later_one(viewer, harness):
+    paths = []
+    listen = partial(harness.probe.create_subscription, Path, 'path', paths.append, qos.LATCHED)
+    with pytest.raises(CommandFailedError, match='no node follows a path: start reference_gen'):
+        viewer.command('path', points=[[1.0, 2.0]])
+    first = listen()
+    viewer.spin_until(lambda: viewer.node._path_publisher.get_subscription_count())
+    assert viewer.command('path', points=[[0.0, 0.5], [1, 2]]).startswith(
+        'path of 2 points to x 1'
+    )
+    viewer.spin_until(lambda: paths)
+    (path,) = paths
+    assert [(p.pose.position.x, p.pose.position.y) for p in path.poses] == [(0.0, 0.5), (1.0, 2.0)]
+    assert path.header.frame_id == 'odom'
+    assert viewer.command('path', points=[[1.0, 2.0]]) == 'goal to x 1.00 m, y 2.00 m'
+    viewer.spin_until(lambda: len(paths) == 2)
+    # A node that starts when it is old must not drive along it.
+    harness.probe.destroy_subscription(first)
+    ended = time.monotonic() + 1.2 * REPLY_TIMEOUT
+    viewer.spin_until(lambda: time.monotonic() > ended)
+    listen()
+    viewer.spin_until(lambda: viewer.node._path_publisher.get_subscription_count())
+    assert viewer.command('path', points=[[3.0, 3.0]])
+    viewer.spin_until(lambda: len(paths) > 2)
+    assert [len(each.poses) for each in paths] == [2, 1, 1]
+    assert paths[-1].poses[0].pose.position.x == 3.0
+
+
 def setting(name, value):
     return {'node': 'sim_robot', 'name': name, 'value': value}
 
@@ -175,7 +213,11 @@ def setting(name, value):
     ('name', 'arguments', 'words'),
     [
         ('e_stop', {}, 'e_stop needs on, true or false: got None'),
-        ('dance', {}, 'the commands are set, e_stop,'),
+        ('dance', {}, 'the commands are set, path, e_stop,'),
+        ('path', {'points': []}, 'path needs points'),
+        ('path', {'points': 'all'}, 'path needs points'),
+        ('path', {'points': [[0.0, math.nan]]}, 'points must be finite'),
+        ('path', {'points': [[0.0], [1.0, 2.0]]}, 'path needs points'),
         ('reseed', {}, 'no node offers the service reference_generator/reseed'),
         ('set', {'node': 'x', 'name': 'y', 'value': 1}, "no node 'x'"),
         ('set', setting('y', 1), 'has no parameter y'),

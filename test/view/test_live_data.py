@@ -88,6 +88,13 @@ def test_time_that_goes_back_starts_the_stream_anew():
     assert read_all(data)[0]['streams']['a']['time'] == [0.0, 1.0]
 
 
+def test_a_sample_that_is_late_does_not_discard_the_others():
+    data = LiveData()
+    for time in (5.0, 6.0, 5.99, 5.6, 6.1):
+        data.add('a', time, [time])
+    assert read_all(data)[0]['streams']['a']['time'] == [5.0, 6.0, 6.1]
+
+
 def test_numbers_that_are_not_finite_become_null():
     data = LiveData()
     data.add('a', 0.0, [math.nan, math.inf, -math.inf, 1.0])
@@ -176,9 +183,9 @@ def test_stops_and_their_ends_are_events():
     run.tick(2.9 + LOST + 0.1)
     events = read_all(run)[0]['events']
     assert [(event['kind'], event['text'].split(':')[0]) for event in events] == [
-        ('note', 'Tracking the reference'),
+        ('resume', 'Tracking the reference'),
         ('stop', 'E-STOP'),
-        ('note', 'Tracking the reference'),
+        ('resume', 'Tracking the reference'),
         ('stop', 'Connection lost'),
     ]
     assert events[1]['time'] == pytest.approx(1.0)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.bag_messages import START, TYPES, odometry_message, twist_message
 from support.browser import Browser
+from support.page_data import check_legends, legends
 from support.robot_bags import following_rows, write
 
 from t3mpc_ros.bag.reader import open_bag
@@ -21,12 +22,6 @@ from t3mpc_ros.view.server import PageServer
 pytestmark = pytest.mark.slow
 
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'
-LEGENDS = """
-charts.moveTo(arguments[0]);
-const shown = charts.charts.map((chart) => [chart.title, Object.fromEntries(chart.series.map(
-  ({label}, i) => [label, chart.values[i].textContent]))]);
-return [cursorTime, Object.fromEntries(shown)];
-"""
 
 
 @pytest.fixture(scope='module')
@@ -54,49 +49,15 @@ def show(browser):
         server.__exit__()
 
 
-def value(text):
-    return None if text == '–' else float(text.replace('−', '-'))
-
-
-def legends(browser, at):
-    """Return the instant of the cursor and the numbers of all legends, by chart and line."""
-    instant, shown = browser.run(LEGENDS, at)
-    return instant, {
-        chart: {label: value(text) for label, text in lines.items()}
-        for chart, lines in shown.items()
-    }
-
-
 def test_the_legend_says_what_was_sent_for_the_cursor(browser, show):
     """It showed the reference 0.4 s later than the measurement and the error beside it."""
     with open_bag(GOLDEN) as recording:
         run = load_run(recording)
-    odom, reference, command = (run.motions[each] for each in ('odom', 'reference', 'cmd_vel'))
     show(recorded_run(GOLDEN))
     # Without a cursor there is no instant, and no value.
     shown = 'return charts.charts.flatMap(({values}) => values.map((each) => each.textContent))'
     assert set(browser.run(shown)) == {'–'}
-    begin, end = max(odom.time[0], reference.time[0]), min(odom.time[-1], reference.time[-1])
-    generator = np.random.default_rng(29)
-    for at in generator.uniform(begin + 0.1, end - 0.1, 50).tolist():
-        instant, shown = legends(browser, at)
-        row = int(np.argmin(np.abs(odom.time - instant)))
-        assert odom.time[row] == pytest.approx(instant, abs=2e-5), 'not a measurement'
-        assert abs(instant - at) < 0.05
-        for wheel in ('right', 'left'):
-            lines = shown[f'{wheel.capitalize()} wheel']
-            measured = odom[wheel][row]
-            wanted = float(np.interp(instant, reference.time, reference[wheel]))
-            assert lines['odometry'] == pytest.approx(measured, abs=6e-4)
-            # Every second sample is shown: across a jump the line is 10 ms less steep.
-            near = np.abs(reference.time - instant) < 0.021
-            spread = np.ptp(reference[wheel][near])
-            assert lines['reference'] == pytest.approx(wanted, abs=6e-4 + (spread > 0.1) * spread)
-            # The legend agrees with itself to its last digit: one instant, no mixture.
-            error = lines['odometry'] - lines['reference']
-            assert shown['Error'][wheel] == pytest.approx(error, abs=1.6e-3)
-            sent = command[wheel][np.abs(command.time - instant) < 0.03]
-            assert sent.min() - 1e-3 <= lines['command'] <= sent.max() + 1e-3
+    check_legends(browser, run, seed=29)
 
 
 @pytest.fixture(scope='module')
@@ -184,12 +145,15 @@ def test_the_error_is_scaled_to_what_was_driven(browser, show):
     data = LiveRun()
     data.set('terms', [])
     generator = np.random.default_rng(5)
+    data.report(0.0, 'resume', 'Tracking the reference')
+    data.report(16.0, 'stop', 'E-STOP')
     for k in range(1000):
-        at, drives = 0.02 * k, k < 900
+        # From 18 s on the controller commands rest; from 16 s the robot does not obey.
+        at, drives, commanded = 0.02 * k, k < 800, k < 900
         error = 0.03 * generator.uniform(-1.0, 1.0) if drives else 5.0
         data.add('reference', at, [4.0, 4.0, 0.0, 0.0, 0.0])
         data.add('odometry', at, [4.0 + error, 4.0 + error, 0.0, 0.0, 0.0])
-        data.add('command', at, [4.0 * drives, 4.0 * drives])
+        data.add('command', at, [4.0 * commanded, 4.0 * commanded])
     data.tick(0.0)
     show(data)
     scale = 'const {min, max} = charts.charts[arguments[0]].uplot.scales.y; return [min, max]'
@@ -247,6 +211,63 @@ def test_what_is_shown_is_saved_as_a_page_that_opens_alone(browser, show, tmp_pa
     assert [
         url for url in browser.requests() if not url.startswith(('file:', 'data:', 'blob:'))
     ] == []
+
+
+def test_a_line_on_the_floor_is_a_path_and_a_touch_a_goal(browser, show):
+    from selenium.webdriver import ActionChains
+
+    data, sent = LiveRun(), []
+    source = {'name': 'source', 'value': 'signals', 'dynamic': False}
+    data.set('terms', [])
+    data.set('parameters/reference_generator', [source])
+    for k in range(100):
+        # The odometry began elsewhere than the map, and turned by a quarter.
+        data.add('odometry', 0.02 * k, [0.0, 0.0, 0.0, 0.0, 0.0])
+        data.add('truth', 0.02 * k, [0.0, 0.0, 1.0, 2.0, 0.5 * np.pi])
+    data.tick(0.0)
+
+    def command(name, arguments, asked):
+        sent.append((name, arguments))
+        return 'sent'
+
+    show(data, command)
+    assert not browser.find('draw').is_displayed(), 'the reference follows no path'
+    data.set('parameters/reference_generator', [{**source, 'value': 'topic'}])
+    browser.wait(lambda: browser.find('draw').is_displayed(), 'no button')
+    floor = browser.find('floor')
+    browser.find('draw').click()
+    browser.wait(lambda: not browser.run('return changed || moved'), 'not drawn')
+    *centre, half = browser.run('return floor.view')
+    per_metre = browser.run('return floor.canvas.clientWidth') / (2.0 * half)
+    step = round(0.2 * per_metre)
+    line = ActionChains(browser.driver).move_to_element(floor).click_and_hold()
+    line.move_by_offset(step, 0).move_by_offset(0, -step).release().perform()
+    browser.wait(lambda: sent, 'no path')
+    name, arguments = sent.pop()
+    points = np.array(arguments['points'])
+    assert name == 'path'
+    assert len(points) > 2
+    # To the right on the map is to the right of a robot that faces up, which is −y; up is ahead.
+    moved = points[-1] - points[0]
+    np.testing.assert_allclose(moved, [step / per_metre, -step / per_metre], atol=0.02)
+    start = np.array([centre[1] - 2.0, 1.0 - centre[0]])
+    np.testing.assert_allclose(points[0], start, atol=0.02)
+
+    assert not browser.run('return isDrawing()'), 'the pen stays up'
+    browser.find('draw').click()
+    browser.wait(lambda: not browser.run('return changed || moved'), 'not drawn')
+    *centre, half = browser.run('return floor.view')
+    right = step * 2.0 * half / browser.run('return floor.canvas.clientWidth')
+    goal = [centre[1] - 2.0, 1.0 - centre[0] - right]
+    ActionChains(browser.driver).move_to_element_with_offset(floor, step, 0).click().perform()
+    browser.wait(lambda: sent, 'no goal')
+    (name, arguments) = sent.pop()
+    assert name == 'path'
+    np.testing.assert_allclose(arguments['points'], [goal], atol=0.02)
+    # Without the pen, the floor takes no orders.
+    ActionChains(browser.driver).move_to_element(floor).click().perform()
+    assert browser.run('return [pen, isDrawing()]') == [False, False]
+    assert sent == []
 
 
 BANNERS = (

@@ -101,12 +101,16 @@ function drawCharts() {
 // Whether the robot was commanded to move, and settled, at an instant: what happens while it is
 // stopped, while it catches up, and at a switch would make everything else a flat line.
 function isDriven({ time, values }) {
-  const breaks = events.filter(({ kind }) => kind === 'switch' || kind === 'stop').map((each) => each.time);
+  const timesOf = (...kinds) => events.filter(({ kind }) => kinds.includes(kind)).map((each) => each.time);
+  const [stops, resumes] = [timesOf('stop'), timesOf('resume')];
+  const breaks = [...timesOf('switch'), ...stops, ...resumes];
   const moves = (row) => values.some((column) => column[row]);
   time.forEach((at, row) => { if (row && moves(row) && !moves(row - 1)) breaks.push(at); });
   breaks.sort((a, b) => a - b);
   return (at) => {
-    if (time.length && !moves(rowAt(time, at))) return false;
+    if (time.length && !moves(rowAt(time, at))) return false; // the controller commands rest
+    const stop = stops[rowAt(stops, at)]; // the robot stands, whatever the controller commands
+    if (stop !== undefined && !(resumes[rowAt(resumes, at)] > stop)) return false;
     const next = rowAt(breaks, at);
     return !(at < breaks[next] + AFTER || at > breaks[next + 1] - BEFORE);
   };
@@ -271,7 +275,8 @@ function drawFloor() {
   const paths = PATHS.filter(([name]) => streams[parts[name][0]]).map(([name, , look]) =>
     path(parts[name][0], look, name === 'truth' ? null : base, parts[name][1]));
   const robot = truth || (odometry && base && compose(base, odometry));
-  floor.draw({ world: facts.world, paths, robot, mounts: facts.mounts, reach: facts.reach,
+  if (drawnPath) paths.push(drawnPath);
+  floor.draw({ still: isDrawing(), world: facts.world, paths, robot, mounts: facts.mounts, reach: facts.reach,
     ranges: sampleOf('ranges', 0, 8), track: facts.robot?.wheel_separation,
     wheel: facts.robot?.wheel_radius });
   if (!robot) return;

@@ -57,6 +57,7 @@ function take(news) {
     if (name === 'recording') showRecording();
     if (name === 'recorder') showRecorder();
     if (name.startsWith('parameters/')) showParameters(name.slice('parameters/'.length));
+    if (name === 'parameters/reference_generator') showDrawing();
   }
   if (news.facts?.terms) makeCharts();
   for (const [name, { time, values }] of Object.entries(news.streams || {})) add(name, time, values);
