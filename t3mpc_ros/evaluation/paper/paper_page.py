@@ -224,7 +224,7 @@ HEADLINE = 'table3_rmse'
 _KINDS = {
     'held': 'yes',
     'not held': 'no',
-    'inconclusive': 'open',
+    'inconclusive': 'apart',
     'not measured': 'open',
     'not comparable': 'apart',
 }

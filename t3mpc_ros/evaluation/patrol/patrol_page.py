@@ -41,7 +41,7 @@ COVERED, TIMES_SLOWER = 0.9, 3.0
 JUDGED_HORIZON, MARGIN = 5.0, 0.05
 """Horizon (s), and by which share of a random walk's skill that of a path may exceed it."""
 HOLDS, FAILS, INCONCLUSIVE = 'holds', 'does not hold', 'inconclusive'
-_KINDS = {HOLDS: 'yes', FAILS: 'no', INCONCLUSIVE: 'open'}
+_KINDS = {HOLDS: 'yes', FAILS: 'no', INCONCLUSIVE: 'apart'}
 
 
 class Claim(NamedTuple):

@@ -35,7 +35,7 @@ from t3mpc_ros.evaluation.reporting import (
 from t3mpc_ros.version import VERSION
 
 BETTER, WORSE, INCONCLUSIVE = 'ours is better', 'ours is worse', 'inconclusive'
-_KINDS = {BETTER: 'yes', WORSE: 'no', INCONCLUSIVE: 'open'}
+_KINDS = {BETTER: 'yes', WORSE: 'no', INCONCLUSIVE: 'apart'}
 _DRAWN = {OURS: '#be123c', 'pure pursuit': '#0284c7', 'regulated pure pursuit': '#65a30d'}
 
 
