@@ -13,7 +13,7 @@ fits both wheels by least squares, with covariance. Errors that last for some ti
 friction, are no white noise: the covariance is that of Newey and West (1987, doi 10.2307/1913610).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ import numpy as np
 
 from t3mpc_ros.evaluation.bag_report.continuity import parts
 from t3mpc_ros.evaluation.bag_report.run_data import Series
+from t3mpc_ros.evaluation.confidence_intervals import student_quantile
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 
@@ -31,6 +32,13 @@ MOST = 20_000
 FEWEST = 50
 MIN_EXPLAINED = 0.3
 """Explained share below which the fit is rejected."""
+MAX_SPREAD = 0.4
+"""Widest range of delays that fit the data equally well, as a share of the delay, of a fit that is
+determined; and at least :data:`MIN_SPREAD`."""
+MIN_SPREAD = 0.02
+"""s"""
+OFFSETS = 4
+"""Parameters that the data determine: dead time, lag, gain and offset."""
 MIN_LAG = 1e-3
 """Lag below which a drive responds at once, s."""
 CORRELATION_TIME = 0.5
@@ -54,11 +62,30 @@ class ResponseFit:
     """Explained share of the variance of the measured speed."""
     step: float
     """Resolution of the dead time, s."""
+    shortest: float = 0.0
+    longest: float = 0.0
+    """Least and largest sum of dead time and lag that fit the data as well, s: those of the 95 %
+    confidence region."""
+
+    @property
+    def delay(self) -> float:
+        """Sum of dead time and lag, s."""
+        return self.dead_time + self.lag
+
+    @property
+    def explains(self) -> bool:
+        """Whether the fit explains enough of the response."""
+        return self.explained >= MIN_EXPLAINED and self.gain > 0.0
+
+    @property
+    def determined(self) -> bool:
+        """Whether the data determine the delay: no very different one fits them as well."""
+        return bool(self.longest - self.shortest <= max(MIN_SPREAD, MAX_SPREAD * self.delay))
 
     @property
     def clear(self) -> bool:
-        """Whether the fit explains enough of the response."""
-        return self.explained >= MIN_EXPLAINED and self.gain > 0.0
+        """Whether the fit explains enough of the response, and the data determine it."""
+        return self.explains and self.determined
 
 
 @kernel
@@ -75,10 +102,11 @@ def lag_behind(u: Array, keep: Array, out: Array) -> None:
 def fit_response(command: Series, motion: Series, name: str) -> ResponseFit | None:
     """Return the dead time, lag and gain that fit the measured speed best.
 
-    Least squares of the output error over a grid of lags and dead times, refined twice. The sum of
-    dead time and lag is better determined than either. In a closed loop, noise fed back through
-    the command biases the delay slightly upwards. None when the two series overlap too briefly
-    or the command does not vary.
+    Least squares of the output error, with an offset, over a grid of lags and dead times, refined
+    once. The sum of dead time and lag is better determined than either; which sums fit as well is
+    said by the fit, widened by those of the halves of the run that contradict it. In a closed
+    loop, noise fed back through the command biases the delay slightly upwards. None when the two
+    series overlap too briefly or the command does not vary.
     """
     if min(len(command), len(motion)) < 3:
         return None
@@ -94,15 +122,72 @@ def fit_response(command: Series, motion: Series, name: str) -> ResponseFit | No
     grid = start + step * np.arange(count, dtype=np.float64)
     u = command.held(name, grid)
     y = np.interp(grid, motion.time, motion[name])
+    found = _fit(u, y, step, shifts)
+    middle = count // 2
+    if found is None or middle < shifts + FEWEST:
+        return found
+    for each in (slice(0, middle), slice(middle - shifts, count)):
+        # A response that changes within the run is not that of the whole.
+        part = _fit(u[each], y[each], step, shifts)
+        if part is None or part.longest >= found.shortest and part.shortest <= found.longest:
+            continue
+        low, high = min(found.shortest, part.delay), max(found.longest, part.delay)
+        found = replace(found, shortest=low, longest=high)
+    return found
+
+
+def _fit(u: Array, y: Array, step: float, shifts: int) -> ResponseFit | None:
+    """Return the fit of samples ``step`` s apart, with fewer shifts than samples."""
     u, y = u - u.mean(), y - y[shifts:].mean()
     if not (np.ptp(u) > 1e-6 and np.ptp(y) > 1e-9):
         return None
-    lags = np.geomspace(0.5 * step, LONGEST_LAG, 30)
-    best = _best(u, y, step, shifts, [0.0, *lags.tolist()])
-    near = int(np.searchsorted(lags, best.lag))
-    low = 0.0 if best.lag == 0.0 else float(lags[max(near - 1, 0)])
-    high = float(lags[min(near + 1, lags.size - 1)])
-    return _best(u, y, step, shifts, [best.lag, *np.linspace(low, high, 16).tolist()])
+    coarse = np.concatenate([[0.0], np.geomspace(0.5 * step, LONGEST_LAG, 30)])
+    coarsely = _explained(u, y, shifts, step, coarse)
+    best = float(coarse[int(np.argmax(coarsely.max(axis=1)))])
+    near = int(np.searchsorted(coarse[1:], best)) + 1
+    low = 0.0 if best == 0.0 else float(coarse[max(near - 1, 1)])
+    high = float(coarse[min(near + 1, coarse.size - 1)])
+    fine = np.array([best, *np.linspace(low, high, 16).tolist()])
+    lags = np.concatenate([fine, coarse])
+    explained = np.vstack([_explained(u, y, shifts, step, fine), coarsely])
+    row, shift = np.unravel_index(int(np.argmax(explained)), explained.shape)
+    largest, lag = float(explained[row, shift]), float(lags[row])
+    if not math.isfinite(largest):
+        return None
+    seen = _lagged(u, lag, step)[shifts - shift : u.size - shift]
+    seen = seen - seen.mean()
+    gain = float(seen @ y[shifts:] / (seen @ seen))
+    independent = seen.size / correlation(y[shifts:] - gain * seen)
+    delays = lags[:, np.newaxis] + step * np.arange(shifts)
+    fitting = delays[explained >= largest - _tolerance(largest, independent)]
+    spread = float(fitting.min()), float(fitting.max())
+    return ResponseFit(float(shift * step), lag, gain, largest, step, *spread)
+
+
+def _tolerance(explained: float, independent: float) -> float:
+    """Return by how much less a fit may explain that is as likely as the best one, at 95 %.
+
+    That of the likelihood of one parameter with so many independent errors.
+    """
+    degrees = int(independent) - OFFSETS
+    if degrees < 1:
+        return math.inf
+    return (1.0 - explained) * student_quantile(degrees) ** 2 / degrees
+
+
+def correlation(errors: Array) -> float:
+    """Return over how many samples errors are correlated, at least 1.
+
+    The integral of their autocorrelation up to where it is first below zero, on both sides.
+    """
+    size = 2 * errors.size
+    power = np.abs(np.fft.rfft(errors, size)) ** 2
+    found = np.fft.irfft(power, size)[: errors.size]
+    if not found[0] > 0.0:
+        return 1.0
+    below = np.flatnonzero(found <= 0.0)
+    last = int(below[0]) if below.size else errors.size
+    return float(1.0 + 2.0 * (found[1:last] / found[0]).sum())
 
 
 def busiest(command: Series, motion: Series, name: str, most: float) -> tuple[float, float]:
@@ -124,28 +209,34 @@ def busiest(command: Series, motion: Series, name: str, most: float) -> tuple[fl
     return span
 
 
-def _best(u: Array, y: Array, step: float, shifts: int, lags: list[float]) -> ResponseFit:
+def _lagged(u: Array, lag: float, step: float) -> Array:
+    if lag <= 0.0:
+        return u
+    x = np.empty(u.size)
+    lag_behind(u, np.full(u.size, math.exp(-step / lag)), x)
+    return x
+
+
+def _explained(u: Array, y: Array, shifts: int, step: float, lags: Array) -> Array:
+    """Return the share of ``y`` that the command explains, shape (lags, shifts).
+
+    By lag and by shift in steps, each with the best gain and offset; -inf for a gain below zero.
+    """
     # All shifts at once by the Fourier transform. A product for each of them would wait, on a busy
     # machine, thousands of times for the threads of the linear algebra library.
     wanted = y[shifts:]
     power = float(wanted @ wanted)
     spectrum = np.conj(np.fft.rfft(wanted, u.size))
-    found = ResponseFit(0.0, 0.0, 0.0, -math.inf, step)
-    x = np.empty(u.size)
-    for lag in lags:
-        lag_behind(u, np.full(u.size, math.exp(-step / lag) if lag > 0.0 else 0.0), x)
-        seen = x if lag > 0.0 else u
-        squares = np.concatenate([[0.0], np.cumsum(seen**2)])
-        energy = (squares[-shifts:] - squares[1 : shifts + 1])[::-1]
+    explained = np.full((lags.size, shifts), -math.inf)
+    for row, lag in enumerate(lags.tolist()):
+        seen = _lagged(u, lag, step)
+        sums, squares = (np.concatenate([[0.0], np.cumsum(each)]) for each in (seen, seen**2))
+        total, energy = ((each[-shifts:] - each[1 : shifts + 1])[::-1] for each in (sums, squares))
+        energy = energy - total**2 / wanted.size  # about its mean, as y is about its own
         product = np.fft.irfft(np.fft.rfft(seen) * spectrum, u.size)[shifts:0:-1]
-        sound = (energy > 0.0) & (product > 0.0)
-        explained = np.full(shifts, -math.inf)
-        explained[sound] = product[sound] ** 2 / (energy[sound] * power)
-        shift = int(np.argmax(explained))
-        if explained[shift] > found.explained:
-            gain = float(product[shift] / energy[shift])
-            found = ResponseFit(shift * step, lag, gain, float(explained[shift]), step)
-    return found
+        sound = (energy > 1e-12 * power) & (product > 0.0)
+        explained[row, sound] = product[sound] ** 2 / (energy[sound] * power)
+    return explained
 
 
 class WheelData(NamedTuple):

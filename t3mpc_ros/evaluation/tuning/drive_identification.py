@@ -128,7 +128,7 @@ def identify_drive(run: Run) -> IdentifiedDrive:
             f'deviation): got {variation:.3g} rad/s'
         )
     coarse = [fit_response(command, motion, name) for name in WHEELS]
-    sound = [fit for fit in coarse if fit is not None and fit.clear]
+    sound = [fit for fit in coarse if fit is not None and fit.explains]
     explained = max((fit.explained for fit in coarse if fit is not None), default=0.0)
     if not sound or explained < MIN_EXPLAINED:
         raise IdentificationError(
