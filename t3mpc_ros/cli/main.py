@@ -96,7 +96,7 @@ def _demo_exit_code(verdict: 'Verdict') -> int:
     if verdict.sound:
         return 0
     # No lack of time damages a recording.
-    return TOO_SLOW if verdict.slow and not verdict.damage else UNSOUND
+    return TOO_SLOW if verdict.slow and not verdict.damaged else UNSOUND
 
 
 def _new_run(folder: Path) -> Path:

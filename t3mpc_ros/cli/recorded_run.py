@@ -80,9 +80,11 @@ def recorded_run(bag: Path, namespace: str | None = None) -> LiveData:
     data.set(
         'banner',
         {
-            'kind': 'good' if verdict.sound else 'warning',
-            'headline': f'Recording {bag_display_name(bag)}, {run.duration:.1f} s',
-            'detail': verdict.text(),
+            'kind': 'good' if verdict.kind == 'good' else 'warning',
+            'headline': verdict.sentence,
+            'detail': ' '.join(
+                [f'Recording {bag_display_name(bag)}, {run.duration:.1f} s.', *verdict.reasons()]
+            ),
         },
     )
     data.set('recording', {'duration': run.duration})

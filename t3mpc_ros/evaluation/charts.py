@@ -47,6 +47,8 @@ class Chart:
     lines: Sequence[Line]
     summary: str
     """What is seen in it."""
+    extent: tuple[float, float] | None = None
+    """Values that are shown; None: those of the lines."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +82,11 @@ class Plane:
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """Events in order: time (s), kind (``switch``, ``stop``, ``gap``, ``note``), text."""
+    """Events in order: time (s), kind, text.
+
+    The kinds ``switch``, ``stop``, ``stall``, ``gap`` and ``jump`` are marked in the charts of the
+    page; ``note`` is not.
+    """
 
     show: ClassVar[str] = 'timeline'
     events: Sequence[tuple[float, str, str]]
@@ -114,7 +120,8 @@ class PageData:
             look = {'label': line.label, 'colour': line.colour, 'dash': list(line.dash)}
             lines.append({**look, 'style': line.style, **rows})
         named = {'title': shown.title, 'unit': shown.unit, 'summary': shown.summary}
-        return {**named, 'lines': lines}
+        extent = None if shown.extent is None else [float(f'{v:.4g}') for v in shown.extent]
+        return {**named, 'lines': lines, 'extent': extent}
 
     def plane(self, shown: Plane) -> dict[str, Any]:
         """Return the description of a plane for its script."""

@@ -5,7 +5,7 @@
 
 const TICK = 1e-5; // s
 const NEAR = 3; // s shown before and after an event
-const EVENTS = { switch: 'switch', stop: 'stopped', gap: 'left' }; // marked in the charts
+const EVENTS = { switch: 'switch', stop: 'stopped', stall: 'c4', gap: 'left', jump: 'c5' }; // marks
 
 const place = (id) => document.getElementById(id);
 const data = JSON.parse(place('data').textContent);
@@ -41,14 +41,16 @@ function show(text) {
 function select(from, to) {
   range = from === null || to - from >= span[1] - span[0] ? null
     : [Math.max(span[0], from), Math.min(span[1], to)];
+  for (const chart of charts.charts) chart.limits = range ? null : chart.extent;
   charts.draw(range || span);
   drawPlanes(null);
   show();
 }
 
-function addChart(id, { title, unit, lines, summary }) {
+function addChart(id, { title, unit, lines, summary, extent }) {
   const box = place(id);
-  const made = charts.add(title, unit, lines, { box, summary: `${title}. ${summary}` });
+  const made = charts.add(title, unit, lines, { box,
+    summary: `${title}. ${summary}` });
   const tables = [];
   let last = -1;
   for (const { time, value } of lines) {
@@ -57,6 +59,7 @@ function addChart(id, { title, unit, lines, summary }) {
     last = time;
   }
   charts.set(made, tables);
+  made.extent = extent;
   box.querySelector('h3').append(element('button', { type: 'button', textContent: 'CSV',
     title: 'Download the data shown', ariaLabel: `Download the data of ${title} as CSV`,
     onclick: () => download(made) }));

@@ -78,7 +78,7 @@ class Paragraph:
 
 @dataclass(frozen=True, slots=True)
 class VerdictBox:
-    """What a page says first; its kind is ``good``, ``open`` or ``bad``."""
+    """What a page says first; its kind is ``good``, ``open``, ``bad`` or ``apart``."""
 
     show: ClassVar[str] = 'verdict'
     headline: str

@@ -233,15 +233,21 @@ OVERLOADED = [(5.0, '/diagnostics', diagnostics(START, 'sim_robot', 1, 'processo
 RUNS = [
     # exit codes of the nodes, what the recorder has recorded, whether a file of it is unfinished,
     # exit code of the demo, words of its output
-    ({}, SOUND, False, 0, 'sound run'),
+    ({}, SOUND, False, 0, 'Good run: settled RMSE 0.571'),
     ({}, ASTRAY, False, 3, 'settled RMSE'),
     ({}, NOT_DRIVEN, False, 3, 'never driven'),
     ({}, [*NOT_DRIVEN, *OVERLOADED], False, 3, 'never driven'),
-    ({}, [row for row in SOUND if row[1] != '/reference'], False, 3, 'NO VERDICT'),
+    (
+        {},
+        [row for row in SOUND if row[1] != '/reference'],
+        False,
+        3,
+        'the bag holds no reference, so tracking cannot be judged',
+    ),
     ({}, SOUND, True, 3, 'truncated'),
-    ({}, [*ASTRAY, *OVERLOADED], False, 4, 'the machine was too slow; settled RMSE'),
+    ({}, [*ASTRAY, *OVERLOADED], False, 4, 'overloaded'),
     ({}, [*ASTRAY, *OVERLOADED], True, 3, 'truncated'),
-    ({}, [*SOUND, *OVERLOADED], False, 0, 'sound run'),
+    ({}, [*SOUND, *OVERLOADED], False, 0, 'overloaded'),
     ({}, [], False, 1, 'error: '),
     *(
         ({node: code}, SOUND, False, 1, f'not every node ended cleanly: {node} with code {code};')

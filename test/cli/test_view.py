@@ -45,7 +45,7 @@ def test_terms_are_recomputed_from_the_journal(shown):
 
 def test_banner_and_switches_are_those_of_the_report(shown):
     facts = shown['facts']
-    assert facts['banner']['headline'].startswith('Recording changes.mcap, ')
+    assert facts['banner']['detail'].startswith('Recording changes.mcap, 9.0 s.')
     assert facts['recording']['duration'] > 1.0
     with open_bag(GOLDEN) as recording:
         switches = load_run(recording).switches
@@ -53,10 +53,13 @@ def test_banner_and_switches_are_those_of_the_report(shown):
     assert found == switches.tolist()
 
 
-@pytest.mark.parametrize(('sound', 'kind'), [(True, 'good'), (False, 'warning')])
-def test_the_banner_has_the_kind_of_the_verdict(sound, kind, monkeypatch):
-    verdict = Verdict(() if sound else ('it was stopped',))
+@pytest.mark.parametrize(
+    ('found', 'kind'), [('good', 'good'), ('open', 'warning'), ('bad', 'warning')]
+)
+def test_the_banner_has_the_kind_and_the_words_of_the_verdict(found, kind, monkeypatch):
+    verdict = Verdict('It was stopped.', 'Stopped', found, 'Release it.')
     metrics = SimpleNamespace(verdict=verdict)
     monkeypatch.setattr('t3mpc_ros.cli.recorded_run.compute_metrics', lambda *_: metrics)
     banner = read_all(recorded_run(GOLDEN))[0]['facts']['banner']
-    assert (banner['kind'], banner['detail']) == (kind, verdict.text())
+    assert (banner['kind'], banner['headline']) == (kind, verdict.sentence)
+    assert banner['detail'].endswith(verdict.remedy)

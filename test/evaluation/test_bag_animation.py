@@ -15,8 +15,8 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main
 from t3mpc_ros.evaluation.bag_report import animation
 from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions, RangeReadings, animate_bag
-from t3mpc_ros.evaluation.bag_report.metrics import tracking_error
 from t3mpc_ros.evaluation.bag_report.run_data import Series, load_run
+from t3mpc_ros.evaluation.bag_report.tracking_errors import tracking_error
 from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE
 from t3mpc_ros.simulation.world import World
 

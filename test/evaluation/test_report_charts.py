@@ -13,10 +13,16 @@ from support.report_run import COMMANDED, LINK, MOTIONS, NUMBERS, RUN, TIME, WHE
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.bag_report import report_page
+from t3mpc_ros.evaluation.bag_report.causes import Cause, cause_between
+from t3mpc_ros.evaluation.bag_report.incidents import Incidents, Stop, find_incidents
+from t3mpc_ros.evaluation.bag_report.known_results import (
+    KNOWN_RESULTS,
+    MAX_RATIO,
+    known_result,
+)
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     ChannelMetrics,
-    ErrorStatistics,
     ReportMetrics,
     compute_metrics,
     estimation_target,
@@ -31,7 +37,8 @@ from t3mpc_ros.evaluation.bag_report.run_data import (
     Series,
     Timing,
 )
-from t3mpc_ros.evaluation.bag_report.verdict import Stop, Verdict, judge
+from t3mpc_ros.evaluation.bag_report.tracking_errors import ErrorStatistics
+from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.charts import Plane
 from t3mpc_ros.evaluation.drive_response import ResponseFit
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
@@ -143,8 +150,7 @@ def test_every_chart_is_known():
 
 
 def test_planes_have_the_axes_of_their_titles():
-    stops = (Stop(3.0, 4.0, '', True),)
-    metrics = replace(METRICS, verdict=replace(METRICS.verdict, stops=stops))
+    metrics = replace(METRICS, incidents=Incidents((Stop(3.0, 4.0, Cause('')),)))
     planes = {
         each.title: each
         for section in SECTIONS
@@ -258,7 +264,8 @@ def statistics(rmse, seconds):
 
 
 FIT = ResponseFit(0.031, 0.012, 0.98, 0.994, 0.001)
-SOUND = Verdict((), stopped=0.3)
+SOUND = Verdict('Good run.', 'Good run', 'good')
+STOOD = Incidents((Stop(3.0, 3.3, Cause('')),))
 COUNTS = dict(zip(COUNTED, (1000.0, 13.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0), strict=True))
 GIVEN = ReportMetrics(
     report=Path('r.html'), duration=61.26, messages=12345, switches=4, measured=TRUTH,
@@ -269,6 +276,7 @@ GIVEN = ReportMetrics(
     channels=BY_WHEEL, responses={'right': FIT, 'left': replace(FIT, lag=0.022)},
     links={'radio': LinkMetrics(COUNTS, 0.987, 0.0065, 0.012, 0.4)},
     latency=0.0031, latency_99=0.0042, missing={ODOMETRY: 0.0234}, absent=(), verdict=SOUND,
+    incidents=STOOD,
 )  # fmt: skip
 
 
@@ -278,11 +286,10 @@ def test_the_summary_in_full():
         '0.130 / 0.140 rad/s; largest error, right / left 0.510 / 0.520 rad/s; variation of the '
         'command per second, right / left 21.0 / 22.0 rad/s; variation of the reference per '
         'second, right / left 1.00 / 2.00 rad/s; command to motion, right / left 43.0 / 53.0 ms; '
-        'duration 61.3 s; messages 12345; switches 4; stopped between the first and the last '
-        'command to move 0.300 s; odometry to command, median 3.10 ms; odometry to command, 99 % '
-        'below 4.20 ms; odometry missing 2.34 %; cycles answered, radio 98.7 %; round trip, '
-        'median, radio 6.50 ms; round trip, worst 99 %, radio 12.0 ms; oldest measurement, radio '
-        '0.400 s: r.html'
+        'duration 61.3 s; messages 12345; switches 4; stood although it was to move 0.300 s; '
+        'odometry to command, median 3.10 ms; odometry to command, 99 % below 4.20 ms; odometry '
+        'missing 2.34 %; cycles answered, radio 98.7 %; round trip, median, radio 6.50 ms; round '
+        'trip, worst 99 %, radio 12.0 ms; oldest measurement, radio 0.400 s: r.html'
     )
     body = {'linear': GIVEN.wheels['right'], 'angular': GIVEN.wheels['left']}
     unknown = replace(GIVEN, channels=BY_BODY, wheels=body, responses={}, links={}, missing={})
@@ -338,126 +345,148 @@ def test_regularity_of_a_topic_in_its_units(monkeypatch, tmp_path):
 
 # -- verdicts -------------------------------------------------------------------------------------
 
-STOPS = (Stop(2.0, 2.5, 'robot: e-stop', True), Stop(4.0, 7.0, '', False))
-MANY = (*STOPS, Stop(9.0, 9.1, 'a', True), Stop(10.0, 10.2, 'b', True))
-LONGEST = [
-    'At 2.0 s for 0.50 s: robot: e-stop.',
-    'At 4.0 s for 3.00 s: the bag holds no diagnostics of that time.',
-]
-FOLLOWED = 'The robot followed the reference, stopped for 0.3 s.'
-ON_PATH = (
-    'the robot was on its path, within 50 mm of it, for {} % of the drive, stopped for 0.3 s; '
-    'the rest were detours around obstacles and the ways back'
-)
-
-
-@pytest.mark.parametrize(
-    ('verdict', 'kind', 'headline', 'text', 'reasons'),
-    [
-        (
-            SOUND, 'good', 'Good run',
-            'sound run: the robot followed the reference, stopped for 0.3 s', [FOLLOWED],
-        ),
-        (
-            replace(SOUND, slow=True), 'good', 'Good run, on a slow machine',
-            'sound run: the robot followed the reference, stopped for 0.3 s',
-            ['The machine was too slow at times, which did not spoil the numbers.', FOLLOWED],
-        ),
-        (
-            replace(SOUND, on_path=0.8), 'good', 'Good run', f'sound run: {ON_PATH.format(80)}',
-            [f'T{ON_PATH.format(80)[1:]}.'],
-        ),
-        (
-            replace(SOUND, on_path=0.49), 'open', 'Mostly off its path',
-            f'sound run: {ON_PATH.format(49)}', [f'T{ON_PATH.format(49)[1:]}.'],
-        ),
-        (
-            Verdict((), judged=False, lacking=('reference', 'odom')), 'open',
-            'Data missing: tracking cannot be judged',
-            'NO VERDICT ON TRACKING: the bag lacks reference, odom',
-            ['The bag lacks reference, odom.'],
-        ),
-        (
-            Verdict(('a', 'b'), slow=True), 'bad', 'Machine too slow',
-            'NO VALID MEASUREMENT: a; b', ['A.', 'B.'],
-        ),
-        (
-            Verdict(('torn',), damage=('torn',)), 'bad', 'Damaged recording',
-            'NO VALID MEASUREMENT: torn', ['Torn.'],
-        ),
-        (
-            Verdict(('a',), missing=True, stops=STOPS[1:]), 'bad', 'Data missing',
-            'NO VALID MEASUREMENT: a', ['A.', LONGEST[1]],
-        ),
-        (
-            Verdict(('a',), missing=True, stops=STOPS), 'bad', 'Stopped 2 times',
-            'NO VALID MEASUREMENT: a', ['A.', *LONGEST],
-        ),
-        (
-            Verdict(('a',), stops=STOPS[:1]), 'bad', 'Stopped once',
-            'NO VALID MEASUREMENT: a', ['A.', LONGEST[0]],
-        ),
-        (
-            Verdict(('a',), stops=MANY), 'bad', 'Stopped 4 times', 'NO VALID MEASUREMENT: a',
-            ['A.', *LONGEST, 'At 10.0 s for 0.20 s: b.', '1 shorter stops: see the events.'],
-        ),
-        (
-            Verdict(('a',)), 'bad', 'No valid measurement', 'NO VALID MEASUREMENT: a', ['A.'],
-        ),
-    ],
-)  # fmt: skip
-def test_a_verdict_in_words(verdict, kind, headline, text, reasons):
-    assert (verdict.kind, verdict.headline, verdict.text()) == (kind, headline, text)
-    assert verdict.reasons() == reasons
-    assert verdict.sound == text.startswith('sound')
-
-
-JUDGED = {'drive': (0.0, 20.0), 'rmse': 0.1, 'counted': 19.0, 'missing': 0.0, 'latency_99': 0.001}
-STANDING = Series(
-    TIME, COMMANDED | {'linear': np.where(TIME < 2.0, 0.0, 1.0), 'angular': 0 * TIME}
-)
+JUDGED = {'counted': 19.0, 'missing': 0.0, 'latency_99': 0.001}
+SMALL = 0.01 * np.sin(3.0 * TIME)
+FOLLOWING = {
+    **RUN.motions,
+    TRUTH: Series(TIME, {**RUN.motions[REFERENCE].values,
+                         **{w: motion(REFERENCE, w) + SMALL for w in WHEELS}}),
+}  # fmt: skip
 SIZE = max(np.sqrt(np.mean(motion(REFERENCE, wheel) ** 2)) for wheel in WHEELS)
+QUIET = replace(RUN, motions=FOLLOWING, receipts={ODOMETRY: TIME, COMMAND: TIME + 0.001})
+RMSE = r'settled RMSE 0\.00(69|7\d)\d / 0\.00(69|7\d)\d rad/s'
+ESTOP = (5.0, 'error', 'robot', 'emergency stop: a')
+LATE = r'The machine was slow: 99 % of the commands came within 11\.0 ms of their odometry, .*'
+
+
+def shifted(**wheels):
+    """Return motions whose wheels have these errors, rad/s."""
+    found = {w: motion(REFERENCE, w) + wheels.get(w, 0.0) for w in WHEELS}
+    return {**RUN.motions, TRUTH: Series(TIME, {**RUN.motions[REFERENCE].values, **found})}
+
+
+def standing(start, end, *, commanded=False):
+    """Return motions of a robot that stands from one time to another."""
+    stands = (start <= TIME) & (end > TIME)
+    values = FOLLOWING[TRUTH].values
+    still = {
+        k: v if k in ('x', 'y', 'yaw') else np.where(stands, 0.0, v) for k, v in values.items()
+    }
+    found = {**FOLLOWING, TRUTH: Series(TIME, still)}
+    if commanded:
+        values = {k: np.where(stands, 0.0, v) for k, v in COMMANDED.items()}
+        found[COMMAND] = Series(TIME, values)
+    return found
+
+
+ZERO = {**FOLLOWING, COMMAND: Series(TIME, {k: 0.0 * v for k, v in COMMANDED.items()})}
 
 
 @pytest.mark.parametrize(
-    ('run', 'given', 'problems'),
+    ('run', 'given', 'sentence', 'kind', 'sound'),
     [
-        ({}, {}, ()),
-        ({}, {'missing': 0.02, 'counted': 10.0, 'latency_99': 0.02, 'rmse': 0.249 * SIZE}, ()),
-        ({}, {'missing': 0.031}, ('3.1 % of odom is missing',)),
-        ({}, {'counted': 9.9}, ('only 9.9 of 20.0 s count',)),
-        ({}, {'rmse': math.nan}, ('no settled motion was measured',)),
+        ({}, {}, rf'Good run: {RMSE}, and the robot never stood\.', 'good', True),
+        ({}, {'missing': 0.02, 'counted': 10.0, 'latency_99': 0.01}, r'Good run: .*',
+         'good', True),
+        ({}, {'missing': 0.031}, rf'3\.1 % of odom is missing; {RMSE}\.', 'bad', False),
+        ({}, {'counted': 9.9}, rf'Only 9\.9 of 20\.0 s count: {RMSE}\.', 'bad', False),
+        ({}, {'latency_99': 0.011}, r'Good run: .*', 'good', True),
         (
-            {}, {'rmse': 0.251 * SIZE},
-            (f'settled RMSE {0.251 * SIZE:.2g} rad/s on a reference of {SIZE:.2g} rad/s',),
+            {'motions': shifted(right=0.26 * SIZE)}, {},
+            rf'The robot did not follow its reference: settled RMSE {0.26 * SIZE:#.3g} / 0\.00 '
+            rf'rad/s on a reference of {SIZE:.2g} rad/s\.', 'bad', False,
         ),
-        ({}, {'drive': (math.inf, -math.inf)}, ('the robot was never driven',)),
-        ({}, {'latency_99': 0.021}, ()),
+        ({'motions': shifted(right=0.24 * SIZE)}, {}, r'Good run: .*', 'good', True),
+        ({'motions': shifted(right=math.nan, left=math.nan)}, {},
+         r'No settled motion was measured\.', 'bad', False),
+        ({'motions': ZERO}, {}, r'The robot was never driven: every command was zero\.',
+         'bad', False),
+        ({'motions': ZERO, 'changes': (ESTOP,)}, {},
+         r'The robot was never driven \(E-stop\): every command was zero\.', 'bad', False),
+        ({'damage': ('torn',)}, {}, rf'Torn; {RMSE}\.', 'bad', False),
         (
-            {}, {'latency_99': 0.021, 'counted': 9.9},
-            ('the machine was too slow', 'only 9.9 of 20.0 s count'),
+            {'complaints': ((1.0, 'warning', 'a', 'processor overloaded'),)}, {},
+            r'The machine was overloaded from 1\.0 s on \(a: processor overloaded\): errors since '
+            rf"then may not be the controller's; {RMSE}\.", 'open', True,
         ),
         (
-            {'complaints': ((1.0, 'warning', 'a', 'processor overloaded'),)}, {'counted': 9.9},
-            ('the machine was too slow', 'only 9.9 of 20.0 s count'),
-        ),
-        ({'damage': ('torn',)}, {}, ('torn',)),
-        (
-            {'motions': {**RUN.motions, COMMAND: STANDING}}, {},
-            ('the robot was stopped for 2.0 of 20.0 s',),
+            {'motions': standing(5.0, 9.0), 'changes': (ESTOP,)}, {},
+            rf'E-stop at 5\.0 s, the robot stood for 4\.0 s; while it drove {RMSE}\.',
+            'bad', False,
         ),
         (
-            {'follows_path': True}, {},
-            ('the robot was within 50 mm of its path for only 0 % of the drive',),
+            {'motions': standing(15.0, 99.0), 'changes': ((15.2, *ESTOP[1:]),)}, {},
+            rf'E-stop at 15\.0 s, the robot stood for 4\.[89] s; until then {RMSE}\.',
+            'bad', False,
+        ),
+        (
+            {'motions': standing(5.0, 9.0, commanded=True)}, {},
+            r'The robot stood for 4\.0 s from 5\.0 s on \(the bag holds no diagnostics of that '
+            rf'time\); while it drove {RMSE}\.', 'bad', False,
+        ),
+        (
+            {'motions': standing(-1.0, 99.0)}, {},
+            r'The robot never moved, although it was to for 19\.\d s\.', 'bad', False,
+        ),
+        (
+            {'follows_path': True, 'motions': RUN.motions}, {},
+            r'The robot did not follow its path: within 50 mm of its path for only 0 % of the '
+            r'drive, path error \d+\.\d mm \(RMS\)\.', 'bad', False,
         ),
     ],
 )  # fmt: skip
-def test_each_problem_in_words_and_its_limit(run, given, problems):
-    verdict = judge(replace(RUN, **run), **(JUDGED | given))
-    assert verdict.problems == problems
-    assert verdict.slow == (
-        'the machine was too slow' in problems or given == {'latency_99': 0.021}
+def test_each_verdict_in_words_and_its_limit(run, given, sentence, kind, sound):
+    run = replace(QUIET, **run)
+    verdict = judge(run, find_incidents(run), **(JUDGED | given))
+    assert re.fullmatch(sentence, verdict.sentence), verdict.sentence
+    assert (verdict.kind, verdict.sound) == (kind, sound)
+    late = [each for each in verdict.reasons() if re.fullmatch(LATE, each)]
+    assert bool(late) == (given.get('latency_99') == 0.011)
+    assert verdict.text() == ' '.join([verdict.sentence, *verdict.reasons()])
+
+
+def test_what_happened_besides_follows_with_the_remedy():
+    """The reason of the robot stands before that of the controller, whichever came first."""
+    changes = (
+        (4.9, 'error', 'controller', 'stopped: odometry is not finite'),
+        (5.3, 'error', 'radio_bridge', 'emergency stop: a'),
     )
+    run = replace(QUIET, motions=standing(5.0, 9.0), changes=changes)
+    verdict = judge(run, find_incidents(run), **(JUDGED | {'missing': 0.5}))
+    assert verdict.label == 'E-stop at 5.0 s'
+    assert verdict.remedy.startswith('When the way is clear, release it')
+    assert verdict.reasons()[1:] == ['50.0 % of odom is missing.']
+
+
+@pytest.mark.parametrize(
+    ('changes', 'name'),
+    [
+        ((), ''),
+        (((7.4, 'error', 'robot', 'emergency stop: a'),), ''),  # too late to be the reason
+        (((1.0, 'error', 'robot', 'emergency stop: a'),), 'E-stop'),  # it still holds
+        (((1.0, 'error', 'robot', 'emergency stop: a'), (3.0, 'ok', 'robot', 'well')), ''),
+        (((5.0, 'warning', 'sim_robot', 'the battery is low: 10 V'),), ''),  # no reason to stop
+        (((5.0, 'warning', 'sim_robot', 'a; processor overloaded: b'),), ''),
+        (((5.0, 'error', 'recorder', 'the disk is full'),), ''),  # not the robot's
+        (((5.0, 'error', 'base/motors', 'overcurrent'),), 'base/motors: overcurrent'),
+    ],
+)
+def test_the_reason_of_a_stop_is_of_its_time_and_of_the_robot(changes, name):
+    assert cause_between(changes, 5.0, 5.4).name == name
+
+
+def test_a_poor_run_is_far_worse_than_what_its_robot_reaches():
+    known = KNOWN_RESULTS[0]
+    for ratio, label in ((0.99 * MAX_RATIO, 'Good run'), (1.01 * MAX_RATIO, 'Poor run')):
+        error = ratio * known.settled
+        run = replace(QUIET, motions=shifted(left=error), parameters=known.parameters)
+        found = judge(run, find_incidents(run), **JUDGED)
+        assert (found.label, found.sound) == (label, label == 'Good run')
+    assert f'{1.01 * MAX_RATIO:.0f} times the {known.settled:g} rad/s' in found.sentence
+    for other in ({'mass_factor': '2.0'}, {'noise.variance': '0.05'}, {'drive.kind': 'torque'}):
+        twin = {**known.parameters['sim_robot'], **other}
+        records = {**known.parameters, 'sim_robot': twin}
+        assert known_result(records) is None or known_result(records) is not known
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,12 @@ from collections.abc import Mapping
 
 LOSSES = 'losses'
 """Name of the metadata record of :func:`message_loss_record`."""
+UNDISCOVERED = 'undiscovered'
+"""Cause of the messages that a recorder misses while it starts."""
 LOSS_CAUSES = {
     'dropped': 'dropped because the disk was too slow',
     'lost': 'lost by the middleware',
-    'undiscovered': 'published before the recorder had discovered their publisher',
+    UNDISCOVERED: 'published before the recorder had discovered their publisher',
 }
 """Why messages are missing in a bag, by key of its loss record."""
 

@@ -30,7 +30,9 @@ COUNTERS = (*COUNTED, 'commands', 'commands_refused')
 """Keys of counters, which only grow."""
 LINK_KEYS = ('cycles', 'cycles_lost', 'lost_share', 'round_trip_median_ms', 'round_trip_p99_ms')
 """A status with at least two of these keys describes a link."""
-_LEVELS = {1: 'warning', 2: 'error', 3: 'stale'}
+_LEVELS = {0: 'ok', 1: 'warning', 2: 'error', 3: 'stale'}
+STANDSTILL = 'standstill'
+"""Key of the reason of a robot that stands: no other warning hides it."""
 
 DiagnosticEvent = tuple[float, str, str, str]
 """Time of the first message, level, node, text."""
@@ -44,7 +46,8 @@ class Diagnostics(NamedTuple):
     complaints: tuple[DiagnosticEvent, ...]
     """Each distinct warning or error with its first time, in order."""
     changes: tuple[DiagnosticEvent, ...]
-    """Each warning or error that follows another state of the same node, in order."""
+    """Each state of a node that follows another one of it, in order; not that it was well from the
+    start."""
     links: 'tuple[LinkHistory, ...]'
 
 
@@ -143,12 +146,13 @@ def read_diagnostics(recording: BagReader, namespace: str) -> Diagnostics:
         for received, message in recording.messages(topic):
             for status in message.status:
                 level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+                word, text = _LEVELS.get(level, str(level)), _text(status)
                 if level:
-                    word = _LEVELS.get(level, str(level))
-                    found.setdefault((word, status.name, status.message), received)
-                    if state.get(status.name) != (level, status.message):
-                        changes.append((received, word, status.name, status.message))
-                state[status.name] = level, status.message
+                    found.setdefault((word, status.name, text), received)
+                now = level, text if level else ''
+                if state.get(status.name, (0, '')) != now:
+                    changes.append((received, word, status.name, text))
+                state[status.name] = now
                 if numbers := _numbers(status):
                     rows.setdefault(status.name, []).append((received, numbers))
     links = []
@@ -170,6 +174,13 @@ def read_diagnostics(recording: BagReader, namespace: str) -> Diagnostics:
         tuple(sorted(changes)[:MAX_CHANGES]),
         tuple(links),
     )
+
+
+def _text(status: Any) -> str:
+    """Return what a node reports, beginning with why its robot stands."""
+    reason = next((each.value for each in status.values if each.key == STANDSTILL), '')
+    text: str = status.message
+    return text if reason in text else f'{reason}; {text}'
 
 
 def _numbers(status: Any) -> dict[str, float]:

@@ -2,130 +2,41 @@
 # SPDX-License-Identifier: Apache-2.0
 """Metrics of a recorded run: tracking errors, chatter, latencies."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.continuity import within_gaps
+from t3mpc_ros.evaluation.bag_report.continuity import gaps
+from t3mpc_ros.evaluation.bag_report.incidents import Incidents, find_incidents
 from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics, link_metrics
-from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, moves
+from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
+from t3mpc_ros.evaluation.bag_report.tracking_errors import (
+    ErrorStatistics,
+    errors_of,
+    format_number,
+    format_pair,
+    path_distance,
+)
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
-from t3mpc_ros.evaluation.record import away_from_switches
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
 
-SETTLING = 1.0
-"""Settling time (s): excluded after the start of the drive and after each switch; also the longest
-switch where it is to have settled; also the longest time left out before a switch."""
 WINDOW = 0.2
 """Width (s) over which the target of the estimate is smoothed."""
 
 
-@dataclass(frozen=True)
-class ErrorStatistics:
-    """Statistics of the tracking error of one channel, in its unit; NaN without a sample."""
-
-    rmse: float
-    mae: float
-    largest: float
-    count: int
-    seconds: float
-    """Time that the samples cover, s."""
-
-
-def statistics(error: Array, period: float = math.nan) -> ErrorStatistics:
-    """Return root mean square, mean and largest of the absolute error.
-
-    Each sample of ``error`` stands for ``period`` seconds.
-    """
-    size = np.abs(error[np.isfinite(error)])
-    if not size.size:
-        return ErrorStatistics(math.nan, math.nan, math.nan, 0, 0.0)
-    return ErrorStatistics(
-        rms(size),
-        float(size.mean()),
-        float(size.max()),
-        int(size.size),
-        size.size * period,
-    )
-
-
-def tracking_error(run: Run, measured: str) -> Series | None:
-    """Return measured minus reference of both channels at the stamps of the ``measured`` motion.
-
-    The reference is interpolated linearly; across a switch its earlier sample is held. Outside the
-    reference, and in its gaps, the error is undefined. None when either motion is missing.
-    """
-    motion, reference = run.motions.get(measured), run.motions.get(REFERENCE)
-    if motion is None or reference is None:
-        return None
-    inside = (motion.time >= reference.time[0]) & (motion.time <= reference.time[-1])
-    inside &= ~within_gaps(motion.time, reference.time)
-    time = motion.time[inside]
-    before = np.clip(np.searchsorted(reference.time, time, 'right') - 1, 0, None)
-    following = np.minimum(before + 1, len(reference) - 1)
-    held = np.isin(reference.time[following], run.switches)
-    errors = {}
-    for wheel, *_ in run.channels:
-        wanted = np.interp(time, reference.time, reference[wheel])
-        wanted = np.where(held, reference[wheel][before], wanted)
-        errors[wheel] = motion[wheel][inside] - wanted
-    return Series(time, errors)
-
-
-def driving(run: Run) -> tuple[float, float]:
-    """Return start and end of the drive, s: the first and the last command other than zero.
-
-    Before, the controller does not follow the reference yet; afterwards it has stopped while the
-    reference, stamped ahead, continues. A stop in between belongs to the drive. (inf, -inf)
-    when every command is zero; (-inf, inf) when the bag has no commands.
-    """
-    command = run.motions.get(COMMAND)
-    if command is None:
-        return -math.inf, math.inf
-    moving = command.time[moves(command)]
-    return (float(moving[0]), float(moving[-1])) if moving.size else (math.inf, -math.inf)
-
-
-def driven(time: Array, run: Run) -> NDArray[np.bool_]:
-    """Return the mask of ``time`` (stamps of an error, s) in which the robot was driven.
-
-    The first :data:`SETTLING` seconds with a command and a reference are excluded: the robot has
-    yet to catch up.
-    """
-    first, last = driving(run)
-    since: Array = time - np.maximum(first, time[:1])
-    return (since >= SETTLING) & (time <= last)
-
-
-def preview_before_switch(run: Run) -> float:
-    """Return how long before a switch a controller may leave the old reference, s.
-
-    A switch is known in advance by the lead of the reference stamps. The interval is at most
-    :data:`SETTLING`, whatever the lead.
-    """
-    return min(run.lead, SETTLING)
-
-
-def settled(time: Array, run: Run) -> NDArray[np.bool_]:
-    """Return the mask of ``time`` (s) that excludes the window around each switch.
-
-    The window is from :func:`preview_before_switch` before it to :data:`SETTLING` seconds after.
-    """
-    return away_from_switches(time, run.switches, preview_before_switch(run), SETTLING)
-
-
 def variation(series: Series, name: str) -> float:
-    """Return the total variation per second of one quantity (chatter)."""
+    """Return the total variation per second of one quantity (chatter), gaps left out."""
     if len(series) < 2:
         return math.nan
-    return float(np.abs(np.diff(series[name])).sum() / (series.time[-1] - series.time[0]))
+    steps = np.diff(series.time)
+    counted = ~np.isin(series.time[:-1], [low for low, _ in gaps(series.time)])
+    return float(np.abs(np.diff(series[name]))[counted].sum() / steps[counted].sum())
 
 
 def latencies(run: Run, *, first: bool = False) -> Series | None:
@@ -234,7 +145,13 @@ class ReportMetrics:
     absent: tuple[str, ...]
     """Topics that are missing in the bag."""
     verdict: Verdict
-    """Whether the numbers measure the controller."""
+    """What happened, and whether the numbers measure the controller."""
+    incidents: Incidents
+    """What interrupted the run."""
+    path_error: float = math.nan
+    """Root mean square of the distance from the path of a reference that is one, m."""
+    path_error_99: float = math.nan
+    """Its 99th percentile, m."""
 
     def delay(self, channel: str) -> float:
         """Return the time from command to motion of a channel, s; NaN if it is not clear."""
@@ -242,14 +159,24 @@ class ReportMetrics:
         return fit.dead_time + fit.lag if fit and fit.clear else math.nan
 
     def numbers(self) -> list[tuple[str, str]]:
-        """Return the main numbers that are known, each with its unit, and what it is."""
-        found = []
+        """Return the main numbers that are known, each with its unit, and what it is.
+
+        Those of the path come first where the robot follows one.
+        """
+        found = [
+            (f'{format_number(1e3 * value)} mm', title)
+            for title, value in (
+                ('path error, root mean square', self.path_error),
+                ('path error, 99 % below', self.path_error_99),
+            )
+            if math.isfinite(value)
+        ]
         names = ' / '.join(each.short for each in self.channels)
         for title, unit, value in CHANNEL_NUMBERS:
             pair = [value(self, each.name) for each in self.channels]
             if any(map(math.isfinite, pair)):
                 units = [unit.format(each.unit) for each in self.channels]
-                found.append((_both(pair, units), f'{title}, {names}'))
+                found.append((format_pair(pair, units), f'{title}, {names}'))
         rows = [(title, unit, value(self)) for title, unit, value in RUN_NUMBERS]
         rows += [
             (f'{title}, {name}', unit, value(link))
@@ -283,8 +210,8 @@ RUN_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics], float]], ...] = (
     ('messages', '', lambda run: run.messages),
     ('switches', '', lambda run: run.switches),
     (
-        'stopped between the first and the last command to move', 's',
-        lambda run: run.verdict.stopped if run.verdict.judged else math.nan,
+        'stood although it was to move', 's',
+        lambda run: run.incidents.stopped if run.measured else math.nan,
     ),
     ('odometry to command, median', 'ms', lambda run: 1e3 * run.latency),
     ('odometry to command, 99 % below', 'ms', lambda run: 1e3 * run.latency_99),
@@ -298,14 +225,6 @@ LINK_NUMBERS: tuple[tuple[str, str, Callable[[LinkMetrics], float]], ...] = (
     ('oldest measurement', 's', lambda link: link.oldest),
 )
 """Main numbers of a radio link."""
-
-
-def _both(values: Sequence[float], units: Sequence[str]) -> str:
-    """Return the numbers of both channels with their units, which may differ."""
-    one, other = map(format_number, values)
-    if units[0] == units[1]:
-        return f'{one} / {other} {units[0]}'
-    return f'{one} {units[0]} / {other} {units[1]}'
 
 
 def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
@@ -324,14 +243,15 @@ def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
     delays = np.array([math.nan]) if delay is None else delay['value']
     prompt = latencies(run, first=True)
     missing = {name: timing.missing for name, timing in run.timing.items()}
+    incidents = find_incidents(run)
     verdict = judge(
         run,
-        driving(run),
-        max(each.settled.rmse for each in wheels.values()),
-        max(each.overall.seconds for each in wheels.values()),
-        missing.get(ODOMETRY, math.nan),
-        math.nan if prompt is None else float(np.percentile(prompt['value'], 99.0)),
+        incidents,
+        counted=max(each.overall.seconds for each in wheels.values()),
+        missing=missing.get(ODOMETRY, math.nan),
+        latency_99=math.nan if prompt is None else float(np.percentile(prompt['value'], 99.0)),
     )
+    distance = path_distance(run)
     return ReportMetrics(
         report=report,
         duration=run.duration,
@@ -347,25 +267,12 @@ def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
         missing=missing,
         absent=run.absent,
         verdict=verdict,
+        incidents=incidents,
+        path_error=math.nan if distance is None else rms(distance['value']),
+        path_error_99=(
+            math.nan if distance is None else float(np.percentile(distance['value'], 99.0))
+        ),
     )
-
-
-def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, ErrorStatistics]]:
-    """Return the statistics while driven and those when settled, by wheel."""
-    error = tracking_error(run, measured)
-    if error is None:
-        nothing = statistics(np.empty(0))
-        return dict.fromkeys((each.name for each in run.channels), (nothing, nothing))
-    moving = driven(error.time, run)
-    calm = moving & settled(error.time, run)
-    period = float(np.median(np.diff(error.time))) if len(error) > 1 else math.nan
-    return {
-        wheel: (
-            statistics(error[wheel][moving], period),
-            statistics(error[wheel][calm], period),
-        )
-        for wheel, *_ in run.channels
-    }
 
 
 def responses(run: Run) -> Mapping[str, ResponseFit]:
@@ -375,12 +282,3 @@ def responses(run: Run) -> Mapping[str, ResponseFit]:
         return {}
     fits = {each.name: fit_response(command, motion, each.name) for each in run.channels}
     return {name: fit for name, fit in fits.items() if fit is not None}
-
-
-def format_number(value: float) -> str:
-    """Return three significant digits, a count in full, or a dash for an unknown value."""
-    if isinstance(value, int):
-        return str(value)
-    if not math.isfinite(value):
-        return '–'
-    return f'{value:.0f}' if abs(value) >= 99.95 else f'{value:#.3g}'

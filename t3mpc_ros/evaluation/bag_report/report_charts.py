@@ -17,16 +17,20 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     UNMEASURED,
     WINDOW,
     ReportMetrics,
-    driven,
     estimation_target,
-    format_number,
     latencies,
     path_of,
+)
+from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
+from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
+from t3mpc_ros.evaluation.bag_report.tracking_errors import (
+    driven,
+    format_number,
+    path_distance,
     tracking_error,
 )
-from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.charts import Chart, Curve, Line, LineStyle, Plane, thinned
-from t3mpc_ros.evaluation.drive_response import busiest, predicted
+from t3mpc_ros.evaluation.drive_response import ResponseFit, busiest, predicted
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import world_outline
@@ -93,6 +97,21 @@ def tracking(run: Run, metrics: ReportMetrics) -> Shown:
         yield Chart(title, unit, lines, seen)
 
 
+def distance(run: Run, metrics: ReportMetrics) -> Shown:
+    """Yield the distance from the path over time, of a robot that follows one."""
+    series = path_distance(run)
+    if not is_long(series):
+        return
+    row = int(np.argmax(series['value']))
+    seen = (
+        f'Root mean square {format_number(1e3 * metrics.path_error)} mm, 99 % below '
+        f'{format_number(1e3 * metrics.path_error_99)} mm; the largest distance is '
+        f'{format_number(1e3 * float(series["value"][row]))} mm at {series.time[row]:.1f} s.'
+    )
+    lines = [line('distance', 'c1', series, scale=1e3)]
+    yield Chart('Distance from the path', 'mm', lines, seen)
+
+
 def error(run: Run, metrics: ReportMetrics) -> Shown:
     """Yield the tracking error of both channels over time."""
     series = tracking_error(run, run.measured)
@@ -113,10 +132,25 @@ def error(run: Run, metrics: ReportMetrics) -> Shown:
         lines.append(line(title, wheel, series, name, dash=WHEEL_DASHES[wheel]))
         seen.append(f'{title.capitalize()}: {text}.')
     if run.channels[0].unit == run.channels[1].unit:
-        yield Chart('Error', run.channels[0].unit, lines, ' '.join(seen))
+        names = [each.name for each in run.channels]
+        extent = _extent_of(series, moving, names)
+        yield Chart('Error', run.channels[0].unit, lines, ' '.join(seen), extent)
         return
     for each, channel, text in zip(lines, run.channels, seen, strict=True):
-        yield Chart(f'Error, {channel.title}', channel.unit, [each], text)
+        extent = _extent_of(series, moving, [channel.name])
+        yield Chart(f'Error, {channel.title}', channel.unit, [each], text, extent)
+
+
+def _extent_of(
+    series: Series, rows: NDArray[np.bool_], names: Sequence[str]
+) -> tuple[float, float] | None:
+    """Return the least and the largest value of some rows, a little wider; None without one."""
+    values = np.concatenate([series[name][rows] for name in names])
+    values = values[np.isfinite(values)]
+    if not values.size or not np.ptp(values) > 0.0:
+        return None
+    edge = 0.05 * float(np.ptp(values))
+    return float(values.min()) - edge, float(values.max()) + edge
 
 
 def switching(run: Run, metrics: ReportMetrics) -> Shown:
@@ -171,6 +205,8 @@ def response(run: Run, metrics: ReportMetrics) -> Shown:
         ]
         fit = metrics.responses.get(name)
         seen = 'No clear response of the speed to the command was found.'
+        if fit is not None and fit.explains and not fit.determined:
+            seen = undetermined(fit)
         if fit is not None and fit.clear:
             start, end = busiest(command, motion, name, DETAIL)
             time = np.arange(max(start - 10.0, command.time[0]), end, 0.005)
@@ -182,6 +218,15 @@ def response(run: Run, metrics: ReportMetrics) -> Shown:
                 f'The fit is drawn from {start:.1f} to {end:.1f} s, where the command varies most.'
             )
         yield Chart(f'Response, {title}', unit, lines, seen)
+
+
+def undetermined(fit: ResponseFit) -> str:
+    """Return that the data do not determine the delay of a fit, as a sentence."""
+    return (
+        'The data do not determine the delay of the robot: each from '
+        f'{1e3 * fit.shortest:.0f} to {1e3 * fit.longest:.0f} ms explains the speed as well, so '
+        'none is shown. A longer run with faster changes of the command determines it.'
+    )
 
 
 def terms(run: Run, metrics: ReportMetrics) -> Shown:
@@ -251,12 +296,15 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
     measured = curves[-1]
     reference = run.motions.get(REFERENCE)
     if is_long(reference):
-        first = min(int(np.searchsorted(base.time, reference.time[0])), len(base) - 1)
-        x, y = path_of(reference, (base['x'][first], base['y'][first], base['yaw'][first]))
+        if followed_reference(run) is not None:
+            x, y = reference['x'], reference['y']
+        else:
+            first = min(int(np.searchsorted(base.time, reference.time[0])), len(base) - 1)
+            x, y = path_of(reference, (base['x'][first], base['y'][first], base['yaw'][first]))
         curves.insert(0, _curve(REFERENCE, reference, x, y))
     for times, colour in (
         (run.switches, 'reference'),
-        (np.array([stop.start for stop in metrics.verdict.stops]), 'stopped'),
+        (np.array([stop.start for stop in metrics.incidents.stops]), 'stopped'),
     ):
         rows = np.searchsorted(measured.time, times[:200])
         rows = rows[rows < measured.time.size]
@@ -269,7 +317,7 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
     )
     if run.switches.size:
         seen += ' Grey points: switches of the reference.'
-    if metrics.verdict.stops:
+    if metrics.incidents.stops:
         seen += ' Red points: stops.'
     yield Plane('Floor', 'm', curves, seen, world_outline(run.world), marks)
 
@@ -402,18 +450,26 @@ class Section:
     title: str
     caption: str
     draw: Callable[[Run, ReportMetrics], Shown]
+    path_caption: str = ''
+    """Caption for a robot that follows a path; empty: the same."""
+
+    def caption_of(self, run: Run) -> str:
+        """Return the caption for a run."""
+        return self.path_caption if run.follows_path and self.path_caption else self.caption
 
 
 SECTIONS = (
     Section(
         'Speeds and their references (Fig. 11)',
-        'Wheel speeds are computed from the body twists by (1). Dashed vertical lines: switches.',
+        'Wheel speeds are computed from the body twists by (1). Dashed vertical lines: switches '
+        '(grey), stops (red), stalls of the machine (violet), gaps (orange), jumps (turquoise).',
         tracking,
     ),
     Section(
         'Tracking error over time',
-        'Speed minus reference at the stamps of the measurement, over the whole recording; the '
-        'metrics count only the time in which the robot was driven.',
+        'Speed minus reference at the stamps of the measurement, over the whole recording. The '
+        'metrics count only the time in which the robot was driven, and so does the scale: before '
+        'and after it the line may leave the chart.',
         error,
     ),
     Section(
@@ -422,6 +478,16 @@ SECTIONS = (
         'positions, so the paths diverge. With ground truth, the frame of the odometry is laid on '
         'the first true pose: later, their distance is the drift.',
         path,
+        'The reference is drawn at its poses, which the robot follows: beyond the path it leaves '
+        'it at obstacles only. With ground truth, the frame of the odometry is laid on the first '
+        'true pose: later, their distance is the drift.',
+    ),
+    Section(
+        'Distance from the path',
+        'Distance of the robot from the place of its reference at the same time, from the first '
+        'to the last command to move. It grows where the robot makes a detour around an obstacle '
+        'or looks around: the reference goes on meanwhile, or waits.',
+        distance,
     ),
     Section(
         'Terms of the control law (Fig. 12)',

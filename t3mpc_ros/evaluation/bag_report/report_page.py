@@ -2,30 +2,36 @@
 # SPDX-License-Identifier: Apache-2.0
 """HTML report of a recorded run."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 import math
 from pathlib import Path
 
 from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.bag.recording.message_losses import LOSS_CAUSES, LOSSES
-from t3mpc_ros.evaluation.bag_report.continuity import gaps
+from t3mpc_ros.bag.recording.message_losses import LOSS_CAUSES, LOSSES, UNDISCOVERED
+from t3mpc_ros.evaluation.bag_report.incidents import BRAKING, driving
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     LINK_NUMBERS,
-    SETTLING,
     UNMEASURED,
     ReportMetrics,
     compute_metrics,
-    driving,
+)
+from t3mpc_ros.evaluation.bag_report.motion import motion_rows
+from t3mpc_ros.evaluation.bag_report.patrol_section import patrol_blocks
+from t3mpc_ros.evaluation.bag_report.report_charts import (
+    LABELS,
+    SECTIONS,
+    Section,
+    undetermined,
+)
+from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
+from t3mpc_ros.evaluation.bag_report.tracking_errors import (
+    SETTLING,
     errors_of,
     format_number,
     preview_before_switch,
 )
-from t3mpc_ros.evaluation.bag_report.motion import motion_rows
-from t3mpc_ros.evaluation.bag_report.patrol_section import patrol_blocks
-from t3mpc_ros.evaluation.bag_report.report_charts import LABELS, SECTIONS
-from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
 from t3mpc_ros.evaluation.drive_response import ResponseFit
@@ -54,7 +60,10 @@ from t3mpc_ros.evaluation.topic_roles import (
 )
 from t3mpc_ros.geometry.types import NANOSECONDS
 
-FIRST = ('tracking', 'error', 'path')
+HEADLINE = ('tracking', 'error')
+PATH_HEADLINE = ('path', 'distance')
+"""Sections of the first screen, of a robot that follows speeds and of one that follows a path."""
+FIRST = ('tracking', 'error', 'path', 'distance')
 """Sections before the events and tables."""
 MAX_EVENTS = 300
 """Events that a page lists."""
@@ -111,20 +120,26 @@ def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
         Paragraph(_origin(recording, run), 'quiet'),
         verdict_box(figures.verdict),
     ]
-    if oddities := [*run.oddities, *_losses(recording)]:
+    unusual, usual = _losses(recording, run)
+    if oddities := [*run.oddities, *unusual]:
         blocks.append(Items([[each] for each in oddities], title='Unusual in this bag'))
-    blocks.append(Tiles(figures.numbers()))
-    if remarks := _remarks(run):
-        blocks.append(Items([[each] for each in remarks], 'side'))
     blocks.append(Contents())
-    blocks += _sections(run, figures, first=True)
+    headline = PATH_HEADLINE if run.follows_path else HEADLINE
+    first = [section for section in SECTIONS if section.draw.__name__ in headline]
+    others = [section for section in SECTIONS if section.draw.__name__ not in headline]
+    blocks += _sections(run, figures, first)
+    blocks.append(Tiles(figures.numbers()))
+    if remarks := [*_remarks(run), *usual]:
+        blocks.append(Items([[each] for each in remarks], 'side'))
+    soon = [section for section in others if section.draw.__name__ in FIRST]
+    blocks += _sections(run, figures, soon)
     events = _events(run, figures)
     quiet = Paragraph('No switch, no stop, no warning.', 'quiet')
     blocks += [Heading('Events'), Timeline(events) if events else quiet]
     if run.ours or figures.measured:
         blocks += [Heading('Tracking error'), *_errors(run)]
     blocks += _response(run, figures)
-    blocks += _sections(run, figures, first=False)
+    blocks += _sections(run, figures, [each for each in others if each not in soon])
     blocks += patrol_blocks(run)
     blocks += [Heading('Timing by topic'), *_timing(run), *_complaints(run)]
     blocks += [Heading('Contents of the bag'), *_contents(recording)]
@@ -133,7 +148,7 @@ def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
 
 def verdict_box(verdict: Verdict, subject: str = '') -> VerdictBox:
     """Return the verdict as a page says it first."""
-    return VerdictBox(verdict.headline, verdict.reasons(), verdict.kind, subject)
+    return VerdictBox(verdict.sentence, verdict.reasons(), verdict.kind, subject)
 
 
 def _origin(recording: BagReader, run: Run) -> str:
@@ -153,10 +168,16 @@ def _origin(recording: BagReader, run: Run) -> str:
     return ' · '.join(words)
 
 
-def _losses(recording: BagReader) -> list[str]:
-    """Return a sentence for each cause of missing messages."""
-    found = []
+def _losses(recording: BagReader, run: Run) -> tuple[list[str], list[str]]:
+    """Return sentences on missing messages, by cause: unusual ones and others.
+
+    A recorder discovers publishers after it has started. What it misses meanwhile is nothing
+    unusual if it records every motion before the time that counts.
+    """
+    unusual, usual = [], []
     record = recording.metadata_records.get(LOSSES, {})
+    counted = driving(run)[0] + SETTLING
+    early = all(float(each.time[0]) <= counted for each in run.motions.values())
     for cause, text in LOSS_CAUSES.items():
         topics = {
             key.partition(' ')[2]: int(count)
@@ -168,8 +189,12 @@ def _losses(recording: BagReader) -> list[str]:
             also = (
                 f', of {len(topics)} topics, most of {most}' if len(topics) > 1 else f' of {most}'
             )
-            found.append(f'{sum(topics.values())} messages{also} are missing: {text}.')
-    return found
+            sentence = f'{sum(topics.values())} messages{also} are missing: {text}'
+            if cause == UNDISCOVERED and early:
+                usual.append(f'{sentence}, before the time that counts.')
+            else:
+                unusual.append(f'{sentence}.')
+    return unusual, usual
 
 
 def _remarks(run: Run) -> list[str]:
@@ -187,17 +212,11 @@ def _remarks(run: Run) -> list[str]:
 def _events(run: Run, figures: ReportMetrics) -> list[tuple[float, str, str]]:
     """Return switches, stops, gaps and changes of the state of nodes, in order."""
     found = [(time, 'switch', 'the reference switches') for time in run.switches.tolist()]
-    for stop in figures.verdict.stops:
-        why = f': {stop.reason}' if stop.reason else ''
-        found.append((stop.start, 'stop', f'for {stop.end - stop.start:.2f} s{why}'))
-    for name in (REFERENCE, ODOMETRY, TRUTH, COMMAND):
-        if name in run.motions:
-            found += [
-                (low, 'gap', f'no {name} for {high - low:.1f} s')
-                for low, high in gaps(run.motions[name].time)
-            ]
+    found += figures.incidents.events()
     found += [
-        (time, 'note', f'{node}: {text} ({level})') for time, level, node, text in run.changes
+        (time, 'note', f'{node}: {text} ({level})')
+        for time, level, node, text in run.changes
+        if level != 'ok'
     ]
     return sorted(found)[:MAX_EVENTS]
 
@@ -234,8 +253,9 @@ def extents(run: Run) -> str:
     else:
         extent = (
             f'Driven: from the first command other than zero, at {first:.1f} s, to the last, at '
-            f'{last:.1f} s. Excluded: standstill before and after, and the '
-            f'first {SETTLING:g} s with a command and a reference (transient).'
+            f'{last:.1f} s. Excluded: standstill before and after; each stop, from {BRAKING:g} s '
+            f'before to {SETTLING:g} s after it; and the transient, the first {SETTLING:g} s with '
+            'a command and a reference.'
         )
     before = preview_before_switch(run)
     ahead = (
@@ -258,24 +278,26 @@ def _response(run: Run, figures: ReportMetrics) -> Iterator[Block]:
         yield response_table(run, figures.responses)
         yield Paragraph(
             'Dead time, first-order lag and gain that explain most of the measured speed; their '
-            'sum is better determined than either. A dash: no clear response to the command.',
+            'sum is better determined than either. A dash: no clear response to the command, or '
+            'one that the data do not determine.',
             'quiet',
         )
+        vague = [fit for fit in figures.responses.values() if fit.explains and not fit.determined]
+        if vague:
+            yield Paragraph(undetermined(max(vague, key=lambda each: each.longest)))
     for title, table in tables:
         if table.rows:
             yield Heading(title)
             yield table
 
 
-def _sections(run: Run, figures: ReportMetrics, *, first: bool) -> Iterator[Block]:
-    """Yield the charts of the first sections, or of all others."""
-    for section in SECTIONS:
-        if (section.draw.__name__ in FIRST) != first:
-            continue
+def _sections(run: Run, figures: ReportMetrics, sections: Sequence[Section]) -> Iterator[Block]:
+    """Yield the charts of some sections."""
+    for section in sections:
         if charts := list(section.draw(run, figures)):
             yield Heading(section.title)
             yield Group(charts, 'div', 'charts')
-            yield Paragraph(section.caption, 'quiet')
+            yield Paragraph(section.caption_of(run), 'quiet')
 
 
 def _timing(run: Run) -> list[Block]:

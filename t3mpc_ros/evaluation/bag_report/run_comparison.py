@@ -11,20 +11,22 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.evaluation.bag_report.incidents import driving
 from t3mpc_ros.evaluation.bag_report.metrics import (
     CHANNEL_NUMBERS,
     RUN_NUMBERS,
     ReportMetrics,
     compute_metrics,
-    driven,
-    driving,
-    format_number,
-    settled,
-    tracking_error,
 )
 from t3mpc_ros.evaluation.bag_report.report_charts import TERM_COLOURS, TERM_DASHES, is_long, line
 from t3mpc_ros.evaluation.bag_report.report_page import verdict_box
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, load_run
+from t3mpc_ros.evaluation.bag_report.tracking_errors import (
+    driven,
+    format_number,
+    settled,
+    tracking_error,
+)
 from t3mpc_ros.evaluation.charts import Chart, Curve, Plane
 from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, rms
 from t3mpc_ros.evaluation.reporting import (
@@ -172,7 +174,7 @@ def why_not_comparable(first: ComparedRun, other: ComparedRun) -> str:
     """Return why two errors cannot be compared; empty if they can."""
     for each in (first, other):
         if not each.metrics.verdict.sound:
-            return f'{each.label}: {each.metrics.verdict.headline.lower()}'
+            return f'{each.label}: {each.metrics.verdict.label}'
     if first.run.channels != other.run.channels:
         return 'the wheels of one robot are unknown'
     share, text = reference_difference(first, other)
@@ -228,10 +230,10 @@ def _verdict(first: ComparedRun, other: ComparedRun) -> VerdictBox:
     """Return which of two runs has the smaller settled error."""
     subject = f'{other.label} against {first.label}'
     if why := why_not_comparable(first, other):
-        return VerdictBox('Not comparable', [f'{why[0].upper()}{why[1:]}.'], 'open', subject)
+        return VerdictBox('Not comparable', [f'{why[0].upper()}{why[1:]}.'], 'apart', subject)
     found = error_differences(first.run, other.run)
     verdicts = {each.verdict for each in found} - {INCONCLUSIVE}
-    headline, kind = 'Inconclusive', 'open'
+    headline, kind = 'Inconclusive', 'apart'
     if verdicts == {BETTER}:
         headline, kind = 'Smaller settled error', 'good'
     elif verdicts == {WORSE}:

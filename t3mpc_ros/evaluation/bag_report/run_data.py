@@ -3,7 +3,7 @@
 """Data of a recorded run: motions, commands and control terms on one time axis."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import math
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from t3mpc_ros.bag.columns import CDR_LAYOUTS, TopicColumns, read_columns
 from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
 from t3mpc_ros.bag.schema import DataError
 from t3mpc_ros.control.controller import WHEELS
-from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, several_robots
+from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, gaps, several_robots
 from t3mpc_ros.evaluation.bag_report.link_history import (
     DiagnosticEvent,
     LinkHistory,
@@ -117,7 +117,7 @@ class Timing:
     jitter: float
     """99th percentile of the deviation of an interval from the median, s."""
     missing: float
-    """Share of samples missing at the median rate of the stamps, see :func:`missing_share`."""
+    """Share of samples missing at the median rate of the stamps, outside of gaps."""
 
 
 @dataclass(frozen=True)
@@ -166,6 +166,11 @@ class Run:
     follows_path: bool = False
     """Whether the controller follows the poses of the reference, not its speeds."""
 
+    other_clock: bool = False
+    """Whether the stamps are of another clock than the receive times, as with simulated time."""
+    parameters: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    """Recorded parameters by node."""
+
     @property
     def notes(self) -> tuple[str, ...]:
         """All sentences on the bag."""
@@ -191,7 +196,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     for name, topic in topics.items():
         raw[name], mixed = _read(recording, name, topic, columns.get(topic), oddities)
         if mixed:
-            damage.append(f'{topic} mixes several robots')
+            damage.append(f'several robots publish {topic}: nothing measured from it is valid')
     raw = {name: table for name, table in raw.items() if table['stamp'].size}
     clock = _Clock(raw, oddities)
     scalars = _recomputed_scalars(recording, choice, notes)
@@ -235,6 +240,8 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         remarks=tuple(notes),
         damage=tuple(damage),
         world=records.get('sim_robot', {}).get('world', ''),
+        other_clock=clock.other,
+        parameters=records,
         follows_path=records.get('controller', {}).get('pose.enabled', '').lower() == 'true',
     )
 
@@ -248,7 +255,7 @@ def _oddities_of_bag(recording: BagReader, choice: TopicChoice) -> tuple[list[st
             f'Truncated or unfinished files, not read: {listed} (t3mpc bag recover writes their '
             'messages to a new bag).'
         )
-        damage.append('files of the bag are truncated')
+        damage.append('files of the bag are truncated or unfinished, and were not read')
     if recording.storage == 'ROS 1':
         found.append('This is a bag of ROS 1: it holds no quality of service.')
     if len(choice.namespaces) > 1:
@@ -326,11 +333,14 @@ class _Clock:
 
     def __init__(self, raw: Mapping[str, Mapping[str, Array]], notes: list[str]) -> None:
         self.origin = 0.0
+        self.other = False
+        """Whether the stamps are of another clock than the receive times."""
         self._received, self._offset = np.zeros(1), np.zeros(1)
         table = raw.get(ODOMETRY) or raw.get(TRUTH)
         if table:
             offset = table['stamp'] - table['received']
             if abs(float(np.median(offset))) > 1.0 or np.ptp(offset) > JUMP:
+                self.other = True
                 self._received, self._offset = table['received'], offset
                 self.origin = float(table['stamp'].min())
                 notes.append(
@@ -414,8 +424,8 @@ def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str]) -> None:
             f'The stamps of {topic} are constant; its messages were placed by receive time.'
         )
         return
-    steps, gaps = np.diff(stamps), np.diff(received)
-    if leaps := np.flatnonzero((steps < -JUMP) | (steps > gaps + JUMP)).tolist():
+    steps, waits = np.diff(stamps), np.diff(received)
+    if leaps := np.flatnonzero((steps < -JUMP) | (steps > waits + JUMP)).tolist():
         table['stamp'] = received
         notes.append(
             f'The stamps of {topic} leap {len(leaps)} times, first by {steps[leaps[0]]:.1f} s at '
@@ -443,13 +453,17 @@ def _motion(time: Array, table: Mapping[str, Array], geometry: WheelGeometry | N
 
 
 def _timing(table: Mapping[str, Array]) -> Timing:
-    gaps = np.diff(table['received'])
-    period = float(np.median(gaps))
+    waits = np.diff(table['received'])
+    period = float(np.median(waits))
     # The rate follows from the stamps: receive times jitter.
-    steps = np.diff(np.unique(table['stamp'][np.isfinite(table['stamp'])]))
+    stamps = np.unique(table['stamp'][np.isfinite(table['stamp'])])
+    steps = np.diff(stamps)
     grid = float(np.median(steps)) if steps.size else 0.0
-    missing = missing_sample_ratio(table['stamp'], 1.0 / grid) if grid > 0.0 else math.nan
-    jitter = round(float(np.percentile(np.abs(gaps - period), 99.0)), 9)  # receipts are in ns
+    # Gaps are told by themselves: else one of a month would make everything missing.
+    closed = np.where(np.isin(stamps[:-1], [low for low, _ in gaps(stamps)]), grid, steps)
+    stamps = np.concatenate([[0.0], np.cumsum(closed)])
+    missing = missing_sample_ratio(stamps, 1.0 / grid) if grid > 0.0 else math.nan
+    jitter = round(float(np.percentile(np.abs(waits - period), 99.0)), 9)  # receipts are in ns
     return Timing(int(table['received'].size), period, jitter, missing)
 
 

@@ -1,194 +1,199 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The verdict on a recorded run: whether its numbers measure the controller, and why not."""
+"""The verdict on a recorded run: what happened in it, and whether its numbers measure something.
 
-from dataclasses import dataclass
+One sentence, the same in the terminal, on the page and in the report. What happened comes first,
+in this order: a recording that cannot be trusted, nothing to judge, a stop, a blocked wheel, a
+gap, a condition of the robot, a machine too slow, a jump, an error that is too large.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 import math
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.evaluation.bag_report.run_data import Run, moves
+from t3mpc_ros.evaluation.bag_report.causes import END_PROGRAMS, OVERLOADED, Cause, cause_of
+from t3mpc_ros.evaluation.bag_report.incidents import Incidents, Stop, driving
+from t3mpc_ros.evaluation.bag_report.known_results import MAX_RATIO, known_result
+from t3mpc_ros.evaluation.bag_report.run_data import Run
+from t3mpc_ros.evaluation.bag_report.tracking_errors import (
+    format_number,
+    format_pair,
+    path_distance,
+    settled_rmse,
+)
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
+from t3mpc_ros.geometry.types import Array
 
 MAX_STOPPED = 0.01
-"""Largest share of the drive without a command to move."""
+"""Largest share of the drive in which the robot of a valid run stands although it is to move."""
 MAX_MISSING = 0.02
 """Largest share of missing odometry."""
 MAX_ERROR = 0.25
 """Largest RMSE, settled, as a share of the root mean square of the reference."""
 MIN_COUNTED = 0.5
 """Least share of the drive in which errors count."""
+NEVER = 0.95
+"""Share of the drive in which a robot stands that never moved."""
 ON_PATH = 0.05
 """Largest distance from its reference of a robot that is on its path, m."""
 MIN_ON_PATH = 0.02
 """Least share of the drive on the path for a robot that follows it at all. Detours around
 obstacles, looking around and the way back are no errors; the path itself goes on meanwhile."""
 MOSTLY = 0.5
-"""Share of the drive on the path below which the headline says so."""
-MAX_LATENCY = 0.02
-"""99th percentile of the time from odometry to command that shows a slow machine, s."""
-COMMAND_TIMEOUT = 0.5
-"""Time without a command after which the robot stands, s."""
-OVERLOAD = ('processor overloaded', 'real-time factor')
-"""Texts of diagnostics that say that the machine is too slow."""
-REASON_WINDOW = 1.5
-"""Diagnostics come once a second: those of a stop are at most this far from its start, s."""
-_MAX_REASONS = 3
-
-
-class Stop(NamedTuple):
-    """A time within the drive without a command to move."""
-
-    start: float
-    end: float
-    reason: str
-    """Diagnostics at that time; empty if there were none."""
-    commanded: bool
-    """Whether commands of zero stopped the robot, not a lack of commands."""
+"""Share of the drive on the path below which the verdict says so."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the numbers of a run measure the controller, and why not."""
+    """What happened in a run, and whether its numbers measure the controller."""
 
-    problems: tuple[str, ...]
-    """Empty for a sound run."""
-    stopped: float = 0.0
-    """Time in which the robot was commanded to stand during the drive, s."""
-    stops: tuple[Stop, ...] = ()
-    slow: bool = False
-    """Whether the machine was too slow, which explains the problems if there are any."""
-    missing: bool = False
-    """Whether too much of the odometry is missing."""
+    sentence: str
+    """What happened."""
+    label: str
+    """The same in a few words."""
+    kind: Literal['good', 'open', 'bad']
+    """Whether the run is good, cannot be judged or was disturbed, or is no valid measurement."""
+    remedy: str = ''
+    """What a reader does about it, in one sentence; empty if there is nothing to do."""
+    details: tuple[str, ...] = ()
+    """What else happened, in sentences."""
+    sound: bool = True
+    """Whether nothing speaks against the numbers."""
     judged: bool = True
     """Whether the bag holds a closed loop of this package, which can be judged."""
-    damage: tuple[str, ...] = ()
-    """Why the recording itself cannot be trusted; also among the problems."""
-    lacking: tuple[str, ...] = ()
-    """Topics without which there is nothing to judge."""
+    slow: bool = False
+    """Whether the machine was too slow, which explains what is wrong if anything is."""
+    damaged: bool = False
+    """Whether the recording itself cannot be trusted."""
     on_path: float | None = None
     """Share of the drive within :data:`ON_PATH` of the reference; None unless the controller
     follows a path."""
 
-    @property
-    def sound(self) -> bool:
-        """Whether nothing speaks against the numbers."""
-        return self.judged and not self.problems
-
-    @property
-    def kind(self) -> Literal['good', 'open', 'bad']:
-        """Whether the run is good, cannot be judged, or is bad."""
-        if self.problems:
-            return 'bad'
-        return 'good' if self.judged and not self._mostly_off_path else 'open'
-
-    @property
-    def headline(self) -> str:
-        """The verdict in a few words."""
-        if self.slow:
-            return 'Machine too slow' if self.problems else 'Good run, on a slow machine'
-        if self.damage:
-            return 'Damaged recording'
-        if self.missing and not any(stop.commanded for stop in self.stops):
-            return 'Data missing'
-        if self.problems and self.stops:
-            times = 'once' if len(self.stops) == 1 else f'{len(self.stops)} times'
-            return f'Stopped {times}'
-        if self.problems:
-            return 'No valid measurement'
-        if self._mostly_off_path:
-            return 'Mostly off its path'
-        return 'Good run' if self.judged else 'Data missing: tracking cannot be judged'
-
-    @property
-    def _mostly_off_path(self) -> bool:
-        return self.on_path is not None and self.on_path < MOSTLY
+    def reasons(self) -> list[str]:
+        """Return the sentences after the first one."""
+        return [*([self.remedy] if self.remedy else []), *self.details]
 
     def text(self) -> str:
-        """Return the verdict in one sentence."""
-        if self.problems:
-            return f'NO VALID MEASUREMENT: {"; ".join(self.problems)}'
-        if not self.judged:
-            return f'NO VERDICT ON TRACKING: the bag lacks {", ".join(self.lacking)}'
-        return f'sound run: {self._followed()}'
-
-    def _followed(self) -> str:
-        """Return what a sound run shows."""
-        stopped = f'stopped for {self.stopped:.1f} s'
-        if self.on_path is None:
-            return f'the robot followed the reference, {stopped}'
-        return (
-            f'the robot was on its path, within {1e3 * ON_PATH:g} mm of it, for '
-            f'{100.0 * self.on_path:.0f} % of the drive, {stopped}; the rest were detours around '
-            'obstacles and the ways back'
-        )
-
-    def reasons(self) -> list[str]:
-        """Return the sentences that explain the headline."""
-        found = [f'{each[0].upper()}{each[1:]}.' for each in self.problems]
-        if self.stops and self.problems:
-            by_length = sorted(self.stops, key=lambda each: each.start - each.end)
-            found += [_stop_text(each) for each in sorted(by_length[:_MAX_REASONS])]
-            if len(self.stops) > _MAX_REASONS:
-                found.append(f'{len(self.stops) - _MAX_REASONS} shorter stops: see the events.')
-        if self.sound:
-            if self.slow:
-                found.append('The machine was too slow at times, which did not spoil the numbers.')
-            text = self._followed()
-            found.append(f'{text[0].upper()}{text[1:]}.')
-        elif self.lacking:
-            found.append(f'The bag lacks {", ".join(self.lacking)}.')
-        return found
+        """Return all sentences in one line."""
+        return ' '.join([self.sentence, *self.reasons()])
 
 
-def _stop_text(stop: Stop) -> str:
-    why = stop.reason or 'the bag holds no diagnostics of that time'
-    return f'At {stop.start:.1f} s for {stop.end - stop.start:.2f} s: {why}.'
+class _Finding(NamedTuple):
+    """Something that happened."""
+
+    text: str
+    """A sentence without its full stop."""
+    label: str = ''
+    """In a few words; empty: as the text."""
+    remedy: str = ''
+    spoils: bool = False
+    """Whether the numbers are no valid measurement."""
+    tail: str | None = None
+    """What was measured nevertheless; None: the settled error of the run."""
 
 
 def judge(
-    run: Run,
-    drive: tuple[float, float],
-    rmse: float,
-    counted: float,
-    missing: float,
-    latency_99: float,
+    run: Run, incidents: Incidents, *, counted: float, missing: float, latency_99: float
 ) -> Verdict:
     """Return the verdict on a run.
 
-    ``drive`` are its first and last command other than zero, ``counted`` is the time in which
-    errors count, s; ``rmse`` the largest settled one of the channels, ``missing`` the share of
-    odometry, ``latency_99`` the 99th percentile from odometry to command, s; NaN if unknown.
+    ``counted`` is the time in which errors count, s; ``missing`` the share of odometry,
+    ``latency_99`` the 99th percentile from odometry to command, s; NaN if unknown.
     """
-    damage = run.damage
+    findings = [_Finding(text, remedy=_recovery(text), spoils=True) for text in run.damage]
+    damaged = bool(findings)
     if lacking := _lacking(run):
-        return Verdict(damage, judged=False, damage=damage, lacking=lacking)
-    if not drive[0] < drive[1]:
-        return Verdict((*damage, 'the robot was never driven'), damage=damage)
-    length = drive[1] - drive[0]
-    stops, stopped = find_stops(run, *drive)
-    on_path = share_on_path(run, drive) if run.follows_path else None
-    problems = []
-    if on_path is None and stopped > MAX_STOPPED * length:
-        problems.append(f'the robot was stopped for {stopped:.1f} of {length:.1f} s')
+        said = _Finding(_without(run, lacking), 'Data missing: tracking cannot be judged')
+        if run.measured:
+            findings += _interruptions(run, incidents)
+        return _verdict([*findings, said], said.text, judged=False, damaged=damaged)
+    first, last = driving(run)
+    if not first < last:
+        findings.append(_never_driven(run))
+        return _verdict(findings, 'every command was zero', damaged=damaged)
+    findings += _interruptions(run, incidents)
+    slow = [*_slow_machine(run, incidents)]
+    loss = []
     if missing > MAX_MISSING:
-        problems.append(f'{100.0 * missing:.1f} % of {ODOMETRY} is missing')
-    if on_path is None:
-        problems += _speed_problems(run, rmse, counted, length)
-    elif on_path < MIN_ON_PATH:
-        problems.append(
-            f'the robot was within {1e3 * ON_PATH:g} mm of its path for only '
-            f'{100.0 * on_path:.0f} % of the drive'
-        )
-    overloaded = any(text in what for *_, what in run.complaints for text in OVERLOAD)
-    slow = overloaded or latency_99 > MAX_LATENCY
-    if slow and problems:
-        # By itself it does not spoil the numbers.
-        problems.insert(0, 'the machine was too slow')
-    found, lost = (*problems, *damage), missing > MAX_MISSING
-    return Verdict(found, stopped, stops, slow, lost, damage=damage, on_path=on_path)
+        text = f'{100.0 * missing:.1f} % of {ODOMETRY} is missing'
+        loss.append(_Finding(text, 'Data missing', spoils=True))
+    findings += [*slow, *loss, *_jumps(incidents)]
+    late = _late(run, latency_99)
+    distance, on_path = path_distance(run), None
+    if run.follows_path:
+        on_path = share_on_path(run)
+        error, reached = _path_finding(on_path, None if distance is None else distance['value'])
+    else:
+        error, reached = _error_finding(run, counted, last - first)
+    if error is not None:
+        findings.append(error)
+    return _verdict(
+        findings, reached, slow=bool(slow or late), damaged=damaged, on_path=on_path, detail=late
+    )
+
+
+def _verdict(
+    findings: Sequence[_Finding],
+    reached: str,
+    *,
+    judged: bool = True,
+    slow: bool = False,
+    damaged: bool = False,
+    on_path: float | None = None,
+    detail: str = '',
+) -> Verdict:
+    """Return the verdict of what happened, most important first, with what was ``reached``."""
+    spoilt = any(each.spoils for each in findings)
+    stood = '' if on_path is not None else ', and the robot never stood'
+    good = Verdict(
+        f'Good run: {reached}{stood}.',
+        'Good run',
+        'good',
+        details=(detail,) if detail else (),
+        sound=judged and not spoilt,
+        judged=judged,
+        slow=slow,
+        damaged=damaged,
+        on_path=on_path,
+    )
+    if not findings:
+        return good
+    first, *others = findings
+    tail = reached if first.tail is None else first.tail
+    text = first.text if tail in first.text else f'{first.text}; {tail}'
+    more = (f'{_capital(each.text)}.' for each in others if each.text not in text)
+    return replace(
+        good,
+        sentence=f'{_capital(text)}.',
+        label=_capital(first.label or first.text),
+        kind='bad' if spoilt else 'open',
+        remedy=first.remedy,
+        details=(*more, *good.details),
+    )
+
+
+def _capital(text: str) -> str:
+    return f'{text[0].upper()}{text[1:]}'
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration in a suitable unit."""
+    for unit, size in (('days', 86_400.0), ('h', 3600.0), ('min', 60.0)):
+        if seconds >= 5.0 * size:
+            return f'{seconds / size:.1f} {unit}'
+    return f'{seconds:.1f} s' if seconds >= 1.0 else f'{seconds:.2f} s'
+
+
+# -- the recording --------------------------------------------------------------------------------
+
+
+def _recovery(damage: str) -> str:
+    known = 'truncated' in damage
+    return '`t3mpc bag recover` writes their messages to a new bag.' if known else ''
 
 
 def _lacking(run: Run) -> tuple[str, ...]:
@@ -197,57 +202,221 @@ def _lacking(run: Run) -> tuple[str, ...]:
     if not run.measured:
         lacking.append(ODOMETRY)
     if not (lacking or run.ours):
-        lacking.append('the topics of the controller of this package')
+        lacking.append('topic of the controller of this package')
     return tuple(lacking)
 
 
-def share_on_path(run: Run, drive: tuple[float, float]) -> float:
-    """Return the share of the drive in which the robot is within :data:`ON_PATH` of its path."""
-    motion, reference = run.motions[run.measured].between(*drive), run.motions[REFERENCE]
-    if not len(motion) or 'x' not in reference.values or 'x' not in motion.values:
-        return 0.0
-    away = [
-        motion[axis] - np.interp(motion.time, reference.time, reference[axis]) for axis in 'xy'
-    ]
-    return float(np.mean(np.hypot(*away) <= ON_PATH))
+def _without(run: Run, lacking: Sequence[str]) -> str:
+    """Return what the robot did, and why its tracking cannot be judged."""
+    text = f'the bag holds no {" and no ".join(lacking)}, so tracking cannot be judged'
+    motion = run.motions.get(run.measured)
+    if motion is None or len(motion) < 2:
+        return text
+    steps = np.diff(motion.time)
+    steps = np.where(steps < 1.0, steps, 0.0)  # not over gaps
+    way = float(np.sum(np.abs(motion['linear'][1:]) * steps))
+    span = float(motion.time[-1] - motion.time[0])
+    return f'the robot drove {format_number(way)} m in {duration_text(span)}; {text}'
 
 
-def _speed_problems(run: Run, rmse: float, counted: float, length: float) -> list[str]:
-    """Return what speaks against the errors of the speeds; arguments as of :func:`judge`."""
+def _never_driven(run: Run) -> _Finding:
+    command = run.motions[COMMAND]
+    causes = [cause for each in run.changes if (cause := cause_of(each))]
+    cause = min(causes, key=lambda each: each.source, default=Cause(''))
+    why = f' ({cause.name})' if cause.known else ''
+    text = f'the robot was never driven{why}: every command was zero'
+    if command.time.size and (command['linear'].any() or command['angular'].any()):
+        text = f'the robot was never driven{why}: a single command was other than zero'
+    return _Finding(text, 'Never driven', cause.remedy, spoils=True, tail='')
+
+
+# -- what interrupted the run ---------------------------------------------------------------------
+
+
+def _interruptions(run: Run, incidents: Incidents) -> Iterator[_Finding]:
+    """Yield stops, blocked wheels, gaps, and conditions of the robot."""
+    if incidents.stops:
+        yield _stop_finding(run, incidents)
+    for start, end, title in incidents.blocked:
+        yield _Finding(
+            f'the {title} stood from {start:.1f} s on for {duration_text(end - start)} although '
+            'it was commanded to turn',
+            f'{title} blocked at {start:.1f} s',
+            'Free the wheel; else see its motor and its driver.',
+            spoils=True,
+        )
+    if incidents.gaps:
+        start, end, name = max(incidents.gaps, key=lambda each: each[1] - each[0])
+        text = f'no {name} for {duration_text(end - start)} from {start:.1f} s on'
+        if (count := len({(low, high) for low, high, _ in incidents.gaps})) > 1:
+            text += f', the longest of {count} gaps'
+        yield _Finding(text, f'Data missing from {start:.1f} s on', spoils=True)
+    seen = set()
+    for event in run.complaints:
+        cause = cause_of(event, stops=False)
+        if cause is None or cause.name in seen or cause.name == OVERLOADED:
+            continue
+        seen.add(cause.name)
+        node, text = event[2], event[3]
+        yield _Finding(
+            f'{cause.name} from {event[0]:.1f} s on ({node}: {text})',
+            f'{cause.name} from {event[0]:.1f} s on',
+            cause.remedy,
+        )
+
+
+def _stop_finding(run: Run, incidents: Incidents) -> _Finding:
+    """Return the longest stop, of all of them, and what was measured until the first one."""
+    stops, stopped = incidents.stops, incidents.stopped
+    main = max(stops, key=lambda each: each.length)
+    first, last = driving(run)
+    last = max(last, stops[-1].end)
+    label = f'{main.cause.name or "Stopped"} at {main.start:.1f} s'
+    if len(stops) == 1 and first < last and main.length >= NEVER * (last - first):
+        why = f'{main.cause.name}: ' if main.cause.known else ''
+        text = f'{why}the robot never moved, although it was to for {duration_text(main.length)}'
+        return _Finding(text, 'Never moved', main.cause.remedy, spoils=True, tail='')
+    stood = f'the robot stood for {duration_text(main.length)}'
+    text = f'{main.cause.name} at {main.start:.1f} s, {stood}'
+    if not main.cause.known:
+        text = f'{stood} from {main.start:.1f} s on'
+    if len(stops) > 1:
+        text += f', the longest of {len(stops)} stops of {duration_text(stopped)} in all'
+    if not main.cause.known:
+        text += f' ({main.cause.text})'
+    spoils = not first < last or stopped > MAX_STOPPED * (last - first)
+    tail = None
+    if REFERENCE in run.motions and not run.follows_path:
+        ended = stops[0].end >= last - 1.0
+        tail = _rmse_text(run, settled_rmse(run, until=stops[0].start if ended else math.inf))
+        tail = f'until then {tail}' if ended else f'while it drove {tail}'
+    return _Finding(text, label, main.cause.remedy, spoils, tail)
+
+
+def stop_texts(stops: Sequence[Stop]) -> list[str]:
+    """Return a sentence for each stop."""
+    return [f'At {stop.start:.1f} s for {stop.length:.2f} s: {stop.cause.text}.' for stop in stops]
+
+
+def _slow_machine(run: Run, incidents: Incidents) -> Iterator[_Finding]:
+    """Yield stalls of the machine and its overload."""
+    if stalls := incidents.stalls:
+        start, end = max(stalls, key=lambda each: each[1] - each[0])
+        times = 'once, for' if len(stalls) == 1 else f'{len(stalls)} times, the longest'
+        after = 'it' if len(stalls) == 1 else 'them'
+        tail = None
+        if REFERENCE in run.motions and not run.follows_path:
+            whole, calm = settled_rmse(run), settled_rmse(run, spared=stalls)
+            tail = _rmse_text(run, whole)
+            if all(map(math.isfinite, calm)) and calm != whole:
+                units = [each.unit for each in run.channels]
+                tail += f', without the 1 s after {after} {format_pair(calm, units)}'
+        yield _Finding(
+            f'the machine stalled {times} {1e3 * (end - start):.0f} ms at {start:.1f} s: errors '
+            f"after {after} are not the controller's",
+            f'Machine stalled {len(stalls)} times' if len(stalls) > 1 else 'Machine stalled',
+            END_PROGRAMS,
+            tail=tail,
+        )
+    for when, _, node, text in run.complaints:
+        cause = cause_of((when, 'warning', node, text), stops=False)
+        if cause is not None and cause.name == OVERLOADED:
+            yield _Finding(
+                f'{OVERLOADED} from {when:.1f} s on ({node}: {text}): errors since then may not '
+                "be the controller's",
+                'Machine too slow',
+                END_PROGRAMS,
+            )
+            return
+
+
+def _late(run: Run, latency_99: float) -> str:
+    """Return a sentence if commands come later than the next odometry; else ''."""
+    timing = run.timing.get(ODOMETRY)
+    if timing is None or not latency_99 > timing.period > 0.0:
+        return ''
+    return (
+        f'The machine was slow: 99 % of the commands came within {1e3 * latency_99:.1f} ms of '
+        f'their odometry, whose period is {1e3 * timing.period:.1f} ms.'
+    )
+
+
+def _jumps(incidents: Incidents) -> Iterator[_Finding]:
+    if jumps := incidents.jumps:
+        largest = max(jumps, key=lambda each: each.distance)
+        text = (
+            f'the position of {largest.name} jumps by {largest.distance:.4g} m at '
+            f'{largest.time:.1f} s'
+        )
+        text += f', the largest of {len(jumps)} jumps' if len(jumps) > 1 else ''
+        yield _Finding(text, f'Jump of the position at {largest.time:.1f} s')
+
+
+# -- what was reached -----------------------------------------------------------------------------
+
+
+def _rmse_text(run: Run, pair: tuple[float, float]) -> str:
+    """Return a settled error in words, with what it is to be compared with if it is too large."""
+    if not any(map(math.isfinite, pair)):
+        return 'no settled motion was measured'
+    worst = max(pair)
+    text = f'settled RMSE {format_pair(pair, [each.unit for each in run.channels])}'
+    if worst > MAX_ERROR * _reference_size(run):
+        text += f' on a reference of {_reference_size(run):.2g} {run.channels[0].unit}'
+    known = known_result(run.parameters)
+    if known is not None and worst > MAX_RATIO * known.settled:
+        times = worst / known.settled
+        text += (
+            f', {times:.0f} times the {known.settled:g} rad/s that the {known.robot} is known to '
+            'reach under these conditions'
+        )
+    return text
+
+
+def _reference_size(run: Run) -> float:
     reference = run.motions[REFERENCE]
-    problems = []
+    return max(rms(reference[each.name]) for each in run.channels)
+
+
+def _error_finding(run: Run, counted: float, length: float) -> tuple[_Finding | None, str]:
+    """Return what speaks against the errors of the speeds, if anything, and what they are."""
+    pair = settled_rmse(run)
+    reached = _rmse_text(run, pair)
+    worst = max(pair)
+    known = known_result(run.parameters)
+    if not math.isfinite(worst):
+        return _Finding(reached, 'No valid measurement', spoils=True), reached
+    if worst > MAX_ERROR * _reference_size(run):
+        text = f'the robot did not follow its reference: {reached}'
+        return _Finding(text, 'Did not follow its reference', spoils=True), reached
+    if known is not None and worst > MAX_RATIO * known.settled:
+        text = f'poor run: {reached}'
+        return _Finding(text, 'Poor run', spoils=True), reached
     if counted < MIN_COUNTED * length:
-        problems.append(f'only {counted:.1f} of {length:.1f} s count')
-    size = max(rms(reference[each.name]) for each in run.channels)
-    if not np.isfinite(rmse):
-        problems.append('no settled motion was measured')
-    elif rmse > MAX_ERROR * size:
-        unit = run.channels[0].unit
-        problems.append(f'settled RMSE {rmse:.2g} {unit} on a reference of {size:.2g} {unit}')
-    return problems
+        text = f'only {counted:.1f} of {length:.1f} s count: {reached}'
+        return _Finding(text, 'No valid measurement', spoils=True), reached
+    return None, reached
 
 
-def find_stops(run: Run, first: float, last: float) -> tuple[tuple[Stop, ...], float]:
-    """Return the stops from ``first`` to ``last``, in order, and their time together, s."""
-    command = run.motions[COMMAND].between(first, last)
-    time, moving = command.time, moves(command)
-    steps = np.diff(time)
-    waits = np.where(moving[:-1], np.maximum(steps - COMMAND_TIMEOUT, 0.0), steps)
-    spans: list[tuple[float, float, bool]] = []
-    for k in np.flatnonzero(waits > 0.0).tolist():
-        start = float(time[k]) + (COMMAND_TIMEOUT if moving[k] else 0.0)
-        end, commanded = float(time[k + 1]), not moving[k]
-        if spans and start <= spans[-1][1] + 1e-9:
-            start, _, before = spans.pop()
-            commanded = commanded or before
-        spans.append((start, end, commanded))
-    stops = (Stop(start, end, _reason(run, start, end), each) for start, end, each in spans)
-    return tuple(stops), float(waits.sum())
+def share_on_path(run: Run) -> float:
+    """Return the share of the drive in which the robot is within :data:`ON_PATH` of its path."""
+    distance = path_distance(run)
+    return 0.0 if distance is None else float(np.mean(distance['value'] <= ON_PATH))
 
 
-def _reason(run: Run, start: float, end: float) -> str:
-    """Return the errors, else the warnings, of the nodes about the start of a stop."""
-    until = max(math.nextafter(start, end), min(end, start + 10.0)) + REASON_WINDOW
-    near = [each for each in run.changes if start - 0.5 <= each[0] <= until]
-    worst = [each for each in near if each[1] == 'error'] or near
-    return '; '.join(dict.fromkeys(f'{name}: {text}' for _, _, name, text in worst[:2]))
+def _path_finding(share: float, distance: Array | None) -> tuple[_Finding | None, str]:
+    """Return what speaks against the path of a patrol, if anything, and how well it was driven."""
+    within = f'within {1e3 * ON_PATH:g} mm of its path for'
+    if distance is None:
+        text = 'the robot did not follow its path: the bag holds no positions of both'
+        return _Finding(text, 'Did not follow its path', spoils=True), 'the path is not known'
+    error = f'path error {1e3 * rms(distance):.1f} mm (RMS)'
+    percent = f'{100.0 * share:.0f} % of the drive'
+    if share < MIN_ON_PATH:
+        text = f'the robot did not follow its path: {within} only {percent}, {error}'
+        return _Finding(text, 'Did not follow its path', spoils=True), error
+    rest = '' if share > 0.995 else '; the rest were detours around obstacles and the ways back'
+    reached = f'{within} {percent}, {error}{rest}'
+    if share < MOSTLY:
+        return _Finding(f'mostly off its path: {reached}', 'Mostly off its path'), reached
+    return None, reached

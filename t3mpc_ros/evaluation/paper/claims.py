@@ -17,7 +17,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from t3mpc_ros.evaluation.bag_report.metrics import format_number
+from t3mpc_ros.evaluation.bag_report.tracking_errors import format_number
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import Difference, mean, paired
 from t3mpc_ros.evaluation.experiment import ResultTable

@@ -1,0 +1,156 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Why a robot stands: what its nodes report, in words for a reader, with a remedy.
+
+The reason of the robot comes first, then that of the controller, then that of the machine: the
+later ones often follow from the earlier ones.
+"""
+
+from collections.abc import Sequence
+import math
+from typing import NamedTuple
+
+from t3mpc_ros.evaluation.bag_report.link_history import DiagnosticEvent
+
+ROBOT, CONTROLLER, MACHINE = 0, 1, 2
+"""Sources of causes in the order in which they are told."""
+_SOURCES = {
+    'sim_robot': ROBOT,
+    'radio_bridge': ROBOT,
+    'controller': CONTROLLER,
+    'reference_generator': MACHINE,
+    'recorder': MACHINE,
+    'player': MACHINE,
+}
+"""By node; every other node is one of the robot's."""
+REASON_WINDOW = 1.5
+"""Diagnostics come once a second: those of a stop are at most this far from its start, s."""
+REASON_LEAD = 0.5
+"""Diagnostics of a cause are at most this far before the stop, s, or still hold then."""
+
+
+class Cause(NamedTuple):
+    """Why a robot stands or is disturbed."""
+
+    name: str
+    """What happened, in a few words; empty if nothing is known."""
+    remedy: str = ''
+    """What a reader does about it, as a sentence; empty if there is nothing to do."""
+    text: str = ''
+    """What the nodes said."""
+    source: int = MACHINE
+
+    @property
+    def known(self) -> bool:
+        """Whether a node gave a reason."""
+        return bool(self.name)
+
+
+class Pattern(NamedTuple):
+    """A text of diagnostics and the cause that it stands for."""
+
+    text: str
+    """What the diagnostics contain."""
+    name: str
+    remedy: str
+    stops: bool = True
+    """Whether it stops the robot; else it is a condition under which it drives on."""
+
+
+_CHARGE = 'Charge the battery.'
+OVERLOADED = 'The machine was overloaded'
+END_PROGRAMS = 'End other programs, or use a faster machine, and repeat the run.'
+PATTERNS = (
+    Pattern(
+        'emergency stop was released', 'Waiting after an e-stop', 'Command it again.',
+    ),
+    Pattern(
+        'emergency stop', 'E-stop',
+        'When the way is clear, release it with the service e_stop; the robot then waits for a '
+        'new command.',
+    ),
+    Pattern(
+        'gyro and steps disagree', 'Slip stop: a wheel slips, is blocked, or has lost steps',
+        'Free the wheels, then command no motion for 0.5 s.',
+    ),
+    Pattern('brown-out', 'Brown-out: the board restarted', _CHARGE),
+    Pattern('below its cut-off', 'Battery below its cut-off', _CHARGE),
+    Pattern(
+        'robot does not answer', 'The robot did not answer',
+        'See that it is on, in range and on the same channel.',
+    ),
+    Pattern(
+        'no command reached the robot', 'No command reached the robot',
+        'Move the dongle nearer to it, or change the channel.',
+    ),
+    Pattern(
+        'dongle', 'The dongle did not answer', 'See its cable and its port.',
+    ),
+    Pattern('the last command has expired', 'No command', 'See why the controller fell silent.'),
+    Pattern('no command', 'No command', 'See why the controller fell silent.'),
+    Pattern('disabled by request', 'Controller disabled', 'Enable it with ~/enable.'),
+    Pattern(
+        'reference is stale', 'Reference too old',
+        'See why the reference generator fell silent.',
+    ),
+    Pattern('no reference yet', 'No reference', 'Start a reference generator.'),
+    Pattern('no odometry', 'No odometry', 'See why the robot fell silent.'),
+    Pattern('odometry is not finite', 'Odometry is not finite', 'See the sensors of the robot.'),
+    Pattern('state is diverging', 'The state diverged', 'See the wheels and the parameters.'),
+    Pattern('odometry has restarted', 'Odometry restarted', 'See why the robot restarted.'),
+    Pattern(
+        'does not follow commands', 'The robot did not follow its commands',
+        'See its drives and its supply.',
+    ),
+    Pattern('battery is low', 'Battery low', _CHARGE, stops=False),
+    Pattern(
+        'inertial sensor does not answer', 'Inertial sensor silent', 'See its wiring.',
+        stops=False,
+    ),
+    Pattern(
+        'a wheel slips', 'A wheel slipped', 'See the floor, the tyres and the load.',
+        stops=False,
+    ),
+    Pattern('processor overloaded', OVERLOADED, END_PROGRAMS, stops=False),
+    Pattern('real-time factor', OVERLOADED, END_PROGRAMS, stops=False),
+)  # fmt: skip
+"""Of two that a text contains the earlier one is meant."""
+
+
+def source_of(node: str) -> int:
+    """Return whose diagnostics a status name is of."""
+    return _SOURCES.get(node.split(':')[0].rpartition('/')[2].strip(), ROBOT)
+
+
+def cause_of(event: DiagnosticEvent, *, stops: bool = True) -> Cause | None:
+    """Return the cause that a warning or error stands for.
+
+    With ``stops`` that of a standstill: an unknown warning is none, an unknown error is one.
+    """
+    _, level, node, text = event
+    found = next((each for each in PATTERNS if each.text in text and level != 'ok'), None)
+    source = MACHINE if found and found.name == OVERLOADED else source_of(node)
+    if found is not None and found.stops == stops:
+        return Cause(found.name, found.remedy, f'{node}: {text}', source)
+    if found is None and stops and level == 'error' and source != MACHINE:
+        return Cause(f'{node}: {text}', '', f'{node}: {text}', source)
+    return None
+
+
+def cause_between(changes: Sequence[DiagnosticEvent], start: float, end: float) -> Cause:
+    """Return the cause of a standstill from ``start`` to ``end``, s.
+
+    From what the nodes reported about its start, and from what still held then.
+    """
+    until = max(math.nextafter(start, end), min(end, start + 10.0)) + REASON_WINDOW
+    near = [each for each in changes if start - REASON_LEAD <= each[0] <= until]
+    held: dict[str, DiagnosticEvent] = {}
+    for each in changes:
+        if each[0] < start - REASON_LEAD:
+            held[each[2]] = each
+    found = [cause for each in [*near, *held.values()] if (cause := cause_of(each))]
+    if not found:
+        texts = [f'{node}: {text}' for _, level, node, text in near if level != 'ok']
+        words = '; '.join(dict.fromkeys(texts[:2]))
+        return Cause('', text=words or 'the bag holds no diagnostics of that time')
+    return min(found, key=lambda each: each.source)  # of equal ones the first

@@ -1,0 +1,370 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What interrupted a recorded run: stops of the robot, stalls of the machine, gaps, jumps."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.bag_report.causes import Cause, cause_between
+from t3mpc_ros.evaluation.bag_report.continuity import (
+    MIN_GAP,
+    POSE_JUMP,
+    gaps,
+    pose_jumps,
+    several_robots,
+)
+from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, moves
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
+from t3mpc_ros.geometry.types import Array
+
+Span = tuple[float, float]
+
+WINDOW = 0.2
+"""Least smoothing width of speeds, s."""
+STILL = {'linear': 0.01, 'angular': 0.05}
+"""Smoothed speeds (m/s, rad/s) below which the robot is at standstill."""
+DEMANDED = 2.0
+"""Speed of a reference or command that asks for motion, in multiples of :data:`STILL`."""
+UNDER_WAY = 5.0
+"""Speed of a robot that has not come to a standstill yet, in multiples of :data:`STILL`."""
+PAUSE = 0.5
+"""Least duration of a standstill, s."""
+COMMAND_TIMEOUT = 0.5
+"""Time without a command after which the robot stands, s."""
+BRAKING = 0.5
+"""Longest time from the begin of a stop to standstill, s; as ``max_stopping_time``."""
+STALL_PERIODS = 5.0
+"""Length of a pause of the loop that is a stall of the machine, in periods of the odometry. The
+watchdog stops the robot after 20 of them; a busy but sufficient machine is 1 to 3 periods late."""
+WHEEL_STILL, WHEEL_DEMANDED = 0.2, 0.8
+"""Smoothed speed of a wheel that stands, and least command to one that is to turn, rad/s."""
+BLOCKED_TIME = 1.0
+"""Least duration of a standstill of one wheel, s: longer than a slow drive crosses zero."""
+MIN_STALL = 0.02
+"""Least length of a stall, s: receipts of fast robots jitter by as much."""
+
+
+class Stop(NamedTuple):
+    """A time in which the robot stood, although it was to move."""
+
+    start: float
+    end: float
+    cause: Cause
+    """What the nodes reported about it."""
+
+    @property
+    def length(self) -> float:
+        """Duration, s."""
+        return self.end - self.start
+
+
+class Jump(NamedTuple):
+    """A displacement of a robot that its speed does not explain."""
+
+    time: float
+    name: str
+    """Relative name of the topic."""
+    distance: float
+    """m"""
+
+
+@dataclass(frozen=True)
+class Incidents:
+    """What interrupted a run, each in order of time, s."""
+
+    stops: tuple[Stop, ...] = ()
+    stalls: tuple[Span, ...] = ()
+    """Pauses of the loop."""
+    gaps: tuple[tuple[float, float, str], ...] = ()
+    """Start, end, and relative name of the topic."""
+    blocked: tuple[tuple[float, float, str], ...] = ()
+    """Start and end of each time in which one wheel stood although it was commanded to turn, while
+    the other one turned, and which."""
+    jumps: tuple[Jump, ...] = ()
+
+    @property
+    def stopped(self) -> float:
+        """Time in which the robot stood although it was to move, s."""
+        return sum(stop.length for stop in self.stops)
+
+    def events(self) -> list[tuple[float, str, str]]:
+        """Return time (s), kind and text of all of them."""
+        found = [
+            (stop.start, 'stop', f'for {stop.length:.2f} s: {stop.cause.text}')
+            for stop in self.stops
+        ]
+        found += [
+            (start, 'stall', f'of the machine: the loop pauses for {1e3 * (end - start):.0f} ms')
+            for start, end in self.stalls
+        ]
+        found += [
+            (start, 'gap', f'no {name} for {end - start:.1f} s') for start, end, name in self.gaps
+        ]
+        found += [
+            (start, 'stop', f'of the {title}, for {end - start:.2f} s, although commanded to turn')
+            for start, end, title in self.blocked
+        ]
+        found += [
+            (jump.time, 'jump', f'of the position of {jump.name}, by {jump.distance:.4g} m')
+            for jump in self.jumps
+        ]
+        return sorted(found)
+
+
+def find_incidents(run: Run) -> Incidents:
+    """Return what interrupted a run."""
+    first, last = driving(run)
+    return Incidents(
+        find_stops(run),
+        tuple(span for span in find_stalls(run) if first <= span[0] and span[1] <= last),
+        tuple(
+            sorted(
+                (low, high, name)
+                for name in (REFERENCE, ODOMETRY, TRUTH, COMMAND)
+                if name in run.motions
+                for low, high in gaps(run.motions[name].time)
+            )
+        ),
+        find_blocked_wheels(run),
+        find_jumps(run),
+    )
+
+
+def driving(run: Run) -> Span:
+    """Return start and end of the drive, s: the first and the last command other than zero.
+
+    Before, the controller does not follow the reference yet; afterwards it has stopped while the
+    reference, stamped ahead, continues. (inf, -inf) when every command is zero; (-inf, inf) when
+    the bag has no commands.
+    """
+    command = run.motions.get(COMMAND)
+    if command is None:
+        return -math.inf, math.inf
+    moving = command.time[moves(command)]
+    return (float(moving[0]), float(moving[-1])) if moving.size else (math.inf, -math.inf)
+
+
+def smooth(series: Series, name: str) -> tuple[Array, Array]:
+    """Return evenly spaced times with the smoothed speed.
+
+    Parabolas are fitted to windows of :data:`WINDOW` or of eight samples, whichever is longer.
+    Empty arrays when the series is too short; NaN across gaps longer than a window.
+    """
+    nothing = np.empty(0)
+    if len(series) < 3:
+        return nothing, nothing
+    width = max(WINDOW, 8.0 * float(np.median(np.diff(series.time))))
+    half = 10
+    step = 0.5 * width / half
+    count = int((series.time[-1] - series.time[0]) / step) + 1
+    if not 2 * half + 1 <= count <= 20_000_000:
+        return nothing, nothing
+    grid = series.time[0] + step * np.arange(count)
+    value = np.interp(grid, series.time, series[name])
+    offsets = step * np.arange(-half, half + 1.0)
+    design = np.stack([np.ones_like(offsets), offsets, 0.5 * offsets**2], axis=1)
+    fitted = np.correlate(value, np.linalg.pinv(design)[0], 'valid')
+    time = grid[half : count - half]
+    following = np.clip(np.searchsorted(series.time, time, 'right'), 1, len(series) - 1)
+    torn = np.diff(series.time)[following - 1] > width
+    return time, np.where(torn, np.nan, fitted)
+
+
+def still_rows(linear: Array, angular: Array) -> NDArray[np.bool_]:
+    """Return where smoothed speeds (m/s, rad/s) are those of a robot that stands."""
+    still: NDArray[np.bool_] = (
+        np.isfinite(linear)
+        & (np.abs(linear) < STILL['linear'])
+        & (np.abs(angular) < STILL['angular'])
+    )
+    return still
+
+
+def spans_of(rows: NDArray[np.bool_]) -> list[slice]:
+    """Return the stretches of rows that are true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(np.int8), [0]])))
+    return [slice(*each) for each in edges.reshape(-1, 2).tolist()]
+
+
+def standstills(motion: Series) -> list[Span]:
+    """Return start and end of each time in which a robot stood, however short, s."""
+    time, linear = smooth(motion, 'linear')
+    _, angular = smooth(motion, 'angular')
+    found = []
+    for each in spans_of(still_rows(linear, angular)):
+        low, high = float(time[each][0]), float(time[each][-1])
+        middle = 0.5 * (low + high)
+        # Smoothing shortens a standstill and blurs its ends: those of the samples are sharper.
+        near = motion.between(low - 0.5 * BRAKING, high + 0.5 * BRAKING)
+        fast = np.any([np.abs(near[k]) > UNDER_WAY * least for k, least in STILL.items()], axis=0)
+        before, after = (
+            near.time[fast & (near.time < middle)],
+            near.time[fast & (near.time > middle)],
+        )
+        found.append((
+            float(before[-1]) if before.size else low,
+            float(after[0]) if after.size else high,
+        ))  # fmt: skip
+    return merged(found)
+
+
+def merged(spans: Sequence[Span], nearer: float = 0.0) -> list[Span]:
+    """Return spans in order, joined where they overlap or are nearer than so many seconds."""
+    found: list[Span] = []
+    for low, high in sorted(spans):
+        if found and low <= found[-1][1] + nearer:
+            found[-1] = found[-1][0], max(found[-1][1], high)
+        else:
+            found.append((low, high))
+    return found
+
+
+def find_stops(run: Run) -> tuple[Stop, ...]:
+    """Return the times in which the robot stood although it was to move.
+
+    What counts is the motion: the robot stands for :data:`PAUSE`, while the reference asks for
+    motion, or the command where there is no reference; or for less, where the commands are those
+    of a stop. After the last command to move it counts only if the nodes gave a
+    reason, and only up to the end of the reference: a drive that is over is no stop.
+    """
+    motion, wanted = run.motions.get(run.measured), run.motions.get(REFERENCE)
+    command = run.motions.get(COMMAND)
+    first, last = driving(run)
+    if motion is None or len(motion) < 3 or not (first < last or command is None):
+        return ()
+    demand = command if wanted is None or len(wanted) < 2 else wanted
+    if demand is None:
+        return ()
+    end = float(demand.time[-1])
+    if REFERENCE in run.receipts and demand is wanted:
+        # It is stamped ahead: the robot cannot follow what is left when the generator ends.
+        end = min(end, end - run.lead)
+    commanded = [] if command is None else _commanded_stops(command.between(first, last))
+    found = []
+    for low, high in standstills(motion):
+        start, stop = max(low, first), min(high, end)
+        start = max(_begin_of_stop(motion, command or demand, low), first)
+        by_command = [each for each in commanded if each[0] <= stop and low <= each[1] + BRAKING]
+        if by_command and demand is wanted:
+            start = max(min(start, by_command[0][0]), low - BRAKING, first)
+        elif stop - start < PAUSE:
+            continue
+        if not (start < stop and _asks_for_motion(demand, start, stop)):
+            continue
+        cause = cause_between(run.changes, start, stop)
+        if start >= last - PAUSE and not cause.known:
+            continue
+        found.append(Stop(start, stop, cause))
+    return tuple(found)
+
+
+def _begin_of_stop(motion: Series, asked: Series, standstill: float) -> float:
+    """Return when a robot that stands from ``standstill`` on last moved as it was asked to, s.
+
+    At most :data:`BRAKING` before; the standstill itself for a robot that did not.
+    """
+    near = motion.between(standstill - BRAKING, standstill)
+    apart = [
+        np.abs(near[name] - asked.held(name, near.time)) > UNDER_WAY * least
+        for name, least in STILL.items()
+    ]
+    moving = [np.abs(near[name]) > UNDER_WAY * least for name, least in STILL.items()]
+    following = near.time[~np.any(apart, axis=0) & np.any(moving, axis=0)]
+    return float(following[-1]) if following.size else standstill
+
+
+def _commanded_stops(command: Series) -> list[Span]:
+    """Return when the commands of a drive were zero, or missing for :data:`COMMAND_TIMEOUT`."""
+    time, moving = command.time, moves(command)
+    waits = np.where(moving[:-1], COMMAND_TIMEOUT, 0.0)
+    rows = np.flatnonzero(np.diff(time) > waits).tolist()
+    return merged([(float(time[k] + waits[k]), float(time[k + 1])) for k in rows], 1e-9)
+
+
+def _asks_for_motion(demand: Series, start: float, end: float) -> bool:
+    """Return whether a reference or command asks for motion in most of a time."""
+    time = np.linspace(start, end, 50)
+    asked = np.zeros(time.size, dtype=np.bool_)
+    for name, least in STILL.items():
+        asked |= np.abs(demand.held(name, time)) > DEMANDED * least
+    asked &= time >= demand.time[0]
+    return bool(np.mean(asked) >= 0.5)
+
+
+def find_blocked_wheels(run: Run) -> tuple[tuple[float, float, str], ...]:
+    """Return when one wheel stood although it was commanded to turn; see :class:`Incidents`."""
+    motion, command = run.motions.get(run.measured), run.motions.get(COMMAND)
+    if motion is None or command is None or run.geometry is None:
+        return ()
+    found = []
+    speeds = {each.name: smooth(motion, each.name) for each in run.channels}
+    for channel, other in (run.channels, run.channels[::-1]):
+        time, speed = speeds[channel.name]
+        if not time.size:
+            return ()
+        still = np.abs(speed) < WHEEL_STILL
+        still &= np.abs(command.held(channel.name, time)) > WHEEL_DEMANDED
+        still &= (time >= command.time[0]) & (np.abs(speeds[other.name][1]) > WHEEL_STILL)
+        found += [
+            (float(time[each][0]), float(time[each][-1]), channel.title)
+            for each in spans_of(still)
+            if time[each][-1] - time[each][0] >= BLOCKED_TIME
+        ]
+    return tuple(sorted(found))
+
+
+def find_stalls(run: Run) -> list[Span]:
+    """Return the pauses of the loop that are longer than :data:`STALL_PERIODS` periods.
+
+    A pause is between two receipts of odometry without a command in between, or from odometry to
+    its command. Commands that go on are those of a machine that does, and so is the reference of a
+    robot behind a radio: there, a packet was lost.
+    """
+    odometry, timing = run.receipts.get(ODOMETRY), run.timing.get(ODOMETRY)
+    if odometry is None or timing is None or not timing.period > 0.0 or run.other_clock:
+        return []
+    least = max(STALL_PERIODS * timing.period, MIN_STALL)
+    steps = np.diff(odometry)
+    rows = np.flatnonzero((steps > least) & (steps < MIN_GAP)).tolist()
+    found = [(float(odometry[k]), float(odometry[k + 1])) for k in rows]
+    going_on = [COMMAND, REFERENCE] if run.links or not run.ours else [COMMAND]
+    others = [run.receipts[name] for name in going_on if name in run.receipts]
+    found = [span for span in found if not any(_received(each, *span) for each in others)]
+    commands = run.receipts.get(COMMAND)
+    if commands is not None and run.ours:
+        index = np.searchsorted(odometry, commands, 'right') - 1
+        prompt = (index >= 0) & (np.diff(index, prepend=-1) > 0)
+        late, asked = commands[prompt], odometry[index[prompt]]
+        slow = (late - asked > least) & (late - asked < MIN_GAP)
+        found += zip(asked[slow].tolist(), late[slow].tolist(), strict=True)
+    return merged(found, -1e-6)
+
+
+def _received(times: Array, low: float, high: float) -> bool:
+    """Return whether messages came well within a span."""
+    edge = 0.2 * (high - low)
+    return bool(np.any((times > low + edge) & (times < high - edge)))
+
+
+def find_jumps(run: Run) -> tuple[Jump, ...]:
+    """Return where the position of a robot jumps, unless several robots publish it."""
+    found = []
+    for name in (ODOMETRY, TRUTH):
+        motion = run.motions.get(name)
+        if motion is None or 'x' not in motion.values:
+            continue
+        places = np.stack([motion['x'], motion['y']], axis=1)
+        given = motion.time, places, motion['linear']
+        if several_robots(*given):
+            continue
+        away = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        found += [
+            Jump(float(motion.time[k]), name, float(away[k - 1]))
+            for k in pose_jumps(*given, POSE_JUMP).tolist()
+        ]
+    return tuple(sorted(found))

@@ -1,0 +1,67 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Errors that robots are known to reach, by robot and conditions, and the bound of a good run."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
+
+MAX_RATIO = 3.0
+"""A settled RMSE of more than so many times the known one is not that of a good run. Seeds and
+spans of the reference differ by less than 1.5 times (docs/results_tables.md); the two machines on
+which the known ones were measured, and busy ones that lose no period, by less than 2 times."""
+
+
+class KnownResult(NamedTuple):
+    """A settled RMSE that a robot reaches."""
+
+    robot: str
+    """Its name in a sentence."""
+    parameters: Mapping[str, Mapping[str, str]]
+    """Recorded parameters by node that make the robot and the task."""
+    settled: float
+    """The larger one of both wheels, rad/s."""
+    source: str
+
+
+_SIGNALS = {'reference_generator': {'source': 'signals', 'output': 'wheels'}}
+KNOWN_RESULTS: tuple[KnownResult, ...] = (
+    KnownResult(
+        'digital twin',
+        {'sim_robot': {'drive.kind': 'stepper', 'world': ''}, **_SIGNALS},
+        0.012,
+        'README.md: 60 s of scripts/demo, noise variance 0.04 (rad/s)²',
+    ),
+)
+"""Of the parameters that are not named those of the twin must have their defaults, but for
+:data:`FREE`."""
+MAX_NOISE = 0.04
+"""Largest variance of the measured wheel speeds of the known results, (rad/s)²."""
+FREE = ('seed', 'noise.variance', 'drive.kind', 'world')
+"""Parameters of the twin that may differ from their defaults, or are named."""
+
+
+def known_result(records: Mapping[str, Mapping[str, str]]) -> KnownResult | None:
+    """Return what the recorded robot is known to reach under these conditions, if anything.
+
+    ``records`` are the recorded parameters by node.
+    """
+    twin = records.get('sim_robot', {})
+    defaults = {name: str(value) for name, value in DigitalTwinParameters().to_dict().items()}
+    for name, value in twin.items():
+        if name in defaults and name not in FREE and value != defaults[name]:
+            return None
+    try:
+        if float(twin.get('noise.variance', '0')) > MAX_NOISE:
+            return None
+    except ValueError:
+        return None
+    for known in KNOWN_RESULTS:
+        if all(
+            records.get(node, {}).get(name) == value
+            for node, values in known.parameters.items()
+            for name, value in values.items()
+        ):
+            return known
+    return None

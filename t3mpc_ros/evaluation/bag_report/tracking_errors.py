@@ -1,0 +1,181 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Tracking errors of a recorded run, and the time in which they count; see docs/metrics.md."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.evaluation.bag_report.continuity import within_gaps
+from t3mpc_ros.evaluation.bag_report.incidents import BRAKING, Span, driving, find_stops
+from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
+from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.record import away_from_switches
+from t3mpc_ros.evaluation.topic_roles import REFERENCE
+from t3mpc_ros.geometry.types import Array
+
+SETTLING = 1.0
+"""Settling time (s): left out after the start of the drive, after each stop and each switch; also
+the longest time left out before a switch."""
+
+
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Statistics of the tracking error of one channel, in its unit; NaN without a sample."""
+
+    rmse: float
+    mae: float
+    largest: float
+    count: int
+    seconds: float
+    """Time that the samples cover, s."""
+
+
+def statistics(error: Array, period: float = math.nan) -> ErrorStatistics:
+    """Return root mean square, mean and largest of the absolute error.
+
+    Each sample of ``error`` stands for ``period`` seconds.
+    """
+    size = np.abs(error[np.isfinite(error)])
+    if not size.size:
+        return ErrorStatistics(math.nan, math.nan, math.nan, 0, 0.0)
+    return ErrorStatistics(
+        rms(size),
+        float(size.mean()),
+        float(size.max()),
+        int(size.size),
+        size.size * period,
+    )
+
+
+def tracking_error(run: Run, measured: str) -> Series | None:
+    """Return measured minus reference of both channels at the stamps of the ``measured`` motion.
+
+    The reference is interpolated linearly; across a switch its earlier sample is held. Outside the
+    reference, and in its gaps, the error is undefined. None when either motion is missing.
+    """
+    motion, reference = run.motions.get(measured), run.motions.get(REFERENCE)
+    if motion is None or reference is None:
+        return None
+    inside = (motion.time >= reference.time[0]) & (motion.time <= reference.time[-1])
+    inside &= ~within_gaps(motion.time, reference.time)
+    time = motion.time[inside]
+    before = np.clip(np.searchsorted(reference.time, time, 'right') - 1, 0, None)
+    following = np.minimum(before + 1, len(reference) - 1)
+    held = np.isin(reference.time[following], run.switches)
+    errors = {}
+    for wheel, *_ in run.channels:
+        wanted = np.interp(time, reference.time, reference[wheel])
+        wanted = np.where(held, reference[wheel][before], wanted)
+        errors[wheel] = motion[wheel][inside] - wanted
+    return Series(time, errors)
+
+
+def driven(time: Array, run: Run) -> NDArray[np.bool_]:
+    """Return the mask of ``time`` (stamps of an error, s) in which the robot was driven.
+
+    The first :data:`SETTLING` seconds with a command and a reference are excluded, because the
+    robot has yet to catch up, and likewise each stop, from :data:`BRAKING` s before standstill
+    to :data:`SETTLING` seconds after it.
+    """
+    first, last = driving(run)
+    since: Array = time - np.maximum(first, time[:1])
+    stops = [(stop.start - BRAKING, stop.end) for stop in find_stops(run)]
+    return (since >= SETTLING) & (time <= last) & apart_from(time, stops)
+
+
+def apart_from(time: Array, spans: Sequence[Span]) -> NDArray[np.bool_]:
+    """Return which instants are in no span, nor in the :data:`SETTLING` seconds after one."""
+    away = np.ones(time.size, dtype=np.bool_)
+    for start, end in spans:
+        away &= (time < start) | (time >= end + SETTLING)
+    return away
+
+
+def preview_before_switch(run: Run) -> float:
+    """Return how long before a switch a controller may leave the old reference, s.
+
+    A switch is known in advance by the lead of the reference stamps. The interval is at most
+    :data:`SETTLING`, whatever the lead.
+    """
+    return min(run.lead, SETTLING)
+
+
+def settled(time: Array, run: Run) -> NDArray[np.bool_]:
+    """Return the mask of ``time`` (s) that excludes the window around each switch.
+
+    The window is from :func:`preview_before_switch` before it to :data:`SETTLING` seconds after.
+    """
+    return away_from_switches(time, run.switches, preview_before_switch(run), SETTLING)
+
+
+def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, ErrorStatistics]]:
+    """Return the statistics while driven and those when settled, by wheel."""
+    error = tracking_error(run, measured)
+    if error is None:
+        nothing = statistics(np.empty(0))
+        return dict.fromkeys((each.name for each in run.channels), (nothing, nothing))
+    moving = driven(error.time, run)
+    calm = moving & settled(error.time, run)
+    period = float(np.median(np.diff(error.time))) if len(error) > 1 else math.nan
+    return {
+        wheel: (
+            statistics(error[wheel][moving], period),
+            statistics(error[wheel][calm], period),
+        )
+        for wheel, *_ in run.channels
+    }
+
+
+def path_distance(run: Run) -> Series | None:
+    """Return how far the robot is from the place of its reference at the same time, m.
+
+    From the first to the last command to move. None for a robot that follows no path, or without
+    the positions of either.
+    """
+    motion, reference = run.motions.get(run.measured), run.motions.get(REFERENCE)
+    if not run.follows_path or motion is None or reference is None or 'x' not in reference.values:
+        return None
+    motion = motion.between(*driving(run)).between(
+        float(reference.time[0]), float(reference.time[-1])
+    )
+    away = [
+        motion[axis] - np.interp(motion.time, reference.time, reference[axis]) for axis in 'xy'
+    ]
+    return Series(motion.time, {'value': np.hypot(*away)}) if len(motion) else None
+
+
+def settled_rmse(
+    run: Run, until: float = math.inf, spared: Sequence[Span] = ()
+) -> tuple[float, float]:
+    """Return the settled RMSE of both channels up to a time, s, apart from some spans.
+
+    In the units of the channels; NaN without a sample.
+    """
+    error = tracking_error(run, run.measured)
+    if error is None:
+        return math.nan, math.nan
+    rows = driven(error.time, run) & settled(error.time, run) & (error.time < until)
+    rows &= apart_from(error.time, spared)
+    right, left = (statistics(error[each.name][rows]).rmse for each in run.channels)
+    return right, left
+
+
+def format_number(value: float) -> str:
+    """Return three significant digits, a count in full, or a dash for an unknown value."""
+    if isinstance(value, int):
+        return str(value)
+    if not math.isfinite(value):
+        return '–'
+    return f'{value:.0f}' if abs(value) >= 99.95 else f'{value:#.3g}'
+
+
+def format_pair(values: Sequence[float], units: Sequence[str]) -> str:
+    """Return the numbers of both channels with their units, which may differ."""
+    one, other = map(format_number, values)
+    if units[0] == units[1]:
+        return f'{one} / {other} {units[0]}'
+    return f'{one} {units[0]} / {other} {units[1]}'

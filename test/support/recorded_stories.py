@@ -1,0 +1,235 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded runs with a known story: what happened in them is what their reports must say first.
+
+A robot with a period of 10 ms follows a reference of 20 s with a settled RMSE of 0.0100 rad/s in
+both wheels, until something happens.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+
+from support.bag_messages import START, diagnostics, odometry_message, twist_message
+from support.robot_bags import write_with_records
+
+DURATION, RATE, LEAD = 20.0, 100.0, 0.4
+RADIUS, SEPARATION = 0.035, 0.147
+ERROR = 0.01 * math.sqrt(2.0)
+"""Amplitude of the error of the wheels, rad/s."""
+BRAKING = 0.1
+"""Time from the begin of a stop to standstill, s."""
+SLIP_STOP = (
+    'gyro and steps disagree: a wheel slips, is blocked, or has lost steps; stop commanding '
+    'motion for 0.5 s to resume'
+)
+SKIPPED = 'processor overloaded: samples were skipped'
+TWIN = {
+    'sim_robot': {
+        'wheel_radius': str(RADIUS), 'wheel_separation': str(SEPARATION), 'world': '',
+        'drive.kind': 'stepper', 'noise.variance': '0.04', 'seed': '7',
+    },
+    'reference_generator': {'source': 'signals', 'output': 'wheels'},
+    'controller': {'pose.enabled': 'False'},
+}  # fmt: skip
+
+
+@dataclass
+class Story:
+    """A run, and what its report says first."""
+
+    sentence: str
+    """A regular expression."""
+    kind: str
+    """Kind of the verdict: good, open or bad."""
+    records: dict = field(default_factory=lambda: TWIN)
+    stands: tuple = ()
+    """Spans in which the robot stands, s."""
+    blocked: tuple = ()
+    """Spans in which its right wheel stands, s."""
+    lost: float = 0.0
+    """Error that it has besides, rad/s."""
+    reports: tuple = ()
+    """Time, node, level and text of diagnostics; they are repeated each second until the next."""
+    late: Callable = lambda t: 0.0
+    """By how much messages of an instant are received late, s."""
+    kept: Callable = lambda t, topic: True
+    """Which messages are recorded."""
+    moved: Callable = lambda t: 0.0
+    """By how much the position is shifted, m."""
+    path: bool = False
+    """Whether the reference is a path with poses."""
+    detour: tuple = ()
+    """Span in which the robot makes a detour of 0.3 m, s."""
+    names: dict = field(default_factory=dict)
+    """Other names of topics."""
+    second_robot: bool = False
+
+    def rows(self):
+        """Return rows of receipt (s), topic and message."""
+        rows, pose, place = [], np.zeros(3), np.zeros(3)
+        for k in range(round(DURATION * RATE)):
+            t = k / RATE
+            wanted = self._reference(t)
+            speed = self._motion(t)
+            pose = _moved(pose, speed)
+            place = _moved(place, wanted)
+            received = t + self.late(t)
+            shown = pose + (self.moved(t), 0.0, 0.0)
+            if self.detour and self.detour[0] <= t < self.detour[1]:
+                shown = shown + (0.0, 0.3, 0.0)
+            stamp = START + round(t * 1e9)
+            target = place if self.path else (0.0, 0.0, 0.0)
+            ahead = odometry_message(stamp, wanted, target)
+            rows += [
+                (max(received - LEAD, 0.0), '/reference', ahead),
+                (received + 2e-4, '/odom', odometry_message(stamp, speed, shown)),
+                (received + 3e-4, '/ground_truth/odom', odometry_message(stamp, speed, shown)),
+                (received + 1e-3, '/cmd_vel', twist_message(self._command(t))),
+            ]
+            if self.second_robot and k % 2:
+                other = odometry_message(stamp + 5_000_000, (0.1, 0.0), (5.0, 0.001 * k, 0.0))
+                rows.append((received + 6e-3, '/odom', other))
+        for second in range(1, round(DURATION)):
+            newest = {}
+            for when, node, level, text in self.reports:
+                if when <= second + 0.5:
+                    newest[node] = level, text
+            rows += [
+                (second + 0.5, '/diagnostics', diagnostics(START, node, *now))
+                for node, now in newest.items()
+            ]
+        return [
+            (t, self.names.get(topic, topic), message)
+            for t, topic, message in sorted(rows, key=lambda row: row[0])
+            if self.names.get(topic, topic) and self.kept(t, topic)
+        ]
+
+    def write(self, folder):
+        """Write the bag and return its folder."""
+        return write_with_records(folder, self.rows(), self.records)
+
+    def _reference(self, t):
+        return 0.18 + 0.04 * math.sin(1.3 * t), 0.5 * math.sin(0.7 * t)
+
+    def _command(self, t):
+        return self._reference(t)
+
+    def _motion(self, t):
+        v, w = self._reference(t)
+        right, left = (v + 0.5 * SEPARATION * w) / RADIUS, (v - 0.5 * SEPARATION * w) / RADIUS
+        error = ERROR * math.sin(9.0 * t) + self.lost
+        right, left = right + error, left + error
+        for start, end in self.stands:
+            if start <= t < end:
+                share = max(0.0, 1.0 - (t - start) / BRAKING)
+                right, left = share * right, share * left
+        if any(start <= t < end for start, end in self.blocked):
+            right = 0.0
+        return 0.5 * RADIUS * (right + left), RADIUS * (right - left) / SEPARATION
+
+
+def _moved(pose, twist):
+    x, y, yaw = pose
+    v, w = twist[0] / RATE, twist[1] / RATE
+    return np.array([x + v * math.cos(yaw), y + v * math.sin(yaw), yaw + w])
+
+
+def stalled(*stalls):
+    """Return by how much messages are late on a machine that pauses at times for durations (s)."""
+
+    def late(t):
+        return max([start + length - t for start, length in stalls if 0.0 <= t - start < length],
+                   default=0.0)  # fmt: skip
+
+    return late
+
+
+SETTLED = r'settled RMSE 0\.0(09\d\d|10\d) / 0\.0(09\d\d|10\d) rad/s'
+OTHER_ROBOT = {'/odom': '/wheels/odometry', '/cmd_vel': '/base/cmd_vel', '/reference': '',
+               '/ground_truth/odom': ''}  # fmt: skip
+PATROL = {**TWIN, 'controller': {'pose.enabled': 'True'}}
+OK, WARNING, ERROR_LEVEL = 0, 1, 2
+
+STORIES = {
+    'good': Story(rf'Good run: {SETTLED}, and the robot never stood\.', 'good'),
+    'e-stop': Story(
+        rf'E-stop at 12\.[01] s, the robot stood for 7\.[4-9] s; until then {SETTLED}\.', 'bad',
+        stands=((12.0, 99.0),),
+        reports=(
+            (0.0, 'sim_robot', OK, 'following commands'),
+            (12.0, 'sim_robot', ERROR_LEVEL, 'emergency stop: requested by service e_stop'),
+            (12.0, 'controller', WARNING, 'the robot does not follow commands'),
+        ),
+    ),
+    'blocked wheel': Story(
+        r'The right wheel stood from 1[12]\.\d s on for [56]\.\d s although it was commanded to '
+        r'turn; settled RMSE .*\.', 'bad', blocked=((12.0, 18.0),),
+    ),
+    'slip stop': Story(
+        rf'Slip stop: a wheel slips, is blocked, or has lost steps at 9\.[01] s, the robot stood '
+        rf'for 3\.[09] s; while it drove {SETTLED}\.', 'bad', stands=((9.0, 12.0),),
+        reports=(
+            (0.0, 'sim_robot', OK, 'following commands'),
+            (9.0, 'sim_robot', WARNING, f'{SLIP_STOP}; {SKIPPED}'),
+            (9.0, 'controller', WARNING, 'the robot does not follow commands'),
+            (12.0, 'sim_robot', OK, 'following commands'),
+            (12.0, 'controller', OK, 'tracking'),
+        ),
+    ),
+    'low battery': Story(
+        rf'Battery low from 8\.5 s on \(sim_robot: the battery is low: 10\.1 V\); {SETTLED}\.',
+        'open', reports=(
+            (0.0, 'sim_robot', OK, 'following commands'),
+            (8.0, 'sim_robot', WARNING, 'the battery is low: 10.1 V'),
+        ),
+    ),
+    'overload': Story(
+        r'The machine was overloaded from 5\.5 s on \(sim_robot: processor overloaded: samples '
+        rf"were skipped\): errors since then may not be the controller's; {SETTLED}\.", 'open',
+        reports=((5.0, 'sim_robot', WARNING, SKIPPED),),
+    ),
+    'stalls': Story(
+        r'The machine stalled 3 times, the longest (8[0-9]) ms at 1[12]\.\d s: errors after them '
+        rf"are not the controller's; {SETTLED}(, without the 1 s after them .*)?\.", 'open',
+        late=stalled((6.0, 0.066), (12.0, 0.074), (15.0, 0.066)),
+    ),
+    'patrol': Story(
+        r'Good run: within 50 mm of its path for 8\d % of the drive, path error 1\d\d\.\d mm '
+        r'\(RMS\); the rest were detours around obstacles and the ways back\.', 'good',
+        records=PATROL, path=True, detour=(8.0, 11.0),
+    ),
+    'other robot': Story(
+        r'The robot drove 3\.[56]\d m in 20\.0 s; the bag holds no reference, so tracking cannot '
+        r'be judged\.', 'open', records={}, names=OTHER_ROBOT,
+    ),
+    'gap': Story(
+        rf'No (odom|ground_truth/odom) for 4\.0 s from 10\.0 s on, the longest of \d gaps; '
+        rf'{SETTLED}\.', 'bad',
+        kept=lambda t, topic: topic == '/reference' or not 10.0 < t < 14.0,
+    ),
+    'jump': Story(
+        rf'The position of (odom|ground_truth/odom) jumps by 3\.00\d m at 8\.0 s, the largest of '
+        rf'2 jumps; {SETTLED}\.', 'open', moved=lambda t: 3.0 * (t >= 8.0),
+    ),
+    'no reference': Story(
+        r'The robot drove 3\.[56]\d m in 20\.0 s; the bag holds no reference, so tracking cannot '
+        r'be judged\.', 'open', names={'/reference': ''},
+    ),
+    'two robots': Story(
+        r'Several robots publish /odom: nothing measured from it is valid; .*', 'bad',
+        second_robot=True, names={'/ground_truth/odom': ''},
+    ),
+    'poor': Story(
+        r'Poor run: settled RMSE 0\.11\d / 0\.11\d rad/s, (9|10) times the 0\.012 rad/s that the '
+        r'digital twin is known to reach under these conditions\.', 'bad', lost=0.11,
+    ),
+    'never moved': Story(
+        r'E-stop: the robot never moved, although it was to for 19\.\d s\.', 'bad',
+        stands=((-1.0, 99.0),),
+        reports=((0.0, 'sim_robot', ERROR_LEVEL, 'emergency stop: requested by service e_stop'),),
+    ),
+}  # fmt: skip
+"""By name."""
