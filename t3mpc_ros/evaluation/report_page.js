@@ -49,8 +49,7 @@ function select(from, to) {
 
 function addChart(id, { title, unit, lines, summary, extent }) {
   const box = place(id);
-  const made = charts.add(title, unit, lines, { box,
-    summary: `${title}. ${summary}` });
+  const made = charts.add(title, unit, lines, { box, summary: `${title}. ${summary}` });
   const tables = [];
   let last = -1;
   for (const { time, value } of lines) {
