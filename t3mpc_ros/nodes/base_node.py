@@ -97,6 +97,7 @@ class BaseNode(Node, Generic[P]):
         # Steady time: diagnostics continue while the simulated clock is paused.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_steady_timer(1.0, self._publish_diagnostics)
+        self._command_publishers = qos.CommandPublishers()
         self._matching: list[qos.MatchingSubscription] = []
         self.create_steady_timer(ADAPT_PERIOD, self._adapt_subscriptions)
         self._unused_overrides: list[str] | None = None
@@ -298,7 +299,7 @@ class BaseNode(Node, Generic[P]):
         found = [
             *self.start_warnings,
             *self.warnings(),
-            qos.command_publishers_problem(self),
+            self._command_publishers.problem(self, self.steady_ns()),
             qos.qos_problem(self, (each.subscription for each in self._matching), 'subscription'),
             qos.qos_problem(self, islice(self._public_publishers(), 20), 'publisher'),
         ]

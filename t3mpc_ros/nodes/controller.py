@@ -24,7 +24,8 @@ from t3mpc_ros.control.controller import (
     Status,
     StepperControllerParameters,
 )
-from t3mpc_ros.control.watchdog import InputMonitor, Reason
+from t3mpc_ros.control.input_monitor import NAMES, InputMonitor
+from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes import conversions, qos
@@ -220,9 +221,10 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         if self._controller.ignored_odometry == ignored or self._last_odometry_ns is None:
             self._last_odometry_ns = self.steady_ns()
         self._publish_command(command, status.stamp_ns)
-        self._input_monitor.update(
-            measured.stamp_ns, self.now_ns(), measured.twist, self._last_command
-        )
+        # Poses alone are differentiated, which says little about a gain.
+        known = None if self._controller.odometry_twist.missing else self._last_command
+        following = status.reason is Reason.TRACKING
+        self._input_monitor.update(measured, self.now_ns(), known, following=following)
         self._last_command = command if status.reason.moves else None
         self._publish_journal(self._journal.step(measured.stamp_ns))
         self._initial_odometry.republish(message)
@@ -323,6 +325,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             'odometry_ignored': self._controller.ignored_odometry,
             'references_rejected': self._rejected_references,
             'odometry_rejected': self._rejected_odometry,
+            **self._input_values(),
         }
         if self.parameters.pose.enabled:
             values['path_error_m'] = self._controller.pose_controller.error.distance
@@ -348,10 +351,34 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             return WARN, 'reference messages with non-finite values were ignored', values
         return OK, status.reason.value, values
 
+    def _input_values(self) -> dict[str, object]:
+        """Return the gaps and jumps of the odometry, and the gains of the response."""
+        monitor = self._input_monitor
+        gaps = monitor.gaps
+        values: dict[str, object] = {
+            'odometry_rate_hz': gaps.rate,
+            'odometry_gaps': gaps.number,
+            'odometry_missing': gaps.missing,
+            'odometry_gap_longest_s': gaps.longest,
+            'odometry_gap_age_s': gaps.age,
+            'odometry_late': monitor.late,
+            'odometry_jumps': monitor.jumps,
+            'odometry_restarts': gaps.restarts,
+        }
+        for axis, name in enumerate(NAMES):
+            if (gain := monitor.gain(axis)) is not None:
+                values[f'{name}_gain'] = gain.value
+                values[f'{name}_gain_std'] = gain.deviation
+        return values
+
     def warnings(self) -> list[str]:
         """Return what does not fit in the odometry or in its response to the commands."""
         simulated = self.get_clock().ros_time_is_active
-        found = self._input_monitor.warnings(simulated_time=simulated)
+        found = self._input_monitor.warnings(
+            simulated_time=simulated,
+            tolerated_gap=0.5 * self.parameters.watchdog.odometry_timeout,
+            geometry=self.parameters.geometry,
+        )
         ignored = self._controller.ignored_odometry
         if ignored > self._reported_ignored:
             found.append(

@@ -24,6 +24,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
+from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.parameters.table import ParameterError
 
@@ -262,14 +263,41 @@ def take_with_info(subscription: Subscription) -> list[tuple[Any, dict[str, Any]
     return messages
 
 
-def command_publishers_problem(node: Node) -> str:
-    """Return the publishers of ``cmd_vel`` if several compete for the robot, or nothing."""
-    topic = node.resolve_topic_name('cmd_vel')
-    own = {each.topic_name for each in (*node.subscriptions, *node.publishers)}
-    if topic not in own:
-        return ''
-    names = sorted(map(node_of, node.get_publishers_info_by_topic(topic)))
-    return f'{topic} has {len(names)} publishers: {", ".join(names)}' if len(names) > 1 else ''
+LEASE = 20.0
+"""Time after which a node that was killed leaves the graph, s: the default of Fast DDS."""
+
+
+class CommandPublishers:
+    """The publishers of ``cmd_vel`` of a graph, and since when each is known."""
+
+    def __init__(self) -> None:
+        self._since_ns: dict[bytes, int] = {}
+
+    def problem(self, node: Node, now_ns: int) -> str:
+        """Return the publishers if several compete for the robot, or nothing.
+
+        now_ns : steady time
+        """
+        topic = node.resolve_topic_name('cmd_vel')
+        own = {each.topic_name for each in (*node.subscriptions, *node.publishers)}
+        if topic not in own:
+            return ''
+        found = {
+            bytes(info.endpoint_gid): info for info in node.get_publishers_info_by_topic(topic)
+        }
+        self._since_ns = {gid: self._since_ns.get(gid, now_ns) for gid in found}
+        names = sorted(map(node_of, found.values()))
+        if len(names) < 2:
+            return ''
+        if len(set(names)) == 1:
+            known = (now_ns - max(self._since_ns.values())) / NANOSECONDS
+            if known < LEASE:
+                return (
+                    f'{topic}: a {names[0]} that has ended without notice is still listed, for '
+                    f'at most {LEASE:g} s'
+                )
+            return f'{topic} has {len(names)} publishers of the same name: {names[0]}'
+        return f'{topic} has {len(names)} publishers: {", ".join(names)}'
 
 
 def qos_problem(node: Node, endpoints: Iterable[Any], kind: Kind) -> str:

@@ -1,61 +1,232 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Plausibility of odometry: clock, rate, gain and sign of the response."""
+"""Plausibility of odometry: clock, rate, gaps, jumps, gain and sign of the response."""
 
 import math
+import re
 
+import numpy as np
 import pytest
 
-from t3mpc_ros.control.watchdog import InputMonitor
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist
+from t3mpc_ros.control.input_monitor import InputMonitor
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
+
+GEOMETRY = WheelGeometry(wheel_radius=0.05, wheel_separation=0.3)
 
 
-def monitor(rate=100.0, real_rate=100.0, offset=0.01, gains=(1.0, 1.0), seconds=10.0, lag=3):
-    """Return a monitor after some seconds of a sinusoidal run."""
-    made = InputMonitor(rate)
-    commands = []
-    for step in range(round(seconds * real_rate)):
-        t = step / real_rate
-        commands.append(BodyTwist(0.2 * math.sin(t), math.cos(2.0 * t)))
-        old = commands[max(0, step - lag)]
-        measured = BodyTwist(gains[0] * old.linear, gains[1] * old.angular)
-        stamp_ns = round(t * NANOSECONDS)
-        made.update(stamp_ns, stamp_ns + round(offset * NANOSECONDS), measured, commands[-1])
-    return made
+class Drive:
+    """A robot with dead time, lag, gains and noise, and a monitor of its odometry."""
+
+    def __init__(self, rate=100.0, seed=1, gains=(1.0, 1.0), dead_time=0.03, lag=0.05, **more):
+        self.monitor = InputMonitor(rate)
+        self._random = np.random.default_rng(seed)
+        self._gains, self._delay = gains, round(dead_time * 1000)
+        self._share = -math.expm1(-0.001 / lag)
+        self._period = round(1000 / more.pop('real_rate', rate))
+        self._offset = more.pop('offset', 0.01)
+        self.noise, self.limit, self.ticks = 0.0, math.inf, 0.0
+        self.loss = self.jitter = 0.0
+        vars(self).update(more)
+        self._phases = self._random.uniform(0.0, 2.0 * math.pi, (2, 4))
+        self._sent, self._time, self._last, self._command = [], 0, 0, None
+        self.speed, self.pose = [0.0, 0.0], [0.0, 0.0, 0.0]
+        self.stopped = self.silent = False
+
+    def wanted(self, seconds):
+        """Return the twist to command: four frequencies below 0.7 Hz, as a chaotic reference."""
+        angles = 2.0 * math.pi * np.array([0.07, 0.19, 0.31, 0.55]) * seconds + self._phases
+        linear, angular = np.sin(angles) @ [0.05, 0.06, 0.04, 0.02]
+        return BodyTwist(float(linear), float(6.0 * angular))
+
+    def run(self, seconds, **changes):
+        """Drive for a time; return the warnings at its end."""
+        vars(self).update(changes)
+        for _ in range(round(seconds * 1000)):
+            self._time += 1
+            given = self._sent[0][1] if self._sent else (0.0, 0.0)
+            while self._sent and self._sent[0][0] <= self._time - self._delay:
+                given = self._sent.pop(0)[1]
+                self._given = given
+            given = getattr(self, '_given', (0.0, 0.0))
+            for axis in (0, 1):
+                goal = 0.0 if self.stopped else self._gains[axis] * given[axis]
+                if self.ticks:
+                    goal = math.trunc(goal / self.ticks) * self.ticks
+                goal = max(-self.limit, min(self.limit, goal))
+                self.speed[axis] += self._share * (goal - self.speed[axis])
+            self.pose[2] += 0.001 * self.speed[1]
+            self.pose[0] += 0.001 * self.speed[0] * math.cos(self.pose[2])
+            self.pose[1] += 0.001 * self.speed[0] * math.sin(self.pose[2])
+            spread = self.jitter * self._period
+            due = self._time - self._last >= self._period + self._random.uniform(-spread, spread)
+            if due:
+                self._last = self._time
+                if not self.silent and self._random.random() >= self.loss:
+                    self._report()
+        return self.warnings()
+
+    def _report(self):
+        noise = self.noise * self._random.standard_normal(2)
+        twist = BodyTwist(*(np.array(self.speed) + noise * (1.0, 6.0)).tolist())
+        stamp = self._time * 1_000_000
+        now = stamp + round(self._offset * NANOSECONDS)
+        self.monitor.update(State(stamp, Pose(*self.pose), twist), now, self._command)
+        self._command = self.wanted(self._time / 1000.0)
+        self._sent.append((self._time, self._command))
+
+    def warnings(self, simulated=False):
+        return self.monitor.warnings(
+            simulated_time=simulated, tolerated_gap=0.1, geometry=GEOMETRY
+        )
 
 
-@pytest.mark.parametrize('rate', [20.0, 50.0, 100.0])
-@pytest.mark.parametrize('offset', [0.0, 0.1])
-def test_a_robot_that_fits_gives_no_warning(rate, offset):
-    found = monitor(rate, rate, offset, (0.95, 1.1), seconds=30.0)
-    assert found.warnings(simulated_time=False) == []
-    assert found.gain(0) == pytest.approx(0.95, abs=0.05)
-    assert found.rate == pytest.approx(rate, rel=0.01)
+ROBOTS = [
+    {},
+    {'rate': 20.0, 'lag': 0.15, 'dead_time': 0.1},
+    {'rate': 50.0, 'lag': 0.1, 'dead_time': 0.15, 'noise': 0.01},
+    {'rate': 30.0, 'ticks': 0.01},
+    {'rate': 200.0, 'lag': 0.02, 'dead_time': 0.005, 'noise': 0.02},
+    {'rate': 50.0, 'jitter': 0.3, 'noise': 0.005},
+    {'rate': 100.0, 'gains': (1.02, 0.98)},
+]
+"""Robots that fit, however slow, noisy or coarse."""
+
+
+@pytest.mark.parametrize('robot', ROBOTS, ids=str)
+@pytest.mark.parametrize('seed', [1, 2])
+def test_a_robot_that_fits_gives_no_warning(robot, seed):
+    drive = Drive(seed=seed, **robot)
+    for _ in range(12):
+        assert drive.run(10.0) == []
+    for axis, true in enumerate(robot.get('gains', (1.0, 1.0))):
+        gain = drive.monitor.gain(axis)
+        assert abs(gain.value - true) < max(0.012, 4.0 * gain.deviation)
+
+
+@pytest.mark.parametrize('robot', [each for each in ROBOTS if 'gains' not in each], ids=str)
+@pytest.mark.parametrize(
+    'gains, values',
+    [
+        ((0.95, 0.95), {'wheel_radius': 0.0475}),
+        ((1.05, 1.05), {'wheel_radius': 0.0525}),
+        ((1.0, 0.95), {'wheel_separation': 0.3158}),
+        ((1.0, 1.05), {'wheel_separation': 0.2857}),
+        ((1.05, 1.0), {'wheel_radius': 0.0525, 'wheel_separation': 0.315}),
+    ],
+)
+def test_a_geometry_wrong_by_5_percent_is_named_within_a_minute(robot, gains, values):
+    """20 % were silent."""
+    (warning,) = Drive(**robot, gains=gains).run(60.0)
+    found = dict(re.findall(r'(wheel_\w+) from [\d.]+ to ([\d.]+) m', warning))
+    assert {name: float(value) for name, value in found.items()} == pytest.approx(
+        values, rel=0.025
+    )
 
 
 @pytest.mark.parametrize(
-    'values, words',
+    'robot, words',
     [
         ({'offset': 1.0}, 'odom is stamped 1 s behind the clock'),
         ({'offset': -1.0}, 'odom is stamped 1 s ahead of the clock'),
         ({'real_rate': 50.0}, 'odom has 50 Hz, but rate is 100 Hz'),
-        ({'gains': (0.5, 1.0)}, 'the linear velocity in odom is 0.5'),
-        ({'gains': (1.0, 2.0)}, 'the angular velocity in odom is 2'),
-        ({'gains': (1.0, -1.0)}, 'the angular velocity in odom is with the opposite sign, -1.00'),
+        ({'gains': (0.5, 1.0)}, 'the linear velocity in odom is 0.50'),
+        ({'gains': (1.0, 2.0)}, 'the angular velocity in odom is 2.0'),
+        ({'gains': (1.0, -1.0)}, 'the angular velocity in odom has the opposite sign'),
+        ({'loss': 0.3}, 'odom had '),
     ],
 )
-def test_what_does_not_fit_is_named(values, words):
-    (warning,) = monitor(**values).warnings(simulated_time=False)
+def test_what_does_not_fit_is_named(robot, words):
+    (warning,) = Drive(**robot).run(30.0)
     assert warning.startswith(words)
 
 
+def test_a_robot_at_its_limit_is_no_wrong_geometry():
+    (warning,) = [each for each in Drive(limit=0.08).run(60.0) if 'linear' in each]
+    assert 'the limits of the robot are below those here' in warning
+    assert 'wheel_radius' not in warning
+
+
+def test_a_stopped_robot_gets_no_advice_about_its_geometry():
+    """During an emergency stop the velocity was "0.61 times the command: check geometry"."""
+    drive = Drive()
+    drive.run(20.0)
+    for _ in range(60):
+        assert drive.run(0.5, stopped=True) == []
+    drive.run(5.0, stopped=False)
+    assert drive.monitor.gain(0).value == pytest.approx(1.0, abs=0.01), 'nothing was learnt'
+
+
+def test_a_robot_that_is_said_not_to_follow_gets_no_advice():
+    drive = Drive(gains=(0.8, 1.0))
+    assert drive.run(60.0) != []
+    state = State(drive._time * 1_000_000 + 1, Pose(*drive.pose), BodyTwist(0.1, 0.1))
+    drive.monitor.update(state, state.stamp_ns, BodyTwist(0.1, 0.1), following=False)
+    assert drive.warnings() == []
+
+
+def test_gaps_are_counted_with_the_longest_and_the_last():
+    drive = Drive(rate=50.0)
+    drive.run(10.0)
+    drive.run(0.5, silent=True)
+    (warning,) = drive.run(2.0, silent=False)
+    gaps = drive.monitor.gaps
+    assert (gaps.number, gaps.missing) == (1, 25)
+    assert gaps.longest == pytest.approx(0.52, abs=0.021)
+    assert gaps.age == pytest.approx(2.0, abs=0.05)
+    assert 'had 1 gaps in the last 10 s, the longest 0.52 s, the last 2.0 s ago: 5 %' in (
+        warning.replace('%', ' %').replace('  ', ' ')
+    )
+    assert drive.run(11.0) == []
+    assert gaps.number == 1
+    assert drive.monitor.jumps == 0
+
+
+def test_a_single_lost_message_is_counted_only():
+    drive = Drive()
+    drive.run(5.0)
+    drive.run(0.011, silent=True)
+    assert drive.run(1.0, silent=False) == []
+    assert drive.monitor.gaps.number == 1
+
+
+def test_jumps_late_messages_and_restarts_are_counted():
+    drive = Drive()
+    drive.run(5.0)
+    drive.pose[0] += 0.5
+    drive.run(1.0)
+    drive.pose[2] += 1.0
+    drive.run(1.0)
+    assert drive.monitor.jumps == 2
+    drive.run(0.1, _offset=0.2)
+    drive.run(0.1, _offset=0.01)
+    assert drive.monitor.late == pytest.approx(10, abs=2)
+    drive._time -= 3000
+    drive._last -= 3000
+    drive.run(1.0)
+    assert drive.monitor.gaps.restarts == 1
+
+
 def test_simulated_time_may_run_ahead_of_the_messages():
-    assert monitor(offset=1.0).warnings(simulated_time=True) == []
+    drive = Drive(offset=1.0)
+    drive.run(10.0)
+    assert drive.warnings(simulated=True) == []
 
 
 def test_without_excitation_the_gain_is_unknown():
     made = InputMonitor(100.0)
-    for step in range(1000):
-        made.update(step * 10_000_000, step * 10_000_000, BodyTwist(0.0, 0.0), None)
+    for step in range(6000):
+        state = State(step * 10_000_000, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, 0.0))
+        made.update(state, state.stamp_ns, None if step % 2 else BodyTwist(0.0, 0.0))
     assert made.gain(0) is made.gain(1) is None
-    assert made.warnings(simulated_time=False) == []
+
+
+def test_a_robot_that_only_stands_and_noise_say_nothing():
+    """With commands of zero the prior remains, and no warning."""
+    made, random = InputMonitor(100.0), np.random.default_rng(3)
+    for step in range(6000):
+        twist = BodyTwist(*(0.01 * random.standard_normal(2)).tolist())
+        state = State(step * 10_000_000, Pose(0.0, 0.0, 0.0), twist)
+        made.update(state, state.stamp_ns, BodyTwist(0.0, 0.0))
+        if step % 100 == 0:
+            assert made.warnings(simulated_time=False, tolerated_gap=0.1, geometry=GEOMETRY) == []

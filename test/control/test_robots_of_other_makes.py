@@ -15,7 +15,8 @@ import yaml
 
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
-from t3mpc_ros.control.watchdog import InputMonitor, Reason
+from t3mpc_ros.control.input_monitor import InputMonitor
+from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, Pose, State
 
 pytestmark = pytest.mark.compiled
@@ -53,7 +54,7 @@ def follow(file, rate, lag, dead_time):
         pose, linear, angular = robot.odometry()
         measured = State(stamp_ns, Pose(*pose), BodyTwist(linear, angular))
         given, status = controller.step(measured)
-        monitor.update(stamp_ns, stamp_ns, measured.twist, command)
+        monitor.update(measured, stamp_ns, command)
         robot.command(given.linear, given.angular)
         command = given if status.reason.moves else None
         reasons.add(status.reason)
@@ -64,7 +65,11 @@ def follow(file, rate, lag, dead_time):
     twists = [np.interp(found[:, 0], known[:, 0], known[:, i]) for i in (1, 2)]
     wanted = (wheels @ twists).T
     rms = [float(np.sqrt(np.mean(some**2))) for some in (found[:, 1:] - wanted, wanted)]
-    return *rms, reasons, monitor.warnings(simulated_time=False)
+    return (
+        *rms,
+        reasons,
+        monitor.warnings(simulated_time=False, tolerated_gap=0.1, geometry=geometry),
+    )
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Nodes in one graph: diagnostics and the mistakes they name, simulated time, names, frames."""
 
+import math
 import sys
 import time
 from types import SimpleNamespace
@@ -23,10 +24,11 @@ from support.ros_graph import (
     reason,
     speed,
     stamp,
+    twist,
 )
 
 from t3mpc_ros.geometry.types import NANOSECONDS
-from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
@@ -247,6 +249,79 @@ def test_the_frames_of_a_namespace_have_its_prefix(harness):
     # That of an exact pose was exactly 0, which filters cannot invert.
     covariance = np.reshape(received['odom'][0].pose.covariance, (6, 6))
     assert np.linalg.eigvalsh(covariance).min() > 1e-7
+
+
+@pytest.mark.ros
+def test_the_map_frame_puts_the_robot_at_its_true_pose(harness, monkeypatch):
+    """Nothing led from the frame of the ground truth to that of the odometry."""
+    sent = []
+    broadcaster = SimpleNamespace(sendTransform=sent.append)
+    tf2_ros = SimpleNamespace(TransformBroadcaster=lambda node: broadcaster)
+    monkeypatch.setitem(sys.modules, 'tf2_ros', tf2_ros)
+    start = {'initial_pose.x': 1.0, 'initial_pose.y': -0.5, 'initial_pose.yaw': 2.0}
+    off = {'enable_static_tf': False, 'noise.variance': 0.5}
+    harness.add(SimRobotNode, namespace='one', enable_map_tf=True, **off, **start)
+    truths = harness.subscribe(Odometry, 'one/ground_truth/odom')
+    commands = harness.connected_publisher(Twist, 'one/cmd_vel')
+
+    def moved():
+        commands.publish(twist(0.3, 1.0))
+        return len(truths) > 60
+
+    harness.spin_until(moved)
+    assert truths[-1].pose.covariance[0] == truths[-1].pose.covariance[35] == 1e-6
+    assert truths[-1].twist.covariance[0] == truths[-1].twist.covariance[35] == 1e-6
+    by_stamp = {stamp(message): message.pose.pose for message in truths}
+    checked = 0
+    for odom, origin in sent:
+        assert [odom.header.frame_id, odom.child_frame_id] == ['one/odom', 'one/base_link']
+        assert [origin.header.frame_id, origin.child_frame_id] == ['map', 'one/odom']
+        true = by_stamp.get(conversions.ns_from_time(odom.header.stamp))
+        if true is None:
+            continue
+        checked += 1
+        turn, half = yaw_of(origin.transform.rotation), yaw_of(odom.transform.rotation)
+        x, y = odom.transform.translation.x, odom.transform.translation.y
+        place = origin.transform.translation
+        assert place.x + x * math.cos(turn) - y * math.sin(turn) == pytest.approx(true.position.x)
+        assert place.y + x * math.sin(turn) + y * math.cos(turn) == pytest.approx(true.position.y)
+        assert math.remainder(turn + half - yaw_of(true.orientation), math.tau) == pytest.approx(0)
+    assert checked > 40
+
+
+def yaw_of(rotation):
+    return 2.0 * math.atan2(rotation.z, rotation.w)
+
+
+@pytest.mark.parametrize(
+    ('names', 'age', 'words'),
+    [
+        (['a'], 0, ''),
+        (['a', 'a'], 5, 'a /a that has ended without notice is still listed'),
+        (['a', 'a'], 25, 'has 2 publishers of the same name: /a'),
+        (['a', 'b'], 5, 'has 2 publishers: /a, /b'),
+        (['a', 'a', 'b'], 5, 'has 3 publishers: /a, /a, /b'),
+    ],
+)
+def test_a_publisher_that_died_is_called_so(names, age, words):
+    """After kill -9 and a restart two controllers seemed to compete for the robot."""
+    infos = [
+        SimpleNamespace(endpoint_gid=[i], node_name=name, node_namespace='/')
+        for i, name in enumerate(names)
+    ]
+    node = SimpleNamespace(
+        resolve_topic_name=lambda name: f'/{name}',
+        subscriptions=[SimpleNamespace(topic_name='/cmd_vel')],
+        publishers=[],
+        get_publishers_info_by_topic=lambda topic: infos,
+    )
+    publishers = qos.CommandPublishers()
+    publishers.problem(node, 0)
+    assert words in publishers.problem(node, age * 10**9)
+    assert bool(publishers.problem(node, age * 10**9)) == bool(words)
+    infos.append(SimpleNamespace(endpoint_gid=[9], node_name='a', node_namespace='/'))
+    later = publishers.problem(node, 10**11)
+    assert ('ended without notice' in later) == (set(names) == {'a'})
 
 
 @pytest.mark.ros
