@@ -69,3 +69,17 @@ def advance_pose(pose: Pose, twist: BodyTwist, dt: float) -> Pose:
         pose.y + chord * math.sin(direction),
         wrap_angle(pose.yaw + 2.0 * half_turn),
     )
+
+
+def frame_between(outer: Pose, inner: Pose) -> Pose:
+    """Return the frame in which a robot has the pose ``inner`` that has ``outer`` outside of it.
+
+    With the true pose and that of the odometry: the origin of the odometry in the map.
+    """
+    yaw = wrap_angle(outer.yaw - inner.yaw)
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    return Pose(
+        outer.x - cosine * inner.x + sine * inner.y,
+        outer.y - sine * inner.x - cosine * inner.y,
+        yaw,
+    )

@@ -24,9 +24,10 @@ MAX_CLOCK_LEAD_NS = NANOSECONDS // 20
 """Lead of the publisher's clock beyond which the age of a message is unknown."""
 UNKNOWN_VARIANCE = 1e6
 """Variance of a quantity that is not measured, in any unit."""
-MIN_POSE_VARIANCE = 1e-6
-"""Least published variance of a pose: 1 mm and 1 mrad. After a reset the pose is exact by
-definition, but filters invert its covariance."""
+MIN_VARIANCE = 1e-6
+"""Least published variance of a pose or twist: 1 mm and 1 mrad, 1 mm/s and 1 mrad/s. After a
+reset the pose is exact by definition, as a reference and the ground truth are, but filters invert
+its covariance."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +124,8 @@ class SerializedOdometry:
     """Serialized odometry messages of two frames that differ in state and covariances only.
 
     Construction and serialization of a message would take most of the time of a robot's step.
+    Until covariances are set, pose and twist are exact, but for the lateral speed, which is
+    unknown.
     """
 
     def __init__(self, frame: str, child: str) -> None:
@@ -138,6 +141,10 @@ class SerializedOdometry:
         self._pose_covariance = start + self._pose.size
         self._twist_start = self._pose_covariance + self._covariance.size
         self._twist_covariance = self._twist_start + self._twist.size
+        none = (0.0, 0.0, 0.0)
+        self.set_pose_covariance(planar_covariance((none, none, none), MIN_VARIANCE))
+        lateral = (0.0, UNKNOWN_VARIANCE, 0.0)
+        self.set_twist_covariance(planar_covariance((none, lateral, none), MIN_VARIANCE))
 
     def set_pose_covariance(self, values: Sequence[float]) -> None:
         """Set the 36 numbers of the covariance of the pose."""

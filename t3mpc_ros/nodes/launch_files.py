@@ -19,7 +19,8 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch import LaunchContext, LaunchDescription
 from t3mpc_ros.nodes.arguments import file_values
 from t3mpc_ros.nodes.registry import parameter_class
-from t3mpc_ros.robot.description import urdf
+from t3mpc_ros.robot.description import Masses, urdf
+from t3mpc_ros.simulation.plant.dynamics import BodyParameters
 
 PACKAGE = 't3mpc_ros'
 
@@ -148,7 +149,10 @@ class PackageNodes:
                 _typed(
                     {
                         'robot_description': urdf(
-                            parameters.frame_names, parameters.geometry, parameters.range_sensor
+                            parameters.frame_names,
+                            parameters.geometry,
+                            parameters.range_sensor,
+                            _masses(getattr(parameters, 'body', BodyParameters())),
                         ),
                         'frame_prefix': parameters.prefixed(base, f'/{place}').removesuffix(base),
                         'use_sim_time': self._simulated,
@@ -202,6 +206,18 @@ def _is_installed(package: str) -> bool:
         )
         return False
     return True
+
+
+def _masses(body: BodyParameters) -> Masses:
+    """Return the masses of the simulation, which the real robot is assumed to have, too."""
+    return Masses(
+        body.body_mass,
+        body.body_inertia,
+        body.com_offset,
+        body.wheel_mass,
+        body.wheel_inertia,
+        body.wheel_turn_inertia,
+    )
 
 
 def _typed(parameters: Mapping[str, Any]) -> dict[str, Any]:

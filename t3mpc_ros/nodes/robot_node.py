@@ -7,18 +7,21 @@ import math
 import threading
 from typing import Any, TypeVar
 
-from geometry_msgs.msg import Twist, TwistStamped
+from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import BatteryState, Imu, JointState, Range
 from std_srvs.srv import SetBool, Trigger
 
-from t3mpc_ros.geometry.kinematics import wheels_from_twist
+from t3mpc_ros.geometry.kinematics import frame_between, wheels_from_twist
 from t3mpc_ros.geometry.types import RANGE_SENSORS, BodyTwist, Pose
 from t3mpc_ros.nodes import conversions, qos, robot_topics
-from t3mpc_ros.nodes.base_node import BaseNode
+from t3mpc_ros.nodes.base_node import ADAPT_PERIOD, BaseNode
 from t3mpc_ros.nodes.robot_topics import RobotDescription, RobotTopicParameters
 from t3mpc_ros.robot.description import fixed_frames
 from t3mpc_ros.robot.interface import RobotCommand, RobotInterface, RobotState
+
+TYPE_PATIENCE = 2.0
+"""Time for which commands have the other type before a robot adapts, s."""
 
 BATTERY_RATE = 1.0
 """Rate of ``battery_state``, Hz."""
@@ -46,9 +49,10 @@ class RobotNode(BaseNode[P]):
         self._command_type = TwistStamped if stamped else Twist
         self._description = self.describe(self.parameters)
         self._create_publishers()
-        self.create_matching_subscription(
-            self._command_type, 'cmd_vel', self._on_command, qos.LATEST
-        )
+        self._commands: qos.MatchingSubscription | None = self._subscribe_to_commands()
+        if self.parameters.detect_cmd_vel_type:
+            self._mismatches = 0
+            self.create_steady_timer(ADAPT_PERIOD, self._adapt_command_type)
         self.offer(Trigger, 'reset_odometry', self._reset_odometry)
         self.offer(SetBool, 'e_stop', self._e_stop)
 
@@ -72,6 +76,41 @@ class RobotNode(BaseNode[P]):
         self._set_covariances()
 
     # -- commands ---------------------------------------------------------------------------------
+
+    def _subscribe_to_commands(self) -> qos.MatchingSubscription:
+        return self.create_matching_subscription(
+            self._command_type, 'cmd_vel', self._on_command, qos.LATEST
+        )
+
+    def _adapt_command_type(self) -> None:
+        """Subscribe to the other type if it is the only one that is published, and remains so.
+
+        The controller adapts its own type within the time.
+        """
+        if self._commands is None:
+            self._subscribe_again()
+            return
+        other = _other_type(self._command_type)
+        peers = self.get_publishers_info_by_topic(self.resolve_topic_name('cmd_vel'))
+        differs = {peer.topic_type for peer in peers} == {conversions.type_name(other)}
+        self._mismatches = self._mismatches + 1 if differs else 0
+        if self._mismatches * ADAPT_PERIOD >= TYPE_PATIENCE:
+            self._mismatches = 0
+            # A participant has one type for a topic, and the executor keeps the old subscription
+            # until it has run: the new one follows at the next call.
+            self.remove_matching_subscription(self._commands)
+            self._commands = None
+
+    def _subscribe_again(self) -> None:
+        """Subscribe with the other type, or as before where the process uses the topic with it."""
+        self._command_type = other = _other_type(self._command_type)
+        try:
+            self._commands = self._subscribe_to_commands()
+        except qos.RCLError:
+            self._command_type = _other_type(other)
+            self._commands = self._subscribe_to_commands()
+            return
+        self.get_logger().info(f'cmd_vel is published as {conversions.type_name(other)}')
 
     def _on_command(self, message: Twist | TwistStamped, info: dict[str, Any]) -> None:
         """Execute a command unless it is too old; its stamp becomes one in robot time."""
@@ -140,7 +179,7 @@ class RobotNode(BaseNode[P]):
             )
         self._joint_publisher = self.create_publisher(JointState, 'joint_states', qos.SCALARS)
         self._broadcaster = None
-        if parameters.enable_odom_tf:
+        if parameters.enable_odom_tf or robot.publishes_map:
             self._broadcaster = self._make_broadcaster('TransformBroadcaster')
         if robot.sensors is None:
             return
@@ -180,7 +219,7 @@ class RobotNode(BaseNode[P]):
 
     def _publish_motion(self, state: RobotState) -> None:
         self._odom.set_pose_covariance(
-            conversions.planar_covariance(state.covariance, conversions.MIN_POSE_VARIANCE)
+            conversions.planar_covariance(state.covariance, conversions.MIN_VARIANCE)
         )
         if state.status.slipping is not self._slipping:
             self._slipping = state.status.slipping
@@ -189,15 +228,23 @@ class RobotNode(BaseNode[P]):
         if state.truth is not None:
             self._truth_publisher.publish(self._truth.with_state(state.truth))
         if self._broadcaster is not None:
-            stamp_ns, pose, _ = state.odometry
-            self._broadcaster.sendTransform(
-                conversions.transform(stamp_ns, pose, self._odom.frame, self._odom.child)
-            )
+            self._broadcaster.sendTransform(self._transforms(state))
         if self._is_due(self.parameters.joint_rate):
             names = self.parameters.right_wheel_name, self.parameters.left_wheel_name
             self._joint_publisher.publish(
                 conversions.joint_state(names, state.angles, state.wheels, state.stamp_ns)
             )
+
+    def _transforms(self, state: RobotState) -> list[TransformStamped]:
+        stamp_ns, pose, _ = state.odometry
+        frame, child = self._odom.frame, self._odom.child
+        found = []
+        if self.parameters.enable_odom_tf:
+            found.append(conversions.transform(stamp_ns, pose, frame, child))
+        if self._description.publishes_map and state.truth is not None:
+            origin = frame_between(state.truth.pose, pose)
+            found.append(conversions.transform(stamp_ns, origin, self._truth.frame, frame))
+        return found
 
     def _publish_sensors(self, state: RobotState) -> None:
         stamp_ns = state.stamp_ns
@@ -250,3 +297,7 @@ class RobotNode(BaseNode[P]):
             )
             return None
         return getattr(tf2_ros, kind)(self)
+
+
+def _other_type(message: type) -> type[Twist | TwistStamped]:
+    return Twist if message is TwistStamped else TwistStamped

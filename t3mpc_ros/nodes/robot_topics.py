@@ -35,6 +35,11 @@ class RobotTopicParameters(FrameParameters):
     enable_stamped_cmd_vel: bool = parameter(
         False, 'subscribe to cmd_vel as TwistStamped instead of Twist'
     )
+    detect_cmd_vel_type: bool = parameter(
+        True,
+        'subscribe to cmd_vel with the type of its publishers, Twist or TwistStamped, if none '
+        'publishes that of enable_stamped_cmd_vel for 2 s',
+    )
     odom_frame_id: str = parameter('odom', 'frame of the odometry')
     base_frame_id: str = parameter('base_link', 'frame of the robot')
     imu_frame_id: str = parameter('imu_link', 'frame of imu/data_raw')
@@ -88,6 +93,8 @@ class RobotDescription(NamedTuple):
     """None: wheel encoders only."""
     truth_frame: str = ''
     """Frame of ground_truth/odom; empty: no ground truth."""
+    publishes_map: bool = False
+    """Whether the transform from that frame to the one of the odometry is published."""
 
 
 def imu_message(parameters: ImuParameters, frame: str) -> Imu:

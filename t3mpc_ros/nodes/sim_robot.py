@@ -51,6 +51,11 @@ class SimRobotParameters(RobotTopicParameters, DigitalTwinParameters):
     """Parameters of the simulated robot node."""
 
     world_frame: str = parameter('map', 'frame of ground_truth/odom')
+    enable_map_tf: bool = parameter(
+        False,
+        'publish the transform from world_frame to odom_frame_id that puts the robot at its true '
+        'pose, if tf2_ros is installed; false where a localisation does',
+    )
     publish_clock: bool = parameter(
         False, 'generate simulated time and publish it on /clock, instead of using the node clock'
     )
@@ -171,7 +176,12 @@ class SimRobotNode(RobotNode[SimRobotParameters]):
         else:
             sensors = None
         return RobotDescription(
-            rate, parameters.geometry, variance, sensors, parameters.world_frame
+            rate,
+            parameters.geometry,
+            variance,
+            sensors,
+            parameters.world_frame,
+            parameters.enable_map_tf,
         )
 
     def _timer_period(self) -> float:

@@ -36,6 +36,21 @@ class FrameNames(NamedTuple):
         return f'{self.range_prefix}{sensor}_range_link'
 
 
+class Masses(NamedTuple):
+    """Masses (kg) and inertias (kg m²) of the body and of a wheel, as in (14)."""
+
+    body: float
+    body_inertia: float
+    """About the vertical through the centre of mass."""
+    com_offset: float
+    """Centre of mass ahead of the axle, m."""
+    wheel: float
+    wheel_inertia: float
+    """About the axle."""
+    wheel_turn_inertia: float
+    """About a diameter."""
+
+
 class FixedFrame(NamedTuple):
     """A frame that does not move in the base frame."""
 
@@ -107,11 +122,14 @@ def fixed_frames(
     return [FixedFrame(names.imu, 0.0, 0.0, height, 0.0), *ranges]
 
 
-def urdf(names: FrameNames, geometry: WheelGeometry, sensors: RangeSensorParameters) -> str:
+def urdf(
+    names: FrameNames, geometry: WheelGeometry, sensors: RangeSensorParameters, masses: Masses
+) -> str:
     """Return the URDF of the robot: body, wheels, castor, IMU and range sensors.
 
     Its joints are the two wheels, continuous and named as in ``joint_states``, and the fixed ones
-    of :func:`fixed_frames`.
+    of :func:`fixed_frames`. Body and wheels have their masses; sensors weigh nothing, and what is
+    without a mass is merged with the body by simulators.
     """
     robot = ElementTree.Element('robot', name='t3mpc_robot')
     for colour, rgba in (('body', '0.85 0.87 0.9 1'), ('tyre', '0.15 0.15 0.15 1')):
@@ -125,6 +143,15 @@ def urdf(names: FrameNames, geometry: WheelGeometry, sensors: RangeSensorParamet
     _add_shape(
         base, 'box', 'body', (0.0, 0.0, 1.2 * radius), size=f'{length:g} {width:g} {radius:g}'
     )
+    # The parameters have no height of the mass, and the inertia about one axis only: the others
+    # are those of a body that is as high as the box.
+    upright_inertia = 0.5 * masses.body_inertia + masses.body * radius**2 / 12.0
+    _add_inertia(
+        base,
+        masses.body,
+        (masses.com_offset, 0.0, 1.2 * radius),
+        (upright_inertia, upright_inertia, masses.body_inertia),
+    )
     castor = 0.35 * radius
     for end in (1.0, -1.0):
         place = (end * (sensors.half_length - castor), 0.0, castor)
@@ -135,6 +162,8 @@ def urdf(names: FrameNames, geometry: WheelGeometry, sensors: RangeSensorParamet
         upright = (0.5 * math.pi, 0.0, 0.0)
         tyre = {'radius': f'{radius:.9g}', 'length': f'{_TYRE_WIDTH:g}'}
         _add_shape(wheel, 'cylinder', 'tyre', (0.0, 0.0, 0.0), upright, **tyre)
+        turn, axle = masses.wheel_turn_inertia, masses.wheel_inertia
+        _add_inertia(wheel, masses.wheel, (0.0, 0.0, 0.0), (turn, axle, turn))
         found = _add_joint(robot, 'continuous', joint, names.base, name, (0.0, side, radius), 0.0)
         ElementTree.SubElement(found, 'axis', xyz='0 1 0')
     for frame in fixed_frames(names, geometry, sensors):
@@ -164,6 +193,23 @@ def _add_shape(
         ElementTree.SubElement(geometry, shape, size)
         if purpose == 'visual':
             ElementTree.SubElement(element, 'material', name=material)
+
+
+def _add_inertia(
+    link: ElementTree.Element,
+    mass: float,
+    centre: tuple[float, float, float],
+    moments: tuple[float, float, float],
+) -> None:
+    """Add mass and moments of inertia about the axes of a link, none if it weighs nothing."""
+    if not mass:
+        return
+    element = ElementTree.SubElement(link, 'inertial')
+    ElementTree.SubElement(element, 'origin', xyz=_numbers(centre), rpy='0 0 0')
+    ElementTree.SubElement(element, 'mass', value=f'{mass:.9g}')
+    values = dict.fromkeys(('ixy', 'ixz', 'iyz'), '0')
+    values |= {key: f'{v:.9g}' for key, v in zip(('ixx', 'iyy', 'izz'), moments, strict=True)}
+    ElementTree.SubElement(element, 'inertia', values)
 
 
 def _add_joint(

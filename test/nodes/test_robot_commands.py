@@ -147,6 +147,32 @@ def test_odometry_has_an_exact_grid_frames_and_joints(harness):
     assert right > left > 0.0
 
 
+@pytest.mark.parametrize(
+    ('published', 'stamped'), [(TwistStamped, False), (Twist, True), (TwistStamped, True)]
+)
+def test_a_robot_accepts_either_type_without_a_parameter(published, stamped, harness):
+    """A stamped command needed a parameter of the robot, and was received by nobody."""
+    robot = harness.add(SimRobotNode, enable_stamped_cmd_vel=stamped)
+    odom = harness.subscribe(Odometry, 'odom')
+    publisher = harness.foreign_node().create_publisher(published, 'cmd_vel', 10)
+    message = published()
+    (message.twist if published is TwistStamped else message).linear.x = 0.2
+
+    def moves():
+        publisher.publish(message)
+        return odom and speed(odom[-1]) > 0.1
+
+    harness.spin_until(moves)
+    assert '/cmd_vel' in {each.topic_name for each in robot.subscriptions}
+
+
+def test_a_robot_without_detection_says_what_is_published(harness):
+    robot = harness.add(SimRobotNode, detect_cmd_vel_type=False)
+    publisher = harness.foreign_node().create_publisher(TwistStamped, 'cmd_vel', 10)
+    words = 'another node publishes geometry_msgs/msg/TwistStamped on cmd_vel'
+    harness.spin_until(lambda: words in reason(robot) and publisher)
+
+
 def test_stamped_commands_are_accepted_and_stale_ones_rejected(harness):
     """A played or delayed stamped command must not move a robot."""
     robot = harness.add(SimRobotNode, enable_stamped_cmd_vel=True)

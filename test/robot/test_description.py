@@ -10,11 +10,12 @@ import pytest
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import RANGE_SENSORS
-from t3mpc_ros.robot.description import FrameNames, fixed_frames, sensor_mounts, urdf
+from t3mpc_ros.robot.description import FrameNames, Masses, fixed_frames, sensor_mounts, urdf
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 
 NAMES = FrameNames('base', 'gyro', 'sharp_', 'right_hinge_joint', 'left_hinge_joint')
 GEOMETRY = WheelGeometry(wheel_radius=0.06, wheel_separation=0.31)
+MASSES = Masses(2.0, 0.03, 0.02, 0.1, 6e-5, 3e-5)
 SENSORS = RangeSensorParameters(half_length=0.2, half_width=0.17, offset=0.11)
 
 
@@ -24,7 +25,7 @@ def numbers(element, name):
 
 @pytest.fixture(scope='module')
 def robot():
-    return ElementTree.fromstring(urdf(NAMES, GEOMETRY, SENSORS))
+    return ElementTree.fromstring(urdf(NAMES, GEOMETRY, SENSORS, MASSES))
 
 
 def test_links_and_joints_are_one_tree_below_the_base(robot):
@@ -87,3 +88,27 @@ def test_nothing_but_the_wheels_reaches_the_floor(robot, shape):
             continue
         half = 0.5 * numbers(found, 'size')[2] if shape == 'box' else float(found.get('radius'))
         assert numbers(collision.find('origin'), 'xyz')[2] - half >= -1e-9
+
+
+def test_the_masses_are_those_of_the_parameters_and_physical(robot):
+    """Simulators refuse links without a mass below a moving joint, or ignore them."""
+    found = {link.get('name'): link.find('inertial') for link in robot.findall('link')}
+    heavy = {name for name, inertial in found.items() if inertial is not None}
+    assert heavy == {'base', 'right_hinge_link', 'left_hinge_link'}
+    masses = {name: float(found[name].find('mass').get('value')) for name in heavy}
+    assert masses == {'base': 2.0, 'right_hinge_link': 0.1, 'left_hinge_link': 0.1}
+    assert numbers(found['base'].find('origin'), 'xyz')[0] == 0.02
+    for name in heavy:
+        moments = [
+            float(found[name].find('inertia').get(f'i{axis}')) for axis in ('xx', 'yy', 'zz')
+        ]
+        assert 2.0 * max(moments) <= sum(moments) * (1 + 1e-9), 'of no distribution of mass'
+    assert float(found['base'].find('inertia').get('izz')) == 0.03
+    assert float(found['left_hinge_link'].find('inertia').get('iyy')) == 6e-5
+    shapes = {link.get('name'): len(link.findall('collision')) for link in robot.findall('link')}
+    assert all(shapes[name] for name in heavy)
+
+
+def test_wheels_without_mass_have_no_inertia():
+    robot = ElementTree.fromstring(urdf(NAMES, GEOMETRY, SENSORS, MASSES._replace(wheel=0.0)))
+    assert len(robot.findall('link/inertial')) == 1
