@@ -6,7 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from t3mpc_ros.evaluation.simulated_links import DROPOUTS, JITTER, NO_FAULTS, OVERLOAD, LinkFaults
+from t3mpc_ros.evaluation.simulated_links import (
+    DROPOUTS,
+    HALF_RATE,
+    JITTER,
+    LATER,
+    LATER_AND_BACK,
+    NO_FAULTS,
+    OVERLOAD,
+    REPEATED,
+    SWAPPED,
+    LinkFaults,
+)
 from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters
 
 ROBOTS = ('twin', 'servo', 'torque')
@@ -33,10 +44,25 @@ class Case:
     links: LinkFaults = NO_FAULTS
     """Faults of the links; unknown to all methods."""
     gyro: bool = False
-    """Whether the baselines take the yaw rate from the odometry with its gyro, and the motion of
-    the body decides."""
+    """Whether the baselines take the yaw rate from the odometry with its gyro."""
+    body: bool = False
+    """Whether the motion of the body decides."""
     reproduced: bool = False
     """Whether it belongs to the reproduction of the paper."""
+
+
+def _geometry(text: str, **multipliers: float) -> Case:
+    """Return a case of a body that is unlike the nominal one, for which the gyro is needed."""
+    return Case(text, multipliers, robots=('twin',), gyro=True, body=True)
+
+
+def _gyro(
+    text: str,
+    changes: Mapping[str, object] | None = None,
+    later: Mapping[str, Mapping[str, float]] | None = None,
+) -> Case:
+    """Return a case of a faulty gyro on the exact robot: who does not use it does not err."""
+    return Case(text, changes or {}, later or {}, robots=('twin',), body=True)
 
 
 _HEAVIER = {'mass_factor': 1.3, 'inertia_factor': 1.3, 'friction_factor': 2.0}
@@ -57,6 +83,29 @@ CASES: Mapping[str, Case] = {
         },
         robots=('twin',),
         gyro=True,
+        body=True,
+    ),
+    'radii and track': _geometry(
+        'wheel radii +2 % and -1 %, track +3 %',
+        right_wheel_radius_multiplier=1.02,
+        left_wheel_radius_multiplier=0.99,
+        wheel_separation_multiplier=1.03,
+    ),
+    'track +6 %': _geometry('track +6 %', wheel_separation_multiplier=1.06),
+    'right radius +5 %': _geometry(
+        'radius of the right wheel +5 %', right_wheel_radius_multiplier=1.05
+    ),
+    'gyro scale +3 %': _gyro(
+        'the gyro turns 3 % too far: the bound of its data sheet, which is stated',
+        changes={'imu.gyro_scale_error': 0.03},
+    ),
+    'gyro bias jump': _gyro(
+        'at half of the run the bias of the gyro jumps by 0.05 rad/s',
+        later={'twin': {'gyro_bias_jump': 0.05}},
+    ),
+    'gyro dead': _gyro(
+        'from half of the run on the gyro does not respond',
+        later={'twin': {'gyro_dead': True}},
     ),
     'mass +30 %': Case(
         'body mass and inertia 30 % above nominal',
@@ -105,6 +154,16 @@ CASES: Mapping[str, Case] = {
         {'drive.dead_time': 0.06},
         robots=('twin', 'servo'),
     ),
+    'dead time +30 ms': Case(
+        'at half of the run commands begin to take 30 ms more',
+        links=LATER,
+        robots=('twin', 'servo'),
+    ),
+    'dead time +30 ms and back': Case(
+        'for 20 s from a third of the run on, commands take 30 ms more',
+        links=LATER_AND_BACK,
+        robots=('twin', 'servo'),
+    ),
     'dropouts': Case('10 % of the commands and 10 % of the measurements are lost', links=DROPOUTS),
     'jitter': Case(
         'each command is up to 20 ms late, and each measurement up to 10 ms', links=JITTER
@@ -112,6 +171,15 @@ CASES: Mapping[str, Case] = {
     'overload': Case(
         'for 4 s from half of the run on, each command and each measurement is 20 to 120 ms late',
         links=OVERLOAD,
+    ),
+    'swapped': Case(
+        'of 20 measurements each, one arrives after its successor', links=SWAPPED, robots=('twin',)
+    ),
+    'repeated': Case('each measurement arrives twice', links=REPEATED, robots=('twin',)),
+    'half rate': Case(
+        'measurements at 50 Hz, where every method expects 100 Hz',
+        links=HALF_RATE,
+        robots=('twin',),
     ),
 }
 """Every case by name, in the order of the tables."""

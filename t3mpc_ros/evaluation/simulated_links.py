@@ -25,7 +25,13 @@ class LinkFaults:
     odometry_loss: float = 0.0
     """Fraction of the measurements that is lost."""
     odometry_delay: tuple[float, float] = (0.0, 0.0)
-    """Least and largest delay of a measurement, s; they arrive in order."""
+    """Least and largest delay of a measurement, s; they arrive in order but for the swapped."""
+    odometry_swapped: int = 0
+    """Of so many measurements each the last arrives after its successor; 0: none."""
+    odometry_repeated: int = 1
+    """How often each measurement arrives."""
+    odometry_kept: int = 1
+    """Of so many measurements each only the last is sent: a lower rate than the nodes assume."""
     begin: float = 0.0
     """Begin of the faults, as a share of the run."""
     lasting: float = math.inf
@@ -40,13 +46,18 @@ class LinkFaults:
 NO_FAULTS = LinkFaults()
 DROPOUTS = LinkFaults(command_loss=0.1, odometry_loss=0.1)
 JITTER = LinkFaults(command_delay=(0.0, 0.02), odometry_delay=(0.0, 0.01))
+SWAPPED = LinkFaults(odometry_swapped=20)
+REPEATED = LinkFaults(odometry_repeated=2)
+HALF_RATE = LinkFaults(odometry_kept=2)
+LATER = LinkFaults(command_delay=(0.03, 0.03), begin=0.5)
+LATER_AND_BACK = LinkFaults(command_delay=(0.03, 0.03), begin=1.0 / 3.0, lasting=20.0)
 OVERLOAD = LinkFaults(
     command_delay=(0.02, 0.12), odometry_delay=(0.02, 0.12), begin=0.5, lasting=4.0
 )
 
 
 class ReportLink:
-    """Reports of a robot on their way to the driver; they arrive in order.
+    """Reports of a robot on their way to the driver; they arrive in order but for the swapped.
 
     Equal seeds draw equal numbers, whatever is sent; ``duration`` is that of the run, s.
     """
@@ -56,6 +67,8 @@ class ReportLink:
         self._begin, self._end = faults.span(duration)
         self._generator = np.random.default_rng((seed, 3))
         self._queue: deque[tuple[int, RobotState]] = deque()
+        self._sent = 0
+        self._overtaken: RobotState | None = None
 
     def send(self, state: RobotState) -> None:
         """Send a report; one that is not late arrives after those before it all the same."""
@@ -67,8 +80,19 @@ class ReportLink:
                 return
             least, most = self._faults.odometry_delay
             delay = least + (most - least) * late
+            self._sent += 1
+            if self._sent % self._faults.odometry_kept:
+                return
+            swapped = self._faults.odometry_swapped
+            if swapped and self._overtaken is None and self._sent % swapped == 0:
+                self._overtaken = state
+                return
         arrival += round(delay * NANOSECONDS)
-        self._queue.append((max(arrival, self._queue[-1][0] if self._queue else 0), state))
+        arrival = max(arrival, self._queue[-1][0] if self._queue else 0)
+        self._queue.extend([(arrival, state)] * self._faults.odometry_repeated)
+        if self._overtaken is not None:
+            self._queue.append((arrival, self._overtaken))
+            self._overtaken = None
 
     def arrived(self, now_ns: int) -> Iterator[tuple[int, RobotState]]:
         """Yield (arrival, report) of what has arrived by ``now_ns``."""
