@@ -33,8 +33,8 @@ from t3mpc_ros.evaluation.bag_report.run_data import load_run  # noqa: E402
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs  # noqa: E402
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller  # noqa: E402
 
-IGNORED = ('version', 'sources')
-"""Keys that say which code it was."""
+IGNORED = ('version', 'sources', 'origin', 'step_time_us')
+"""Keys that say which code it was, on which machine."""
 
 
 def command(*words: str, written: str = '') -> object:

@@ -3,6 +3,8 @@
 """``t3mpc compare``: the controller and every baseline on one robot, case by case."""
 
 import argparse
+from pathlib import Path
+import time
 from typing import TYPE_CHECKING
 
 from t3mpc_ros.cli import run_options
@@ -58,25 +60,33 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     )
     run_options.add_workers(parser)
     run_options.add_outputs(parser, json='write every number to this file')
+    parser.add_argument(
+        '--csv', type=Path, help='write a row for each run, with commit and machine'
+    )
     parser.set_defaults(run=run)
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the tables and return 0."""
     from t3mpc_ros.evaluation import comparison_page
-    from t3mpc_ros.evaluation.comparison import run_plan
+    from t3mpc_ros.evaluation.api.comparison_runs import Comparison
+    from t3mpc_ros.evaluation.api.table_files import columns_of, write_csv
+    from t3mpc_ros.evaluation.comparison import run_plan, step_times
     from t3mpc_ros.evaluation.experiment import print_report
 
     plan = _plan(options)
     run_options.prepare_outputs(options)
     with run_options.executor_of(options) as executor:
         results = run_plan(plan, executor, print_report)
-    print(comparison_page.markdown(plan, results))
+    times = step_times(plan, time.perf_counter_ns)
+    print(comparison_page.markdown(plan, results, times))
     run_options.write_outputs(
         options,
-        lambda: comparison_page.record(plan, results),
-        lambda: comparison_page.page(plan, results),
+        lambda: comparison_page.record(plan, results, times),
+        lambda: comparison_page.page(plan, results, times),
     )
+    if options.csv:
+        write_csv(options.csv, columns_of(Comparison(plan, results).rows()))
     return 0
 
 

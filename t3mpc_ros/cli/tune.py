@@ -67,12 +67,16 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
 
 def run(options: argparse.Namespace) -> int:
     """Tune every method, or identify the drive in a bag; print the result and return 0."""
-    from t3mpc_ros.evaluation.methods import method_definitions, require_libraries
+    from t3mpc_ros.evaluation.methods import (
+        further_definitions,
+        method_definitions,
+        require_libraries,
+    )
     from t3mpc_ros.parameters.table import find_names
 
     if options.robot not in (None, TWIN, *DRIVES):
         return _identify(options)
-    known = method_definitions()
+    known = [*method_definitions(), *further_definitions()]
     names = find_names('method', options.methods, [method.name for method in known])
     methods = [method for method in known if method.name in names or not names]
     require_libraries(method.name for method in methods)

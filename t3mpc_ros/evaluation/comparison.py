@@ -2,17 +2,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison of methods: a plan of cases, methods and seeds, and its experiment."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+import statistics
+from typing import Any, Protocol
 
+from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
-from t3mpc_ros.evaluation.loop import Method
+from t3mpc_ros.evaluation.loop import Driver, Method, run
 from t3mpc_ros.evaluation.methods import FEED_FORWARD
 from t3mpc_ros.evaluation.scenario import Scenario
+from t3mpc_ros.robot.interface import RobotCommand, RobotState
 
 QUICK_SEEDS = tuple(range(201, 207))
 """Default seeds: none of them was used for tuning, or is in a table of the paper's results."""
+
+
+class ComparedMethod(Method, Protocol):
+    """A method that states what it knows."""
+
+    def knowledge(self, scenario: Scenario) -> str:
+        """Return what it knows of robot and reference, for tables."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -22,7 +33,7 @@ class ComparisonPlan:
     scenario: Scenario
     """A run without its method; the others differ from it by case and seed."""
     cases: tuple[str, ...]
-    methods: Mapping[str, Method]
+    methods: Mapping[str, ComparedMethod]
     """By name, in the order of the tables."""
     seeds: tuple[int, ...] = QUICK_SEEDS
     against: str = FEED_FORWARD
@@ -54,6 +65,53 @@ class ComparisonPlan:
                     }
                     found.append(Run((scenario, method), row))
         return found
+
+
+StepTimes = Mapping[str, float]
+"""Median time of a step of each method, µs."""
+TIMED = 6.0
+"""Length of the run in which steps are timed, s."""
+
+
+def step_times(plan: ComparisonPlan, clock_ns: Callable[[], int]) -> StepTimes:
+    """Return the median time of a step of every method, µs, on this machine.
+
+    State estimate and limits are part of a step. It is no number of the runs: those depend on no
+    machine. Weights are not pretrained for it, they take no time.
+    """
+    case, seed = plan.cases[0], plan.seeds[0]
+    length = min(TIMED, plan.scenario.duration)
+    scenario = replace(plan.scenario, case=case, seed=seed, duration=length)
+    found = {}
+    for name, method in plan.methods.items():
+        if isinstance(method, MethodSpec):
+            method = replace(method, pretrained=False)
+        timed = TimedMethod(method, clock_ns)
+        run(scenario, timed)
+        found[name] = 1e-3 * statistics.median(timed.taken_ns)
+    return found
+
+
+class TimedMethod:
+    """A method whose driver is asked how long each step takes."""
+
+    def __init__(self, method: Method, clock_ns: Callable[[], int]) -> None:
+        self.name, self._method, self._clock_ns = method.name, method, clock_ns
+        self.taken_ns: list[int] = []
+
+    def driver(self, scenario: Scenario) -> Driver:
+        """Return a new driver."""
+        driver, clock_ns, taken_ns = self._method.driver(scenario), self._clock_ns, self.taken_ns
+        step = driver.step
+
+        def timed_step(state: RobotState) -> RobotCommand:
+            begin = clock_ns()
+            command = step(state)
+            taken_ns.append(clock_ns() - begin)
+            return command
+
+        driver.step = timed_step  # type: ignore[method-assign]
+        return driver
 
 
 def run_plan(plan: ComparisonPlan, workers: Any = 1, report: Report | None = None) -> ResultTable:

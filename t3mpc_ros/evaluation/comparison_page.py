@@ -2,18 +2,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables, HTML page and JSON record of a comparison."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from t3mpc_ros.evaluation.baselines.baseline_controller import EXACT_INERTIA, FRICTION
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
-from t3mpc_ros.evaluation.comparison import ComparisonPlan
-from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean
+from t3mpc_ros.evaluation.comparison import ComparisonPlan, StepTimes
+from t3mpc_ros.evaluation.confidence_intervals import Difference, holm, interval, mean
 from t3mpc_ros.evaluation.drivers import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, TWIN_ADVANCE
+from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, MODEL_ERROR
 from t3mpc_ros.evaluation.metrics import (
     DRIFT,
     METRICS,
@@ -21,6 +24,7 @@ from t3mpc_ros.evaluation.metrics import (
     SETTLED,
     START,
     STOPPED,
+    VARIATION,
     YAW_RATE,
     YAW_RATE_SETTLED,
     Metric,
@@ -39,19 +43,19 @@ from t3mpc_ros.evaluation.reporting import (
 )
 from t3mpc_ros.evaluation.scenario import (
     HELD_OUT_SEEDS,
+    LEAD,
     PRETRAINING_SEEDS,
     TUNING_SEEDS,
     Scenario,
 )
+from t3mpc_ros.parameters.provenance import machine, provenance
 from t3mpc_ros.version import VERSION
 
 BETTER, WORSE, INCONCLUSIVE = 'better', 'worse', 'inconclusive'
-"""Verdicts on a paired difference: its 95 % interval lies below zero, above it, or contains it."""
-OWN_KNOWLEDGE = (
-    'the Observation of each step: estimated speeds and disturbance, reference, and with preview '
-    'the reference 0.4 s ahead; a class with an argument model: the nominal model'
-)
-"""What a controller of one's own knows."""
+"""Verdicts on a paired difference: that it is below zero or above it, or that this is open."""
+LEVEL = 0.05
+"""Largest probability of one wrong verdict in a table."""
+Key = TypeVar('Key', bound=Hashable)
 
 
 def difference(
@@ -62,40 +66,92 @@ def difference(
     return None if first == second else results.difference(metric.name, first, second)
 
 
-def verdict(found: Difference) -> str:
-    """Return the verdict on a paired difference; a run that diverged is worse."""
-    if math.isnan(found.mean):
-        return WORSE
-    if not found.certain:
-        return INCONCLUSIVE
-    return BETTER if found.mean < 0.0 else WORSE
+def verdicts(differences: Mapping[Key, Difference | None], seeds: int) -> dict[Key, str]:
+    """Return the verdict on every paired difference of a table, with Holm's correction.
+
+    Each is the mean over as many ``seeds``. A run that diverged is worse; without a difference
+    there is no verdict.
+    """
+    found = {key: each for key, each in differences.items() if each is not None}
+    certain = holm({key: each.p_value(seeds) for key, each in found.items()}, LEVEL)
+    return {
+        key: WORSE
+        if math.isnan(each.mean)
+        else INCONCLUSIVE
+        if key not in certain
+        else BETTER
+        if each.mean < 0.0
+        else WORSE
+        for key, each in found.items()
+    }
+
+
+def case_differences(
+    plan: ComparisonPlan, results: ResultTable, case: str
+) -> dict[tuple[str, Metric], Difference | None]:
+    """Return the differences that a case is judged by, of every method and metric."""
+    return {
+        (method, metric): difference(plan, results, case, method, metric)
+        for method in plan.methods
+        for metric in judged_metrics(case)
+    }
+
+
+def case_verdicts(
+    plan: ComparisonPlan, results: ResultTable, case: str
+) -> dict[tuple[str, Metric], str]:
+    """Return the verdicts of the table of a case."""
+    return verdicts(case_differences(plan, results, case), len(plan.seeds))
 
 
 def judged_metrics(case: str) -> tuple[Metric, ...]:
     """Return the metrics that decide a case: of the wheels, or of the body if it is unknown."""
-    if CASES[case].gyro:
+    if CASES[case].body:
         return YAW_RATE_SETTLED, YAW_RATE, DRIFT
     return SETTLED, OVERALL
 
 
-def summary_table(plan: ComparisonPlan, results: ResultTable) -> Table:
-    """Return the first judged metric of every method and case, with its verdict."""
+def summary_table(
+    plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | None = None
+) -> Table:
+    """Return the first judged metric of every method and case, with its verdict.
+
+    Beside it the variation of the command in the first case, and the time of a step, µs.
+    """
+    firsts = {case: judged_metrics(case)[0] for case in plan.cases}
+    judged = verdicts(
+        {
+            (method, case): difference(plan, results, case, method, metric)
+            for method in plan.methods
+            for case, metric in firsts.items()
+        },
+        len(plan.seeds),
+    )
     rows = []
     for method in plan.methods:
         cells = [method]
-        for case in plan.cases:
-            metric = judged_metrics(case)[0]
-            found = difference(plan, results, case, method, metric)
-            average = mean(results.values(metric.name, case=case, controller=method))
-            text = 'diverged' if math.isnan(average) else f'{average:.{metric.digits}f}'
-            cells.append(text if found is None else f'{text} {verdict(found)}')
+        for case, metric in firsts.items():
+            cell = _cell(results.values(metric.name, case=case, controller=method), metric)
+            cells.append(f'{cell} {judged.get((method, case), "")}'.rstrip())
+        variation = results.values(VARIATION.name, case=plan.cases[0], controller=method)
+        cells.append(_cell(variation, VARIATION))
+        if step_times:
+            cells.append(f'{step_times[method]:.0f}')
         rows.append(tuple(cells))
-    body = [case for case in plan.cases if judged_metrics(case)[0] is not SETTLED]
+    body = [case for case, metric in firsts.items() if metric is not SETTLED]
     title = 'Settled RMSE of the wheel speeds, rad/s'
     if body:
         title += f' ({", ".join(body)}: of the yaw rate of the body)'
-    title += f'; verdict against {plan.against}'
-    return Table(title, ('method', *plan.cases), rows, (FULL,), wrap=True)
+    title += f'; mean ± half the 95 % interval (seeds); verdict against {plan.against}'
+    head = ['method', *plan.cases, f'{VARIATION.heading}, {plan.cases[0]}, {VARIATION.unit}']
+    head += ['step, µs'] if step_times else []
+    return Table(title, head, rows, (FULL,), wrap=True)
+
+
+def _cell(values: Sequence[float], metric: Metric) -> str:
+    """Return mean ± half the interval and the number of seeds."""
+    text = format_interval(mean(values), interval(values), '', metric.digits)
+    return f'{text} ({len(values)})'
 
 
 def case_table(plan: ComparisonPlan, results: ResultTable, case: str) -> Table:
@@ -116,74 +172,60 @@ def case_table(plan: ComparisonPlan, results: ResultTable, case: str) -> Table:
     if compared:
         for metric in judged:
             head += [f'{metric.heading} − {plan.against}', 'verdict']
+    head.append('knows')
+    differences = case_differences(plan, results, case)
+    judgement = verdicts(differences, len(plan.seeds))
     rows = []
     for method in plan.methods:
         cells = [method]
         for metric in metrics:
-            numbers = results.values(metric.name, case=case, controller=method)
-            cells.append(format_interval(mean(numbers), interval(numbers), '', metric.digits))
+            cells.append(_cell(results.values(metric.name, case=case, controller=method), metric))
         for metric in judged if compared else ():
-            found = difference(plan, results, case, method, metric)
+            found = differences[method, metric]
             if found is None:
                 cells += [EMPTY_CELL, EMPTY_CELL]
             else:
                 text = format_interval(found.mean, found.half, '+', metric.digits)
-                cells += [text, verdict(found)]
+                cells += [text, judgement[method, metric]]
+        cells.append(known_by(plan, method, case))
         rows.append(tuple(cells))
     title = f'{case}: {CASES[case].text}'
     return Table(title, head, rows, (FULL,), wrap=True)
 
 
+def known_by(plan: ComparisonPlan, method: str, case: str) -> str:
+    """Return what a method knows in a case, as it states."""
+    return plan.methods[method].knowledge(replace(plan.scenario, case=case))
+
+
 def knowledge_table(plan: ComparisonPlan) -> Table:
-    """Return what each kind of method knows."""
+    """Return what the words of the column *knows* mean."""
+    scenario = replace(plan.scenario, case=plan.cases[0])
+    model = scenario.nominal_model()
     rows = {
-        'all': 'noise variance, limits, lag and dead time of the estimator (the true dead time '
-        'only where the case says that it is known); state estimate and limits are the same for '
-        'all',
-        'with preview': 'the reference 0.4 s ahead: feed-forward, full, and what has preview in '
-        'its name or is an NMPC',
-        'predictive with preview': 'a model with 1.3 times the inertia of the body; "exact '
-        'model": that of the nominal robot',
+        'all': 'noise variance, limits, geometry, lag and dead time of the estimator (the true '
+        'dead time only where the case says that it is known); state estimate and limits are the '
+        'same for all but the controller of the node, which has its own of the same kind',
+        'reference ahead': f'the reference up to {LEAD:g} s ahead; "now": up to the present',
+        'wheel speeds': 'the measured ones; on the twin those of the step counters',
+        'their difference by the gyro': 'the difference of the wheel speeds is that of the yaw of '
+        'the odometry, which contains the gyro',
+        'estimate of the dead time': 'from commands and measured speeds, by one estimator',
+        f'{EXACT_INERTIA}; inertia × {MODEL_ERROR:g}': 'inertia of the nominal robot, or that '
+        'with an error: in the model of a prediction, or in the torques of a torque drive. '
+        'Where nothing is said, accelerations become torques by the exact one',
+        FRICTION: 'friction and turning of the nominal robot, as a function of the speeds',
+        'weights': 'learnt on the nominal robot before the run',
+        'parameters': f'tuned on other seeds with equal effort for {plan.scenario.kind.tuned_for}'
+        ' (t3mpc tune); gains with the ramp that were not tuned with it are those tuned without; '
+        f'{FULL} on the twin and the variants of {FEED_FORWARD} have their defaults',
     }
-    if plan.scenario.robot == 'twin':
-        scenario = Scenario('twin', 'nominal', 0)
-        model = scenario.nominal_model()
-        gyro = [name for name in plan.cases if plan.scenario.gyro or CASES[name].gyro] or [
-            'no case'
-        ]
-        rows |= {
-            FULL: 'the controller of the node with the parameters of the node for this robot, and '
-            'no learnt weights at the start; likewise with a part left out. It receives the '
-            'odometry as it is published: wheel speeds of the step counters, and a pose whose yaw '
-            'contains the gyro',
-            FEED_FORWARD: f'no measurement; the reference {1e3 * TWIN_ADVANCE:g} ms beyond the '
-            'dead time',
-            'baselines': 'parameters tuned for this robot, with equal effort (t3mpc tune --robot '
-            'twin); no learnt weights at the start. The model is '
-            f'a servo with a lag of {1e3 * model.lag:g} ms without friction, which is exact for '
-            'a stepper motor but for the oscillation of its rotor',
-            'gyro': f'{", ".join(gyro)}: every baseline takes the difference of its wheel speeds '
-            'from the yaw of the odometry, which contains the gyro; in other cases from the step '
-            'counters',
-        }
-    else:
-        rows |= {
-            FULL: 'the tuned parameters of this drive, and the weights of three pretraining runs '
-            'on the nominal robot; its stages and ablations likewise',
-            FEED_FORWARD: 'no measurement',
-            'baselines': 'the tuned parameters of this drive, with equal effort; adaptive ones '
-            'start with the weights of the same pretraining runs',
-        }
-    own = [
-        name
-        for name, method in plan.methods.items()
-        if not isinstance(method, MethodSpec | NodeMethod)
-    ]
-    if own:
-        rows[', '.join(own)] = OWN_KNOWLEDGE
-    return Table(
-        'What each method knows', ('method', 'knows'), list(rows.items()), text=2, wrap=True
-    )
+    if plan.scenario.kind.has_gyro:
+        rows['model'] = (
+            f'on the twin a servo with a lag of {1e3 * model.lag:g} ms without friction, which is '
+            'exact for a stepper motor but for the oscillation of its rotor'
+        )
+    return Table('What the methods know', ('word', 'means'), list(rows.items()), text=2, wrap=True)
 
 
 def description(plan: ComparisonPlan) -> str:
@@ -209,8 +251,9 @@ def description(plan: ComparisonPlan) -> str:
         )
     return text + (
         'Variation: total variation of the commanded acceleration per second and wheel. '
-        f'Differences from {plan.against} are paired by seed; better or worse: their 95 % '
-        'interval excludes zero.'
+        f"Differences from {plan.against} are paired by seed; better or worse by Student's test "
+        f"at {100.0 * LEVEL:g} % with Holm's correction over all comparisons of a table. In "
+        'brackets the number of seeds.'
     )
 
 
@@ -218,32 +261,42 @@ def _are_outside(seeds: Sequence[int]) -> bool:
     return not {*seeds} & {*TUNING_SEEDS, *PRETRAINING_SEEDS, *HELD_OUT_SEEDS}
 
 
-def markdown(plan: ComparisonPlan, results: ResultTable) -> str:
+def markdown(
+    plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | None = None
+) -> str:
     """Return all tables in Markdown."""
     tables = [
-        summary_table(plan, results),
+        summary_table(plan, results, step_times),
         *(case_table(plan, results, case) for case in plan.cases),
         knowledge_table(plan),
     ]
     return '\n\n'.join([description(plan), *(table.markdown() for table in tables)])
 
 
-def page(plan: ComparisonPlan, results: ResultTable) -> str:
+def page(plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | None = None) -> str:
     """Return the page as self-contained HTML."""
     blocks: list[Block] = []
-    caption = f'Difference from {plan.against}, with 95 % interval'
+    figures: Mapping[str, Callable[[ComparisonPlan, ResultTable, str], Any]] = {
+        f'Difference from {plan.against}, with 95 % interval': _draw_differences,
+        'Error against variation of the command; joined: no method is better in both': draw_pareto,
+        'Every seed, and the mean': draw_seeds,
+    }
     for case in plan.cases:
         blocks.append(Heading(case))
-        if picture := png_of(lambda of: _draw_differences(plan, results, of), case):
-            blocks.append(Picture(f'{caption}: {case}', picture, caption))
-        if case == plan.cases[0]:
-            blocks += [Contents(), Paragraph(description(plan)), summary_table(plan, results)]
+        for caption, draw in figures.items():
+            if picture := png_of(partial(draw, plan, results), case):
+                blocks.append(Picture(f'{caption}: {case}', picture, caption))
+            if draw is _draw_differences and case == plan.cases[0]:
+                summary = summary_table(plan, results, step_times)
+                blocks += [Contents(), Paragraph(description(plan)), summary]
         blocks.append(case_table(plan, results, case))
-    blocks += [Heading('What each method knows'), knowledge_table(plan)]
+    blocks += [Heading('What the methods know'), knowledge_table(plan)]
     return html_page(f'Comparison of methods: {plan.scenario.robot}', blocks)
 
 
-def record(plan: ComparisonPlan, results: ResultTable) -> dict[str, Any]:
+def record(
+    plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | None = None
+) -> dict[str, Any]:
     """Return plan, runs and differences for a JSON file; NaN where a run diverged."""
     cases: dict[str, Any] = {}
     for case in CASES:
@@ -253,6 +306,8 @@ def record(plan: ComparisonPlan, results: ResultTable) -> dict[str, Any]:
     return {
         'format': 1,
         'version': VERSION,
+        'origin': provenance() | machine(),
+        'step_time_us': dict(step_times or {}),
         'robot': plan.scenario.robot,
         'drive_of_tuning': plan.scenario.kind.tuned_for,
         'seeds': list(plan.seeds),
@@ -263,6 +318,7 @@ def record(plan: ComparisonPlan, results: ResultTable) -> dict[str, Any]:
         'parameters': {
             name: _parameters(plan.scenario.robot, method) for name, method in plan.methods.items()
         },
+        'knowledge': {name: known_by(plan, name, plan.cases[0]) for name in plan.methods},
         'cases': cases,
     }
 
@@ -282,6 +338,7 @@ def _method_record(
 ) -> dict[str, Any]:
     runs = results.where(case=case, controller=method)
     names = [metric.name for metric in METRICS if metric.name in runs[0]]
+    judgement = case_verdicts(plan, results, case)
     differences = {}
     for metric in METRICS:
         found = difference(plan, results, case, method, metric)
@@ -289,11 +346,12 @@ def _method_record(
             differences[metric.name] = {
                 'mean': found.mean,
                 'half_interval': found.half,
-                'verdict': verdict(found),
+                'p': found.p_value(len(plan.seeds)),
+                'verdict': judgement.get((method, metric), ''),
             }
     return {
         'mean': {name: mean([run[name] for run in runs]) for name in names},
-        'runs': [{name: run[name] for name in names} for run in runs],
+        'runs': [{name: run[name] for name in ('seed', *names)} for run in runs],
         f'difference_from_{plan.against.replace("-", "_")}': differences,
     }
 
@@ -312,12 +370,73 @@ def _draw_differences(plan: ComparisonPlan, results: ResultTable, case: str) -> 
     axis = figure.subplots()
     places = np.arange(len(rows))[::-1]
     colours = {BETTER: '#15803d', WORSE: '#be123c', INCONCLUSIVE: '#6b7280'}
-    for place, (_, found) in zip(places, rows, strict=True):
+    judgement = case_verdicts(plan, results, case)
+    for place, (method, found) in zip(places, rows, strict=True):
         half = found.half if math.isfinite(found.half) else 0.0
-        colour = colours[verdict(found)]
+        colour = colours[judgement[method, metric]]
         axis.errorbar(found.mean, place, xerr=half, fmt='o', color=colour, markersize=4)
     axis.axvline(0.0, color='#1f2937', linewidth=0.8)
     axis.set_yticks(places, [name for name, _ in rows])
     axis.set_xscale('symlog', linthresh=0.01)
+    axis.set_xlabel(f'{metric.heading} / ({metric.unit})')
+    return figure
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Return the indices of the points that no other is below in both numbers, by the first."""
+    found: list[int] = []
+    for i in sorted(range(len(points)), key=lambda i: points[i]):
+        if not found or points[i][1] < points[found[-1]][1]:
+            found.append(i)
+    return found
+
+
+def draw_pareto(plan: ComparisonPlan, results: ResultTable, case: str) -> Any:
+    """Return a figure of the first judged metric against the variation, or None."""
+    metric = judged_metrics(case)[0]
+    chosen, points = [], []
+    for method in plan.methods:
+        variation, error = (
+            mean(results.values(name, case=case, controller=method))
+            for name in (VARIATION.name, metric.name)
+        )
+        if math.isfinite(variation) and math.isfinite(error):
+            chosen.append(method)
+            points.append((variation, error))
+    if len(points) < 2:
+        return None
+    figure = new_figure(3.6)
+    axis = figure.subplots()
+    best = front(points)
+    axis.step(*zip(*(points[i] for i in best), strict=True), where='post', color='#9ca3af')
+    for i, (method, point) in enumerate(zip(chosen, points, strict=True)):
+        axis.plot(*point, 'o', color='#15803d' if i in best else '#6b7280', markersize=4)
+        axis.annotate(method, point, xytext=(3, 3), textcoords='offset points', fontsize=6)
+    axis.set_xscale('log')
+    axis.set_yscale('log')
+    axis.set_xlabel(f'{VARIATION.heading} / ({VARIATION.unit})')
+    axis.set_ylabel(f'{metric.heading} / ({metric.unit})')
+    return figure
+
+
+def draw_seeds(plan: ComparisonPlan, results: ResultTable, case: str) -> Any:
+    """Return a figure of the first judged metric of every seed and method, or None."""
+    metric = judged_metrics(case)[0]
+    rows = {
+        method: [each for each in values if math.isfinite(each)]
+        for method in plan.methods
+        if (values := results.values(metric.name, case=case, controller=method))
+    }
+    rows = {method: values for method, values in rows.items() if values}
+    if not rows:
+        return None
+    figure = new_figure(0.9 + 0.2 * len(rows))
+    axis = figure.subplots()
+    places = np.arange(len(rows))[::-1]
+    for place, values in zip(places, rows.values(), strict=True):
+        axis.plot(values, np.full(len(values), place), '|', color='#0284c7', markersize=8)
+        axis.plot(mean(values), place, 'o', color='#1f2937', markersize=4)
+    axis.set_yticks(places, list(rows))
+    axis.set_xscale('log')
     axis.set_xlabel(f'{metric.heading} / ({metric.unit})')
     return figure

@@ -2,15 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Means over seeds with Student's confidence intervals, and paired differences."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from functools import lru_cache
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Values = Sequence[float] | NDArray[np.float64]
+Key = TypeVar('Key', bound=Hashable)
 
 
 class Difference(NamedTuple):
@@ -24,6 +25,18 @@ class Difference(NamedTuple):
     def certain(self) -> bool:
         """Whether the interval leaves zero out."""
         return abs(self.mean) > self.half
+
+    def p_value(self, n: int) -> float:
+        """Return the p-value of Student's test that the mean of ``n`` differences is zero.
+
+        The interval is that of 95 %; 1 for fewer than two differences, or if it is not finite.
+        """
+        if n < 2 or not math.isfinite(self.mean + self.half):
+            return 1.0
+        if self.half == 0.0:
+            return 1.0 if self.mean == 0.0 else 0.0
+        t = abs(self.mean) / self.half * student_quantile(n - 1)
+        return 1.0 - _within(math.atan(t / math.sqrt(n - 1)), n - 1)
 
 
 def mean(values: Values) -> float:
@@ -58,6 +71,21 @@ def paired(a: Values, b: Values, confidence: float = 0.95) -> Difference:
         raise ValueError(f'paired values must be equally many: got {len(a)} and {len(b)}')
     differences = [x - y for x, y in zip(a, b, strict=True)]
     return Difference(mean(differences), interval(differences, confidence))
+
+
+def holm(p_values: Mapping[Key, float], level: float = 0.05) -> set[Key]:
+    """Return which of several hypotheses are rejected, at most one in 1/level tables wrongly.
+
+    The smallest of m p-values must be at most level/m, the next one level/(m - 1), and so on up to
+    the first that is not (Holm 1979).
+    """
+    rejected: set[Key] = set()
+    ordered = sorted(p_values.items(), key=lambda item: item[1])
+    for rank, (key, p) in enumerate(ordered):
+        if p > level / (len(ordered) - rank):
+            break
+        rejected.add(key)
+    return rejected
 
 
 @lru_cache(maxsize=1024)

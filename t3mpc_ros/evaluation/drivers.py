@@ -8,7 +8,7 @@ has its own.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 import math
 from typing import NamedTuple
@@ -152,7 +152,7 @@ class MethodDriver:
             self._model.drive,
             self._model.period,
         )
-        self._inertia = wheel_inertia(robot.body, robot.geometry)
+        self._inertia: Array = wheel_inertia(robot.body, robot.geometry)
         self._torque_limit = robot.drive.torque_limit
         self._enabled = True
         self.reason = ''
@@ -164,10 +164,15 @@ class MethodDriver:
         self._dead_time: DeadTimeEstimator | None = None
         self._observed = -1
         """Period of the last report."""
+        self._observed_ns = 0
+        """Its stamp, ns."""
         self._yaw = 0.0
         """Its yaw, rad."""
+        self._yaw_rate = math.nan
+        """Mean yaw rate of the odometry up to it, rad/s."""
         self._acceleration = np.zeros(2)
         self._limited = False
+        self._sent = ZERO_WHEEL_SPEEDS
 
     @property
     def signals(self) -> Signals:
@@ -196,13 +201,20 @@ class MethodDriver:
             return RobotCommand(ZERO_WHEEL_SPEEDS, state.stamp_ns)
         k = round(state.stamp_ns * RATE / NANOSECONDS)
         elapsed = k - self._observed if self._observed >= 0 else 1
-        measured = self._measured(state, elapsed)
+        if elapsed <= 0:  # repeated, or overtaken by a later one
+            return RobotCommand(self._sent, self._observed_ns)
+        self._yaw_rate = math.nan
+        if self._observed >= 0:
+            turned = wrap_angle(state.odometry.pose.yaw - self._yaw)
+            self._yaw_rate = turned / (elapsed * self._model.period)
+        measured = self._measured(state)
         if self._controller is None:
             self._actuation.reset(measured)
             self._controller = self._new_controller(measured)
         elif self._dead_time is not None:
             self._update_dead_time(self._dead_time, measured, elapsed)
-        self._observed, self._yaw = k, state.odometry.pose.yaw
+        self._observed, self._observed_ns = k, state.stamp_ns
+        self._yaw = state.odometry.pose.yaw
         asked, cut = self._limited_torque(self._answer(self._controller, k, measured, elapsed))
         if not np.isfinite(asked).all():
             return RobotCommand(WheelSpeeds(math.nan, math.nan), state.stamp_ns)
@@ -211,8 +223,9 @@ class MethodDriver:
         self._controller.applied(self._acceleration, limited=self._limited)
         sent = self._actuation.command
         if self._model.drive == 'torque':
-            sent = np.dot(self._inertia, self._acceleration)
-        return RobotCommand(WheelSpeeds(*sent.tolist()), state.stamp_ns)
+            sent = np.dot(self._believed_inertia, self._acceleration)
+        self._sent = WheelSpeeds(*sent.tolist())
+        return RobotCommand(self._sent, state.stamp_ns)
 
     def _new_controller(self, measured: Array) -> BaselineController:
         controller, seam = self._method(self._model), self._actuation
@@ -224,24 +237,29 @@ class MethodDriver:
             preview=controller.preview,
         )
         self._late = self._reference.late
+        self._believed_inertia = controller.inertia_error * self._inertia
         if controller.estimate_dead_time and seam.takes_speeds:
+            filtered, friction = seam.speed_filter.parameters, self._model.robot.friction
+            # The pulses of a stepper ramp over a period, half a period late on average.
             self._dead_time = DeadTimeEstimator(
-                seam.speed_filter.parameters, self._model.period, mean_speeds=False, friction=True
+                replace(filtered, lag=max(filtered.lag, 0.5 * self._model.period)),
+                self._model.period,
+                mean_speeds=self._scenario.kind.mean_speeds,
+                friction=max(friction.viscous, friction.coulomb) > 0.0,
             )
             self._dead_time.reset(measured)
         return controller
 
-    def _measured(self, state: RobotState, elapsed: int) -> Array:
+    def _measured(self, state: RobotState) -> Array:
         """Return the measured wheel speeds, rad/s, shape (2,).
 
         With the gyro, their difference is that of the yaw rate of the odometry's pose.
         """
         if not self._scenario.uses_gyro or self._observed < 0:
             return np.array(state.wheels)
-        turned = wrap_angle(state.odometry.pose.yaw - self._yaw)
-        geometry, period = self._model.robot.geometry, self._model.period
+        geometry = self._model.robot.geometry
         mean = 0.5 * (state.wheels.right + state.wheels.left)
-        half = turned / (elapsed * period) * geometry.half_separation / geometry.wheel_radius
+        half = self._yaw_rate * geometry.half_separation / geometry.wheel_radius
         return np.array([mean + half, mean - half])
 
     def _update_dead_time(
@@ -272,6 +290,7 @@ class MethodDriver:
                 future,
                 elapsed,
                 self._late,
+                self._yaw_rate,
             )
         )
 
@@ -279,17 +298,21 @@ class MethodDriver:
         """Return accelerations that a torque drive can give, and whether they were cut."""
         if self._model.drive != 'torque':
             return asked, False
-        (diagonal, beside), (right, left) = self._inertia[0].tolist(), asked.tolist()
+        inertia = self._believed_inertia
+        (diagonal, beside), (right, left) = inertia[0].tolist(), asked.tolist()
         limit = self._torque_limit
         if not limit < max(
             abs(diagonal * right + beside * left), abs(beside * right + diagonal * left)
         ):
             return asked, False
-        torque = np.clip(self._inertia @ asked, -limit, limit)
-        return np.asarray(np.linalg.solve(self._inertia, torque), dtype=np.float64), True
+        torque = np.clip(inertia @ asked, -limit, limit)
+        return np.asarray(np.linalg.solve(inertia, torque), dtype=np.float64), True
 
 
 # -- methods ------------------------------------------------------------------------------------
+
+SEPARATOR = '; '
+"""Between the parts of what a method knows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,6 +346,16 @@ class MethodSpec:
                 pretrain(self.controller_type, self.parameters, nominal_model.drive)
             )
         return controller
+
+    def knowledge(self, scenario: Scenario) -> str:
+        """Return what it knows, as its controller states."""
+        controller = self.controller_type(self.parameters, scenario.nominal_model())
+        known = controller.knowledge
+        if scenario.uses_gyro and 'wheel speeds' in known:
+            known.append('their difference by the gyro')
+        if self.pretrained and controller.get_weights():
+            known.append(f'weights of {len(PRETRAINING_SEEDS)} runs')
+        return SEPARATOR.join(dict.fromkeys(known))
 
     @property
     def preview(self) -> bool:
@@ -370,6 +403,17 @@ class NodeMethod:
 
     name: str
     changes: Mapping[str, object]
+
+    def knowledge(self, scenario: Scenario) -> str:
+        """Return what it knows."""
+        parameters = self.parameters_for(scenario)
+        known = [f'reference {"ahead" if parameters.jump_transition.preview else "now"}']
+        known += ['wheel speeds', 'yaw rate of the gyro and tolerance of its scale']
+        if parameters.estimate_dead_time:
+            known.append('estimate of the dead time')
+        if any(parameters.command_shaper.delays):
+            known.append('frequencies of the rotors')
+        return SEPARATOR.join(known)
 
     def parameters_for(self, scenario: Scenario) -> ControllerParameters:
         """Return its parameters in a run."""

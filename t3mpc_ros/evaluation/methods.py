@@ -5,17 +5,25 @@
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module
+from typing import TypeVar
 
+from t3mpc_ros.control.command_shaper import CommandShaperParameters
 from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import AdaptiveIntervalType2, AdaptiveType1
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
     DynamicMatrix,
     DynamicMatrixPreview,
 )
-from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
+from t3mpc_ros.evaluation.baselines.feed_forward import (
+    FeedForward,
+    FeedForwardParameters,
+    LmsBodyCorrection,
+    LmsBodyCorrectionParameters,
+)
 from t3mpc_ros.evaluation.baselines.feedback_control import (
     ComputedTorque,
     DisturbanceRejection,
+    FeedbackBaseline,
     ProportionalIntegral,
     SlidingMode,
 )
@@ -31,16 +39,26 @@ from t3mpc_ros.parameters.table import Parameters
 
 FULL = 'full'
 NMPC = 'CasADi NMPC'
+OFFSET_FREE = 'offset-free MPC'
+RAMP = ' + ramp'
+"""Suffix of the name of a feedback baseline with the preview and the ramp of the controller."""
 EXACT_MODEL = ', exact model'
 """Suffix of the name of a method whose model has no error."""
 MODEL_ERROR = 1.3
 """Ratio of model inertia to true inertia of the predictive baselines with preview."""
+FULL_WRONG = f'{FULL}, inertia × {MODEL_ERROR:g}'
+"""The full controller with this error, on the torque drive."""
+Tunable = TypeVar('Tunable', bound=Parameters)
 
 FEED_FORWARD = 'feed-forward'
 """The method with which every other is compared."""
-TWIN_ADVANCE = 0.0095
-"""Lead of feed-forward over the dead time on the twin, s: its pulse generator ramps to a command
-during the whole period that follows, and its rotors have hardly any lag."""
+SHAPED = 'feed-forward + shaper'
+SHAPED_IN_TIME = 'feed-forward + shaper + dead time'
+IN_TIME = 'feed-forward + dead time'
+LMS = 'LMS body correction'
+TWIN_ADVANCE = 0.0104
+"""Lead of feed-forward over the dead time on the twin, s: T/(1 - exp(-T/lag)), by which the law of
+the controller is ahead when its feedback cancels the measured speed."""
 
 STAGES: Mapping[str, Mapping[str, object]] = {
     'feedback': {
@@ -177,8 +195,43 @@ def proposed_parameters() -> dict[str, Parameters]:
     return {'torque': torque, 'velocity': velocity}
 
 
+def further_definitions() -> list[MethodDefinition]:
+    """Return the tunable methods that are in comparisons and not in the paper's study.
+
+    Feedback baselines with the preview and the ramp of the controller; linear MPC that knows the
+    exact inertia and estimates the disturbance by itself; the simplest correction of the body.
+    """
+    found = []
+    for name, kind, changes, ranges in _BASELINES:
+        if issubclass(kind, FeedbackBaseline):
+            start = kind.parameters_type().with_values(
+                {**changes, 'jump_transition.preview': True}
+            )
+            starts = {drive: _with_ramp_of(drive, start) for drive in PLANT_OF}
+            found.append(MethodDefinition(name + RAMP, kind, starts, ranges))
+    free = LinearMpcPreview.parameters_type().with_values({**_PLAIN, 'disturbance_share': 0.0})
+    ranges = tuple(each for each in _MPC if each.name != 'disturbance_share')
+    starts = dict.fromkeys(PLANT_OF, free)
+    found.append(MethodDefinition(OFFSET_FREE, LinearMpcPreview, starts, ranges))
+    lms = feed_forward_on_the_twin(LmsBodyCorrectionParameters)
+    ranges = (SearchRange('learning_rate', 1e-4, 1.0),)
+    return [*found, MethodDefinition(LMS, LmsBodyCorrection, {'twin': lms}, ranges)]
+
+
+def feed_forward_on_the_twin(table: type[FeedForwardParameters]) -> FeedForwardParameters:
+    """Return the parameters of a feed-forward with the shaper of the node and its dead time."""
+    shaper = CommandShaperParameters()
+    return table(advance=TWIN_ADVANCE, estimate_dead_time=True, command_shaper=shaper)
+
+
+def _with_ramp_of(drive: str, parameters: Tunable) -> Tunable:
+    """Return the parameters with the ramp of the proposed controller on a drive."""
+    ramp = proposed_parameters()[drive].to_dict()['jump_transition.acceleration']
+    return parameters.with_values({'jump_transition.acceleration': ramp})
+
+
 def methods(drive: str, store: TunedParameters | None = None) -> dict[str, MethodSpec]:
-    """Return every compared method by name, with its tuned parameters.
+    """Return every method of the paper's study by name, with its tuned parameters.
 
     StoreError: a method was not tuned in this drive, what is stored does not fit it any more, or
     the methods were not tuned with equal effort.
@@ -200,6 +253,33 @@ def methods(drive: str, store: TunedParameters | None = None) -> dict[str, Metho
     return found
 
 
+def further_methods(drive: str) -> dict[str, MethodSpec]:
+    """Return the methods of :func:`further_definitions` on the paper's plant.
+
+    With the ramp, gains that were not tuned with it are those tuned without.
+    """
+    tuned = TunedParameters.load(PACKAGED_FILE)
+    return {
+        each.name: MethodSpec(
+            each.name,
+            each.controller_type,
+            tuned_parameters(tuned, each.name, drive, each.start[drive]),
+            True,
+        )
+        for each in further_definitions()
+        if drive in each.start
+    }
+
+
+def tuned_parameters(tuned: TunedParameters, name: str, drive: str, start: Tunable) -> Tunable:
+    """Return ``start`` with what was tuned for a method, else for the one that it is made of."""
+    exact = name.removesuffix(EXACT_MODEL)
+    for each in (exact, exact.removesuffix(RAMP)):
+        if (each, drive) in tuned:
+            return tuned.applied(each, drive, start)
+    return start
+
+
 def _proposed_methods(full: Parameters) -> dict[str, MethodSpec]:
     return {
         name: MethodSpec(name, ProposedController, full.with_values(changes), True, baseline=False)
@@ -210,20 +290,28 @@ def _proposed_methods(full: Parameters) -> dict[str, MethodSpec]:
 @cache
 def methods_for(robot: str) -> Mapping[str, MethodSpec | NodeMethod]:
     """Return the methods of a robot by name; the first one is the full controller."""
-    table = methods(KINDS[robot].drive)
+    drive = KINDS[robot].drive
+    table, further = methods(drive), further_methods(drive)
     forward = MethodSpec(FEED_FORWARD, FeedForward, feed_forward_parameters(robot))
-    ordered: dict[str, MethodSpec | NodeMethod]
-    ordered = {FULL: table[FULL], FEED_FORWARD: forward, **table}
-    return _twin_methods(table, forward) if robot == 'twin' else ordered
+    if robot == 'twin':
+        return _twin_methods(table | further, forward)
+    found: dict[str, MethodSpec | NodeMethod] = {FULL: table[FULL], FEED_FORWARD: forward}
+    if drive == 'velocity':
+        values = {'estimate_dead_time': True}
+        parameters = forward.parameters.with_values(values)
+        found[IN_TIME] = MethodSpec(IN_TIME, FeedForward, parameters)
+    else:
+        wrong = table[FULL].parameters.with_values({'inertia_error': MODEL_ERROR})
+        found[FULL_WRONG] = MethodSpec(FULL_WRONG, ProposedController, wrong, True, baseline=False)
+    return found | table | further
 
 
 def feed_forward_parameters(robot: str) -> FeedForwardParameters:
     """Return the parameters of feed-forward on a robot."""
     if robot == 'twin':
         return FeedForwardParameters(advance=TWIN_ADVANCE)
-    if robot == 'torque':  # the ramp that the other methods with preview have there
-        return FeedForwardParameters().with_values({'jump_transition.acceleration': 200.0})
-    return FeedForwardParameters()
+    # The ramp that the other methods with preview have there.
+    return _with_ramp_of(KINDS[robot].drive, FeedForwardParameters())
 
 
 def _twin_methods(
@@ -235,17 +323,20 @@ def _twin_methods(
     Baselines have the parameters tuned for the twin; those of a baseline that was not are its
     :func:`twin_start`.
     """
-    tuned = TunedParameters.load()
+    tuned, twin = TunedParameters.load(), KINDS['twin'].tuned_for
+    in_time = feed_forward_on_the_twin(FeedForwardParameters)
+    shaped = in_time.with_values({'estimate_dead_time': False})
+    lms = feed_forward_on_the_twin(LmsBodyCorrectionParameters)
     found: dict[str, MethodSpec | NodeMethod] = {
         FULL: NodeMethod(FULL, {}),
         FEED_FORWARD: forward,
+        SHAPED: MethodSpec(SHAPED, FeedForward, shaped),
+        SHAPED_IN_TIME: MethodSpec(SHAPED_IN_TIME, FeedForward, in_time),
+        LMS: MethodSpec(LMS, LmsBodyCorrection, tuned_parameters(tuned, LMS, twin, lms)),
     }
     for name, method in table.items():
         if method.baseline:
-            parameters = twin_start(method.parameters)
-            tuned_name = name.removesuffix(EXACT_MODEL)
-            if (tuned_name, KINDS['twin'].tuned_for) in tuned:
-                parameters = tuned.applied(tuned_name, KINDS['twin'].tuned_for, parameters)
+            parameters = tuned_parameters(tuned, name, twin, twin_start(method.parameters))
             found[name] = MethodSpec(name, method.controller_type, parameters)
     return found | {name: NodeMethod(name, changes) for name, changes in TWIN_PARTS.items()}
 
@@ -263,6 +354,11 @@ def twin_start(parameters: Parameters) -> Parameters:
 
 
 def default_methods(robot: str) -> tuple[str, ...]:
-    """Return the full controller and every baseline, without stages and ablations."""
+    """Return the full controller and every baseline, without stages and ablations.
+
+    Of a baseline that can use preview it is the variant with it.
+    """
+    known = methods_for(robot)
     parts = {*STAGES, *WITHOUT, *TWIN_PARTS} - {FULL}
-    return tuple(name for name in methods_for(robot) if name not in parts)
+    without = {name for name in known if {name + RAMP, f'{name} preview'} & {*known}}
+    return tuple(name for name in known if name not in parts | without)

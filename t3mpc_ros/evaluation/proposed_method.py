@@ -30,6 +30,11 @@ class ProposedParameters(Nt3fsMpcParameters):
     estimate_dead_time: bool = parameter(
         True, 'whether the dead time of a velocity drive is estimated, and the estimate used'
     )
+    inertia_error: float = parameter(
+        1.0,
+        'inertia by which accelerations become the torques of a torque drive, over the true one',
+        bounds=(0.1, 10.0),
+    )
     random_predictor: bool = parameter(
         False,
         'replace the trained output weights of the predictor by random ones, without learning: '
@@ -59,6 +64,7 @@ class ProposedController(BaselineController):
         if self._random is not None:
             self._randomize_predictor(self._random)
         self.estimate_dead_time = table.estimate_dead_time
+        self.inertia_error = table.inertia_error
         self._begun = False
         self._steps = 0
         """Control periods since the first observation."""

@@ -258,6 +258,8 @@ class RobotKind:
     shortest = 1.0 / RATE
     """Lower bound of the duration of a run, s."""
     has_gyro = False
+    mean_speeds = False
+    """Whether a measured speed is the mean over the last period, as from counters of steps."""
 
     def __init__(self, text: str, drive: str) -> None:
         self.text, self.drive = text, drive
@@ -338,6 +340,7 @@ class TwinKind(RobotKind):
     settling = (0.5, 1.0)  # its rotors ring longer than the wheels of the plant
     shortest = 2.0
     has_gyro = True
+    mean_speeds = True
 
     def __init__(self, text: str) -> None:
         super().__init__(text, 'velocity')

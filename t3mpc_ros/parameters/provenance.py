@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Version and commit of the running package, for bags and reports."""
 
+import contextlib
+import os
 from pathlib import Path
 import platform
 import subprocess
@@ -22,6 +24,19 @@ def provenance(package: Path = PACKAGE_DIRECTORY) -> dict[str, str]:
         'commit': _commit(package),
         'python': platform.python_version(),
     }
+
+
+def machine() -> dict[str, str]:
+    """Return processor and operating system, without the name of the machine."""
+    processor = platform.machine()
+    with contextlib.suppress(OSError):
+        for line in Path('/proc/cpuinfo').read_text(encoding='utf-8').splitlines():
+            name, _, value = line.partition(':')
+            if name.strip() == 'model name':
+                processor = value.strip()
+                break
+    cores = os.cpu_count() or 1
+    return {'machine': f'{processor}, {cores} processors, {platform.system()}'}
 
 
 def _commit(package: Path) -> str:

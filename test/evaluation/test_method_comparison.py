@@ -31,7 +31,7 @@ from t3mpc_ros.evaluation.comparison_page import (
     difference,
     judged_metrics,
     record,
-    verdict,
+    verdicts,
 )
 from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeDriver
 from t3mpc_ros.evaluation.experiment import ResultTable, measured_run
@@ -244,8 +244,8 @@ def test_the_yaw_of_the_odometry_is_the_gyro_measurement():
         for stamp, pose in ((2_000_000_000, ORIGIN), (2_010_000_000, Pose(0.001, 0.0, 0.003))):
             odometry = State(stamp, pose, BodyTwist(0.1, 0.5))
             state = robot.advance(0)._replace(stamp_ns=stamp, wheels=wheels, odometry=odometry)
-            measured = driver._measured(state, 1)
             driver.step(state)
+            measured = driver._measured(state)
         twist = twist_from_wheels(WheelSpeeds(*measured), geometry)
         assert twist.linear == pytest.approx(0.1)
         assert twist.angular == pytest.approx(0.3 if gyro else 0.5)
@@ -333,7 +333,7 @@ def test_differences_are_paired_with_their_verdict():
         return difference(plan, ResultTable(rows), NOMINAL, method, SETTLED)
 
     def judged(mine, other):
-        return verdict(found(mine, other))
+        return verdicts({0: found(mine, other)}, len(mine))[0]
 
     assert judged([1.1, 2.1, 3.1], [1.0, 2.0, 3.0]) == WORSE
     assert judged([0.9, 1.91, 2.9], [1.0, 2.0, 3.0]) == BETTER
@@ -357,6 +357,9 @@ class Diverging:
     parameters = ProportionalIntegralParameters()
     settings = (('gain', 3.0), ('law', object))
 
+    def knowledge(self, scenario):
+        return 'nothing'
+
     def driver(self, scenario):
         kind = NotFinite if scenario.seed == 2 else ProportionalIntegral
         return MethodDriver(lambda model: kind(self.parameters, model), scenario)
@@ -379,7 +382,7 @@ def test_a_seed_that_diverges_makes_every_mean_diverge(first):
     found = record(plan, results)
     assert found['parameters']['diverging'] == {'gain': 3.0, 'law': "<class 'object'>"}
     stored = found['cases'][NOMINAL]['methods']['diverging']
-    assert stored['difference_from_feed_forward'][YAW_RATE.name]['verdict'] == WORSE
+    assert stored['difference_from_feed_forward'][SETTLED.name]['verdict'] == WORSE
 
 
 def test_a_plan_has_every_case_and_seed_of_every_method():
@@ -423,10 +426,10 @@ def test_the_command_writes_tables_json_and_page(tmp_path, capsys):
     assert mean == pytest.approx(sum(run[SETTLED.name] for run in runs) / 2)
     assert re.search(rf'\| {re.escape(PI)} \| {mean:.4f} ', text.out)
     page = files[1].read_text()
-    assert page.count('<img ') == 2
+    assert page.count('<img ') == 6
     assert page.index('<img ') < page.index('<nav') < page.index('<table')
     assert 'http' not in page.replace('http-equiv', '')
-    assert 'What each method knows' in page
+    assert 'What the methods know' in page
 
 
 def test_seeds_are_a_range_or_one():

@@ -13,7 +13,16 @@ from t3mpc_ros.evaluation.baselines.feedback_control import ProportionalIntegral
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.drivers import NodeMethod
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.methods import EXACT_MODEL, FULL, method_definitions, methods_for
+from t3mpc_ros.evaluation.methods import (
+    EXACT_MODEL,
+    FULL,
+    LMS,
+    OFFSET_FREE,
+    RAMP,
+    further_definitions,
+    method_definitions,
+    methods_for,
+)
 from t3mpc_ros.evaluation.metrics import OVERALL, VARIATION, measure
 from t3mpc_ros.evaluation.record import rolling_speeds
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
@@ -147,12 +156,25 @@ def test_every_method_was_tuned_on_the_twin_alike(definitions):
             assert each.low <= entry.values[each.name] <= each.high
 
 
+def test_the_correction_of_the_body_was_tuned_alike():
+    (lms,) = (each for each in twin_definitions(further_definitions()) if each.name == LMS)
+    entry = TunedParameters.load().entry(LMS, TWIN)
+    assert entry.tuned == lms.space.names
+    assert entry.objective <= entry.start_objective
+    assert lms.start[TWIN].estimate_dead_time
+
+
 def test_the_comparison_uses_the_parameters_for_the_twin():
     store, found = TunedParameters.load(), methods_for('twin')
     for name, method in found.items():
-        if isinstance(method, NodeMethod) or name == 'feed-forward':
+        if isinstance(method, NodeMethod) or name.startswith('feed-forward'):
             continue
-        entry = store.entry(name.removesuffix(EXACT_MODEL), TWIN)
+        tuned = [each for each in (name.removesuffix(EXACT_MODEL), name.removesuffix(RAMP))
+                 if (each, TWIN) in store]  # fmt: skip
+        if not tuned:
+            assert name == OFFSET_FREE
+            continue
+        entry = store.entry(tuned[0], TWIN)
         values = method.parameters.to_dict()
         assert {one: values[one] for one in entry.tuned} == {
             one: entry.values[one] for one in entry.tuned

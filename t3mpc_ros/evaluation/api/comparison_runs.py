@@ -21,7 +21,7 @@ from t3mpc_ros.evaluation.experiment import ResultTable, print_report
 from t3mpc_ros.evaluation.metrics import METRICS, Metric
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
-from t3mpc_ros.parameters.provenance import provenance
+from t3mpc_ros.parameters.provenance import machine, provenance
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
@@ -79,7 +79,7 @@ class Comparison:
 
     def rows(self) -> list[dict[str, Any]]:
         """Return one row for each run: controller, case, seed, setting, metrics, provenance."""
-        origin = provenance()
+        origin = provenance() | machine()
         return [row | origin for row in self.results]
 
     @one_sentence

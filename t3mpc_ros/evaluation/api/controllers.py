@@ -23,8 +23,8 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
     Observation,
 )
+from t3mpc_ros.evaluation.comparison import ComparedMethod
 from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeMethod
-from t3mpc_ros.evaluation.loop import Method
 from t3mpc_ros.evaluation.methods import methods_for, require_libraries
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.types import Array
@@ -33,6 +33,8 @@ from t3mpc_ros.parameters.table import Parameters, find_names
 
 Settings = Mapping[str, Any]
 FILE_SEPARATOR = '.py:'
+OWN_KNOWLEDGE = 'Observation of each step; NominalModel by an argument model'
+"""What a controller of one's own knows."""
 MODEL = 'model'
 """Name of the argument of a class that gets the :class:`NominalModel`."""
 
@@ -71,13 +73,13 @@ class Controller:
             plain = _plain_name(self.source)
             object.__setattr__(self, 'name', f'{plain}, {values}' if values else plain)
 
-    def method(self, robot: str) -> Method:
+    def method(self, robot: str) -> ComparedMethod:
         """Return it as a method of a robot: ``twin``, ``servo`` or ``torque``."""
         if isinstance(self.source, str) and FILE_SEPARATOR not in self.source:
             return self._packaged(robot, self.source)
         return OwnMethod(self.name, checked_source(self.source), tuple(self.settings.items()))
 
-    def _packaged(self, robot: str, wanted: str) -> Method:
+    def _packaged(self, robot: str, wanted: str) -> ComparedMethod:
         known = methods_for(robot)
         (found,) = find_names('controller', [wanted], known)
         require_libraries([found])
@@ -219,6 +221,10 @@ class OwnMethod:
     def driver(self, scenario: Scenario) -> MethodDriver:
         """Return a new driver for a run."""
         return MethodDriver(self, scenario)
+
+    def knowledge(self, scenario: Scenario) -> str:
+        """Return what it knows."""
+        return OWN_KNOWLEDGE
 
     def _instance(
         self, kind: type, settings: dict[str, Any], nominal_model: NominalModel

@@ -71,6 +71,8 @@ class NominalModel:
         return u
 
 
+EXACT_INERTIA, FRICTION = 'exact inertia', 'nominal friction'
+"""What a method knows of the model, in words."""
 JUMP = 0.3
 """A change of r in one period (rad/s), beyond the change before it, that is a jump."""
 
@@ -161,6 +163,9 @@ class Observation:
     """Control periods since the observation before; more than 1 after lost measurements."""
     late: int = 0
     """Control periods until that instant: the dead time in use."""
+    yaw_rate: float = math.nan
+    """Mean yaw rate of the odometry since the observation before, rad/s; NaN at the first one, and
+    for a robot without a pose. On the twin it contains the gyro."""
 
 
 class BaselineController(ABC):
@@ -169,8 +174,13 @@ class BaselineController(ABC):
     parameters_type: ClassVar[type[Parameters]]
     preview: ClassVar[bool] = False
     """Whether it uses :attr:`Observation.future`."""
+    measured: ClassVar[str] = 'wheel speeds'
+    """What it measures, in words; empty for nothing."""
     estimate_dead_time: bool = False
     """Whether it estimates the dead time of a velocity drive; the configured one otherwise."""
+    inertia_error: float = 1.0
+    """Inertia by which its accelerations become the torques of a torque drive, over the true
+    one."""
 
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
         if type(parameters) is not self.parameters_type:
@@ -180,6 +190,18 @@ class BaselineController(ABC):
             )
         self.parameters: Any = parameters
         self._nominal_model = nominal_model
+
+    @property
+    def knowledge(self) -> list[str]:
+        """What it knows beside noise and limits, which are known to all, each in a few words."""
+        found = ['reference ahead' if self.preview else 'reference now']
+        if self.measured:
+            found.append(self.measured)
+        if self.estimate_dead_time:
+            found.append('estimate of the dead time')
+        if self.inertia_error != 1.0:
+            found.append(f'inertia × {self.inertia_error:g}')
+        return found
 
     @abstractmethod
     def step(self, observation: Observation) -> Array:

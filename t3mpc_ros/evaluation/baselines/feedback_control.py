@@ -21,21 +21,28 @@ limits: an integral, a sliding variable or an adapted coefficient that uses e ca
 This is model recovery anti-windup, back-calculation through the plant's own model (Galeani,
 Tarbouriech, Turner and Zaccarian 2009), with the jumps of the reference entering like a deficit
 of the drive. v closes h at its own rate, because h contains no noise: two degrees of freedom.
+
+With ``jump_transition.preview`` the reference is the reachable one of
+:mod:`t3mpc_ros.control.jump_transition`, as that of the controller: it has no jumps.
 """
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import Generic, TypeVar
 
 import numpy as np
 
+from t3mpc_ros.control.jump_transition import JumpTransitionParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
+    EXACT_INERTIA,
+    FRICTION,
     BaselineController,
     NominalModel,
     Observation,
     WheelLoads,
 )
+from t3mpc_ros.evaluation.baselines.planned_reference import PlannedReference
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters, group, parameter
 
@@ -64,6 +71,7 @@ class FeedbackParameters(Parameters):
     """Parameters of every feedback baseline."""
 
     jump_transient: JumpTransientParameters = group(JumpTransientParameters)
+    jump_transition: JumpTransitionParameters = group(JumpTransitionParameters, preview=False)
 
 
 Table = TypeVar('Table', bound=FeedbackParameters)
@@ -87,6 +95,10 @@ class FeedbackBaseline(BaselineController, Generic[Table]):
         self._requested: Array = np.zeros(2)
         self._applied: Array = np.zeros(2)
         self._predicted_reference: Array | None = None
+        transition = self.parameters.jump_transition
+        self.preview = transition.preview  # type: ignore[misc]
+        lag = nominal_model.lag if nominal_model.drive == 'velocity' else 0.0
+        self._plan = PlannedReference(transition, nominal_model, lag) if self.preview else None
 
     @abstractmethod
     def feedback(self, observation: Observation, feedforward: Array, error: Array) -> Array:
@@ -94,6 +106,11 @@ class FeedbackBaseline(BaselineController, Generic[Table]):
 
     def step(self, observation: Observation) -> Array:
         """Return u, rad/s², shape (2,)."""
+        if (plan := self._plan) is not None:
+            plan.step(observation)
+            reachable = plan.reachable.copy()
+            following = reachable + self._period * plan.rate
+            observation = replace(observation, reference=reachable, next_reference=following)
         error = self._disturbance_error(observation)
         slope = (observation.next_reference - observation.reference) / self._period
         u = self.feedback(observation, slope + self._closing, error)
@@ -337,6 +354,11 @@ class ComputedTorque(ProportionalIntegral):
         self._felt, self._measured = self.parameters.belief, self.parameters.measured
         if nominal_model.drive == 'velocity':
             self._felt *= nominal_model.lag * nominal_model.share / nominal_model.period
+
+    @property
+    def knowledge(self) -> list[str]:
+        """What it knows, see :attr:`BaselineController.knowledge`."""
+        return [*super().knowledge, EXACT_INERTIA, FRICTION]
 
     def feedback(self, observation: Observation, feedforward: Array, error: Array) -> Array:
         """Return u, rad/s², shape (2,)."""

@@ -56,7 +56,7 @@ class CasadiNmpcParameters(ObserverParameters, PredictiveParameters):
     disturbance_share: float = parameter(
         0.3,
         'share taken of the part of the disturbance estimate that the model does not explain',
-        bounds=(0.01, 2.0),
+        bounds=(0.0, 2.0),
     )
 
 

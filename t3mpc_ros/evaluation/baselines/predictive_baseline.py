@@ -15,6 +15,8 @@ import daqp
 import numpy as np
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
+    EXACT_INERTIA,
+    FRICTION,
     BaselineController,
     NominalModel,
     Observation,
@@ -43,7 +45,7 @@ class PredictiveParameters(Parameters):
         (0.001, 0.5),
     )
     disturbance_share: float = parameter(
-        0.3, 'share taken of the shared disturbance estimate', bounds=(0.01, 2.0)
+        0.3, 'share taken of the shared disturbance estimate', bounds=(0.0, 2.0)
     )
 
 
@@ -194,6 +196,20 @@ class PredictiveBaseline(BaselineController):
         self._fade = math.exp(-nominal_model.period / slope_time)
         self._command: Array = np.zeros(2)
         """First command of the plan, or the u that the limits let through."""
+
+    @property
+    def knowledge(self) -> list[str]:
+        """What it knows, see :attr:`BaselineController.knowledge`."""
+        found, factor = super().knowledge, self.parameters.model_error
+        found.append(EXACT_INERTIA if factor == 1.0 else f'inertia × {factor:g}')
+        if self.knows_friction:
+            found.append(FRICTION)
+        return found
+
+    @property
+    def knows_friction(self) -> bool:
+        """Whether the model has the friction of the nominal robot."""
+        return bool(getattr(self.parameters, 'load_share', 1.0))
 
     def step(self, observation: Observation) -> Array:
         """Return u, rad/s², shape (2,)."""

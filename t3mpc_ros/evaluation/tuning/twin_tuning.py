@@ -18,7 +18,7 @@ from t3mpc_ros.control.controller import ControllerParameters, StepperController
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired, rms
 from t3mpc_ros.evaluation.experiment import Report
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.methods import FULL, methods, twin_start
+from t3mpc_ros.evaluation.methods import FULL, further_methods, methods, twin_start
 from t3mpc_ros.evaluation.metrics import START, VARIATION, measure
 from t3mpc_ros.evaluation.proposed_method import ProposedController
 from t3mpc_ros.evaluation.record import rolling_speeds
@@ -56,7 +56,7 @@ def twin_definitions(known: Iterable[MethodDefinition]) -> list[MethodDefinition
     Baselines start from the parameters for the velocity drive, see :func:`twin_start`; the full
     controller from the defaults of the node.
     """
-    tuned = methods('velocity')
+    tuned = methods('velocity') | further_methods('velocity')
     found = []
     for each in known:
         if each.name == FULL:
@@ -68,7 +68,7 @@ def twin_definitions(known: Iterable[MethodDefinition]) -> list[MethodDefinition
             )
             continue
         ranges = tuple(GAIN_RANGE if one.name == 'gain' else one for one in each.ranges)
-        start = twin_start(tuned[each.name].parameters)
+        start = each.start.get(TWIN) or twin_start(tuned[each.name].parameters)
         found.append(replace(each, start={TWIN: start}, ranges=ranges))
     return found
 
