@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Flash a board with the programmer that is plugged in: ``make flash``, ``make flash-dongle``.
+"""Flash a board: ``make flash PORT=/dev/…``, ``make flash-dongle PORT=/dev/…``.
 
-Programmers, in this order: USBasp, USBtinyISP and AVRISP mkII by their USB ids; then, by asking at
-each serial port of an Arduino, an Arduino with the sketch ArduinoISP, and the boot loader of the
-board itself. A boot loader keeps the fuses; a programmer writes them.
+The port is that of an Arduino with the sketch ArduinoISP, or of the board itself, whose boot
+loader answers. Without a port only programmers on USB are used: USBasp, USBtinyISP and AVRISP
+mkII, by their USB ids. No other serial port is opened, because that resets the device behind it,
+and what is asked there may move it. A boot loader keeps the fuses; a programmer writes them.
 """
 
 import argparse
@@ -31,7 +32,7 @@ USB_PROGRAMMERS = {
     '03eb:2104': ('avrispmkII', 'AVRISP mkII'),
 }
 SERIAL_CHIPS = ('2341', '2a03', '1a86', '0403', '10c4')
-"""Vendors of Arduinos and of the USB chips of their clones: nothing else is asked."""
+"""Vendors of Arduinos and of the USB chips of their clones: their ports are listed."""
 OLD_LOADER = (
     'this boot loader may keep the board resetting after a watchdog reset, until its power is cut '
     '(docs/robot.md, Boot loaders)'
@@ -144,21 +145,26 @@ def ask_port(port: str) -> Programmer | None:
 def find_programmer(
     sysfs: Path, port: str | None, ask: Callable[[str], Programmer | None] = ask_port
 ) -> Programmer:
-    """Return the only programmer; FlashError if there is none, or more than one."""
-    found = [] if port else usb_programmers(sysfs)
-    if not found:
-        ports = [port] if port else serial_ports(sysfs)
-        found = [programmer for name in ports if (programmer := ask(name)) is not None]
-        if not found:
-            asked = ', '.join(ports) or 'there is none'
+    """Return the programmer at ``port``, else the only one on USB; FlashError if there is none."""
+    if port:
+        programmer = ask(port)
+        if programmer is None:
             raise FlashError(
-                'no programmer: plug in a USBasp or an Arduino with the sketch ArduinoISP, or the '
-                f'USB port of the board itself (serial ports asked: {asked}); is another program '
-                'using the port?'
+                f'no programmer answers at {port}: neither the sketch ArduinoISP nor the boot '
+                'loader of a board; is another program using the port?'
             )
+        return programmer
+    found = usb_programmers(sysfs)
+    if not found:
+        ports = ', '.join(serial_ports(sysfs)) or 'none is plugged in'
+        raise FlashError(
+            'no programmer on USB, and no serial port is opened unasked, because that resets the '
+            'device behind it: plug in a USBasp, or name the port of the board, or of an Arduino '
+            f'with the sketch ArduinoISP: PORT=/dev/… (serial ports: {ports})'
+        )
     if len(found) > 1:
         names = '\n  '.join(programmer.name for programmer in found)
-        raise FlashError(f'more than one programmer: unplug one, or give PORT=/dev/…\n  {names}')
+        raise FlashError(f'more than one programmer: unplug all but one\n  {names}')
     return found[0]
 
 
@@ -174,7 +180,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description='Flash a board.')
     parser.add_argument('board', choices=sorted(PARTS))
     parser.add_argument('file', type=Path)
-    parser.add_argument('--port', help='serial port; default: search')
+    parser.add_argument(
+        '--port', help='serial port of board or programmer; default: programmers on USB'
+    )
     parser.add_argument('--dry-run', action='store_true', help='print the command only')
     parser.add_argument('--sysfs', type=Path, default=Path('/sys'), help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)

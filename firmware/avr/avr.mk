@@ -4,9 +4,9 @@
 # make avr        both boards' firmware, build/dongle.elf and build/robot.elf, and their sizes;
 #                 RADIO_RATE=0|1|2 (250 kbit/s, 1, 2 Mbit/s) is an option, and RADIO_CHANNEL=0…125,
 #                 the channel of a dongle before CFG and of a robot without settings
-# make flash, make flash-dongle
-#                 flash the robot or the dongle with the programmer that is plugged in; PORT=/dev/… names
-#                 a serial port, DRY_RUN=1 only prints the command
+# make flash PORT=/dev/…, make flash-dongle PORT=/dev/…
+#                 flash the robot or the dongle at a serial port; without PORT with the programmer on USB;
+#                 DRY_RUN=1 only prints the command
 # make simavr     both boards in a simulator with their peripherals, as a library for ctypes
 
 AVR_OBJCOPY ?= avr-objcopy

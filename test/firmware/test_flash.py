@@ -61,19 +61,32 @@ def test_a_programmer_on_usb_is_preferred_and_writes_fuses(sysfs):
     assert words[-1] == 'flash:w:robot.hex:i'
 
 
-def test_only_serial_ports_of_arduinos_are_asked(sysfs):
+def test_no_serial_port_is_opened_unasked(sysfs):
+    """All were asked: that reset every device with such a chip, and wrote to it."""
     folder, plug = sysfs
     plug('1-1', '2341:0042', 'ttyACM0')
     plug('1-2', '1a86:7523', 'ttyUSB0')
     plug('1-3', '12d1:1506', 'ttyUSB1')  # a modem
+    with pytest.raises(
+        flash.FlashError, match=r'PORT=.*serial ports: /dev/ttyACM0, /dev/ttyUSB0\)'
+    ):
+        flash.find_programmer(folder, None, fail)
+
+
+def test_only_the_named_port_is_asked(sysfs):
+    folder, plug = sysfs
+    plug('1-1', '16c0:05dc')
+    plug('1-2', '1a86:7523', 'ttyUSB0')
     asked = []
 
     def ask(port):
         asked.append(port)
         return flash.boot_loader(port, 'wiring', 115200) if 'ACM' in port else None
 
-    programmer = flash.find_programmer(folder, None, ask)
-    assert asked == ['/dev/ttyACM0', '/dev/ttyUSB0']
+    with pytest.raises(flash.FlashError, match='no programmer answers at /dev/ttyUSB0'):
+        flash.find_programmer(folder, '/dev/ttyUSB0', ask)
+    programmer = flash.find_programmer(folder, '/dev/ttyACM0', ask)
+    assert asked == ['/dev/ttyUSB0', '/dev/ttyACM0']
     words = flash.command(programmer, 'robot', Path('robot.hex'))
     assert words[1:8] == ['-c', 'wiring', '-P', '/dev/ttyACM0', '-b', '115200', '-D']
     assert not any('fuse' in word for word in words)
