@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 import math
 import random
+import string
 
-from t3mpc_ros.emulator.event_queue import MICROSECOND, EventQueue
+from t3mpc_ros.emulator.event_queue import MICROSECOND
 from t3mpc_ros.emulator.fault_injection import Fault, FaultInjection
 from t3mpc_ros.emulator.link.dongle import Dongle
-from t3mpc_ros.emulator.link.radio_channel import RadioChannel, RadioParameters
+from t3mpc_ros.emulator.link.radio_channel import Medium, RadioChannel, RadioParameters
 from t3mpc_ros.emulator.link.serial_line import SerialLine
 from t3mpc_ros.emulator.plant import Plant
 from t3mpc_ros.emulator.robot_board import RadioSettings, RobotBoard
@@ -44,9 +45,14 @@ class EmulatorParameters(Parameters):
         82, 'channel in the settings of the robot: 2400 MHz plus this', 'MHz', (0, 125)
     )
     rate: str = parameter('1M', 'bit rate in the settings of the robot', choices=RATES)
+    address: str = parameter(
+        '54334d5043', 'address in the settings of the robot, 10 hexadecimal digits'
+    )
 
     def check_consistency(self) -> None:
         """Raise ParameterError if the plant does not suit the board."""
+        if len(self.address) != 10 or set(self.address.lower()) - set(string.hexdigits):
+            raise ParameterError(f'address must be 10 hexadecimal digits: got {self.address!r}')
         twin = self.twin
         if twin.drive.kind != 'stepper':
             raise ParameterError(f'twin.drive.kind must be stepper: got {twin.drive.kind}')
@@ -61,7 +67,8 @@ class Emulator:
     """A dongle on a serial line and a robot in its radio range, in virtual time.
 
     At ``now_ns`` both boards have booted and the robot is at rest. ``erased``: its EEPROM
-    holds neither settings nor a key. ``seed`` is that of all but the plant.
+    holds neither settings nor a key. ``seed`` is that of all but the plant. With a ``medium``,
+    other emulators are in range, and ``now_ns`` is its time.
     FirmwareLibraryError: there is no C compiler, for example.
     """
 
@@ -72,16 +79,18 @@ class Emulator:
         seed: int = 1,
         now_ns: int = 0,
         erased: bool = False,
+        medium: Medium | None = None,
     ) -> None:
         self._parameters = parameters
-        self._start_ns = now_ns
-        self._events = EventQueue(now_ns)
+        medium = medium or Medium(now_ns)
+        self._events = medium.events
+        self._start_ns = now_ns = self._events.now_ns
         self.faults = FaultInjection(lambda: self._events.now_ns, seed)
         self._clock_rate = 1.0 + parameters.robot_clock_error
         self.plant = Plant(parameters.twin, self._clock_rate)
         rate = RATES.index(parameters.rate)
         self._channel = RadioChannel(
-            self._events,
+            medium,
             RadioParameters(channel=parameters.channel, rate=rate),
             self._advance_robot,
             lambda payload: self.board.receive(payload),
@@ -95,6 +104,7 @@ class Emulator:
             self._channel.load,
             rate,
             None if erased else parameters.channel,
+            bytes.fromhex(parameters.address),
         )
         self.board.on_settings = self._follow_settings
         self._follow_settings(self.board.radio_settings)
@@ -219,6 +229,7 @@ class Emulator:
         effects = {
             'robot_reset': (self._cut_power, lambda: self._boot_robot(_EXTERNAL_RESET)),
             'imu_absent': (lambda: self._set_imu(False), lambda: self._set_imu(True)),
+            'battery_wire': (lambda: self._break_wire(True), lambda: self._break_wire(False)),
             'button': (lambda: self._press_button(True), lambda: self._press_button(False)),
             'dongle_reset': (self.restart_dongle, _no_action),
             'close_port': (self._unplug, self._plug_in),
@@ -248,6 +259,11 @@ class Emulator:
     def _set_imu(self, present: bool) -> None:
         self._advance_robot()
         self.plant.imu_absent = not present
+        self.board.sense()
+
+    def _break_wire(self, broken: bool) -> None:
+        self._advance_robot()
+        self.plant.battery_wire_broken = broken
         self.board.sense()
 
     def _press_button(self, pressed: bool) -> None:

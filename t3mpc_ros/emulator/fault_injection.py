@@ -48,6 +48,7 @@ FAULT_KINDS = (
     FaultKind('dongle_reset', _NO_VALUE, 0.0, 'the dongle reboots (1.5 s)', _INSTANT),
     FaultKind('robot_reset', _NO_VALUE, 0.0, 'the robot board loses power, then reboots', 0.5),
     FaultKind('imu_absent', _NO_VALUE, 0.0, 'the IMU of the robot does not respond'),
+    FaultKind('battery_wire', _NO_VALUE, 0.0, 'the wire that measures the battery is broken'),
     FaultKind('button', _NO_VALUE, 0.0, 'the emergency stop button of the robot is pressed'),
     FaultKind('close_port', _NO_VALUE, 0.0, 'the dongle is unplugged, then plugged in again', 1.0),
     FaultKind('move_link', _NO_VALUE, 0.0, 'the dongle changes its device name', _INSTANT),

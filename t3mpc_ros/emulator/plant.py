@@ -82,6 +82,8 @@ class Plant:
         """Value of :attr:`elapsed` at the last motor pulse; None while the motors turn."""
         self.imu_absent = False
         """Whether the IMU does not respond."""
+        self.battery_wire_broken = False
+        """Whether the wire from the battery to its divider is broken."""
         self._build_drivetrain(parameters.motor, None)
 
     def _build_drivetrain(self, motor: StepperMotorParameters, before: Drivetrain | None) -> None:
@@ -170,7 +172,8 @@ class Plant:
         """Counts of the converter: the eight range sensors, then the battery."""
         dead = self._parameters.faults.ranges_dead
         ranges = (NOT_CONVERTED,) * len(RANGE_SENSORS) if dead else self._ranges.counts
-        count = int(1000.0 * self._battery.voltage * _ADC_COUNTS / _ADC_FULL_SCALE)
+        voltage = 0.0 if self.battery_wire_broken else self._battery.voltage
+        count = int(1000.0 * voltage * _ADC_COUNTS / _ADC_FULL_SCALE)
         return *ranges, min(count, _ADC_COUNTS - 1)
 
     # -- ground truth -----------------------------------------------------------------------------

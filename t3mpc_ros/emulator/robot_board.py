@@ -22,7 +22,7 @@ UNPOWERED_US = 20_000
 _LEFT, _RIGHT = 0, 1
 _USB_ROOM = 4096
 _DEFAULT_MICROSTEPS = 16
-_DEFAULT_ADDRESS = b'T3MPC'
+_ADDRESS_SIZE = 5
 _Registers, _Counts = ctypes.c_int16 * 7, ctypes.c_uint16 * 9
 
 
@@ -50,6 +50,7 @@ class RobotBoard:
         load: Callable[[bytes], None],
         rate: int,
         channel: int | None,
+        address: bytes = b'T3MPC',
     ) -> None:
         self._plant = plant
         self._load = load
@@ -58,7 +59,7 @@ class RobotBoard:
         if channel is None:
             call('erase')
         else:
-            call('store_settings', channel, _DEFAULT_MICROSTEPS, _DEFAULT_ADDRESS)
+            call('store_settings', channel, _DEFAULT_MICROSTEPS, address)
             call('store_rate', rate)
         if key:
             call('store_key', key)
@@ -135,7 +136,7 @@ class RobotBoard:
     @property
     def radio_settings(self) -> RadioSettings:
         """Settings in effect."""
-        address = ctypes.create_string_buffer(len(_DEFAULT_ADDRESS))
+        address = ctypes.create_string_buffer(_ADDRESS_SIZE)
         self._board.call('address', address)
         return RadioSettings(self._board.call('channel'), self._board.call('rate'), address.raw)
 

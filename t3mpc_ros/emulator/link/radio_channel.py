@@ -1,16 +1,19 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Radio channel between two nRF24L01+ transceivers, packet by packet, with data-sheet timing.
+"""Radio channels between nRF24L01+ transceivers, packet by packet, with data-sheet timing.
+
+Each dongle and its robot have a channel; the medium joins those of several. A packet reaches every
+robot of its frequency, rate and address. Packets that overlap at one frequency are all lost.
 
 nRF24L01+ product specification 1.0: 7.4 (retransmission), 7.5 (acknowledgement with payload),
 6.1.7 (timing).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 import random
 from typing import NamedTuple
 
-from t3mpc_ros.emulator.event_queue import EventQueue
+from t3mpc_ros.emulator.event_queue import MICROSECOND, EventQueue
 from t3mpc_ros.emulator.fault_injection import FaultInjection
 
 SETTLE_US = 130.0
@@ -20,6 +23,10 @@ _OVERHEAD = 1 + 5 + 2
 """Bytes of preamble, address and CRC."""
 _CONTROL_BITS = 9
 _DELAY_UNIT_US = 250.0
+_CAPTURE_SHARE = 0.5
+"""Share of simultaneous acknowledgements of which one is received, the stronger one; assumed."""
+_LONGEST_NS = 2_000_000
+"""No packet is longer."""
 
 ExchangeCallback = Callable[[bool, int, bytes], None]
 """Called with: acknowledged, number of retransmissions, payload of the acknowledgement."""
@@ -53,6 +60,61 @@ class RadioParameters(NamedTuple):
         )
 
 
+class Transmission:
+    """A packet in the air: frequency, start and end (ns)."""
+
+    def __init__(self, frequency: int, start_ns: int, end_ns: int) -> None:
+        self.frequency, self.start_ns, self.end_ns = frequency, start_ns, end_ns
+
+    def overlaps(self, other: 'Transmission') -> bool:
+        """Return whether both are in the air at one time, at one frequency."""
+        return (
+            self.frequency == other.frequency
+            and self.start_ns < other.end_ns
+            and other.start_ns < self.end_ns
+        )
+
+
+class Medium:
+    """What transceivers in range of each other share: time, and who transmits when.
+
+    Emulators with one medium run together: whoever advances one of them advances all.
+    """
+
+    def __init__(self, now_ns: int = 0, seed: int = 1) -> None:
+        self.events = EventQueue(now_ns)
+        self.channels: list[RadioChannel] = []
+        """Of all robots."""
+        self._generator = random.Random(f'capture {seed}')
+        self._transmissions: list[Transmission] = []
+
+    def transmit(self, frequency: int, delay_us: float, air_us: float) -> Transmission:
+        """Note a transmission that begins ``delay_us`` from now."""
+        now_ns = self.events.now_ns
+        start_ns = now_ns + round(delay_us * MICROSECOND)
+        new = Transmission(frequency, start_ns, start_ns + round(air_us * MICROSECOND))
+        self._transmissions = [
+            each for each in self._transmissions if each.end_ns > now_ns - _LONGEST_NS
+        ]
+        self._transmissions.append(new)
+        return new
+
+    def is_disturbed(self, transmission: Transmission) -> bool:
+        """Return whether another transmission overlaps one that has ended."""
+        return any(
+            other is not transmission and other.overlaps(transmission)
+            for other in self._transmissions
+        )
+
+    def strongest(self, replies: Sequence[bytes]) -> bytes | None:
+        """Return the acknowledgement that is received of simultaneous ones; None if none is."""
+        if len(replies) < 2:
+            return replies[0] if replies else None
+        if self._generator.random() >= _CAPTURE_SHARE:
+            return None
+        return self._generator.choice(replies)
+
+
 class RadioChannel:
     """Carries packets from the dongle to the robot, and acknowledgements back.
 
@@ -63,14 +125,15 @@ class RadioChannel:
 
     def __init__(
         self,
-        events: EventQueue,
+        medium: Medium,
         robot: RadioParameters,
         advance_robot: Callable[[], bool],
         deliver: Callable[[bytes], None],
         faults: FaultInjection,
         generator: random.Random,
     ) -> None:
-        self._events = events
+        self.medium = medium
+        medium.channels.append(self)
         self.robot = robot
         """Configuration of the robot's transceiver, which follows its settings."""
         self._advance_robot = advance_robot
@@ -92,7 +155,9 @@ class RadioChannel:
         """Send a packet with automatic retransmission; call ``done`` with the outcome."""
         _Exchange(self, payload, radio, done).begin()
 
-    def _receive(self, payload: bytes, radio: RadioParameters, repeated: bool) -> bytes | None:
+    def _receive(
+        self, payload: bytes, radio: RadioParameters, repeated: bool, disturbed: bool
+    ) -> bytes | None:
         """Return the payload of the robot's acknowledgement; None if it received nothing.
 
         A repeated packet (same PID and CRC) is acknowledged and dropped. A fetched payload stays
@@ -100,7 +165,7 @@ class RadioChannel:
         """
         receives = self._advance_robot() and radio.matches(self.robot)
         lost = self._generator.random() < self._faults.combined_probability('loss', 'loss_down')
-        if not receives or lost or self._faults.active('jam'):
+        if not receives or lost or disturbed or self._faults.active('jam'):
             return None
         if not repeated and self._fetched:
             self._ack_payload = None
@@ -122,31 +187,65 @@ class _Exchange:
         self, channel: RadioChannel, payload: bytes, radio: RadioParameters, done: ExchangeCallback
     ) -> None:
         self._channel = channel
+        self._medium = channel.medium
         self._payload = payload
         self._radio = radio
         self._done = done
-        self._received = False
+        self._received: set[RadioChannel] = set()
+        """Channels whose robot has received the packet."""
         self._retransmissions = 0
 
     def begin(self) -> None:
-        arrival = SETTLE_US + self._radio.air_us(len(self._payload))
-        self._channel._events.schedule_after(arrival, self._arrive)
+        self._transmit(SETTLE_US + self._radio.air_us(len(self._payload)))
 
-    def _arrive(self) -> None:
-        radio, events = self._radio, self._channel._events
-        reply = self._channel._receive(self._payload, radio, self._received)
+    def _transmit(self, until_us: float) -> None:
+        """Send the packet so that it ends ``until_us`` from now."""
+        air_us = self._radio.air_us(len(self._payload))
+        packet = self._medium.transmit(self._radio.channel, until_us - air_us, air_us)
+        self._medium.events.schedule_after(until_us, lambda: self._arrive(packet))
+
+    def _arrive(self, packet: 'Transmission') -> None:
+        replies = self._receive_everywhere(self._medium.is_disturbed(packet))
         acknowledged = self._channel._acknowledgement_arrives()
-        delay = radio.retry_delay_us
-        if reply is not None:
-            self._received = True
-            duration = SETTLE_US + radio.air_us(len(reply))
+        reply = self._medium.strongest(replies)
+        if reply is not None and acknowledged:
+            air_us = self._radio.air_us(len(reply))
             # The retransmission cuts off an acknowledgement longer than the delay.
-            if acknowledged and duration <= delay:
-                count = self._retransmissions
-                events.schedule_after(duration, lambda: self._done(True, count, reply))
+            if SETTLE_US + air_us <= self._radio.retry_delay_us:
+                answer = self._medium.transmit(self._radio.channel, SETTLE_US, air_us)
+                after_us = SETTLE_US + air_us
+                self._medium.events.schedule_after(
+                    after_us, lambda: self._finish(answer, reply, after_us)
+                )
                 return
-        if self._retransmissions < radio.retries:
-            self._retransmissions += 1
-            events.schedule_after(delay + radio.air_us(len(self._payload)), self._arrive)
+        self._retry(0.0)
+
+    def _receive_everywhere(self, disturbed: bool) -> list[bytes]:
+        """Return the acknowledgement of each robot that receives the packet."""
+        replies = []
+        for channel in self._medium.channels:
+            if channel is not self._channel and not self._radio.matches(channel.robot):
+                continue
+            repeated = channel in self._received
+            reply = channel._receive(self._payload, self._radio, repeated, disturbed)
+            if reply is not None:
+                self._received.add(channel)
+                replies.append(reply)
+        return replies
+
+    def _finish(self, answer: 'Transmission', reply: bytes, passed_us: float) -> None:
+        if self._medium.is_disturbed(answer):
+            self._retry(passed_us)
         else:
-            events.schedule_after(delay, lambda: self._done(False, self._retransmissions, b''))
+            self._done(True, self._retransmissions, reply)
+
+    def _retry(self, passed_us: float) -> None:
+        """Retransmit after the retry delay, of which this time has passed, or give up."""
+        delay_us = self._radio.retry_delay_us - passed_us
+        if self._retransmissions < self._radio.retries:
+            self._retransmissions += 1
+            self._transmit(delay_us + self._radio.air_us(len(self._payload)))
+        else:
+            self._medium.events.schedule_after(
+                delay_us, lambda: self._done(False, self._retransmissions, b'')
+            )
