@@ -20,6 +20,7 @@ enum t3_parameter {
     T3_IDLE_OFF,       // ms at rest until the drivers switch off; 0: never
     T3_INVERT_WHEELS,  // bit 0 left, bit 1 right: against the settings
     T3_BATTERY_CUTOFF,  // mV below which the robot does not drive; 0: none
+    T3_BOOTS,           // starts of the board, modulo 2**31
     T3_PARAMETERS
 };
 

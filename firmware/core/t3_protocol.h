@@ -10,7 +10,7 @@
 
 #define T3_VERSION 2u
 #define T3_FIRMWARE_MAJOR 2u
-#define T3_FIRMWARE_MINOR 0u
+#define T3_FIRMWARE_MINOR 1u
 // Set by the Makefile: a digest of the sources and of the build settings.
 #ifndef T3_BUILD
 #define T3_BUILD 0

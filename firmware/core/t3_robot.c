@@ -251,7 +251,8 @@ static void measure_battery(struct t3_robot *robot)
     const uint16_t count = robot->port->adc(robot->port->context, T3_ADC_BATTERY);
     const uint32_t supply = t3_calibration_battery(
         &robot->calibration, t3_battery_mv_of(robot->settings.now.divider, count));
-    if (!supply || !robot->battery_sum)
+    const bool wired = robot->settings.now.wired;
+    if ((!supply && !wired) || !robot->battery_sum)
         robot->battery_sum = T3_BATTERY_WEIGHT * supply;
     else
         robot->battery_sum += supply - robot->battery_sum / T3_BATTERY_WEIGHT;
@@ -259,7 +260,7 @@ static void measure_battery(struct t3_robot *robot)
     const int32_t cutoff = parameter(robot, T3_BATTERY_CUTOFF);
     const int32_t low = parameter(robot, T3_BATTERY_LOW);
     // The voltage rises as soon as the motors rest: below the warning, the robot stays off.
-    if (!filtered || (filtered >= cutoff && filtered >= low))
+    if ((!filtered && !wired) || (filtered >= cutoff && filtered >= low))
         robot->flat = false;
     else if (filtered < cutoff)
         robot->flat = true;
@@ -420,6 +421,8 @@ void t3_robot_boot(struct t3_robot *robot, const struct t3_port *port, uint8_t r
     scale_steps(robot);  // the step interrupt does not run yet
     robot->steps.inverted = robot->settings.now.inverted;
     measure_battery(robot);
+    robot->session.boots = t3_session_count_boot(port);
+    robot->parameters.values[T3_BOOTS] = (int32_t)(robot->session.boots & INT32_MAX);
     t3_session_boot(&robot->session, port);
     // The first packet fetches a state too.
     t3_answer_with(robot, T3_STATE, 0, 0, 0);

@@ -48,8 +48,8 @@ uint8_t t3_robot_status(const struct t3_robot *robot)
         status |= T3_STATUS_TTL_EXPIRED;
     if (robot->imu_fault)
         status |= T3_STATUS_IMU_FAULT;
-    // 0: nothing is wired to it
-    if (supply && supply < robot->parameters.values[T3_BATTERY_LOW])
+    // 0: nothing is wired to it, unless the settings say so
+    if ((supply || robot->settings.now.wired) && supply < robot->parameters.values[T3_BATTERY_LOW])
         status |= T3_STATUS_LOW_BATTERY;
     if (!robot->session.id)
         status |= T3_STATUS_NO_SESSION;

@@ -25,27 +25,38 @@ static void hash(const struct t3_session *session, uint8_t use, const uint8_t *d
     t3_siphash(session->key, text, (uint8_t)(size + 1u), out);
 }
 
-static void count_boot(struct t3_session *session, const struct t3_port *port)
+uint32_t t3_session_count_boot(const struct t3_port *port)
 {
     uint8_t bytes[4];
+    uint32_t boots;
     // A count that was lost in mid-write starts anywhere: not where it has been before.
     if (t3_store_read(port, T3_STORE_BOOTS, bytes, sizeof bytes) == T3_RECORD_GOOD)
-        session->boots = t3_get32(bytes) + 1;
+        boots = t3_get32(bytes) + 1;
     else
-        session->boots = port->noise(port->context);
-    t3_put32(bytes, session->boots);
+        boots = port->noise(port->context);
+    t3_put32(bytes, boots);
     t3_store_write(port, T3_STORE_BOOTS, bytes, sizeof bytes);
+    return boots;
+}
+
+// Forget key and session. What keeps a nonce from repeating goes on until the next start of the board.
+static void forget(struct t3_session *session)
+{
+    const uint32_t boots = session->boots, greetings = session->greetings;
+    memset(session, 0, sizeof *session);
+    session->boots = boots;
+    session->greetings = greetings;
 }
 
 void t3_session_lock(struct t3_session *session)
 {
-    memset(session, 0, sizeof *session);
+    forget(session);
     session->keyed = session->locked = true;
 }
 
 void t3_session_boot(struct t3_session *session, const struct t3_port *port)
 {
-    memset(session, 0, sizeof *session);
+    forget(session);
     uint8_t mark;
     port->eeprom_read(port->context, T3_STORE_KEY_MARK, &mark, 1);
     if (mark != NO_MARK) {
@@ -54,7 +65,7 @@ void t3_session_boot(struct t3_session *session, const struct t3_port *port)
     }
     switch (t3_store_read(port, T3_STORE_KEY, session->key, T3_KEY_SIZE)) {
     case T3_RECORD_BLANK:
-        return;  // an unkeyed board spares its EEPROM the count
+        return;
     case T3_RECORD_DAMAGED:
         // A link that was keyed must not open because a cell of the memory died.
         t3_session_lock(session);
@@ -67,7 +78,6 @@ void t3_session_boot(struct t3_session *session, const struct t3_port *port)
     hash(session, USE_CHECK, NAME, sizeof NAME, digest);
     session->check = t3_get32(digest);
     session->keyed = true;
-    count_boot(session, port);
 }
 
 void t3_session_end(struct t3_session *session)

@@ -28,8 +28,11 @@ struct t3_session {
     uint32_t boots, greetings;  // no pair repeats, so no nonce repeats
 };
 
+// Count the start of the board in its EEPROM; return the count.
+uint32_t t3_session_count_boot(const struct t3_port *port);
+
 // Read the key, if any; no session. With a damaged key the robot is locked and accepts only emergency
-// stops.
+// stops. `boots` is set before, and kept like `greetings`.
 void t3_session_boot(struct t3_session *session, const struct t3_port *port);
 
 // End the session, and lock the robot until t3_session_boot.

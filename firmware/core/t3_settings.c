@@ -13,7 +13,8 @@
 #define POWER_LIMIT 3u
 #define STEPS_LEAST 20u
 #define STEPS_LIMIT 10000u
-#define INVERTED_LIMIT 3u
+#define INVERTED 3u
+#define WIRED_BIT 2u
 // Full scale of 65.5 V: voltages are 16 bits of mV.
 #define DIVIDER_LEAST 1000u
 #define DIVIDER_LIMIT 13000u
@@ -41,7 +42,7 @@ static bool setup_valid(const struct t3_setup *setup)
            microsteps <= MICROSTEPS_LIMIT && !(microsteps & (uint16_t)(microsteps - 1u)) &&
            setup->rate <= RATE_LIMIT && setup->power <= POWER_LIMIT &&
            setup->steps_per_turn >= STEPS_LEAST && setup->steps_per_turn <= STEPS_LIMIT &&
-           setup->inverted <= INVERTED_LIMIT && setup->divider >= DIVIDER_LEAST &&
+           setup->inverted <= INVERTED && setup->wired <= 1u && setup->divider >= DIVIDER_LEAST &&
            setup->divider <= DIVIDER_LIMIT && sensors_valid(setup->sensors);
 }
 
@@ -64,7 +65,7 @@ void t3_setup_encode(const struct t3_setup *setup, uint8_t *body)
     to = t3_put8(to + sizeof setup->address, setup->rate);
     to = t3_put8(to, setup->power);
     to = t3_put16(to, setup->steps_per_turn);
-    to = t3_put8(to, setup->inverted);
+    to = t3_put8(to, (uint8_t)(setup->inverted | setup->wired << WIRED_BIT));
     to = t3_put16(to, setup->divider);
     memcpy(to, setup->sensors, sizeof setup->sensors);
 }
@@ -77,7 +78,8 @@ void t3_setup_decode(const uint8_t *body, struct t3_setup *setup)
     setup->rate = body[9];
     setup->power = body[10];
     setup->steps_per_turn = t3_get16(body + 11);
-    setup->inverted = body[13];
+    setup->inverted = body[13] & INVERTED;
+    setup->wired = body[13] >> WIRED_BIT;
     setup->divider = t3_get16(body + 14);
     memcpy(setup->sensors, body + 16, sizeof setup->sensors);
 }

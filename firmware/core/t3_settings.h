@@ -4,7 +4,7 @@
 // valid settings the robot accepts no session.
 //
 // The record, version 2: format u8 (2), channel u8, microsteps u16, address 5, rate u8, power u8,
-// steps per turn u16, inverted wheels u8, divider u16, sensor types 8. Version 1 had no more than the
+// steps per turn u16, inverted wheels and wired battery u8, divider u16, sensor types 8. Version 1 had no more than the
 // address; it is refused as T3_SETTINGS_OLD.
 #ifndef T3_SETTINGS_H
 #define T3_SETTINGS_H
@@ -20,6 +20,7 @@ struct t3_setup {
     uint8_t rate, power;      // as in t3_radio_settings
     uint16_t steps_per_turn;  // full steps of a turn of the wheel
     uint8_t inverted;         // bit 0 left, bit 1 right: the motor is reversed
+    uint8_t wired;            // 1: the battery is measured, so a voltage of 0 is a fault
     uint16_t divider;         // battery voltage / voltage at the converter, 1/1000
     uint8_t sensors[T3_RANGES];  // T3_SENSOR_*
 };
@@ -27,7 +28,7 @@ struct t3_setup {
 #define T3_SETUP_BODY (T3_STORE_SETTINGS_SIZE - T3_CRC_SIZE)
 #define T3_SETUP_DEFAULTS                                                                         \
     {T3_RADIO_CHANNEL, T3_DEFAULT_MICROSTEPS, {'T', '3', 'M', 'P', 'C'}, T3_RADIO_RATE, 3, 200, 0,  \
-     4000, {1, 1, 1, 1, 1, 1, 1, 1}}
+     0, 4000, {1, 1, 1, 1, 1, 1, 1, 1}}
 
 struct t3_settings {
     struct t3_setup now;  // in effect; the defaults without a valid copy

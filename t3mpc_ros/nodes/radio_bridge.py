@@ -111,7 +111,7 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
 
     def _serve_port(self) -> None:
         try:
-            received = b''
+            received, reported = b'', ''
             while True:
                 step_ns = self.steady_ns()
                 with self._lock:
@@ -119,7 +119,11 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
                     states = self._robot.take_states()
                     done = self._robot.link.state is LinkState.DONE
                     reason = self._robot.reason(self.steady_ns())
+                    restart = self._robot.restart(step_ns)
                 self._log_reason(reason)
+                if restart and restart != reported:
+                    self.get_logger().warning(restart)
+                reported = restart
                 if reason == ROBOT_USB and self._port is not None and len(self._ports()) > 1:
                     self._port.close()
                     self._choice += 1
@@ -198,6 +202,7 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
         with self._lock:
             state, link = self._robot.advance(now_ns), self._robot.link
             quality = self._robot.quality(now_ns)
+            restart, unknown = self._robot.restart(now_ns), self._robot.unknown_travel
             link_state, authenticated = link.state, link.authenticated
         values: dict[str, object] = {
             'port': self._path,
@@ -205,6 +210,7 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
             'authenticated': authenticated,
             **self._command_values(),
             **_link_values(quality),
+            'unknown_travel_m': unknown,
             **state_values(state),
         }
         if link_state is not LinkState.RUN or state.status.estop:
@@ -212,7 +218,7 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
         if quality.level is DiagnosticLevel.ERROR:
             return ERROR, quality.text, values
         found = [*state_warnings(state, command_problem=self._command_problem)]
-        found += filter(None, (self._command_type_problem(), quality.text))
+        found += filter(None, (restart, self._command_type_problem(), quality.text))
         if found:
             return WARN, '; '.join(found), values
         suffix = '' if authenticated else ', unauthenticated'
@@ -241,7 +247,11 @@ def _link_values(quality: LinkQuality) -> Mapping[str, object]:
         'robot_resets': quality.robot_resets,
         'dongle_resets': quality.dongle_resets,
         'sessions': quality.sessions,
+        'address_collisions': quality.collisions,
         'port_failures': quality.port_failures,
+        **{f'cycles_lost_{hop.name.lower()}': count for hop, count in quality.losses.items()},
+        'damaged_frames_host': quality.cable_errors.host,
+        'damaged_frames_dongle': quality.cable_errors.dongle,
         'crc_errors': quality.host.crc_errors,
         'frame_errors': quality.host.frame_errors,
     }

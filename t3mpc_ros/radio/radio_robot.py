@@ -16,6 +16,7 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parame
 from t3mpc_ros.radio.link.link import Link
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState, PortAction
+from t3mpc_ros.radio.link.standstill_reasons import restarted
 from t3mpc_ros.radio.link.statistics import LinkQuality
 from t3mpc_ros.radio.link.telemetry import Telemetry
 from t3mpc_ros.robot import interface
@@ -24,6 +25,10 @@ from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParame
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
 from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON, SlipMonitor
 
+_COASTING_DECELERATION = 0.5
+"""Least deceleration of a robot whose motors lost their power, m/s², assumed."""
+_RESTART_WARNING_NS = 10 * NANOSECONDS
+"""Time for which a restart is reported."""
 UNKNOWN_STATUS = interface.RobotStatus(
     enabled=False, moving=False, estop=False, timed_out=False, limited=False, imu_fault=True
 )
@@ -96,6 +101,9 @@ class RadioRobot(interface.RobotInterface):
         self._now_ns = 0
         self._telemetry: Telemetry | None = None
         self._resets = 0
+        self._restart, self._restart_ns = '', 0
+        self.unknown_travel = 0.0
+        """Sum of the greatest path lengths that restarts in motion left unmeasured, m."""
         self._limited = False
         self._expiry_ns = 0
         """Time at which the robot stops by itself without another command."""
@@ -135,6 +143,10 @@ class RadioRobot(interface.RobotInterface):
         if self.link.state is not LinkState.RUN:
             return self.link.reason(now_ns)
         return self._limiter.reason or self.link.reason(now_ns)
+
+    def restart(self, now_ns: int) -> str:
+        """Return what a restart of the robot in the last seconds left unknown; empty without."""
+        return self._restart if now_ns - self._restart_ns < _RESTART_WARNING_NS else ''
 
     def configure(self, parameters: RadioRobotParameters) -> None:
         """Apply changed dynamic parameters."""
@@ -223,6 +235,7 @@ class RadioRobot(interface.RobotInterface):
         if resets != self._resets:
             self._resets = resets
             self._odometry.forget_bias()
+            self._report_restart(before, telemetry)
             before = None  # motion during the restart was not counted
         if before is not None:
             elapsed = (telemetry.stamp_ns - before.stamp_ns) / NANOSECONDS
@@ -239,6 +252,33 @@ class RadioRobot(interface.RobotInterface):
             self._limiter.stop(SLIP_STOP_REASON, self._now_ns)
         self._state = self._make_state(telemetry)
         self._new_states.append(self._state)
+
+    def _report_restart(self, before: Telemetry | None, after: Telemetry) -> None:
+        """Add the greatest travel since the last measurement to the uncertainty of the pose.
+
+        The robot followed its last command until the restart, or until that expired, then it
+        rolled without power.
+        """
+        right = left = 0.0
+        if before is not None:
+            booted_ns = after.stamp_ns - 1000 * after.raw.time_us
+            longest = self._parameters.limiter.max_stopping_time
+            driven = min(max(booted_ns - before.stamp_ns, 0) / NANOSECONDS, longest)
+            right, left = (
+                self._unmeasured_travel(measured, commanded, driven)
+                for measured, commanded in zip(before.wheels, self._state.commanded, strict=True)
+            )
+            self._odometry.add_unknown_travel(right, left)
+        unknown = max(abs(right), abs(left))
+        self.unknown_travel += unknown
+        cause = 0 if self.link.info is None else self.link.info.reset_cause
+        self._restart, self._restart_ns = restarted(cause, unknown), self._now_ns
+
+    def _unmeasured_travel(self, measured: float, commanded: float, driven: float) -> float:
+        """Return the greatest distance (m) of a wheel after ``driven`` seconds at its speed."""
+        radius = self._parameters.geometry.wheel_radius
+        speed = radius * max(measured, commanded, key=abs)
+        return speed * driven + speed * abs(speed) / (2.0 * _COASTING_DECELERATION)
 
     def _make_state(self, telemetry: Telemetry) -> interface.RobotState:
         twist = twist_from_wheels(telemetry.wheels, self._parameters.geometry)

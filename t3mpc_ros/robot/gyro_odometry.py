@@ -250,6 +250,18 @@ class GyroOdometry:
             matrix[:, 3] = 0.0
         self._covariance[3, 3] = (0.5 * self._parameters.gyro_bias_limit) ** 2
 
+    def add_unknown_travel(self, right: float, left: float) -> None:
+        """Add to the covariance what no step counter has measured; the pose stays.
+
+        Each wheel travelled between 0 and this distance (m, signed), evenly distributed: partly
+        both by the same share, partly each by its own.
+        """
+        yaw, share = float(self._pose[2]), 0.5 / self._geometry.half_separation
+        by_right = right * np.array((0.5 * math.cos(yaw), 0.5 * math.sin(yaw), share))
+        by_left = left * np.array((0.5 * math.cos(yaw), 0.5 * math.sin(yaw), -share))
+        for direction in (by_right + by_left, by_right, by_left):
+            self._covariance[:3, :3] += np.outer(direction, direction) / 3.0
+
     def update(
         self, right: float, left: float, gyro: float | None, dt: float, jitter: float = 0.0
     ) -> None:

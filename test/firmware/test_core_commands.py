@@ -7,7 +7,8 @@ import struct
 import pytest
 from support import firmware_core as core
 
-from t3mpc_ros.radio.protocol.frames import RefusalReason
+from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD, RefusalReason
+from t3mpc_ros.radio.tool import robot_records
 
 PRESS, RELEASE = 5_200, 50_200
 """Debounce times of the button and a period of the main loop, us."""
@@ -34,7 +35,7 @@ def test_hello_starts_a_session_at_rest_and_keeps_the_counters(robot):
     robot.drive(5000, 5000, 500_000)
     steps = robot.steps
     info = robot.hello(session=77)
-    assert (info[0], info[1], info[3], info[7]) == (0x23, 77, 2, 11)
+    assert (info[0], info[1], info[3], info[7]) == (0x23, 77, 2, 12)
     assert struct.unpack_from('<HH', info, 8) == (200, 16)
     robot.run(300_000)
     assert robot.status == 0
@@ -251,6 +252,40 @@ def test_an_empty_battery_stops_the_robot_until_charged(robot):
     assert robot.set(core.CUTOFF, 0)[0] == core.OK
     supply(robot, 5_000, 5_000_000)
     assert robot.status == core.ENABLED | core.MOVING | core.LOW_BATTERY
+
+
+def wired(library):
+    """Return a robot whose settings say that its battery is measured."""
+    robot = core.Robot(library)
+    settings = robot_records.RobotSettings(battery_wired=True)
+    assert robot.store(SETTINGS_RECORD, robot_records.encode_settings(settings)) == core.OK
+    robot.hello()
+    return robot
+
+
+def test_a_broken_wire_of_a_wired_battery_stops_the_robot(library):
+    """It read 0 V, as if nothing were connected: the cut-off was gone without a word."""
+    robot = wired(library)
+    supply(robot, 11_000, 3_000_000)
+    assert robot.status == core.ENABLED | core.MOVING
+    robot.call('set_adc', 8, 0)
+    robot.drive(3000, 3000, 50_000)  # a loose contact is no broken wire
+    supply(robot, 11_000, 2_000_000)
+    assert robot.status == core.ENABLED | core.MOVING
+    robot.call('set_adc', 8, 0)
+    robot.drive(3000, 3000, 5_000_000)
+    assert robot.status == core.LOW_BATTERY
+    assert not robot.call('powered')
+    supply(robot, 11_000, 5_000_000)
+    assert robot.status == core.ENABLED | core.MOVING
+
+
+def test_a_wired_battery_that_was_never_there_lets_nothing_move(library):
+    robot = wired(library)
+    robot.call('set_adc', 8, 0)
+    robot.drive(3000, 3000, 2_000_000)
+    assert robot.status == core.LOW_BATTERY
+    assert robot.steps == (0, 0)
 
 
 # -- echoes ---------------------------------------------------------------------------------------

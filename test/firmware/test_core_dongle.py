@@ -116,7 +116,7 @@ def test_pong_reports_the_errors_of_the_line(library):
     (pong,) = dongle.frames()
     assert pong[:6] == b'\x83\x07ping'
     fields = struct.unpack('<IBBBBHHHBBB5sI', pong[6:])
-    assert fields == (5000, 2, 2, 0, 1, 1, 1, 1, 2, 0, 82, b'T3MPC', 0)
+    assert fields == (5000, 2, 2, 1, 1, 1, 1, 1, 2, 0, 82, b'T3MPC', 0)
     dongle.write(b'\x05')
     dongle.write(b'\x03\x07pin')
     dongle.write(b'\x01\x07\x00\x00')

@@ -33,7 +33,17 @@ from t3mpc_ros.radio.tool.robot_records import (
 OLD_SETTINGS = encode_settings(RobotSettings())
 NEW_SETTINGS = encode_settings(
     RobotSettings(
-        bytes.fromhex('c25a33a6e1'), 100, '250k', '-6', 32, 400, True, True, 3.7, 8 * ('GP2Y0A41',)
+        bytes.fromhex('c25a33a6e1'),
+        100,
+        '250k',
+        '-6',
+        32,
+        400,
+        True,
+        True,
+        3.7,
+        False,
+        8 * ('GP2Y0A41',),
     )
 )
 CURVE = SharpCurve(0.3, 0.02, 0.05, 0.003)
@@ -148,7 +158,7 @@ def test_only_whole_and_possible_records_are_stored(robot):
     assert robot.console(bytes([6, 9, 9, 0]))[0][2] == core.UNKNOWN
     assert robot.console(bytes([6, 9, 0, 2]))[0][2] == core.UNKNOWN
     for record, good, values in (
-        (SETTINGS_RECORD, NEW_SETTINGS, {0: 1, 1: 126, 2: 3, 9: 3, 10: 4, 12: 99, 13: 4, 16: 3}),
+        (SETTINGS_RECORD, NEW_SETTINGS, {0: 1, 1: 126, 2: 3, 9: 3, 10: 4, 12: 99, 13: 8, 16: 3}),
         (CALIBRATION_RECORD, NEW_CALIBRATION, {0: 2, 4: 99, 5: 0, 14: 0x7F, 19: 0, 25: 0, 28: 99}),
     ):
         for at, value in values.items():

@@ -40,9 +40,40 @@ def test_read_only_and_unknown_parameters_are_rejected(robot):
     assert robot.set(core.STEPS_PER_REV, 400) == (core.READ_ONLY, 200)
     assert robot.set(core.GYRO_RANGE, 250) == (core.READ_ONLY, 500)
     assert robot.set(core.MICROSTEPS, 8) == (core.READ_ONLY, 16)
-    for number in (11, 12, 128, 255):
+    assert robot.set(core.BOOTS, 1)[0] == core.READ_ONLY
+    for number in (12, 13, 128, 255):
         assert robot.set(number, 1) == (core.UNKNOWN, 0)
         assert robot.get(number) == (core.UNKNOWN, 0)
+
+
+def test_the_count_of_starts_changes_with_each_start_only(library):
+    """Modulo 2**31; a key that is written does not count."""
+    robot = core.Robot(library)
+
+    def boots():
+        robot.run(200_000)  # the EEPROM is written
+        robot.hello()
+        return robot.get(core.BOOTS)[1]
+
+    before = boots()
+    robot.console(b'\x04\x09' + bytes(range(16)), 500_000)
+    robot.console(b'\x04\x0a' + bytes(16), 500_000)
+    assert boots() == before
+    for count in range(1, 4):
+        robot.call('boot', 2, 0)
+        assert boots() == (before + count) % 2**31
+
+
+def test_a_lost_count_of_starts_does_not_begin_where_it_was(library):
+    robot = core.Robot(library)
+    robot.run(200_000)
+    robot.hello()
+    before = robot.get(core.BOOTS)[1]
+    robot.call('poke_eeprom', 33, 0x5A)  # its CRC is wrong now
+    robot.call('set_noise', 777)
+    robot.call('boot', 2, 0)
+    robot.hello()
+    assert robot.get(core.BOOTS)[1] not in (before, before + 1)
 
 
 def test_the_direction_changes_only_at_rest(robot):

@@ -4,7 +4,8 @@
 
 import math
 
-from t3mpc_ros.radio.link.statistics import DiagnosticLevel, LinkStatistics
+from t3mpc_ros.radio.link.statistics import CableErrors, DiagnosticLevel, LinkStatistics, Loss
+from t3mpc_ros.radio.protocol.frames import Pong
 from t3mpc_ros.radio.protocol.framing import FrameCounts
 
 NOTHING = FrameCounts(0, 0, 0)
@@ -28,7 +29,7 @@ def test_quality_before_the_first_cycle():
 
 def test_losses_and_round_trips_of_the_last_ten_seconds():
     trips = [0.001 * (1 + at % 100) for at in range(1000)]
-    statistics = after(*[None] * 700, *trips)
+    statistics = after(*[Loss.RADIO] * 700, *trips)
     quality = statistics.quality(0.0, NOTHING)
     assert (quality.cycles, quality.lost) == (1700, 700)
     assert quality.lost_share == 0.0
@@ -37,15 +38,15 @@ def test_losses_and_round_trips_of_the_last_ten_seconds():
 
 
 def test_more_than_one_loss_in_twenty_is_a_warning():
-    cycle = [0.005] * 19 + [None]
+    cycle = [0.005] * 19 + [Loss.RADIO]
     assert after(*cycle * 10).quality(0.0, NOTHING).level is DiagnosticLevel.OK
-    worse = after(*cycle * 10, None).quality(0.0, NOTHING)
+    worse = after(*cycle * 10, Loss.RADIO).quality(0.0, NOTHING)
     assert worse.level is DiagnosticLevel.WARN
-    assert worse.text == '5.5 % of the cycles are lost'
+    assert worse.text.startswith('5.5 % of the cycles are lost on the radio')
 
 
 def test_a_few_cycles_are_not_judged():
-    assert after(None, 0.005).quality(0.0, NOTHING).level is DiagnosticLevel.OK
+    assert after(Loss.RADIO, 0.005).quality(0.0, NOTHING).level is DiagnosticLevel.OK
 
 
 def test_slow_round_trips_are_a_warning_with_their_usual_cause():
@@ -69,3 +70,45 @@ def test_retransmissions_are_counted_by_number():
         statistics.add_exchange(tries)
     counted = statistics.quality(0.0, NOTHING).retransmissions
     assert counted == (2, 0, 0, 1, *[0] * 11, 1)
+
+
+def test_the_hop_that_lost_most_is_named():
+    for worst, text in (
+        (Loss.NO_REPLY, 'at the dongle: no reply'),
+        (Loss.RADIO, 'on the radio'),
+        (Loss.ROBOT, 'at the robot'),
+    ):
+        statistics = after(*[0.005] * 60, *Loss, *[worst] * 3)
+        quality = statistics.quality(0.0, NOTHING)
+        assert f'are lost {text}' in quality.text
+        assert quality.losses == {hop: 1 + 3 * (hop is worst) for hop in Loss}
+        assert quality.lost == 6
+
+
+def test_damaged_frames_of_either_end_tell_the_cable_from_the_dongle():
+    statistics = after(*[0.005] * 60)
+    statistics.add_pong(a_pong(65_530, 1, 0), False)
+    statistics.count_host_errors(FrameCounts(100, 4, 3))
+    for _ in range(5):
+        statistics.add_cycle(Loss.NO_REPLY)
+    statistics.add_pong(a_pong(4, 2, 0), False)  # its counters have 16 bits
+    statistics.count_host_errors(FrameCounts(100, 6, 4))
+    statistics.add_cycle(Loss.NO_REPLY)
+    quality = statistics.quality(0.0, NOTHING)
+    assert quality.cable_errors == CableErrors(10, 65_542)
+    assert 'on the cable: 10 damaged frames at the host, 65542 at the dongle' in quality.text
+    statistics.add_pong(a_pong(5, 0, 0), True)
+    assert statistics.quality(0.0, NOTHING).cable_errors.dongle == 65_547
+
+
+def a_pong(*counts):
+    return Pong(0, bytes(4), 0, 2, 2, 1, 1, *counts, 0, 0, 82, b'T3MPC', 0)
+
+
+def test_a_silence_is_blamed_on_the_hop_of_the_cycles_since_the_last_state():
+    absent = 'the robot does not answer: is it on, in range, on channel 82?'
+    assert LinkStatistics(0.02, 0.2).silence_reason(82) == absent
+    assert after(Loss.NO_REPLY, 0.005).silence_reason(82) == absent
+    unplugged = after(0.005, Loss.NO_REPLY, Loss.NO_REPLY, Loss.RADIO).silence_reason(82)
+    assert unplugged == 'the dongle does not reply: is its cable loose or damaged?'
+    assert after(0.005, Loss.NO_REPLY, Loss.RADIO, Loss.RADIO).silence_reason(82) == absent

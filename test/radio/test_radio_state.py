@@ -105,21 +105,23 @@ def a_telemetry_decoder(source):
     used, fresh = TelemetryDecoder(), TelemetryDecoder()
     now_ns = 5 * SECOND
     robot.boot(now_ns, source.randrange(2**32), (source.randrange(2**31), source.randrange(2**31)))
+    used.start_session(1, robot.boots, now_ns)
     for _ in range(source.randrange(1, 10)):
         now_ns += source.randrange(1, 800) * MS
         robot.speeds, robot.until_ns = (source.uniform(-9, 9), source.uniform(-9, 9)), now_ns
-        _decode(used, robot, now_ns, source.random() < 0.8)
+        _decode(used, robot, now_ns, source.random() < 0.8, 1)
     if source.random() < 0.5:
         for each in (used, fresh):
             each.configure(400 * 16, 1000)
     before = used.angles
     now_ns += source.randrange(1, 5) * SECOND
-    clock_us = robot.time_us(now_ns) + 2**31  # none that the old clock could show
-    robot.boot(now_ns, clock_us % 2**32)
-    kept = '_base', '_time.total', '_left.total', '_right.total', 'rebooted'
+    robot.boot(now_ns, source.randrange(2**32))
+    for each in (used, fresh):
+        each.start_session(2, robot.boots, now_ns)
+    kept = '_base', '_time.total', '_left.total', '_right.total'
     for _ in range(3):
         now_ns += 20 * MS
-        got, expected = (_decode(each, robot, now_ns, True) for each in (used, fresh))
+        got, expected = (_decode(each, robot, now_ns, True, 2) for each in (used, fresh))
         angles = [a - b for a, b in zip(got.angles, before, strict=True)]
         assert angles == pytest.approx(expected.angles, abs=1e-6)
         yield got, expected._replace(angles=got.angles), ()
@@ -127,10 +129,11 @@ def a_telemetry_decoder(source):
         yield used, fresh, (*kept, *clock)
 
 
-def _decode(decoder, robot, now_ns, timed):
+def _decode(decoder, robot, now_ns, timed, session):
     robot.command_ns = now_ns - 5 * MS
     timing = CommandTiming(now_ns - 6 * MS, MS) if timed else None
-    return decoder.decode(robot.state(now_ns), now_ns, timing)
+    state = robot.state(now_ns)._replace(session=session)
+    return decoder.decode(state, now_ns, timing)
 
 
 def a_handshake(source):

@@ -68,8 +68,13 @@ def test_records_of_the_specification_byte_for_byte():
     golden = dict(VECTORS['records']['settings'])
     body = bytes.fromhex(golden.pop('bytes'))
     golden |= {'address': bytes.fromhex(golden['address']), 'sensors': tuple(golden['sensors'])}
-    assert robot_records.encode_settings(robot_records.RobotSettings(**golden)) == body
-    assert robot_records.decode_settings(body) == robot_records.RobotSettings(**golden)
+    settings = robot_records.RobotSettings(**golden)
+    assert robot_records.encode_settings(settings) == body
+    assert robot_records.decode_settings(body) == settings
+    wired = settings._replace(battery_wired=True)  # from firmware 2.1
+    body = body[:13] + bytes([body[13] | 4]) + body[14:]
+    assert robot_records.encode_settings(wired) == body
+    assert robot_records.decode_settings(body) == wired
     golden = VECTORS['records']['calibration']
     body = bytes.fromhex(golden['bytes'])
     names = 'wheel_radius', 'track', 'gyro_scale', 'gyro_bias'

@@ -5,6 +5,7 @@
 Errors of the port are in ``test_serial_port.py`` and are reported unchanged.
 """
 
+from itertools import count
 import math
 
 import pytest
@@ -17,6 +18,8 @@ from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Pong, StatusFlag
+from t3mpc_ros.radio.protocol.framing import crc16
+from t3mpc_ros.radio.tool import robot_records
 from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 
 KEY = bytes(range(16))
@@ -136,11 +139,35 @@ def the_air_is_jammed(bench):
     bench.run(0.5)
 
 
-@cause('of the cycles are lost')
+@cause('of the cycles are lost on the radio')
 def the_air_is_bad(bench):
     driving(bench)
     bench.inject('loss', math.inf, 0.35)
     bench.run(5.0)
+
+
+@cause('of the cycles are lost on the cable')
+def the_cable_is_bad(bench):
+    """30 % of the frames were damaged, and the radio was blamed."""
+    driving(bench)
+    bench.inject('flip_bits', math.inf, 0.005)
+    bench.run(8.0)
+
+
+@cause('of the cycles are lost at the dongle: no reply')
+def the_dongle_loses_frames(bench):
+    driving(bench)
+    for _ in range(20):
+        bench.inject('silence', 0.02)
+        bench.run(0.3)
+
+
+@cause('of the cycles are lost at the robot')
+def the_robot_is_too_slow_with_its_state(bench):
+    driving(bench)
+    load, number = bench.board._load, count()
+    bench.board._load = lambda payload: next(number) % 3 and load(payload)
+    bench.run(2.5)
 
 
 @cause('the keys differ', key=KEY, robot_key=bytes(16))
@@ -204,6 +231,28 @@ def the_bridge_ends(bench):
     driving(bench)
     bench.robot.shut_down()
     bench.run(1.0)
+
+
+@cause('measures no battery voltage, but its settings say that the battery is wired')
+def the_wire_of_the_battery_breaks(bench):
+    settings = robot_records.encode_settings(robot_records.RobotSettings(battery_wired=True))
+    body = settings + crc16(settings).to_bytes(2, 'little')
+    for copy in (40, 72):
+        bench.board.write_eeprom(copy, body)
+    bench.inject('robot_reset', 0.1)
+    bench.run(1.0)
+    driving(bench)
+    bench.inject('battery_wire')
+    bench.run(6.0)
+    assert bench.board.speeds == (0, 0)
+
+
+@cause('')
+def an_unwired_battery_is_not_missed(bench):
+    bench.inject('battery_wire')
+    driving(bench)
+    bench.run(6.0)
+    assert bench.followed[-1][1].left == 3000
 
 
 def driving_with_complaints(bench):

@@ -46,6 +46,7 @@ class FakeRobot:
         self.booted_ns, self.clock_us = now_ns, clock_us
         self.steps = [float(steps[0]), float(steps[1])]
         self.parameters = [parameter.default for parameter in BOARD_PARAMETERS]
+        self.parameters[-1] = self.boots
         self.speeds = (0.0, 0.0)
         self.enabled = self.estop = self.expired = False
         self.seq, self.last_seq = 0, None
@@ -235,6 +236,7 @@ class FakeDongle:
         self.ready_ns = now_ns + self.boot_delay_ns
         self.decoder = FrameDecoder()
         self.configured = False
+        self.radio = 82, b'T3MPC'
 
     def time_us(self, now_ns):
         return (now_ns - self.started_ns) // 1000 % WRAP
@@ -292,13 +294,13 @@ class FakeDongle:
                 0,
                 2,
                 0,
-                82,
-                b'T3MPC',
+                *self.radio,
                 0,
             )
             return now_ns + MS, pong
         if isinstance(frame, frames.Configure):
             self.configured = True
+            self.radio = frame.channel, frame.address
             return now_ns + MS, frames.Configured(*frame, int(self.chip_ok))
         if self.busy:
             self.busy -= 1

@@ -23,6 +23,9 @@ _BYTE, _WORD = 0xFF, 0xFFFFFFFF
 _RETRY_NS = NANOSECONDS // 10
 _REJECTED_RETRY_NS = NANOSECONDS
 """Retry period after a rejection, whose cause may be repaired meanwhile."""
+BOOTS_ID = [parameter.name for parameter in frames.BOARD_PARAMETERS].index('boots')
+_BOOTS_READS = 4
+"""Additional reads of the count of starts: of two robots with one address, both answer in turn."""
 _MAX_ATTEMPTS = 50
 """Attempts for one parameter before a new HELLO."""
 _RESULT_TEXTS = {
@@ -160,6 +163,8 @@ class Handshake:
             self.reason = (
                 reasons.robot_version(result.foreign_version)
                 if result.foreign_version
+                else reasons.NO_REPLY
+                if result.reply is None
                 else reasons.robot_absent(self._channel)
             )
             return _RETRY_NS
@@ -183,6 +188,8 @@ class Handshake:
         self._pending.extend(
             (number, None) for number in range(min(count, len(frames.BOARD_PARAMETERS)))
         )
+        if count > BOOTS_ID:
+            self._pending.extend([(BOOTS_ID, None)] * _BOOTS_READS)
 
     def _handle_parameter(self, result: TransactionResult) -> int:
         number, target = self._pending[0]

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.radio.link import standstill_reasons as reasons
-from t3mpc_ros.radio.link.handshake import Entropy, Handshake, Session
+from t3mpc_ros.radio.link.handshake import BOOTS_ID, Entropy, Handshake, Session
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, PortAction, Wait, Write
 from t3mpc_ros.radio.link.setpoint import SetpointArbiter
-from t3mpc_ros.radio.link.statistics import LinkQuality, LinkStatistics
+from t3mpc_ros.radio.link.statistics import LinkQuality, LinkStatistics, Loss
 from t3mpc_ros.radio.link.telemetry import GYRO_RANGE, Telemetry, TelemetryDecoder
 from t3mpc_ros.radio.link.transaction import TransactionLayer, TransactionResult
 from t3mpc_ros.radio.protocol import frames
@@ -38,7 +38,7 @@ _MIN_IDLE_NS = NANOSECONDS // 100
 """Idle time before the next cycle that a request needs."""
 _REQUEST_DECIMATION = 10
 """Without idle time, every tenth cycle is replaced by a request."""
-_AUX_PERIOD_NS = _PING_PERIOD_NS = NANOSECONDS
+_AUX_PERIOD_NS = _PING_PERIOD_NS = _BOOTS_PERIOD_NS = NANOSECONDS
 _ACTIVE_PING_TIMEOUT_NS = NANOSECONDS // 20
 """Short, because the next command waits for it."""
 _MAX_LOST_CYCLES = 100
@@ -50,6 +50,10 @@ _MIN_STOP_COMMANDS = 3
 _STOP_TIMEOUT_NS = NANOSECONDS
 """Time after which the drives are disabled in any case."""
 _DISABLE_COMMANDS = 5
+_MIN_BATTERY_VOLTAGE = 1.0
+"""V; no battery has less."""
+_COLLISION_HOLD_NS = 5 * NANOSECONDS
+"""Standstill after two robots have answered."""
 _REFUSAL_QUERY_NS = NANOSECONDS // 10
 """Time without an accepted command after which AUX is requested for the reason, and again."""
 
@@ -68,6 +72,7 @@ class ActiveSession:
         arbiter: SetpointArbiter,
         statistics: LinkStatistics,
         now_ns: int,
+        counts_boots: bool,
     ) -> None:
         self._parameters = parameters
         self._session = session
@@ -76,7 +81,8 @@ class ActiveSession:
         self._period_ns = round(NANOSECONDS / parameters.cycle_rate)
         self.due_ns = now_ns
         """Time of the next cycle."""
-        self._aux_ns = self._ping_ns = now_ns
+        self._aux_ns = self._ping_ns = self._boots_ns = now_ns
+        self._counts_boots = counts_boots
         self._cycles = 0
         self._accepted_ns = self._answered_ns = now_ns
         # With slow cycles a single answer is a cycle old when the next command is due.
@@ -102,8 +108,11 @@ class ActiveSession:
             self._stops, self._stop_until_ns = _MIN_STOP_COMMANDS, now_ns + _STOP_TIMEOUT_NS
             self.due_ns = now_ns
 
-    def next(self, now_ns: int) -> frames.Downlink | PingRequest | None:
-        """Return the request to send now, if any; a POLL for STATE follows each payload."""
+    def next(self, now_ns: int, hold: bool = False) -> frames.Downlink | PingRequest | None:
+        """Return the request to send now, if any; a POLL for STATE follows each payload.
+
+        ``hold``: command standstill, whatever the setpoint.
+        """
         if now_ns < self.due_ns:
             return self._next_request(now_ns) if self.due_ns - now_ns >= _MIN_IDLE_NS else None
         # Late cycles are skipped.
@@ -113,7 +122,7 @@ class ActiveSession:
             request = self._next_request(now_ns)
             if request is not None:
                 return request
-        return self._next_command(now_ns)
+        return self._next_command(now_ns, hold)
 
     def handle(self, result: TransactionResult) -> str:
         """Process a result; return the reason for a new handshake, empty if none is needed."""
@@ -123,8 +132,8 @@ class ActiveSession:
             self._answered_ns = result.returned_ns
         if isinstance(result.request, frames.Command):
             answered = isinstance(result.uplink, frames.State)
-            complete = answered and _is_own_state(result, result.request)
-            self._statistics.add_cycle(result.round_trip if complete else None)
+            loss = _find_loss(result, result.request)
+            self._statistics.add_cycle(result.round_trip if loss is None else loss)
             self._lost = 0 if answered else self._lost + 1
             self._count_disable(result)
         elif isinstance(result.request, frames.Poll) and result.request.what == frames.STATE:
@@ -132,7 +141,7 @@ class ActiveSession:
         if isinstance(result.uplink, frames.State):
             return self._check_state(result, result.uplink)
         if self._lost >= _MAX_LOST_CYCLES:
-            return reasons.robot_absent(self._parameters.channel)
+            return self._statistics.silence_reason(self._parameters.channel)
         return ''
 
     def _continue_cycles(self, result: TransactionResult) -> None:
@@ -155,9 +164,13 @@ class ActiveSession:
         if now_ns >= self._ping_ns:
             self._ping_ns = now_ns + _PING_PERIOD_NS
             return PingRequest()
+        if self._counts_boots and now_ns >= self._boots_ns:
+            # Another count than at the start of the session is that of another robot.
+            self._boots_ns = now_ns + _BOOTS_PERIOD_NS
+            return self._session.get(BOOTS_ID)
         return None
 
-    def _next_command(self, now_ns: int) -> frames.Downlink:
+    def _next_command(self, now_ns: int, hold: bool) -> frames.Downlink:
         if self._stops is not None:
             standing = not self._status & frames.StatusFlag.MOVING and self._stops <= 0
             disable = standing or now_ns >= self._stop_until_ns
@@ -167,7 +180,7 @@ class ActiveSession:
         if self._session.echo_us is None and not self._arbiter.estop:
             return self._session.poll(frames.STATE)
         setpoint = self._arbiter.next_setpoint(
-            bool(self._status & frames.StatusFlag.ESTOP), now_ns, self.is_silent(now_ns)
+            bool(self._status & frames.StatusFlag.ESTOP), now_ns, hold or self.is_silent(now_ns)
         )
         flags, left, right, ttl = setpoint
         return self._session.command(flags, ttl, left, right, now_ns)
@@ -190,7 +203,7 @@ class ActiveSession:
     def _check_state(self, result: TransactionResult, state: frames.State) -> str:
         self._status = frames.StatusFlag(state.status)
         if state.session != self._session.number or state.status & frames.StatusFlag.NO_SESSION:
-            return 'the robot has lost its session'
+            return reasons.SESSION_LOST
         if isinstance(result.request, frames.Command):
             # ESTOP is always executed, whether or not the rest of the command is accepted.
             if state.seq == result.request.seq or result.request.flags & frames.CommandFlag.ESTOP:
@@ -205,16 +218,20 @@ class ActiveSession:
         return ''
 
 
-def _is_own_state(result: TransactionResult, command: frames.Command) -> bool:
-    """Return whether a STATE was sampled in this cycle: the CMD itself fetches an older one.
+def _find_loss(result: TransactionResult, command: frames.Command) -> Loss | None:
+    """Return where a cycle was lost; None if it returned a STATE that was sampled in it.
 
-    A retransmitted CMD may fetch its own STATE; the POLL then returns none.
+    The CMD itself fetches an older one. A retransmitted CMD may fetch its own STATE; the POLL then
+    returns none.
     """
-    fetched = (
-        isinstance(result.reply, frames.Result)
-        and decode_exchange_status(result.reply.second).has_payload
-    )
-    return fetched or getattr(result.uplink, 'seq', None) == command.seq
+    if not isinstance(result.reply, frames.Result):
+        return Loss.NO_REPLY
+    poll = decode_exchange_status(result.reply.second)
+    if isinstance(result.uplink, frames.State) and (
+        poll.has_payload or result.uplink.seq == command.seq
+    ):
+        return None
+    return Loss.ROBOT if poll.acknowledged else Loss.RADIO
 
 
 class Link:
@@ -248,6 +265,12 @@ class Link:
         """Entry into PING or RUN."""
         self._reopen_ns = _MIN_REOPEN_NS
         self._estop_ns = 0
+        self._lost_session = 0
+        """Number of the session that the robot has reported as lost; 0: none."""
+        self._session_ended = False
+        """Whether an answer had another session than this one, which had started."""
+        self._collision_until_ns = 0
+        """Time until which the robot stands, because two robots have answered."""
         self._session: Session | None = None
         self._handshake: Handshake | None = None
         self._active: ActiveSession | None = None
@@ -308,13 +331,15 @@ class Link:
 
     def reason(self, now_ns: int) -> str:
         """Return why the robot does not move; empty when it follows commands."""
+        if now_ns < self._collision_until_ns and self.state in (*_HANDSHAKE_STATES, LinkState.RUN):
+            return reasons.two_robots(self._parameters.address, self._parameters.channel)
         if self.state in _HANDSHAKE_STATES and self._handshake is not None:
             return self._handshake.reason
         if self.state is not LinkState.RUN:
             return self._reason
         silence = min(self._age(now_ns), (now_ns - self._since_ns) / NANOSECONDS)
         if silence > self._parameters.ttl:
-            return reasons.robot_absent(self._parameters.channel)
+            return self._statistics.silence_reason(self._parameters.channel)
         status = self.telemetry.raw.status if self.telemetry is not None else frames.StatusFlag(0)
         if reason := self._arbiter.reason(bool(status & frames.StatusFlag.ESTOP)):
             return reason
@@ -322,8 +347,10 @@ class Link:
             return reasons.TTL_EXPIRED
         if status & frames.StatusFlag.ENABLED:
             return ''
-        low = status & frames.StatusFlag.LOW_BATTERY
-        return reasons.BATTERY_CUTOFF if low else reasons.DRIVES_DISABLED
+        if not status & frames.StatusFlag.LOW_BATTERY:
+            return reasons.DRIVES_DISABLED
+        absent = self.battery is not None and self.battery.voltage < _MIN_BATTERY_VOLTAGE
+        return reasons.BATTERY_ABSENT if absent else reasons.BATTERY_CUTOFF
 
     # -- commands ---------------------------------------------------------------------------------
 
@@ -437,7 +464,7 @@ class Link:
             self._transact(frame, now_ns, what)
 
     def _send_active(self, active: ActiveSession, now_ns: int) -> None:
-        frame = active.next(now_ns)
+        frame = active.next(now_ns, hold=now_ns < self._collision_until_ns)
         if isinstance(frame, PingRequest):
             self._write(self._transactions.ping(_ACTIVE_PING_TIMEOUT_NS, now_ns))
         elif frame is not None:
@@ -454,16 +481,19 @@ class Link:
         self._actions.append(Write(data))
 
     def _handle(self, result: TransactionResult, now_ns: int) -> None:
-        self._statistics.dongle_resets += result.dongle_restarted
+        restarted = result.dongle_restarted or self._lost_configuration(result)
+        self._statistics.dongle_resets += restarted
+        self._statistics.count_host_errors(self._transactions.frame_counts)
         if isinstance(result.reply, frames.Pong):
-            self._statistics.dongle = result.reply
+            self._statistics.add_pong(result.reply, restarted)
         if isinstance(result.uplink, frames.Aux):
             self._statistics.robot = result.uplink
         if isinstance(result.uplink, frames.State):
             self._handle_state(result, result.uplink)
+        self._note_collision(self._contradicts(result.uplink), now_ns)
         if self.state is LinkState.PING:
             self._handle_pong(result, now_ns)
-        elif result.dongle_restarted:
+        elif restarted:
             self._configure_radio(now_ns)  # the restart cleared its configuration
         elif self._transactions.timeouts >= _MAX_TIMEOUTS:
             self._search_dongle(reasons.DONGLE_TIMEOUT, now_ns)
@@ -472,12 +502,22 @@ class Link:
         else:
             self._handle_robot(result, now_ns)
 
+    def _lost_configuration(self, result: TransactionResult) -> bool:
+        """Return whether a PONG in a session shows another channel or address than configured."""
+        pong = result.reply
+        if self._active is None or not isinstance(pong, frames.Pong):
+            return False
+        wanted = self._parameters.configure(0)
+        return (pong.channel, pong.address) != (wanted.channel, wanted.address)
+
     def _handle_robot(self, result: TransactionResult, now_ns: int) -> None:
         """Process the answer of the robot in a session, or in the handshake before it."""
         if self._active is not None:
             reason = self._active.handle(result)
             if self._active.finished:
                 self._close(LinkState.DONE, reasons.SHUT_DOWN)
+            elif self._counts_differ(result.uplink):
+                self._start_handshake(reasons.OTHER_ROBOT, now_ns)
             elif reason:
                 self._start_handshake(reason, now_ns)
         elif self._handshake is not None and not isinstance(result.request, frames.Command):
@@ -491,12 +531,48 @@ class Link:
         own = self._active is not None and state.seq == getattr(result.request, 'seq', None)
         timing = result.timing if own else None
         telemetry = self._decoder.decode(state, result.returned_ns, timing)
-        self._statistics.robot_resets += self._decoder.rebooted
+        self._note_collision(self._decoder.two_robots, result.returned_ns)
         if telemetry is not None:
             if self._session is not None:
                 self._session.echo_us = state.time_us
             self.telemetry = telemetry
             self._received_ns = result.returned_ns
+
+    def _note_collision(self, two_robots: bool, now_ns: int) -> None:
+        """Stop for a while if two robots answer: each would follow every command."""
+        if two_robots:
+            self._statistics.collisions += 1
+            self._collision_until_ns = now_ns + _COLLISION_HOLD_NS
+
+    def _contradicts(self, answer: frames.Uplink | None) -> bool:
+        """Return whether an answer and an earlier one cannot be of one robot.
+
+        A session that an answer did not have is over, and the robot does not return to it.
+        """
+        if answer is None or self._session is None:
+            return False
+        if self._lost_session and answer.session == self._lost_session:
+            return True
+        if self.state not in (LinkState.PARAMS, LinkState.RUN, LinkState.STOP):
+            self._session_ended = False
+        elif answer.session != self._session.number:
+            self._session_ended = True
+        elif self._session_ended:
+            return True
+        return self._counts_differ(answer)
+
+    def _counts_differ(self, answer: frames.Uplink | None) -> bool:
+        """Return whether an answer has another count of starts than that of the session."""
+        return (
+            isinstance(answer, frames.Param)
+            and (answer.id, answer.rc) == (BOOTS_ID, frames.OK)
+            and self._known_boots() not in (None, answer.value)
+        )
+
+    def _known_boots(self) -> int | None:
+        """Return the count of starts that the robot of this session has reported."""
+        reported = self._handshake.board_parameters if self._handshake else self._board_parameters
+        return reported.get(BOOTS_ID)
 
     def _handle_pong(self, result: TransactionResult, now_ns: int) -> None:
         pong = result.reply
@@ -544,6 +620,7 @@ class Link:
     def _start_handshake(self, reason: str, now_ns: int) -> None:
         before = self._session.number if self._session else 0
         self._session = Session(self._key, self._entropy, before, now_ns)
+        self._lost_session = before if reason == reasons.SESSION_LOST else 0
         self._enter(LinkState.HELLO, reason)
         self._handshake = Handshake(self._session, self._parameters, reason)
         self._due_ns = now_ns
@@ -558,11 +635,21 @@ class Link:
         except ValueError as error:
             self._start_handshake(f'the robot reports invalid information: {error}', now_ns)
             return
+        self._statistics.robot_resets += self._decoder.start_session(
+            self._session.number, self._board_parameters.get(BOOTS_ID), now_ns
+        )
+        self._note_collision(self._decoder.two_robots, now_ns)
+        self._lost_session = 0
         self._enter(LinkState.RUN, '')
         self._since_ns = now_ns
         self._statistics.sessions += 1
         self._active = ActiveSession(
-            self._parameters, self._session, self._arbiter, self._statistics, now_ns
+            self._parameters,
+            self._session,
+            self._arbiter,
+            self._statistics,
+            now_ns,
+            BOOTS_ID in self._board_parameters,
         )
 
     def _continue_stop(self, now_ns: int) -> None:

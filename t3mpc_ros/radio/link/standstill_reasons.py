@@ -8,6 +8,7 @@ NO_COMMAND = 'no command yet'
 DONGLE_STARTING = 'the dongle does not answer yet: it takes 1.5 s to start'
 DONGLE_TIMEOUT = 'the dongle stopped answering: did it restart?'
 NO_DONGLE = 'no dongle answers on this port: is it the right port?'
+NO_REPLY = 'the dongle does not reply: is its cable loose or damaged?'
 NO_CHIP = 'the radio chip of the dongle does not answer: check its wiring and supply'
 ROBOT_USB = (
     'this is the USB port of the robot board, not of the dongle; '
@@ -37,9 +38,15 @@ SETTINGS = {
 }
 """By the state of the settings in INFO."""
 BATTERY_CUTOFF = 'the battery of the robot is below its cut-off: charge it'
+BATTERY_ABSENT = (
+    'the robot measures no battery voltage, but its settings say that the battery is wired: check '
+    'wire and divider'
+)
 DRIVES_DISABLED = 'the drives of the robot are not enabled yet'
 COMMAND_EXPIRED = 'the last command has expired'
 TTL_EXPIRED = 'no command reached the robot in time: it stopped by itself'
+SESSION_LOST = 'the robot has lost its session'
+OTHER_ROBOT = 'another robot answers'
 ROBOT_ESTOP = 'the emergency stop of the robot is latched'
 ESTOP_BUTTON_HELD = 'the emergency stop of the robot stays latched: is its button still pressed?'
 SHUT_DOWN = 'the link is shut down'
@@ -57,6 +64,46 @@ _REFUSALS: dict[int, str] = {
     frames.RefusalReason.STALE: 'they arrive too late, or its answers do',
 }
 
+_RESET_CAUSES = ('power on', 'reset button or opened port', 'brown-out', 'watchdog', 'JTAG')
+"""By bit of the register MCUSR of the AVR."""
+
+
+def reset_cause(register: int) -> str:
+    """Return the cause of a reset in INFO or in the log of the robot."""
+    causes = [text for bit, text in enumerate(_RESET_CAUSES) if register >> bit & 1]
+    return ', '.join(causes) or 'started by a boot loader'
+
+
+def restarted(register: int, unknown: float) -> str:
+    """Return the text for a robot that restarted, with the length (m) of its unknown path."""
+    if not unknown:
+        return f'the robot restarted ({reset_cause(register)})'
+    return (
+        f'the robot restarted in motion ({reset_cause(register)}): up to {unknown:.2f} m of its '
+        'path are unknown'
+    )
+
+
+_LOSS_TEXTS = {
+    'radio': (
+        'on the radio: distance, antenna, supply of a radio module, or another transmitter on the '
+        'channel; t3mpc robot scan'
+    ),
+    'robot': 'at the robot: it acknowledges, but is too slow with its state; t3mpc robot log',
+}
+
+
+def lost_cycles(hop: str, host_errors: int, dongle_errors: int) -> str:
+    """Return where cycles are lost: ``hop`` of the reply, and damaged frames at both ends."""
+    if hop in _LOSS_TEXTS:
+        return _LOSS_TEXTS[hop]
+    if host_errors or dongle_errors:
+        return (
+            f'on the cable: {host_errors} damaged frames at the host, {dongle_errors} at the '
+            'dongle; another cable or port'
+        )
+    return 'at the dongle: no reply within 50 ms, and no damaged frame'
+
 
 def refused(what: str, reason: int) -> str:
     """Return the text for frames that the robot refuses, with the reason in INFO or AUX."""
@@ -67,6 +114,14 @@ def robot_version(version: int) -> str:
     """Return the text for a robot of another version of the protocol."""
     return (
         f'the robot must speak protocol {frames.VERSION}: it speaks {version}; flash both boards'
+    )
+
+
+def two_robots(address: str, channel: int) -> str:
+    """Return the text for two robots with one address."""
+    return (
+        f'two robots answer on address {address}, channel {channel}: give each an address of its '
+        'own, t3mpc robot setup --address'
     )
 
 

@@ -1,15 +1,18 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Link statistics: lost cycles, retransmissions, round trips, counters of both ends.
+"""Link statistics: lost cycles by the hop that lost them, retransmissions, round trips, counters.
 
-A cycle is one CMD with its POLL. It counts as lost when its own state did not return, for whatever
-reason; the robot may or may not have received the command.
+A cycle is one CMD with its POLL. It counts as lost when its own state did not return; the robot
+may or may not have received the command. The reply of the dongle tells the hop: none, one without
+an acknowledgement, or one without a new state.
 """
 
 from collections import deque
-from enum import IntEnum
+from collections.abc import Mapping
+from enum import Enum, IntEnum
 from typing import NamedTuple
 
+from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.protocol.frames import Aux, Pong
 from t3mpc_ros.radio.protocol.framing import FrameCounts
 
@@ -21,6 +24,7 @@ LOSS_LIMIT = 0.05
 """Loss rate above which the level is WARN."""
 ROUND_TRIP_LIMIT = 0.5
 """Fraction of the period above which slow round trips cause WARN."""
+_WRAP = 1 << 16
 RETRY_COUNTS = 16
 """Number of retransmission counts: the radio chip counts to 15."""
 
@@ -33,6 +37,29 @@ class DiagnosticLevel(IntEnum):
     ERROR = 2
 
 
+class Loss(Enum):
+    """Where a cycle was lost."""
+
+    NO_REPLY = 'no reply'
+    """Between host and dongle: the cable damaged a frame, or the dongle did not answer."""
+    RADIO = 'radio'
+    """A packet was not acknowledged."""
+    ROBOT = 'robot'
+    """All packets were acknowledged, but no new state came with them."""
+
+
+class CableErrors(NamedTuple):
+    """Damaged frames and lost bytes on the serial line, since the port was first opened."""
+
+    host: int = 0
+    """Counted by the host: frames from the dongle."""
+    dongle: int = 0
+    """Counted by the dongle: frames to it."""
+
+    def __sub__(self, other: 'CableErrors') -> 'CableErrors':
+        return CableErrors(self.host - other.host, self.dongle - other.dongle)
+
+
 class LinkQuality(NamedTuple):
     """Quality of the link; loss rate and round trips over the last 500 cycles."""
 
@@ -43,6 +70,9 @@ class LinkQuality(NamedTuple):
     """Since the port was first opened."""
     lost: int
     """Lost cycles since then."""
+    losses: Mapping[Loss, int]
+    """Lost cycles by hop."""
+    cable_errors: CableErrors
     lost_share: float
     """0 to 1; NaN before the first cycle, like the next two."""
     round_trip_median: float
@@ -58,6 +88,8 @@ class LinkQuality(NamedTuple):
     dongle_resets: int
     sessions: int
     """Started, including the first."""
+    collisions: int
+    """Number of answers that showed a second robot with the same address."""
     port_failures: int
     host: FrameCounts
     """Frames received by the host."""
@@ -79,13 +111,16 @@ class LinkStatistics:
     def __init__(self, period: float, timeout: float) -> None:
         self._period = period
         self._timeout = timeout
-        self._recent: deque[float | None] = deque(maxlen=_WINDOW_CYCLES)
-        """Round trip of each cycle, None for a lost one."""
+        self._recent: deque[tuple[float | Loss, CableErrors]] = deque(maxlen=_WINDOW_CYCLES)
+        """Round trip of each cycle or where it was lost, and the errors counted by then."""
+        self._losses = dict.fromkeys(Loss, 0)
+        self._cable_errors = CableErrors()
         self._retransmissions = [0] * RETRY_COUNTS
-        self._cycles = self._lost = 0
+        self._cycles = 0
         self.robot_resets = 0
         self.dongle_resets = 0
         self.sessions = 0
+        self.collisions = 0
         self.port_failures = 0
         self.malformed = 0
         self.dongle: Pong | None = None
@@ -95,16 +130,50 @@ class LinkStatistics:
         """Count one transmitted packet."""
         self._retransmissions[retransmissions] += 1
 
-    def add_cycle(self, round_trip: float | None) -> None:
-        """Count a cycle with its round trip (s); None for a lost one."""
+    def add_cycle(self, outcome: float | Loss) -> None:
+        """Count a cycle with its round trip (s), or where it was lost."""
         self._cycles += 1
-        self._recent.append(round_trip)
-        if round_trip is None:
-            self._lost += 1
+        self._recent.append((outcome, self._cable_errors))
+        if isinstance(outcome, Loss):
+            self._losses[outcome] += 1
+
+    def add_pong(self, pong: Pong, restarted: bool) -> None:
+        """Take the counters of the dongle, which start at 0 when it does."""
+        before, self.dongle = self.dongle, pong
+        counts = pong.crc_errors, pong.frame_errors, pong.overruns
+        earlier = (0, 0, 0)
+        if before is not None and not restarted:
+            earlier = before.crc_errors, before.frame_errors, before.overruns
+        new = sum((now - then) % _WRAP for now, then in zip(counts, earlier, strict=True))
+        self._cable_errors = self._cable_errors._replace(dongle=self._cable_errors.dongle + new)
+
+    def count_host_errors(self, counts: FrameCounts) -> None:
+        """Take the counters of the host."""
+        self._cable_errors = self._cable_errors._replace(
+            host=counts.crc_errors + counts.frame_errors
+        )
+
+    def worst_hop(self) -> str:
+        """Return the text for the hop that lost most of the recent cycles; empty without any."""
+        lost = [outcome for outcome, _ in self._recent if isinstance(outcome, Loss)]
+        if not lost:
+            return ''
+        worst = max(Loss, key=lost.count)
+        errors = self._recent[-1][1] - self._recent[0][1]
+        return reasons.lost_cycles(worst.value, errors.host, errors.dongle)
+
+    def silence_reason(self, channel: int) -> str:
+        """Return why nothing has come from the robot, by the cycles since its last state."""
+        unanswered = 0
+        for outcome, _ in reversed(self._recent):
+            if not isinstance(outcome, Loss):
+                break
+            unanswered += 1 if outcome is Loss.NO_REPLY else -1
+        return reasons.NO_REPLY if unanswered > 0 else reasons.robot_absent(channel)
 
     def quality(self, age: float, host: FrameCounts) -> LinkQuality:
         """Return the quality of the link at telemetry age ``age`` (s)."""
-        trips = sorted(trip for trip in self._recent if trip is not None)
+        trips = sorted(trip for trip, _ in self._recent if not isinstance(trip, Loss))
         recent = len(self._recent)
         lost_share = (recent - len(trips)) / recent if recent else float('nan')
         median, slow = _quantile(trips, 0.5), _quantile(trips, 0.99)
@@ -116,7 +185,7 @@ class LinkStatistics:
         elif lost_share > LOSS_LIMIT:
             level, text = (
                 DiagnosticLevel.WARN,
-                f'{100.0 * lost_share:.1f} % of the cycles are lost',
+                f'{100.0 * lost_share:.1f} % of the cycles are lost {self.worst_hop()}',
             )
         elif slow > ROUND_TRIP_LIMIT * self._period:
             level = DiagnosticLevel.WARN
@@ -126,7 +195,9 @@ class LinkStatistics:
             level,
             text,
             self._cycles,
-            self._lost,
+            sum(self._losses.values()),
+            dict(self._losses),
+            self._cable_errors,
             lost_share,
             median,
             slow,
@@ -135,6 +206,7 @@ class LinkStatistics:
             self.robot_resets,
             self.dongle_resets,
             self.sessions,
+            self.collisions,
             self.port_failures,
             host,
             self.malformed,

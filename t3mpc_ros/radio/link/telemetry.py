@@ -5,18 +5,16 @@
 import math
 from typing import NamedTuple
 
-from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.radio.protocol.clock_sync import ClockModel, CounterUnwrapper, wrapped_difference
 from t3mpc_ros.radio.protocol.frames import AGE_NONE, State, StatusFlag
 from t3mpc_ros.robot.interface import ImuSample, RobotStatus, WheelAngles
 from t3mpc_ros.robot.sensor_conversions import ImuParameters, decode_range
 
-_MICROSECOND = 1000
-"""ns"""
-_MAX_CLOCK_ERROR = 1.0
-"""Maximum constant difference of the time that elapsed for host and robot, s."""
-_MAX_CLOCK_ERROR_RATIO = 0.02
-"""Maximum additional difference relative to the elapsed time."""
+_MAX_COUNTED_RESTARTS = 1000
+"""Difference of two counts of starts above which one of them was lost: one restart is certain."""
+_CLOCK_WINDOW_NS = 10 * NANOSECONDS
+"""Silence between two sessions after which the samples of the clock are too old."""
 _MAX_STATE_AGE_US = 200_000
 """Maximum age of a STATE: without packets, the robot loads one twice as often."""
 _MAX_SPEED_INTERVAL = 0.5
@@ -51,7 +49,12 @@ class CommandTiming(NamedTuple):
 
 
 class TelemetryDecoder:
-    """Converts successive STATE frames into measurements; detects restarts of the robot."""
+    """Converts the STATE frames of successive sessions into measurements.
+
+    A session ends with a restart of the robot, so within a session time and counters of the robot
+    are continuous, however late a STATE is read. Between two sessions the robot has restarted if
+    its count of starts differs.
+    """
 
     def __init__(self) -> None:
         self._clock = ClockModel()
@@ -62,8 +65,17 @@ class TelemetryDecoder:
         self._wheels = WheelSpeeds(0.0, 0.0)
         self._last: State | None = None
         self._last_ns = 0
-        self.rebooted = False
-        """Whether the robot restarted before the last measurement."""
+        self._session = 0
+        self._boots: int | None = None
+        self._former_boots: set[int | None] = set()
+        self.two_robots = False
+        """Whether the last STATE, or the start of the session, was of another robot.
+
+        A clock that goes back within a session, or a former count of starts, is not that of one
+        robot: two with one address answer in turn.
+        """
+        self._unmeasured = True
+        """Whether the next measurement is the first one, or the first since a restart."""
         self._step = math.tau / (STEPS_PER_REV * MICROSTEPS)
         self.configure(STEPS_PER_REV * MICROSTEPS, GYRO_RANGE)
 
@@ -89,16 +101,43 @@ class TelemetryDecoder:
             self._base, self._step = self.angles, step
             self._left, self._right = CounterUnwrapper(), CounterUnwrapper()
 
+    def start_session(self, number: int, boots: int | None, now_ns: int) -> int:
+        """Decode the STATE frames of this session from now on; return the restarts before it.
+
+        ``boots`` is the number of starts that the robot has counted, None if it does not count.
+        """
+        before, self._boots = self._boots, boots
+        self.two_robots = boots != before and boots in self._former_boots
+        if before is not None:
+            self._former_boots.add(before)
+        first, self._session = not self._session, number
+        restarts = 0 if first or self.two_robots else _restarts(before, boots)
+        if restarts or self.two_robots:
+            self._unmeasured = True
+            for counter in (self._left, self._right):
+                counter.rebase()
+                if restarts:
+                    counter.add(0)  # where it starts
+        if self._unmeasured or now_ns - self._last_ns > _CLOCK_WINDOW_NS:
+            self._last = None
+            self._time.rebase()
+            self._clock.reset()
+        return restarts
+
     def decode(
         self, state: State, now_ns: int, timing: CommandTiming | None = None
     ) -> Telemetry | None:
-        """Return the measurement of a STATE; None if it is not newer than the last one."""
-        self.rebooted = self._has_restarted(state, now_ns)
-        if self.rebooted:
-            for counter in (self._time, self._left, self._right):
-                counter.rebase()
-            self._clock.reset()
-        elif self._last is not None and wrapped_difference(self._last.time_us, state.time_us) <= 0:
+        """Return the measurement of a STATE.
+
+        None if it is of another session, or not newer than the last one.
+        """
+        if state.session != self._session:
+            return None
+        ahead_us = (
+            1 if self._last is None else wrapped_difference(self._last.time_us, state.time_us)
+        )
+        self.two_robots = ahead_us < -_MAX_STATE_AGE_US
+        if ahead_us <= 0:
             return None
         before_us, right, left = self._time.total, self._right.total, self._left.total
         time_us = self._time.add(state.time_us)
@@ -118,25 +157,9 @@ class TelemetryDecoder:
             state,
         )
 
-    def _has_restarted(self, state: State, now_ns: int) -> bool:
-        """Return whether the robot clock jumped against the host clock.
-
-        A lost session alone is no evidence: the robot ends it after a long silence and keeps its
-        counters.
-        """
-        last = self._last
-        if last is None:
-            return False
-        back_us = wrapped_difference(state.time_us, last.time_us)
-        if state.status & StatusFlag.NO_SESSION and back_us > _MAX_STATE_AGE_US:
-            return True
-        elapsed_us = (now_ns - self._last_ns) // _MICROSECOND
-        error = wrapped_difference((last.time_us + elapsed_us) % (1 << 32), state.time_us) / 1e6
-        return abs(error) > _MAX_CLOCK_ERROR + _MAX_CLOCK_ERROR_RATIO * elapsed_us / 1e6
-
     def _update_speed(self, elapsed_us: int, right: int, left: int) -> None:
-        if self.rebooted:
-            self._wheels = WheelSpeeds(0.0, 0.0)
+        if self._unmeasured:
+            self._wheels, self._unmeasured = WheelSpeeds(0.0, 0.0), False
         elapsed = elapsed_us / 1e6 * (1.0 + self._clock.skew)
         if 0.0 < elapsed <= _MAX_SPEED_INTERVAL:
             self._wheels = WheelSpeeds(right * self._step / elapsed, left * self._step / elapsed)
@@ -148,6 +171,14 @@ class TelemetryDecoder:
         return ImuSample(
             state.gyro_z * self._rate_step, state.accel_x * step, state.accel_y * step
         )
+
+
+def _restarts(before: int | None, after: int | None) -> int:
+    """Return the number of restarts between two counts of starts, modulo 2**31."""
+    if before is None or after is None:
+        return 1  # a robot that does not count may have restarted
+    restarts = (after - before) % (1 << 31)
+    return restarts if restarts <= _MAX_COUNTED_RESTARTS else 1
 
 
 def _decode_status(bits: int) -> RobotStatus:

@@ -8,7 +8,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.radio.link.statistics import LinkStatistics
 from t3mpc_ros.radio.link.telemetry import CommandTiming
 from t3mpc_ros.radio.protocol import frames
-from t3mpc_ros.radio.protocol.clock_sync import forward_delay_ns, wrapped_difference
+from t3mpc_ros.radio.protocol.clock_sync import forward_delay_ns
 from t3mpc_ros.radio.protocol.codec import (
     decode_exchange_status,
     decode_from_dongle,
@@ -19,8 +19,11 @@ from t3mpc_ros.radio.protocol.framing import FrameCounts, FrameDecoder, encode_f
 
 _REPLY_TIMEOUT_NS = 50_000_000
 """Timeout of a reply; a transaction takes 10.3 ms at most, an FTDI chip up to 16 ms each way."""
-_MAX_CLOCK_ERROR_US = 1_000_000
-"""Maximum difference between dongle clock and host clock over the time between two results."""
+_CLOCK_TOLERANCE_US, _CLOCK_TOLERANCE_SHARE = 20_000, 50
+"""Accepted difference of the clocks of dongle and host: this time, plus a 50th of what elapsed."""
+_MAX_CLOCK_STEP_US = 5_000
+"""Accepted step back between the clocks in a RESULT and in the PONG that follows."""
+_WRAP = 1 << 32
 
 
 class TransactionResult(NamedTuple):
@@ -62,8 +65,8 @@ class TransactionLayer:
         self._decoder = FrameDecoder()
         self._pending: _PendingRequest | None = None
         self._id = 0
-        self._dongle: tuple[int, int] | None = None
-        """Dongle clock (us) and host clock (ns) at its last reply."""
+        self._dongle: tuple[int, int, int] | None = None
+        """Dongle clock (us) in its last reply, and when that was requested and read (host, ns)."""
         self.timeouts = 0
         """Number of consecutive requests without a reply."""
 
@@ -146,9 +149,9 @@ class TransactionLayer:
     ) -> TransactionResult:
         uplink, timing, restarted, foreign_version = None, None, False, 0
         if isinstance(reply, frames.Pong):
-            restarted = self._detect_restart(reply.time_us, now_ns)
+            restarted = self._detect_restart(reply.time_us, pending.sent_ns, now_ns)
         elif isinstance(reply, frames.Result):
-            restarted = self._detect_restart(reply.dongle_us, now_ns)
+            restarted = self._detect_restart(reply.dongle_us, pending.sent_ns, now_ns)
             first = decode_exchange_status(reply.first)
             second = decode_exchange_status(reply.second)
             for status in (first, second):
@@ -178,11 +181,20 @@ class TransactionLayer:
             foreign_version,
         )
 
-    def _detect_restart(self, dongle_us: int, now_ns: int) -> bool:
-        """Return whether the dongle clock jumped against the host clock since the last reply."""
-        before, self._dongle = self._dongle, (dongle_us, now_ns)
+    def _detect_restart(self, dongle_us: int, sent_ns: int, now_ns: int) -> bool:
+        """Return whether the dongle clock has restarted since the last reply.
+
+        The dongle wrote each reply between the request and the reading of that reply, which may
+        be long for a suspended host. That bounds the time that elapsed for the dongle.
+        """
+        before, self._dongle = self._dongle, (dongle_us, sent_ns, now_ns)
         if before is None:
             return False
-        elapsed_us = (now_ns - before[1]) // 1000
-        error = wrapped_difference((before[0] + elapsed_us) % (1 << 32), dongle_us)
-        return abs(error) > _MAX_CLOCK_ERROR_US + elapsed_us // 50
+        before_us, before_sent_ns, before_read_ns = before
+        longest_us = (now_ns - before_sent_ns) // 1000
+        tolerance_us = _CLOCK_TOLERANCE_US + longest_us // _CLOCK_TOLERANCE_SHARE
+        shortest_us = (sent_ns - before_read_ns) // 1000 - tolerance_us
+        shortest_us = max(shortest_us, -_MAX_CLOCK_STEP_US)
+        # The shortest elapsed time that fits the clock, which wraps.
+        elapsed_us = shortest_us + (dongle_us - before_us - shortest_us) % _WRAP
+        return elapsed_us > longest_us + tolerance_us

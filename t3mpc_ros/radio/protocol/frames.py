@@ -506,5 +506,6 @@ BOARD_PARAMETERS = (
     BoardParameter('idle_off', 'ms', 0, 0, 600000, 'drivers off after this standstill; 0: never'),
     BoardParameter('invert_wheels', 'bits', 0, 0, 3, '1: left, 2: right; against the settings'),
     BoardParameter('battery_cutoff', 'mV', 9000, 0, 30000, 'no driving below this; 0: no limit'),
+    BoardParameter('boots', '', 0, 0, 2**31 - 1, 'starts of the board, from any number', True),
 )
 """Board parameters by id."""

@@ -7,6 +7,7 @@ from enum import IntEnum
 import struct
 from typing import NamedTuple
 
+from t3mpc_ros.radio.link.standstill_reasons import reset_cause
 from t3mpc_ros.radio.protocol.frames import LOG_RECORD, Record
 from t3mpc_ros.radio.protocol.framing import crc16
 from t3mpc_ros.radio.tool.procedure import Script, wait_for_board
@@ -16,8 +17,6 @@ from t3mpc_ros.radio.tool.robot_settings import SETTINGS_TEXTS
 _PLACES = 16
 _ENTRY = struct.Struct('<IBBIHHH')
 _WORD = 1 << 32
-_RESETS = ('power on', 'reset button or opened port', 'brown-out', 'watchdog', 'JTAG')
-"""By bit of the register MCUSR of the AVR."""
 
 
 class LogKind(IntEnum):
@@ -91,8 +90,7 @@ def format_log(entries: tuple[LogEntry, ...]) -> str:
 def _describe(entry: LogEntry) -> str:
     kind, value = entry.kind, entry.value
     if kind == LogKind.BOOT:
-        causes = [text for bit, text in enumerate(_RESETS) if value >> bit & 1]
-        return f'boot: {", ".join(causes) or "started by a boot loader"}'
+        return f'boot: {reset_cause(value)}'
     if kind == LogKind.RECORDS:
         known = value < len(SETTINGS_TEXTS)
         return SETTINGS_TEXTS[value] if known else f'records in state {value}'

@@ -59,6 +59,8 @@ class RobotSettings(NamedTuple):
     invert_right: bool = False
     divider: float = 4.0
     """Battery voltage / voltage at the converter, 1 to 13."""
+    battery_wired: bool = False
+    """The battery is measured, so that 0 V (a broken wire) stops the robot."""
     sensors: tuple[str, ...] = SENSOR_COUNT * ('GP2Y0A21',)
     """One of :data:`SENSORS` each, in the order of STATE."""
 
@@ -104,7 +106,7 @@ def encode_settings(settings: RobotSettings) -> bytes:
         frames.RATES.index(settings.rate),
         frames.POWERS.index(settings.power),
         settings.steps_per_turn,
-        settings.invert_left + 2 * settings.invert_right,
+        settings.invert_left + 2 * settings.invert_right + 4 * settings.battery_wired,
         round(1000.0 * settings.divider),
         bytes(SENSORS.index(name) for name in settings.sensors),
     )
@@ -155,6 +157,7 @@ def decode_settings(body: bytes) -> RobotSettings:
         bool(inverted & 1),
         bool(inverted & 2),
         divider / 1000.0,
+        bool(inverted & 4),
         tuple(_choice(SENSORS, number) for number in sensors),
     )
     check_settings(settings)

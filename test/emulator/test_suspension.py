@@ -1,0 +1,176 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry and restarts: a suspended host, a stalled line, resets of robot and dongle."""
+
+from itertools import product
+import math
+
+import numpy as np
+import pytest
+from support.emulator_bench import MS, RobotBench
+from support.long_tests import few_of
+
+from t3mpc_ros.radio.link.port_actions import LinkState
+
+STEP = math.tau / 3200
+CYCLE_NS = 20 * MS
+PHASES = 20
+USUAL_PHASES = 5
+"""Of them, those of a short check."""
+
+
+def a_moving_robot(**given):
+    """Return a bench whose robot drives a curve; two events of its clock never coincide."""
+    bench = RobotBench(flat={'robot_clock_error': 0.003}, **given)
+    bench.connect()
+    bench.drive(6.0, 4.5)
+    bench.run(1.5)
+    return bench
+
+
+def suspend(bench, seconds):
+    """Stop the host, like SIGSTOP; what arrives meanwhile waits in the buffer of the port."""
+    bench.now_ns += round(seconds * 1e9)
+    waiting = bench.emulator.run_to(bench.now_ns)
+    bench._step(b''.join(data for _, data in waiting))
+
+
+def run_to_rest(bench):
+    bench.drive(0.0, 0.0)
+    bench.run(0.6)
+    bench.release_controls()
+    bench.run(1.0)
+
+
+def pulses_of(bench):
+    right, left = bench.link.telemetry.angles
+    return round(left / STEP), round(right / STEP)
+
+
+def resets(bench):
+    quality = bench.link.quality(bench.now_ns)
+    return quality.robot_resets, quality.dongle_resets
+
+
+@pytest.mark.parametrize(
+    'seconds, publishes, phases',
+    few_of(
+        [
+            (1.2, True, range(0, PHASES, PHASES // USUAL_PHASES)),
+            (2.0, False, range(0, PHASES, PHASES // USUAL_PHASES)),
+            *(
+                (s, p, range(PHASES))
+                for s in (0.3, 0.9, 1.2, 2.0, 4.0, 10.0)
+                for p in (True, False)
+            ),
+        ],
+        2,
+    ),
+)
+def test_no_distance_is_lost_while_the_host_is_suspended(seconds, publishes, phases):
+    """The result that waited looked like a restart of robot and dongle: 1568 microsteps were lost.
+
+    SIGSTOP of 1.2 s and 2 s, in 2 of 7 phases of the cycle.
+    """
+    for phase in phases:
+        bench = a_moving_robot()
+        if not publishes:
+            bench.release_controls()
+        bench.run(phase / PHASES * CYCLE_NS / 1e9 + 1e-6)
+        suspend(bench, seconds)
+        bench.run(0.5)
+        run_to_rest(bench)
+        assert pulses_of(bench) == bench.plant.pulses, phase
+        assert min(bench.plant.pulses) > 500
+        assert resets(bench) == (0, 0)
+        assert bench.link.quality(bench.now_ns).sessions == 1
+
+
+def test_a_suspended_host_repeats_no_command():
+    """It wakes up with the result of an old cycle: the robot follows new commands only."""
+    bench = a_moving_robot()
+    followed = len(bench.followed)
+    suspend(bench, 2.0)
+    bench.release_controls()
+    bench.run(1.0)
+    late = bench.followed[followed + 1 :]  # one may have been under way
+    assert not [command for _, command in late if command.left or command.right]
+
+
+def test_a_stalled_line_is_neither_a_restart_nor_a_lost_distance():
+    for phase, seconds in product((0, 7, 13), (0.8, 2.0)):
+        bench = a_moving_robot()
+        bench.run(phase / PHASES * CYCLE_NS / 1e9 + 1e-6)
+        bench.inject('stall', seconds)
+        bench.run(seconds + 3.0)
+        run_to_rest(bench)
+        assert pulses_of(bench) == bench.plant.pulses, (phase, seconds)
+        assert resets(bench) == (0, 0)
+
+
+@pytest.mark.parametrize('times', few_of([3, 1]))
+def test_every_restart_of_the_robot_is_counted_once(times):
+    """Also several that the host did not see, while it was suspended."""
+    bench = a_moving_robot()
+    for _ in range(times):
+        bench.inject('robot_reset', 0.1)
+        bench.emulator.run_to(bench.now_ns + 400 * MS)
+        suspend(bench, 0.4)
+    bench.run(3.0, lambda: bench.link.state is LinkState.RUN)
+    bench.run(0.2)
+    assert resets(bench) == (times, 0)
+    # Its counters began at 0 again, and what it has issued since is complete.
+    before = pulses_of(bench)
+    issued = bench.plant.pulses
+    bench.run(1.0)
+    run_to_rest(bench)
+    after, now = pulses_of(bench), bench.plant.pulses
+    assert np.subtract(after, before) == pytest.approx(np.subtract(now, issued), abs=200)
+
+
+@pytest.mark.parametrize('phase', few_of([0.0, 0.3, 0.6, 0.9]))
+def test_a_restart_in_motion_is_named_with_what_is_unknown(phase):
+    """The odometry was silently short by 6 to 8 mm, and by what the robot rolled without power."""
+    bench = a_moving_robot()
+    bench.run(phase * CYCLE_NS / 1e9 + 1e-6)
+    bench.inject('robot_reset', 0.3)
+    bench.release_controls()
+    bench.run(3.0, lambda: bench.link.robot_resets == 1)
+    bench.run(0.5)
+    text = bench.robot.restart(bench.now_ns)
+    assert 'restarted in motion (reset button or opened port): up to 0.' in text
+    state, true = bench.states[-1], bench.plant.pose
+    pose = state.odometry.pose
+    error = math.hypot(pose.x - true.x, pose.y - true.y)
+    spread = math.sqrt(state.covariance[0, 0] + state.covariance[1, 1])
+    print(f'phase {phase}: {1e3 * error:.1f} mm, standard deviation {1e3 * spread:.1f} mm')
+    assert 0.003 < error < bench.robot.unknown_travel
+    assert error < 2.0 * spread
+    bench.run(10.0)
+    assert bench.robot.restart(bench.now_ns) == ''
+
+
+def test_a_restart_at_rest_leaves_nothing_unknown():
+    bench = a_moving_robot()
+    run_to_rest(bench)
+    before = bench.states[-1]
+    bench.inject('robot_reset', 0.3)
+    bench.run(3.0, lambda: bench.link.robot_resets == 1)
+    bench.run(0.2)
+    assert bench.robot.restart(bench.now_ns) == (
+        'the robot restarted (reset button or opened port)'
+    )
+    assert bench.robot.unknown_travel == 0.0
+    assert bench.states[-1].odometry.pose == before.odometry.pose
+
+
+@pytest.mark.parametrize('suspended', [False, True])
+def test_a_restart_of_the_dongle_is_no_restart_of_the_robot(suspended):
+    bench = a_moving_robot()
+    bench.inject('dongle_reset')
+    if suspended:
+        suspend(bench, 3.0)
+    bench.run(4.0)
+    run_to_rest(bench)
+    assert resets(bench) == (0, 1)
+    assert pulses_of(bench) == bench.plant.pulses
