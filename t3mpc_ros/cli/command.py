@@ -88,5 +88,6 @@ def ask_line(question: str, stop: Callable[[], bool]) -> str:
 
 def check_writable(path: Path) -> None:
     """Raise ParameterError if a file cannot be written: before the work whose result it takes."""
-    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+    target = path if path.exists() else path.parent
+    if path.is_dir() or not path.parent.is_dir() or not os.access(target, os.W_OK):
         raise ParameterError(f'{path} cannot be written: give a file in a folder that exists')

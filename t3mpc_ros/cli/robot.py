@@ -4,6 +4,7 @@
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 import math
 import os
 from pathlib import Path
@@ -114,6 +115,8 @@ def _setup(options: argparse.Namespace, stop: StopSignal) -> int:
     if options.invert is not None:
         changes['invert_left'] = options.invert in ('left', 'both')
         changes['invert_right'] = options.invert in ('right', 'both')
+    if options.battery is not None:
+        changes['battery_wired'] = options.battery == 'wired'
     loaded = _load_settings(options.load) if options.load is not None else None
     compared = _load_settings(options.diff) if options.diff is not None else None
     if options.save is not None:
@@ -288,6 +291,8 @@ def _link_parameters(options: argparse.Namespace) -> LinkParameters:
     values: dict[str, object] = {}
     if options.params_file is not None:
         values.update(_read_link_parameters(options.params_file))
+        with _named(options.params_file):
+            LinkParameters.from_dict(values)
     texts = [text.removeprefix('link.') for text in options.set]
     return LinkParameters.from_dict(values | parse_assignments(LinkParameters, texts))
 
@@ -304,12 +309,21 @@ def _read_link_parameters(path: Path) -> dict[str, object]:
         ) from error
 
 
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Name the file in the error of a parameter."""
+    try:
+        yield
+    except ParameterError as error:
+        raise ParameterError(f'{path}: {error}') from error
+
+
 def _flat_items(group: dict[str, object]) -> Iterator[tuple[str, object]]:
     for name, value in group.items():
         if isinstance(value, dict):
             yield from ((f'{name}.{inner}', item) for inner, item in _flat_items(value))
         else:
-            yield name, value
+            yield str(name), value
 
 
 def _setting(name: str, convert: Callable[[str], object]) -> Callable[[str], object]:
@@ -319,7 +333,7 @@ def _setting(name: str, convert: Callable[[str], object]) -> Callable[[str], obj
         try:
             value = convert(text)
             check_settings(RobotSettings()._replace(**{name: value}))  # type: ignore[arg-type]
-        except ValueError as error:
+        except (ValueError, SettingsFileError) as error:
             raise argparse.ArgumentTypeError(str(error)) from error
         return value
 
@@ -407,7 +421,7 @@ def _add_settings_commands(
     add('--port', required=True, help='USB port of the robot board')
     add(
         '--address',
-        type=_setting('address', bytes.fromhex),
+        type=_setting('address', robot_settings.parse_address),
         metavar='HEX',
         help='10 hexadecimal digits; default: as stored, on a new board random',
     )
@@ -421,6 +435,8 @@ def _add_settings_commands(
         add(f'--{name.replace("_", "-")}', type=_setting(name, convert), help=text)
     add('--invert', choices=('none', 'left', 'right', 'both'), help='wheels that turn backward')
     add('--divider', type=_setting('divider', float), help='of the battery voltage, 4: 1/4 of it')
+    text = 'wired: the battery is measured, and the robot stops when it measures nothing'
+    add('--battery', choices=('wired', 'unwired'), help=text)
     add(
         '--sensors',
         type=_setting('sensors', _sensors),

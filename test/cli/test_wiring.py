@@ -543,6 +543,7 @@ TABLE = {
                 'write_settings.settings.invert_right': True,
             },
             '--divider 3': {'write_settings.settings.divider': 3.0},
+            '--battery wired': {'write_settings.settings.battery_wired': True},
             '--sensors none': {'write_settings.settings.sensors': 8 * ('none',)},
             '--load robot.yaml': {'write_settings.settings.channel': 7},
             '--diff robot.yaml': {'code': 1},

@@ -3,9 +3,11 @@
 """Settings of the robot over the USB of its board: change, compare, save to and load from YAML."""
 
 from collections.abc import Callable, Mapping
+import string
 from typing import Any, NamedTuple
 
-from t3mpc_ros.parameters.yaml_files import parameter_file
+from t3mpc_ros.parameters.table import number_hint
+from t3mpc_ros.parameters.yaml_files import parameter_file, shortened
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD
 from t3mpc_ros.radio.tool import robot_records
@@ -25,6 +27,7 @@ _CONFUSABLE = (0x00, 0x55, 0xAA, 0xFF)
 """Bytes that the receiver takes for noise or a preamble (nRF24L01+ data sheet 1.0, 7.3.2)."""
 _LINK = ('address', 'channel', 'rate')
 """Settings that are link parameters of the host too."""
+_KINDS = {int: 'a whole number', float: 'a number', bool: 'true or false', str: 'text in quotes'}
 _BOARD = '/robot_board'
 """Name of no node: a node rejects parameters that it does not have."""
 
@@ -51,6 +54,19 @@ def draw_address(entropy: Callable[[int], bytes]) -> bytes:
         letters = set(address.hex()) & set('abcdf')
         if letters and len(set(address)) > 1 and not set(address) & set(_CONFUSABLE):
             return address
+
+
+def parse_address(text: object) -> bytes:
+    """Return an address written as 10 hexadecimal digits; SettingsFileError: it is none."""
+    if not isinstance(text, str):
+        raise SettingsFileError(
+            f'address must be text in quotes, 10 hexadecimal digits: got {shortened(text)}'
+        )
+    if len(text) != 2 * ADDRESS_SIZE or set(text.lower()) - set(string.hexdigits):
+        raise SettingsFileError(
+            f'address must be 10 hexadecimal digits, such as 54334d5043: got {shortened(text)}'
+        )
+    return bytes.fromhex(text)
 
 
 def read_settings() -> Script[StoredSettings]:
@@ -124,13 +140,20 @@ def settings_file(settings: robot_records.RobotSettings) -> str:
 
 def settings_of_file(content: object) -> robot_records.RobotSettings:
     """Return the settings of a file of :func:`settings_file`, parsed as YAML."""
-    values: dict[str, Any] = {}
+    values: dict[str, Any] = {'battery_wired': False}  # which older files lack
     try:
         link = content['/**']['ros__parameters']['link']  # type: ignore[index]
         board = content[_BOARD]['ros__parameters']  # type: ignore[index]
-        values = {**link, **board}
-        values['address'] = bytes.fromhex(values['address'])
-        values['sensors'] = tuple(values['sensors'])
+        values |= {**link, **board}
+        values['address'] = parse_address(values['address'])
+        if not isinstance(values['sensors'], list):
+            raise SettingsFileError(
+                f'sensors must be a list of {robot_records.SENSOR_COUNT}: '
+                f'got {shortened(values["sensors"])}'
+            )
+        values['sensors'] = tuple(map(str, values['sensors']))
+    except SettingsFileError:
+        raise
     except (KeyError, TypeError, ValueError) as error:
         raise SettingsFileError(
             f'must be a file of t3mpc robot setup --save, with link below /**, and {_BOARD}'
@@ -145,8 +168,11 @@ def settings_of_file(content: object) -> robot_records.RobotSettings:
     settings = robot_records.RobotSettings(**values)
     for name, kind in robot_records.RobotSettings.__annotations__.items():
         value = getattr(settings, name)
-        if kind in (int, bool) and type(value) is not kind:
-            raise SettingsFileError(f'{name} must be of type {kind.__name__}: got {value!r}')
+        allowed = {float: (int, float)}.get(kind, (kind,))
+        if kind in (int, bool, float, str) and type(value) not in allowed:
+            raise SettingsFileError(
+                f'{name} must be {_KINDS[kind]}: got {shortened(value)}{number_hint(value)}'
+            )
     try:
         robot_records.check_settings(settings)
     except (TypeError, ValueError) as error:
