@@ -20,6 +20,7 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.radio_robot import RadioRobotParameters
 from t3mpc_ros.radio.tool.calibration_wizard import (
     STEPS,
+    USB_STEPS,
     CalibrationRobot,
     CalibrationWizard,
     Interrupted,
@@ -139,6 +140,7 @@ def calibrate(
     check_writable(options.save)
     if not sys.stdin.isatty():
         raise ProcedureError('calibrating a robot needs a person: run it at a terminal')
+    _check_steps(options)
     path: Path = options.save
     robot = CalibrationRobot(
         options.port, options.robot_port, parameters, key, os.urandom, stop, _report
@@ -164,6 +166,19 @@ def calibrate(
         path.write_text(calibration_file(wizard.calibration, _today(), link))
         _show(f'{path}: saved; ros2 launch t3mpc_ros robot.launch.py params_file:={path}')
     return code
+
+
+def _check_steps(options: argparse.Namespace) -> None:
+    """Raise ProcedureError for a step that needs the other pass: a cable, or none."""
+    cable = bool(options.robot_port)
+    for step in options.steps or ():
+        if cable and step not in USB_STEPS:
+            raise ProcedureError(
+                f'the step {step} moves or turns the robot: unplug its cable, and run it without '
+                '--robot-port'
+            )
+        if not cable and step in USB_STEPS:
+            raise ProcedureError(f'the step {step} needs --robot-port, at rest')
 
 
 def _show(text: str) -> None:
@@ -194,7 +209,7 @@ def _wizard_options(options: argparse.Namespace) -> WizardOptions:
     return WizardOptions(
         marks,
         WheelGeometry(options.wheel_radius, options.wheel_separation),
-        tuple(options.steps),
+        tuple(options.steps or STEPS),
         options.distance,
         options.turns,
         options.speed,
@@ -207,7 +222,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     usual = WizardOptions()
     geometry = usual.geometry
-    add('--robot-port', default='', help='USB port of the robot board, for ranges and battery')
+    add('--robot-port', default='', help='USB port of the robot board: the second pass, at rest')
     add(
         '--save',
         type=Path,
@@ -219,9 +234,9 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add(
         '--steps',
         type=_steps,
-        default=tuple(STEPS),
         metavar='STEP,…',
-        help=f'some of {", ".join(STEPS)}; default: all',
+        help=f'some of {", ".join(STEPS)}; default: with --robot-port {" and ".join(USB_STEPS)}, '
+        'without it the others',
     )
     for flag, kind, default, text in (
         ('--wheel-radius', bounded_float(0.005, 1.0), geometry.wheel_radius, 'nominal, m'),

@@ -74,6 +74,8 @@ def test_a_whole_run_finds_the_errors_of_the_twin(person, monkeypatch, tmp_path)
     monkeypatch.setattr(sys.stdin, 'isatty', lambda: True)
     person.answers = {f'{side}: put the board': ['skip'] for side in ('left', 'rear', 'right')}
     for line in _transcript()[0].splitlines():
+        if line.startswith('#'):
+            continue
         command = shlex.split(line.removeprefix('scripts/run t3mpc robot '))
         assert robot_cli.main(command) == 0
     assert _numberless(person.transcript) == _numberless(_transcript()[1])
@@ -107,7 +109,7 @@ def test_a_whole_run_finds_the_errors_of_the_twin(person, monkeypatch, tmp_path)
 def _transcript():
     """Return the command of the page, and what it prints."""
     text = (Path(__file__).resolve().parents[2] / 'docs' / 'calibration.md').read_text()
-    (command,) = re.findall(r'```sh\n(scripts/run t3mpc robot calibrate .*?)\n```', text)
+    (command,) = re.findall(r'```sh\n(# first pass.*?)\n```', text, re.DOTALL)
     (printed,) = re.findall(r'^```text\n(.*?)\n```', text, re.DOTALL | re.MULTILINE)
     return command, printed
 
@@ -199,6 +201,15 @@ def test_raw_counts_need_the_usb_of_the_robot(person):
     """Without it, both steps are not offered."""
     assert wizard(person, 'ranges', 'battery').run() == Calibration()
     assert 'Step' not in person.transcript
+
+
+def test_a_robot_on_a_cable_is_not_moved(person):
+    """It would drive 2 m and turn ten times."""
+    person.moves = False
+    person.answers = {'Store these values': ['no']}
+    wizard(person, 'rest', 'radius', 'track', 'hand', robot_port='ttyACM0').run()
+    assert 'Step' not in person.transcript
+    assert person.plant.pulses == (0, 0)
 
 
 # -- parameter file -------------------------------------------------------------------------------

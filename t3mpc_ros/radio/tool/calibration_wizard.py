@@ -36,7 +36,8 @@ STEPS = {
     'battery': 'divider of the battery',
 }
 """Title of each step, which the method ``measure_`` and its name runs, in their order."""
-_USB_STEPS = 'ranges', 'battery'
+USB_STEPS = 'ranges', 'battery'
+"""Steps over the USB port of the robot board, at rest; the others need a robot without cables."""
 _REST_TIME = 10.0
 _RESTS = (4.0, 4.0)
 """Before and after a turn, s."""
@@ -174,8 +175,7 @@ class CalibrationWizard:
     def run(self) -> calibration.Calibration:
         """Run the steps; return the calibration."""
         steps = [step for step in STEPS if step in self._options.steps]
-        if not self._robot.has_usb:
-            steps = [step for step in steps if step not in _USB_STEPS]
+        steps = [step for step in steps if (step in USB_STEPS) == self._robot.has_usb]
         for number, step in enumerate(steps):
             self._show(f'Step {number + 1} of {len(steps)}: {STEPS[step]}')
             self._repeat(getattr(self, f'measure_{step}'))
