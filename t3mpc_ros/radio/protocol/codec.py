@@ -66,6 +66,15 @@ def encode(
     return fixed
 
 
+def layout(frame: Any) -> tuple[str, tuple[tuple[str, int], ...]]:
+    """Return the name of a frame in docs/radio.md, and name and size (bytes) of its fixed fields.
+
+    The first byte comes before them.
+    """
+    form = _LAYOUTS[type(frame)][-1 if frame[-1] != b'' else 0]
+    return form.name, form.field_sizes
+
+
 def decode_downlink(data: bytes) -> frames.Downlink:
     """Return the radio payload from a host, or raise FrameError."""
     return _decode(data, _DOWNLINK)  # type: ignore[no-any-return]
@@ -162,6 +171,9 @@ class _Form:
         self._struct = struct.Struct('<B' + ''.join(field.code for field in self._fields))
         self.size = self._struct.size
         self._names = {field.name for field in self._fields}
+        self.field_sizes = tuple(
+            (field.name, struct.calcsize('<' + field.code)) for field in self._fields
+        )
 
     def pack(self, frame: Any) -> bytes:
         values = []
