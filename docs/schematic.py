@@ -327,7 +327,7 @@ def draw_power(folder: Path) -> None:
     # Relay of the motor supply, held by the second contact of the emergency stop; C9 delays it.
     component('Button', (16.2, 0), (16.2, -2), 'S2b\nemergency\nstop', (-0.55, 0.0))
     component('ResistorIEC', (16.2, -2.4), (18.2, -2.4), 'R7  10 Ω', above)
-    component('Capacitor', (18.4, -2.4), (18.4, -4.4), 'C9\n1000 µF', (-0.45, 0.0))
+    component('Capacitor', (18.4, -2.4), (18.4, -4.4), 'C9\n2200 µF', (-0.45, 0.0))
     component('Inductor2', (19.6, -2.4), (19.6, -4.4), 'K1', (0.5, 0.0))
     component('Diode', (20.8, -4.4), (20.8, -2.4), 'D2\n1N4007', right)
     sheet.wire((16.2, -2), (16.2, -2.4))
@@ -363,7 +363,7 @@ def draw_power(folder: Path) -> None:
 
 _POWER_NOTES = (
     'Both contacts of S2 are closed until it is pressed.',
-    'The contact of K1 is closed while its coil of 12 V, 400 Ω has current.',
+    'The contact of K1 is closed while its coil of 9 V, 200 Ω has current.',
     'Ground: one star point at the negative terminal of BT1.',
 )
 

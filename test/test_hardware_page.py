@@ -3,11 +3,18 @@
 """The schematics of docs/hardware.md agree with the firmware, with their source and the page."""
 
 from importlib.util import module_from_spec, spec_from_file_location
+import math
 from pathlib import Path
 import re
+import sys
 import xml.etree.ElementTree as ElementTree
 
 import pytest
+
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.types import RANGE_SENSORS
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'hardware.md'
@@ -166,3 +173,103 @@ def test_reference_voltages_follow_from_their_formulas():
     full_scale = 0.325 / (0.11 + 0.02)
     expected = [8.0 * rs for rs in (0.05, 0.068, 0.1)] + [5.0 * 0.1, 2.5 / full_scale]
     assert values == [pytest.approx(value, abs=0.005) for value in expected]
+
+
+# -- drawings -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope='module')
+def drawings():
+    spec = spec_from_file_location('drawings', ROOT / 'docs' / 'drawings.py')
+    module = module_from_spec(spec)
+    sys.modules['drawings'] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules['drawings']
+
+
+def test_the_drawings_are_drawn_from_their_source(drawings, tmp_path):
+    """And so from the parameters of geometry and sensors."""
+    drawings.draw_all(tmp_path)
+    for path in sorted(tmp_path.glob('*.svg')):
+        assert path.read_text() == (ROOT / 'docs' / 'images' / path.name).read_text(), (
+            'run python docs/drawings.py'
+        )
+        assert f'images/{path.name}' in PAGE.read_text()
+
+
+def test_the_dimensions_are_those_of_the_parameters():
+    texts = set(_texts(ROOT / 'docs' / 'images' / 'drawing_top.svg'))
+    geometry, sensors = WheelGeometry(), RangeSensorParameters()
+    assert f'track {1e3 * geometry.wheel_separation:g}' in texts
+    assert f'wheel {1e3 * geometry.wheel_radius:g}' in texts
+    assert f'faces {1e3 * sensors.half_length:g}' in texts
+    assert f'sensors {1e3 * sensors.offset:g}' in texts
+    assert {name.replace('_', ' ') for name in RANGE_SENSORS} <= texts
+
+
+def test_the_side_sensors_clear_the_tyres(drawings):
+    """Lying, with 37 mm along the body, they would touch them."""
+    depth, length = drawings.SENSOR
+    inner = drawings.HALF_WIDTH - depth
+    assert inner < drawings.TRACK / 2 + drawings.TYRE / 2
+    assert drawings.OFFSET - depth / 2 > drawings.RADIUS
+    assert drawings.OFFSET - length / 2 < drawings.RADIUS
+
+
+def test_the_strip_board_connects_what_the_schematic_connects(drawings, schematic):
+    """Groups of pins by strips, cuts and links are the nets of radio, buffer, regulator and R6."""
+    nets = {}
+    for name, part in (('U2', schematic.BUFFER), ('radio', schematic.RADIO)):
+        for pins, net in part.nets().items():
+            for pin in _single_pins(pins):
+                nets.setdefault(net, set()).add(f'{name} {pin}')
+    for pin, net in schematic.ADAPTER.nets().items():
+        nets.setdefault(net, set()).add(f'wires {pin}')
+    for pin, net in {
+        'U3 VIN': '+5V',
+        'U3 GND': 'GND',
+        'U3 VOUT': '+3V0',
+        'C6 +': '+5V',
+        'C6 -': 'GND',
+        'C7 +': '+3V0',
+        'C7 -': 'GND',
+        'C8 +': '+3V0',
+        'C8 -': 'GND',
+        'R6 1': '+3V0',
+        'R6 2': 'CSN',
+    }.items():
+        nets.setdefault(net, set()).add(pin)
+    found = [group for group in drawings.connected() if group not in ({'U2 3Y'}, {'U2 4Y'})]
+    assert sorted(map(sorted, found)) == sorted(map(sorted, nets.values()))
+
+
+def _single_pins(text):
+    """Return the pins of a name of the schematic: ``3OE 4OE`` are two."""
+    return text.split()
+
+
+def test_no_hole_of_the_strip_board_is_used_twice(drawings):
+    holes = list(drawings.used_holes())
+    assert len(holes) == len(set(holes))
+    for row, column in holes:
+        assert row in drawings.ROWS
+        assert 1 <= column <= drawings.COLUMNS
+        assert (row, float(column)) not in drawings.CUTS
+
+
+def test_the_relay_pulls_in_at_the_battery_cut_off():
+    """A relay of 12 V needs 9.0 V, and got 8.8 V."""
+    coil, series, rated, operates = 200.0, 10.0, 9.0, 0.75
+    cutoff = LinkParameters().robot.battery_cutoff
+    at_coil = cutoff * coil / (coil + series)
+    copper = 1.0 + 0.00393 * (60.0 - 23.0)
+    assert at_coil > copper * operates * rated
+    section = PAGE.read_text().split('## Emergency stop')[1]
+    assert f'gets {at_coil:.1f} V behind R7' in section
+    assert f'{operates * rated:.2f} V at 23' in section
+    assert f'{copper * operates * rated:.1f} V with a coil' in section
+    for charge, drop in ((cutoff, 0.4), (12.6, 0.1)):
+        seconds = coil * 2200e-6 * math.log(charge * coil / (coil + series) / (drop * rated))
+        print(f'{charge} V: {seconds:.2f} s')
+        assert 0.35 < seconds < 1.25
