@@ -118,7 +118,7 @@ def a_telemetry_decoder(source):
     robot.boot(now_ns, source.randrange(2**32))
     for each in (used, fresh):
         each.start_session(2, robot.boots, now_ns)
-    kept = '_base', '_time.total', '_left.total', '_right.total'
+    kept = '_base', '_time.total', '_left.total', '_right.total', '_former_boots'
     for _ in range(3):
         now_ns += 20 * MS
         got, expected = (_decode(each, robot, now_ns, True, 2) for each in (used, fresh))

@@ -213,7 +213,7 @@ def the_battery_is_low(bench):
 @cause(SLIP_STOP_REASON, flat={'twin.faults.wheel_blocked': 'left'})
 def a_wheel_is_blocked(bench):
     bench.connect()
-    bench.run(1.5)  # calibration of the gyro bias
+    bench.run(2.5)  # calibration of the gyro bias: the drives shake the robot when they hold it
     bench.drive(4.0, 4.0)
     bench.run(2.0)
 
