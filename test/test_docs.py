@@ -228,6 +228,8 @@ def test_defaults_of_the_robot_in_its_pages():
     shown = {name.strip('-').replace('-', '_'): cells[0] for name, cells in rows.items()}
     assert shown.pop('invert') == 'none'
     assert (settings.invert_left, settings.invert_right) == (False, False)
+    assert shown.pop('battery') == 'unwired'
+    assert not settings.battery_wired
     assert shown.pop('power') == f'{settings.power} dBm'
     assert {shown.pop('sensors')} == {*settings.sensors}
     assert shown == {name: f'{getattr(settings, name)}'.removesuffix('.0') for name in shown}

@@ -22,7 +22,7 @@ static const struct t3_bounds BOUNDS[T3_PARAMETERS] = {
     [T3_IDLE_OFF] = {0, 0, 600000, false, false},
     [T3_INVERT_WHEELS] = {0, 0, 3, false, true},
     [T3_BATTERY_CUTOFF] = {9000, 0, 30000, false, false},
-    [T3_BOOTS] = {0, 0, INT32_MAX, true, false},
+    [T3_BOOTS] = {0, 0, 2147483647, true, false},
 };
 
 const struct t3_bounds *t3_parameter_bounds(uint8_t id)

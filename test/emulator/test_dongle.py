@@ -4,10 +4,9 @@
 
 import pytest
 
-from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import Fault, FaultInjection
 from t3mpc_ros.emulator.link.dongle import Dongle
-from t3mpc_ros.emulator.link.radio_channel import RadioChannel, RadioParameters
+from t3mpc_ros.emulator.link.radio_channel import Medium, RadioChannel, RadioParameters
 from t3mpc_ros.radio.protocol.codec import decode_from_dongle, encode
 from t3mpc_ros.radio.protocol.frames import Configure, Configured, Ping, Result, Transmit
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
@@ -29,13 +28,14 @@ class Station:
     """A dongle, and a robot that records the received packets."""
 
     def __init__(self, *values):
-        self.events = EventQueue(0)
+        medium = Medium()
+        self.events = medium.events
         self.faults = FaultInjection(lambda: self.events.now_ns, 1)
         self.received = []
         self.replies = []
         self.robot = RadioParameters()
         self.channel = RadioChannel(
-            self.events,
+            medium,
             self.robot,
             lambda: True,
             self._receive,

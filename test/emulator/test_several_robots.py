@@ -134,7 +134,7 @@ def test_two_hosts_of_one_robot_are_no_two_robots():
     assert all(bench.link.reason(bench.now_ns) for bench in made)
 
 
-def test_packets_that_overlap_at_one_frequency_disturb_each_other():
+def test_packets_that_overlap_at_one_frequency_are_disturbed():
     medium = Medium()
     first = medium.transmit(82, 130.0, 300.0)
     assert not medium.is_disturbed(first)
@@ -149,7 +149,7 @@ def test_packets_that_overlap_at_one_frequency_disturb_each_other():
     assert not Transmission(82, 0, 5).overlaps(Transmission(82, 5, 9))
 
 
-def test_of_simultaneous_acknowledgements_one_or_none_is_received():
+def test_of_simultaneous_answers_one_or_none_is_received():
     medium = Medium(seed=3)
     received = [medium.strongest([b'a', b'b']) for _ in range(400)]
     assert {received.count(each) // 50 for each in (b'a', b'b')} <= {1, 2}

@@ -85,7 +85,7 @@ def test_the_hop_that_lost_most_is_named():
         assert quality.lost == 6
 
 
-def test_damaged_frames_of_either_end_tell_the_cable_from_the_dongle():
+def test_damaged_frames_tell_the_cable_from_the_dongle():
     statistics = after(*[0.005] * 60)
     statistics.add_pong(a_pong(65_530, 1, 0), False)
     statistics.count_host_errors(FrameCounts(100, 4, 3))
@@ -105,7 +105,7 @@ def a_pong(*counts):
     return Pong(0, bytes(4), 0, 2, 2, 1, 1, *counts, 0, 0, 82, b'T3MPC', 0)
 
 
-def test_a_silence_is_blamed_on_the_hop_of_the_cycles_since_the_last_state():
+def test_a_silence_is_blamed_on_the_hop_of_its_own_cycles():
     absent = 'the robot does not answer: is it on, in range, on channel 82?'
     assert LinkStatistics(0.02, 0.2).silence_reason(82) == absent
     assert after(Loss.NO_REPLY, 0.005).silence_reason(82) == absent

@@ -42,7 +42,7 @@ def test_the_session_is_complete_and_every_field_has_its_bytes(generator):
             at += len(row[1].strip('`').split())
 
 
-def test_the_robot_moves_within_the_session_and_its_drives_are_off_at_the_end(generator):
+def test_the_robot_moves_in_the_session_and_is_off_at_the_end(generator):
     lines = generator['record_session'](b'', 0.06)
     states = []
     for line in lines:
