@@ -14,6 +14,7 @@ from t3mpc_ros.nodes.launch_files import (
     flag,
     params_file,
 )
+from t3mpc_ros.nodes.registry import CALIBRATED_GYRO
 
 
 def nodes(launched):
@@ -23,6 +24,8 @@ def nodes(launched):
     # With a given place, the pose of both nodes is that of the simulator.
     place = [('odom', 'ground_truth/odom')] if launched.flag('localised') else []
     path = {'pose.enabled': True, 'keep_out.enabled': True}
+    if launched.flag('robot'):
+        path |= CALIBRATED_GYRO
     # Seed 0 of a portrait is a secret one.
     source = {'source': 'portrait', 'seed': 0}
     made = [

@@ -11,6 +11,7 @@ from t3mpc_ros.nodes.launch_files import (
     describe,
     params_file,
 )
+from t3mpc_ros.nodes.registry import CALIBRATED_GYRO
 
 
 def nodes(launched):
@@ -19,8 +20,7 @@ def nodes(launched):
     clock = {'publish_clock': launched.flag('use_sim_time')}
     loop = [
         *launched.robot('sim_robot', {**launched.given('world'), **seed}, defaults=clock),
-        # The gyro of the simulated robot is calibrated.
-        launched.node('controller', defaults={'body.gyro_scale_tolerance': 0.001}),
+        launched.node('controller', defaults=CALIBRATED_GYRO),
         launched.node('reference_generator', seed),
     ]
     return [*loop, launched.node('recorder')] if launched.flag('record') else loop

@@ -15,6 +15,7 @@ from t3mpc_ros.nodes.launch_files import (
     describe,
     params_file,
 )
+from t3mpc_ros.nodes.registry import CALIBRATED_GYRO
 
 ROBOTS = {
     'robot_1': {'initial_pose.x': -0.5, 'initial_pose.y': 0.0, 'initial_pose.yaw': 0.0},
@@ -36,7 +37,7 @@ def nodes(launched):
                 defaults={'world': 'room', **defaults, **pose, **clock},
                 namespace=name,
             ),
-            launched.node('controller', namespace=name),
+            launched.node('controller', defaults=CALIBRATED_GYRO, namespace=name),
             launched.node('reference_generator', given, defaults=defaults, namespace=name),
         ]
     return made

@@ -14,6 +14,7 @@ import webbrowser
 from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup, StopRequestedError
 from t3mpc_ros.cli.view import PAGE_AT
+from t3mpc_ros.nodes.registry import CALIBRATED_GYRO
 from t3mpc_ros.parameters.command_line import parse_assignments
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.stop_signal import StopSignal
@@ -25,8 +26,6 @@ BOARD = 'emulator'
 """Not a node: it has no parameters and its own ready message."""
 PAPER_NOISE = 0.04
 """Variance of the measured wheel speeds, (rad/s)², as in the paper's simulations."""
-CALIBRATED_GYRO = {'body.gyro_scale_tolerance': 0.001}
-"""What the simulated gyro has, and what its odometry states."""
 ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
     'twin': {'sim_robot': {'drive.kind': 'stepper'}, 'controller': CALIBRATED_GYRO},
     'servo': {

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from t3mpc_ros.parameters.table import Parameters
 
 
+CALIBRATED_GYRO = {'body.gyro_scale_tolerance': 0.001}
+"""Parameters of the controller of a robot with a calibrated gyro, such as the simulated one."""
+
+
 class NodeInterface(NamedTuple):
     """Where a node stands, what it is for, its topics and services; ``*``: several names."""
 

@@ -100,6 +100,22 @@ def test_an_unusable_argument_is_an_error(file, given, error, words):
         launched(file, **given)
 
 
+@pytest.mark.parametrize('file', FILES)
+def test_the_controller_knows_whether_the_gyro_is_calibrated(file):
+    """Two files of the simulated robot left the controller with the tolerance of a data sheet."""
+    nodes = launched(file)
+    robots = [node for node in nodes if node.executable == 'sim_robot']
+    for controller in (node for node in nodes if node.executable == 'controller'):
+        stated = controller.all_values.get('body.gyro_scale_tolerance')
+        calibrated = parameter_class('sim_robot')().odometry.gyro_scale_tolerance
+        assert stated == (calibrated if robots else None)
+
+
+def test_a_patrol_of_another_robot_assumes_no_calibration():
+    controller = only(launched('patrol.launch.py', robot='false'), 'controller')
+    assert 'body.gyro_scale_tolerance' not in controller.all_values
+
+
 def test_texts_of_arguments_stay_texts():
     """Launch takes 12345 as a number, which is no valid port and no valid file."""
     bridge = only(launched('robot.launch.py', port='12345', key_file='99'), 'radio_bridge')
