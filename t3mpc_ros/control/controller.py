@@ -29,6 +29,7 @@ from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import (
+    DriveMonitor,
     InputWatchdog,
     OdometryTwist,
     Reason,
@@ -72,6 +73,10 @@ MIN_DEAD_TIME_CHANGE = 0.0005
 
 MAX_MISSED = 20
 """Largest number of periods without a step through which a ramp goes on."""
+
+REPORTED_DEAD_TIME, REPORTED_DISTURBANCE = 0.015, 1.0
+"""Difference of the dead time from the configured one, and duration of a disturbed response, that
+are reported, s."""
 
 SNAPSHOT_PERIOD = 0.25
 """Time between two snapshots of the weights, s."""
@@ -267,12 +272,15 @@ class Controller:
         self._set_dead_time(self.parameters.speed_filter.dead_time)
         self.disturbed = False
         """Whether the response is disturbed, so that nothing is learned from it."""
+        self._disturbed_for = 0.0
         self._before_disturbance: tuple[Any, Any] | None = None
         self._snapshots: deque[tuple[Any, Any]] = deque(maxlen=SNAPSHOT_COUNT)
         """Weights, oldest first."""
         self._steps_since_snapshot = 0
         self._place = ORIGIN
         self._last_stamp_ns: int | None = None
+        self.drive_monitor = DriveMonitor()
+        """Pauses of the commands."""
         self.odometry_twist = OdometryTwist()
         """Whether the odometry has a twist."""
         self.ignored_odometry = 0
@@ -288,6 +296,26 @@ class Controller:
     def gain(self) -> float:
         """Feedback gain K in use, 1/s."""
         return self._tracker.parameters.law.gain
+
+    def problems(self) -> list[str]:
+        """Return what does not fit in odometry and response, each with its remedy."""
+        found = [self.drive_monitor.problem()]
+        if self.odometry_twist.missing:
+            found.append('odom has no twist: its poses are differentiated; publish the twist')
+        configured = self.parameters.speed_filter.dead_time
+        in_use = self.actuation.dead_time
+        if abs(in_use - configured) > REPORTED_DEAD_TIME:
+            found.append(
+                f'the robot responds after {in_use:.3f} s, speed_filter.dead_time is '
+                f'{configured:g} s: the estimate is in use; set the parameter'
+            )
+        if self._disturbed_for > REPORTED_DISTURBANCE:
+            found.append(
+                'the response to the commands is disturbed, nothing is learnt from it: commands '
+                'or odometry are late, or the dead time has changed'
+            )
+        found.append(self.body.problem())
+        return [text for text in found if text]
 
     def get_weights(self) -> dict[str, Array]:
         """Return all adapted arrays by name: those of the law, and the gains of the body."""
@@ -328,6 +356,8 @@ class Controller:
     def enable(self, on: bool) -> None:
         """Enable the robot's motion, or stop the robot until it is enabled again."""
         self._watchdog.enabled = on
+        if on:
+            self.drive_monitor.reset()
 
     def reset(self) -> None:
         """Discard the state and the weights; the robot stops until new inputs arrive."""
@@ -392,6 +422,12 @@ class Controller:
         plan_ns, reason = self._sample_plan(odometry)
         if reason.moves and restarted:
             reason = Reason.ODOMETRY_RESTARTED
+        if elapsed is None or not reason.moves:
+            self.drive_monitor.begin()
+        if reason.moves:
+            reason = self.drive_monitor.decide(
+                odometry, self.actuation.twist, elapsed or 0.0, following=self._response.responsive
+            )
         speeds, reference, begin, end = self._sampled
         if not reason.moves:
             self._stop()
@@ -399,6 +435,11 @@ class Controller:
             return STANDSTILL, self.status
 
         actuation, dt = self.actuation, elapsed or self._period
+        if self.status.reason is Reason.PAUSED and not self._response.responsive:
+            # Commands go on as before the pause: nothing is learnt until the robot responds.
+            actuation.reset(speeds)
+            self._moving = True
+            return self._command_unresponsive(odometry, dt)
         restart = elapsed is None or not self._moving
         if restart:
             actuation.reset(speeds)
@@ -455,6 +496,7 @@ class Controller:
         if restart:
             self.dead_time.reset(speeds)
             self.disturbed, self._before_disturbance = False, None
+            self._disturbed_for = 0.0
         else:
             self._update_dead_time(speeds, dt)
 
@@ -569,6 +611,7 @@ class Controller:
         if self.parameters.estimate_dead_time:
             self.disturbed = estimator.step(speeds, actuation.command, elapsed)
             dead_time = estimator.dead_time_in_use
+        self._disturbed_for = self._disturbed_for + elapsed if self.disturbed else 0.0
         if self.disturbed and self._before_disturbance is None and self._snapshots:
             self._before_disturbance = self._snapshots[0]
             self._snapshots.clear()

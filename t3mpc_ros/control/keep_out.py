@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.arena import Obstacles
-from t3mpc_ros.geometry.types import STANDSTILL, Array, BodyTwist, Pose, wrap_angle
+from t3mpc_ros.geometry.types import Array, BodyTwist, Pose, has_moved, wrap_angle
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
@@ -60,9 +60,6 @@ SECTORS = 16
 """Sectors around the robot, each with its nearest unsafe cell."""
 SEARCH_RADIUS = 0.5
 """Distance from the centre up to which cells are considered, m."""
-DRIVE_TIMEOUT, DRIVE_PAUSE = 2.0, 0.8
-"""Time for which commands may fail to move the robot, and standstill after it, s: a robot that has
-stopped because of slip drives again after half a second without a command."""
 TURN_WEIGHT = 0.12
 """Change of v (m/s) that is as bad as a change of omega by 1 rad/s: turning is preferred."""
 
@@ -307,14 +304,6 @@ class KeepOutParameters(Parameters):
             )
 
 
-def has_moved(start: Pose | None, pose: Pose, distance: float, angle: float) -> bool:
-    """Return whether a pose is farther than a distance (m) or an angle (rad) from the start."""
-    return start is None or (
-        math.hypot(pose.x - start.x, pose.y - start.y) > distance
-        or abs(wrap_angle(pose.yaw - start.yaw)) > angle
-    )
-
-
 class Activity(enum.Enum):
     """What the keep-out does, in words for the diagnostics."""
 
@@ -369,9 +358,6 @@ class KeepOut:
         self._detour: float | None = None
         self._progress: Pose | None = None
         self._waited = 0.0
-        self._anchor: Pose | None = None
-        self._driven = 0.0
-        self._pause = 0.0
 
     def step(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist nearest to ``wanted``, or one that looks around.
@@ -386,24 +372,7 @@ class KeepOut:
             room = self.parameters.distance + self.parameters.ahead + 0.06
             self.map.mark_free(pose.x, pose.y, room)
             self._look_around(pose, math.pi)
-        if self._pause > 0.0:
-            # Commands have not moved the robot: it gets none for a while.
-            self._pause -= elapsed
-            self.changed, self.activity = True, Activity.STUCK_DRIVE
-            return STANDSTILL
-        permitted = self._reshaped(wanted, pose, elapsed)
-        self._watch_drive(permitted, pose, elapsed)
-        return permitted
-
-    def _watch_drive(self, twist: BodyTwist, pose: Pose, elapsed: float) -> None:
-        """Pause the commands when they have not moved the robot for DRIVE_TIMEOUT."""
-        moved = has_moved(self._anchor, pose, 0.03, 0.15)
-        if moved or (abs(twist.linear) < 0.05 and abs(twist.angular) < 0.3):
-            self._anchor, self._driven = pose, 0.0
-            return
-        self._driven += elapsed
-        if self._driven > DRIVE_TIMEOUT:
-            self._driven, self._pause = 0.0, DRIVE_PAUSE
+        return self._reshaped(wanted, pose, elapsed)
 
     def _reshaped(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist, or one that looks around."""

@@ -8,7 +8,7 @@ import enum
 import math
 from typing import ClassVar
 
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State, wrap_angle
+from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State, has_moved, wrap_angle
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 
@@ -58,6 +58,8 @@ class Reason(enum.Enum):
     REFERENCE_STALE = 'reference is stale'
     DIVERGING = 'state is diverging'
     NOT_FOLLOWING = 'the robot does not follow commands'
+    PAUSED = 'commands pause because the robot does not follow them'
+    STOPPED_AGAIN = 'the robot has stopped again after each of three pauses'
 
     def __init__(self, text: str) -> None:
         self.moves = text in ('tracking', 'the robot does not follow commands')
@@ -179,9 +181,7 @@ class OdometryTwist:
             return odometry
         if self._anchor is None:
             self._anchor = pose
-        moved = math.hypot(pose.x - self._anchor.x, pose.y - self._anchor.y)
-        turned = abs(wrap_angle(pose.yaw - self._anchor.yaw))
-        self.missing = self.missing or moved > MOVED or turned > TURNED
+        self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
         if restart or last is None or not self.missing:
             return odometry
         elapsed = (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
@@ -249,3 +249,116 @@ class ResponseMonitor:
         if self.evidence >= EVIDENCE_WEIGHT * self._timeout_steps:
             self.responsive, self.evidence = not self.responsive, 0
         return self.responsive
+
+
+MOTION, ASKED_MOTION = (0.03, 0.15), (0.1, 0.5)
+"""Change of the pose (m, rad) that is motion, and what the commands to a robot that stands must
+have asked of it."""
+STANDING_TIME = 1.5
+"""Time in which commands must move the robot, s."""
+ASTRAY_TIME = 5.0
+"""Time in which a robot may move otherwise than commanded, s."""
+PAUSE = 0.8
+"""Duration of a pause, s: a robot that has stopped because of slip asks for half a second."""
+TRIALS = 3
+"""Pauses after which the commands end, if the robot has moved and stopped again after each."""
+RECOVERY_TIME = 5.0
+"""Time of driving as commanded after which earlier pauses do not count, s."""
+
+
+class DriveMonitor:
+    """Pauses the commands to a robot that stands in spite of them, or that moves otherwise.
+
+    A robot that has stopped because of slip stands until nothing was commanded for a while. One
+    that never moves gets commands again after each pause, however many: its emergency stop may be
+    released, its board may start. One that moves and then stops again gets three pauses.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all pauses."""
+        self.pauses = 0
+        """Pauses since the robot drove as commanded."""
+        self._trials = 0
+        self._ended = False
+        self._pause = 0.0
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a drive: nothing was commanded before."""
+        self._anchor: Pose | None = None
+        self._moved = False
+        self._well = self._astray = 0.0
+        self._restart(None)
+
+    def _restart(self, pose: Pose | None) -> None:
+        self._anchor = pose
+        self._since = 0.0
+        self._asked = [0.0, 0.0]
+        self._measured = [0.0, 0.0]
+
+    def decide(
+        self, odometry: State, command: BodyTwist, elapsed: float, *, following: bool
+    ) -> Reason:
+        """Return TRACKING if the robot may move, else the reason why nothing is commanded.
+
+        command : twist of the last period
+        elapsed : time since the last odometry, s
+        following : whether the wheels respond to the commands
+        """
+        if self._ended:
+            return Reason.STOPPED_AGAIN
+        if self._pause > 0.0:
+            self._pause -= elapsed
+            if self._pause > 0.0:
+                return Reason.PAUSED
+            self.begin()
+            return Reason.TRACKING
+        if self._stands(odometry, command, elapsed):
+            return self._begin_pause()
+        if following:
+            self._astray = max(self._astray - elapsed, 0.0)
+            self._well += elapsed
+            if self._moved and self._well > RECOVERY_TIME:
+                self.pauses = self._trials = 0
+        elif self._moved:
+            self._astray += elapsed
+            if self._astray > ASTRAY_TIME:
+                return self._begin_pause()
+        return Reason.TRACKING
+
+    def problem(self) -> str:
+        """Return what to do about a robot that does not follow, or nothing."""
+        if self._ended:
+            return 'free the wheels, look at the diagnostics of the robot, then call ~/enable'
+        if self.pauses:
+            return (
+                f'{self.pauses} pauses of the commands, each followed by another attempt: look at '
+                'the diagnostics of the robot; emergency stop, power, wheels and stamps of odom'
+            )
+        return ''
+
+    def _stands(self, odometry: State, command: BodyTwist, elapsed: float) -> bool:
+        """Whether the robot has not moved for longer than its commands allow."""
+        pose, measured, asked = odometry.pose, self._measured, self._asked
+        for i in range(2):
+            measured[i] += odometry.twist[i] * elapsed
+            asked[i] += command[i] * elapsed
+        self._since += elapsed
+        moved = any(abs(one) > bound for one, bound in zip(measured, MOTION, strict=True))
+        if self._anchor is None or moved or has_moved(self._anchor, pose, *MOTION):
+            self._moved = self._moved or self._anchor is not None
+            self._restart(pose)
+            return False
+        return self._since > STANDING_TIME and any(
+            abs(one) > bound for one, bound in zip(asked, ASKED_MOTION, strict=True)
+        )
+
+    def _begin_pause(self) -> Reason:
+        self.pauses += 1
+        self._trials += self._moved
+        self._ended = self._trials > TRIALS
+        self._pause = PAUSE
+        return Reason.STOPPED_AGAIN if self._ended else Reason.PAUSED

@@ -60,6 +60,7 @@ class NodeDriver:
         self._controller, self._geometry, self._course = controller, geometry, course
         self._known = 0
         """Periods whose reference the controller has."""
+        self._enabled = True
         self.reason = ''
         self.signals: Signals = {}
 
@@ -69,7 +70,9 @@ class NodeDriver:
             twist = twist_from_wheels(WheelSpeeds(*self._course[j].tolist()), self._geometry)
             self._controller.add_reference(State(stamp_of(j), ORIGIN, twist))
             self._known = j + 1
-        self._controller.enable(enabled)
+        if enabled is not self._enabled:  # a call, as of the service, also ends pauses
+            self._enabled = enabled
+            self._controller.enable(enabled)
 
     def step(self, state: RobotState) -> RobotCommand:
         """Return the command that follows from a report of the robot."""

@@ -84,6 +84,14 @@ def check_pose(pose: Pose) -> None:
         raise ValueError(f'pose must be finite: got {pose}')
 
 
+def has_moved(start: Pose | None, pose: Pose, distance: float, angle: float) -> bool:
+    """Return whether a pose is farther than a distance (m) or an angle (rad) from the start."""
+    return start is None or (
+        math.hypot(pose.x - start.x, pose.y - start.y) > distance
+        or abs(wrap_angle(pose.yaw - start.yaw)) > angle
+    )
+
+
 def wrap_angle(angle: float) -> float:
     """Return ``angle`` (rad) wrapped into (-pi, pi]."""
     wrapped = math.remainder(angle, math.tau)

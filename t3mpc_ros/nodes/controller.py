@@ -25,7 +25,7 @@ from t3mpc_ros.control.controller import (
     StepperControllerParameters,
 )
 from t3mpc_ros.control.input_monitor import NAMES, InputMonitor
-from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.control.watchdog import TRIALS, Reason
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes import conversions, qos
@@ -323,6 +323,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             'gyro_bias_rad_s': self._controller.body.gyro_bias,
             'odometry_has_twist': not self._controller.odometry_twist.missing,
             'odometry_ignored': self._controller.ignored_odometry,
+            'pauses': self._controller.drive_monitor.pauses,
             'references_rejected': self._rejected_references,
             'odometry_rejected': self._rejected_odometry,
             **self._input_values(),
@@ -335,6 +336,9 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         if self._odometry_problem:
             return ERROR, f'stopped: odom {self._odometry_problem}', values
         waiting = self._steps == 0
+        if status.reason in (Reason.PAUSED, Reason.NOT_FOLLOWING):
+            lasts = self._controller.drive_monitor.pauses >= TRIALS
+            return ERROR if lasts else WARN, status.reason.value, values
         stopped = f'stopped: {status.reason.value}'
         if not status.reason.moves and not waiting:
             return ERROR, stopped, values
@@ -342,8 +346,6 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             return WARN, problem, values
         if waiting:
             return WARN, stopped, values
-        if status.reason is Reason.NOT_FOLLOWING:
-            return WARN, status.reason.value, values
         keep_out = self._controller.keep_out
         if keep_out is not None and keep_out.activity.stuck:
             return WARN, keep_out.activity.value, values
@@ -386,11 +388,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
                 'overtaken by later ones; one publisher only, with increasing stamps'
             )
         self._reported_ignored = ignored
-        if self._controller.odometry_twist.missing:
-            found.append('odom has no twist: its poses are differentiated; publish the twist')
-        if problem := self._controller.body.problem():
-            found.append(problem)
-        return found
+        return found + self._controller.problems()
 
     def on_shutdown(self) -> None:
         """Publish a zero command and the last row of the journal."""

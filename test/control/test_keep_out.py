@@ -139,15 +139,6 @@ def test_an_obstacle_seen_again_must_be_cleared_anew():
     assert _state(keep_out, 0.605, 0.05) == FREE
 
 
-def test_drive_that_does_not_answer_is_paused():
-    """A robot stopped by slip drives again after half a second without a command."""
-    keep_out = _seen()
-    twists = [keep_out.step(BodyTwist(0.2, 0.0), ORIGIN, PERIOD) for _ in range(280)]
-    assert twists[100].linear == pytest.approx(0.2)
-    assert [each for each in twists[205:275] if each != (0.0, 0.0)] == []
-    assert keep_out.activity is Activity.STUCK_DRIVE
-
-
 @pytest.mark.compiled
 def test_a_reading_counts_at_the_pose_of_the_last_odometry():
     """A robot that had been carried while its controller was disabled marked the wrong floor."""

@@ -14,7 +14,13 @@ from support.control_loops import GEOMETRY, PERIOD, ServoLoop
 from support.properties import PROPERTY, STATEFUL
 
 from t3mpc_ros.control.watchdog import (
+    ASTRAY_TIME,
     EVIDENCE_WEIGHT,
+    PAUSE,
+    RECOVERY_TIME,
+    STANDING_TIME,
+    TRIALS,
+    DriveMonitor,
     InputWatchdog,
     OdometryTwist,
     Reason,
@@ -265,11 +271,13 @@ def test_an_unresponsive_robot_gets_the_reference_as_command():
     assert robot.controller.status.reason is Reason.NOT_FOLLOWING
     assert Reason.NOT_FOLLOWING.moves  # a restarted board needs commands
     weights = robot.controller.law.get_weights()
-    robot.run(2.0, unresponsive=True)
-    for name, value in robot.controller.law.get_weights().items():
-        np.testing.assert_array_equal(value, weights[name])
+    robot.run(0.4, unresponsive=True)
     sent = wheels_from_twist(robot.delayed, GEOMETRY)
     assert sent == pytest.approx(robot.wanted(robot.now - PERIOD), abs=0.05)
+    robot.run(20.0, unresponsive=True)
+    assert set(robot.reasons[-1500:]) == {Reason.NOT_FOLLOWING, Reason.PAUSED}
+    for name, value in robot.controller.law.get_weights().items():
+        np.testing.assert_array_equal(value, weights[name])
 
 
 @pytest.mark.compiled
@@ -278,10 +286,10 @@ def test_a_robot_that_follows_again_gets_no_step_of_the_command():
     robot, sent = StoppingRobot(), []
     robot.run(5.0)
     for unresponsive in (True, False):
-        for _ in range(200):
+        for _ in range(130):
             robot.run(0.01, unresponsive)
             sent.append(wheels_from_twist(robot.delayed, GEOMETRY))
-    reasons = robot.reasons[-200:]
+    reasons = robot.reasons[-130:]
     assert reasons[0] is Reason.NOT_FOLLOWING
     assert reasons[-1] is Reason.TRACKING
     limit = robot.controller.parameters.limits.wheel_acceleration
@@ -330,3 +338,161 @@ def test_a_message_that_is_not_finite_keeps_the_twist_missing():
     assert found[:6] == [0.0] * 6
     assert found[20] == 0.0
     assert found[7:20] + found[21:] == pytest.approx([0.2] * 22)
+
+
+# -- pauses of the commands -----------------------------------------------------------------------
+
+
+class Course:
+    """A drive monitor and a robot, of which a test says how it moves under a command."""
+
+    def __init__(self, moves):
+        self.monitor, self.moves, self.wanted = DriveMonitor(), moves, BodyTwist(0.2, 0.0)
+        self.time = self.silent = 0.0
+        self.pose, self.twist = Pose(0.0, 0.0, 0.0), STANDSTILL
+        self.log = []
+
+    def run(self, seconds, following=None):
+        """Return the reasons of the periods."""
+        begin = len(self.log)
+        for _ in range(round(seconds * 100)):
+            self.time += 0.01
+            (x, y, yaw), (linear, angular) = self.pose, self.twist
+            yaw += 0.01 * angular
+            self.pose = Pose(
+                x + 0.01 * linear * math.cos(yaw), y + 0.01 * linear * math.sin(yaw), yaw
+            )
+            command = self.wanted if self.log and self.log[-1].moves else STANDSTILL
+            fits = self.twist == command if following is None else following
+            odometry = State(round(self.time * 1e9), self.pose, self.twist)
+            self.log.append(self.monitor.decide(odometry, command, 0.01, following=fits))
+            command = self.wanted if self.log[-1].moves else STANDSTILL
+            self.silent = 0.0 if self.log[-1].moves else self.silent + 0.01
+            self.twist = self.moves(self, command)
+        return self.log[begin:]
+
+    def changes(self):
+        """Return the reasons in turn."""
+        return [b for a, b in zip([None, *self.log], self.log, strict=False) if a is not b]
+
+
+class SlipStop:
+    """Moves for ``slips`` s after each pause, then stands until nothing is commanded for 0.5 s."""
+
+    def __init__(self, slips, until=math.inf):
+        self.slips, self.until, self.moved = slips, until, 0.0
+
+    def __call__(self, course, command):
+        if course.silent >= 0.5:
+            self.moved = 0.0
+        if course.time < self.until and self.moved >= self.slips:
+            return STANDSTILL
+        self.moved += 0.01
+        return command
+
+
+def test_a_robot_that_stopped_by_itself_gets_a_pause_and_goes_on():
+    """The controller kept on commanding, and the robot stood for ever."""
+    course = Course(SlipStop(1.2, until=3.0))
+    course.run(20.0)
+    assert course.changes() == [Reason.TRACKING, Reason.PAUSED, Reason.TRACKING]
+    assert course.log.count(Reason.PAUSED) == pytest.approx(100 * PAUSE, abs=1)
+    assert course.monitor.pauses == 0
+    assert course.monitor.problem() == ''
+
+
+def test_a_robot_that_stops_again_after_each_pause_is_left_alone():
+    course = Course(SlipStop(1.2))
+    course.run(60.0)
+    attempts = TRIALS * [Reason.TRACKING, Reason.PAUSED]
+    assert course.changes() == [*attempts, Reason.TRACKING, Reason.STOPPED_AGAIN]
+    assert '~/enable' in course.monitor.problem()
+    assert course.log.index(Reason.STOPPED_AGAIN) * 0.01 == pytest.approx(
+        (TRIALS + 1) * (1.2 + STANDING_TIME) + TRIALS * PAUSE, abs=0.6
+    )
+    course.monitor.begin()  # a gap in the odometry, or a reference that was stale
+    assert set(course.run(5.0)) == {Reason.STOPPED_AGAIN}
+    course.monitor.reset()
+    assert course.run(0.5)[0] is Reason.TRACKING
+
+
+def test_stops_far_apart_are_not_counted_together():
+    course = Course(SlipStop(STANDING_TIME + RECOVERY_TIME))
+    course.run(200.0)
+    assert Reason.STOPPED_AGAIN not in course.log
+    assert course.log.count(Reason.PAUSED) > 10 * 100 * PAUSE
+
+
+def test_a_robot_that_never_moves_gets_commands_for_ever():
+    """Its emergency stop is released, or its board starts, after any time."""
+    course = Course(lambda course, command: command if course.time > 300.0 else STANDSTILL)
+    course.run(300.0)
+    assert set(course.log) == {Reason.TRACKING, Reason.PAUSED}
+    assert course.monitor.pauses > 100
+    assert 'emergency stop' in course.monitor.problem()
+    reasons = course.run(STANDING_TIME + PAUSE + RECOVERY_TIME)
+    assert reasons[-1] is Reason.TRACKING
+    assert course.run(1.0)[-1] is Reason.TRACKING
+    assert course.monitor.problem() == ''
+
+
+def test_a_robot_that_moves_otherwise_is_stopped():
+    """Swapped wheels, stamps that are a second late, or another publisher of commands."""
+    course = Course(lambda course, command: BodyTwist(-command.linear, 0.0))
+    course.run(60.0, following=False)
+    assert course.changes()[-1] is Reason.STOPPED_AGAIN
+    assert course.log.index(Reason.PAUSED) * 0.01 == pytest.approx(ASTRAY_TIME, abs=0.5)
+
+
+def test_a_response_disturbed_for_a_short_time_costs_no_pause():
+    course = Course(lambda course, command: command)
+    for _ in range(20):
+        course.run(0.9 * ASTRAY_TIME, following=False)
+        course.run(ASTRAY_TIME, following=True)
+    assert set(course.log) == {Reason.TRACKING}
+
+
+@pytest.mark.parametrize(
+    'wanted',
+    [
+        lambda t: BodyTwist(0.1 * math.sin(8.0 * t), 0.0),  # to and fro within 2.5 cm
+        lambda t: BodyTwist(0.0, 0.5 * math.sin(8.0 * t)),
+        lambda t: BodyTwist(0.02, 0.0),
+        lambda t: BodyTwist(0.0, 0.05),
+        lambda t: BodyTwist(0.005, 3.0),
+        lambda t: STANDSTILL,
+    ],
+)
+def test_a_robot_that_follows_gets_no_pause(wanted):
+    course = Course(lambda course, command: command)
+    for k in range(3000):
+        course.wanted = wanted(0.01 * k)
+        course.run(0.01)
+    assert set(course.log) == {Reason.TRACKING}
+
+
+@pytest.mark.parametrize('late', [0.1, 0.3, 0.6])
+def test_an_odometry_that_is_late_is_no_robot_that_stands(late):
+    course = Course(lambda course, command: command if course.time > late else STANDSTILL)
+    assert set(course.run(5.0, following=True)) == {Reason.TRACKING}
+
+
+@pytest.mark.parametrize('part', ['pose', 'twist'])
+def test_pose_or_twist_alone_show_that_a_robot_moves(part):
+    monitor = DriveMonitor()
+    for k in range(1000):
+        moving = BodyTwist(0.2, 0.0) if part == 'twist' else STANDSTILL
+        pose = Pose(0.002 * k, 0.0, 0.0) if part == 'pose' else Pose(0.0, 0.0, 0.0)
+        state = State(k * 10_000_000, pose, moving)
+        reason = monitor.decide(state, BodyTwist(0.2, 0.0), 0.01, following=True)
+        assert reason is Reason.TRACKING
+
+
+def test_noise_of_a_standing_robot_is_no_motion():
+    generator = np.random.default_rng(5)
+    monitor, reasons = DriveMonitor(), []
+    for k in range(500):
+        twist = BodyTwist(*(generator.normal(size=2) * (0.005, 0.07)).tolist())
+        state = State(k * 10_000_000, Pose(0.0, 0.0, 0.0), twist)
+        reasons.append(monitor.decide(state, BodyTwist(0.2, 0.0), 0.01, following=False))
+    assert Reason.PAUSED in reasons[: round(100 * STANDING_TIME) + 20]

@@ -12,12 +12,15 @@ from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry, Path
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Range
+from std_srvs.srv import SetBool
 from support.ros_graph import (
     LATCHED,
     diagnostic,
+    diagnostic_level,
     is_ok,
     odometry,
     on_grid,
@@ -349,3 +352,56 @@ def test_fixed_frames_have_the_names_of_the_messages(harness, monkeypatch):
     sent.clear()
     harness.add(SimRobotNode, namespace='two', enable_odom_tf=False, enable_static_tf=False)
     assert not sent
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_a_robot_that_slipped_gets_going_again_three_times(harness):
+    """The robot asked for a pause of the commands, which never came."""
+    robot = harness.add(
+        SimRobotNode, rate=50.0, publish_clock=True, real_time_factor=0.0, step_time=0.02
+    )
+    controller = harness.add(ControllerNode, rate=50.0, watchdog__odometry_timeout=5.0)
+    references = harness.connected_publisher(Odometry, 'reference')
+    harness.spin_until(lambda: robot._state is not None)
+    for publisher, count in ((robot._odom_publisher, 1), (controller._command_publisher, 1)):
+        harness.wait_for_subscriber(publisher, count)
+
+    def drive(seconds, until=None):
+        for _ in range(round(50 * seconds)):
+            stamp_ns = robot._state.stamp_ns
+            moving = stamp_ns > 2 * NANOSECONDS  # the gyro needs a standstill before
+            references.publish(odometry(stamp_ns + 400_000_000, 0.2 if moving else 0.0))
+            steps, commands = diagnostic(controller, 'steps'), robot._received
+            robot._step()
+            harness.spin_until(lambda before=steps: diagnostic(controller, 'steps') > before)
+            harness.spin_until(lambda before=commands: robot._received > before)
+            if until and reason(controller) == until:
+                return True
+        return not until
+
+    def block(wheel):
+        value = Parameter('faults.wheel_blocked', value=wheel)
+        assert robot.set_parameters([value])[0].successful
+
+    drive(4.0)
+    assert reason(controller) == 'tracking'
+    block('right')
+    assert drive(6.0, 'commands pause because the robot does not follow them')
+    assert diagnostic_level(controller) == WARN
+    assert 'slip' in reason(robot)
+    block('none')
+    drive(8.0)
+    assert reason(controller) == 'tracking'
+    assert (diagnostic(controller, 'pauses'), diagnostic(robot, 'moving')) == (0, True)
+    block('right')
+    assert drive(30.0, 'stopped: the robot has stopped again after each of three pauses')
+    assert diagnostic_level(controller) == ERROR
+    assert 'call ~/enable' in '; '.join(controller.warnings())
+    block('none')
+    drive(2.0)
+    assert not diagnostic(robot, 'moving')
+    assert harness.call(SetBool, 'controller/enable', data=True).success
+    drive(2.0)
+    assert reason(controller) == 'tracking'
+    assert diagnostic(robot, 'moving')

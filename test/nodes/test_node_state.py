@@ -161,7 +161,7 @@ def test_changed_parameters_are_published_with_their_revision(start):
     node = start('controller')
     revisions = published(node._revision_publisher)
     rows = published(node._journal_publisher)
-    for number, gain in enumerate((3.0, 4.0), 1):
+    for number, gain in enumerate((90.0, 95.0), 1):
         changed(node, **{'law.gain': gain})
         content = json.loads(revisions[-1].data)
         listed = json.loads(json.dumps(node.parameters.to_dict()))
@@ -169,7 +169,7 @@ def test_changed_parameters_are_published_with_their_revision(start):
         assert listed['law.gain'] == gain
         assert rows[-1].data[1] == 4  # Event.CONFIGURE
         assert rows[-1].data[4] == number == len(revisions)
-    changed(node, **{'law.gain': 4.0})
+    changed(node, **{'law.gain': 95.0})
     assert len(revisions) == 2
 
 
@@ -282,9 +282,13 @@ def test_levels_of_the_controller(start):
     controller = node._controller
     for reason in Reason:
         node._controller = Instead(controller, status=controller.status._replace(reason=reason))
-        level = {Reason.TRACKING: OK, Reason.NOT_FOLLOWING: WARN}.get(reason, ERROR)
-        text = reason.value if reason.moves else f'stopped: {reason.value}'
+        passing = reason in (Reason.NOT_FOLLOWING, Reason.PAUSED)
+        level = OK if reason is Reason.TRACKING else WARN if passing else ERROR
+        text = reason.value if passing or reason.moves else f'stopped: {reason.value}'
         assert report(node) == (level, text)
+        if passing:  # not after three pauses
+            node._controller.drive_monitor = SimpleNamespace(pauses=3)
+            assert report(node) == (ERROR, text)
     status = controller.status._replace(reason=Reason.TRACKING)
     for stuck, level in ((False, OK), (True, WARN)):
         keep_out = SimpleNamespace(activity=SimpleNamespace(stuck=stuck, value='what it does'))

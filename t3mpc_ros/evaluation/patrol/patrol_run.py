@@ -175,11 +175,13 @@ class PathDriver:
         self._ranges: tuple[float, ...] = ()
         self._k = 0
         self._driving = False
+        self._controller.enable(False)
         self._pose, self._twist = ORIGIN, STANDSTILL
         self.reason = ''
 
     def begin(self, k: int, *, enabled: bool) -> None:
         """Extend the reference up to its lead."""
+        changed = enabled is not self._driving
         self._k, self._driving = k, enabled
         while len(self._references) <= k + round(LEAD * RATE):
             stamp = stamp_of(len(self._references))
@@ -188,7 +190,8 @@ class PathDriver:
                 reference = self._timing.advance_along(self._points)
             self._references.append(reference)
             self._controller.add_reference(State(stamp, *reference))
-        self._controller.enable(enabled)
+        if changed:
+            self._controller.enable(enabled)
 
     def step(self, state: RobotState) -> RobotCommand:
         """Return the command that follows from a report of the robot."""
