@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.fault_study import ALLOWED, BEGIN, DURATION, PAUSE
+from t3mpc_ros.evaluation.fault_study import ALLOWED, BEGIN, DURATION
 from t3mpc_ros.evaluation.plotting import COLOURS, legend_above, new_figure, png_of
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
@@ -65,8 +65,6 @@ def outcome_sentence(row: Row) -> str:
     text = f'stops: {_short(row["reason"])}'
     if row['resumption'] == 'by itself':
         return f'{text}, for {row["stopped_for"]:.1f} s; resumes by itself, {recovery}'
-    if row['resumption'] == 'after a pause':
-        return f'{text}, until commands pause; then resumes, {recovery}'
     return f'{text}, and remains stopped'
 
 
@@ -119,7 +117,6 @@ def console_text(rows: Sequence[Row]) -> str:
 
 def page_section(rows: Sequence[Row]) -> str:
     """Return the section of the page from mark to mark."""
-    after, pause = PAUSE
     return f"""{BEGIN_MARK}
 
 The controller drives the twin. Each fault begins at {BEGIN:g} s and lasts 5 s; `brown_out`
@@ -127,11 +124,9 @@ restarts the board, which takes 0.5 s. A run lasts {DURATION:g} s, one into a wa
 the robot needs 11 s to get there.
 
 Errors are root mean squares over both wheels, of rotor speed against reference:
-from 3 s on before the fault, during it, and from 2 s after it to the end. The error has
-*recovered* when the rest of the run is no worse than {ALLOWED:g} times the same run without the
-fault. Where the robot stands until commands pause, a person pauses the controller for {pause:g} s,
-{after:g} s after the fault: the error after the fault then counts after the pause, and the
-odometry is that of the run without a pause.
+from 3 s on before the fault, during it, and from 2 s after it and the last stop to the end. The
+error has *recovered* when the rest of the run is no worse than {ALLOWED:g} times the same run
+without the fault.
 
 Ground truth shows full steps lost by the right and the left motor at most, and how much
 faster (root mean square) the wheels turn than they roll.

@@ -44,7 +44,7 @@ BEGIN = 10.0
 SETTLED = 3.0
 """Errors count from here, s."""
 AFTER = 2.0
-"""Time after the end of a fault before its error after the fault counts, s."""
+"""Time after the end of a fault, and of the last stop, before the error after it counts, s."""
 ALLOWED = 1.5
 """Ratio to the error without the fault up to which an error counts as recovered."""
 REST = 4.0
@@ -66,7 +66,7 @@ def evaluate_outcome(
     ``verdict``: ``bounded``, the robot stays within its limits and the error recovers; ``stops``,
     it stops with a reason; ``impaired``, within limits, but the error remains; ``unbounded``
     otherwise. ``reason`` of the stop, or the violated bound; ``stopped_for``, time with a stop
-    reason (s); ``resumption``: ``by itself``, ``after a pause``, ``not``, or '' without a stop.
+    reason (s); ``resumption``: ``by itself``, ``not``, or '' without a stop.
 
     ``before``, ``during``, ``after``: root mean square error of the speeds of both wheels (rad/s),
     the last one None if the robot stands at the end or the fault lasts; ``recovery_time`` from the
@@ -86,6 +86,7 @@ def evaluate_outcome(
     during = begin, min(end, last)
     reasons = stop_reasons(record, begin)
     stopped = bool(record.robot_reasons[-1] or record.driver_reasons[-1])
+    resumed = max(end, float(np.max(record.time[record.stopped], initial=0.0)))
     recovery_time = None if stays or stopped else time_to_return(record, undisturbed_run, end)
     violation = _bound_violation(record, begin, parameters)
     if violation:
@@ -102,7 +103,7 @@ def evaluate_outcome(
         'resumption': ('not' if stopped else 'by itself') if reasons else '',
         'before': wheel_error(record, SETTLED, begin),
         'during': wheel_error(record, begin, end),
-        'after': None if stays or stopped else wheel_error(record, end + AFTER, last),
+        'after': None if stays or stopped else wheel_error(record, resumed + AFTER, last),
         'recovery_time': recovery_time,
         'odometry_before': _odometry_error(record, begin),
         'odometry_after': off,
@@ -238,8 +239,6 @@ def _undetected(
 
 DURATION = 40.0
 """s; length of a run."""
-PAUSE = (5.0, 1.0)
-"""Time from the fault to the pause of the controller of a stopped robot, and its length, s."""
 
 
 def straight_course(duration: float, turn: float = 0.0) -> SampledReference:
@@ -273,13 +272,12 @@ class FaultRun:
         """The name of the fault, ``collision`` for a wall."""
         return 'collision' if self.event is None else self.event.fault
 
-    def scenario(self, pauses: tuple[tuple[float, float], ...] = ()) -> Scenario:
-        """Return the run on the twin, with pauses of the controller (s)."""
+    def scenario(self) -> Scenario:
+        """Return the run on the twin."""
         own = OwnParts(
             reference=_course(self.course, self.duration),
             events=() if self.event is None else (self.event,),
             robot_parameters={'world': self.world},
-            pauses=pauses,
         )
         return Scenario('twin', 'nominal', 1, self.duration, own=own)
 
@@ -329,10 +327,7 @@ def study_faults(
 
 
 def measured_fault(job: tuple[FaultRun, NodeMethod]) -> Row:
-    """Return the outcome of the closed loop in one run.
-
-    If the robot stands at the end, the run is repeated with a pause of the controller.
-    """
+    """Return the outcome of the closed loop in one run."""
     trial, _ = job
     event = trial.event
     parameters = trial.scenario().true_robot()
@@ -346,16 +341,7 @@ def measured_fault(job: tuple[FaultRun, NodeMethod]) -> Row:
     else:
         begin = event.at
         end = event.until + (parameters.boot_time if event.fault == 'brown_out' else 0.0)
-    row = evaluate_outcome(record, undisturbed_run, begin, end, parameters)
-    if row['verdict'] == 'stops' and row['resumption'] == 'not' and event is not None:
-        again, wait = end + PAUSE[0], PAUSE[1]
-        paused = _run(trial, ((again, again + wait),))
-        if not stop_reasons(paused, again + wait + AFTER):
-            end = again + wait
-            row['resumption'] = 'after a pause'
-            row['after'] = wheel_error(paused, end + AFTER, trial.duration)
-            row['recovery_time'] = time_to_return(paused, undisturbed_run, end)
-    return row
+    return evaluate_outcome(record, undisturbed_run, begin, end, parameters)
 
 
 @lru_cache(maxsize=8)
@@ -364,8 +350,8 @@ def undisturbed(course: str, duration: float) -> Record:
     return _run(FaultRun('none', course, None, '', duration))
 
 
-def _run(trial: FaultRun, pauses: tuple[tuple[float, float], ...] = ()) -> Record:
-    return run(trial.scenario(pauses), METHOD)
+def _run(trial: FaultRun) -> Record:
+    return run(trial.scenario(), METHOD)
 
 
 @cache

@@ -12,6 +12,7 @@ import pytest
 from support.long_tests import few_of
 
 from t3mpc_ros.cli.main import main
+from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import fault_study
 from t3mpc_ros.evaluation.drivers import NodeMethod
 from t3mpc_ros.evaluation.fault_page import (
@@ -134,12 +135,16 @@ EXPECTED = {
     'command_delay 0.1 s': ('bounded', '', ''),
     'command_jitter 0.05 s': ('bounded', '', ''),
     'command_loss 1': ('stops', 'no command for 0.25 s', 'by itself'),
-    'gyro_bias_jump 0.35 rad/s': ('stops', SLIP_STOP_REASON, 'after a pause'),
+    'gyro_bias_jump 0.35 rad/s': (
+        'stops',
+        f'{SLIP_STOP_REASON}; {Reason.PAUSED.value}',
+        'by itself',
+    ),
     'gyro_dead': ('bounded', '', ''),
     'ranges_dead': ('bounded', '', ''),
-    'wheel_blocked right': ('stops', SLIP_STOP_REASON, 'after a pause'),
+    'wheel_blocked right': ('stops', f'{SLIP_STOP_REASON}; {Reason.PAUSED.value}', 'by itself'),
     'load_change 3 kg': ('bounded', '', ''),
-    'slippery 0.05': ('stops', SLIP_STOP_REASON, 'after a pause'),
+    'slippery 0.05': ('stops', f'{SLIP_STOP_REASON}; {Reason.PAUSED.value}', 'by itself'),
     'supply_sag 5 V': ('stops', BROWN_OUT_REASON, 'by itself'),
     'brown_out': ('stops', BROWN_OUT_REASON, 'by itself'),
 }
