@@ -1,0 +1,377 @@
+#!/usr/bin/env python3
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Faults and wrong assumptions: the controller of the node beside feed-forward on the twin.
+
+Usage: fault_comparison.py [--seeds 2001-2003] [--only TEXT] [--method NAME ...] [--workers N]
+
+For each row the ratio of the errors, settled and with switches, to those of feed-forward with the
+same fault (means over the seeds), the time for which the controller stops the robot, and what its
+diagnostics say first within 5 s of the fault. Where the wheels do not decide how the body moves,
+the yaw rate counts too. The exit code is 1 if a ratio is above 1.15, or a fault that costs more
+than 15 % of the errors without it is not named.
+"""
+
+import argparse
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+import math
+from pathlib import Path
+import sys
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+from t3mpc_ros.control.controller import Controller
+from t3mpc_ros.control.watchdog import InputMonitor
+from t3mpc_ros.evaluation import loop
+from t3mpc_ros.evaluation.drivers import NodeDriver, NodeMethod
+from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, methods_for
+from t3mpc_ros.evaluation.metrics import Numbers, measure
+from t3mpc_ros.evaluation.record import RATE, stamp_of
+from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
+from t3mpc_ros.evaluation.simulated_links import NO_FAULTS, LinkFaults, ReportLink
+from t3mpc_ros.evaluation.workers import map_jobs
+from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist
+from t3mpc_ros.robot.interface import RobotState
+from t3mpc_ros.simulation.fault_injection import FaultEvent
+
+DURATION, BEGIN, NAMED = 30.0, 15.0, 5.0
+"""Length of a run, begin of what does not last for the whole run, and time to name it, s."""
+MARGIN = 1.15
+"""Largest ratio to the errors of feed-forward."""
+METRICS = 'settled', 'overall', 'yaw_rate_settled', 'yaw_rate'
+
+Send = Callable[[Any, int, RobotState], Iterable[RobotState]]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What differs from the exact robot, or from what the controller assumes of it."""
+
+    changes: Mapping[str, object] = field(default_factory=dict)
+    """Parameters of the robot."""
+    events: Mapping[str, Any] = field(default_factory=dict)
+    """Faults of the twin from :data:`BEGIN` on."""
+    links: LinkFaults = NO_FAULTS
+    send: Send | None = None
+    """What becomes of a report of the robot, with its number."""
+    assumed: Mapping[str, object] = field(default_factory=dict)
+    """Parameters of the controller."""
+    lasting: float = math.inf
+    """Duration of the events, s."""
+    begin: float = 2.0
+    """When the fault shows, s."""
+
+
+def with_twist(change: Callable[[BodyTwist], BodyTwist]) -> Send:
+    """Return a fault of the twist in each report."""
+
+    def send(link: Any, k: int, state: RobotState) -> list[RobotState]:
+        odometry = state.odometry
+        return [state._replace(odometry=odometry._replace(twist=change(odometry.twist)))]
+
+    return send
+
+
+def with_pose(changed: Callable[[Any, int, Any], Mapping[str, float]]) -> Send:
+    """Return a fault of the pose in each report."""
+
+    def send(link: Any, k: int, state: RobotState) -> list[RobotState]:
+        odometry = state.odometry
+        pose = odometry.pose._replace(**changed(link, k, odometry.pose))
+        return [state._replace(odometry=odometry._replace(pose=pose))]
+
+    return send
+
+
+def swapped(every: int) -> Send:
+    """Return a fault: of each ``every`` reports, the last arrives after its successor."""
+
+    def send(link: Any, k: int, state: RobotState) -> list[RobotState]:
+        if k % every == 0:
+            link.kept = state
+            return []
+        kept, link.kept = link.kept, None
+        return [state] if kept is None else [state, kept]
+
+    return send
+
+
+def frozen_yaw(link: Any, k: int, pose: Any) -> Mapping[str, float]:
+    """Return the yaw of the begin of the fault."""
+    if k == round(BEGIN * RATE):
+        link.kept = pose.yaw
+    return {'yaw': link.kept} if k >= BEGIN * RATE else {}
+
+
+def stamped_late(late: float) -> Send:
+    """Return a fault: stamps that are late, as those of a clock that differs."""
+    shift = round(late * 1e9)
+
+    def send(link: Any, k: int, state: RobotState) -> list[RobotState]:
+        odometry = state.odometry
+        if odometry.stamp_ns < shift:
+            return []
+        return [state._replace(odometry=odometry._replace(stamp_ns=odometry.stamp_ns - shift))]
+
+    return send
+
+
+def late(seconds: float) -> LinkFaults:
+    """Return odometry that is late from the start."""
+    return LinkFaults(odometry_delay=(seconds, seconds))
+
+
+AFTER = BEGIN * RATE
+FAULTS: Mapping[str, Fault] = {
+    'none': Fault(),
+    # messages of the odometry
+    'one pair swapped': Fault(send=swapped(round(AFTER)), begin=BEGIN),
+    'a pair swapped every 0.2 s': Fault(send=swapped(20)),
+    'every third swapped': Fault(send=swapped(3)),
+    'each message twice': Fault(send=lambda link, k, state: [state, state]),
+    'half the rate': Fault(send=lambda link, k, state: [state] if k % 2 else []),
+    'a fifth of the rate': Fault(send=lambda link, k, state: [] if k % 5 else [state]),
+    'rate set to 50, odometry has 100 Hz': Fault(assumed={'rate': 50.0}),
+    'rate set to 200, odometry has 100 Hz': Fault(assumed={'rate': 200.0}),
+    'one in five lost in bursts': Fault(
+        send=lambda link, k, state: [] if k % 50 < 10 else [state]
+    ),
+    '30 % of the odometry lost': Fault(links=LinkFaults(odometry_loss=0.3)),
+    'odometry up to 40 ms late': Fault(links=LinkFaults(odometry_delay=(0.0, 0.04))),
+    'odometry 50 ms late': Fault(links=late(0.05)),
+    'odometry 100 ms late': Fault(links=late(0.1)),
+    'odometry 200 ms late': Fault(links=late(0.2)),
+    'odometry 1 s late': Fault(links=late(1.0)),
+    'no twist in the odometry': Fault(send=with_twist(lambda twist: STANDSTILL)),
+    'twist of the odometry + 10 %': Fault(
+        send=with_twist(lambda twist: BodyTwist(1.1 * twist.linear, 1.1 * twist.angular))
+    ),
+    'yaw rate of the odometry reversed': Fault(
+        send=with_twist(lambda twist: BodyTwist(twist.linear, -twist.angular))
+    ),
+    'twist reversed': Fault(
+        send=with_twist(lambda twist: BodyTwist(-twist.linear, -twist.angular))
+    ),
+    'yaw set by 0.5 rad': Fault(
+        send=with_pose(lambda link, k, pose: {'yaw': pose.yaw + 0.5 * (k >= AFTER)}), begin=BEGIN
+    ),
+    'pose set by 1 m': Fault(
+        send=with_pose(lambda link, k, pose: {'x': pose.x + (k >= AFTER)}), begin=BEGIN
+    ),
+    'yaw frozen': Fault(send=with_pose(frozen_yaw), begin=BEGIN),
+    'one message not finite': Fault(
+        send=with_pose(lambda link, k, pose: {'x': math.nan} if k == AFTER else {}), begin=BEGIN
+    ),
+    # gyro
+    'gyro bias + 0.05 rad/s': Fault(events={'gyro_bias_jump': 0.05}, begin=BEGIN),
+    'gyro bias - 0.01 rad/s': Fault(events={'gyro_bias_jump': -0.01}, begin=BEGIN),
+    'gyro bias + 0.35 rad/s': Fault(events={'gyro_bias_jump': 0.35}, begin=BEGIN),
+    'gyro dead': Fault(events={'gyro_dead': True}, begin=BEGIN),
+    'gyro scale + 3 %, stated': Fault(changes={'imu.gyro_scale_error': 0.03}),
+    'gyro scale + 1 %, not stated': Fault(
+        changes={'imu.gyro_scale_error': 0.01}, assumed={'body.gyro_scale_tolerance': 0.001}
+    ),
+    'gyro scale + 3 %, not stated': Fault(
+        changes={'imu.gyro_scale_error': 0.03}, assumed={'body.gyro_scale_tolerance': 0.001}
+    ),
+    # commands
+    '10 % of the commands lost': Fault(events={'command_loss': 0.1}, begin=BEGIN),
+    '30 % of the commands lost': Fault(events={'command_loss': 0.3}, begin=BEGIN),
+    'commands up to 50 ms late': Fault(events={'command_jitter': 0.05}, begin=BEGIN),
+    'dead time + 30 ms from 15 s on': Fault(events={'command_delay': 0.03}, begin=BEGIN),
+    'dead time + 100 ms from 15 s on': Fault(events={'command_delay': 0.1}, begin=BEGIN),
+    'dead time 30 ms, 10 ms assumed': Fault(changes={'drive.dead_time': 0.03}),
+    'dead time 60 ms, 10 ms assumed': Fault(changes={'drive.dead_time': 0.06}),
+    'dead time 10 ms, 60 ms assumed': Fault(assumed={'speed_filter.dead_time': 0.06}),
+    # robot
+    'wheel radii + 2 %, - 1 %': Fault(
+        changes={'right_wheel_radius_multiplier': 1.02, 'left_wheel_radius_multiplier': 0.99}
+    ),
+    'right radius + 5 %': Fault(changes={'right_wheel_radius_multiplier': 1.05}),
+    'track + 6 %': Fault(changes={'wheel_separation_multiplier': 1.06}),
+    'body 2 kg heavier from 15 s on': Fault(events={'load_change': 2.0}, begin=BEGIN),
+    'a third of the grip for 5 s': Fault(events={'slippery': 0.3}, lasting=5.0, begin=BEGIN),
+    'friction x3': Fault(changes={'friction_factor': 3.0}),
+    'disturbance x10': Fault(changes={'disturbance.bound': 0.02}),
+    'supply 2 V lower': Fault(events={'supply_sag': 2.0}, begin=BEGIN),
+    'noise 0.2 (rad/s)², 0.04 assumed': Fault(
+        changes={'noise.variance': 0.2}, assumed={'speed_filter.noise_variance': 0.04}
+    ),
+    'noise 0.04 (rad/s)², none assumed': Fault(assumed={'speed_filter.noise_variance': 0.0}),
+    'lag 20 ms assumed, none': Fault(assumed={'speed_filter.lag': 0.02}),
+    'shaper for another robot': Fault(
+        assumed={
+            'command_shaper.straight_frequency': 6.0,
+            'command_shaper.turning_frequency': 4.0,
+        }
+    ),
+}
+
+
+class Link(ReportLink):
+    """Reports that a fault changes."""
+
+    send_changed: Send
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.k, self.kept = 0, None
+
+    def send(self, state: RobotState) -> None:
+        """Send what a fault makes of a report."""
+        self.k += 1
+        for each in type(self).send_changed(self, self.k, state):
+            super().send(each)
+
+
+class WatchedDriver(NodeDriver):
+    """The controller of the node with what its diagnostics say, once a second."""
+
+    def __init__(self, method: NodeMethod, scenario: Scenario) -> None:
+        parameters = method.parameters_for(scenario)
+        inner = Controller(parameters.with_values({'rate': RATE}))
+        super().__init__(inner, scenario.true_robot().geometry, scenario.reference().speeds)
+        self._controller = Controller(parameters)
+        self._controller.warm_up()
+        self._monitor = InputMonitor(parameters.rate)
+        self._command: BodyTwist | None = None
+        self._now_ns, self._ignored = 0, 0
+        self.said: list[tuple[float, str]] = []
+
+    def begin(self, k: int, *, enabled: bool) -> None:
+        """Note what the diagnostics say in this period, if they are published."""
+        super().begin(k, enabled=enabled)
+        self._now_ns = stamp_of(k)
+        if k % round(RATE) or not enabled:
+            return
+        controller = self._controller
+        texts = self._monitor.warnings(simulated_time=False) + controller.problems()
+        if controller.status.reason.name != 'TRACKING':
+            texts.insert(0, controller.status.reason.value)
+        if controller.ignored_odometry > self._ignored:
+            texts.append('messages of odom were ignored')
+        self._ignored = controller.ignored_odometry
+        self.said += [(k / RATE, text) for text in texts]
+
+    def step(self, state: RobotState) -> Any:
+        """Return the command, and watch the inputs as the node does."""
+        command = super().step(state)
+        odometry, status = state.odometry, self._controller.status
+        self._monitor.update(odometry.stamp_ns, self._now_ns, odometry.twist, self._command)
+        self._command = self._controller.actuation.twist if status.reason.moves else None
+        return command
+
+
+@dataclass(frozen=True)
+class Watched:
+    """The method of a watched driver, for one run."""
+
+    method: NodeMethod
+    made: list[WatchedDriver] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        """Name in errors."""
+        return self.method.name
+
+    def driver(self, scenario: Scenario) -> WatchedDriver:
+        """Return the driver."""
+        self.made.append(WatchedDriver(self.method, scenario))
+        return self.made[-1]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a method with a fault."""
+
+    fault: str
+    name: str
+    seed: int
+
+
+def run_job(pair: tuple[Job, Job]) -> tuple[Numbers, list[tuple[float, str]]]:
+    """Return the numbers of a run, and what the diagnostics said when."""
+    job, fault = pair[0], FAULTS[pair[0].fault]
+    events = [
+        FaultEvent(BEGIN, name, value, fault.lasting) for name, value in fault.events.items()
+    ]
+    own = OwnParts(robot_parameters=fault.changes, events=events, links=fault.links)
+    scenario = Scenario('twin', 'nominal', job.seed, DURATION, own=own)
+    kind = type('Faulty', (Link,), {'send_changed': fault.send or (lambda link, k, one: [one])})
+    method: Any = methods_for('twin')[job.name]
+    if isinstance(method, NodeMethod):
+        method = Watched(NodeMethod(job.name, {**method.changes, **fault.assumed}))
+    with patch.object(loop, 'ReportLink', kind):
+        numbers = measure(scenario, loop.run(scenario, method))
+    return numbers, method.made[0].said if isinstance(method, Watched) else []
+
+
+def first_said(fault: Fault, said: Iterable[tuple[float, str]]) -> str:
+    """Return what the diagnostics said within 5 s of the begin of a fault, and not before."""
+    said = list(said)
+    before = {text[:30] for time, text in said if time < fault.begin}
+    found = [
+        f'{text} ({time - fault.begin:.0f} s)'
+        for time, text in said
+        if fault.begin <= time <= fault.begin + NAMED and text[:30] not in before
+    ]
+    return '; '.join({text[:30]: text for text in reversed(found)}.values())
+
+
+def main() -> int:
+    """Print the table; return 1 if full is too much worse, or a fault is not named."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n', maxsplit=1)[0])
+    parser.add_argument('--seeds', default='2001-2003')
+    parser.add_argument('--only', default='', help='rows whose name contains this')
+    parser.add_argument('--method', nargs='+', default=[FULL])
+    parser.add_argument('--workers', type=int, default=2)
+    chosen = parser.parse_args()
+    first, _, last = chosen.seeds.partition('-')
+    seeds = range(int(first), int(last or first) + 1)
+    rows = [name for name in FAULTS if chosen.only in name]
+    jobs = [
+        Job(fault, name, seed)
+        for fault in dict.fromkeys(('none', *rows))
+        for name in (FEED_FORWARD, *chosen.method)
+        for seed in seeds
+    ]
+    results = map_jobs(run_job, [(job, job) for job in jobs], chosen.workers, progress=True)
+    found = dict(zip(jobs, results, strict=True))
+
+    def mean(fault: str, name: str, metric: str) -> float:
+        return float(np.mean([found[Job(fault, name, seed)][0][metric] for seed in seeds]))
+
+    failed = 0
+    head = 'fault', 'method', 'settled', 'ratio', 'with switches', 'ratio', 'yaw rate', 'stopped'
+    print(f'| {" | ".join(head)} / s | said |\n{9 * "|---"}|')
+    for fault in rows:
+        forward = {metric: mean(fault, FEED_FORWARD, metric) for metric in METRICS}
+        for name in chosen.method:
+            full = {metric: mean(fault, name, metric) for metric in METRICS}
+            ratio = {metric: full[metric] / forward[metric] for metric in METRICS}
+            stopped = mean(fault, name, 'stopped')
+            said = first_said(FAULTS[fault], found[Job(fault, name, seeds[0])][1])
+            cost = max(full[metric] / mean('none', name, metric) for metric in METRICS)
+            mark = ''
+            if stopped == 0.0 and not max(ratio.values()) <= MARGIN:
+                mark = ' **worse**'
+            if not said and not cost <= MARGIN and fault != 'none':
+                mark += ' **not named**'
+            failed += bool(mark)
+            print(
+                f'| {fault} | {name} | {full["settled"]:.4f} | {ratio["settled"]:.2f} | '
+                f'{full["overall"]:.4f} | {ratio["overall"]:.2f} | '
+                f'{ratio["yaw_rate_settled"]:.2f}, {ratio["yaw_rate"]:.2f} | {stopped:.1f} | '
+                f'{said}{mark} |',
+                flush=True,
+            )
+    return bool(failed)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
