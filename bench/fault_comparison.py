@@ -26,7 +26,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from t3mpc_ros.control.controller import Controller
-from t3mpc_ros.control.watchdog import InputMonitor
+from t3mpc_ros.control.input_monitor import InputMonitor
+from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.drivers import NodeDriver, NodeMethod
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, methods_for
@@ -250,8 +251,14 @@ class WatchedDriver(NodeDriver):
         if k % round(RATE) or not enabled:
             return
         controller = self._controller
-        texts = self._monitor.warnings(simulated_time=False) + controller.problems()
-        if controller.status.reason.name != 'TRACKING':
+        parameters = controller.parameters
+        texts = self._monitor.warnings(
+            simulated_time=False,
+            tolerated_gap=0.5 * parameters.watchdog.odometry_timeout,
+            geometry=parameters.geometry,
+        )
+        texts += controller.problems()
+        if controller.status.reason is not Reason.TRACKING:
             texts.insert(0, controller.status.reason.value)
         if controller.ignored_odometry > self._ignored:
             texts.append('messages of odom were ignored')
@@ -262,7 +269,9 @@ class WatchedDriver(NodeDriver):
         """Return the command, and watch the inputs as the node does."""
         command = super().step(state)
         odometry, status = state.odometry, self._controller.status
-        self._monitor.update(odometry.stamp_ns, self._now_ns, odometry.twist, self._command)
+        known = None if self._controller.odometry_twist.missing else self._command
+        following = status.reason is Reason.TRACKING
+        self._monitor.update(odometry, self._now_ns, known, following=following)
         self._command = self._controller.actuation.twist if status.reason.moves else None
         return command
 

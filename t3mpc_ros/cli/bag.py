@@ -414,7 +414,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
         action='append',
         default=[],
         metavar='NAME=VALUE',
-        help='another setting than the recorded one, law.gain=30 say; may be given again',
+        help='another setting than the recorded one, law.gain=90 say; may be given again',
     )
     parser.add_argument(
         '--model', type=Path, metavar='FILE', help='model file to begin with (default: as the bag)'

@@ -125,7 +125,7 @@ class DemoOptions:
 def parse_settings(
     options: DemoOptions, texts: Iterable[str]
 ) -> Mapping[str, Mapping[str, object]]:
-    """Return parameters by node and name from texts like ``controller.law.gain=30``."""
+    """Return parameters by node and name from texts like ``controller.law.gain=90``."""
     from t3mpc_ros.nodes.registry import parameter_class  # takes a second
 
     found: dict[str, Mapping[str, object]] = {}

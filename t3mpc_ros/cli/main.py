@@ -223,7 +223,7 @@ def _parser() -> argparse.ArgumentParser:
         action='append',
         default=[],
         metavar='NODE.NAME=VALUE',
-        help='parameter of a node, such as controller.law.gain=30; may be given again',
+        help='parameter of a node, such as controller.law.gain=90; may be given again',
     )
     demo.set_defaults(run=_demo)
 

@@ -34,6 +34,9 @@ TERM_NAMES = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
 FRICTION_WEIGHTS = 'friction.coefficients'
 """Name of the weights of the friction term."""
 
+MAX_SMOOTHING = 100.0
+"""Largest width epsilon of the compensator, rad/s."""
+
 TANH_GAP = 0.2785
 """E14: the maximum of |x| - x tanh(x), rounded up (0.27846, at x = 0.6392)."""
 
@@ -48,7 +51,7 @@ class LawParameters(Parameters):
         'slope of the compensator, (omega-bar + v_p-bar)/epsilon, is (1 - exp(-T/lag))/T, at '
         'which measurement noise cancels in the command. 15.2 is tuned for a lag of 0.02 s',
         '1/s',
-        (0.0, 100.0),
+        (0.0, 1000.0),
         dynamic=True,
     )
     compensator: bool = parameter(
@@ -66,7 +69,7 @@ class LawParameters(Parameters):
         'width epsilon of the compensator tanh(delta/epsilon): the error bound E14 grows with '
         '0.2785 epsilon, small values chatter with noise',
         'rad/s',
-        (1e-3, 100.0),
+        (1e-3, MAX_SMOOTHING),
         dynamic=True,
     )
 
@@ -140,6 +143,11 @@ class Nt3fsMpcParameters(Parameters):
         return self.law.error_bound + predictive
 
 
+def servo_gain(period: float, lag: float) -> float:
+    """Return the gain (1/s) at which the measured speed cancels in the command of E19."""
+    return (1.0 - math.exp(-period / lag)) / period
+
+
 def fitting_gain(parameters: Nt3fsMpcParameters, drive: str) -> tuple[float, float]:
     """Return the gain K (1/s) and the width epsilon (rad/s) that fit drive and noise.
 
@@ -159,14 +167,14 @@ def fitting_gain(parameters: Nt3fsMpcParameters, drive: str) -> tuple[float, flo
     """
     period, filtered = 1.0 / parameters.rate, parameters.speed_filter
     if drive == 'velocity':
-        total = (1.0 - math.exp(-period / filtered.lag)) / period
+        total = servo_gain(period, filtered.lag)
     else:
         noise = math.sqrt(max(filtered.noise_variance, 1e-9) * period)
         total = min(0.5 * math.sqrt(filtered.disturbance / noise), 0.3 / period)
     smoothing, bound = parameters.law.smoothing, parameters.compensated_bound
     if not parameters.law.compensator:
         return total, smoothing
-    smoothing = min(max(smoothing, 2.0 * bound / total), 100.0)
+    smoothing = min(max(smoothing, 2.0 * bound / total), MAX_SMOOTHING)
     return total - bound / smoothing, smoothing
 
 

@@ -15,6 +15,7 @@ from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
 from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParameters
 from t3mpc_ros.control.control_law import (
+    MAX_SMOOTHING,
     TERM_NAMES,
     CertificateReading,
     FrictionTermParameters,
@@ -22,6 +23,7 @@ from t3mpc_ros.control.control_law import (
     Nt3fsMpcController,
     Nt3fsMpcParameters,
     fitting_gain,
+    servo_gain,
 )
 from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
 from t3mpc_ros.control.jump_transition import JumpTransition, MotorLimit
@@ -67,6 +69,9 @@ JUMP_DETECTION_FACTOR = 2.2
 
 BODY_WEIGHTS = 'body.estimate'
 """Name of what the body correction has learnt."""
+
+FEEDBACK_RANGE = {'body': (0.8, 1.2), 'paper': (0.0, 1.4)}
+"""Permitted slope of the command in the speed error, relative to the one that fits."""
 
 MIN_DEAD_TIME_CHANGE = 0.0005
 """Smallest change (s) of the dead time in use."""
@@ -131,6 +136,34 @@ class ControllerParameters(Nt3fsMpcParameters):
             raise ParameterError(
                 'jump_transition.method must be ramp with composition body, which has no '
                 'predictive term: got predictive; or set composition to paper'
+            )
+        self._check_feedback()
+
+    def _check_feedback(self) -> None:
+        """Raise :class:`ParameterError` where the feedback does not fit rate and lag.
+
+        A wheel that follows its command exactly has the better measurement: with less feedback
+        than cancels it, the speed is an integral of the noise, with more it oscillates. Where
+        the learning parts act on the wheels, they also correct what low feedback leaves.
+        """
+        period, lag = 1.0 / self.rate, self.speed_filter.lag
+        fitting, body = servo_gain(period, lag), self.composition == 'body'
+        bound = self.compensated_bound if self.law.compensator and not body else 0.0
+        if self.law.gain == 0.0:
+            most = 0.5 * MAX_SMOOTHING * fitting
+            if bound > most:
+                raise ParameterError(
+                    f'law.error_bound plus predictive.v_max must be at most {most:.4g} rad/s² at '
+                    f'this rate and lag with law.gain 0: got {bound:g}'
+                )
+            return
+        slope = self.law.gain + bound / self.law.smoothing
+        least, most = (share * fitting for share in FEEDBACK_RANGE[self.composition])
+        if not least <= slope <= most:
+            sum_of = ' plus the slope of the compensator' if bound else ''
+            raise ParameterError(
+                f'law.gain{sum_of} must be from {least:.3g} to {most:.3g} 1/s at this rate and '
+                f'lag: got {slope:.3g}; law.gain 0 chooses the gain that fits'
             )
 
     def resolved(self) -> Self:

@@ -28,7 +28,7 @@ class NominalLoopParameters(Parameters):
     """
 
     feedback_gain: float = parameter(
-        8.0, 'feedback K; the controller replaces it by its own', '1/s', (0.1, 100.0)
+        8.0, 'feedback K; the controller replaces it by its own', '1/s', (0.01, 1000.0)
     )
     lag: float = parameter(0.02, 'time constant from v_p to acceleration', 's', (1e-3, 1.0))
     dead_time: float = parameter(0.01, 'dead time of v_p', 's', (0.0, 1.0))

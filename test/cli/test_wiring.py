@@ -823,8 +823,8 @@ DEMO = {
         'sim_robot world': 'room',
     },
     '--patrol --seed 5': {'reference_generator seed': 5},
-    '--set controller.law.gain=30 --set sim_robot.seed=9': {
-        'controller law.gain': 30,
+    '--set controller.law.gain=90 --set sim_robot.seed=9': {
+        'controller law.gain': 90,
         'sim_robot seed': 9,
     },
     '--view': {

@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 import math
+import re
 import sys
 
 import numpy as np
@@ -12,7 +13,12 @@ from support import waiting
 from support.control_loops import GEOMETRY, LEAD, PERIOD, Loop, ServoLoop, make_state
 
 from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
-from t3mpc_ros.control.controller import Controller, ControllerParameters, SwitchingTracker
+from t3mpc_ros.control.controller import (
+    Controller,
+    ControllerParameters,
+    StepperControllerParameters,
+    SwitchingTracker,
+)
 from t3mpc_ros.control.jump_transition import JumpTransitionParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
@@ -179,7 +185,7 @@ def test_the_same_message_twice_changes_nothing():
 
 def test_wheel_parts_are_off_in_the_composition_of_the_body():
     """On a stepper the wheels follow exactly: there is nothing to learn about them."""
-    loop = Loop(composition='body')
+    loop = Loop(composition='body', **{'law.gain': 0.0})
     statuses = loop.run(200)
     assert not np.any(loop.controller.law.fuzzy.coefficients)
     assert not np.any([statuses[-1].terms[row] for row in (0, 3, 4)])
@@ -451,3 +457,45 @@ def test_after_the_warm_up_no_step_compiles(parameters):
     """A separate process, because other tests compile in this one."""
     done = waiting.run([sys.executable, '-c', COMPILES, parameters], 300.0)
     assert done.stdout.strip() == 'nothing', done.stdout + done.stderr
+
+
+# -- values that leave no margin ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    'changes, words',
+    [
+        ({'law.gain': 10.0}, 'law.gain must be from 77.1 to 116 1/s'),
+        ({'law.gain': 0.02}, 'got 0.02; law.gain 0 chooses'),
+        ({'law.gain': 140.0}, 'got 140'),
+        ({'law.gain': 95.0, 'rate': 50.0}, 'from 39.9 to 59.9 1/s at this rate'),
+        (
+            {'law.gain': 200.0, 'composition': 'paper'},
+            'law.gain plus the slope of the compensator',
+        ),
+        ({'law.gain': 60.0, 'composition': 'paper', 'speed_filter.lag': 0.02}, 'to 55.1 1/s'),
+        (
+            {'predictive.v_max': 1e4, 'composition': 'paper'},
+            'law.error_bound plus predictive.v_max',
+        ),
+    ],
+)
+def test_feedback_without_margin_is_refused_with_its_bound(changes, words):
+    """With ``composition: body`` a gain of 10 had 16 times the error of feed-forward."""
+    with pytest.raises(ParameterError, match=re.escape(words)):
+        StepperControllerParameters.from_dict(changes)
+
+
+@pytest.mark.parametrize('composition', ['body', 'paper'])
+@pytest.mark.parametrize('lag', [0.001, 0.003, 0.02, 0.1, 1.0])
+@pytest.mark.parametrize('rate', [5.0, 20.0, 50.0, 100.0, 120.0, 200.0, 1000.0])
+def test_the_gain_that_fits_is_accepted_at_every_rate_and_lag(rate, lag, composition):
+    """Above 104 Hz the controller of the default robot refused its own gain."""
+    changes = {'rate': rate, 'speed_filter.lag': lag, 'composition': composition}
+    parameters = StepperControllerParameters.from_dict(changes)
+    fitted = parameters.resolved()
+    assert 0.0 < fitted.law.gain <= 1.0 / lag
+    again = parameters.with_values(
+        {'law.gain': fitted.law.gain, 'law.smoothing': fitted.law.smoothing}
+    )
+    assert again.resolved().law == fitted.law

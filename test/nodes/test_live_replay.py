@@ -77,7 +77,7 @@ def eventful_run(harness, bag, model, late):
     assert harness.call(Trigger, 'controller/reset').success
     drive(bench, 50)
     drive(bench, 200, mean=0.3, linear=0.0)
-    for name, value in (('law.gain', 17.0), ('linear.x.max_velocity', 0.12)):
+    for name, value in (('law.gain', 90.0), ('linear.x.max_velocity', 0.12)):
         assert controller.set_parameters([Parameter(name, value=value)])[0].successful
         drive(bench, 50)
     for enabled in (False, True):

@@ -129,8 +129,8 @@ def test_inconsistent_parameters_are_rejected_with_the_reason(harness):
 
 
 def test_integers_and_empty_lists_are_accepted_at_start(harness, tmp_path):
-    controller = harness.add(ControllerNode, ['-p', 'law.gain:=5', '-p', 'rate:=50'])
-    assert (controller.parameters.law.gain, controller.get_parameter('rate').value) == (5.0, 50.0)
+    controller = harness.add(ControllerNode, ['-p', 'law.gain:=50', '-p', 'rate:=50'])
+    assert (controller.parameters.law.gain, controller.get_parameter('rate').value) == (50.0, 50.0)
     assert record(harness, tmp_path).parameters.topics == ()
 
 

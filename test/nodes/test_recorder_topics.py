@@ -140,15 +140,15 @@ def test_a_full_disk_ends_the_recording_only(harness, logged, tmp_path, monkeypa
 def test_parameters_are_recorded_by_namespace(harness, tmp_path):
     """Two controllers have the same name in two namespaces."""
     recorder = record(harness, tmp_path, 'odom', namespace='a')
-    harness.add(ControllerNode, namespace='a', law__gain=3.0)
-    harness.add(ControllerNode, namespace='b', law__gain=4.0)
+    harness.add(ControllerNode, namespace='a', law__gain=90.0)
+    harness.add(ControllerNode, namespace='b', law__gain=95.0)
     harness.spin_until(
         lambda: {'recorder', 'controller', '/b/controller'} <= recorder._metadata.records.keys()
     )
     harness.remove(recorder)
     with open_bag(tmp_path) as recording:
-        assert recording.metadata_records['controller']['law.gain'] == '3.0'
-        assert recording.metadata_records['/b/controller']['law.gain'] == '4.0'
+        assert recording.metadata_records['controller']['law.gain'] == '90.0'
+        assert recording.metadata_records['/b/controller']['law.gain'] == '95.0'
         assert recording.metadata_records['recorder']['storage.uri'] == str(tmp_path)
 
 

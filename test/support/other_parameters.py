@@ -25,5 +25,5 @@ def _others(spec, value):
     if spec.many:
         return [(spec.kind(1),), ('wheel',)]
     numbers = [value * factor for factor in (0.5, 0.9, 0.99, 1.1, 2.0)]
-    numbers += [value + step for step in (0.25, -0.25, 0.01)]
+    numbers += [value + step for step in (0.25, -0.25, 0.01, 90.0)]
     return [spec.kind(number) for number in numbers if spec.kind(number) != value]
