@@ -1,5 +1,16 @@
 # Copyright 2026 The t3mpc_ros developers
-# SPDX-License-Identifier: Apache-2.0
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
 """Architecture of the package: import direction, import closure, names, licence headers."""
 
 import ast
@@ -325,7 +336,8 @@ def test_every_source_file_carries_the_licence():
     files = [*SOURCES, *(ROOT / 'test').rglob('*.py'), *(ROOT / 'launch').glob('*.py')]
     files += [path for path in (ROOT / 'scripts').iterdir() if path.is_file()]
     for path in files:
-        assert 'SPDX-License-Identifier: Apache-2.0' in path.read_text()[:300], path
+        words = 'SPDX-License-Identifier: Apache-2.0', 'Apache License, Version 2.0'
+        assert any(each in path.read_text()[:300] for each in words), path
 
 
 def test_version_is_the_same_everywhere():
