@@ -14,7 +14,8 @@
 # limitations under the License.
 """Published results, frozen: compute them anew, and compare them with those in ``bench/frozen``.
 
-Usage: frozen_results.py [--update] [NAME ...]; by default all names, which takes an hour or more.
+Usage: frozen_results.py [--update | --sample RUNS] [NAME ...]; by default all names, which takes
+an hour or more. --sample makes only so many runs of the frozen comparisons, some minutes for 60.
 A change that is to change no number runs this before it lands; the exit code is 1 if a number, a
 text or a key differs. --update writes the file instead: then the commit says why, with the old and
 the new values.
@@ -27,6 +28,7 @@ import hashlib
 import json
 import math
 from pathlib import Path
+import random
 import sys
 import tempfile
 
@@ -41,8 +43,12 @@ from t3mpc_ros.bag.reader import open_bag  # noqa: E402
 from t3mpc_ros.cli.main import main as t3mpc  # noqa: E402
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics  # noqa: E402
 from t3mpc_ros.evaluation.bag_report.run_data import load_run  # noqa: E402
+from t3mpc_ros.evaluation.cases import ROBOTS  # noqa: E402
+from t3mpc_ros.evaluation.experiment import measured_run  # noqa: E402
+from t3mpc_ros.evaluation.methods import methods_for  # noqa: E402
 from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs  # noqa: E402
 from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller  # noqa: E402
+from t3mpc_ros.evaluation.scenario import Scenario  # noqa: E402
 
 IGNORED = ('version', 'sources', 'origin', 'step_time_us')
 """Keys that say which code it was, on which machine."""
@@ -142,6 +148,25 @@ RESULTS: dict[str, Callable[[], object]] = {
 }
 
 
+def sample(count: int) -> Iterator[tuple[str, object, object]]:
+    """Yield what differs in ``count`` runs of the frozen comparisons, spread over all of them."""
+    runs = []
+    for robot in ROBOTS:
+        frozen = json.loads((FROZEN / f'compare_{robot}.json').read_text())
+        first, last = frozen['seeds']
+        runs += [
+            (Scenario(robot, case, seed, frozen['duration']), name, each['runs'][seed - first])
+            for case, cell in frozen['cases'].items()
+            for name, each in cell['methods'].items()
+            for seed in range(first, last + 1)
+        ]
+    for scenario, name, old in random.Random(count).sample(runs, count):
+        numbers = measured_run((scenario, methods_for(scenario.robot)[name]))
+        print(f'{scenario}, {name}', flush=True)
+        new = {key: value for key, value in numbers.items() if key in old}
+        yield from differences(old, new, f'/{scenario}/{name}')
+
+
 def differences(old: object, new: object, where: str = '') -> Iterator[tuple[str, object, object]]:
     """Yield place, old and new value of whatever differs."""
     if isinstance(old, dict) and isinstance(new, dict):
@@ -157,7 +182,12 @@ def differences(old: object, new: object, where: str = '') -> Iterator[tuple[str
 
 def compare(name: str, new: object) -> bool:
     """Print how a result differs from the frozen one; return whether it does."""
-    found = [*differences(json.loads((FROZEN / f'{name}.json').read_text()), new)]
+    frozen = json.loads((FROZEN / f'{name}.json').read_text())
+    return print_differences(name, [*differences(frozen, new)])
+
+
+def print_differences(name: str, found: list[tuple[str, object, object]]) -> bool:
+    """Print what differs; return whether anything does."""
     numbers = [
         (abs(b - a), abs(b - a) / max(abs(a), 1e-300), place)
         for place, a, b in found
@@ -181,7 +211,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('names', nargs='*', metavar='NAME', help=', '.join(RESULTS))
     parser.add_argument('--update', action='store_true')
+    parser.add_argument('--sample', type=int, metavar='RUNS')
     options = parser.parse_args()
+    if options.sample:
+        return int(print_differences('sample', [*sample(options.sample)]))
     if unknown := {*options.names} - {*RESULTS}:
         parser.error(f'unknown: {", ".join(sorted(unknown))}; there are {", ".join(RESULTS)}')
     differs = False
