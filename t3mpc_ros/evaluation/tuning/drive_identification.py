@@ -32,7 +32,7 @@ from t3mpc_ros.control.dead_time_estimator import (
     MIN_DEVIATION,
     MIN_NOISE_VARIANCE,
 )
-from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
+from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, load_run
 from t3mpc_ros.evaluation.drive_response import (
     DEAD_TIME,
     LAG,
@@ -138,15 +138,7 @@ def identify_drive(run: Run) -> IdentifiedDrive:
             f'the commanded wheel speeds must vary by at least {MIN_VARIATION:g} rad/s (standard '
             f'deviation): got {variation:.3g} rad/s'
         )
-    coarse = [fit_response(command, motion, name) for name in WHEELS]
-    sound = [fit for fit in coarse if fit is not None and fit.explains]
-    explained = max((fit.explained for fit in coarse if fit is not None), default=0.0)
-    if not sound or explained < MIN_EXPLAINED:
-        raise IdentificationError(
-            f'the commands must explain at least {100 * MIN_EXPLAINED:g} % of the measured wheel '
-            f'speeds: got {100 * max(explained, 0.0):.0f} %'
-        )
-    delay = float(np.mean([fit.dead_time + fit.lag for fit in sound]))
+    delay = _rough_delay(command, motion)
     settled = used & (motion.time >= start + min(5.0 * delay, 0.3 * (end - start)))
     data = WheelData(
         command.time,
@@ -157,6 +149,19 @@ def identify_drive(run: Run) -> IdentifiedDrive:
     )
     fits = [fit_wheels(each, delay) for each in (data, data._replace(window=0.0))]
     return _identified(fits, period, end - start, run.geometry)
+
+
+def _rough_delay(command: Series, motion: Series) -> float:
+    """Return dead time and lag together, s, of the wheels whose responses are clear."""
+    coarse = [fit_response(command, motion, name) for name in WHEELS]
+    sound = [fit for fit in coarse if fit is not None and fit.explains]
+    explained = max((fit.explained for fit in coarse if fit is not None), default=0.0)
+    if not sound or explained < MIN_EXPLAINED:
+        raise IdentificationError(
+            f'the commands must explain at least {100 * MIN_EXPLAINED:g} % of the measured wheel '
+            f'speeds: got {100 * max(explained, 0.0):.0f} %'
+        )
+    return float(np.mean([fit.dead_time + fit.lag for fit in sound]))
 
 
 def _identified(
