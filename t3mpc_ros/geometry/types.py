@@ -24,6 +24,14 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 """Of any shape; docstrings give shape and units."""
 
+
+def read_only(values: Array) -> Array:
+    """Return a view of an array through which nobody can change it."""
+    view = values.view()
+    view.flags.writeable = False
+    return view
+
+
 NANOSECONDS = 1_000_000_000
 """Nanoseconds per second: stamps are ``int`` nanoseconds, durations ``float`` seconds."""
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
-from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.geometry.types import NANOSECONDS, read_only
 from t3mpc_ros.parameters.table import nearest_hint
 
 Array = NDArray[Any]
@@ -112,7 +112,7 @@ def _read(path: Path, topic: str) -> dict[str, Array]:
 
 
 def _column(values: list[Any]) -> Array:
-    return np.array(values, dtype=object if isinstance(values[0], str) else None)
+    return read_only(np.array(values, dtype=object if isinstance(values[0], str) else None))
 
 
 def _flatten(value: Any, name: str, row: dict[str, Any]) -> None:

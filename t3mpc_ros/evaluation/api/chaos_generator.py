@@ -29,7 +29,7 @@ from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
 from t3mpc_ros.evaluation.api.references import numbers
 from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
 from t3mpc_ros.evaluation.api.table_files import write_csv
-from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.geometry.types import Array, read_only
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,4 +128,4 @@ def chaos(
     for k in range(1, count + 1):
         states[k] = solver.advance(every)
     times: Array = begin + dt * every * np.arange(count + 1, dtype=np.float64)
-    return ChaosSolution(times, states, chosen)
+    return ChaosSolution(read_only(times), read_only(states), chosen)

@@ -15,7 +15,7 @@
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 import hashlib
 import importlib.util
@@ -38,7 +38,7 @@ from t3mpc_ros.evaluation.comparison import ComparedMethod
 from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.methods import methods_for, require_libraries
 from t3mpc_ros.evaluation.scenario import Scenario
-from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.geometry.types import Array, read_only
 from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.parameters.table import Parameters, find_names
 
@@ -285,7 +285,7 @@ class OwnController(BaselineController):
     def step(self, observation: Observation) -> Array:
         """Return u, rad/s², shape (2,)."""
         try:
-            asked = self._step(observation)
+            asked = self._step(_kept(observation))
         except Exception as error:
             text = f'{self._name} raised {described(error)}, at {self._time():.2f} s'
             raise ScriptError(text) from None
@@ -308,10 +308,24 @@ class OwnController(BaselineController):
     def applied(self, acceleration: Array, *, limited: bool) -> None:
         """Pass on the u that the limits let through, where the controller has ``applied``."""
         if self._applied is not None:
-            self._applied(acceleration, limited=limited)
+            self._applied(read_only(acceleration.copy()), limited=limited)
 
     def _time(self) -> float:
         return self._steps * self._period
+
+
+def _kept(observation: Observation) -> Observation:
+    """Return an observation with arrays of its own, which cannot be written.
+
+    Those of the loop change with every step, and ``error = observation.speeds; error -= ...`` in a
+    controller of one's own would change what the estimator knows.
+    """
+    arrays: dict[str, Any] = {
+        each.name: read_only(value.copy())
+        for each in fields(observation)
+        if isinstance(value := getattr(observation, each.name), np.ndarray)
+    }
+    return replace(observation, **arrays)
 
 
 def described(error: BaseException, file: str = '') -> str:

@@ -26,7 +26,7 @@ from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.api.controllers import described
 from t3mpc_ros.evaluation.api.references import numbers
 from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
-from t3mpc_ros.geometry.types import Array, WheelSpeeds
+from t3mpc_ros.geometry.types import Array, WheelSpeeds, read_only
 from t3mpc_ros.mpc.pretraining import matrix_exponential
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
@@ -181,8 +181,10 @@ class OdePlant:
 
 
 def _called(time: float, what: str, function: Callable[..., Any], *arguments: Any) -> Array:
+    """Return what a function of the plant makes of arguments; it cannot write their arrays."""
+    given = [read_only(each) if isinstance(each, np.ndarray) else each for each in arguments]
     try:
-        return np.asarray(function(*arguments), dtype=np.float64)
+        return np.array(function(*given), dtype=np.float64)
     except Exception as error:
         raise ScriptError(
             f'{what} of the plant raised {described(error)}, at {time:.3f} s'
@@ -353,7 +355,9 @@ class LawNoise:
         """Return wheel speeds (rad/s) with noise at a time (s)."""
         time, true = round(time, 9), np.array(wheels)  # a law may compare the time
         try:
-            noise = np.asarray(self._law.draw(self._generator, time, true), dtype=np.float64)
+            noise = np.asarray(
+                self._law.draw(self._generator, time, read_only(true)), dtype=np.float64
+            )
         except Exception as error:
             raise ScriptError(
                 f'the noise law raised {described(error)}, at {time:.2f} s'

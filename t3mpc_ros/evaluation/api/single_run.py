@@ -48,7 +48,7 @@ class RunResult:
     ``reference``, ``measured`` and ``speed`` (the true one) of each wheel, as in
     ``reference_right``, rad/s; ``command`` of each wheel: wheel speeds (rad/s) sent to the robot,
     or torques (N m) with a torque drive; on the twin also the true pose ``x``, ``y`` (m) and
-    ``yaw`` (rad).
+    ``yaw`` (rad). The arrays cannot be written: ``run['time'].copy()`` can.
     """
 
     controller: str
@@ -170,6 +170,8 @@ def simulate(
             f'the run of {method.name} diverged at {record.time[k]:.2f} s: the last finite wheel '
             f'speeds were {last[0]:.4g} and {last[1]:.4g} rad/s'
         )
+    for values in record.columns.values():
+        values.flags.writeable = False
     return RunResult(method.name, scenario, record, _columns(record), measure(scenario, record))
 
 
