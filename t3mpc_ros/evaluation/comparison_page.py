@@ -227,8 +227,9 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
         'Where nothing is said, accelerations become torques by the exact one',
         FRICTION: 'friction and turning of the nominal robot, as a function of the speeds',
         'weights': 'learnt on the nominal robot before the run',
-        'parameters': f'tuned on other seeds with equal effort for {plan.scenario.kind.tuned_for}'
-        ' (t3mpc tune); gains with the ramp that were not tuned with it are those tuned without; '
+        'parameters': f'tuned on other seeds with equal effort for {plan.scenario.kind.tuned_for} '
+        '(t3mpc tune); with the ramp those tuned without it, unless they were tuned with it; of '
+        'the offset-free MPC those of the linear one with preview; '
         f'{FULL} on the twin and the variants of {FEED_FORWARD} have their defaults',
     }
     if plan.scenario.kind.has_gyro:

@@ -267,7 +267,8 @@ def methods(drive: str, store: TunedParameters | None = None) -> dict[str, Metho
 def further_methods(drive: str) -> dict[str, MethodSpec]:
     """Return the methods of :func:`further_definitions` on the paper's plant.
 
-    With the ramp, gains that were not tuned with it are those tuned without.
+    With the ramp, gains that were not tuned with it are those tuned without; offset-free MPC has
+    those of the linear one with preview.
     """
     tuned = TunedParameters.load(PACKAGED_FILE)
     return {
@@ -288,6 +289,9 @@ def tuned_parameters(tuned: TunedParameters, name: str, drive: str, start: Tunab
     for each in (exact, exact.removesuffix(RAMP)):
         if (each, drive) in tuned:
             return tuned.applied(each, drive, start)
+    if name == OFFSET_FREE:
+        values = {'disturbance_share': start.to_dict()['disturbance_share']}
+        return tuned.applied('linear MPC preview', drive, start).with_values(values)
     return start
 
 

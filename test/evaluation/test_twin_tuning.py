@@ -182,11 +182,11 @@ def test_the_comparison_uses_the_parameters_for_the_twin():
             continue
         tuned = [each for each in (name.removesuffix(EXACT_MODEL), name.removesuffix(RAMP))
                  if (each, TWIN) in store]  # fmt: skip
-        if not tuned:
-            assert name == OFFSET_FREE
-            continue
-        entry = store.entry(tuned[0], TWIN)
+        entry = store.entry(tuned[0] if tuned else 'linear MPC preview', TWIN)
         values = method.parameters.to_dict()
+        if name == OFFSET_FREE:
+            assert values['disturbance_share'] == 0.0
+            values['disturbance_share'] = entry.values['disturbance_share']
         assert {one: values[one] for one in entry.tuned} == {
             one: entry.values[one] for one in entry.tuned
         }
