@@ -286,12 +286,21 @@ class BodyCorrection:
                 'gyro; it is not followed; let the robot stand for two seconds'
             )
         share = estimate[TURNING] + estimate[GYRO_SCALE]
-        deviation = math.sqrt(self._state.covariance[TURNING, TURNING])
+        deviations = np.sqrt(np.diag(self._state.covariance))
+        deviation = deviations[TURNING]
         if abs(estimate[GYRO_SCALE]) > WARNED_SCALE and deviation > WARNED_DEVIATION:
             return (
                 f'the yaw of odom turns by {100.0 * share:.1f} % more than the wheels: scale of '
                 'the gyro, or wheel separation; calibrate the robot, or lower '
                 'body.gyro_scale_tolerance if the gyro is right'
+            )
+        least = np.maximum(4.0 * deviations, self.parameters.wheel_tolerance)
+        if (np.abs(estimate[:GYRO_SCALE]) > least[:GYRO_SCALE]).any():
+            turning, asymmetry = 100.0 * estimate[TURNING], 100.0 * estimate[ASYMMETRY]
+            return (
+                f'the robot turns by {turning:.1f} % more than the wheels, and by {asymmetry:.1f} '
+                '% of their mean speed: wheel separation or radii are not those that are set, or '
+                'the gyro is not calibrated; corrected as far as the wheels allow'
             )
         return ''
 

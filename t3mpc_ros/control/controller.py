@@ -90,9 +90,11 @@ MIN_DEAD_TIME_CHANGE = 0.0005
 MAX_MISSED = 20
 """Largest number of periods without a step through which a ramp goes on."""
 
-REPORTED_DEAD_TIME, REPORTED_DISTURBANCE = 0.015, 1.0
+REPORTED_DEAD_TIME, REPORTED_DISTURBANCE = 0.008, 1.0
 """Difference of the dead time from the configured one, and duration of a disturbed response, that
 are reported, s."""
+EARLY = 0.6
+"""Share of the period before which an odometry is too early for a step."""
 
 SNAPSHOT_PERIOD = 0.25
 """Time between two snapshots of the weights, s."""
@@ -445,8 +447,9 @@ class Controller:
 
         odometry : state of the robot. A message with the stamp of the last one, or with one that
             is older by no more than the time-out, is counted and changes nothing, but that it
-            stops a disabled robot. A message that is not finite, older than that or too late
-            stops the robot, with the reason in the status.
+            stops a disabled robot. One that comes before 0.6 of a period has passed changes
+            nothing either: the odometry is faster than ``rate``. A message that is not finite,
+            older than that or too late stops the robot, with the reason in the status.
         """
         stamp = odometry.stamp_ns
         if self._watchdog.is_out_of_order(stamp):
@@ -455,7 +458,10 @@ class Controller:
                 self._stop()
                 self.status = self._make_status(stamp, Reason.DISABLED, self.status.error)
             return self.actuation.twist, self.status
-        restarted = self._last_stamp_ns is not None and stamp < self._last_stamp_ns
+        last = self._last_stamp_ns
+        if last is not None and 0 < stamp - last < EARLY * self._period_ns:
+            return self._wait(odometry)
+        restarted = last is not None and stamp < last
         self._last_stamp_ns = stamp
         elapsed = self._watchdog.elapsed(stamp)
         odometry = self.odometry_twist.measured(odometry, restart=elapsed is None)
@@ -510,6 +516,15 @@ class Controller:
         self._take_snapshot()
         self.status = self._make_status(stamp, reason, actuation.speeds - reference, applied)
         return actuation.twist, self.status
+
+    def _wait(self, odometry: State) -> tuple[BodyTwist, Status]:
+        """Return the last command at an odometry that comes before the period has passed."""
+        _, reason = self._sample_plan(odometry)
+        if reason.moves:
+            return self.actuation.twist, self.status
+        self._stop()
+        self.status = self._make_status(odometry.stamp_ns, reason, self.status.error)
+        return STANDSTILL, self.status
 
     def _sample_plan(self, odometry: State) -> tuple[int, Reason]:
         """Sample speeds and reference; return the instant planned for, ns, and whether to move."""
@@ -655,7 +670,10 @@ class Controller:
         if self.parameters.estimate_dead_time:
             self.disturbed = estimator.step(speeds, actuation.command, elapsed)
             dead_time = estimator.dead_time_in_use
-        self._disturbed_for = self._disturbed_for + elapsed if self.disturbed else 0.0
+        if self.disturbed:
+            self._disturbed_for += elapsed
+        else:  # disturbances that come and go are one
+            self._disturbed_for = max(self._disturbed_for - 0.25 * elapsed, 0.0)
         if self.disturbed and self._before_disturbance is None and self._snapshots:
             self._before_disturbance = self._snapshots[0]
             self._snapshots.clear()

@@ -273,6 +273,12 @@ PAUSE = 0.8
 """Duration of a pause, s: a robot that has stopped because of slip asks for half a second."""
 TRIALS = 3
 """Pauses after which the commands end, if the robot has moved and stopped again after each."""
+OPPOSED, OPPOSED_MEMORY = -0.3, 3.0
+"""Quotient of measured and commanded velocity below which the robot moves the other way, and the
+time constant of its means, s; at the earliest after STANDING_TIME."""
+OPPOSED_EXCITATION = 0.004, 0.13
+"""Integral of the squared command from which that is known, m²/s and rad²/s: 0.05 m/s and 0.3
+rad/s for 1.5 s."""
 RECOVERY_TIME = 5.0
 """Time of driving as commanded after which earlier pauses do not count, s."""
 
@@ -302,6 +308,8 @@ class DriveMonitor:
         self._anchor: Pose | None = None
         self._moved = False
         self._well = self._astray = 0.0
+        self._power, self._product = [0.0, 0.0], [0.0, 0.0]
+        self._time = 0.0
         self._restart(None)
 
     def _restart(self, pose: Pose | None) -> None:
@@ -327,7 +335,8 @@ class DriveMonitor:
                 return Reason.PAUSED
             self.begin()
             return Reason.TRACKING
-        if self._stands(odometry, command, elapsed):
+        stands = self._stands(odometry, command, elapsed)
+        if stands or self._is_opposed(odometry.twist, command, elapsed):
             return self._begin_pause()
         if following:
             self._astray = max(self._astray - elapsed, 0.0)
@@ -347,7 +356,8 @@ class DriveMonitor:
         if self.pauses:
             return (
                 f'{self.pauses} pauses of the commands, each followed by another attempt: look at '
-                'the diagnostics of the robot; emergency stop, power, wheels and stamps of odom'
+                'the diagnostics of the robot; emergency stop, power, wheels; signs and stamps '
+                'of odom'
             )
         return ''
 
@@ -366,6 +376,16 @@ class DriveMonitor:
         return self._since > STANDING_TIME and any(
             abs(one) > bound for one, bound in zip(asked, ASKED_MOTION, strict=True)
         )
+
+    def _is_opposed(self, measured: BodyTwist, command: BodyTwist, elapsed: float) -> bool:
+        """Whether a velocity of the robot has the opposite sign of its command."""
+        self._time += elapsed
+        kept, opposed = 1.0 - min(elapsed / OPPOSED_MEMORY, 1.0), False
+        for i, enough in enumerate(OPPOSED_EXCITATION):
+            self._power[i] = kept * self._power[i] + elapsed * command[i] ** 2
+            self._product[i] = kept * self._product[i] + elapsed * command[i] * measured[i]
+            opposed |= self._power[i] > enough and self._product[i] < OPPOSED * self._power[i]
+        return opposed and self._time > STANDING_TIME
 
     def _begin_pause(self) -> Reason:
         self.pauses += 1

@@ -197,7 +197,7 @@ def test_a_wrong_delay_is_no_geometry(late):
             r'by 2\.\d % more than the wheels: scale of the gyro, or wheel separation',
         ),
         (1.0, 0.05, 0.03, r'by 0\.0\d\d rad/s more than the wheels: bias of the gyro'),
-        (1.03, 0.0, CALIBRATED, ''),  # the robot's, and corrected
+        (1.03, 0.0, CALIBRATED, r'the robot turns by 2\.\d % more'),  # and is corrected
     ],
 )
 def test_within_5_s_it_says_what_the_gyro_does(scale, bias, tolerance, problem):

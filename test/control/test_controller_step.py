@@ -510,3 +510,20 @@ def test_the_gain_that_fits_is_accepted_at_every_rate_and_lag(rate, lag, composi
         {'law.gain': fitted.law.gain, 'law.smoothing': fitted.law.smoothing}
     )
     assert again.resolved().law == fitted.law
+
+
+def test_an_odometry_faster_than_the_rate_is_thinned_out():
+    """At half the rate of the odometry, the plan was behind: six times the error."""
+    loop = ServoLoop(lambda t: (0.12 + 0.1 * math.sin(2.0 * t), math.sin(1.7 * t)), rate=100.0)
+    fast = ServoLoop(lambda t: (0.12 + 0.1 * math.sin(2.0 * t), math.sin(1.7 * t)), rate=50.0)
+    commands = []
+    for one in (loop, fast):
+        one.run(300)
+        commands.append([(one.step().stamp_ns, one.twist) for _ in range(200)])
+    stamps = {stamp for stamp, _ in commands[1]}
+    assert len(stamps) == pytest.approx(100, abs=1)
+    difference = np.array([twist for _, twist in commands[0]]) - [t for _, t in commands[1]]
+    assert np.abs(difference).max() < 0.06
+    early = make_state(fast.now - PERIOD + 1_000_000, math.nan)
+    command, status = fast.controller.step(early)
+    assert (command, status.reason) == ((0.0, 0.0), Reason.ODOMETRY_BAD)

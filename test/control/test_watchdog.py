@@ -449,7 +449,7 @@ def test_a_robot_that_never_moves_gets_commands_for_ever():
 
 def test_a_robot_that_moves_otherwise_is_stopped():
     """Swapped wheels, stamps that are a second late, or another publisher of commands."""
-    course = Course(lambda course, command: BodyTwist(-command.linear, 0.0))
+    course = Course(lambda course, command: BodyTwist(0.0, 0.5))
     course.run(60.0, following=False)
     assert course.changes()[-1] is Reason.STOPPED_AGAIN
     assert course.log.index(Reason.PAUSED) * 0.01 == pytest.approx(ASTRAY_TIME, abs=0.5)
@@ -507,3 +507,25 @@ def test_noise_of_a_standing_robot_is_no_motion():
         state = State(k * 10_000_000, Pose(0.0, 0.0, 0.0), twist)
         reasons.append(monitor.decide(state, BodyTwist(0.2, 0.0), 0.01, following=False))
     assert Reason.PAUSED in reasons[: round(100 * STANDING_TIME) + 20]
+
+
+@pytest.mark.parametrize('axis', [0, 1])
+@pytest.mark.parametrize('late', [0.0, 0.2])
+def test_a_velocity_of_the_opposite_sign_is_stopped_within_3_s(axis, late):
+    """Swapped sides of motors or encoders: errors were fifty times those without feedback."""
+    for sign in (-1.0, 1.0):
+        monitor, reasons = DriveMonitor(), []
+        commands = [
+            BodyTwist(0.15 * math.sin(2.0 * t), 1.0 * math.cos(3.0 * t))
+            for t in np.arange(0.0, 20.0, 0.01)
+        ]
+        for k, command in enumerate(commands):
+            found = list(commands[max(k - round(100 * late), 0)])
+            found[axis] *= sign
+            state = State(k * 10_000_000, Pose(0.0, 0.0, 0.0), BodyTwist(*found))
+            reasons.append(monitor.decide(state, command, 0.01, following=True))
+        if sign > 0.0:
+            assert set(reasons) == {Reason.TRACKING}
+        else:
+            assert 0.01 * reasons.index(Reason.PAUSED) < 3.0
+            assert reasons[-1] is Reason.STOPPED_AGAIN
