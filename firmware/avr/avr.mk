@@ -7,6 +7,8 @@
 # make flash PORT=/dev/…, make flash-dongle PORT=/dev/…
 #                 flash the robot or the dongle at a serial port; without PORT with the programmer on USB;
 #                 DRY_RUN=1 only prints the command
+# make release    both programs with their version in the name, SHA256SUMS, and the compiler: build/release;
+#                 the same sources, compiler and options give the same bytes
 # make simavr     both boards in a simulator with their peripherals, as a library for ctypes
 
 AVR_OBJCOPY ?= avr-objcopy
@@ -25,7 +27,7 @@ ROBOT_FILES := avr/robot_main.c hal/reset.c hal/nrf24.c hal/stepping.c hal/analo
 
 PYTHON ?= python3
 
-.PHONY: simavr flash flash-dongle
+.PHONY: simavr flash flash-dongle release
 
 # Everything for the boards depends on it.
 $(AVR_SETTINGS): always
@@ -53,6 +55,15 @@ flash: $(BUILD)/robot.hex
 
 flash-dongle: $(BUILD)/dongle.hex
 	$(PYTHON) flash.py dongle $< $(if $(PORT),--port $(PORT)) $(if $(DRY_RUN),--dry-run) $(FLASH)
+
+VERSION = $(shell sed -n 's/.define T3_FIRMWARE_M[AI][JN]OR \([0-9]*\)u/\1/p' core/t3_protocol.h | paste -sd.)
+RELEASE := $(BUILD)/release
+
+release: $(BUILD)/robot.hex $(BUILD)/dongle.hex
+	@rm -rf $(RELEASE) && mkdir -p $(RELEASE)
+	@for board in robot dongle; do cp $(BUILD)/$$board.hex $(RELEASE)/$$board-$(VERSION).hex; done
+	@$(AVR_CC) --version | head -n 1 > $(RELEASE)/COMPILER
+	@cd $(RELEASE) && sha256sum *.hex > SHA256SUMS && cat COMPILER SHA256SUMS
 
 SIMAVR_FILES := $(sort $(wildcard simavr/*.c))
 
