@@ -93,6 +93,7 @@ SHORTENED = {
     'scripts/run t3mpc robot key create robot.key': '',
     'scripts/run t3mpc robot key write robot.key --port robot_usb': '',
     'scripts/run t3mpc robot ping --port dongle --params-file robot.yaml': '',
+    'scripts/run t3mpc robot jog left 1 --port robot_usb --key robot.key --yes': '',
     f'scripts/run t3mpc robot jog left 1 --port dongle {PARAMETERS} --key robot.key --yes': '',
     f'scripts/run radio_bridge --ros-args {PARAMETERS} -p port:=dongle {KEY_FILE}': 'Ctrl-C',
     'scripts/run t3mpc bag info runs/latest/bag': '',

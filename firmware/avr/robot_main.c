@@ -385,7 +385,7 @@ int main(void)
         memory_work();
         imu_work(stepping_time_us());
         show_signal();
-        if (!hurries() && (serial_waits() || t3_console_writes(&console)))
+        if (!hurries() && (serial_waits() || t3_console_waits(&console)))
             serve_console();
     }
 }

@@ -28,6 +28,10 @@
 #define RECORD_IS_SIZE (7u + T3_PART_SIZE)
 #define SENSE_SIZE 2u
 #define SENSE_IS_SIZE 32u
+#define TX_HEAD 4u
+#define RESULT_TIME 4u      // where the time of a RESULT is
+#define STATUS_ANSWERED 3u  // acknowledged, with a payload
+#define STATUS_SKIPPED 8u
 
 static void reply(struct t3_console *console, const uint8_t *frame, uint8_t size)
 {
@@ -245,6 +249,66 @@ static void take_sense(struct t3_console *console, const uint8_t *frame, uint8_t
     reply(console, answer, sizeof answer);
 }
 
+// A transaction as that of a dongle, in three passes of the main loop, each of which is short: the first
+// payload; its answer, which the second payload of a dongle would fetch, and the second payload; the reply.
+static void take_tx(struct t3_console *console, const uint8_t *frame, uint8_t size)
+{
+    if (size < TX_HEAD || frame[3] < 1 || frame[3] > T3_RADIO_LIMIT ||
+        size < TX_HEAD + frame[3] || size > TX_HEAD + frame[3] + T3_RADIO_LIMIT) {
+        refuse(console, T3_ERR_MALFORMED, T3_TX);
+        return;
+    }
+    if (console->tx != T3_TX_RESTS) {
+        refuse(console, T3_ERR_BUSY, frame[1]);
+        return;
+    }
+    const struct t3_port *board = console->robot->port;
+    const uint8_t first = frame[3];
+    console->second_size = (uint8_t)(size - TX_HEAD - first);
+    memcpy(console->second, frame + TX_HEAD + first, console->second_size);
+    uint8_t *to = t3_put8(console->result, T3_RESULT);
+    to = t3_put8(to, frame[1]);
+    to = t3_put8(to, STATUS_ANSWERED);
+    t3_put8(to, console->second_size ? STATUS_ANSWERED : STATUS_SKIPPED);
+    console->answer = t3_robot_cable(console->robot, frame + TX_HEAD, first,
+                                     board->time_us(board->context));
+    console->tx = T3_TX_TAKEN;
+}
+
+static void answer_tx(struct t3_console *console)
+{
+    struct t3_robot *robot = console->robot;
+    const uint32_t now_us = robot->port->time_us(robot->port->context);
+    uint8_t *to = t3_put32(console->result + RESULT_TIME, now_us);
+    to += t3_robot_cable_answer(robot, console->answer, to);
+    console->result_size = (uint8_t)(to - console->result);
+    if (console->second_size)
+        t3_robot_cable(robot, console->second, console->second_size, now_us);
+}
+
+static void continue_tx(struct t3_console *console)
+{
+    switch (console->tx) {
+    case T3_TX_RESTS:
+        return;
+    case T3_TX_TAKEN:
+        console->tx = T3_TX_DECODED;  // in the pass of the frame nothing more
+        return;
+    case T3_TX_DECODED:
+        answer_tx(console);
+        console->tx = T3_TX_ANSWERED;
+        return;
+    default:
+        reply(console, console->result, console->result_size);
+        console->tx = T3_TX_RESTS;
+    }
+}
+
+bool t3_console_waits(const struct t3_console *console)
+{
+    return console->tx != T3_TX_RESTS || t3_console_writes(console);
+}
+
 bool t3_console_writes(const struct t3_console *console)
 {
     const struct t3_robot *robot = console->robot;
@@ -276,6 +340,7 @@ static void end_write(struct t3_console *console, uint8_t record, enum t3_progre
 void t3_console_tick(struct t3_console *console)
 {
     const struct t3_port *board = console->robot->port;
+    continue_tx(console);
     end_write(console, T3_RECORD_SETTINGS,
               t3_settings_tick(&console->robot->settings, board, console->port));
     end_write(console, T3_RECORD_CALIBRATION,
@@ -320,6 +385,9 @@ bool t3_console_byte(struct t3_console *console, uint8_t byte)
     // The decoder keeps the frame until the next byte.
     const uint8_t *frame = console->splitter.frame;
     switch (frame[0]) {
+    case T3_TX:
+        take_tx(console, frame, size);
+        break;
     case T3_PING:
         take_ping(console, frame, size);
         break;

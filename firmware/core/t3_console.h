@@ -12,7 +12,8 @@
 // See the License for the specific language governing permissions and
 // limitations under the License.
 
-// USB console of the robot board: status, key, records, raw sensors. The key is written over this port
+// USB console of the robot board: status, key, records, raw sensors, and the transactions of a dongle, so
+// that a host drives over the cable under the rules of the radio. The key is written over this port
 // only and is never sent; a check value of 32 bits identifies it. A record (settings, calibration) is
 // read and staged in parts of 16 bytes; STORE writes it if its CRC is that of all staged bytes.
 //
@@ -46,6 +47,10 @@ struct t3_console {
     uint8_t id;      // of the frame whose key or record is being written
     struct t3_log log;
     struct t3_signal signal;
+    enum { T3_TX_RESTS, T3_TX_TAKEN, T3_TX_DECODED, T3_TX_ANSWERED } tx;
+    struct t3_answer answer;                           // of the first payload of a TX
+    uint8_t second[T3_RADIO_LIMIT], second_size;       // payload of the TX, still to be executed
+    uint8_t result[8u + T3_RADIO_LIMIT], result_size;  // its RESULT, still to be sent
     uint8_t staged_record;
     uint8_t staged[T3_PARTS * T3_PART_SIZE];
     uint8_t key[T3_KEY_SIZE];
@@ -63,6 +68,9 @@ void t3_console_overrun(struct t3_console *console);
 
 // Return whether a key or a record is being written.
 bool t3_console_writes(const struct t3_console *console);
+
+// Return whether t3_console_tick has something to do.
+bool t3_console_waits(const struct t3_console *console);
 
 // Call in each pass of the main loop: an EEPROM write takes many passes.
 void t3_console_tick(struct t3_console *console);

@@ -232,6 +232,29 @@ void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
     }
 }
 
+struct t3_answer t3_robot_cable(struct t3_robot *robot, const uint8_t *data, uint8_t size,
+                                uint32_t received_us)
+{
+    const struct t3_answer waiting = robot->answer;
+    const bool waits = robot->answer_waits;
+    const uint32_t from_us = robot->answer_from_us;
+    t3_robot_packet(robot, data, size, received_us);
+    const struct t3_answer made = robot->answer;
+    robot->answer = waiting;
+    robot->answer_waits = waits;
+    robot->answer_from_us = from_us;
+    return made;
+}
+
+uint8_t t3_robot_cable_answer(struct t3_robot *robot, struct t3_answer answer, uint8_t *to)
+{
+    const struct t3_answer waiting = robot->answer;
+    robot->answer = answer;
+    const uint8_t size = t3_telemetry(robot, robot->port->time_us(robot->port->context), to);
+    robot->answer = waiting;
+    return size;
+}
+
 // -- time ----------------------------------------------------------------------------------------
 
 static void watch_ttl(struct t3_robot *robot, uint32_t now_us)

@@ -54,6 +54,14 @@ void t3_robot_boot(struct t3_robot *robot, const struct t3_port *port, uint8_t r
 void t3_robot_packet(struct t3_robot *robot, const uint8_t *data, uint8_t size,
                      uint32_t received_us);
 
+// Process a payload that came over the cable at `received_us`, under the rules of a radio payload; return
+// what answers it. What the radio answers next stays.
+struct t3_answer t3_robot_cable(struct t3_robot *robot, const uint8_t *data, uint8_t size,
+                                uint32_t received_us);
+
+// Write an answer to the cable, at most T3_RADIO_LIMIT bytes; return its size.
+uint8_t t3_robot_cable_answer(struct t3_robot *robot, struct t3_answer answer, uint8_t *to);
+
 // Call in each pass of the main loop, at least every 2 ms.
 void t3_robot_tick(struct t3_robot *robot);
 

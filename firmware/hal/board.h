@@ -44,7 +44,7 @@
 // Robot: Arduino Mega, radio at 50 to 53, 10 and 2.
 #define SERIAL_RX_VECTOR USART0_RX_vect
 #define SERIAL_EMPTY_VECTOR USART0_UDRE_vect
-#define SERIAL_ROOM 32u  // one frame and a half: it has more to do than listen to its USB
+#define SERIAL_ROOM 96u  // the longest frame, and the zero before it
 #define SPI_DDR DDRB
 #define SPI_PORT PORTB
 #define SPI_SCK PB1

@@ -94,7 +94,7 @@ void t3_host_robot_wear(struct t3_host_robot *host, uint16_t address, bool worn)
 // USB console: feed bytes; take its output (at most `room`).
 void t3_host_robot_usb(struct t3_host_robot *host, const uint8_t *data, uint32_t size);
 uint32_t t3_host_robot_usb_take(struct t3_host_robot *host, uint8_t *to, uint32_t room);
-// Whether a key or record of a frame is being written, during which nothing moves.
+// Whether a key or record of a frame is being written, or a transaction is to be answered.
 bool t3_host_robot_changing(const struct t3_host_robot *host);
 bool t3_host_robot_writing(const struct t3_host_robot *host);  // the same, or a copy is repaired
 void t3_host_robot_usb_overrun(struct t3_host_robot *host);

@@ -568,7 +568,8 @@ uint32_t t3_host_robot_usb_take(struct t3_host_robot *host, uint8_t *to, uint32_
 
 bool t3_host_robot_changing(const struct t3_host_robot *host)
 {
-    return host->console.step != T3_KEY_RESTS || host->console.sets;
+    return host->console.step != T3_KEY_RESTS || host->console.sets ||
+           host->console.tx != T3_TX_RESTS;
 }
 
 bool t3_host_robot_writing(const struct t3_host_robot *host)

@@ -34,8 +34,8 @@ from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 _EXTERNAL_RESET, _BROWN_OUT_RESET = 2, 4
 """Reset flags as in the MCUSR register of an AVR."""
 _ROBOT_BOOT_LOADER_NS = NANOSECONDS
-_WRITING_PERIOD_US = 5_000.0
-"""Period at which the board is advanced while it writes its EEPROM, to reply when it is done."""
+_CONSOLE_PERIOD_US = 500.0
+"""Period at which the board is advanced while its console is busy, to reply in time."""
 
 
 @dataclass(frozen=True)
@@ -199,15 +199,15 @@ class Emulator:
     def _deliver_to_console(self, data: bytes) -> None:
         if self._advance_robot():
             self.board.feed_console(data)
-            self._await_eeprom()
+            self._await_console()
 
-    def _await_eeprom(self) -> None:
+    def _await_console(self) -> None:
         def advance() -> None:
             if self._advance_robot():
-                self._await_eeprom()
+                self._await_console()
 
-        if self.board.writing:
-            self._events.schedule_after(_WRITING_PERIOD_US, advance)
+        if self.board.busy:
+            self._events.schedule_after(_CONSOLE_PERIOD_US, advance)
 
     def _deliver_from_console(self, data: bytes) -> None:
         self._console_output.append((self._events.now_ns, data))

@@ -140,8 +140,8 @@ class RobotBoard:
         return int(self._board.call('stale'))
 
     @property
-    def writing(self) -> bool:
-        """Whether a key or settings from the console are being written."""
+    def busy(self) -> bool:
+        """Whether the console writes a key or settings, or has a reply to a transaction."""
         return bool(self._board.call('changing'))
 
     @property

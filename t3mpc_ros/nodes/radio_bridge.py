@@ -70,7 +70,8 @@ class RadioBridgeParameters(RobotTopicParameters, RadioRobotParameters):
     port: str = parameter(
         '/dev/t3mpc_dongle*',
         'serial port of the dongle, or a pattern: of several ports, the one that answers as a '
-        'dongle is used. The default are the names that the udev rule of the package sets',
+        'dongle is used. The only port may be that of the robot board, which then drives over '
+        'its cable. The default are the names that the udev rule of the package sets',
     )
     key_file: str = parameter(
         '',
@@ -167,7 +168,8 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
                 self._path = ports[self._choice % len(ports)]
                 self._port = SerialPort(self._path)
                 with self._lock:
-                    self._robot.link.port_opened(self.steady_ns())
+                    # Of several ports, that of a dongle is meant.
+                    self._robot.link.port_opened(self.steady_ns(), cable=len(ports) == 1)
             elif isinstance(action, Write) and self._port is not None:
                 if self.steady_ns() - step_ns <= MAX_WRITE_DELAY_NS:
                     self._port.write(action.data)
@@ -215,9 +217,11 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
             quality = self._robot.quality(now_ns)
             restart, unknown = self._robot.restart(now_ns), self._robot.unknown_travel
             link_state, authenticated = link.state, link.authenticated
+            cable = link.over_cable
         values: dict[str, object] = {
             'port': self._path,
             'link': link_state.value,
+            'path': 'cable' if cable else 'radio',
             'authenticated': authenticated,
             **self._command_values(),
             **_link_values(quality),
@@ -232,8 +236,8 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
         found += filter(None, (restart, self._command_type_problem(), quality.text))
         if found:
             return WARN, '; '.join(found), values
-        suffix = '' if authenticated else ', unauthenticated'
-        return OK, f'{FOLLOWING}{suffix}', values
+        where, unsigned = ', over the cable' * cable, ', unauthenticated' * (not authenticated)
+        return OK, f'{FOLLOWING}{where}{unsigned}', values
 
     def on_shutdown(self) -> None:
         """Stop the robot: three standstill commands, then disable its drives."""

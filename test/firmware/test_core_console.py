@@ -127,7 +127,7 @@ def test_power_loss_leaves_the_old_key_the_new_key_or_a_lock(library, before, af
 def test_frames_for_a_dongle_are_refused(library):
     robot = made(library)
     # 5 was SETTINGS once.
-    for frame in (b'\x01\x00\x00\x01\x15', b'\x02\x00', b'\x05\x01'):
+    for frame in (b'\x02\x00', b'\x05\x01'):
         assert decode_from_board(robot.console(frame)[0]) == Refusal(1, frame[0])
     for kind in (b'\x04', b'\x06', b'\x07', b'\x08'):
         assert decode_from_board(robot.console(kind)[0]) == Refusal(2, kind[0])

@@ -56,6 +56,7 @@ FIELDS = (
     'ramp.speed',
     'ramp.target',
     'loaded_us',
+    'longest_us',
 )
 
 

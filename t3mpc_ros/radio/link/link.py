@@ -63,6 +63,8 @@ _STOP_TIMEOUT_NS = NANOSECONDS
 _DISABLE_COMMANDS = 5
 _MIN_BATTERY_VOLTAGE = 1.0
 """V; no battery has less."""
+_CABLE_FIRMWARE = 2, 1
+"""First version of the firmware that drives over the cable."""
 _COLLISION_HOLD_NS = 5 * NANOSECONDS
 """Standstill after two robots have answered."""
 _REFUSAL_QUERY_NS = NANOSECONDS // 10
@@ -285,6 +287,9 @@ class Link:
         self._session: Session | None = None
         self._handshake: Handshake | None = None
         self._active: ActiveSession | None = None
+        self._cable_allowed = True
+        self.over_cable = False
+        """Whether the port is the USB port of the robot board: there is no dongle and no radio."""
         self.info: frames.Info | None = None
         """Identity of the robot; None before the first session."""
         self._board_parameters: dict[int, int] = {}
@@ -391,9 +396,13 @@ class Link:
 
     # -- port -------------------------------------------------------------------------------------
 
-    def port_opened(self, now_ns: int) -> None:
-        """Report that the port is open."""
+    def port_opened(self, now_ns: int, cable: bool = True) -> None:
+        """Report that the port is open.
+
+        ``cable``: if it is the USB port of a robot board, drive the robot over it.
+        """
         self._transactions.reset()
+        self._cable_allowed = cable
         # The finding of the last attempt stays visible until there is a new one.
         reason = self._reason if self._reason == reasons.NO_DONGLE else reasons.DONGLE_STARTING
         self._search_dongle(reason, now_ns)
@@ -493,7 +502,7 @@ class Link:
 
     def _handle(self, result: TransactionResult, now_ns: int) -> None:
         restarted = result.dongle_restarted or self._lost_configuration(result)
-        self._statistics.dongle_resets += restarted
+        self._statistics.dongle_resets += restarted and not self.over_cable
         self._statistics.count_host_errors(self._transactions.frame_counts)
         if isinstance(result.reply, frames.Pong):
             self._statistics.add_pong(result.reply, restarted)
@@ -507,7 +516,8 @@ class Link:
         elif restarted:
             self._configure_radio(now_ns)  # the restart cleared its configuration
         elif self._transactions.timeouts >= _MAX_TIMEOUTS:
-            self._search_dongle(reasons.DONGLE_TIMEOUT, now_ns)
+            cable = self.over_cable
+            self._search_dongle(reasons.BOARD_TIMEOUT if cable else reasons.DONGLE_TIMEOUT, now_ns)
         elif self.state is LinkState.CFG:
             self._handle_configured(result, now_ns)
         else:
@@ -516,7 +526,7 @@ class Link:
     def _lost_configuration(self, result: TransactionResult) -> bool:
         """Return whether a PONG in a session shows another channel or address than configured."""
         pong = result.reply
-        if self._active is None or not isinstance(pong, frames.Pong):
+        if self._active is None or self.over_cable or not isinstance(pong, frames.Pong):
             return False
         wanted = self._parameters.configure(0)
         return (pong.channel, pong.address) != (wanted.channel, wanted.address)
@@ -594,8 +604,6 @@ class Link:
             self._reason = (
                 f'the dongle must speak protocol {frames.VERSION}: it speaks {pong.protocol}'
             )
-        elif not pong.chip_ok:
-            self._reason = reasons.NO_CHIP
         else:
             self._configure_radio(now_ns)
             return
@@ -606,8 +614,10 @@ class Link:
     def _handle_configured(self, result: TransactionResult, now_ns: int) -> None:
         reply = result.reply
         if isinstance(reply, frames.Configured) and isinstance(result.request, frames.Configure):
+            self._use_cable(False)
             if not reply.chip_ok:
-                self._search_dongle(reasons.NO_CHIP, now_ns)
+                self._reason = reasons.NO_CHIP
+                self._due_ns = now_ns + _DEFECT_RETRY_NS
                 return
             if reply[:-1] == tuple(result.request):
                 self._start_handshake(reasons.robot_absent(self._parameters.channel), now_ns)
@@ -615,10 +625,22 @@ class Link:
             self._reason = reasons.RADIO_NOT_CONFIGURED
         elif isinstance(reply, frames.Refusal) and reply.code == frames.UNKNOWN:
             # Its console answers PING as well. The port stays open: opening it resets the robot.
+            if self._cable_allowed and self._speaks_over_cable():
+                self._use_cable(True)
+                self._start_handshake(reasons.ROBOT_SILENT, now_ns)
+                return
             self._reason = reasons.ROBOT_USB
             self._due_ns = now_ns + _DEFECT_RETRY_NS
             return
         self._due_ns = now_ns + _CONFIGURE_RETRY_NS
+
+    def _speaks_over_cable(self) -> bool:
+        """Return whether the firmware of the robot board takes transactions over its USB."""
+        pong = self._statistics.dongle
+        return pong is not None and (pong.major, pong.minor) >= _CABLE_FIRMWARE
+
+    def _use_cable(self, cable: bool) -> None:
+        self.over_cable = self._transactions.over_cable = cable
 
     def _search_dongle(self, reason: str, now_ns: int) -> None:
         self._enter(LinkState.PING, reason)

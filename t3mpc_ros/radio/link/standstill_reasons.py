@@ -18,6 +18,8 @@ from t3mpc_ros.radio.protocol import frames
 NO_COMMAND = 'no command yet'
 DONGLE_STARTING = 'the dongle does not answer yet: it takes 1.5 s to start'
 DONGLE_TIMEOUT = 'the dongle stopped answering: did it restart?'
+BOARD_TIMEOUT = 'the robot board stopped answering: did it restart, is its cable good?'
+ROBOT_SILENT = 'the robot board does not answer HELLO'
 NO_DONGLE = 'no dongle answers on this port: is it the right port?'
 NO_REPLY = 'the dongle does not reply: is its cable loose or damaged?'
 NO_CHIP = 'the radio chip of the dongle does not answer: check its wiring and supply'
@@ -25,6 +27,7 @@ ROBOT_USB = (
     'this is the USB port of the robot board, not of the dongle; '
     'ls -l /dev/serial/by-id lists both'
 )
+"""Where a dongle is needed, or the firmware of the robot is older than 2.1."""
 RADIO_NOT_CONFIGURED = 'the dongle rejects the radio configuration'
 HOST_KEY_MISSING = 'the robot requires signed commands: give the host the key'
 ROBOT_KEY_MISSING = (

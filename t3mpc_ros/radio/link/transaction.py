@@ -19,7 +19,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.radio.link.statistics import LinkStatistics
 from t3mpc_ros.radio.link.telemetry import CommandTiming
 from t3mpc_ros.radio.protocol import frames
-from t3mpc_ros.radio.protocol.clock_sync import forward_delay_ns
+from t3mpc_ros.radio.protocol.clock_sync import BYTE_NS, forward_delay_ns
 from t3mpc_ros.radio.protocol.codec import (
     decode_exchange_status,
     decode_from_dongle,
@@ -80,6 +80,8 @@ class TransactionLayer:
         """Dongle clock (us) in its last reply, and when that was requested and read (host, ns)."""
         self.timeouts = 0
         """Number of consecutive requests without a reply."""
+        self.over_cable = False
+        """Whether the robot itself replies, without a radio between."""
 
     @property
     def frame_counts(self) -> FrameCounts:
@@ -179,7 +181,9 @@ class TransactionLayer:
             sent = pending.frame
             command = isinstance(pending.request, frames.Command)
             if command and isinstance(sent, frames.Transmit) and prompt:
-                delay = forward_delay_ns(pending.wire_bytes, len(sent.first))
+                delay = pending.wire_bytes * BYTE_NS
+                if not self.over_cable:
+                    delay = forward_delay_ns(pending.wire_bytes, len(sent.first))
                 timing = CommandTiming(pending.sent_ns, delay)
         return TransactionResult(
             pending.request,

@@ -38,6 +38,7 @@ class Jog(Manoeuvre):
     """Turns one wheel, LEFT or RIGHT, over the link; negative revolutions are backward."""
 
     _ends_when_silent = False
+    _over_cable = True
     _late_reason = 'the wheel does not reach its target: does the board count its steps?'
 
     def __init__(

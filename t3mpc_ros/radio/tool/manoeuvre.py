@@ -128,7 +128,7 @@ class Manoeuvre:
 
     def port_opened(self, now_ns: int) -> None:
         """Report that the port is open."""
-        self.link.port_opened(now_ns)
+        self.link.port_opened(now_ns, cable=self._over_cable)
 
     def port_failed(self, text: str, absent: bool, now_ns: int) -> None:
         """Fail with ``text``; the robot stops by itself within the TTL."""
@@ -185,6 +185,8 @@ class Manoeuvre:
         else:
             self._move(telemetry, now_ns)
 
+    _over_cable = False
+    """Whether the robot may be driven over its own USB: with its wheels in the air."""
     _ends_when_silent = True
     """Whether a robot that does not answer for the time to live ends the manoeuvre."""
     _late_reason = 'the wheels do not reach their target: does the board count its steps?'

@@ -1,0 +1,252 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Driving over the USB of the robot board: the session, key, limits and stops of the radio."""
+
+import math
+
+import pytest
+from support.emulator_bench import MS, START_NS, Bench, RobotBench, check_followed
+from support.long_tests import few_of
+
+from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
+from t3mpc_ros.radio.link import standstill_reasons as reasons
+from t3mpc_ros.radio.link.link_parameters import LinkParameters
+from t3mpc_ros.radio.link.port_actions import LinkState
+from t3mpc_ros.radio.protocol import codec, frames
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
+
+KEY = bytes(range(16))
+STEP = math.tau / 3200
+
+
+class CableEmulator(Emulator):
+    """The emulator, of which a bench uses the USB port of the robot board."""
+
+    unplugged = False
+
+    def feed(self, data, now_ns):
+        if not self.unplugged:
+            self.feed_console(data, now_ns)
+
+    def run_to(self, now_ns):
+        super().run_to(now_ns)
+        blocks = self.take_console()
+        return [] if self.unplugged else blocks
+
+
+def cable(flat=None, key=b'', robot_key=None, seed=1, kind=Bench, **given):
+    parameters = EmulatorParameters.from_dict(flat or {})
+    emulator = CableEmulator(parameters, key if robot_key is None else robot_key, seed, START_NS)
+    made = kind(key=key, seed=seed, emulator=emulator, **given)
+    made.followed_by_console = []
+    return made
+
+
+@pytest.fixture(params=[b'', KEY], ids=['open', 'keyed'])
+def bench(request):
+    made = cable(key=request.param)
+    made.connect()
+    made.drive(5.0, 4.0)
+    made.run(1.0)
+    assert made.link.reason(made.now_ns) == ''
+    return made
+
+
+def rests(bench):
+    return bench.board.speeds == (0, 0) and max(map(abs, bench.plant.wheels)) < 0.2
+
+
+def test_a_robot_drives_over_its_cable_as_over_the_radio(bench):
+    assert bench.link.over_cable
+    assert bench.link.authenticated == bool(bench.link._key)
+    assert bench.plant.wheels.right == pytest.approx(5.0, abs=0.3)
+    assert bench.plant.wheels.left == pytest.approx(4.0, abs=0.3)
+    bench.run(2.0)
+    quality = bench.link.quality(bench.now_ns)
+    assert (quality.lost, quality.sessions, quality.robot_resets) == (0, 1, 0)
+    assert (quality.dongle_resets, quality.collisions, quality.malformed) == (0, 0, 0)
+    print(f'round trip {1e3 * quality.round_trip_median:.2f} ms')
+    assert quality.round_trip_p99 < 0.01
+    bench.drive(0.0, 0.0)
+    bench.run(0.6)
+    bench.release_controls()
+    bench.run(1.0)
+    right, left = bench.link.telemetry.angles
+    assert (round(left / STEP), round(right / STEP)) == bench.plant.pulses
+    bench.link.shut_down()
+    bench.run(2.0, lambda: bench.link.state is LinkState.DONE)
+    assert not bench.board.powered
+
+
+def test_the_radio_chip_may_be_missing(bench):
+    """It is the robot's; over the cable nothing needs it."""
+    assert bench.link.over_cable
+    bench.inject('jam')
+    bench.run(1.0)
+    assert bench.link.reason(bench.now_ns) == ''
+
+
+@pytest.mark.parametrize('how', ['host dies', 'unplugged', 'suspended'])
+def test_without_commands_over_the_cable_the_robot_rests_in_time(bench, how):
+    if how == 'host dies':
+        bench.kill()
+    elif how == 'unplugged':
+        bench.emulator.unplugged = True
+    else:
+        bench.now_ns += 10**9
+        bench.emulator.run_to(bench.now_ns)
+    last_ns, still_ns = bench.now_ns - (10**9 if how == 'suspended' else 0), []
+    bench.each = lambda: still_ns.append(bench.now_ns) if rests(bench) else None
+    if how == 'suspended':
+        assert rests(bench)
+        return
+    for _ in range(200):
+        bench.run(0.005)
+        bench.each()
+    assert still_ns
+    assert still_ns[0] - last_ns <= 0.45e9
+    assert still_ns[-1] == bench.now_ns
+
+
+def test_the_emergency_stop_works_over_the_cable(bench):
+    bench.link.latch_estop('test')
+    bench.run(0.4)
+    assert rests(bench)
+    assert bench.board.status & frames.StatusFlag.ESTOP
+    assert bench.link.release_estop(bench.now_ns) == ''
+    bench.run(0.6)
+    assert bench.plant.wheels.right == pytest.approx(5.0, abs=0.3)
+    bench.inject('button', 0.1)
+    bench.run(0.4)
+    assert rests(bench)
+    assert bench.link.reason(bench.now_ns) == reasons.ROBOT_ESTOP
+
+
+def test_a_robot_with_a_key_follows_signed_commands_only():
+    for key, robot_key, reason in (
+        (b'', KEY, reasons.HOST_KEY_MISSING),
+        (KEY, b'', reasons.ROBOT_KEY_MISSING),
+        (KEY, bytes(16)[:15] + b'\1', 'so the keys differ'),
+    ):
+        made = cable(key=key, robot_key=robot_key)
+        made.drive(5.0, 5.0)
+        made.run(1.0)
+        assert reason in made.link.reason(made.now_ns)
+        assert made.board.counters == (0, 0)
+
+
+def test_limits_of_the_board_hold_over_the_cable():
+    made = cable(link=LinkParameters.from_dict({'robot.max_speed': 3.0}))
+    made.connect()
+    made.drive(9.0, 9.0)
+    made.run(1.0)
+    assert max(made.board.speeds) == pytest.approx(3_000_000, abs=2000)
+
+
+def test_radio_and_cable_take_the_robot_from_each_other():
+    """There is one session: the robot follows one of them, never both."""
+    made = cable()
+    made.connect()
+    made.drive(5.0, 5.0)
+    made.run(0.5)
+    ours = made.board.session
+    made.board.receive(bytes([0x24, ours % 255 + 1, 0, 0]))  # HELLO over the radio
+    assert made.board.session == ours % 255 + 1
+    made.run(0.05, lambda: made.link.state is not LinkState.RUN)
+    made.run(1.0, lambda: made.link.reason(made.now_ns) == '')
+    assert made.link.quality(made.now_ns).collisions == 0
+
+
+def exchange(emulator, payload, second=b''):
+    """Return the payload of the RESULT of a TX over the cable, and its statuses."""
+    frame = encode_frame(codec.encode(frames.Transmit(7, 0, payload, second)))
+    emulator.feed(frame, emulator.now_ns)
+    replies = FrameDecoder().feed(
+        b''.join(data for _, data in emulator.run_to(emulator.now_ns + 20 * MS))
+    )
+    (reply,) = map(codec.decode_from_dongle, replies)
+    return reply
+
+
+def test_the_second_payload_fetches_the_answer_to_the_first():
+    emulator = cable().emulator
+    poll = codec.encode(frames.Poll(0, 1, frames.STATE))
+    kinds = {frames.STATE: frames.State, frames.AUX: frames.Aux, frames.INFO: frames.Info}
+    for what, kind in kinds.items():
+        reply = exchange(emulator, codec.encode(frames.Poll(0, 1, what)), poll)
+        assert isinstance(codec.decode_uplink(reply.payload), kind)
+        assert (reply.first, reply.second) == (3, 3)
+    alone = exchange(emulator, poll)
+    assert (alone.first, alone.second) == (3, 8)
+    assert isinstance(codec.decode_uplink(alone.payload), frames.State)
+
+
+@pytest.mark.parametrize(
+    'frame',
+    [b'\x01', b'\x01\x07\0', b'\x01\x07\0\0', b'\x01\x07\0\x05abc', b'\x01\x07\0\x21' + bytes(33)],
+)
+def test_a_malformed_transaction_is_refused_and_changes_nothing(frame):
+    emulator = cable().emulator
+    emulator.feed(encode_frame(frame), emulator.now_ns)
+    replies = FrameDecoder().feed(
+        b''.join(data for _, data in emulator.run_to(emulator.now_ns + 20 * MS))
+    )
+    assert replies == [b'\x8f\x02\x01']
+    assert emulator.board.session == 0
+
+
+def test_the_cable_leaves_the_answer_of_the_radio(bench):
+    """A dongle that polls meanwhile gets STATE, not what the cable asked for."""
+    emulator = bench.emulator
+    exchange_ns = emulator.now_ns
+    emulator.board.receive(codec.encode(frames.Poll(0, 1, frames.INFO)))
+    emulator.feed(
+        encode_frame(
+            codec.encode(frames.Transmit(7, 0, codec.encode(frames.Poll(0, 1, frames.AUX))))
+        ),
+        exchange_ns,
+    )
+    emulator.run_to(exchange_ns + 5 * MS)
+    payload = emulator._channel._ack_payload
+    assert isinstance(codec.decode_uplink(payload), frames.Info)
+
+
+def test_of_several_ports_the_dongle_is_meant():
+    made = cable()
+    made.link.port_opened = lambda now_ns, opened=made.link.port_opened: opened(
+        now_ns, cable=False
+    )
+    made.run(1.0)
+    assert made.link.reason(made.now_ns) == reasons.ROBOT_USB
+    assert not made.link.over_cable
+    assert made.board.session == 0
+
+
+@pytest.mark.parametrize('phase', few_of([0.0, 0.25, 0.5, 0.75], 2))
+@pytest.mark.parametrize('seconds', [1.2, 2.0])
+def test_no_distance_is_lost_while_the_host_is_suspended(seconds, phase):
+    made = cable({'robot_clock_error': 0.003}, kind=RobotBench)
+    made.connect()
+    made.drive(6.0, 4.5)
+    made.run(1.0 + 0.02 * phase)
+    made.now_ns += round(seconds * 1e9)
+    made._step(b''.join(data for _, data in made.emulator.run_to(made.now_ns)))
+    made.run(0.5)
+    made.drive(0.0, 0.0)
+    made.run(0.6)
+    made.release_controls()
+    made.run(1.0)
+    right, left = made.link.telemetry.angles
+    assert (round(left / STEP), round(right / STEP)) == made.plant.pulses
+    quality = made.link.quality(made.now_ns)
+    assert (quality.robot_resets, quality.dongle_resets) == (0, 0)
+
+
+def test_a_restart_over_the_cable_is_one_of_the_robot(bench):
+    bench.inject('robot_reset', 0.3)
+    bench.run(3.0, lambda: bench.link.robot_resets == 1)
+    quality = bench.link.quality(bench.now_ns)
+    assert (quality.robot_resets, quality.dongle_resets) == (1, 0)
+    check = getattr(bench, 'followed', [])
+    assert check == []  # commands of the cable are not those of the radio
+    check_followed(bench)

@@ -1,0 +1,71 @@
+# Copyright 2026 The t3mpc_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The real firmware of the robot in simavr, driven over its USB, beside the radio."""
+
+import math
+
+import pytest
+from support.avr_bench import on_avr
+from support.avr_boards import ROBOT
+from support.emulator_bench import Bench
+from support.missing_tools import AVR, needing
+
+from t3mpc_ros.radio.link.port_actions import LinkState
+
+pytestmark = [needing(*AVR), pytest.mark.slow]
+
+KEY = bytes(range(16))
+STEP = math.tau / 3200
+
+
+class CableBench(Bench):
+    """A bench at the USB port of the robot board."""
+
+    def __init__(self, emulator, **given):
+        run_to = emulator.run_to
+        emulator.feed = emulator.feed_console
+        emulator._report_command = lambda: None  # it looks for the command in the radio
+
+        def arrived(now_ns):
+            run_to(now_ns)
+            return emulator.take_console()
+
+        emulator.run_to = arrived
+        super().__init__(emulator=emulator, **given)
+
+
+def drive(bench):
+    """Drive for a second; return the load of the processor and its longest pass (us)."""
+    bench.connect()
+    bench.drive(7.0, 6.0)
+    bench.run(0.3)
+    boards, ram = bench.emulator.boards, bench.board.ram
+    ram.put('longest_us', 0, 2)
+    begun, busy = boards.now_us, boards.call('busy_cycles', ROBOT)
+    bench.run(1.0)
+    assert bench.link.reason(bench.now_ns) == ''
+    load = (boards.call('busy_cycles', ROBOT) - busy) / 16 / (boards.now_us - begun)
+    return load, ram.get('longest_us', 2)
+
+
+@pytest.mark.parametrize('way', [CableBench, Bench], ids=['cable', 'radio'])
+def test_the_board_drives_over_the_cable_in_time(way):
+    """A signed CMD, a POLL and their RESULT, 50 times a second, while the wheels turn."""
+    with on_avr(way, key=KEY) as bench:
+        load, longest_us = drive(bench)
+        quality = bench.link.quality(bench.now_ns)
+        print(
+            f'\n{way.__name__}: load {load:.1%}, longest pass {longest_us} us, round trip '
+            f'{1e3 * quality.round_trip_median:.1f} ms (99 %: {1e3 * quality.round_trip_p99:.1f})'
+        )
+        assert bench.link.over_cable == (way is CableBench)
+        assert (quality.robot_resets, quality.sessions) == (0, 1)
+        assert quality.lost <= 1  # in one of some hundred phases an answer misses its packet
+        assert load < 0.95
+        assert longest_us < 2000
+        bench.kill()  # nothing moves on an old command
+        begun_ns = bench.now_ns
+        bench.run(0.6)
+        assert bench.board.speeds == (0, 0)
+        assert bench.now_ns - begun_ns >= 0.45e9
+        assert bench.link.state is LinkState.RUN
