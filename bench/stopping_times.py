@@ -91,9 +91,10 @@ class Disturbed(RuntimeError):
 class DrivenRobot:
     """A bridge process in a namespace, its emulated boards, and the publisher of its commands."""
 
-    def __init__(self, node, processes, folder, name=''):
+    def __init__(self, node, processes, folder, name='', cable=False):
         self.name = f'bridge{name}'
-        self._path = folder / f'dongle{name}'
+        dongle, usb = folder / f'dongle{name}', folder / f'robot{name}'
+        self._path = usb if cable else dongle
         self._namespace = f'/robot{name}'
         self._processes = processes
         self._emulator = Emulator(EmulatorParameters())
@@ -105,9 +106,9 @@ class DrivenRobot:
         self.speed = None
         """Commanded speed, m/s; None: the publisher is gone."""
         self._published = []
-        port = PtyPort(self._path)
+        ports = [PtyPort(path) for path in (dongle, usb)]
         self._threads = [
-            threading.Thread(target=self._serve, args=(port,), daemon=True),
+            threading.Thread(target=self._serve, args=ports, daemon=True),
             threading.Thread(target=self._publish, daemon=True),
         ]
         for thread in self._threads:
@@ -174,9 +175,12 @@ class DrivenRobot:
         with suppress(KeyError):
             self._processes.kill(self.name)
 
-    def _serve(self, port):
-        serve(self._emulator, port, 1.0, self._stopped, on_update=self._on_update)
-        port.close()
+    def _serve(self, dongle, usb):
+        serve(
+            self._emulator, dongle, 1.0, self._stopped, console_port=usb, on_update=self._on_update
+        )
+        dongle.close()
+        usb.close()
 
     def _stopped(self):
         while self._faults:
@@ -418,6 +422,8 @@ def rows(node, processes, folder, trials, durations=DURATIONS, kinds=('all',)):
                 other.close()
     finally:
         robot.close()
+    if wanted('cable'):
+        yield from _cable_rows(node, processes, folder, trials)
     if wanted('sim'):
         twin = SimulatedRobot(node, processes)
         for duration in [each for each in durations if each >= 1.0]:
@@ -425,6 +431,24 @@ def rows(node, processes, folder, trials, durations=DURATIONS, kinds=('all',)):
                 f'sim_robot suspended {duration:g} s, publisher ends meanwhile',
                 *repeat(partial(twin.suspend, duration), trials),
             )
+
+
+def _cable_rows(node, processes, folder, trials):
+    """Yield rows of a robot that is driven over the USB of its board."""
+    robot = DrivenRobot(node, processes, folder, '_c', cable=True)
+    try:
+        for name, measure in (
+            ('publisher ends', end_publisher),
+            ('bridge killed', kill_host),
+            (
+                'bridge suspended 1 s, publisher goes on',
+                partial(suspend, duration=1.0, publishing=True),
+            ),
+        ):
+            row = repeat(partial(measure, robot), trials, [robot])
+            yield f'over the cable: {name}', *row
+    finally:
+        robot.close()
 
 
 def format_row(name, trials, disturbed):

@@ -30,6 +30,7 @@ from t3mpc_ros.emulator.emulator import Emulator
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 _POLL_PERIOD_NS = NANOSECONDS // 50
+_CONSOLE_POLL_PERIOD_NS = NANOSECONDS // 1000
 """Longest time between two updates of the emulator, and between two checks for a client."""
 _MAX_SLEEP = 0.1
 """Longest interruption of the process that virtual time catches up with, s."""
@@ -136,6 +137,8 @@ def serve(
     while not stopped():
         next_ns = emulator.next_ns
         until_ns = now_ns + _POLL_PERIOD_NS
+        if console is not None and console.connected:
+            until_ns = now_ns + _CONSOLE_POLL_PERIOD_NS  # a host may drive over it
         if next_ns is not None:
             until_ns = min(next_ns, until_ns)
         received = port.wait(max(until_ns - now_ns, 0) / NANOSECONDS / real_time_factor)
@@ -170,15 +173,16 @@ class _ConsolePort:
         self._emulator = emulator
         self._port = port
         self._restart_on_open = restart_on_open
-        self._connected = False
+        self.connected = False
+        """Whether a client has the port open."""
 
     def update(self, now_ns: int) -> None:
         received = self._port.wait(0.0)
-        if received is not None and not self._connected and self._restart_on_open:
+        if received is not None and not self.connected and self._restart_on_open:
             self._emulator.restart_robot()
-        self._connected = received is not None
+        self.connected = received is not None
         if received:
             self._emulator.feed_console(received, now_ns)
         for _, data in self._emulator.take_console():
-            if self._connected:
+            if self.connected:
                 self._port.write(data)

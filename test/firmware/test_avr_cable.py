@@ -24,7 +24,6 @@ class CableBench(Bench):
     def __init__(self, emulator, **given):
         run_to = emulator.run_to
         emulator.feed = emulator.feed_console
-        emulator._report_command = lambda: None  # it looks for the command in the radio
 
         def arrived(now_ns):
             run_to(now_ns)

@@ -325,6 +325,20 @@ def test_restarts_are_counted_by_the_count_of_the_robot(before, after, restarts)
     assert decoder.start_session(2, after, 10) == restarts
 
 
+def test_what_a_restarted_robot_has_counted_is_not_lost():
+    """Another host may have driven it: its counters have begun at 0."""
+    robot, decoder = FakeRobot(), TelemetryDecoder()
+    decoder.start_session(1, 7, 0)
+    robot.steps = [100.0, 1000.0]
+    assert decoder.decode(robot.state(20 * MS)._replace(session=1), 21 * MS)
+    robot.boot(30 * MS, steps=(50, 500))
+    assert decoder.start_session(2, 8, 40 * MS) == 1
+    found = decoder.decode(robot.state(60 * MS)._replace(session=2), 61 * MS)
+    step = math.tau / 3200
+    assert found.angles == pytest.approx((500 * step, 50 * step))
+    assert found.wheels == (0.0, 0.0)
+
+
 def test_a_clock_that_wraps_between_two_sessions_is_no_restart():
     """The counters continue, too: the steps between are measured, whatever time has passed."""
     robot, decoder = FakeRobot(), TelemetryDecoder()

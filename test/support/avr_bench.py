@@ -36,7 +36,7 @@ from t3mpc_ros.emulator.plant import Plant, Registers
 from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.radio.protocol.codec import decode_downlink
 from t3mpc_ros.radio.protocol.frames import Command
-from t3mpc_ros.radio.protocol.framing import crc16
+from t3mpc_ros.radio.protocol.framing import FrameDecoder, crc16
 from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.simulation.sensors.range_sensor import output_voltage
 from t3mpc_ros.simulation.world import cast_rays, load_world
@@ -171,6 +171,9 @@ class AvrEmulator:
         self._to_dongle = SerialLine(self._events, self.faults, self._write, 0)
         self._to_host = SerialLine(self._events, self.faults, self._deliver, 0)
         self._piece = b''
+        self._console = FrameDecoder()
+        self._drives_over_cable = False
+        """Whether the last command came over the USB of the robot board."""
         self._host_input = []
         self.port_open = True
         self._dongle_ready_ns = START_NS
@@ -194,6 +197,7 @@ class AvrEmulator:
 
     def feed(self, data, now_ns):
         self.run_until(now_ns)
+        self._drives_over_cable = False
         if self.port_open:
             self._to_dongle.send(data)
             self._events.run_to(now_ns)
@@ -201,6 +205,7 @@ class AvrEmulator:
     def feed_console(self, data, now_ns):
         """Send bytes to the USB console of the robot board at this time."""
         self.run_until(now_ns)
+        self._drives_over_cable |= any(frame[0] == 1 for frame in self._console.feed(data))
         self.boards.call('usb_write', data, len(data))
 
     def take_console(self):
@@ -258,6 +263,8 @@ class AvrEmulator:
         if self._ttl_start_us != before or self._ttl_start_us in (self._ttl_from_us, 0):
             return
         self._ttl_from_us = self._ttl_start_us
+        if self._drives_over_cable:
+            return  # the packet below is one of the radio
         command = decode_downlink(self.boards.last_packet())
         assert isinstance(command, Command)
         assert command.seq == self.board.ram.get('seq', 1)
