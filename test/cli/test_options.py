@@ -123,7 +123,7 @@ IN_CODE = {
     'bag animate': AnimationOptions()._asdict(),
     'robot calibrate': {
         name: getattr(WizardOptions(), name)
-        for name in ('steps', 'distance', 'turns', 'speed', 'distances')
+        for name in ('distance', 'turns', 'speed', 'distances')
     }
     | asdict(WizardOptions().geometry)
     | {
