@@ -18,6 +18,7 @@ from http.client import HTTPConnection
 import json
 import math
 import re
+import socket
 import time
 
 import pytest
@@ -168,6 +169,16 @@ def test_an_answer_without_news_comes_at_once_with_the_time(page):
     assert before <= news.pop('now') <= time.monotonic()
     assert news == {}
     assert page.events(last)[0] == last
+
+
+def test_an_answer_is_sent_at_once(page):
+    """Its head went first; the rest waited 40 ms for an acknowledgement, ten times a second."""
+    with socket.create_connection((ADDRESS, page.server.port), timeout=20) as connection:
+        for _ in range(3):
+            connection.sendall(f'GET /events HTTP/1.1\r\nHost: {page.host}\r\n\r\n'.encode())
+            head, _, body = connection.recv(65536).partition(b'\r\n\r\n')
+            assert head.startswith(b'HTTP/1.1 200 OK\r\n')
+            assert 'now' in json.loads(body)
 
 
 def test_a_report_is_served_alone_and_cannot_command(page, tmp_path):
