@@ -47,6 +47,10 @@ class Banner(NamedTuple):
     headline: str
     detail: str
 
+    def cause(self) -> tuple[str, str]:
+        """Return the headline and the first reason."""
+        return self.headline, self.detail.partition('; ')[0]
+
 
 def banner(reports: Mapping[str, NodeReport], odometry_age: float | None) -> Banner:
     """Return what a person has to know first.
@@ -130,6 +134,8 @@ class LiveRun(LiveData):
         if previous is None or shown.kind == previous.kind == 'lost':
             return
         if shown.kind in ('stopped', 'lost'):
+            if shown.cause() == previous.cause():
+                return  # what follows from a stop comes later: it is no other stop
             reason = f': {shown.detail}' if shown.detail else ''
             self.report(self._time, 'stop', f'{shown.headline}{reason}')
         elif previous.kind in ('stopped', 'lost'):

@@ -188,6 +188,10 @@ def test_stops_and_their_ends_are_events():
         run.add('odometry', 0.1 * k, [0.0])
         if k == 10:
             run.node_report('sim_robot', *ESTOP)
+        if k == 15:  # what follows from the stop is no other stop
+            run.node_report('controller', 'commands pause', 'stopped')
+        if k == 19:
+            run.node_report('controller', 'tracking', 'normal')
         if k == 20:
             run.node_report('sim_robot', 'following commands', 'normal')
         run.tick(0.1 * k)
