@@ -146,6 +146,7 @@ def topics(path):
 PAPER = 'evaluation.paper.reproduce.reproduce'
 COMPARE = {
     'evaluation.comparison.run_plan': {},
+    'evaluation.comparison.step_times': {},
     'evaluation.comparison_page.markdown': '',
     'evaluation.comparison_page.record': {},
     'evaluation.comparison_page.page': '',
