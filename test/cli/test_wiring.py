@@ -325,6 +325,7 @@ TABLE = {
             '--gyro': {'run_plan.plan.scenario.gyro': True},
             '--json new.json': {'files': 'new.json'},
             '--html new.html': {'files': 'new.html'},
+            '--csv new.csv': {'files': 'new.csv'},
             **workers('run_plan.workers'),
         },
     ),
