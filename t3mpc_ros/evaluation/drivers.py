@@ -232,7 +232,8 @@ class MethodDriver:
         asked, cut = self._limited_torque(self._answer(self._controller, k, measured, elapsed))
         if not np.isfinite(asked).all():
             return RobotCommand(WheelSpeeds(math.nan, math.nan), state.stamp_ns)
-        self._acceleration = self._actuation.send_acceleration(asked)
+        elapsed_s = elapsed * self._model.period
+        self._acceleration = self._actuation.send_acceleration(asked, elapsed_s)
         self._limited = self._actuation.limited or cut
         self._controller.applied(self._acceleration, limited=self._limited)
         sent = self._actuation.command

@@ -366,6 +366,24 @@ def test_swapped_and_thinned_reports_arrive_as_the_case_says():
     assert set(swapped) == {1, 2}
 
 
+def test_after_a_gap_the_command_may_change_by_as_much_more():
+    """At half the rate the limit of one period left feed-forward 7 rad/s behind a swing."""
+
+    class Hasty(FeedForward):
+        def step(self, observation):
+            return np.full(2, 1e4)
+
+    scenario = Scenario('servo', 'nominal', 201, 2.0, 0.0)
+    driver = MethodDriver(MethodSpec('hasty', Hasty, FeedForwardParameters()), scenario)
+    driver.begin(0, enabled=True)
+    state, sent = scenario.simulation().advance(0), [np.zeros(2)]
+    for stamp_ns in (0, 10_000_000, 60_000_000, 70_000_000):
+        sent.append(np.array(driver.step(state._replace(stamp_ns=stamp_ns)).wheels))
+    changes = np.diff(sent[1:], axis=0)[:, 0]
+    assert changes == pytest.approx(changes[0] * np.array([1.0, 5.0, 1.0]))
+    assert changes[0] > 0.1
+
+
 # -- what each states to know ---------------------------------------------------------------------
 
 
