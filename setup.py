@@ -18,6 +18,8 @@ from glob import glob
 import gzip
 import os
 import re
+import shutil
+import sys
 import tarfile
 
 from setuptools import find_packages, setup
@@ -43,6 +45,9 @@ NODES = (
     'player',
     'composed',
 )
+EXECUTABLES = (*NODES, 't3mpc')
+PIP_COMMANDS = {'dist_info', 'bdist_wheel', 'editable_wheel'}
+"""Commands with which pip builds; colcon uses others, and installs all executables in lib."""
 
 
 def requirements(file):
@@ -97,7 +102,7 @@ COMMANDS = {'sdist': SourceDistribution}
 if bdist_wheel:
 
     class Wheel(bdist_wheel):
-        """A wheel without the umask of its build; the time is ``SOURCE_DATE_EPOCH``."""
+        """A wheel with the executables, without the umask and the time of its build."""
 
         def write_wheelfile(self, *arguments, **options):
             """Write the last file before the wheel is packed, and set the modes of all."""
@@ -105,10 +110,27 @@ if bdist_wheel:
             for folder, _, files in os.walk(self.bdist_dir or ''):
                 for file in files:
                     os.chmod(os.path.join(folder, file), mode_of(folder=False))
+            # PATH gets t3mpc only; ros2 run finds the nodes in lib.
+            place = f'{self.bdist_dir}/{NAME}-{VERSION}.data/data/lib/{NAME}'
+            os.makedirs(place)
+            for name in EXECUTABLES:
+                shutil.copyfile('resource/executable', f'{place}/{name}')
+                os.chmod(f'{place}/{name}', 0o755)
 
     COMMANDS['bdist_wheel'] = Wheel
 
 NEEDED = requirements('requirements.txt')
+FOR_PIP = bool(PIP_COMMANDS.intersection(sys.argv))
+
+
+def page():
+    """Return the page of the package: the README, whose relative links lead nowhere there."""
+    path = os.path.join(os.path.dirname(os.path.realpath(__file__)), 'README.md')
+    with open(path, encoding='utf-8') as file:
+        text = file.read()
+    text = re.sub(r'!\[[^\]]*\]\((?!https?:)[^)]*\)\n*', '', text)
+    return re.sub(r'\[([^\]]*)\]\((?!https?:)[^)]*\)', r'\1', text)
+
 
 setup(
     name=NAME,
@@ -135,12 +157,12 @@ setup(
         f'{NAME}.simulation': ['worlds/*.yaml', 'schedules/*.yaml'],
         f'{NAME}.view': ['page/*'],
     },
-    install_requires=['setuptools', *(each for each in NEEDED if not each.startswith(ROS))],
+    install_requires=[each for each in NEEDED if not each.startswith(ROS)],
     # colcon test runs pytest only where it is a test dependency.
     extras_require={
         'ros': [each for each in NEEDED if each.startswith(ROS)],
-        'compare': ['casadi>=3.6', 'pyarrow>=15'],
-        'cluster': ['distributed>=2024.5', 'pyarrow>=15'],
+        'compare': ['casadi>=3.6,<4', 'pyarrow>=15,<30'],
+        'cluster': ['distributed>=2024.5,<2028', 'pyarrow>=15,<30'],
         'dev': requirements('requirements-dev.txt'),
         'test': ['pytest'],
     },
@@ -150,10 +172,21 @@ setup(
     maintainer_email='developers@t3mpc.example',
     description='Type-3 fuzzy, Boltzmann-machine predictive control of a two-wheeled robot '
     'along fractional-order chaotic references.',
+    long_description=page(),
+    long_description_content_type='text/markdown',
     license='Apache-2.0',
+    project_urls={'Paper': 'https://doi.org/10.1007/s40747-023-01086-4'},
+    keywords='ROS 2, mobile robot, predictive control, type-3 fuzzy system, chaos, MCAP',
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        *(f'Programming Language :: Python :: 3.{minor}' for minor in (11, 12, 13, 14)),
+        'Topic :: Scientific/Engineering',
+    ],
     entry_points={
         'console_scripts': [
-            *(f'{node} = {NAME}.nodes.entry_point:{node}' for node in NODES),
+            *(f'{node} = {NAME}.nodes.entry_point:{node}' for node in NODES if not FOR_PIP),
             f't3mpc = {NAME}.cli.executable:t3mpc',
         ],
     },

@@ -71,7 +71,7 @@ wanted_stamp() {
   hash="$({
     origin_of "$BASE_PYTHON"
     case "$1" in
-    run) cat "$ROOT"/{requirements.txt,setup.py,setup.cfg,package.xml,t3mpc_ros/version.py} \
+    run) cat "$ROOT"/{requirements.txt,setup.py,setup.cfg,package.xml,resource/executable,t3mpc_ros/version.py} \
       "$ROOT"/{config/*.*,launch/*.launch.py} "$ROOT"/scripts/{environment.sh,finish_install.py} ;;
     check) cat "$ROOT"/requirements-*.txt ;;
     esac
@@ -208,7 +208,7 @@ make_environment() {
   start env -C "$ROOT" "$PYTHON" -m t3mpc_ros.cli.main compile
   compiler=$!
   { install 't3mpc_ros' --no-deps --no-build-isolation -e "$ROOT" &&
-    run 'moving its executables to lib/t3mpc_ros, where ros2 run looks' \
+    run 'writing its executables to lib/t3mpc_ros, where ros2 run looks' \
       "$PYTHON" "$ROOT/scripts/finish_install.py"; } ||
     fail "the package could not be installed: $(tail -n 1 "$LOG")" "see $LOG"
   say '  compiling the kernels for this processor, since the libraries are there'

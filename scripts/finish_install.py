@@ -16,7 +16,6 @@
 from collections import defaultdict
 import contextlib
 from hashlib import sha256
-from importlib.metadata import distribution
 import os
 from pathlib import Path
 import shutil
@@ -27,17 +26,20 @@ import setuptools  # noqa: F401
 # Brought by setuptools: Python 3.12 has none of its own.
 from distutils.core import run_setup  # isort: skip
 
+from t3mpc_ros.nodes.registry import NODES
+
 LARGE = 500_000
 """Size from which equal files are linked, bytes."""
 
 
-def move_executables(environment: Path) -> None:
-    """Move the executables from bin to lib/t3mpc_ros, the folder that ros2 run searches."""
+def write_executables(environment: Path, source: Path) -> None:
+    """Write the executables to lib/t3mpc_ros, the folder that ros2 run searches."""
     folder = environment / 'lib' / 't3mpc_ros'
     shutil.rmtree(folder, ignore_errors=True)  # with those of an earlier version
     folder.mkdir()
-    for entry in distribution('t3mpc_ros').entry_points.select(group='console_scripts'):
-        (environment / 'bin' / entry.name).rename(folder / entry.name)
+    for name in (*NODES, 't3mpc'):
+        shutil.copyfile(source / 'resource' / 'executable', folder / name)
+        (folder / name).chmod(0o755)
 
 
 def link_data_files(environment: Path, source: Path) -> None:
@@ -79,7 +81,7 @@ def link_copies(environment: Path) -> None:
 
 
 if __name__ == '__main__':
-    move_executables(Path(sys.prefix))
+    write_executables(Path(sys.prefix), Path(__file__).resolve().parent.parent)
     link_data_files(Path(sys.prefix), Path(__file__).resolve().parent.parent)
     shorten_path(Path(sys.prefix), Path(__file__).resolve().parent.parent)
     link_copies(Path(sys.prefix))

@@ -389,17 +389,14 @@ def test_the_installer_is_uv_and_without_it_pip(checkout):
     assert not (checkout.root / '.venv' / 'uv').exists()
 
 
-def test_executables_are_moved_and_files_linked(tmp_path, monkeypatch):
+def test_executables_are_written_and_files_linked(tmp_path):
     finish = runpy.run_path(str(ROOT / 'scripts' / 'finish_install.py'))
-    bin_folder, target = tmp_path / 'bin', tmp_path / 'lib' / 't3mpc_ros'
-    for folder in (bin_folder, target):
-        folder.mkdir(parents=True)
+    target = tmp_path / 'lib' / 't3mpc_ros'
+    target.mkdir(parents=True)
     (target / 'of_an_earlier_version').touch()
-    for name in (*EXECUTABLES, 'python'):
-        (bin_folder / name).touch()
-    finish['move_executables'](tmp_path)
+    finish['write_executables'](tmp_path, ROOT)
     assert {path.name for path in target.iterdir()} == EXECUTABLES
-    assert [path.name for path in bin_folder.iterdir()] == ['python']
+    assert all(os.access(path, os.X_OK) for path in target.iterdir())
 
     finish['link_data_files'](tmp_path, ROOT)
     share = tmp_path / 'share'

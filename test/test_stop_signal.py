@@ -82,6 +82,25 @@ def test_ctrl_c_while_an_executable_imports_is_quiet(module, code):
     assert (done.returncode, done.stderr) == (code, '')
 
 
+@pytest.mark.parametrize('number', SIGNALS)
+def test_a_signal_before_the_imports_is_quiet(number, tmp_path):
+    """While Python reads its path files, where the wheels of ROS start it anew."""
+    root = Path(__file__).resolve().parent.parent
+    for folder in ('bin', 'lib/t3mpc_ros'):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / 'bin' / 'python3').symlink_to(sys.executable)
+    program = tmp_path / 'lib' / 't3mpc_ros' / 'controller'
+    program.write_bytes((root / 'resource' / 'executable').read_bytes())
+    program.chmod(0o755)
+    (tmp_path / 'sitecustomize.py').write_text(
+        f'import os\nprint("here", flush=True)\nos.kill(os.getpid(), {int(number)})\n'
+    )
+    environment = os.environ | {'PYTHONPATH': f'{tmp_path}{os.pathsep}{root}'}
+    with attended():
+        done = subprocess.run([program], capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stdout, done.stderr) == (0, 'here\n', '')
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
 def test_the_workers_of_a_killed_process_end_with_it(number, tmp_path):
