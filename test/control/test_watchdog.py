@@ -529,3 +529,18 @@ def test_a_velocity_of_the_opposite_sign_is_stopped_within_3_s(axis, late):
         else:
             assert 0.01 * reasons.index(Reason.PAUSED) < 3.0
             assert reasons[-1] is Reason.STOPPED_AGAIN
+
+
+def test_a_robot_that_drives_the_other_way_gets_three_attempts():
+    course = Course(lambda course, command: BodyTwist(-command.linear, 0.0))
+    course.run(30.0, following=True)
+    attempts = TRIALS * [Reason.TRACKING, Reason.PAUSED]
+    assert course.changes() == [*attempts, Reason.TRACKING, Reason.STOPPED_AGAIN]
+
+
+def test_a_robot_that_is_asked_for_nothing_shows_no_recovery():
+    course = Course(lambda course, command: STANDSTILL)
+    course.run(STANDING_TIME + 2.0 * PAUSE)
+    course.wanted = STANDSTILL
+    course.run(3.0 * RECOVERY_TIME)
+    assert course.monitor.pauses > 0
