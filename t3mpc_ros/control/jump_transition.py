@@ -46,7 +46,7 @@ class JumpTransitionParameters(Parameters):
         'acceleration of the ramp: at most the acceleration limit of a wheel; a torque drive '
         'crosses with what its motors have for the direction of the jump instead',
         'rad/s²',
-        (0.1, 1e4),
+        (1.0, 1e4),
         dynamic=True,
     )
 
