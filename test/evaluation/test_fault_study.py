@@ -299,7 +299,7 @@ def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     assert 'old' not in text
     assert text.count('| `gyro_dead` |') == 2
     shown = html.read_text(encoding='utf-8')
-    assert shown.index('Every fault stays bounded') < shown.index('<img') < shown.index('<nav')
+    assert shown.index('Every fault stays') < shown.index('<img') < shown.index('<nav')
     assert shown.count('<td class="text">gyro_dead</td>') == 2
     assert [one['course'] for one in json.loads(numbers.read_text())] == ['chaotic', 'straight']
 

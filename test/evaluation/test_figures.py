@@ -459,6 +459,12 @@ def test_errors_of_faults_are_named_and_judged_by_the_worst(caught):
     assert [to_hex(each.get_color()) for each in axis.lines] == [GREY, RED, COMMAND]
     assert 'Every fault stays bounded' in page
     assert '2 stay within the limits and recover.' in page
+    lost = {'undetected': ['odometry is wrong'], 'odometry_after': [1.03, 0.5]}
+    astray = fault_page.page([OUTCOME, other | lost])
+    assert (
+        '<div class="verdict open"><p class="headline">Every fault stays within the limits, but '
+        'the odometry is wrong after 1 of 2, by up to 1.03 m, 28.6° (brown_out)' in astray
+    ), 'it was green: every fault stays bounded'
     worse = fault_page.page([OUTCOME, other | {'verdict': 'unbounded', 'undetected': ['tilt']}])
     assert 'Not every fault stays bounded' in worse
     assert '1 exceed a limit.' in worse

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from support.report_run import COMMANDED, LINK, MOTIONS, NUMBERS, RUN, TIME, WHEELS
 
+from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.bag_report import report_page
 from t3mpc_ros.evaluation.bag_report.causes import Cause, cause_between
@@ -54,6 +55,7 @@ from t3mpc_ros.evaluation.charts import Plane
 from t3mpc_ros.evaluation.drive_response import ResponseFit
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 
+DEMO = Path(__file__).parents[2] / 'bench' / 'frozen' / 'demo.mcap'
 GOLDEN = Path(__file__).parents[1] / 'golden' / 'switches.mcap'
 METRICS = compute_metrics(RUN, Path('r.html'), 7)
 
@@ -154,7 +156,7 @@ def test_every_chart_is_known():
     assert CHARTS.keys() == expected().keys()
     colours = {line.label: line.colour for title in BY_WHEEL for line in CHARTS[title.title].lines}
     assert colours == {
-        'robot (ground truth)': 'truth', 'robot (odometry)': 'right', 'reference': 'reference',
+        'robot (ground truth)': 'truth', 'robot (odometry)': 'odometry', 'reference': 'reference',
     }  # fmt: skip
     for title in ('Error', 'Acceleration u applied', 'Skill of the predictor'):
         assert [line.colour for line in CHARTS[title].lines] == [*WHEELS]
@@ -494,10 +496,19 @@ def test_a_poor_run_is_far_worse_than_what_its_robot_reaches():
         found = judge(run, find_incidents(run), **JUDGED)
         assert (found.label, found.sound) == (label, label == 'Good run')
     assert f'{1.01 * MAX_RATIO:.0f} times the {known.settled:g} rad/s' in found.sentence
-    for other in ({'mass_factor': '2.0'}, {'noise.variance': '0.05'}, {'drive.kind': 'torque'}):
-        twin = {**known.parameters['sim_robot'], **other}
-        records = {**known.parameters, 'sim_robot': twin}
-        assert known_result(records) is None or known_result(records) is not known
+
+
+def test_a_recorded_demo_is_known_and_other_conditions_are_not():
+    with open_bag(DEMO) as recording:
+        records = recording.metadata_records
+    assert known_result(records) is KNOWN_RESULTS[0]
+    for node, other in (
+        ('sim_robot', {'mass_factor': '2.0'}), ('sim_robot', {'noise.variance': '0.05'}),
+        ('sim_robot', {'faults.slippery': '0.3'}), ('sim_robot', {'world': 'room'}),
+        ('sim_robot', {'noise.variance': 'much'}), ('reference_generator', {'source': 'path'}),
+    ):  # fmt: skip
+        assert known_result({**records, node: {**records[node], **other}}) is None
+    assert known_result({}) is None
 
 
 @pytest.mark.parametrize(

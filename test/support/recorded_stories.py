@@ -23,7 +23,7 @@ import math
 
 import numpy as np
 
-from support.bag_messages import START, diagnostics, odometry_message, twist_message
+from support.bag_messages import START, TYPES, diagnostics, odometry_message, twist_message
 from support.robot_bags import write_with_records
 
 DURATION, RATE, LEAD = 20.0, 100.0, 0.4
@@ -77,6 +77,10 @@ class Story:
     names: dict = field(default_factory=dict)
     """Other names of topics."""
     second_robot: bool = False
+    switches: tuple = ()
+    """Times at which the reference switches, s."""
+    apart: int = 0
+    """Time from a stamp of the reference to one of the odometry, ns."""
 
     def rows(self):
         """Return rows of receipt (s), topic and message."""
@@ -92,17 +96,20 @@ class Story:
             if self.detour and self.detour[0] <= t < self.detour[1]:
                 shown = shown + (0.0, 0.3, 0.0)
             stamp = START + round(t * 1e9)
+            measured = stamp + self.apart
             target = place if self.path else (0.0, 0.0, 0.0)
             ahead = odometry_message(stamp, wanted, target)
             rows += [
                 (max(received - LEAD, 0.0), '/reference', ahead),
-                (received + 2e-4, '/odom', odometry_message(stamp, speed, shown)),
-                (received + 3e-4, '/ground_truth/odom', odometry_message(stamp, speed, shown)),
+                (received + 2e-4, '/odom', odometry_message(measured, speed, shown)),
+                (received + 3e-4, '/ground_truth/odom', odometry_message(measured, speed, shown)),
                 (received + 1e-3, '/cmd_vel', twist_message(self._command(t))),
             ]
             if self.second_robot and k % 2:
                 other = odometry_message(stamp + 5_000_000, (0.1, 0.0), (5.0, 0.001 * k, 0.0))
                 rows.append((received + 6e-3, '/odom', other))
+        for mode, t in enumerate((0.0, *self.switches) if self.switches else ()):
+            rows.append((max(t - LEAD, 1e-4), '/reference/signals', _signals(mode)))
         for second in range(1, round(DURATION)):
             newest = {}
             for when, node, level, text in self.reports:
@@ -123,7 +130,8 @@ class Story:
         return write_with_records(folder, self.rows(), self.records)
 
     def _reference(self, t):
-        return 0.18 + 0.04 * math.sin(1.3 * t), 0.5 * math.sin(0.7 * t)
+        mode = sum(switch <= t + 1e-9 for switch in self.switches)
+        return 0.18 - 0.08 * (mode % 2) + 0.04 * math.sin(1.3 * t), 0.5 * math.sin(0.7 * t)
 
     def _command(self, t):
         return self._reference(t)
@@ -140,6 +148,12 @@ class Story:
         if any(start <= t < end for start, end in self.blocked):
             right = 0.0
         return 0.5 * RADIUS * (right + left), RADIUS * (right - left) / SEPARATION
+
+
+def _signals(mode):
+    layout = TYPES['std_msgs/msg/MultiArrayLayout'](dim=[], data_offset=0)
+    values = np.array([mode, mode % 4, (mode + 1) % 4], dtype=np.int32)
+    return TYPES['std_msgs/msg/Int32MultiArray'](layout, values)
 
 
 def _moved(pose, twist):
@@ -244,3 +258,11 @@ STORIES = {
     ),
 }  # fmt: skip
 """By name."""
+
+SIGNALS_STORY = Story(
+    rf'Good run: {SETTLED}, and the robot never stood\.',
+    'good',
+    switches=(6.0, 11.0, 15.5),
+    apart=3_000_000,
+)
+"""One with switches, each between a stamp of the odometry and those of the reference."""

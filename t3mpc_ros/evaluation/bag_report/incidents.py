@@ -101,7 +101,7 @@ class Incidents:
     @property
     def stopped(self) -> float:
         """Time in which the robot stood although it was to move, s."""
-        return sum(stop.length for stop in self.stops)
+        return sum((stop.length for stop in self.stops), 0.0)
 
     def events(self) -> list[tuple[float, str, str]]:
         """Return time (s), kind and text of all of them."""
