@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.fault_study import ALLOWED, BEGIN, DURATION
+from t3mpc_ros.evaluation.fault_study import ALLOWED, BEGIN, DURATION, ODOMETRY_WRONG
 from t3mpc_ros.evaluation.plotting import COLOURS, legend_above, new_figure, png_of
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
@@ -197,7 +197,15 @@ def _verdict(rows: Sequence[Row]) -> VerdictBox:
         reasons.append(f'Not detected by robot or controller: {", ".join(names)}.')
     if count['unbounded']:
         return VerdictBox('Not every fault stays bounded', reasons, 'bad')
-    return VerdictBox('Every fault stays bounded', reasons, 'good')
+    lost = [row for row in rows if ODOMETRY_WRONG in row['undetected']]
+    if not lost:
+        return VerdictBox('Every fault stays bounded', reasons, 'good')
+    worst = max(lost, key=lambda row: row['odometry_after'][0])
+    headline = (
+        f'Every fault stays within the limits, but the odometry is wrong after {len(lost)} of '
+        f'{len(rows)}, by up to {_place(*worst["odometry_after"])} ({worst["name"]})'
+    )
+    return VerdictBox(headline, reasons, 'open')
 
 
 def _draw_errors(rows: Sequence[Row]) -> Any:

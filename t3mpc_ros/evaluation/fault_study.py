@@ -62,6 +62,8 @@ REST = 4.0
 """Shortest time over which an error can count as recovered, s."""
 BRAKING_TIME = 0.6
 """Time after a stop reason by which the robot must stand still, s."""
+ODOMETRY_WRONG = 'odometry is wrong'
+"""Effect that only ground truth shows: its pose is off by more than without the fault."""
 METHOD = NodeMethod(FULL, {})
 
 
@@ -244,7 +246,7 @@ def _undetected(
     if slide > 0.2:
         found.append(f'tyres slide ({slide:.1f} rad/s)')
     if off[0] > usual[0] + 0.02 or off[1] > usual[1] + 0.05:
-        found.append('odometry is wrong')
+        found.append(ODOMETRY_WRONG)
     return found
 
 

@@ -138,7 +138,7 @@ def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
     headline = PATH_HEADLINE if run.follows_path else HEADLINE
     first = [section for section in SECTIONS if section.draw.__name__ in headline]
     others = [section for section in SECTIONS if section.draw.__name__ not in headline]
-    blocks += _sections(run, figures, first)
+    blocks += _beside(run, figures, first) if run.follows_path else _sections(run, figures, first)
     blocks.append(Tiles(figures.numbers()))
     if remarks := [*_remarks(run), *usual]:
         blocks.append(Items([[each] for each in remarks], 'side'))
@@ -309,6 +309,15 @@ def _sections(run: Run, figures: ReportMetrics, sections: Sequence[Section]) -> 
             yield Heading(section.title)
             yield Group(charts, 'div', 'charts')
             yield Paragraph(section.caption_of(run), 'quiet')
+
+
+def _beside(run: Run, figures: ReportMetrics, sections: Sequence[Section]) -> Iterator[Block]:
+    """Yield the charts of some sections side by side."""
+    charts = [chart for section in sections for chart in section.draw(run, figures)]
+    if charts:
+        yield Heading('; '.join(section.title for section in sections))
+        yield Group(charts, 'div', 'charts')
+        yield from (Paragraph(section.caption_of(run), 'quiet') for section in sections)
 
 
 def _timing(run: Run) -> list[Block]:
