@@ -5,7 +5,7 @@
 
 const TICK = 1e-5; // s
 const NEAR = 3; // s shown before and after an event
-const EVENTS = { switch: 'switch', stop: 'stopped', stall: 'c4', gap: 'left', jump: 'c5' }; // marks
+const EVENTS = { switch: 'switch', stop: 'stopped', stall: 'c4', gap: 'soft', jump: 'c5' }; // marks
 
 const place = (id) => document.getElementById(id);
 const data = JSON.parse(place('data').textContent);

@@ -17,16 +17,19 @@ An e-stop of 17.7 s was *No valid measurement: settled RMSE 1.9 rad/s, stopped 0
 machine that stalled, with an error nine times that of a quiet one, was a *good run*.
 """
 
+from dataclasses import replace
 from html import unescape
 import re
 
 import pytest
 from support.page_data import read_all
-from support.recorded_stories import STORIES
+from support.recorded_stories import STORIES, TWIN, Story
 
 from t3mpc_ros.cli.main import main as t3mpc
 from t3mpc_ros.cli.recorded_run import recorded_run
+from t3mpc_ros.evaluation.bag_report.report_page import write_report
 
+LOSSES = {'losses': {'undiscovered': '25', 'undiscovered /imu/data_raw': '25'}}
 HEADLINE = re.compile(r'<div class="verdict (\w+)"><p class="headline">(.*?)</p>')
 
 
@@ -45,3 +48,45 @@ def test_the_first_sentence_tells_the_story_everywhere(name, tmp_path, capsys):
     banner = read_all(recorded_run(bag))[0]['facts']['banner']
     assert banner['headline'] == sentence
     assert (banner['kind'] == 'good') == (kind == 'good')
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('late', [False, True])
+def test_what_a_recorder_misses_at_its_start_is_usual(late, tmp_path):
+    """A normal demo had 870 unusual messages, so nobody read what is unusual in a bag.
+
+    Where it records the odometry only after the robot drives, errors are missing.
+    """
+    story = STORIES['good']
+    if late:
+        story = replace(story, kept=lambda t, topic: topic != '/ground_truth/odom' or t > 1.5)
+    story = replace(story, records={**TWIN, **LOSSES})
+    page = write_report(story.write(tmp_path / 'bag')).report.read_text(encoding='utf-8')
+    assert '25 messages of /imu/data_raw are missing: published before the recorder' in page
+    assert ('Unusual in this bag' in page) == late
+
+
+@pytest.mark.slow
+def test_errors_after_stalls_are_told_apart(tmp_path):
+    """Nine times the error of a quiet machine, all of it after the stalls, was a good run."""
+    calm = STORIES['stalls']
+
+    class Shaken(Story):
+        def _motion(self, t):
+            v, w = super()._motion(t)
+            shaken = any(0.0 < t - start < 0.5 for start in (6.0, 12.0, 15.0))
+            return v + 0.01 * shaken, w
+
+    story = Shaken(**{**vars(calm), 'sentence': ''})
+    figures = write_report(story.write(tmp_path / 'bag'))
+    found = re.fullmatch(
+        r'The machine stalled 3 times, the longest 8\d ms at 12\.0 s: errors after them are not '
+        r"the controller's; settled RMSE (\S+) / \S+ rad/s, (\d+) times the 0\.012 rad/s that the "
+        r'digital twin is known to reach under these conditions, without the 1 s after them '
+        r'(\S+) / \S+ rad/s\.',
+        figures.verdict.sentence,
+    )
+    assert found, figures.verdict.sentence
+    assert float(found[1]) > 0.07
+    assert float(found[3]) == pytest.approx(0.01, rel=0.02)
+    assert (figures.verdict.kind, figures.verdict.slow) == ('bad', True)

@@ -38,6 +38,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     driven,
     format_number,
     path_distance,
+    settled,
     tracking_error,
 )
 from t3mpc_ros.evaluation.charts import Chart, Curve, Line, LineStyle, Plane, thinned
@@ -129,6 +130,7 @@ def error(run: Run, metrics: ReportMetrics) -> Shown:
     if not is_long(series):
         return
     moving = driven(series.time, run)
+    calm = moving & settled(series.time, run)
     lines, seen = [], []
     for wheel, (name, title, _, unit) in zip(WHEELS, run.channels, strict=True):
         found, text = metrics.wheels[name], UNMEASURED
@@ -144,11 +146,11 @@ def error(run: Run, metrics: ReportMetrics) -> Shown:
         seen.append(f'{title.capitalize()}: {text}.')
     if run.channels[0].unit == run.channels[1].unit:
         names = [each.name for each in run.channels]
-        extent = _extent_of(series, moving, names)
+        extent = _extent_of(series, calm, names)
         yield Chart('Error', run.channels[0].unit, lines, ' '.join(seen), extent)
         return
     for each, channel, text in zip(lines, run.channels, seen, strict=True):
-        extent = _extent_of(series, moving, [channel.name])
+        extent = _extent_of(series, calm, [channel.name])
         yield Chart(f'Error, {channel.title}', channel.unit, [each], text, extent)
 
 
@@ -473,14 +475,15 @@ SECTIONS = (
     Section(
         'Speeds and their references (Fig. 11)',
         'Wheel speeds are computed from the body twists by (1). Dashed vertical lines: switches '
-        '(grey), stops (red), stalls of the machine (violet), gaps (orange), jumps (turquoise).',
+        '(brown), stops (red), stalls of the machine (violet), gaps (grey), jumps (turquoise).',
         tracking,
     ),
     Section(
         'Tracking error over time',
         'Speed minus reference at the stamps of the measurement, over the whole recording. The '
-        'metrics count only the time in which the robot was driven, and so does the scale: before '
-        'and after it the line may leave the chart.',
+        'metrics count only the time in which the robot was driven. The scale is that of the '
+        'settled error: at switches and outside of the drive the line may leave the chart, until '
+        'a part of the time is selected.',
         error,
     ),
     Section(

@@ -315,7 +315,7 @@ def _beside(run: Run, figures: ReportMetrics, sections: Sequence[Section]) -> It
     """Yield the charts of some sections side by side."""
     charts = [chart for section in sections for chart in section.draw(run, figures)]
     if charts:
-        yield Heading('; '.join(section.title for section in sections))
+        yield Heading('Path, and distance from it')
         yield Group(charts, 'div', 'charts')
         yield from (Paragraph(section.caption_of(run), 'quiet') for section in sections)
 

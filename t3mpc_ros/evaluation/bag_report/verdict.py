@@ -47,6 +47,8 @@ MAX_ERROR = 0.25
 """Largest RMSE, settled, as a share of the root mean square of the reference."""
 MIN_COUNTED = 0.5
 """Least share of the drive in which errors count."""
+CALMER = 0.9
+"""Error without the time after stalls, as a share of that with it, below which it is told, too."""
 NEVER = 0.95
 """Share of the drive in which a robot stands that never moved."""
 ON_PATH = 0.05
@@ -319,7 +321,7 @@ def _slow_machine(run: Run, incidents: Incidents) -> Iterator[_Finding]:
         if REFERENCE in run.motions and not run.follows_path:
             whole, calm = settled_rmse(run), settled_rmse(run, spared=stalls)
             tail = _rmse_text(run, whole)
-            if all(map(math.isfinite, calm)) and calm != whole:
+            if max(calm) < CALMER * max(whole):
                 units = [each.unit for each in run.channels]
                 tail += f', without the 1 s after {after} {format_pair(calm, units)}'
         yield _Finding(
