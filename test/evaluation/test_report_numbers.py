@@ -1,5 +1,16 @@
 # Copyright 2026 The t3mpc_ros developers
-# SPDX-License-Identifier: Apache-2.0
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
 """Every number of a report, computed again from its bag with ``mcap`` and NumPy alone.
 
 By the words of docs/metrics.md, to the last printed digit. Nothing of the package is used but the
@@ -180,11 +191,14 @@ def stops_of(bag, measured):
     end = min(last, bag.time[REFERENCE][-1] - bag.lead)
     limits = np.array([0.05, 0.25])
     found = []
-    for a, b in stretches((np.abs(v) < 0.01) & (np.abs(w) < 0.05)):
+    still = (np.abs(v) < 0.01) & (np.abs(w) < 0.05)
+    for a, b in stretches((np.abs(v) < 0.03) & (np.abs(w) < 0.15)):
+        if still[a : b + 1].mean() < 0.5:
+            continue
         middle = 0.5 * (at[a] + at[b])
-        near = (time >= at[a] - 0.25) & (time <= at[b] + 0.25)
-        fast = near & (np.abs(twist) > limits).any(axis=1)
-        before, after = time[fast & (time < middle)], time[fast & (time > middle)]
+        fast = (np.abs(twist) > limits).any(axis=1)
+        before = time[fast & (np.abs(time - at[a]) <= 0.25) & (time < middle)]
+        after = time[fast & (np.abs(time - at[b]) <= 0.25) & (time > middle)]
         low = before[-1] if before.size else at[a]
         high = after[0] if after.size else at[b]
         near = (time >= low - 0.5) & (time <= low)

@@ -39,6 +39,8 @@ WINDOW = 0.2
 """Least smoothing width of speeds, s."""
 STILL = {'linear': 0.01, 'angular': 0.05}
 """Smoothed speeds (m/s, rad/s) below which the robot is at standstill."""
+HOLD = 3.0
+"""Speeds up to which a standstill lasts, in multiples of :data:`STILL`: those of noise."""
 DEMANDED = 2.0
 """Speed of a reference or command that asks for motion, in multiples of :data:`STILL`."""
 UNDER_WAY = 5.0
@@ -186,12 +188,12 @@ def smooth(series: Series, name: str) -> tuple[Array, Array]:
     return time, np.where(torn, np.nan, fitted)
 
 
-def still_rows(linear: Array, angular: Array) -> NDArray[np.bool_]:
-    """Return where smoothed speeds (m/s, rad/s) are those of a robot that stands."""
+def still_rows(linear: Array, angular: Array, factor: float = 1.0) -> NDArray[np.bool_]:
+    """Return where smoothed speeds (m/s, rad/s) are below ``factor`` times :data:`STILL`."""
     still: NDArray[np.bool_] = (
         np.isfinite(linear)
-        & (np.abs(linear) < STILL['linear'])
-        & (np.abs(angular) < STILL['angular'])
+        & (np.abs(linear) < factor * STILL['linear'])
+        & (np.abs(angular) < factor * STILL['angular'])
     )
     return still
 
@@ -206,22 +208,31 @@ def standstills(motion: Series) -> list[Span]:
     """Return start and end of each time in which a robot stood, however short, s."""
     time, linear = smooth(motion, 'linear')
     _, angular = smooth(motion, 'angular')
+    still = still_rows(linear, angular)
     found = []
-    for each in spans_of(still_rows(linear, angular)):
+    for each in spans_of(still_rows(linear, angular, HOLD)):
+        if np.mean(still[each]) < 0.5:
+            continue
         low, high = float(time[each][0]), float(time[each][-1])
-        middle = 0.5 * (low + high)
-        # Smoothing shortens a standstill and blurs its ends: those of the samples are sharper.
-        near = motion.between(low - 0.5 * BRAKING, high + 0.5 * BRAKING)
-        fast = np.any([np.abs(near[k]) > UNDER_WAY * least for k, least in STILL.items()], axis=0)
-        before, after = (
-            near.time[fast & (near.time < middle)],
-            near.time[fast & (near.time > middle)],
+        found.append(
+            (
+                _edge(motion, low, -1, 0.5 * (low + high)),
+                _edge(motion, high, 0, 0.5 * (low + high)),
+            )
         )
-        found.append((
-            float(before[-1]) if before.size else low,
-            float(after[0]) if after.size else high,
-        ))  # fmt: skip
     return merged(found)
+
+
+def _edge(motion: Series, at: float, which: int, middle: float) -> float:
+    """Return the last (-1) or first (0) sample of a moving robot about an end of a standstill, s.
+
+    Smoothing blurs the ends of a standstill: those of the samples are sharper. ``at`` itself where
+    the robot does not move within half of :data:`BRAKING`.
+    """
+    near = motion.between(at - 0.5 * BRAKING, at + 0.5 * BRAKING)
+    fast = np.any([np.abs(near[k]) > UNDER_WAY * least for k, least in STILL.items()], axis=0)
+    fast &= near.time < middle if which else near.time > middle
+    return float(near.time[fast][which]) if fast.any() else at
 
 
 def merged(spans: Sequence[Span], nearer: float = 0.0) -> list[Span]:
@@ -332,9 +343,10 @@ def find_blocked_wheels(run: Run) -> tuple[tuple[float, float, str], ...]:
 def find_stalls(run: Run) -> list[Span]:
     """Return the pauses of the loop that are longer than :data:`STALL_PERIODS` periods.
 
-    A pause is between two receipts of odometry without a command in between, or from odometry to
-    its command. Commands that go on are those of a machine that does, and so is the reference of a
-    robot behind a radio: there, a packet was lost.
+    A pause is between two receipts of odometry without a command in between, between two commands
+    of our controller although odometry comes, or from odometry to its command. Commands that
+    go on are those of a machine that does, and so is the reference of a robot behind a radio:
+    there, a packet was lost.
     """
     odometry, timing = run.receipts.get(ODOMETRY), run.timing.get(ODOMETRY)
     if odometry is None or timing is None or not timing.period > 0.0 or run.other_clock:
@@ -343,11 +355,17 @@ def find_stalls(run: Run) -> list[Span]:
     steps = np.diff(odometry)
     rows = np.flatnonzero((steps > least) & (steps < MIN_GAP)).tolist()
     found = [(float(odometry[k]), float(odometry[k + 1])) for k in rows]
+    commands = run.receipts.get(COMMAND) if run.ours else None
+    if commands is not None and commands.size > 2:
+        steps = np.diff(commands)
+        least = max(least, STALL_PERIODS * float(np.median(steps)))
+        rows = np.flatnonzero((steps > least) & (steps < MIN_GAP)).tolist()
+        pauses = [(float(commands[k]), float(commands[k + 1])) for k in rows]
+        found += [span for span in pauses if _received(odometry, *span)]
     going_on = [COMMAND, REFERENCE] if run.links or not run.ours else [COMMAND]
     others = [run.receipts[name] for name in going_on if name in run.receipts]
     found = [span for span in found if not any(_received(each, *span) for each in others)]
-    commands = run.receipts.get(COMMAND)
-    if commands is not None and run.ours:
+    if commands is not None:
         index = np.searchsorted(odometry, commands, 'right') - 1
         prompt = (index >= 0) & (np.diff(index, prepend=-1) > 0)
         late, asked = commands[prompt], odometry[index[prompt]]

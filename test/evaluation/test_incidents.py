@@ -1,0 +1,194 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Stops, stalls, blocked wheels and jumps of a run are found, and nothing else is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.report_run import RUN
+
+from t3mpc_ros.evaluation.bag_report.incidents import (
+    STALL_PERIODS,
+    find_blocked_wheels,
+    find_incidents,
+    find_stalls,
+    find_stops,
+)
+from t3mpc_ros.evaluation.bag_report.run_data import Series, Timing
+from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+
+TIME = 0.01 * np.arange(4000)
+GEOMETRY = WheelGeometry()
+BRAKING = 0.1
+ESTOP = 'error', 'robot', 'emergency stop: a'
+
+
+def motion(right, left):
+    """Return the motion of wheel speeds, rad/s."""
+    linear = 0.5 * GEOMETRY.wheel_radius * (right + left)
+    angular = GEOMETRY.wheel_radius * (right - left) / GEOMETRY.wheel_separation
+    x = 0.01 * np.cumsum(linear)
+    values = {'linear': linear, 'angular': angular, 'right': right, 'left': left}
+    return Series(TIME, values | {'x': x, 'y': 0.0 * x, 'yaw': 0.0 * x})
+
+
+def wheels(rng):
+    """Return speeds of a reference that never stands still for long."""
+    phase = rng.uniform(0.0, 6.0, 4)
+    right = 4.0 + 2.0 * np.sin(0.9 * TIME + phase[0]) + np.sin(2.3 * TIME + phase[1])
+    return right, 4.0 + 2.0 * np.sin(0.7 * TIME + phase[2]) + np.sin(1.9 * TIME + phase[3])
+
+
+def run_of(wanted, moved, commanded=None, **changes):
+    motions = {
+        REFERENCE: motion(*wanted),
+        ODOMETRY: motion(*moved),
+        COMMAND: motion(*(wanted if commanded is None else commanded)),
+    }
+    receipts = dict.fromkeys(motions, TIME)
+    whole = {'motions': motions, 'receipts': receipts, 'switches': np.empty(0), 'links': ()}
+    return replace(RUN, **(whole | {'lead': 0.0} | changes))
+
+
+def standing(speeds, spans):
+    """Return the speeds of a robot that brakes and then stands in spans."""
+    share = np.ones(TIME.size)
+    for start, end in spans:
+        share *= np.where((start <= TIME) & (end > TIME),
+                          np.clip(1.0 - (TIME - start) / BRAKING, 0.0, 1.0), 1.0)  # fmt: skip
+    return [share * each for each in speeds]
+
+
+@pytest.mark.parametrize('seed', range(12))
+@pytest.mark.parametrize('noise', [0.0, 0.2])
+def test_each_stop_is_found_with_its_begin_and_end(seed, noise):
+    """Also by odometry with the noise of the paper, 0.2 rad/s at each wheel."""
+    rng = np.random.default_rng(seed)
+    starts = np.cumsum(rng.uniform(4.0, 9.0, rng.integers(0, 5)))
+    spans = [(t, t + rng.uniform(0.8, 3.0)) for t in starts.tolist()]
+    wanted = wheels(rng)
+    speeds = [each + noise * rng.normal(size=TIME.size) for each in standing(wanted, spans)]
+    found = find_stops(run_of(wanted, speeds))
+    assert len(found) == len(spans)
+    for stop, (start, end) in zip(found, spans, strict=True):
+        assert stop.start == pytest.approx(start, abs=0.08)
+        assert stop.end == pytest.approx(end, abs=0.08)
+
+
+@pytest.mark.parametrize('delay', [0.0, 0.1, 0.3])
+def test_a_robot_that_stands_because_it_is_to_is_not_stopped(delay):
+    """The reference pauses, and the robot with it, though later."""
+    rng = np.random.default_rng(3)
+    wanted = standing(wheels(rng), [(10.0, 13.0), (20.0, 20.6)])
+    late = round(delay / 0.01)
+    moved = [np.concatenate([np.full(late, each[0]), each])[: TIME.size] for each in wanted]
+    assert find_stops(run_of(wanted, moved)) == ()
+    # Without a reference, likewise by the command.
+    run = run_of(wanted, moved)
+    motions = {name: each for name, each in run.motions.items() if name != REFERENCE}
+    assert find_stops(replace(run, motions=motions)) == ()
+
+
+def test_a_drive_that_is_over_is_no_stop_unless_a_node_says_why():
+    wanted = wheels(np.random.default_rng(4))
+    moved = standing(wanted, [(30.0, 99.0)])
+    run = run_of(wanted, moved, commanded=moved)
+    assert find_stops(run) == ()
+    (stop,) = find_stops(replace(run, changes=((30.4, *ESTOP),)))
+    assert stop.cause.name == 'E-stop'
+    assert (stop.start, stop.end) == pytest.approx((30.0, TIME[-1]), abs=0.15)
+    # The reference is stamped ahead: what is left of it when its generator ends is no demand.
+    assert find_stops(replace(run, changes=((30.4, *ESTOP),), lead=9.8)) == ()
+
+
+def test_a_short_stop_counts_where_it_was_commanded():
+    wanted = wheels(np.random.default_rng(5))
+    moved = standing(wanted, [(10.0, 10.4)])
+    zero = [np.where((TIME >= 10.0) & (TIME < 10.4), 0.0, each) for each in wanted]
+    assert find_stops(run_of(wanted, moved)) == ()
+    (stop,) = find_stops(run_of(wanted, moved, commanded=zero))
+    assert (stop.start, stop.end) == pytest.approx((10.0, 10.4), abs=0.05)
+    # A command of zero that the robot has no time to follow is none.
+    assert find_stops(run_of(wanted, wanted, commanded=zero)) == ()
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_stalls_are_counted_and_jitter_is_none(seed):
+    rng = np.random.default_rng(seed)
+    received = TIME + rng.uniform(0.0, 0.02, TIME.size)  # up to two periods late
+    received.sort()
+    rows = np.sort(rng.choice(np.arange(50, 3800, 200), rng.integers(0, 6), replace=False))
+    lengths = rng.uniform(0.08, 1.5, rows.size)
+    stalls = []
+    for row, length in zip(rows.tolist(), lengths.tolist(), strict=True):
+        start = received[row]
+        late = (received > start) & (received < start + length)
+        received[late] = start + length
+        stalls.append((start, start + length))
+    run = run_of(wheels(rng), wheels(rng), receipts={
+        ODOMETRY: received, COMMAND: received + 0.001, REFERENCE: TIME,
+    }, timing={ODOMETRY: Timing(TIME.size, 0.01, 0.0, 0.0)})  # fmt: skip
+    found = find_stalls(run)
+    assert [start for start, _ in found] == pytest.approx([start for start, _ in stalls])
+    for (_, end), (_, expected) in zip(found, stalls, strict=True):
+        assert expected - 1e-9 <= end <= expected + 0.03
+    assert all(end - start > STALL_PERIODS * 0.01 for start, end in found)
+    # Simulated time relates to no time of the machine.
+    assert find_stalls(replace(run, other_clock=True)) == []
+
+
+def test_a_lost_packet_is_no_stall():
+    """Odometry pauses, and the commands with it; the reference of the host goes on."""
+    kept = ~((TIME > 10.0) & (TIME < 10.3))
+    receipts = {ODOMETRY: TIME[kept], COMMAND: TIME[kept] + 0.001, REFERENCE: TIME}
+    speeds = wheels(np.random.default_rng(1))
+    timing = {ODOMETRY: Timing(TIME.size, 0.01, 0.0, 0.0)}
+    run = run_of(speeds, speeds, receipts=receipts, timing=timing)
+    assert find_stalls(run) == [pytest.approx((10.0, 10.3), abs=2e-3)]
+    assert find_stalls(replace(run, links=RUN.links)) == []
+    silent = {**receipts, REFERENCE: TIME[kept]}
+    assert find_stalls(replace(run, links=RUN.links, receipts=silent))
+    # Nor does a controller stall that misses some samples: its commands pause.
+    late = np.where((TIME > 20.0) & (TIME < 20.1), TIME + 0.2, TIME + 0.001)
+    slow = {ODOMETRY: TIME, COMMAND: np.sort(late), REFERENCE: TIME}
+    assert find_stalls(replace(run, receipts=slow))
+
+
+@pytest.mark.parametrize('wheel', ['right', 'left'])
+def test_a_blocked_wheel_is_named(wheel):
+    wanted = wheels(np.random.default_rng(2))
+    moved = [each.copy() for each in wanted]
+    moved[wheel == 'left'][(TIME > 12.0) & (TIME < 15.0)] = 0.0
+    ((start, end, name),) = find_blocked_wheels(run_of(wanted, moved))
+    assert (start, end) == pytest.approx((12.0, 15.0), abs=0.15)
+    assert name == f'{wheel} wheel'
+    both = standing(wanted, [(12.0, 15.0)])
+    assert find_blocked_wheels(run_of(wanted, both)) == (), 'that is a stop'
+    assert find_blocked_wheels(run_of(wanted, wanted)) == ()
+
+
+def test_nothing_happens_in_a_run_without_an_incident():
+    speeds = wheels(np.random.default_rng(9))
+    found = find_incidents(run_of(speeds, speeds))
+    assert found.events() == []
+    assert found.stopped == 0.0
+    for gone in (REFERENCE, ODOMETRY, COMMAND):
+        run = run_of(speeds, speeds)
+        few = {name: each for name, each in run.motions.items() if name != gone}
+        assert find_incidents(replace(run, motions=few)).events() == []
+        one = {**run.motions, gone: Series(TIME[:1], {
+            name: each[:1] for name, each in run.motions[gone].values.items()})}  # fmt: skip
+        find_incidents(replace(run, motions=one))
