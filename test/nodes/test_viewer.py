@@ -210,6 +210,9 @@ def test_a_drawn_path_reaches_the_reference_and_no_later_one(viewer, harness):
     viewer.spin_until(lambda: time.monotonic() > ended)
     listen()
     viewer.spin_until(lambda: viewer.node._path_publisher.get_subscription_count())
+    given = time.monotonic() + 1.0  # an old path would come within milliseconds
+    viewer.spin_until(lambda: time.monotonic() > given)
+    assert len(paths) == 2
     assert viewer.command('path', points=[[3.0, 3.0]])
     viewer.spin_until(lambda: len(paths) > 2)
     assert [len(each.poses) for each in paths] == [2, 1, 1]
