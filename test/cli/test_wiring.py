@@ -218,6 +218,7 @@ VIEW = {
     'nodes.viewer.view_node': context(SimpleNamespace(spin=lambda stop: None, command=print)),
     'view.server.PageServer': context(SimpleNamespace(url='http://page')),
     'cli.recorded_run.recorded_run': 'run',
+    'cli.run_recorder.RunRecorder': SimpleNamespace(close=lambda: None),
 }
 GRAPH = MagicMock()
 GRAPH.topics.return_value = {'/odom': ['nav_msgs/msg/Odometry']}
@@ -442,6 +443,7 @@ TABLE = {
             '--namespace r1': {'view_node.namespace': 'r1'},
             '--port 0': {'PageServer.port': 0},
             '--read-only': {'PageServer.command': None},
+            '--runs new': {'RunRecorder.runs': 'new'},
             '--headless': {'browser': None},
         },
     ),

@@ -19,6 +19,7 @@ Every quantity of the runs has a value of its own, so that any two that are exch
 from dataclasses import replace
 from itertools import product
 import math
+import re
 from types import SimpleNamespace
 
 from matplotlib.colors import to_hex
@@ -415,7 +416,14 @@ def test_differences_of_methods_are_coloured_by_their_verdict(caught):
     plan = ComparisonPlan(Scenario('servo', 'nominal', 1), ('nominal',), methods, (1, 2, 3))
 
     rows = [
-        {'controller': name, 'case': 'nominal', 'seed': seed, 'settled': 1.0 + n, 'overall': 2.0}
+        {
+            'controller': name,
+            'case': 'nominal',
+            'seed': seed,
+            'settled': 1.0 + n,
+            'overall': 2.0,
+            'variation': 9.0,
+        }
         for name, shift in {'feed-forward': None, **apart}.items()
         for seed, n in enumerate(0.0 * noise if shift is None else shift + noise)
     ]
@@ -431,7 +439,8 @@ def test_differences_of_methods_are_coloured_by_their_verdict(caught):
         assert middles == pytest.approx(np.mean(noise) + shift)
         assert half == pytest.approx(interval(noise))
         assert to_hex(container.lines[0].get_color()) == colour
-        assert f'{1.0 + shift + np.mean(noise):.4f} {verdict}' in page
+        value = f'{1.0 + shift + np.mean(noise):.4f}'
+        assert re.search(rf'{value} ±[^"]*{verdict}', page)
         stored = comparison_page.record(plan, results)['cases']['nominal']['methods'][name]
         assert stored['difference_from_feed_forward']['settled']['verdict'] == verdict
     assert axis.get_xlabel() == 'settled / (rad/s)'

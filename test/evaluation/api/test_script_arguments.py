@@ -104,7 +104,7 @@ def seen(value):
     return value
 
 
-LINKS = t3.LinkFaults(0.2, (0.01, 0.03), 0.2, (0.0, 0.02), 0.2, 1.5)
+LINKS = t3.LinkFaults(0.2, (0.01, 0.03), 0.2, (0.0, 0.02), begin=0.2, lasting=1.5)
 BLOCK = t3.FaultEvent(2.5, 'wheel_blocked', 'right', 0.5)
 SIMULATED = {
     'reference': wave, 'plant': 'torque', 'noise': 0.0, 'faults': LINKS, 'duration': 3.0,
@@ -184,10 +184,12 @@ TABLE = {
     ),
     'LinkFaults': (lambda **given: run(faults=t3.LinkFaults(**given)), {
         'command_loss': 0.3, 'command_delay': (0.0, 0.02), 'odometry_loss': 0.2,
-        'odometry_delay': (0.0, 0.02),
+        'odometry_delay': (0.0, 0.02), 'odometry_swapped': 3, 'odometry_repeated': 2,
+        'odometry_kept': 2,
     }, {
         'command_loss': 0.6, 'command_delay': (0.05, 0.08), 'odometry_loss': 0.5,
         'odometry_delay': (0.05, 0.08), 'begin': 0.5, 'lasting': 0.5,
+        'odometry_swapped': 5, 'odometry_repeated': 3, 'odometry_kept': 3,
     }),
     'NoiseLaw': (
         lambda **given: run(noise=t3.NoiseLaw(**given)), {'draw': quiet, 'variance': 0.01},
