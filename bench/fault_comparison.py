@@ -38,7 +38,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from t3mpc_ros.control.controller import Controller
-from t3mpc_ros.control.input_monitor import InputMonitor
+from t3mpc_ros.control.odometry_plausibility import InputMonitor
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.drivers import NodeDriver, NodeMethod

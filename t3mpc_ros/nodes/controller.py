@@ -35,7 +35,7 @@ from t3mpc_ros.control.controller import (
     Status,
     StepperControllerParameters,
 )
-from t3mpc_ros.control.input_monitor import NAMES, InputMonitor
+from t3mpc_ros.control.odometry_plausibility import NAMES, InputMonitor
 from t3mpc_ros.control.watchdog import TRIALS, Reason
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, STANDSTILL, BodyTwist

@@ -19,7 +19,7 @@ import re
 import numpy as np
 import pytest
 
-from t3mpc_ros.control.input_monitor import InputMonitor
+from t3mpc_ros.control.odometry_plausibility import InputMonitor
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
 

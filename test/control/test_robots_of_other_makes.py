@@ -26,7 +26,7 @@ import yaml
 
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
-from t3mpc_ros.control.input_monitor import InputMonitor
+from t3mpc_ros.control.odometry_plausibility import InputMonitor
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, BodyTwist, Pose, State
 

@@ -19,10 +19,9 @@ from statistics import median
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, State, wrap_angle
+from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, State, wrap_angle
 
 MAX_DELAY, MAX_LEAD = 0.3, 0.05
 """Offset of odometry stamps from the node's clock beyond which the clocks differ, s."""
@@ -30,8 +29,6 @@ MAX_SIMULATED_OFFSET = 5.0
 """The same with simulated time, which may pass many times faster than messages travel, s."""
 RATE_TOLERANCE = 0.2
 """Relative difference between measured and set rate that is reported."""
-
-Array = npt.NDArray[np.float64]
 
 GAP = 1.7
 """Interval from which a message is missing, in periods: with a jitter of 30 % none reaches it."""
