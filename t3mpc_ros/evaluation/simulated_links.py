@@ -37,16 +37,24 @@ class LinkFaults:
     """Fraction of the measurements that is lost."""
     odometry_delay: tuple[float, float] = (0.0, 0.0)
     """Least and largest delay of a measurement, s; they arrive in order but for the swapped."""
+    begin: float = 0.0
+    """Begin of the faults, as a share of the run."""
+    lasting: float = math.inf
+    """Duration of the faults, s."""
     odometry_swapped: int = 0
     """Of so many measurements each the last arrives after its successor; 0: none."""
     odometry_repeated: int = 1
     """How often each measurement arrives."""
     odometry_kept: int = 1
     """Of so many measurements each only the last is sent: a lower rate than the nodes assume."""
-    begin: float = 0.0
-    """Begin of the faults, as a share of the run."""
-    lasting: float = math.inf
-    """Duration of the faults, s."""
+
+    def __post_init__(self) -> None:
+        for name, least in (('swapped', 0), ('repeated', 1), ('kept', 1)):
+            count = getattr(self, f'odometry_{name}')
+            if isinstance(count, bool) or not isinstance(count, int) or count < least:
+                raise ValueError(
+                    f'odometry_{name} must be a whole number of at least {least}: got {count!r}'
+                )
 
     def span(self, duration: float) -> tuple[float, float]:
         """Return begin and end (s) of the faults in a run of ``duration`` seconds."""

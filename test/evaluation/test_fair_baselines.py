@@ -502,3 +502,21 @@ def test_a_table_says_how_many_seeds_and_what_each_method_knows():
     assert {'commit', 'machine'} <= {*written['origin']}
     runs = written['cases']['nominal']['methods'][FULL]['runs']
     assert [each['seed'] for each in runs] == [201, 202]
+
+
+@pytest.mark.parametrize(
+    ('name', 'least', 'values'),
+    [
+        ('odometry_swapped', 0, (-1, 2.0, True)),
+        ('odometry_repeated', 1, (0, -2, 1.5)),
+        ('odometry_kept', 1, (0, -1, 2.5)),
+    ],
+)
+def test_counts_of_disordered_reports_are_whole_and_possible(name, least, values):
+    """None kept was a division by zero; none repeated, a robot that never moved."""
+    LinkFaults(**{name: least})
+    for value in values:
+        with pytest.raises(
+            ValueError, match=rf'{name} must be a whole number of at least {least}'
+        ):
+            LinkFaults(**{name: value})

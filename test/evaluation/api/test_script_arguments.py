@@ -104,7 +104,7 @@ def seen(value):
     return value
 
 
-LINKS = t3.LinkFaults(0.2, (0.01, 0.03), 0.2, (0.0, 0.02), begin=0.2, lasting=1.5)
+LINKS = t3.LinkFaults(0.2, (0.01, 0.03), 0.2, (0.0, 0.02), 0.2, 1.5)
 BLOCK = t3.FaultEvent(2.5, 'wheel_blocked', 'right', 0.5)
 SIMULATED = {
     'reference': wave, 'plant': 'torque', 'noise': 0.0, 'faults': LINKS, 'duration': 3.0,
