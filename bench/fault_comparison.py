@@ -80,8 +80,8 @@ class Fault:
     """Duration of the events, s."""
     begin: float = 2.0
     """When the fault shows, s."""
-    forward_send: Send | None = None
-    """The same for feed-forward, where its reports differ: it has no ``rate``."""
+    forward_links: LinkFaults | None = None
+    """Links of feed-forward, where they differ: it has no ``rate``."""
 
 
 def with_twist(change: Callable[[BodyTwist], BodyTwist]) -> Send:
@@ -101,19 +101,6 @@ def with_pose(changed: Callable[[Any, int, Any], Mapping[str, float]]) -> Send:
         odometry = state.odometry
         pose = odometry.pose._replace(**changed(link, k, odometry.pose))
         return [state._replace(odometry=odometry._replace(pose=pose))]
-
-    return send
-
-
-def swapped(every: int) -> Send:
-    """Return a fault: of each ``every`` reports, the last arrives after its successor."""
-
-    def send(link: Any, k: int, state: RobotState) -> list[RobotState]:
-        if k % every == 0:
-            link.kept = state
-            return []
-        kept, link.kept = link.kept, None
-        return [state] if kept is None else [state, kept]
 
     return send
 
@@ -147,14 +134,14 @@ AFTER = BEGIN * RATE
 FAULTS: Mapping[str, Fault] = {
     'none': Fault(),
     # messages of the odometry
-    'one pair swapped': Fault(send=swapped(round(AFTER)), begin=BEGIN),
-    'a pair swapped every 0.2 s': Fault(send=swapped(20)),
-    'every third swapped': Fault(send=swapped(3)),
-    'each message twice': Fault(send=lambda link, k, state: [state, state]),
-    'half the rate': Fault(send=lambda link, k, state: [state] if k % 2 else []),
-    'a fifth of the rate': Fault(send=lambda link, k, state: [] if k % 5 else [state]),
+    'one pair swapped': Fault(links=LinkFaults(odometry_swapped=round(AFTER)), begin=BEGIN),
+    'a pair swapped every 0.2 s': Fault(links=LinkFaults(odometry_swapped=20)),
+    'every third swapped': Fault(links=LinkFaults(odometry_swapped=3)),
+    'each message twice': Fault(links=LinkFaults(odometry_repeated=2)),
+    'half the rate': Fault(links=LinkFaults(odometry_kept=2)),
+    'a fifth of the rate': Fault(links=LinkFaults(odometry_kept=5)),
     'rate set to 50, odometry has 100 Hz': Fault(
-        assumed={'rate': 50.0}, forward_send=lambda link, k, state: [state] if k % 2 else []
+        assumed={'rate': 50.0}, forward_links=LinkFaults(odometry_kept=2)
     ),
     'rate set to 200, odometry has 100 Hz': Fault(assumed={'rate': 200.0}),
     'one in five lost in bursts': Fault(
@@ -328,11 +315,12 @@ def run_job(pair: tuple[Job, Job]) -> tuple[Numbers, list[tuple[float, str]]]:
     events = [
         FaultEvent(BEGIN, name, value, fault.lasting) for name, value in fault.events.items()
     ]
-    own = OwnParts(robot_parameters=fault.changes, events=events, links=fault.links)
-    scenario = Scenario('twin', 'nominal', job.seed, DURATION, own=own)
     method: Any = methods_for('twin')[job.name]
-    send = fault.send if isinstance(method, NodeMethod) else fault.forward_send or fault.send
-    kind = type('Faulty', (Link,), {'send_changed': send or (lambda link, k, one: [one])})
+    links = fault.links if isinstance(method, NodeMethod) else fault.forward_links or fault.links
+    own = OwnParts(robot_parameters=fault.changes, events=events, links=links)
+    scenario = Scenario('twin', 'nominal', job.seed, DURATION, own=own)
+    send = fault.send or (lambda link, k, state: [state])
+    kind = type('Faulty', (Link,), {'send_changed': send})
     if isinstance(method, NodeMethod):
         method = Watched(NodeMethod(job.name, {**method.changes, **fault.assumed}))
     with patch.object(loop, 'ReportLink', kind):
