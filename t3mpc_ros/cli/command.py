@@ -71,15 +71,12 @@ class RemovedOption(argparse.Action):
 def run_command(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
     """Return the exit code of the chosen subcommand: its own, or 1 after an error.
 
-    A wrong command line ends the program with 2, Ctrl-C gives 130. Each subcommand sets ``run``,
+    A wrong command line ends the program with 2. Each subcommand sets ``run``,
     which takes the options and returns the exit code.
     """
     options = parser.parse_args(arguments)
     try:
         code: int = options.run(options)
-    except KeyboardInterrupt:
-        print('stopped', file=sys.stderr)
-        return 130
     except (OSError, RuntimeError, ValueError) as error:
         print(f'error: {sentence(error)}', file=sys.stderr)
         return 1

@@ -86,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.experiment import print_report
 
     plan = _plan(options)
-    run_options.prepare_outputs(options)
+    run_options.prepare_outputs(options, options.csv)
     with run_options.executor_of(options) as executor:
         results = run_plan(plan, executor, print_report)
     times = step_times(plan, time.perf_counter_ns)

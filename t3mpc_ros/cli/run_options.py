@@ -107,9 +107,9 @@ def add_outputs(
     parser.add_argument('--html', type=Path, help='write one page to this file')
 
 
-def prepare_outputs(options: argparse.Namespace) -> None:
+def prepare_outputs(options: argparse.Namespace, *further: Path | None) -> None:
     """Make the folders of the files: one that cannot be made is an error before the runs."""
-    for path in (options.json, options.html):
+    for path in (options.json, options.html, *further):
         if path:
             path.parent.mkdir(parents=True, exist_ok=True)
 

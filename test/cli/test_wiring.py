@@ -919,3 +919,13 @@ def test_what_arrives_is_printed_at_once(command, monkeypatch, tmp_path):
         assert main(['topic', command, '/odom']) == 0
     assert seen[1]
     assert seen[1] != seen[2]
+
+
+@pytest.mark.parametrize('option', ['--json', '--html', '--csv'])
+def test_a_folder_that_cannot_be_made_ends_it_before_the_runs(option, observed):
+    """A path below a file was found out after an hour of runs."""
+    Path('a_file').write_text('')
+    found = observed(f'compare {option} a_file/new', TABLE['compare'][0])
+    assert found['code'] == 1
+    assert 'a_file' in found['error']
+    assert not [path for path in found if path.startswith('run_plan')]
