@@ -13,8 +13,6 @@
 # limitations under the License.
 """Driving over the USB of the robot board: the session, key, limits and stops of the radio."""
 
-import math
-
 import pytest
 from support.emulator_bench import MS, START_NS, Bench, RobotBench, check_followed
 from support.long_tests import few_of
@@ -27,7 +25,6 @@ from t3mpc_ros.radio.protocol import codec, frames
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 
 KEY = bytes(range(16))
-STEP = math.tau / 3200
 
 
 class CableEmulator(Emulator):
@@ -78,12 +75,8 @@ def test_a_robot_drives_over_its_cable_as_over_the_radio(bench):
     assert (quality.dongle_resets, quality.collisions, quality.malformed) == (0, 0, 0)
     print(f'round trip {1e3 * quality.round_trip_median:.2f} ms')
     assert quality.round_trip_p99 < 0.01
-    bench.drive(0.0, 0.0)
-    bench.run(0.6)
-    bench.release_controls()
-    bench.run(1.0)
-    right, left = bench.link.telemetry.angles
-    assert (round(left / STEP), round(right / STEP)) == bench.plant.pulses
+    bench.run_to_rest()
+    assert bench.counted_pulses == bench.plant.pulses
     bench.link.shut_down()
     bench.run(2.0, lambda: bench.link.state is LinkState.DONE)
     assert not bench.board.powered
@@ -240,15 +233,10 @@ def test_no_distance_is_lost_while_the_host_is_suspended(seconds, phase):
     made.connect()
     made.drive(6.0, 4.5)
     made.run(1.0 + 0.02 * phase)
-    made.now_ns += round(seconds * 1e9)
-    made._step(b''.join(data for _, data in made.emulator.run_to(made.now_ns)))
+    made.suspend(seconds)
     made.run(0.5)
-    made.drive(0.0, 0.0)
-    made.run(0.6)
-    made.release_controls()
-    made.run(1.0)
-    right, left = made.link.telemetry.angles
-    assert (round(left / STEP), round(right / STEP)) == made.plant.pulses
+    made.run_to_rest()
+    assert made.counted_pulses == made.plant.pulses
     quality = made.link.quality(made.now_ns)
     assert (quality.robot_resets, quality.dongle_resets) == (0, 0)
 

@@ -28,13 +28,6 @@ from t3mpc_ros.radio.link.port_actions import LinkState
 pytestmark = pytest.mark.slow
 
 KEY = bytes(range(16))
-STEP = math.tau / 3200
-
-
-def run_to_rest(bench):
-    """Stop the robot, and run until its final state has arrived."""
-    bench.release_controls()
-    bench.run(2.0)
 
 
 def test_counters_equal_the_pulses_of_the_plant():
@@ -44,10 +37,9 @@ def test_counters_equal_the_pulses_of_the_plant():
         bench.drive(5.0 * math.sin(0.7 * second), 6.0 * math.cos(0.4 * second))
         bench.run(1.0)
         assert bench.link.reason(bench.now_ns) == ''
-    run_to_rest(bench)
-    right, left = bench.link.telemetry.angles
+    bench.run_to_rest()
     pulses = bench.plant.pulses
-    assert (round(left / STEP), round(right / STEP)) == pulses
+    assert bench.counted_pulses == pulses
     assert bench.board.counters == pulses
     assert min(map(abs, pulses)) > 1000
     quality = bench.link.quality(bench.now_ns)

@@ -17,7 +17,7 @@ from itertools import product
 import math
 
 import pytest
-from support.emulator_bench import MS, START_NS, Bench, check_followed
+from support.emulator_bench import MS, START_NS, STEP, Bench, check_followed
 from support.long_tests import few_of
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
@@ -25,7 +25,6 @@ from t3mpc_ros.emulator.link.radio_channel import Medium, RadioParameters, Trans
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
 
-STEP = math.tau / 3200
 KEYS = bytes(range(16)), bytes(range(16, 32))
 
 

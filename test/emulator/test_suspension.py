@@ -23,7 +23,6 @@ from support.long_tests import few_of
 
 from t3mpc_ros.radio.link.port_actions import LinkState
 
-STEP = math.tau / 3200
 CYCLE_NS = 20 * MS
 PHASES = 20
 USUAL_PHASES = 5
@@ -37,25 +36,6 @@ def a_moving_robot(**given):
     bench.drive(6.0, 4.5)
     bench.run(1.5)
     return bench
-
-
-def suspend(bench, seconds):
-    """Stop the host, like SIGSTOP; what arrives meanwhile waits in the buffer of the port."""
-    bench.now_ns += round(seconds * 1e9)
-    waiting = bench.emulator.run_to(bench.now_ns)
-    bench._step(b''.join(data for _, data in waiting))
-
-
-def run_to_rest(bench):
-    bench.drive(0.0, 0.0)
-    bench.run(0.6)
-    bench.release_controls()
-    bench.run(1.0)
-
-
-def pulses_of(bench):
-    right, left = bench.link.telemetry.angles
-    return round(left / STEP), round(right / STEP)
 
 
 def resets(bench):
@@ -88,10 +68,10 @@ def test_no_distance_is_lost_while_the_host_is_suspended(seconds, publishes, pha
         if not publishes:
             bench.release_controls()
         bench.run(phase / PHASES * CYCLE_NS / 1e9 + 1e-6)
-        suspend(bench, seconds)
+        bench.suspend(seconds)
         bench.run(0.5)
-        run_to_rest(bench)
-        assert pulses_of(bench) == bench.plant.pulses, phase
+        bench.run_to_rest()
+        assert bench.counted_pulses == bench.plant.pulses, phase
         assert min(bench.plant.pulses) > 500
         assert resets(bench) == (0, 0)
         assert bench.link.quality(bench.now_ns).sessions == 1
@@ -101,7 +81,7 @@ def test_a_suspended_host_repeats_no_command():
     """It wakes up with the result of an old cycle: the robot follows new commands only."""
     bench = a_moving_robot()
     followed = len(bench.followed)
-    suspend(bench, 2.0)
+    bench.suspend(2.0)
     bench.release_controls()
     bench.run(1.0)
     late = bench.followed[followed + 1 :]  # one may have been under way
@@ -114,8 +94,8 @@ def test_a_stalled_line_is_neither_a_restart_nor_a_lost_distance():
         bench.run(phase / PHASES * CYCLE_NS / 1e9 + 1e-6)
         bench.inject('stall', seconds)
         bench.run(seconds + 3.0)
-        run_to_rest(bench)
-        assert pulses_of(bench) == bench.plant.pulses, (phase, seconds)
+        bench.run_to_rest()
+        assert bench.counted_pulses == bench.plant.pulses, (phase, seconds)
         assert resets(bench) == (0, 0)
 
 
@@ -126,16 +106,16 @@ def test_every_restart_of_the_robot_is_counted_once(times):
     for _ in range(times):
         bench.inject('robot_reset', 0.1)
         bench.emulator.run_to(bench.now_ns + 400 * MS)
-        suspend(bench, 0.4)
+        bench.suspend(0.4)
     bench.run(3.0, lambda: bench.link.state is LinkState.RUN)
     bench.run(0.2)
     assert resets(bench) == (times, 0)
     # Its counters began at 0 again, and what it has issued since is complete.
-    before = pulses_of(bench)
+    before = bench.counted_pulses
     issued = bench.plant.pulses
     bench.run(1.0)
-    run_to_rest(bench)
-    after, now = pulses_of(bench), bench.plant.pulses
+    bench.run_to_rest()
+    after, now = bench.counted_pulses, bench.plant.pulses
     assert np.subtract(after, before) == pytest.approx(np.subtract(now, issued), abs=200)
 
 
@@ -163,7 +143,7 @@ def test_a_restart_in_motion_is_named_with_what_is_unknown(phase):
 
 def test_a_restart_at_rest_leaves_nothing_unknown():
     bench = a_moving_robot()
-    run_to_rest(bench)
+    bench.run_to_rest()
     before = bench.states[-1]
     bench.inject('robot_reset', 0.3)
     bench.run(3.0, lambda: bench.link.robot_resets == 1)
@@ -180,8 +160,8 @@ def test_a_restart_of_the_dongle_is_no_restart_of_the_robot(suspended):
     bench = a_moving_robot()
     bench.inject('dongle_reset')
     if suspended:
-        suspend(bench, 3.0)
+        bench.suspend(3.0)
     bench.run(4.0)
-    run_to_rest(bench)
+    bench.run_to_rest()
     assert resets(bench) == (0, 1)
-    assert pulses_of(bench) == bench.plant.pulses
+    assert bench.counted_pulses == bench.plant.pulses

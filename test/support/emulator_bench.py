@@ -13,6 +13,7 @@
 # limitations under the License.
 """Bench of the host link against the emulator in virtual time."""
 
+import math
 import random
 
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
@@ -30,6 +31,9 @@ MS = 1_000_000
 START_NS = 5_000_000_000
 TTL_AND_SLACK = 0.25
 """s"""
+
+STEP = math.tau / 3200
+"""Turn of a wheel by a microstep, rad."""
 
 
 class Bench:
@@ -163,6 +167,25 @@ class Bench:
     def release_controls(self):
         """Send no more setpoints."""
         self.wheels = None
+
+    def suspend(self, seconds):
+        """Stop the host, like SIGSTOP; what arrives meanwhile waits in the buffer of the port."""
+        self.now_ns += round(seconds * 1e9)
+        waiting = self.emulator.run_to(self.now_ns)
+        self._step(b''.join(data for _, data in waiting))
+
+    def run_to_rest(self):
+        """Drive to standstill, and send no more setpoints."""
+        self.drive(0.0, 0.0)
+        self.run(0.6)
+        self.release_controls()
+        self.run(1.0)
+
+    @property
+    def counted_pulses(self):
+        """Microsteps, right and left, as the telemetry of the robot has them."""
+        right, left = self.link.telemetry.angles
+        return round(left / STEP), round(right / STEP)
 
     def kill(self):
         """Stop the host at once, like SIGKILL."""
