@@ -34,6 +34,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
 from support.robot_page import FOCUS, LATCHED, RobotPage  # noqa: E402
 
+from t3mpc_ros.cli.private_graph import PrivateGraph  # noqa: E402
 from t3mpc_ros.cli.process_group import ProcessGroup  # noqa: E402
 
 TABS = (1, 2, 6, 7, 12)
@@ -133,9 +134,8 @@ def main() -> int:
     parser.add_argument('--count', type=int, default=20, help='stops of each condition')
     parser.add_argument('--json', type=Path)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {'ROS_DOMAIN_ID': str(120 + os.getpid() % 80)}
-        processes = ProcessGroup(Path(folder), environment)
+    with PrivateGraph() as graph, tempfile.TemporaryDirectory() as folder:
+        processes = ProcessGroup(Path(folder), graph.environment())
         page = None
         try:
             page = WatchedPage(processes)

@@ -19,7 +19,6 @@ Usage: page_images.py [--output FOLDER]; needs Chromium with its driver. Starts 
 """
 
 import argparse
-import os
 from pathlib import Path
 import sys
 import tempfile
@@ -30,6 +29,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
 from support.browser import SIZES, Browser  # noqa: E402
 
+from t3mpc_ros.cli.private_graph import PrivateGraph  # noqa: E402
 from t3mpc_ros.cli.process_group import ProcessGroup  # noqa: E402
 from t3mpc_ros.cli.view import PAGE_AT  # noqa: E402
 
@@ -55,9 +55,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('--output', type=Path, default=ROOT / 'docs' / 'images')
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {'ROS_DOMAIN_ID': str(120 + os.getpid() % 80)}
-        processes = ProcessGroup(Path(folder), environment)
+    with PrivateGraph() as graph, tempfile.TemporaryDirectory() as folder:
+        processes = ProcessGroup(Path(folder), graph.environment())
         browser = None
         try:
             processes.start('sim_robot', parameters=ROBOT)
