@@ -49,7 +49,7 @@ MOTOR, MOTOR_LENGTH = 42.3, 40.0
 HOLES, COLLAR = 31.0, 22.0
 """Distance of the four M3 holes, diameter of the collar: NEMA ICS 16, size 17."""
 SENSOR = (13.0, 37.0)
-"""Depth and length of a GP2Y0A21YK0F without its ears."""
+"""Depth and length of a GP2Y0A21YK0F without its mounting lugs."""
 
 
 class Sheet:

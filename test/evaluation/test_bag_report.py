@@ -494,14 +494,16 @@ def response_of(seed):
     step, before = 0.002, 5.0
     time = step * np.arange(round((duration + before) / step)) - before
     phases, rates = rng.uniform(0.0, math.tau, 6), fastest * rng.uniform(0.3, 1.0, 6)
-    told = np.sin(math.tau * rates[:, np.newaxis] * time + phases[:, np.newaxis]).sum(axis=0) / 3.0
+    asked = (
+        np.sin(math.tau * rates[:, np.newaxis] * time + phases[:, np.newaxis]).sum(axis=0) / 3.0
+    )
     every, late = 10, round(dead_time / step)
-    held = told[np.arange(time.size) // every * every]
-    acting = np.concatenate([np.full(late, held[0]), held])[: time.size]
+    stepped = asked[np.arange(time.size) // every * every]
+    acting = np.concatenate([np.full(late, stepped[0]), stepped])[: time.size]
     seen = np.empty(time.size)
     lag_behind(acting, np.full(time.size, math.exp(-step / max(lag, 1e-4))), seen)
     rows = np.flatnonzero(time >= 0.0)[::every]
-    command = Series(time[rows], {'linear': held[rows]})
+    command = Series(time[rows], {'linear': stepped[rows]})
     measured = seen[rows] + 0.02 + noise * rng.normal(size=rows.size)
     return command, Series(time[rows], {'linear': measured}), late * step + lag
 

@@ -245,29 +245,29 @@ def missing(stamps):
     return max(0.0, 1.0 - stamps.size / (round(span / period) + 1))
 
 
-def busiest_part(time, told_at, told):
+def busiest_part(time, commanded_at, commanded):
     """Return start and end of the part without a gap in which the command varies most."""
-    edges = [max(time[0], told_at[0]), min(time[-1], told_at[-1])]
-    for gap in gaps_of(time) + gaps_of(told_at):
+    edges = [max(time[0], commanded_at[0]), min(time[-1], commanded_at[-1])]
+    for gap in gaps_of(time) + gaps_of(commanded_at):
         edges[1:1] = gap
     edges = sorted(edges)
     parts = [
         (a, b)
         for a, b in zip(edges, edges[1:], strict=False)
-        if not any(a < high and low < b for low, high in gaps_of(time) + gaps_of(told_at))
+        if not any(a < high and low < b for low, high in gaps_of(time) + gaps_of(commanded_at))
     ]
-    moved = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(told)))])
-    return max(parts, key=lambda part: np.diff(np.interp(part, told_at, moved))[0])
+    moved = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(commanded)))])
+    return max(parts, key=lambda part: np.diff(np.interp(part, commanded_at, moved))[0])
 
 
 def response(bag, measured, wheel):
     """Return dead time, lag (s), gain and explained share of one wheel, by exhaustion."""
     time, speed = bag.time[measured], bag.wheels(measured)[wheel]
-    told_at, told = bag.time[COMMAND], bag.wheels(COMMAND)[wheel]
+    commanded_at, commanded = bag.time[COMMAND], bag.wheels(COMMAND)[wheel]
     step = min(max(0.25 * float(np.median(np.diff(time))), 0.002), 0.01)
-    start, end = busiest_part(time, told_at, told)
+    start, end = busiest_part(time, commanded_at, commanded)
     grid = start + step * np.arange(int((end - start) / step) + 1)
-    u, y = held(told_at, told, grid), np.interp(grid, time, speed)
+    u, y = held(commanded_at, commanded, grid), np.interp(grid, time, speed)
     shifts = int(1.0 / step) + 1
     y = y[shifts:] - y[shifts:].mean()
 

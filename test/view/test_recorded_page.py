@@ -264,7 +264,7 @@ def test_a_line_on_the_floor_is_a_path_and_a_touch_a_goal(browser, show):
     start = np.array([centre[1] - 2.0, 1.0 - centre[0]])
     np.testing.assert_allclose(points[0], start, atol=0.02)
 
-    assert not browser.run('return isDrawing()'), 'the pen stays up'
+    assert not browser.run('return isDrawing()'), 'a line is still drawn'
     browser.find('draw').click()
     browser.wait(lambda: not browser.run('return changed || moved'), 'not drawn')
     *centre, half = browser.run('return floor.view')
@@ -275,9 +275,9 @@ def test_a_line_on_the_floor_is_a_path_and_a_touch_a_goal(browser, show):
     (name, arguments) = sent.pop()
     assert name == 'path'
     np.testing.assert_allclose(arguments['points'], [goal], atol=0.02)
-    # Without the pen, the floor takes no orders.
+    # Without drawing, the floor takes no goals.
     ActionChains(browser.driver).move_to_element(floor).click().perform()
-    assert browser.run('return [pen, isDrawing()]') == [False, False]
+    assert browser.run('return [drawingLine, isDrawing()]') == [False, False]
     assert sent == []
 
 

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Why a robot stands: what its nodes report, in words for a reader, with a remedy.
+"""Why a robot stands: what its nodes report, as text for a reader, with a remedy.
 
 The reason of the robot comes first, then that of the controller, then that of the machine: the
 later ones often follow from the earlier ones.
@@ -24,7 +24,7 @@ from typing import NamedTuple
 from t3mpc_ros.evaluation.bag_report.link_history import DiagnosticEvent
 
 ROBOT, CONTROLLER, MACHINE = 0, 1, 2
-"""Sources of causes in the order in which they are told."""
+"""Sources of causes in the order in which they are reported."""
 _SOURCES = {
     'sim_robot': ROBOT,
     'radio_bridge': ROBOT,
@@ -151,15 +151,15 @@ def cause_of(event: DiagnosticEvent, *, stops: bool = True) -> Cause | None:
 def cause_between(changes: Sequence[DiagnosticEvent], start: float, end: float) -> Cause:
     """Return the cause of a standstill from ``start`` to ``end``, s.
 
-    From what the nodes reported about its start, and from what still held then.
+    From what the nodes reported about its start, and from what still applied then.
     """
     until = max(math.nextafter(start, end), min(end, start + 10.0)) + REASON_WINDOW
     near = [each for each in changes if start - REASON_LEAD <= each[0] <= until]
-    held: dict[str, DiagnosticEvent] = {}
+    active: dict[str, DiagnosticEvent] = {}
     for each in changes:
         if each[0] < start - REASON_LEAD:
-            held[each[2]] = each
-    found = [cause for each in [*near, *held.values()] if (cause := cause_of(each))]
+            active[each[2]] = each
+    found = [cause for each in [*near, *active.values()] if (cause := cause_of(each))]
     if not found:
         texts = [f'{node}: {text}' for _, level, node, text in near if level != 'ok']
         words = '; '.join(dict.fromkeys(texts[:2]))

@@ -470,7 +470,7 @@ def _timing(table: Mapping[str, Array]) -> Timing:
     stamps = np.unique(table['stamp'][np.isfinite(table['stamp'])])
     steps = np.diff(stamps)
     grid = float(np.median(steps)) if steps.size else 0.0
-    # Gaps are told by themselves: else one of a month would make everything missing.
+    # Gaps are reported by themselves: else one of a month would make everything missing.
     closed = np.where(np.isin(stamps[:-1], [low for low, _ in gaps(stamps)]), grid, steps)
     stamps = np.concatenate([[0.0], np.cumsum(closed)])
     missing = missing_sample_ratio(stamps, 1.0 / grid) if grid > 0.0 else math.nan

@@ -26,7 +26,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from t3mpc_ros.evaluation.bag_report.causes import END_PROGRAMS, OVERLOADED, Cause, cause_of
-from t3mpc_ros.evaluation.bag_report.incidents import Incidents, Stop, driving
+from t3mpc_ros.evaluation.bag_report.incidents import Incidents, driving
 from t3mpc_ros.evaluation.bag_report.known_results import MAX_RATIO, known_result
 from t3mpc_ros.evaluation.bag_report.run_data import Run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
@@ -48,7 +48,7 @@ MAX_ERROR = 0.25
 MIN_COUNTED = 0.5
 """Least share of the drive in which errors count."""
 CALMER = 0.9
-"""Error without the time after stalls, as a share of that with it, below which it is told, too."""
+"""Error without the time after stalls, as a share of that with it, below which both are stated."""
 NEVER = 0.95
 """Share of the drive in which a robot stands that never moved."""
 ON_PATH = 0.05
@@ -306,11 +306,6 @@ def _stop_finding(run: Run, incidents: Incidents) -> _Finding:
     return _Finding(text, label, main.cause.remedy, spoils, tail)
 
 
-def stop_texts(stops: Sequence[Stop]) -> list[str]:
-    """Return a sentence for each stop."""
-    return [f'At {stop.start:.1f} s for {stop.length:.2f} s: {stop.cause.text}.' for stop in stops]
-
-
 def _slow_machine(run: Run, incidents: Incidents) -> Iterator[_Finding]:
     """Yield stalls of the machine and its overload."""
     if stalls := incidents.stalls:
@@ -369,7 +364,7 @@ def _jumps(incidents: Incidents) -> Iterator[_Finding]:
 
 
 def _rmse_text(run: Run, pair: tuple[float, float]) -> str:
-    """Return a settled error in words, with what it is to be compared with if it is too large."""
+    """Return a settled error as text, with what it is to be compared with if it is too large."""
     if not any(map(math.isfinite, pair)):
         return 'no settled motion was measured'
     worst = max(pair)

@@ -83,7 +83,7 @@ class NominalModel:
 
 
 EXACT_INERTIA, FRICTION = 'exact inertia', 'nominal friction'
-"""What a method knows of the model, in words."""
+"""What a method knows of the model, as text."""
 JUMP = 0.3
 """A change of r in one period (rad/s), beyond the change before it, that is a jump."""
 
@@ -186,7 +186,7 @@ class BaselineController(ABC):
     preview: ClassVar[bool] = False
     """Whether it uses :attr:`Observation.future`."""
     measured: ClassVar[str] = 'wheel speeds'
-    """What it measures, in words; empty for nothing."""
+    """What it measures, as text; empty for nothing."""
     estimate_dead_time: bool = False
     """Whether it estimates the dead time of a velocity drive; the configured one otherwise."""
     inertia_error: float = 1.0

@@ -8,7 +8,7 @@ const MAX_POINTS = 120; // that a command holds
 const GOAL = 0.05; // m of a line up to which it is a point, the goal
 
 let drawnPath = null; // {x, y} on the map, as long as no other one is drawn
-let pen = false; // whether a line is being drawn
+let drawingLine = false; // whether a line is being drawn
 
 function showDrawing() {
   const rows = facts['parameters/reference_generator'] || [];
@@ -45,15 +45,15 @@ function drawnPoints({ x, y }) {
 place('floor').addEventListener('pointerdown', (event) => {
   if (!isDrawing() || !base) return;
   place('floor').setPointerCapture(event.pointerId);
-  [pen, drawnPath] = [true, { x: [], y: [], colour: 'accent', dash: [] }];
+  [drawingLine, drawnPath] = [true, { x: [], y: [], colour: 'accent', dash: [] }];
   addPoint(event);
 });
-place('floor').addEventListener('pointermove', (event) => { if (pen) addPoint(event); });
-place('floor').addEventListener('pointercancel', () => { [pen, drawnPath] = [false, null]; });
+place('floor').addEventListener('pointermove', (event) => { if (drawingLine) addPoint(event); });
+place('floor').addEventListener('pointercancel', () => { [drawingLine, drawnPath] = [false, null]; });
 place('floor').addEventListener('pointerup', (event) => {
-  if (!pen) return;
+  if (!drawingLine) return;
   addPoint(event);
-  pen = false;
+  drawingLine = false;
   setDrawing(false);
   command('path', { points: drawnPoints(drawnPath) });
 });
