@@ -26,7 +26,7 @@ from t3mpc_ros.emulator.emulator import EmulatorParameters
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS
 from t3mpc_ros.nodes.registry import NODES, parameter_class, with_parameters
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.tool.robot_records import RobotSettings
+from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'equations.md'

@@ -40,13 +40,13 @@ from t3mpc_ros.radio.tool import (
     robot_log,
     robot_settings,
 )
-from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, ProcedureError, Script
-from t3mpc_ros.radio.tool.robot_records import (
+from t3mpc_ros.radio.tool.eeprom_records import (
     SENSOR_COUNT,
     SENSORS,
     RobotSettings,
     check_settings,
 )
+from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, ProcedureError, Script
 from t3mpc_ros.radio.tool.robot_settings import SettingsFileError, StoredSettings
 from t3mpc_ros.stop_signal import StopSignal
 

@@ -105,7 +105,7 @@ def _tuned(
 
     output = options.output or OUTPUT
     if options.robot == TWIN:
-        from t3mpc_ros.evaluation.tuning.twin_tuning import tune_twin, twin_definitions
+        from t3mpc_ros.evaluation.tuning.closed_loop_tuning import tune_twin, twin_definitions
 
         return tune_twin(
             twin_definitions(methods),

@@ -73,7 +73,14 @@ from t3mpc_ros.geometry.types import (
     WheelSpeeds,
 )
 from t3mpc_ros.kernels import TypedKernel, kernel
-from t3mpc_ros.parameters.table import ParameterError, group, parameter, with_default
+from t3mpc_ros.parameters.table import (
+    ParameterError,
+    at_least,
+    at_most,
+    group,
+    parameter,
+    with_default,
+)
 
 JUMP_DETECTION_FACTOR = 2.2
 """A reference acceleration above this multiple of the acceleration limit is a jump."""
@@ -166,8 +173,8 @@ class ControllerParameters(Nt3fsMpcParameters):
             most = 0.5 * MAX_SMOOTHING * fitting
             if bound > most:
                 raise ParameterError(
-                    f'law.error_bound plus predictive.v_max must be at most {most:.4g} rad/s² at '
-                    f'this rate and lag with law.gain 0: got {bound:g}'
+                    f'law.error_bound plus predictive.v_max must be at most {at_most(most, 4)} '
+                    f'rad/s² at this rate and lag with law.gain 0: got {bound:g}'
                 )
             return
         slope = self.law.gain + bound / self.law.smoothing
@@ -175,8 +182,8 @@ class ControllerParameters(Nt3fsMpcParameters):
         if not least <= slope <= most:
             sum_of = ' plus the slope of the compensator' if bound else ''
             raise ParameterError(
-                f'law.gain{sum_of} must be from {least:.3g} to {most:.3g} 1/s at this rate and '
-                f'lag: got {slope:.3g}; law.gain 0 chooses the gain that fits'
+                f'law.gain{sum_of} must be from {at_least(least)} to {at_most(most)} 1/s at this '
+                f'rate and lag: got {slope:.3g}; law.gain 0 chooses the gain that fits'
             )
 
     def resolved(self) -> Self:

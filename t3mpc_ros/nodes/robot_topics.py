@@ -24,6 +24,7 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.conversions import UNKNOWN_VARIANCE, FrameParameters
 from t3mpc_ros.parameters.table import parameter
+from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 from t3mpc_ros.robot.description import FrameNames
 from t3mpc_ros.robot.interface import BatteryReading, ImuSample, RobotState
 from t3mpc_ros.robot.sensor_conversions import (
@@ -32,7 +33,6 @@ from t3mpc_ros.robot.sensor_conversions import (
     ImuParameters,
     RangeSensorParameters,
 )
-from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 from t3mpc_ros.simulation.digital_twin import TwinDiagnostics
 
 BATTERY_RATE = 1.0

@@ -21,6 +21,7 @@ nobody has a reason to set is a class variable beside them, a constant.
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context
 import difflib
 from functools import partial
 import math
@@ -41,6 +42,16 @@ Value = (
 
 class ParameterError(ValueError):
     """An invalid parameter; the text contains its name, the bound and the value."""
+
+
+def at_least(bound: float, digits: int = 3) -> str:
+    """Return a computed lower bound as text, rounded up so that the bound named is accepted."""
+    return f'{float(Context(digits, ROUND_CEILING).create_decimal(repr(float(bound)))):g}'
+
+
+def at_most(bound: float, digits: int = 3) -> str:
+    """Return a computed upper bound as text, rounded down so that the bound named is accepted."""
+    return f'{float(Context(digits, ROUND_FLOOR).create_decimal(repr(float(bound)))):g}'
 
 
 def nearest_name(name: str, known: Iterable[str]) -> str:

@@ -32,9 +32,13 @@ from t3mpc_ros.radio.link.statistics import LinkQuality
 from t3mpc_ros.radio.link.telemetry import Telemetry
 from t3mpc_ros.robot import interface
 from t3mpc_ros.robot.calibration import CalibrationParameters
-from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters
+from t3mpc_ros.robot.command_limiter import (
+    SLIP_STOP_REASON,
+    CommandLimiter,
+    CommandLimiterParameters,
+    SlipMonitor,
+)
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
-from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON, SlipMonitor
 
 _COASTING_DECELERATION = 0.5
 """Least deceleration of a robot whose motors lost their power, m/s², assumed."""

@@ -21,12 +21,11 @@ import numpy as np
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import RANGE_SENSORS, Pose, State, WheelSpeeds, check_pose
-from t3mpc_ros.parameters.table import ParameterError, group, parameter
+from t3mpc_ros.parameters.table import ParameterError, at_most, group, parameter
 from t3mpc_ros.robot import interface
-from t3mpc_ros.robot.command_limiter import CommandLimiter
+from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON, CommandLimiter, SlipMonitor
 from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
-from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON, SlipMonitor
 from t3mpc_ros.simulation.fault_injection import (
     FaultParameters,
     FaultSchedule,
@@ -136,13 +135,14 @@ class DigitalTwinParameters(PaperRobotParameters):
         fastest = max_rate(self.motor, load, self.bumper)
         if self.step * fastest > STABILITY_LIMIT:
             raise ParameterError(
-                f'substep must be at most {STABILITY_LIMIT / fastest:.2g} s with this motor, '
-                f'body, bumper and friction (fastest rate {fastest:.4g} 1/s): got {self.substep:g}'
+                f'substep must be at most {at_most(STABILITY_LIMIT / fastest, 2)} s with this '
+                f'motor, body, bumper and friction (fastest rate {fastest:.4g} 1/s): got '
+                f'{self.substep:g}'
             )
         if self.limiter.wheel_speed > self.motor.top_speed:
             raise ParameterError(
-                f'wheel.max_velocity must be at most {self.motor.top_speed:.4g} rad/s, which is '
-                f'{self.motor.step_rate:g} pulses a second with {self.motor.microsteps} '
+                f'wheel.max_velocity must be at most {at_most(self.motor.top_speed, 4)} rad/s, '
+                f'which is {self.motor.step_rate:g} pulses a second with {self.motor.microsteps} '
                 f'microsteps: got {self.limiter.wheel_speed:g}'
             )
         delay, assumed = self.imu.delay, self.odometry.gyro_delay

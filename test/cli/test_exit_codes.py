@@ -31,9 +31,9 @@ from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup
 from t3mpc_ros.emulator.fault_injection import FaultError
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.tool.bench_checklist import FAIL, PASS, SKIPPED, Check
+from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
 from t3mpc_ros.radio.tool.link_test import BAD, GOOD, POOR, ReportRow
 from t3mpc_ros.radio.tool.procedure import ProcedureError
-from t3mpc_ros.radio.tool.robot_records import RobotSettings
 from t3mpc_ros.radio.tool.robot_settings import StoredSettings, settings_file
 
 RUN = 'radio.tool.procedure.run_script'

@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from t3mpc_ros.cli import robot as cli
-from t3mpc_ros.radio.tool.robot_records import RobotSettings
+from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
 from t3mpc_ros.radio.tool.robot_settings import (
     SettingsFileError,
     parse_address,

@@ -40,7 +40,7 @@ from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.nodes.registry import NODES, parameter_class
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import key_check
-from t3mpc_ros.radio.tool.robot_records import RobotSettings
+from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
 from t3mpc_ros.radio.tool.robot_settings import StoredSettings, settings_file
 from t3mpc_ros.robot.calibration import Calibration
 
@@ -170,7 +170,7 @@ PATROL = {
 TUNE = {
     'evaluation.methods.require_libraries': None,
     'evaluation.tuning.tune_methods.tune_methods': SimpleNamespace(table=text),
-    'evaluation.tuning.twin_tuning.tune_twin': SimpleNamespace(table=text),
+    'evaluation.tuning.closed_loop_tuning.tune_twin': SimpleNamespace(table=text),
     'evaluation.tuning.drive_identification.identify_bag': ('drive', 'paper'),
     'evaluation.tuning.drive_identification.drive_file': 'a: 1\n',
 }

@@ -478,7 +478,7 @@ def test_after_the_warm_up_no_step_compiles(parameters):
 @pytest.mark.parametrize(
     'changes, words',
     [
-        ({'law.gain': 10.0}, 'law.gain must be from 77.1 to 116 1/s'),
+        ({'law.gain': 10.0}, 'law.gain must be from 77.1 to 115 1/s'),
         ({'law.gain': 0.02}, 'got 0.02; law.gain 0 chooses'),
         ({'law.gain': 140.0}, 'got 140'),
         ({'law.gain': 95.0, 'rate': 50.0}, 'from 39.9 to 59.9 1/s at this rate'),

@@ -55,7 +55,7 @@ from t3mpc_ros.evaluation.scenario import (
     sampled_speeds,
 )
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
+from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 from t3mpc_ros.simulation.digital_twin import BROWN_OUT_REASON
 from t3mpc_ros.simulation.fault_injection import FAULTS, FaultEvent
 

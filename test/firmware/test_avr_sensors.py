@@ -27,7 +27,7 @@ from support.emulator_bench import RobotBench
 from support.missing_tools import AVR, needing
 
 from t3mpc_ros.geometry.types import RANGE_SENSORS
-from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
+from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 
 pytestmark = needing(*AVR)
 

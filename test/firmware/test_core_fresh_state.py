@@ -32,7 +32,7 @@ from support.missing_tools import find, needs
 
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import CALIBRATION_RECORD, SETTINGS_RECORD, Key
-from t3mpc_ros.radio.tool import robot_records
+from t3mpc_ros.radio.tool import eeprom_records
 
 HEADERS = '\n'.join(path.read_text() for path in sorted((core.FIRMWARE / 'core').glob('*.h')))
 STRUCTS = dict(re.findall(r'^struct (t3_\w+) \{\n(.*?)^\};', HEADERS, re.DOTALL | re.MULTILINE))
@@ -234,16 +234,16 @@ def test_a_new_session_begins_as_the_first_one(library, layout, key, seed):
     assert used.steps[0] == 0
 
 
-CURVE = robot_records.SharpCurve(0.3, 0.02, 0.05, 0.003)
-CALIBRATION = robot_records.Calibration(
-    divider=robot_records.DividerCorrection(0.05, -0.1, 0.02), curves=8 * (CURVE,)
+CURVE = eeprom_records.SharpCurve(0.3, 0.02, 0.05, 0.003)
+CALIBRATION = eeprom_records.Calibration(
+    divider=eeprom_records.DividerCorrection(0.05, -0.1, 0.02), curves=8 * (CURVE,)
 )
 CHANGES = {
-    'divider': robot_records.RobotSettings(divider=7.5),
-    'direction': robot_records.RobotSettings(invert_left=True),
-    'steps': robot_records.RobotSettings(microsteps=32, steps_per_turn=400),
-    'radio': robot_records.RobotSettings(rate='250k', channel=7, address=b'12345'),
-    'sensors': robot_records.RobotSettings(sensors=('GP2Y0A41',) * 8),
+    'divider': eeprom_records.RobotSettings(divider=7.5),
+    'direction': eeprom_records.RobotSettings(invert_left=True),
+    'steps': eeprom_records.RobotSettings(microsteps=32, steps_per_turn=400),
+    'radio': eeprom_records.RobotSettings(rate='250k', channel=7, address=b'12345'),
+    'sensors': eeprom_records.RobotSettings(sensors=('GP2Y0A41',) * 8),
     'calibration': CALIBRATION,
     'key': Key(2, core.KEY),
     'no key': Key(2, bytes(16)),
@@ -254,10 +254,10 @@ def change(robot, what):
     """Store a record or a key over USB."""
     if isinstance(what, Key):
         robot.console(encode(what))
-    elif isinstance(what, robot_records.Calibration):
-        robot.store(CALIBRATION_RECORD, robot_records.encode_calibration(what))
+    elif isinstance(what, eeprom_records.Calibration):
+        robot.store(CALIBRATION_RECORD, eeprom_records.encode_calibration(what))
     else:
-        robot.store(SETTINGS_RECORD, robot_records.encode_settings(what))
+        robot.store(SETTINGS_RECORD, eeprom_records.encode_settings(what))
     robot.run(700_000)
 
 

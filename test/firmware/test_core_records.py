@@ -31,7 +31,7 @@ from t3mpc_ros.radio.protocol.frames import (
     RefusalReason,
 )
 from t3mpc_ros.radio.protocol.framing import crc16
-from t3mpc_ros.radio.tool.robot_records import (
+from t3mpc_ros.radio.tool.eeprom_records import (
     Calibration,
     DividerCorrection,
     Estimate,

@@ -28,6 +28,7 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State, WheelSpeeds, wrap_angle
 from t3mpc_ros.nodes import conversions, robot_topics
 from t3mpc_ros.nodes.robot_topics import state_values, state_warnings
+from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 from t3mpc_ros.robot.interface import (
     ZERO_WHEEL_SPEEDS,
     BatteryReading,
@@ -41,7 +42,6 @@ from t3mpc_ros.robot.sensor_conversions import (
     ImuParameters,
     RangeSensorParameters,
 )
-from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 from t3mpc_ros.simulation.digital_twin import TwinDiagnostics
 from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters
 

@@ -42,8 +42,8 @@ from t3mpc_ros.nodes.remote_parameters import ParameterWatch
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.statistics import DiagnosticLevel
+from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 from t3mpc_ros.robot.interface import BatteryReading
-from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
 
 pytestmark = pytest.mark.ros
 

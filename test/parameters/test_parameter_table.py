@@ -21,7 +21,15 @@ from typing import ClassVar
 import pytest
 
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
-from t3mpc_ros.parameters.table import ParameterError, Parameters, find_names, group, parameter
+from t3mpc_ros.parameters.table import (
+    ParameterError,
+    Parameters,
+    at_least,
+    at_most,
+    find_names,
+    group,
+    parameter,
+)
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 
 
@@ -246,3 +254,20 @@ def test_names_that_differ_by_a_sign_are_told_apart():
     assert find_names('case', ['friction-X3'], known) == ('Friction x3',)
     with pytest.raises(ValueError, match='got mass 30; did you mean mass'):
         find_names('case', ['mass 30'], known)
+
+
+@pytest.mark.parametrize('digits', [2, 3, 4])
+def test_a_computed_bound_is_named_by_a_value_that_it_admits(digits):
+    """An error once named 116 as the greatest gain, where 115.6 was, and then refused 116."""
+    source = random.Random(5)
+    for _ in range(500):
+        bound = source.choice((-1.0, 1.0)) * 10.0 ** source.uniform(-6.0, 6.0)
+        below, above = float(at_most(bound, digits)), float(at_least(bound, digits))
+        assert below <= bound <= above
+        assert above - below <= 1.001 * 10.0 ** (1 - digits) * abs(bound)
+    assert (at_most(0.3), at_least(0.3), at_most(1e5), at_most(0.0)) == (
+        '0.3',
+        '0.3',
+        '100000',
+        '0',
+    )

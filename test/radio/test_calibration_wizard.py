@@ -28,7 +28,7 @@ from t3mpc_ros.cli import robot_calibrate as cli
 from t3mpc_ros.nodes.registry import parameter_class
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.tool import procedure, robot_records
+from t3mpc_ros.radio.tool import eeprom_records, procedure
 from t3mpc_ros.radio.tool.calibration_wizard import (
     CalibrationRobot,
     CalibrationWizard,
@@ -109,7 +109,7 @@ def test_a_whole_run_finds_the_errors_of_the_twin(person, monkeypatch, tmp_path)
     corrected = found.divider.voltage(volts)
     assert abs(corrected - 11.0) < 1.5 * COVERAGE * found.divider.uncertainty
 
-    stored = person.bench.at_robot(robot_records.read_calibration())
+    stored = person.bench.at_robot(eeprom_records.read_calibration())
     for in_robot, in_file in zip(stored[:4], found[:4], strict=True):
         assert in_robot.value == pytest.approx(in_file.value, abs=2e-5)
     assert stored.curves[0][:3] == pytest.approx(found.curves[0][:3], abs=1e-4)

@@ -37,9 +37,9 @@ from t3mpc_ros.radio.tool import (
     robot_settings,
 )
 from t3mpc_ros.radio.tool.channel_scan import ChannelResult
+from t3mpc_ros.radio.tool.eeprom_records import SENSORS, RobotSettings
 from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, Procedure, ProcedureError
 from t3mpc_ros.radio.tool.robot_log import LogEntry, LogKind, format_log
-from t3mpc_ros.radio.tool.robot_records import SENSORS, RobotSettings
 
 KEY, OTHER = bytes(range(16)), bytes(range(1, 17))
 TURN = 3200

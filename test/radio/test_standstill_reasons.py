@@ -30,8 +30,8 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Pong, StatusFlag
 from t3mpc_ros.radio.protocol.framing import crc16
-from t3mpc_ros.radio.tool import robot_records
-from t3mpc_ros.robot.slip_monitor import SLIP_STOP_REASON
+from t3mpc_ros.radio.tool import eeprom_records
+from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 
 KEY = bytes(range(16))
 CAUSES = {}
@@ -246,7 +246,7 @@ def the_bridge_ends(bench):
 
 @cause('measures no battery voltage, but its settings say that the battery is wired')
 def the_wire_of_the_battery_breaks(bench):
-    settings = robot_records.encode_settings(robot_records.RobotSettings(battery_wired=True))
+    settings = eeprom_records.encode_settings(eeprom_records.RobotSettings(battery_wired=True))
     body = settings + crc16(settings).to_bytes(2, 'little')
     for copy in (40, 72):
         bench.board.write_eeprom(copy, body)

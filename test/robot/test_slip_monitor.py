@@ -14,8 +14,8 @@
 """Slip monitor: when it stops the robot, and when it lets it go."""
 
 from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.robot.command_limiter import SlipMonitor
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
-from t3mpc_ros.robot.slip_monitor import SlipMonitor
 
 STAND, DRIVE = RobotCommand(ZERO_WHEEL_SPEEDS, 0), RobotCommand(WheelSpeeds(1.0, 0.0), 0)
 

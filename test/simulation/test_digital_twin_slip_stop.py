@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.robot.command_limiter import SLIP_RELEASE_TIME, SLIP_STOP_REASON
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
-from t3mpc_ros.robot.slip_monitor import RELEASE_TIME, SLIP_STOP_REASON
 from t3mpc_ros.simulation.digital_twin import BROWN_OUT_REASON, DigitalTwin, DigitalTwinParameters
 
 FORWARD = WheelSpeeds(5.0, 5.0)
@@ -95,7 +95,7 @@ def test_robot_resumes_after_the_release_time(pause):
     robot = stopped()
     fault(robot, wheel_blocked='none')
     drive(robot, FORWARD, 1.0)
-    states = pause(robot, RELEASE_TIME + 0.05)
+    states = pause(robot, SLIP_RELEASE_TIME + 0.05)
     assert {state.reason for state in states[:-10]} == {SLIP_STOP_REASON}
     states = drive(robot, FORWARD, 1.0)
     assert states[-1].reason == ''
@@ -107,7 +107,7 @@ def test_pause_shorter_than_the_release_time_does_not_count():
     fault(robot, wheel_blocked='none')
     drive(robot, FORWARD, 1.0)
     for _ in range(5):
-        drive(robot, ZERO_WHEEL_SPEEDS, 0.8 * RELEASE_TIME)
+        drive(robot, ZERO_WHEEL_SPEEDS, 0.8 * SLIP_RELEASE_TIME)
         states = drive(robot, FORWARD, 0.1)
     assert states[-1].reason == SLIP_STOP_REASON
     assert states[-1].commanded == ZERO_WHEEL_SPEEDS
@@ -115,7 +115,7 @@ def test_pause_shorter_than_the_release_time_does_not_count():
 
 def test_robot_stops_again_while_the_wheel_is_blocked():
     robot = stopped()
-    drive(robot, ZERO_WHEEL_SPEEDS, RELEASE_TIME + 0.05)
+    drive(robot, ZERO_WHEEL_SPEEDS, SLIP_RELEASE_TIME + 0.05)
     states = drive(robot, FORWARD, 2.0)
     assert any(state.commanded != ZERO_WHEEL_SPEEDS for state in states)
     assert states[-1].reason == SLIP_STOP_REASON
@@ -127,10 +127,10 @@ def test_delayed_commands_count_at_their_arrival():
     robot = stopped()
     fault(robot, wheel_blocked='none', command_delay=0.2)
     drive(robot, FORWARD, 0.1)
-    silence(robot, RELEASE_TIME - 0.1)
+    silence(robot, SLIP_RELEASE_TIME - 0.1)
     robot.apply(RobotCommand(FORWARD, robot.state.stamp_ns), robot.state.stamp_ns)
     assert silence(robot, 0.25)[-1].reason == SLIP_STOP_REASON
-    silence(robot, RELEASE_TIME)
+    silence(robot, SLIP_RELEASE_TIME)
     assert drive(robot, FORWARD, 0.4)[-1].reason == ''
 
 
@@ -171,5 +171,5 @@ def test_external_rotation_stop_ends_with_the_rotation():
     fault(robot, gyro_bias_jump=1.0)
     assert drive(robot, ZERO_WHEEL_SPEEDS, 1.4)[-1].reason == SLIP_STOP_REASON
     fault(robot, gyro_bias_jump=0.0)
-    drive(robot, ZERO_WHEEL_SPEEDS, RELEASE_TIME + 0.3)
+    drive(robot, ZERO_WHEEL_SPEEDS, SLIP_RELEASE_TIME + 0.3)
     assert drive(robot, FORWARD, 0.3)[-1].reason == ''

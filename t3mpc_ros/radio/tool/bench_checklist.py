@@ -22,7 +22,7 @@ import numpy as np
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import CALIBRATION_RECORD, Pong, Samples
-from t3mpc_ros.radio.tool import link_test, robot_records
+from t3mpc_ros.radio.tool import eeprom_records, link_test
 from t3mpc_ros.radio.tool.procedure import Pause, Script, wait_for_board
 from t3mpc_ros.radio.tool.robot_log import LogEntry, LogKind, read_log
 from t3mpc_ros.radio.tool.robot_settings import SETTINGS_TEXTS, StoredSettings, read_settings
@@ -136,7 +136,7 @@ class BoardFindings(NamedTuple):
 
     pong: Pong
     settings: StoredSettings
-    calibration: robot_records.Stored[Calibration]
+    calibration: eeprom_records.Stored[Calibration]
     """All None unless the robot holds one."""
     log: tuple[LogEntry, ...]
     samples: tuple[Samples, ...]
@@ -147,12 +147,12 @@ def examine_board() -> Script[BoardFindings]:
     """Return the records, the log and two seconds of samples of the robot board."""
     pong = yield from wait_for_board()
     settings = yield from read_settings()
-    stored = yield from robot_records.read_record(CALIBRATION_RECORD)
-    calibration = stored.decoded(robot_records.decode_calibration)
+    stored = yield from eeprom_records.read_record(CALIBRATION_RECORD)
+    calibration = stored.decoded(eeprom_records.decode_calibration)
     log = yield from read_log()
     samples = []
     for _ in range(SAMPLE_COUNT):
-        samples.append((yield from robot_records.read_samples()))
+        samples.append((yield from eeprom_records.read_samples()))
         yield Pause(_SAMPLE_PERIOD)
     return BoardFindings(pong, settings, calibration, log, tuple(samples))
 
@@ -226,7 +226,7 @@ def _check_settings(found: BoardFindings, parameters: LinkParameters) -> list[Ch
     return checks
 
 
-def _check_calibration(stored: robot_records.Stored[Calibration]) -> Check:
+def _check_calibration(stored: eeprom_records.Stored[Calibration]) -> Check:
     usable, found = stored.valid or stored.state == frames.SETTINGS_MISSING, stored.content
     if stored.valid:
         parts = [name for name in found._fields[:-1] if getattr(found, name) is not None]
@@ -290,14 +290,14 @@ def _check_imu(samples: Sequence[Samples]) -> list[Check]:
 
 
 def _check_ranges(found: BoardFindings) -> Check:
-    counts = np.array([robot_records.range_counts(sample) for sample in found.samples])
+    counts = np.array([eeprom_records.range_counts(sample) for sample in found.samples])
     problems = []
     used = 0
     for number, kind in enumerate(found.settings.content.sensors):
         if kind == 'none':
             continue
         used += 1
-        column = counts[counts[:, number] != robot_records.NOT_MEASURED, number]
+        column = counts[counts[:, number] != eeprom_records.NOT_MEASURED, number]
         if not column.size:
             problems.append(f'A{number} not measured')
         elif (column > MAX_SHARP_COUNT).any():

@@ -30,7 +30,7 @@ import numpy as np
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.tool import procedure, robot_records, robot_settings
+from t3mpc_ros.radio.tool import eeprom_records, procedure, robot_settings
 from t3mpc_ros.radio.tool.manoeuvre import HandTurn, Manoeuvre, Rest
 from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, ProcedureError, Script
 from t3mpc_ros.robot import calibration
@@ -102,7 +102,7 @@ class CalibrationRobot:
 
     def counts(self, samples: int) -> Sequence[tuple[int, ...]]:
         """Return raw counts: of the eight distance sensors and, last, of the battery."""
-        return self._at_board(robot_records.read_counts(samples))
+        return self._at_board(eeprom_records.read_counts(samples))
 
     def divider(self) -> float:
         """Return the nominal divider of the battery, as in the settings of the robot."""
@@ -114,13 +114,13 @@ class CalibrationRobot:
     def store(self, found: calibration.Calibration) -> None:
         """Store a calibration in the robot, in place of the one that it has."""
         try:
-            self._at_board(robot_records.write_calibration(found))
+            self._at_board(eeprom_records.write_calibration(found))
         except ValueError as error:
             raise ProcedureError(f'the robot cannot hold this calibration: {error}') from error
 
     def stored(self) -> calibration.Calibration:
         """Return the calibration in the robot."""
-        return self._at_board(robot_records.read_calibration())
+        return self._at_board(eeprom_records.read_calibration())
 
     def _at_board(self, script: Script[Value]) -> Value:
         try:

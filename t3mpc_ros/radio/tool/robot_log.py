@@ -21,8 +21,8 @@ from typing import NamedTuple
 from t3mpc_ros.radio.link.standstill_reasons import reset_cause
 from t3mpc_ros.radio.protocol.frames import LOG_RECORD, Record
 from t3mpc_ros.radio.protocol.framing import crc16
+from t3mpc_ros.radio.tool.eeprom_records import request_part
 from t3mpc_ros.radio.tool.procedure import Script, wait_for_board
-from t3mpc_ros.radio.tool.robot_records import request_part
 from t3mpc_ros.radio.tool.robot_settings import SETTINGS_TEXTS
 
 _PLACES = 16

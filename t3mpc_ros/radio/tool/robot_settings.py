@@ -21,7 +21,7 @@ from t3mpc_ros.parameters.table import number_hint
 from t3mpc_ros.parameters.yaml_files import parameter_file, shortened
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD
-from t3mpc_ros.radio.tool import robot_records
+from t3mpc_ros.radio.tool import eeprom_records
 from t3mpc_ros.radio.tool.procedure import Script
 
 SETTINGS_TEXTS = (
@@ -47,7 +47,7 @@ class SettingsFileError(Exception):
     """A file of settings cannot be read or written; the text contains the reason."""
 
 
-StoredSettings = robot_records.Stored[robot_records.RobotSettings]
+StoredSettings = eeprom_records.Stored[eeprom_records.RobotSettings]
 
 
 class Difference(NamedTuple):
@@ -82,13 +82,13 @@ def parse_address(text: object) -> bytes:
 
 def read_settings() -> Script[StoredSettings]:
     """Return the settings of the robot."""
-    stored = yield from robot_records.read_record(SETTINGS_RECORD)
-    return stored.decoded(robot_records.decode_settings)
+    stored = yield from eeprom_records.read_record(SETTINGS_RECORD)
+    return stored.decoded(eeprom_records.decode_settings)
 
 
 def change_settings(
     stored: StoredSettings, changes: Mapping[str, object], entropy: Callable[[int], bytes]
-) -> robot_records.RobotSettings:
+) -> eeprom_records.RobotSettings:
     """Return the settings with changes, by field name.
 
     A robot without settings gets a random address, so that two robots never obey one host by
@@ -97,20 +97,20 @@ def change_settings(
     settings = stored.content._replace(**changes)  # type: ignore[arg-type]
     if not stored.valid and 'address' not in changes:
         settings = settings._replace(address=draw_address(entropy))
-    robot_records.check_settings(settings)
+    eeprom_records.check_settings(settings)
     return settings
 
 
-def write_settings(settings: robot_records.RobotSettings) -> Script[StoredSettings]:
+def write_settings(settings: eeprom_records.RobotSettings) -> Script[StoredSettings]:
     """Store settings in both copies; return what the robot holds."""
-    body = yield from robot_records.write_record(
-        SETTINGS_RECORD, robot_records.encode_settings(settings)
+    body = yield from eeprom_records.write_record(
+        SETTINGS_RECORD, eeprom_records.encode_settings(settings)
     )
-    return StoredSettings(frames.SETTINGS_GOOD, robot_records.decode_settings(body))
+    return StoredSettings(frames.SETTINGS_GOOD, eeprom_records.decode_settings(body))
 
 
 def differences(
-    old: robot_records.RobotSettings, new: robot_records.RobotSettings
+    old: eeprom_records.RobotSettings, new: eeprom_records.RobotSettings
 ) -> list[Difference]:
     """Return the settings that differ; the sensors one by one."""
     pairs = [(name, getattr(old, name), getattr(new, name)) for name in old._fields[:-1]]
@@ -140,7 +140,7 @@ def format_settings(stored: StoredSettings) -> str:
     return '\n'.join(lines)
 
 
-def settings_file(settings: robot_records.RobotSettings) -> str:
+def settings_file(settings: eeprom_records.RobotSettings) -> str:
     """Return a ROS parameter file: the link parameters of the host, and all other settings."""
     values: dict[str, object] = settings._asdict()
     values |= {'address': settings.address.hex(), 'sensors': list(settings.sensors)}
@@ -149,7 +149,7 @@ def settings_file(settings: robot_records.RobotSettings) -> str:
     return parameter_file(title, {'/**': {'link': link}, _BOARD: values})
 
 
-def settings_of_file(content: object) -> robot_records.RobotSettings:
+def settings_of_file(content: object) -> eeprom_records.RobotSettings:
     """Return the settings of a file of :func:`settings_file`, parsed as YAML."""
     values: dict[str, Any] = {'battery_wired': False}  # which older files lack
     try:
@@ -159,7 +159,7 @@ def settings_of_file(content: object) -> robot_records.RobotSettings:
         values['address'] = parse_address(values['address'])
         if not isinstance(values['sensors'], list):
             raise SettingsFileError(
-                f'sensors must be a list of {robot_records.SENSOR_COUNT}: '
+                f'sensors must be a list of {eeprom_records.SENSOR_COUNT}: '
                 f'got {shortened(values["sensors"])}'
             )
         values['sensors'] = tuple(map(str, values['sensors']))
@@ -170,14 +170,14 @@ def settings_of_file(content: object) -> robot_records.RobotSettings:
             f'must be a file of t3mpc robot setup --save, with link below /**, and {_BOARD}'
         ) from error
     unknown, missing = (
-        set(values) - set(robot_records.RobotSettings._fields),
-        set(robot_records.RobotSettings._fields) - set(values),
+        set(values) - set(eeprom_records.RobotSettings._fields),
+        set(eeprom_records.RobotSettings._fields) - set(values),
     )
     if unknown or missing:
         names = ', '.join(sorted(unknown or missing))
         raise SettingsFileError(f'{"has unknown" if unknown else "lacks the"} settings: {names}')
-    settings = robot_records.RobotSettings(**values)
-    for name, kind in robot_records.RobotSettings.__annotations__.items():
+    settings = eeprom_records.RobotSettings(**values)
+    for name, kind in eeprom_records.RobotSettings.__annotations__.items():
         value = getattr(settings, name)
         allowed = {float: (int, float)}.get(kind, (kind,))
         if kind in (int, bool, float, str) and type(value) not in allowed:
@@ -185,7 +185,7 @@ def settings_of_file(content: object) -> robot_records.RobotSettings:
                 f'{name} must be {_KINDS[kind]}: got {shortened(value)}{number_hint(value)}'
             )
     try:
-        robot_records.check_settings(settings)
+        eeprom_records.check_settings(settings)
     except (TypeError, ValueError) as error:
         raise SettingsFileError(str(error)) from error
     return settings

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import Array, Pose, State, WheelSpeeds, check_pose, wrap_angle
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
+from t3mpc_ros.parameters.table import ParameterError, Parameters, at_most, group, parameter
 from t3mpc_ros.robot import interface
 from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters, ramp_towards
 from t3mpc_ros.robot.wheel_odometry import WheelOdometry, WheelOdometryParameters
@@ -162,8 +162,8 @@ class PaperRobotParameters(Parameters):
         fastest = max_rate(self)
         if self.step * fastest > STABILITY_LIMIT:
             raise ParameterError(
-                f'substep must be at most {STABILITY_LIMIT / fastest:.2g} s with this body, drive '
-                f'and friction (fastest rate {fastest:.4g} 1/s): got {self.substep:g}'
+                f'substep must be at most {at_most(STABILITY_LIMIT / fastest, 2)} s with this '
+                f'body, drive and friction (fastest rate {fastest:.4g} 1/s): got {self.substep:g}'
             )
         if self.drive.kind == 'velocity':
             self.check_ramp()

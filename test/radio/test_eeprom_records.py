@@ -27,17 +27,17 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_from_board, encode
 from t3mpc_ros.radio.protocol.frames import Configured, Pong, Refusal
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
-from t3mpc_ros.radio.tool import robot_records
+from t3mpc_ros.radio.tool import eeprom_records
 from t3mpc_ros.radio.tool.procedure import Procedure
 
 VECTORS = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
-CURVES = (robot_records.SharpCurve(0.28, 0.02, 0.05, 0.003), *7 * (None,))
-CALIBRATION = robot_records.Calibration(
-    robot_records.Estimate(0.03512, 2e-5),
-    robot_records.Estimate(0.2012, 1.3e-4),
-    robot_records.Estimate(1.0123, 2e-4),
-    robot_records.Estimate(-0.01, 1e-4),
-    robot_records.DividerCorrection(-0.013, 0.02, 0.01),
+CURVES = (eeprom_records.SharpCurve(0.28, 0.02, 0.05, 0.003), *7 * (None,))
+CALIBRATION = eeprom_records.Calibration(
+    eeprom_records.Estimate(0.03512, 2e-5),
+    eeprom_records.Estimate(0.2012, 1.3e-4),
+    eeprom_records.Estimate(1.0123, 2e-4),
+    eeprom_records.Estimate(-0.01, 1e-4),
+    eeprom_records.DividerCorrection(-0.013, 0.02, 0.01),
     CURVES,
 )
 
@@ -79,26 +79,26 @@ def test_records_of_the_specification_byte_for_byte():
     golden = dict(VECTORS['records']['settings'])
     body = bytes.fromhex(golden.pop('bytes'))
     golden |= {'address': bytes.fromhex(golden['address']), 'sensors': tuple(golden['sensors'])}
-    settings = robot_records.RobotSettings(**golden)
-    assert robot_records.encode_settings(settings) == body
-    assert robot_records.decode_settings(body) == settings
+    settings = eeprom_records.RobotSettings(**golden)
+    assert eeprom_records.encode_settings(settings) == body
+    assert eeprom_records.decode_settings(body) == settings
     wired = settings._replace(battery_wired=True)  # from firmware 2.1
     body = body[:13] + bytes([body[13] | 4]) + body[14:]
-    assert robot_records.encode_settings(wired) == body
-    assert robot_records.decode_settings(body) == wired
+    assert eeprom_records.encode_settings(wired) == body
+    assert eeprom_records.decode_settings(body) == wired
     golden = VECTORS['records']['calibration']
     body = bytes.fromhex(golden['bytes'])
     names = 'wheel_radius', 'track', 'gyro_scale', 'gyro_bias'
-    calibration = robot_records.Calibration(
-        *(robot_records.Estimate(*golden[name]) for name in names),
-        robot_records.DividerCorrection(*golden['divider']),
-        tuple(curve and robot_records.SharpCurve(*curve) for curve in golden['curves']),
+    calibration = eeprom_records.Calibration(
+        *(eeprom_records.Estimate(*golden[name]) for name in names),
+        eeprom_records.DividerCorrection(*golden['divider']),
+        tuple(curve and eeprom_records.SharpCurve(*curve) for curve in golden['curves']),
     )
     assert calibration == CALIBRATION
-    assert robot_records.encode_calibration(calibration) == body
+    assert eeprom_records.encode_calibration(calibration) == body
     # What is read and written again does not drift, and no uncertainty shrinks.
-    again = robot_records.decode_calibration(body)
-    assert robot_records.encode_calibration(again) == body
+    again = eeprom_records.decode_calibration(body)
+    assert eeprom_records.encode_calibration(again) == body
     assert again.gyro_bias.uncertainty >= CALIBRATION.gyro_bias.uncertainty
 
 
@@ -106,9 +106,9 @@ def test_uncertainties_are_never_stored_as_smaller_or_as_none():
     source = random.Random(3)
     for _ in range(500):
         uncertainty = 10 ** source.uniform(-12, -3)
-        estimate = robot_records.Estimate(source.uniform(0.02, 0.05), uncertainty)
-        stored = robot_records.decode_calibration(
-            robot_records.encode_calibration(robot_records.Calibration(wheel_radius=estimate))
+        estimate = eeprom_records.Estimate(source.uniform(0.02, 0.05), uncertainty)
+        stored = eeprom_records.decode_calibration(
+            eeprom_records.encode_calibration(eeprom_records.Calibration(wheel_radius=estimate))
         )
         assert stored.wheel_radius.value == pytest.approx(estimate.value, abs=5.1e-8)
         assert uncertainty * (1 - 1e-6) <= stored.wheel_radius.uncertainty <= uncertainty + 1e-7
@@ -118,25 +118,28 @@ def test_uncertainties_are_never_stored_as_smaller_or_as_none():
     'change, words',
     [
         (
-            {'wheel_radius': robot_records.Estimate(0.0, 1e-5)},
+            {'wheel_radius': eeprom_records.Estimate(0.0, 1e-5)},
             r'wheel_radius must be from 0\.001 to 10',
         ),
-        ({'wheel_radius': robot_records.Estimate(float('nan'), 1e-5)}, 'wheel_radius must be'),
-        ({'track': robot_records.Estimate(0.2, 0.0)}, r'track\.uncertainty must be above 0'),
-        ({'track': robot_records.Estimate(0.2, 0.1)}, r'track\.uncertainty must be above 0'),
-        ({'gyro_scale': robot_records.Estimate(1.3, 1e-3)}, 'gyro_scale must be from 0.8 to 1.2'),
-        ({'gyro_bias': robot_records.Estimate(1.0, 1e-3)}, 'gyro_bias must be'),
-        ({'divider': robot_records.DividerCorrection(0.0, 40.0, 0.1)}, r'divider\.offset must be'),
+        ({'wheel_radius': eeprom_records.Estimate(float('nan'), 1e-5)}, 'wheel_radius must be'),
+        ({'track': eeprom_records.Estimate(0.2, 0.0)}, r'track\.uncertainty must be above 0'),
+        ({'track': eeprom_records.Estimate(0.2, 0.1)}, r'track\.uncertainty must be above 0'),
+        ({'gyro_scale': eeprom_records.Estimate(1.3, 1e-3)}, 'gyro_scale must be from 0.8 to 1.2'),
+        ({'gyro_bias': eeprom_records.Estimate(1.0, 1e-3)}, 'gyro_bias must be'),
+        (
+            {'divider': eeprom_records.DividerCorrection(0.0, 40.0, 0.1)},
+            r'divider\.offset must be',
+        ),
         ({'curves': ()}, 'curves must be 8'),
         (
-            {'curves': (*CURVES[:7], robot_records.SharpCurve(2.0, 0.0, 0.0, 0.01))},
+            {'curves': (*CURVES[:7], eeprom_records.SharpCurve(2.0, 0.0, 0.0, 0.01))},
             r'curves\[7\]\.scale',
         ),
     ],
 )
 def test_values_that_do_not_fit_are_rejected_before_sending(change, words):
     with pytest.raises(ValueError, match=words):
-        next(robot_records.write_calibration(CALIBRATION._replace(**change)))
+        next(eeprom_records.write_calibration(CALIBRATION._replace(**change)))
 
 
 @pytest.mark.parametrize('loss', [0.0, 0.1])
@@ -144,21 +147,21 @@ def test_calibration_survives_reset_and_lost_frames(library, loss):
     robot = Robot(library)
     robot.call('set_cell_us', 3400)
     cable = Cable(robot, loss)
-    assert cable.run(robot_records.read_calibration()) == robot_records.Calibration()
-    stored = cable.run(robot_records.write_calibration(CALIBRATION))
-    assert robot_records.encode_calibration(stored) == robot_records.encode_calibration(
+    assert cable.run(eeprom_records.read_calibration()) == eeprom_records.Calibration()
+    stored = cable.run(eeprom_records.write_calibration(CALIBRATION))
+    assert eeprom_records.encode_calibration(stored) == eeprom_records.encode_calibration(
         CALIBRATION
     )
     robot.call('boot', 4, 0)
-    assert cable.run(robot_records.read_calibration()) == stored
+    assert cable.run(eeprom_records.read_calibration()) == stored
     # A value is changed with the others kept.
     changed = stored._replace(gyro_bias=None)
-    assert cable.run(robot_records.write_calibration(changed)) == changed
-    settings = robot_records.RobotSettings(channel=100, sensors=8 * ('none',))
-    body = robot_records.encode_settings(settings)
-    assert cable.run(robot_records.write_record(frames.SETTINGS_RECORD, body)) == body
-    record = cable.run(robot_records.read_record(frames.SETTINGS_RECORD))
-    assert (record.valid, robot_records.decode_settings(record.content)) == (True, settings)
+    assert cable.run(eeprom_records.write_calibration(changed)) == changed
+    settings = eeprom_records.RobotSettings(channel=100, sensors=8 * ('none',))
+    body = eeprom_records.encode_settings(settings)
+    assert cable.run(eeprom_records.write_record(frames.SETTINGS_RECORD, body)) == body
+    record = cable.run(eeprom_records.read_record(frames.SETTINGS_RECORD))
+    assert (record.valid, eeprom_records.decode_settings(record.content)) == (True, settings)
 
 
 def test_damage_and_bad_timing_have_a_remedy(library):
@@ -166,14 +169,14 @@ def test_damage_and_bad_timing_have_a_remedy(library):
     cable = Cable(robot)
     robot.hello()
     robot.drive(1000, 1000, 40_000)
-    assert 'stop the bridge' in cable.run(robot_records.write_calibration(CALIBRATION))
+    assert 'stop the bridge' in cable.run(eeprom_records.write_calibration(CALIBRATION))
     robot.run(1_000_000)
     for copy in (104, 192):
         robot.call('poke_eeprom', copy + 3, 0)
     robot.call('boot', 4, 0)
-    assert 'damaged' in cable.run(robot_records.read_calibration())
+    assert 'damaged' in cable.run(eeprom_records.read_calibration())
     robot.call('wear', 110, True)
-    assert 'worn out' in cable.run(robot_records.write_calibration(CALIBRATION))
+    assert 'worn out' in cable.run(eeprom_records.write_calibration(CALIBRATION))
 
 
 def test_raw_samples(library):
@@ -183,16 +186,16 @@ def test_raw_samples(library):
     registers = (ctypes.c_int16 * 7)(1, -2, 16384, 0, 4, 5, -6)
     robot.call('set_imu', True, registers)
     cable = Cable(robot)
-    samples = cable.run(robot_records.read_samples())
-    assert robot_records.range_counts(samples) == tuple(range(0, 800, 100))
+    samples = cable.run(eeprom_records.read_samples())
+    assert eeprom_records.range_counts(samples) == tuple(range(0, 800, 100))
     assert samples[2:] == (800, 1, -2, 16384, 4, 5, -6)
     robot.call('set_imu', False, registers)
-    assert cable.run(robot_records.read_samples())[3:] == (0, 0, 0, 0, 0, 0)
+    assert cable.run(eeprom_records.read_samples())[3:] == (0, 0, 0, 0, 0, 0)
 
 
 @pytest.mark.parametrize('dongle', [True, False])
 def test_dongle_and_old_firmware_are_distinguished(dongle):
-    task = Procedure(robot_records.read_calibration(), decode_from_board)
+    task = Procedure(eeprom_records.read_calibration(), decode_from_board)
     task.port_opened(0)
     decoder = FrameDecoder()
     received = b''
