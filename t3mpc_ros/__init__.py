@@ -34,10 +34,10 @@ if TYPE_CHECKING:
     from t3mpc_ros.evaluation.api.parameter_sweep import Sweep, sweep
     from t3mpc_ros.evaluation.api.plants import NoiseLaw, OdePlant, Robot, StateSpace
     from t3mpc_ros.evaluation.api.references import Waypoints
-    from t3mpc_ros.evaluation.api.script_error import ScriptError
     from t3mpc_ros.evaluation.api.single_run import RunResult, simulate
     from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
     from t3mpc_ros.evaluation.simulated_links import LinkFaults
+    from t3mpc_ros.script_error import ScriptError
     from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 
 __version__ = VERSION
@@ -78,7 +78,7 @@ _HOMES = {
     'evaluation.api.parameter_sweep': ('Sweep', 'sweep'),
     'evaluation.api.plants': ('NoiseLaw', 'OdePlant', 'Robot', 'StateSpace'),
     'evaluation.api.references': ('Waypoints',),
-    'evaluation.api.script_error': ('ScriptError',),
+    'script_error': ('ScriptError',),
     'evaluation.api.single_run': ('RunResult', 'simulate'),
     'evaluation.simulated_links': ('LinkFaults',),
     'simulation.fault_injection': ('FaultEvent', 'FaultSchedule'),

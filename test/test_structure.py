@@ -44,6 +44,7 @@ PACKAGES = {
     'missing_library': set(),
     'atomic_file': set(),
     'version': set(),
+    'script_error': set(),
     'geometry': {'parameters', 'kernels'},
     'chaos': BASE,
     'fuzzy': BASE,
@@ -51,11 +52,11 @@ PACKAGES = {
     'robot': BASE,
     'bag': BASE | {'atomic_file'},
     'control': BASE | {'fuzzy', 'mpc'},
-    'simulation': BASE | {'robot'},
+    'simulation': BASE | {'robot', 'script_error'},
     'radio': BASE | {'robot'},
     'emulator': BASE | {'robot', 'simulation', 'radio'},
     'evaluation': CORE
-    | {'page', 'atomic_file', 'stop_signal', 'parent_process', 'missing_library'},
+    | {'page', 'atomic_file', 'stop_signal', 'parent_process', 'missing_library', 'script_error'},
     'nodes': CORE | {'radio', 'stop_signal', 'missing_library'},
     'cli': CORE
     | {'radio', 'stop_signal', 'parent_process', 'missing_library'}
@@ -63,7 +64,7 @@ PACKAGES = {
     'page': set(),
     'view': {'page'},
 }
-FRONT = {'evaluation', 'simulation'}
+FRONT = {'evaluation', 'simulation', 'script_error'}
 """Packages that hold the names of the top level, which imports them when they are used."""
 # Libraries that each package may import.
 LIBRARIES = {

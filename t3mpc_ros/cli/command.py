@@ -15,14 +15,11 @@
 
 import argparse
 from collections.abc import Callable, Sequence
-import os
-from pathlib import Path
 import select
 import sys
 from typing import Any
 
-from t3mpc_ros.evaluation.api.script_error import sentence
-from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.evaluation.api.one_sentence import sentence
 from t3mpc_ros.version import VERSION
 
 
@@ -92,10 +89,3 @@ def ask_line(question: str, stop: Callable[[], bool]) -> str:
         if ready:
             return sys.stdin.readline()
     return ''
-
-
-def check_writable(path: Path) -> None:
-    """Raise ParameterError if a file cannot be written: before the work whose result it takes."""
-    target = path if path.exists() else path.parent
-    if path.is_dir() or not path.parent.is_dir() or not os.access(target, os.W_OK):
-        raise ParameterError(f'{path} cannot be written: give a file in a folder that exists')

@@ -23,8 +23,13 @@ import sys
 from typing import Any, TypeVar
 
 from t3mpc_ros.cli import robot_calibrate
-from t3mpc_ros.cli.command import ArgumentParser, ask_line, check_writable
-from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
+from t3mpc_ros.cli.command import ArgumentParser, ask_line
+from t3mpc_ros.parameters.command_line import (
+    bounded_float,
+    bounded_int,
+    check_writable,
+    parse_assignments,
+)
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.parameters.yaml_files import YamlError, file_errors, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters

@@ -131,9 +131,18 @@ def draw_world(axis: Any, world: World) -> None:
     axis.add_collection(LineCollection(walls, colors='#374151', linewidths=1.4))
 
 
+class ShownFigure(Figure):
+    """A figure that a notebook shows, without a magic word that sets up pyplot."""
+
+    def _repr_png_(self) -> bytes:
+        buffer = io.BytesIO()
+        self.savefig(buffer, dpi=100)
+        return buffer.getvalue()
+
+
 def new_figure(height: float) -> Any:
     """Return an empty figure of ``height`` inches, independent of pyplot."""
-    figure = Figure(figsize=(WIDTH, height), layout='constrained')
+    figure = ShownFigure(figsize=(WIDTH, height), layout='constrained')
     FigureCanvasAgg(figure)
     return figure
 

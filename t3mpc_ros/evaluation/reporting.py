@@ -18,6 +18,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import csv
 from dataclasses import dataclass
 from functools import cache
+import html
 import json
 import math
 from pathlib import Path
@@ -64,9 +65,76 @@ class Table:
         lines = [f'**{self.title}**', ''] if self.title else []
         lines += [_line(self.head), '|---' * len(self.head) + '|']
         for row in self.rows:
-            name, *cells = (each if isinstance(each, str) else each.text for each in row)
+            name, *cells = _words(row)
             lines.append(_line([f'**{name}**' if name in self.bold else name, *cells]))
         return '\n'.join(lines)
+
+    def html(self) -> str:
+        """Return the table as HTML without a style of its own, as for a cell of a notebook."""
+        title = f'<caption>{html.escape(self.title)}</caption>' if self.title else ''
+        lines = [_html_row('th', self.head, self.text)]
+        for row in self.rows:
+            lines.append(_html_row('td', _words(row), self.text, row[0] in self.bold))
+        return f'<table>{title}' + ''.join(lines) + '</table>'
+
+    def latex(self) -> str:
+        """Return the table as a LaTeX float with the rules of the package ``booktabs``."""
+        places = 'l' * self.text + 'r' * (len(self.head) - self.text)
+        lines = [r'\begin{table}', r'  \centering']
+        if self.title:
+            lines.append(rf'  \caption{{{_latex(self.title)}}}')
+        lines += [rf'  \begin{{tabular}}{{{places}}}', r'    \toprule', _latex_row(self.head)]
+        lines.append(r'    \midrule')
+        lines += [_latex_row(_words(row), row[0] in self.bold) for row in self.rows]
+        lines += [r'    \bottomrule', r'  \end{tabular}', r'\end{table}']
+        return '\n'.join(lines) + '\n'
+
+
+def _words(row: Sequence[str | Mark]) -> list[str]:
+    return [each if isinstance(each, str) else each.text for each in row]
+
+
+def _html_row(kind: str, cells: Sequence[str], text: int, bold: bool = False) -> str:
+    shown = [html.escape(cell) for cell in cells]
+    if bold:
+        shown[0] = f'<b>{shown[0]}</b>'
+    ways = ['left' if i < text else 'right' for i in range(len(shown))]
+    pairs = zip(ways, shown, strict=True)
+    return (
+        f'<tr>{"".join(f"<{kind} style=text-align:{way}>{x}</{kind}>" for way, x in pairs)}</tr>'
+    )
+
+
+LATEX = {
+    '\\': r'\textbackslash{}',
+    **{sign: f'\\{sign}' for sign in '&%$#_{}'},
+    '~': r'\textasciitilde{}',
+    '^': r'\textasciicircum{}',
+    '±': r'$\pm$',
+    '−': '$-$',
+    '×': r'$\times$',
+    '·': r'$\cdot$',
+    '≤': r'$\le$',
+    '≥': r'$\ge$',
+    '∞': r'$\infty$',
+    'ω': r'$\omega$',
+    '°': r'\textdegree{}',
+    '²': '$^2$',
+    '³': '$^3$',
+    '→': r'$\to$',
+}
+"""How LaTeX writes what it reads otherwise, or does not have in every font."""
+
+
+def _latex(text: str) -> str:
+    return ''.join(LATEX.get(sign, sign) for sign in text)
+
+
+def _latex_row(cells: Sequence[str], bold: bool = False) -> str:
+    written = [_latex(cell) for cell in cells]
+    if bold:
+        written[0] = rf'\textbf{{{written[0]}}}'
+    return f'    {" & ".join(written)} ' + r'\\'
 
 
 @dataclass(frozen=True, slots=True)

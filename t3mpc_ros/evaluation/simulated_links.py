@@ -21,7 +21,12 @@ import math
 import numpy as np
 
 from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.parameters.yaml_files import EntryError, check_list, check_number
 from t3mpc_ros.robot.interface import RobotState
+from t3mpc_ros.script_error import ScriptError
+
+MAX_DELAY = 10.0
+"""Largest delay of a message, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +54,25 @@ class LinkFaults:
     """Of so many measurements each only the last is sent: a lower rate than the nodes assume."""
 
     def __post_init__(self) -> None:
+        try:
+            self._check()
+        except EntryError as error:
+            raise ScriptError(str(error)) from None
+
+    def _check(self) -> None:
+        for name in ('command_loss', 'odometry_loss', 'begin'):
+            check_number(getattr(self, name), name, 0.0, 1.0)
+        check_number(self.lasting, 'lasting', 0.0, math.inf, 's')
+        for name in ('command_delay', 'odometry_delay'):
+            pair = getattr(self, name)
+            given = list(pair) if isinstance(pair, tuple) else pair
+            least, most = check_list(given, name, 2, 2)
+            check_number(least, f'the least {name}', 0.0, MAX_DELAY, 's')
+            check_number(most, f'the largest {name}', least, MAX_DELAY, 's')
         for name, least in (('swapped', 0), ('repeated', 1), ('kept', 1)):
             count = getattr(self, f'odometry_{name}')
             if isinstance(count, bool) or not isinstance(count, int) or count < least:
-                raise ValueError(
+                raise ScriptError(
                     f'odometry_{name} must be a whole number of at least {least}: got {count!r}'
                 )
 

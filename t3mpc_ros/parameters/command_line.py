@@ -16,6 +16,8 @@
 from argparse import ArgumentTypeError
 import ast
 from collections.abc import Callable, Iterable
+import os
+from pathlib import Path
 from typing import TypeVar
 
 from t3mpc_ros.parameters.table import ParameterError, Parameters
@@ -74,3 +76,10 @@ def _bounded(kind: type[N], low: float, high: float, unit: str) -> Callable[[str
 
     parse.__name__ = 'number'  # argparse: "invalid number value: 'x'"
     return parse
+
+
+def check_writable(path: Path) -> None:
+    """Raise ParameterError if a file cannot be written: before the work whose result it takes."""
+    target = path if path.exists() else path.parent
+    if path.is_dir() or not path.parent.is_dir() or not os.access(target, os.W_OK):
+        raise ParameterError(f'{path} cannot be written: give a file in a folder that exists')

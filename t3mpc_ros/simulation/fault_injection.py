@@ -30,6 +30,7 @@ from t3mpc_ros.parameters.table import (
     nearest_hint,
     parameter,
 )
+from t3mpc_ros.script_error import ScriptError
 
 SCHEDULES_FOLDER = Path(__file__).resolve().parent / 'schedules'
 """Folder of the bundled schedules."""
@@ -114,7 +115,7 @@ def active_faults(parameters: FaultParameters) -> tuple[str, ...]:
     return tuple(texts)
 
 
-class ScheduleError(ValueError):
+class ScheduleError(ScriptError):
     """An invalid schedule; the text contains file, entry, bound and value."""
 
 

@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
+from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.geometry.types import NANOSECONDS, read_only
 from t3mpc_ros.parameters.table import nearest_hint
+from t3mpc_ros.script_error import ScriptError
 
 Array = NDArray[Any]
 RECEIVED, STAMP = 'received', 'stamp'

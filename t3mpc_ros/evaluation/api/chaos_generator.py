@@ -26,13 +26,20 @@ from numpy.typing import ArrayLike
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
+from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.references import numbers
-from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
 from t3mpc_ros.evaluation.api.table_files import write_csv
 from t3mpc_ros.geometry.types import Array, read_only
+from t3mpc_ros.script_error import ScriptError
+
+LONGEST_STEP, HALVINGS = 0.001, 7
+"""Step that is halved until the solution does not depend on it, s, and how often."""
+ROW = 0.01
+"""Time between two rows, s."""
+MIN_RTOL = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ChaosSolution:
     """Solution of a fractional-order system."""
 
@@ -42,10 +49,16 @@ class ChaosSolution:
     """States, shape (n, d)."""
     system: QuadraticSystem
     """What was solved."""
+    dt: float
+    """Step of the solver, s."""
+
+    def __repr__(self) -> str:
+        end = f'{len(self.t)} rows to {self.t[-1]:g} s'
+        return f'<{type(self).__name__}: {self.system.size} states, {end}, step {self.dt:g} s>'
 
     @one_sentence
     def plot(self, path: str | os.PathLike[str] | None = None, *, plane: bool = False) -> Any:
-        """Return a Matplotlib figure; write it to ``path`` (.png) if one is given.
+        """Return a Matplotlib figure; write it to ``path`` (.png, .pdf, .svg) if one is given.
 
         Each state over time, or with ``plane`` the second state over the first.
         """
@@ -71,9 +84,10 @@ def chaos(
     alpha: float | Sequence[float] = 0.98,
     *,
     tspan: tuple[float, float] = (0.0, 60.0),
-    dt: float = 0.001,
+    dt: float | None = None,
     y0: ArrayLike | None = None,
-    every: int = 10,
+    every: int | None = None,
+    rtol: float = 1e-3,
     system: QuadraticSystem | None = None,
 ) -> ChaosSolution:
     """Return the solution of the hyperchaotic system (85) with E6, or of another system.
@@ -88,12 +102,17 @@ def chaos(
     tspan
         First and last time, s.
     dt
-        Step of the solver, s.
+        Step of the solver, s; None: it follows from ``rtol``. The generator of the reference has
+        1 ms, with which the solution at 1 s is off by up to 3 %.
     y0
         State at the first time, shape (d,); by default that of the reference generator, and ones
         for another system.
     every
-        Steps between two rows of the result.
+        Steps between two rows of the result; by default there is a row every 10 ms.
+    rtol
+        Without ``dt``: the longest step 1 ms / 2^k is taken with which half of it changes the
+        states of the first second by at most this share of their largest one. Later errors of a
+        chaotic system grow, whatever the step, by its largest Lyapunov exponent.
     system
         Another system with quadratic terms, which has its own orders.
 
@@ -108,10 +127,12 @@ def chaos(
         raise ScriptError(f'tspan must be two times in s: got {tspan!r}') from None
     if not (math.isfinite(begin) and begin < end < math.inf):
         raise ScriptError(f'tspan must ascend: got {tspan!r}')
-    if not (isinstance(dt, int | float) and 0.0 < dt <= end - begin):
+    if dt is not None and not (isinstance(dt, int | float) and 0.0 < dt <= end - begin):
         raise ScriptError(f'dt must be above 0 s and at most the span: got {dt!r}')
-    if isinstance(every, bool) or not (isinstance(every, int) and every >= 1):
+    if every is not None and (isinstance(every, bool) or not isinstance(every, int) or every < 1):
         raise ScriptError(f'every must be a whole number, at least 1: got {every!r}')
+    if not (isinstance(rtol, float) and MIN_RTOL <= rtol <= 1.0):
+        raise ScriptError(f'rtol must be from {MIN_RTOL:g} to 1: got {rtol!r}')
     if system is None:
         orders = numbers('alpha', alpha, '() or (4,)')
         if orders.shape not in ((), (1,), (4,)):
@@ -121,11 +142,35 @@ def chaos(
     else:
         chosen, start = system, np.ones(system.size)
     initial = start if y0 is None else numbers('y0', y0, f'({chosen.size},)')
-    solver = FractionalSolver(chosen, dt, initial)
-    count = round((end - begin) / (dt * every))
-    states = np.empty((count + 1, chosen.size))
+    step = dt or _step_of(chosen, initial, end - begin, rtol)
+    rows = every or max(1, round(ROW / step))
+    states = _solve(chosen, initial, step, rows, end - begin)
+    times: Array = begin + step * rows * np.arange(len(states), dtype=np.float64)
+    return ChaosSolution(read_only(times), read_only(states), chosen, step)
+
+
+def _solve(system: QuadraticSystem, initial: Array, dt: float, every: int, span: float) -> Array:
+    solver = FractionalSolver(system, dt, initial)
+    states = np.empty((round(span / (dt * every)) + 1, system.size))
     states[0] = solver.state
-    for k in range(1, count + 1):
+    for k in range(1, len(states)):
         states[k] = solver.advance(every)
-    times: Array = begin + dt * every * np.arange(count + 1, dtype=np.float64)
-    return ChaosSolution(read_only(times), read_only(states), chosen)
+    return states
+
+
+def _step_of(system: QuadraticSystem, initial: Array, span: float, rtol: float) -> float:
+    """Return the longest step with which the first second is within ``rtol`` of half the step."""
+    first = min(span, 1.0)
+    dt = min(LONGEST_STEP, first)
+    every = max(1, round(min(ROW, first) / dt))
+    coarse, change = _solve(system, initial, dt, every, first), math.inf
+    for _ in range(HALVINGS):
+        fine = _solve(system, initial, 0.5 * dt, 2 * every, first)
+        change = float(np.max(np.abs(fine - coarse)) / max(np.max(np.abs(fine)), 1e-300))
+        if change <= rtol:
+            return dt
+        dt, every, coarse = 0.5 * dt, 2 * every, fine
+    raise ScriptError(
+        f'rtol must be at least {change:.2g} for this system with steps of {dt:.2g} s: '
+        f'got {rtol:g}'
+    )

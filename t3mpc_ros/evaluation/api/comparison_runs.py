@@ -21,24 +21,27 @@ from pathlib import Path
 from typing import Any
 
 from t3mpc_ros.evaluation.api.controllers import as_controllers
+from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
-from t3mpc_ros.evaluation.api.table_files import columns_of, write_csv, write_parquet
+from t3mpc_ros.evaluation.api.result_tables import ShownAsTables, data_frame
+from t3mpc_ros.evaluation.api.table_files import columns_of, writable, write_csv, write_parquet
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, run_plan
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.experiment import ResultTable, print_report
 from t3mpc_ros.evaluation.metrics import METRICS, Metric
+from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.parameters.provenance import machine, provenance
 from t3mpc_ros.parameters.table import find_names
+from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(ShownAsTables):
     """Result of a comparison: the metrics of every run, and what is made of them."""
 
     plan: ComparisonPlan
@@ -51,14 +54,19 @@ class Comparison:
         Differences are paired by seed, with the verdict ``better``, ``worse`` or
         ``inconclusive``. Without a case: of all of them, one below the other.
         """
+        return '\n\n'.join(table.markdown() for table in self._tables(case))
+
+    def _summary(self) -> str:
+        plan, count = self.plan, len(self.results)
+        names, cases = ', '.join(plan.methods), ', '.join(plan.cases)
+        return f'{names}; {cases}; {len(plan.seeds)} seeds, {count} runs'
+
+    def _tables(self, chosen: str | None = None) -> list[Table]:
         from t3mpc_ros.evaluation.comparison_page import case_table
 
-        cases = self.plan.cases if case is None else find_names('case', [case], self.plan.cases)
-        tables = [case_table(self.plan, self.results, each).markdown() for each in cases]
-        return '\n\n'.join(tables)
-
-    def __str__(self) -> str:
-        return self.table()
+        known = self.plan.cases
+        cases = known if chosen is None else find_names('case', [chosen], known)
+        return [case_table(self.plan, self.results, case) for case in cases]
 
     @one_sentence
     def values(self, controller: str, metric: str = 'overall', case: str = '') -> list[float]:
@@ -94,6 +102,11 @@ class Comparison:
         return [row | origin for row in self.results]
 
     @one_sentence
+    def to_frame(self) -> Any:
+        """Return one row for each run as a data frame of pandas, if that is installed."""
+        return data_frame(columns_of(self.rows()))
+
+    @one_sentence
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write one row for each run as CSV and return the path."""
         return write_csv(path, columns_of(self.rows()))
@@ -108,8 +121,7 @@ class Comparison:
         """Write tables and figures as one page and return the path."""
         from t3mpc_ros.evaluation.comparison_page import page
 
-        target = Path(path).expanduser()
-        target.parent.mkdir(parents=True, exist_ok=True)
+        target = writable(path)
         target.write_text(page(self.plan, self.results), encoding='utf-8')
         return target
 
@@ -137,7 +149,8 @@ def compare(
     controllers
         One or more of what :func:`simulate` takes as a controller.
     seeds
-        Whole numbers; no default one was used to tune a controller of the package.
+        Whole numbers, such as ``range(201, 207)``; no default one was used to tune a controller of
+        the package.
     cases
         Names of cases: what differs from the nominal robot.
     reference, plant, noise, faults, duration
@@ -186,9 +199,11 @@ def chosen_cases(cases: str | Sequence[str], scenario: Scenario) -> tuple[str, .
 def checked_seeds(seeds: Any) -> tuple[int, ...]:
     """Return seeds as a tuple, or raise :class:`ScriptError`."""
     try:
-        found = tuple([seeds] if isinstance(seeds, int) else seeds)
+        found = tuple(seeds)
     except TypeError:
-        found = (seeds,)
+        raise ScriptError(
+            f'seeds must be a list of them, such as [1] or range(1, 6): got {seeds!r}'
+        ) from None
     for seed in found:
         if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
             raise ScriptError(f'seeds must be whole numbers of at least 0: got {seed!r}')

@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
+from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,
@@ -41,6 +41,7 @@ from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.types import Array, read_only
 from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.parameters.table import Parameters, find_names
+from t3mpc_ros.script_error import ScriptError
 
 Settings = Mapping[str, Any]
 FILE_SEPARATOR = '.py:'

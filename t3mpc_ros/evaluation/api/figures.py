@@ -15,13 +15,12 @@
 
 from collections.abc import Callable, Mapping
 import os
-from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 
-from t3mpc_ros.evaluation.api.script_error import ScriptError
+from t3mpc_ros.evaluation.api.table_files import writable
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.plotting import (
@@ -31,10 +30,10 @@ from t3mpc_ros.evaluation.plotting import (
     name_time,
     new_figure,
     new_panels,
-    png_of,
 )
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.script_error import ScriptError
 
 
 def drawn(draw: Callable[[], Any], path: str | os.PathLike[str] | None) -> Any:
@@ -42,12 +41,17 @@ def drawn(draw: Callable[[], Any], path: str | os.PathLike[str] | None) -> Any:
     with matplotlib.rc_context(STYLE):
         figure = draw()
     if path is not None:
-        target = Path(path).expanduser()
-        if target.suffix != '.png':
-            raise ScriptError(f'path must end in .png: got {target}')
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(png_of(lambda _: figure, None) or b'')
+        target = writable(path)
+        if target.suffix not in PICTURES:
+            raise ScriptError(f'path must end in {", ".join(PICTURES)}: got {target}')
+        with matplotlib.rc_context({**STYLE, 'svg.hashsalt': 't3mpc_ros'}):
+            dated = PICTURES[target.suffix]
+            figure.savefig(target, dpi=150, metadata={dated: None} if dated else None)
     return figure
+
+
+PICTURES = {'.png': '', '.pdf': 'CreationDate', '.svg': 'Date'}
+"""Kinds of files, each with what dates it and is left out: equal figures are equal files."""
 
 
 def run_figure(name: str, columns: Mapping[str, Array]) -> Any:

@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.references import numbers
-from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
 from t3mpc_ros.fuzzy.inference import FuzzyParameters, FuzzyTables, build_sets, evaluate_basis
 from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.script_error import ScriptError
 
 
 class FuzzySystem:
@@ -167,8 +168,8 @@ def fuzzy(
         An argument is out of range.
     """
     names = inputs or ('x',)
-    if len({*names}) < len(names) or not all(isinstance(name, str) for name in names):
-        raise ScriptError(f'inputs must be names, each once: got {list(names)}')
+    if not all(isinstance(name, str) for name in names) or len({*names}) < len(names):
+        raise ScriptError(f'inputs must be names, each once: got {str(list(names))[1:-1]}')
     try:
         low, high = (float(centre) for centre in centres)
     except (TypeError, ValueError):

@@ -18,12 +18,12 @@ from typing import Any
 
 from t3mpc_ros.evaluation.api.plants import NoiseLaw, OdePlant, Robot, StateSpace, gaussian_noise
 from t3mpc_ros.evaluation.api.references import sampled
-from t3mpc_ros.evaluation.api.script_error import ScriptError
 from t3mpc_ros.evaluation.cases import NOMINAL, ROBOTS
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.parameters.table import find_names
+from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule, load_schedule
 
 

@@ -26,10 +26,11 @@ import numpy as np
 
 from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds, chosen_cases, find_metric
 from t3mpc_ros.evaluation.api.controllers import as_controllers
+from t3mpc_ros.evaluation.api.one_sentence import one_sentence, sentence
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence, sentence
-from t3mpc_ros.evaluation.api.table_files import columns_of, write_csv, write_parquet
+from t3mpc_ros.evaluation.api.result_tables import ShownAsTables, data_frame
+from t3mpc_ros.evaluation.api.table_files import columns_of, writable, write_csv, write_parquet
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.experiment import (
@@ -48,6 +49,7 @@ from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
+from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
 ROBOT = 'robot.'
@@ -58,8 +60,8 @@ RUN, ERROR = 'run', 'error'
 SUFFIX = '.parquet'
 
 
-@dataclass(frozen=True, eq=False)
-class Sweep:
+@dataclass(frozen=True, eq=False, repr=False)
+class Sweep(ShownAsTables):
     """Result of a sweep: one row for each run.
 
     A row holds ``controller``, the swept parameters by name, ``robot``, ``reference``, ``case``,
@@ -81,18 +83,21 @@ class Sweep:
     @one_sentence
     def table(self, metric: str = 'overall') -> str:
         """Return a metric in Markdown: mean and 95 % interval over the seeds of each cell."""
-        chosen = find_metric(metric)
+        return self._tables(metric)[0].markdown()
+
+    def _summary(self) -> str:
+        return f'{", ".join(self.parameters)}; {len(self.rows)} runs'
+
+    def _tables(self, chosen: str | None = None) -> list[Table]:
+        metric = find_metric(chosen or 'overall')
         names = ('controller', *self.parameters, 'case')
         lines = []
         for cell, rows in ResultTable(self.rows).groups(*names).items():
-            values = [row.get(chosen.name, math.nan) for row in rows]
-            text = format_interval(mean(values), interval(values), '', chosen.digits)
+            values = [row.get(metric.name, math.nan) for row in rows]
+            text = format_interval(mean(values), interval(values), '', metric.digits)
             lines.append((*map(str, cell), str(len(values)), text))
-        head = (*names, 'seeds', f'{chosen.heading}, {chosen.unit}')
-        return Table('', head, lines, text=1 + len(self.parameters) + 1).markdown()
-
-    def __str__(self) -> str:
-        return self.table()
+        head = (*names, 'seeds', f'{metric.heading}, {metric.unit}')
+        return [Table('', head, lines, text=1 + len(self.parameters) + 1)]
 
     @one_sentence
     def plot(
@@ -100,7 +105,8 @@ class Sweep:
     ) -> Any:
         """Return a Matplotlib figure of a metric over a swept parameter, a line per controller.
 
-        Means over all else, with 95 % intervals; written to ``path`` (.png) if one is given.
+        Means over all else, with 95 % intervals; written to ``path``, a .png, .pdf or .svg, if one
+        is given.
         """
         from t3mpc_ros.evaluation.api.figures import drawn, sweep_figure
 
@@ -112,6 +118,11 @@ class Sweep:
             lines.setdefault(str(line), {})[value] = numbers
         label = f'{wanted.heading} / ({wanted.unit})'
         return drawn(lambda: sweep_figure(lines, name, label), path)
+
+    @one_sentence
+    def to_frame(self) -> Any:
+        """Return one row for each run as a data frame of pandas, if that is installed."""
+        return data_frame(self.columns)
 
     @one_sentence
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
@@ -280,11 +291,9 @@ def _checked_path(output: str | os.PathLike[str] | None) -> Path | None:
     """Return the path; a missing library is an error before the runs, not after them."""
     if output is None:
         return None
-    path = Path(output).expanduser()
+    path = writable(output)
     if path.suffix != SUFFIX:
         raise ScriptError(f'output must end in {SUFFIX}: got {path}')
-    if path.is_dir():
-        raise ScriptError(f'output must be a file: got the folder {path}')
     import pyarrow.parquet  # noqa: F401
 
     return path

@@ -20,18 +20,23 @@ import math
 import os
 from pathlib import Path
 from typing import Any
+import warnings
 
 import numpy as np
+from numpy.exceptions import ComplexWarning
 from numpy.typing import ArrayLike, NDArray
 
-from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
+from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.baselines.baseline_controller import JUMP
 from t3mpc_ros.evaluation.record import RATE
 from t3mpc_ros.evaluation.scenario import SampledReference
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheel_speeds
 from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.script_error import ScriptError
 
 TIME = 'time'
+MAX_SPEED = 200.0
+"""Upper end of the range of ``wheel.max_velocity``, rad/s."""
 WHEELS, TWIST = ('right', 'left'), ('linear', 'angular')
 """Columns of a CSV file beside the time: wheel speeds (rad/s), or m/s and rad/s of the body."""
 
@@ -125,6 +130,11 @@ def sampled(source: Any, duration: float, geometry: WheelGeometry) -> SampledRef
         speeds = np.array([_row(source, t) for t in time.tolist()])
     else:
         speeds = _held(numbers('reference', source, '(n, 2)'), rows)
+    if (fastest := np.max(np.abs(speeds))) > MAX_SPEED:
+        raise ScriptError(
+            f'reference must be from {-MAX_SPEED:g} to {MAX_SPEED:g} rad/s, the highest '
+            f'wheel speed that a robot may have: got {fastest:.4g} rad/s'
+        )
     switched = jumps(speeds)
     modes = np.cumsum(switched, dtype=np.int64)
     return SampledReference(time, speeds, _slopes(speeds, switched), modes, switched)
@@ -132,8 +142,15 @@ def sampled(source: Any, duration: float, geometry: WheelGeometry) -> SampledRef
 
 def numbers(name: str, given: Any, shape: str) -> Array:
     """Return finite numbers as an array, or raise :class:`ScriptError` with the name."""
+    with warnings.catch_warnings(action='error', category=ComplexWarning):
+        return _finite_numbers(name, given, shape)
+
+
+def _finite_numbers(name: str, given: Any, shape: str) -> Array:
     try:
         found = np.array(given, dtype=np.float64)
+    except ComplexWarning:
+        raise ScriptError(f'{name} must be real numbers: got complex ones') from None
     except (TypeError, ValueError):
         raise ScriptError(
             f'{name} must be numbers of the shape {shape}: got {type(given).__name__} '
@@ -190,6 +207,8 @@ def read_csv(path: Path, time: Array, geometry: WheelGeometry) -> Array:
             head, *rows = [row for row in csv.reader(stream) if row] or [[]]
     except OSError as error:
         raise ScriptError(f'{path} cannot be read: {error.strerror}') from None
+    except (UnicodeDecodeError, csv.Error):
+        raise ScriptError(f'{path} must be a CSV file: got one that is no text in UTF-8') from None
     names = [name.strip() for name in head]
     kind = next((pair for pair in (WHEELS, TWIST) if {TIME, *pair} <= {*names}), None)
     if kind is None:

@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 
-from t3mpc_ros.evaluation.api.script_error import ScriptError
+from t3mpc_ros.script_error import ScriptError
 
 
 @contextmanager

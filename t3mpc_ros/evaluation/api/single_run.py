@@ -22,9 +22,10 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.evaluation.api.controllers import as_controllers
+from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.script_error import ScriptError, one_sentence
+from t3mpc_ros.evaluation.api.result_tables import ShownAsTables, data_frame
 from t3mpc_ros.evaluation.api.table_files import write_csv, write_parquet
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import rms
@@ -35,13 +36,14 @@ from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
 SIDES = ('right', 'left')
 
 
-@dataclass(frozen=True, eq=False)
-class RunResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class RunResult(ShownAsTables):
     """Result of one run.
 
     ``columns`` holds one array per name, a row for each control period: ``time`` (s);
@@ -83,21 +85,31 @@ class RunResult:
 
     def table(self) -> str:
         """Return the metrics as a Markdown table."""
+        return str(self)
+
+    def _summary(self) -> str:
+        settled = self.metrics['settled']
+        return f'{self.controller}: {self.scenario}, settled RMSE {settled:.4f} rad/s'
+
+    def _tables(self, chosen: str | None = None) -> list[Table]:
         rows = [
             (metric.heading, f'{self.metrics[metric.name]:.{metric.digits}f}', metric.unit)
             for metric in METRICS
             if metric.name in self.metrics
         ]
-        return Table(
-            f'{self.controller}: {self.scenario}', ('metric', 'value', 'unit'), rows
-        ).markdown()
+        return [Table(f'{self.controller}: {self.scenario}', ('metric', 'value', 'unit'), rows)]
 
-    def __str__(self) -> str:
-        return self.table()
+    @one_sentence
+    def to_frame(self) -> Any:
+        """Return the columns as a data frame of pandas, if that is installed."""
+        return data_frame(self.columns)
 
     @one_sentence
     def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
-        """Return a Matplotlib figure of speeds and error; write it to ``path`` if one is given."""
+        """Return a Matplotlib figure of speeds and error, which a notebook shows.
+
+        It is written to ``path``, a .png, .pdf or .svg, if one is given.
+        """
         from t3mpc_ros.evaluation.api.figures import drawn, run_figure
 
         return drawn(lambda: run_figure(self.controller, self.columns), path)

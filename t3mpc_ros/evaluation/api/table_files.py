@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.script_error import ScriptError
 from t3mpc_ros.evaluation.reporting import write_columns
+from t3mpc_ros.parameters.command_line import check_writable
 from t3mpc_ros.parameters.provenance import provenance
 
 Columns = Mapping[str, Sequence[Any] | np.ndarray[Any, Any]]
@@ -35,7 +35,7 @@ def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
 
 def write_csv(path: str | os.PathLike[str], columns: Columns) -> Path:
     """Write columns as CSV with one line of names, numbers with all their digits."""
-    target = _prepared(path)
+    target = writable(path)
     write_columns(target, columns)
     return target
 
@@ -47,7 +47,7 @@ def write_parquet(
     import pyarrow
     import pyarrow.parquet
 
-    target = _prepared(path)
+    target = writable(path)
     table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
     texts = {**provenance(), **(details or {})}
     table = table.replace_schema_metadata({name: str(text) for name, text in texts.items()})
@@ -58,9 +58,8 @@ def write_parquet(
     return target
 
 
-def _prepared(path: str | os.PathLike[str]) -> Path:
+def writable(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a file; ParameterError if it cannot be written, as in no folder."""
     target = Path(path).expanduser()
-    if target.is_dir():
-        raise ScriptError(f'path must be a file: got the folder {target}')
-    target.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(target)
     return target

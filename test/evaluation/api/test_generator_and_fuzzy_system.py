@@ -25,7 +25,8 @@ BAG = ROOT / 'test' / 'golden' / 'stops.mcap'
 
 
 def test_the_solution_is_that_of_the_full_memory():
-    solution = t3.chaos((0.9, 0.95, 0.98, 1.0), tspan=(2.0, 2.5), y0=np.ones(4), every=1)
+    orders = 0.9, 0.95, 0.98, 1.0
+    solution = t3.chaos(orders, tspan=(2.0, 2.5), dt=0.001, y0=np.ones(4), every=1)
     full = solve_full_memory(solution.system, 0.001, np.ones(4), 500)
     assert solution.t[[0, -1]].tolist() == pytest.approx([2.0, 2.5])
     np.testing.assert_allclose(solution.y, full, rtol=1e-5)

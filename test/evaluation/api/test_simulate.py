@@ -232,7 +232,7 @@ def test_the_twin_takes_reference_controller_and_faults():
 @pytest.mark.slow
 def test_files_hold_every_digit(tmp_path):
     run = t3.simulate(proportional, **SHORT)
-    head, *rows = csv.reader(run.to_csv(tmp_path / 'new' / 'run.csv').read_text().splitlines())
+    head, *rows = csv.reader(run.to_csv(tmp_path / 'run.csv').read_text().splitlines())
     assert head == [*run.columns]
     assert np.array_equal(np.array(rows, float)[:, 3], run[head[3]])
     pyarrow = pytest.importorskip('pyarrow.parquet')

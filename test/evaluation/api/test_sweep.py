@@ -249,8 +249,11 @@ def test_a_file_of_another_kind_is_left_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / 'sweep.parquet'
     (tmp_path / 'folder.parquet').mkdir()
-    for name, text in (('x.csv', 'end in .parquet: got x.csv'), ('folder.parquet', 'be a file')):
-        with pytest.raises(t3.ScriptError, match=f'output must {text}'):
+    for name, text in (
+        ('x.csv', 'must end in .parquet: got x.csv'),
+        ('folder.parquet', 'cannot be written'),
+    ):
+        with pytest.raises(t3.ScriptError, match=text):
             t3.sweep(Proportional, GAINS, executor=1, output=name, **SHORT)
     t3.simulate(Proportional, **SHORT).to_parquet(path)
     content = path.read_bytes()

@@ -13,8 +13,10 @@
 # limitations under the License.
 """Wrong use is one sentence: it names the thing, the bound, the value, and what to do next."""
 
+from pathlib import Path
 import subprocess
 import sys
+import tempfile
 import traceback
 
 import numpy as np
@@ -61,7 +63,40 @@ class WrongArguments:
         return np.zeros(2)
 
 
+def write_bytes(content):
+    """Return a CSV file that is none."""
+    path = Path(tempfile.mkdtemp()) / 'bytes.csv'
+    path.write_bytes(content)
+    return path
+
+
 WRONG = {
+    'one number for seeds': (
+        lambda: t3.compare('feed-forward', seeds=5, **SHORT),
+        r'seeds must be a list of them, such as \[1\] or range\(1, 6\): got 5',
+    ),
+    'folder of a file': (
+        lambda: t3.simulate(plant='servo', duration=4.0).to_csv('/nowhere/at/all.csv'),
+        'all.csv cannot be written: give a file in a folder that exists',
+    ),
+    'picture of another kind': (
+        lambda: t3.simulate(plant='servo', duration=4.0).plot('run.gif'),
+        'path must end in .png, .pdf, .svg: got run.gif',
+    ),
+    'fast reference': (
+        lambda: t3.simulate(reference=lambda time: (0.0, -1e9), plant='servo', duration=4.0),
+        r'reference must be from -200 to 200 rad/s, .* got 1e\+09 rad/s',
+    ),
+    'complex numbers': (
+        lambda: t3.simulate(reference=np.ones((9, 2), complex), plant='servo', duration=4.0),
+        'reference must be real numbers: got complex ones',
+    ),
+    'binary reference': (
+        lambda: t3.simulate(reference=write_bytes(b'\xff\x00\x80'), plant='servo', duration=4.0),
+        'bytes.csv must be a CSV file: got one that is no text in UTF-8',
+    ),
+    'list for a name': (lambda: t3.fuzzy(['x']), r"inputs must be names, each once: got \['x'\]"),
+    'tolerance of the generator': (lambda: t3.chaos(rtol=0.0), 'rtol must be from 1e-06 to 1'),
     'list for array': (
         lambda: t3.simulate(returns_list, **SHORT),
         r'returns_list must return a numpy array of shape \(2,\), .* got \[1.0, 2.0\] at 0.00 s',
@@ -158,6 +193,26 @@ def test_wrong_use_is_one_sentence(call, text):
         frame for frame in traceback.extract_tb(caught.tb) if '/t3mpc_ros/' in frame.filename
     ]
     assert len(inside) <= 2
+
+
+@pytest.mark.parametrize(
+    'kind, given, text',
+    [
+        ('LinkFaults', {'command_loss': 2.0}, 'command_loss must be a number from 0 to 1: got 2'),
+        ('LinkFaults', {'odometry_loss': True}, 'odometry_loss must be a number from 0 to 1'),
+        ('LinkFaults', {'begin': -0.1}, 'begin must be a number from 0 to 1: got -0.1'),
+        ('LinkFaults', {'lasting': float('nan')}, 'lasting must be a number from 0 to inf s'),
+        ('LinkFaults', {'odometry_delay': (0.2, 0.1)}, 'from 0.2 to 10 s: got 0.1'),
+        ('LinkFaults', {'command_delay': 0.1}, 'command_delay must be a list: got 0.1'),
+        ('LinkFaults', {'odometry_kept': 0}, 'odometry_kept must be a whole number of at least 1'),
+        ('FaultEvent', {'at': -1.0, 'fault': 'slippery', 'value': True}, 'at must be a number'),
+        ('FaultEvent', {'at': 1.0, 'fault': 'slipery', 'value': True}, 'did you mean slippery'),
+    ],
+)
+def test_faults_of_ones_own_are_checked_when_they_are_made(kind, given, text):
+    """A loss of 200 % was a loss of everything; an event raised an error of another class."""
+    with pytest.raises(t3.ScriptError, match=text):
+        getattr(t3, kind)(**given)
 
 
 @pytest.mark.slow

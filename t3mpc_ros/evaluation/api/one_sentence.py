@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The error of the scripting interface, and what makes it one sentence."""
+"""What makes an error of the scripting interface one sentence."""
 
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
@@ -19,16 +19,10 @@ from functools import wraps
 from typing import ParamSpec, TypeVar
 
 from t3mpc_ros.missing_library import remedy
+from t3mpc_ros.script_error import ScriptError
 
 P = ParamSpec('P')
 R = TypeVar('R')
-
-
-class ScriptError(ValueError):
-    """Wrong use, or a failure of a controller or plant of one's own; the text says what and where.
-
-    It is raised at the function that was called, without the calls inside of it.
-    """
 
 
 def one_sentence(function: Callable[P, R]) -> Callable[P, R]:

@@ -1,0 +1,69 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How the results of a script are shown: in a terminal, a notebook and a paper."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from importlib import import_module
+import sys
+from typing import Any
+
+from t3mpc_ros.evaluation.api.one_sentence import one_sentence
+from t3mpc_ros.evaluation.reporting import Table
+from t3mpc_ros.script_error import ScriptError
+
+
+class ShownAsTables(ABC):
+    """A result whose numbers are tables.
+
+    Its ``repr`` is one line, its ``str`` Markdown; as the last value of a cell of a notebook it is
+    shown as tables.
+    """
+
+    @abstractmethod
+    def _summary(self) -> str:
+        """Return what it is, in one line."""
+
+    @abstractmethod
+    def _tables(self, chosen: str | None = None) -> list[Table]:
+        """Return the tables of what is chosen, or of all."""
+
+    def __repr__(self) -> str:
+        return f'<{type(self).__name__}: {self._summary()}>'
+
+    def __str__(self) -> str:
+        return '\n\n'.join(table.markdown() for table in self._tables())
+
+    def _repr_html_(self) -> str:
+        return '\n'.join(table.html() for table in self._tables())
+
+    @one_sentence
+    def to_latex(self, chosen: str | None = None) -> str:
+        """Return the tables in LaTeX, with the rules of its package ``booktabs``.
+
+        ``chosen`` is a case of a comparison, or a metric of a sweep; by default as ``str`` shows.
+        """
+        return '\n'.join(table.latex() for table in self._tables(chosen))
+
+
+def data_frame(columns: Mapping[str, Any]) -> Any:
+    """Return columns as a data frame of pandas, which no extra of the package installs."""
+    try:
+        # No requirement of the package, which makes no frame itself.
+        pandas = import_module('pandas')
+    except ModuleNotFoundError:
+        raise ScriptError(
+            f'a data frame needs pandas: {sys.executable} -m pip install pandas'
+        ) from None
+    return pandas.DataFrame(dict(columns))
