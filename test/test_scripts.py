@@ -106,7 +106,7 @@ class Checkout:
         self.notes = folder / 'notes'
         self.bin = folder / 'bin'
         self.python(self.bin, '3.12.3')
-        tools = 'bash cat chmod cp dirname env flock grep locale mkdir mktemp mv readlink rm'
+        tools = 'bash cat chmod cp dirname env flock grep locale mkdir mktemp mv nproc readlink rm'
         tools += ' sed setsid sha256sum sleep sort tail uname'
         for tool in tools.split():
             (self.bin / tool).symlink_to(shutil.which(tool))

@@ -25,6 +25,8 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timed]
 
 ROBOT = {'world': 'room', 'noise.variance': 0.04}
+SWITCHING = {'switching.times': [3.0, 6.0]}
+"""Switches follow each other sooner than by default."""
 
 
 class LivePage(Browser):
@@ -48,7 +50,7 @@ def browser():
 def page(processes, browser, tmp_path):
     """Start graph and page, and open it; it records into the folder of the test."""
     processes.start('sim_robot', parameters=ROBOT)
-    processes.start('reference_generator')
+    processes.start('reference_generator', parameters=SWITCHING)
     processes.start('controller')
     options = '--headless', '--port', '0', '--runs', str(tmp_path)
     processes.start('view', 'view', *options, program='t3mpc')

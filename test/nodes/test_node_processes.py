@@ -132,7 +132,7 @@ class Run:
             processes.wait_ready(name)
         processes.wait_for('controller', 'tracking')
         self._record(self.bag)
-        observer.wait_for_motion(4.0)
+        observer.wait_for_motion(1.5)
         for victim in VICTIMS:
             self._kill(victim, 1.5)
             self._start(victim)

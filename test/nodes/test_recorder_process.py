@@ -44,8 +44,8 @@ SLOTS = 5
 
 def test_two_thousand_messages_a_second_are_all_recorded(processes, tmp_path):
     """``bench/recorder_load.py`` runs this for a minute and prints the processor load."""
-    found = run(tmp_path / 'bag', processes, seconds=4.0)
-    assert found.sent == 8000
+    found = run(tmp_path / 'bag', processes, seconds=2.0)
+    assert found.sent == 4000
     assert found.recorded == found.sent
     assert found.in_order
     with open_bag(tmp_path / 'bag') as recording:
