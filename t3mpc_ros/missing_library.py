@@ -30,6 +30,7 @@ REQUIREMENTS = {
     'daqp': 'daqp>=0.11,<1',
     'jinja2': 'jinja2>=3.1,<4',
     'tqdm': 'tqdm>=4.66,<5',
+    'shtab': 'shtab>=1.7,<2',
     'casadi': 'casadi>=3.6,<4',
     'pyarrow': 'pyarrow>=15,<30',
     'distributed': 'distributed>=2024.5,<2028',

@@ -75,7 +75,7 @@ LIBRARIES = {
     'evaluation': {'matplotlib', 'PIL', 'yaml', 'cma', 'casadi', 'jinja2', 'tqdm', 'daqp'}
     | {'pyarrow', 'distributed'},
     'nodes': {'yaml'},
-    'cli': {'yaml'},
+    'cli': {'yaml', 'shtab'},
 }
 ROS = re.compile(
     r'^(rclpy|rcl_interfaces|builtin_interfaces|tf2_ros|std_srvs|\w+_msgs|launch\w*|ament_index_python)$'
@@ -388,6 +388,7 @@ def test_package_xml_names_the_rosdep_keys_of_the_libraries():
         'daqp',
         'lz4',
         'zstandard',
+        'shtab',
         'casadi',
         'pyarrow',
         'distributed',

@@ -582,10 +582,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     3: done, but the bag is damaged or differs; see each command.
     """
-    return run_command(_bag_parser(), arguments)
+    return run_command(program_parser(), arguments)
 
 
-def _bag_parser() -> argparse.ArgumentParser:
+def program_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser: argparse.ArgumentParser = ArgumentParser(
         prog='t3mpc bag', description='Bags without a ROS graph.'
     )

@@ -35,7 +35,7 @@ from t3mpc_ros.stop_signal import StopSignal
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the emulator until a stop signal; return the exit code."""
-    options = _parser().parse_args(arguments)
+    options = program_parser().parse_args(arguments)
     try:
         key = read_key(options.key) if options.key is not None else b''
         values: dict[str, object] = {'twin.world': options.world, 'twin.seed': options.seed}
@@ -95,7 +95,8 @@ def _fail(error: Exception) -> int:
     return 2
 
 
-def _parser() -> argparse.ArgumentParser:
+def program_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     faults = '\n'.join(
         f'  {kind.name:<16} {kind.text}' + ('' if math.isnan(kind.value) else f' ({kind.value:g})')
         for kind in FAULT_KINDS

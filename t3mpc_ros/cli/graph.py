@@ -36,10 +36,13 @@ WINDOW = 10_000
 def add_parser(commands: Any) -> None:
     """Add the subcommands for topics, parameters and services."""
     topic = commands.add_parser('topic', help='topics of the graph, as ros2 topic')
-    words = topic.add_subparsers(dest='word', required=True, metavar='list|echo|hz')
+    words = topic.add_subparsers(dest='word', required=True, metavar='list|info|echo|hz')
     listing = words.add_parser('list', help='names of the topics')
     listing.add_argument('-t', '--show-types', action='store_true', help='with their types')
     listing.set_defaults(run=_with_graph(_list_topics))
+    info = words.add_parser('info', help='types, publishers and subscriptions of a topic')
+    info.add_argument('topic')
+    info.set_defaults(run=_with_graph(_show_topic))
     echo = words.add_parser('echo', help='messages of a topic')
     echo.add_argument('topic')
     echo.add_argument('--field', default='', help='one field, for example pose.pose.position')
@@ -50,15 +53,17 @@ def add_parser(commands: Any) -> None:
     rate.set_defaults(run=_with_graph(_rate))
 
     param = commands.add_parser('param', help='parameters of the nodes, as ros2 param')
-    words = param.add_subparsers(dest='word', required=True, metavar='list|get|set')
+    words = param.add_subparsers(dest='word', required=True, metavar='list|describe|get|set')
     listing = words.add_parser('list', help='names of the parameters')
     listing.add_argument('node', nargs='?', help='of this node only, for example /controller')
     listing.set_defaults(run=_with_graph(_list_parameters))
+    describing = words.add_parser('describe', help='what a parameter is, with its range')
     getting = words.add_parser('get', help='value of a parameter')
     setting = words.add_parser('set', help='set a dynamic parameter')
-    for parser in (getting, setting):
+    for parser in (describing, getting, setting):
         parser.add_argument('node')
         parser.add_argument('name')
+    describing.set_defaults(run=_with_graph(_describe_parameter))
     getting.set_defaults(run=_with_graph(_get_parameter))
     setting.add_argument('value', help='in YAML: 0.3, true, [1.0, 2.0], text')
     setting.set_defaults(run=_with_graph(_set_parameter))
@@ -87,6 +92,11 @@ def _with_graph(
 def _list_topics(graph: 'Graph', options: argparse.Namespace) -> int:
     for name, kinds in graph.topics().items():
         print(f'{name} [{", ".join(kinds)}]' if options.show_types else name)
+    return 0
+
+
+def _show_topic(graph: 'Graph', options: argparse.Namespace) -> int:
+    print(graph.topic_text(options.topic))
     return 0
 
 
@@ -123,6 +133,11 @@ def _list_parameters(graph: 'Graph', options: argparse.Namespace) -> int:
         return 0
     for node in graph.nodes():
         print('\n  '.join([f'{node}:', *graph.parameter_names(node)]))
+    return 0
+
+
+def _describe_parameter(graph: 'Graph', options: argparse.Namespace) -> int:
+    print(graph.parameter_description(options.node, options.name))
     return 0
 
 

@@ -14,13 +14,13 @@
 """``t3mpc``: the command-line program; each subcommand has a module of its name."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from datetime import datetime
 from importlib import import_module
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 import webbrowser
 
 from t3mpc_ros.cli import compare, faults, graph, paper, patrol, sweep, train, tune, view
@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(words: Sequence[str]) -> int:
     if words and words[0] in PROGRAMS:
         # Imported only when it is used: `t3mpc --help` stays fast.
-        code: int = import_module(f't3mpc_ros.cli.{words[0]}').main(words[1:])
+        code: int = _program(words[0]).main(words[1:])
         return code
     parser = _parser()
     reject_removed(parser, ' '.join(['t3mpc', *words[:1]]))
@@ -193,7 +193,23 @@ def _compile_controllers() -> None:
         run(Scenario(robot, NOMINAL, 1, 1.0), spec)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _complete(options: argparse.Namespace) -> int:
+    """Print what a shell reads to complete commands and options."""
+    import shtab
+
+    parser = _parser({name: _program(name).program_parser() for name in PROGRAMS})
+    print(shtab.complete(parser, options.shell))
+    return 0
+
+
+def _program(name: str) -> Any:
+    return import_module(f't3mpc_ros.cli.{name}')
+
+
+def _parser(
+    programs: Mapping[str, argparse.ArgumentParser] | None = None,
+) -> argparse.ArgumentParser:
+    """Return the parser of the command line; ``programs`` are those of :data:`PROGRAMS`."""
     parser: argparse.ArgumentParser = ArgumentParser(
         prog='t3mpc',
         description='Tools of t3mpc_ros; topic, param, call, stop, view and demo use a ROS graph.',
@@ -240,6 +256,8 @@ def _parser() -> argparse.ArgumentParser:
 
     for name, text in PROGRAMS.items():
         commands.add_parser(name, help=text, add_help=False)
+        if programs:
+            commands.choices[name] = programs[name]
 
     estimation = commands.add_parser(
         'estimation', help='the kinds of fuzzy systems as estimators, without a controller (86)'
@@ -265,6 +283,12 @@ def _parser() -> argparse.ArgumentParser:
 
     for module in (paper, compare, sweep, patrol, tune, train, faults, view, graph):
         module.add_parser(commands)
+    completing = commands.add_parser(
+        'completion',
+        help='print what bash or zsh completes: eval "$(t3mpc completion bash)"',
+    )
+    completing.add_argument('shell', choices=('bash', 'zsh'))
+    completing.set_defaults(run=_complete)
     compiling = commands.add_parser('compile', help='compile every kernel into the cache')
     compiling.set_defaults(run=_compile)
     return parser

@@ -66,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0: done, result good; 1: done, result poor; 2: failed, or wrong command line; 130: interrupted.
     """
-    options = _parser().parse_args(arguments)
+    options = program_parser().parse_args(arguments)
     with StopSignal() as stop:
         try:
             return int(options.run(options, stop))
@@ -368,7 +368,8 @@ def _revolutions(text: str) -> float:
     return value
 
 
-def _parser() -> argparse.ArgumentParser:
+def program_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     parser: argparse.ArgumentParser = ArgumentParser(
         prog='t3mpc robot',
         description='Key, link and wheels of the real robot, on the bench.',

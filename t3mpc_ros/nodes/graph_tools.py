@@ -25,16 +25,28 @@ from typing import Any
 
 import numpy as np
 from rcl_interfaces.msg import ParameterValue
-from rcl_interfaces.srv import GetParameters, ListParameters, SetParameters
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+)
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import SetBool
 import yaml
 
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.conversions import message_class
 from t3mpc_ros.nodes.process import own_context
-from t3mpc_ros.nodes.remote_parameters import parameter_message, plain_value, refusal, type_text
+from t3mpc_ros.nodes.remote_parameters import (
+    parameter_message,
+    parameter_row,
+    plain_value,
+    refusal,
+    type_text,
+)
 
 LISTING = 1.5
 """Time in which nodes are discovered before they are listed, s."""
@@ -94,6 +106,27 @@ class Graph:
             if name not in own or self._node.count_publishers(name) > 0
         }
 
+    def topic_text(self, topic: str) -> str:
+        """Return types, publishers and subscriptions of a topic, a node a line, with their QoS.
+
+        GraphError if neither is there.
+        """
+        name = self._node.resolve_topic_name(topic)
+        node = self._node
+        self.discover(lambda: node.count_publishers(name) + node.count_subscribers(name) > 0)
+        ends = {
+            'publishers': node.get_publishers_info_by_topic(name),
+            'subscriptions': node.get_subscriptions_info_by_topic(name),
+        }
+        kinds = sorted({info.topic_type for found in ends.values() for info in found})
+        if not kinds:
+            raise GraphError(f'nothing publishes or receives {name} (t3mpc topic list)')
+        lines = [f'type: {", ".join(kinds)}']
+        for word, found in ends.items():
+            lines.append(f'{word}: {len(found)}')
+            lines += sorted(f'  {_end_text(info)}' for info in found)
+        return '\n'.join(lines)
+
     def messages(self, topic: str) -> Iterator[Any]:
         """Yield the messages of a topic from now on, and None about twenty times a second.
 
@@ -146,6 +179,20 @@ class Graph:
         value = self._parameter(node, name)
         *many, kind = type_text(value.type).split(' of ')
         return f'{_WORDS[kind]} {"values are" if many else "value is"}: {plain_value(value)}'
+
+    def parameter_description(self, node: str, name: str) -> str:
+        """Return what a parameter is: text, type, unit, range or choices, whether dynamic."""
+        value = self._parameter(node, name)
+        request = DescribeParameters.Request(names=[name])
+        answer = self.call(f'{node}/describe_parameters', DescribeParameters, request)
+        row = parameter_row(answer.descriptors[0], value)
+        lines = [f'{name}: {row["text"]}', f'  type: {row["type"]}', f'  value: {row["value"]}']
+        bounds = {'unit': row['unit'], 'least': row['low'], 'largest': row['high']}
+        lines += [f'  {word}: {each}' for word, each in bounds.items() if each not in ('', None)]
+        if row['choices']:
+            lines.append(f'  one of: {", ".join(row["choices"])}')
+        lines.append(f'  can be set while the node runs: {"yes" if row["dynamic"] else "no"}')
+        return '\n'.join(lines)
 
     def set_parameter(self, node: str, name: str, value: object) -> str:
         """Set a parameter; return the reason of a refusal, or nothing.
@@ -248,6 +295,14 @@ def graph(stop: Callable[[], bool] = lambda: False) -> Iterator[Graph]:
     options = {'start_parameter_services': False, 'enable_rosout': False}
     with own_context(lambda: Node('t3mpc', **options)) as node, closing(Graph(node, stop)) as made:
         yield made
+
+
+def _end_text(info: TopicEndpointInfo) -> str:
+    """Return a publisher or subscription: its node, and what it offers or requests."""
+    profile = info.qos_profile
+    policies = (profile.reliability, profile.durability)
+    words = ', '.join(each.short_key.replace('_', ' ') for each in policies)
+    return f'{qos.full_name(info.node_namespace, info.node_name)} ({info.topic_type}; {words})'
 
 
 def plain(message: Any) -> Any:

@@ -226,6 +226,8 @@ GRAPH.messages.return_value = ['one', 'two']
 GRAPH.nodes.return_value = ['/controller']
 GRAPH.parameter_names.return_value = ['rate']
 GRAPH.parameter_text.return_value = '1.0'
+GRAPH.topic_text.return_value = 'of /odom'
+GRAPH.parameter_description.return_value = 'a rate'
 GRAPH.set_parameter.return_value = ''
 GRAPH.stop_robots.return_value = {'/e_stop': ''}
 SEEN = {
@@ -448,6 +450,10 @@ TABLE = {
         },
     ),
     'topic list': (SEEN, {'-t': {'text': '/odom [nav_msgs/msg/Odometry]\n'}}),
+    'topic info /odom': (
+        SEEN,
+        {'': {'text': 'of /odom\n', 'graph': ('topic_text', '/odom')}},
+    ),
     'topic echo /odom': (
         SEEN,
         {
@@ -460,6 +466,10 @@ TABLE = {
     'param list': (
         SEEN,
         {'/player': {'text': 'rate\n', 'graph': ('parameter_names', '/player')}},
+    ),
+    'param describe /player rate': (
+        SEEN,
+        {'': {'text': 'a rate\n', 'graph': ('parameter_description', '/player', 'rate')}},
     ),
     'param get /player rate': (SEEN, {'': {'graph': ('parameter_text', '/player', 'rate')}}),
     'param set /player rate 0.3': (
@@ -695,9 +705,11 @@ def test_an_option_changes_what_it_names(words, observed):
             assert not option or base.get(path, ...) != value, f'{option} must change {path}'
 
 
-@pytest.mark.parametrize(
-    'command', [name for name in commands() if name not in ('demo', 'bag info', 'compile')]
-)
+WITHOUT_ROWS = 'demo', 'bag info', 'compile', 'completion'
+"""Without options, or with tests of their own."""
+
+
+@pytest.mark.parametrize('command', [name for name in commands() if name not in WITHOUT_ROWS])
 def test_every_option_has_a_row(command):
     used = ' '.join(
         f'{words} {" ".join(rows)} '

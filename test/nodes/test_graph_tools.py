@@ -63,7 +63,16 @@ def test_topics_have_types_and_messages(asked, harness, nothing_comes):
     first, second = asked.messages('odom', 2)
     assert yaml.safe_load(message_text(first, 'header.frame_id')) == 'odom'
     assert second.header.stamp != first.header.stamp
+    lines = asked('topic_text', 'odom').splitlines()
+    assert lines[:2] == ['type: nav_msgs/msg/Odometry', 'publishers: 1']
+    assert lines[2] == '  /sim_robot (nav_msgs/msg/Odometry; reliable, volatile)'
+    assert asked('topic_text', '/cmd_vel').splitlines()[1:3] == [
+        'publishers: 0',
+        'subscriptions: 1',
+    ]
     nothing_comes()
+    with pytest.raises(GraphError, match='nothing publishes or receives /odam'):
+        asked('topic_text', 'odam')
     with pytest.raises(GraphError, match='no messages of /odam: nothing publishes it'):
         asked.messages('odam', 1)
 
@@ -76,6 +85,16 @@ def test_parameters_are_listed_read_and_set(asked, harness, nothing_comes):
     text = asked('parameter_text', '/sim_robot', 'drive.kind')
     assert text == f'String value is: {robot.parameters.drive.kind}'
     assert asked('set_parameter', '/sim_robot', 'faults.command_loss', 0.5) == ''
+    described = asked('parameter_description', '/sim_robot', 'faults.command_loss').splitlines()
+    assert described[0].startswith('faults.command_loss: ')
+    words = ['type: float', 'value: 0.5', 'least: 0.0', 'largest: 1.0']
+    assert [line.strip() for line in described[1:]] == [
+        *words,
+        'can be set while the node runs: yes',
+    ]
+    described = asked('parameter_description', '/sim_robot', 'drive.kind')
+    assert 'one of: velocity, torque, stepper' in described
+    assert described.endswith(': no')
     assert robot.parameters.faults.command_loss == 0.5
     assert 'read-only' in asked('set_parameter', '/sim_robot', 'drive.kind', 'velocity')
     with pytest.raises(GraphError, match='has no parameter no_such'):
