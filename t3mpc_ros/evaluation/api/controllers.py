@@ -15,7 +15,7 @@
 
 from collections.abc import Callable, Mapping
 from copy import deepcopy
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 import hashlib
 import importlib.util
@@ -104,10 +104,25 @@ class Controller:
 
 
 def loaded(spec: str) -> Any:
-    """Return the class, function or object that ``file.py:Name`` is."""
+    """Return the class, function or object that ``file.py:Name`` is.
+
+    The functions of a plant go to other processes with the text of their file: by their name, as
+    functions are sent, no other process finds them.
+    """
     if FILE_SEPARATOR not in spec:
         raise ScriptError(f'must be FILE.py:NAME: got {spec}')
-    return FileController.load(spec).resolve()
+    source = FileController.load(spec)
+    found = source.resolve()
+    if not is_dataclass(found) or isinstance(found, type):
+        return found
+    names = {id(value): name for name, value in vars(sys.modules[source.module]).items()}
+    parts = {each.name: getattr(found, each.name) for each in fields(found)}
+    own = {
+        name: replace(source, name=names[id(value)])
+        for name, value in parts.items()
+        if getattr(value, '__module__', '') == source.module and id(value) in names
+    }
+    return replace(found, **own)
 
 
 def as_controllers(given: Any) -> list[Controller]:
@@ -154,32 +169,42 @@ class FileController:
             names = [
                 name
                 for name, value in content.items()
-                if not name.startswith('_') and getattr(value, '__module__', '') == self._key
+                if not name.startswith('_') and getattr(value, '__module__', '') == self.module
             ]
             raise ScriptError(
                 f'{self.path} must define {self.name}: it defines {", ".join(names) or "nothing"}'
             )
         return content[self.name]
 
+    def __call__(self, *arguments: Any) -> Any:
+        """Return what the function returns."""
+        return self.resolve()(*arguments)
+
     @property
-    def _key(self) -> str:
+    def __name__(self) -> str:
+        """Name in errors and tables."""
+        return self.name
+
+    @property
+    def module(self) -> str:
+        """Name of the module of the file in each process."""
         digest = hashlib.sha256(self.text.encode()).hexdigest()[:12]
         return f'{Path(self.path).stem}_{digest}'
 
     def _module(self) -> ModuleType:
         """Return the module of the file, run once in each process."""
-        if self._key in sys.modules:
-            return sys.modules[self._key]
-        spec = importlib.util.spec_from_loader(self._key, None, origin=self.path)
+        if self.module in sys.modules:
+            return sys.modules[self.module]
+        spec = importlib.util.spec_from_loader(self.module, None, origin=self.path)
         assert spec is not None
         module = importlib.util.module_from_spec(spec)
-        sys.modules[self._key] = module
+        sys.modules[self.module] = module
         folder = str(Path(self.path).resolve().parent)
         sys.path.insert(0, folder)  # as when the file is run as a program
         try:
             exec(compile(self.text, self.path, 'exec'), vars(module))
         except Exception as error:
-            del sys.modules[self._key]
+            del sys.modules[self.module]
             raise ScriptError(
                 f'{self.path} cannot be run: {described(error, self.path)}'
             ) from None

@@ -15,11 +15,14 @@
 
 import csv
 import math
+import pickle
+import sys
 
 import numpy as np
 import pytest
 
 import t3mpc_ros as t3
+from t3mpc_ros.evaluation.api.controllers import loaded
 from t3mpc_ros.evaluation.api.references import sampled
 
 PERIOD = 0.01
@@ -243,3 +246,29 @@ def test_files_hold_every_digit(tmp_path):
     assert run.plot(tmp_path / 'run.png').axes
     assert (tmp_path / 'run.png').read_bytes().startswith(b'\x89PNG')
     assert '| variation |' in run.table()
+
+
+PLANT_FILE = """import t3mpc_ros as t3
+
+
+def lag(time, state, command):
+    return 20.0 * (command - state)
+
+
+named = t3.OdePlant(lag)
+"""
+
+
+def test_a_plant_of_a_file_goes_to_another_process_with_its_file(tmp_path):
+    """``t3mpc compare --robot FILE.py:NAME`` ended with the advice to guard the script."""
+    path = tmp_path / 'own.py'
+    path.write_text(PLANT_FILE)
+    found = loaded(f'{path}:named')
+    here = t3.simulate('PI + feed-forward', plant=found, duration=4.0)
+    sent = pickle.dumps(found)
+    path.unlink()
+    for name in [name for name in sys.modules if name.startswith('own_')]:
+        del sys.modules[name]
+    there = t3.simulate('PI + feed-forward', plant=pickle.loads(sent), duration=4.0)
+    assert np.array_equal(there['speed_right'], here['speed_right'])
+    assert found.name == 'lag'
