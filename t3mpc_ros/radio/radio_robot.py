@@ -27,7 +27,7 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parame
 from t3mpc_ros.radio.link.link import Link
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState, PortAction
-from t3mpc_ros.radio.link.standstill_reasons import restarted
+from t3mpc_ros.radio.link.standstill_reasons import ANSWERS_AGAIN, restarted
 from t3mpc_ros.radio.link.statistics import LinkQuality
 from t3mpc_ros.radio.link.telemetry import Telemetry
 from t3mpc_ros.robot import interface
@@ -120,6 +120,8 @@ class RadioRobot(interface.RobotInterface):
         self.unknown_travel = 0.0
         """Sum of the greatest path lengths that restarts in motion left unmeasured, m."""
         self._limited = False
+        self._silence = ''
+        """Reason of a stop for a robot that does not answer; empty when it does."""
         self._expiry_ns = 0
         """Time at which the robot stops by itself without another command."""
         self._commanded = interface.ZERO_WHEEL_SPEEDS
@@ -216,7 +218,12 @@ class RadioRobot(interface.RobotInterface):
     def _send_command(self, now_ns: int) -> None:
         """Pass the limited command to the link, once per cycle."""
         if self.link.is_silent(now_ns):
-            self._limiter.stop(self.link.reason(now_ns), now_ns)
+            self._silence = self.link.reason(now_ns)
+            self._limiter.stop(self._silence, now_ns)
+        elif self._silence:
+            if self._limiter.reason == self._silence:
+                self._limiter.stop(ANSWERS_AGAIN, now_ns)
+            self._silence = ''
         if 0 < self._limiter.remaining_ns(now_ns) < self._period_ns:
             self._limiter.expire()  # within this cycle
         if now_ns > self._expiry_ns + 2 * self._period_ns:

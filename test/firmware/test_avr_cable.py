@@ -18,7 +18,7 @@ import math
 import pytest
 from support.avr_bench import on_avr
 from support.avr_boards import ROBOT
-from support.emulator_bench import Bench
+from support.emulator_bench import Bench, CablePort
 from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.link.port_actions import LinkState
@@ -33,15 +33,7 @@ class CableBench(Bench):
     """A bench at the USB port of the robot board."""
 
     def __init__(self, emulator, **given):
-        run_to = emulator.run_to
-        emulator.feed = emulator.feed_console
-
-        def arrived(now_ns):
-            run_to(now_ns)
-            return emulator.take_console()
-
-        emulator.run_to = arrived
-        super().__init__(emulator=emulator, **given)
+        super().__init__(emulator=CablePort(emulator), **given)
 
 
 def drive(bench):

@@ -117,9 +117,19 @@ def a_pong(*counts):
 
 
 def test_a_silence_is_blamed_on_the_hop_of_its_own_cycles():
-    absent = 'the robot does not answer: is it on, in range, on channel 82?'
-    assert LinkStatistics(0.02, 0.2).silence_reason(82) == absent
-    assert after(Loss.NO_REPLY, 0.005).silence_reason(82) == absent
-    unplugged = after(0.005, Loss.NO_REPLY, Loss.NO_REPLY, Loss.RADIO).silence_reason(82)
-    assert unplugged == 'the dongle does not reply: is its cable loose or damaged?'
-    assert after(0.005, Loss.NO_REPLY, Loss.RADIO, Loss.RADIO).silence_reason(82) == absent
+    assert not LinkStatistics(0.02, 0.2).lost_before_radio()
+    assert not after(Loss.NO_REPLY, 0.005).lost_before_radio()
+    assert after(0.005, Loss.NO_REPLY, Loss.NO_REPLY, Loss.RADIO).lost_before_radio()
+    assert not after(0.005, Loss.NO_REPLY, Loss.RADIO, Loss.RADIO).lost_before_radio()
+
+
+def test_losses_that_a_restart_explains_are_not_judged():
+    """A robot that had restarted was warned of as a bad radio for ten seconds."""
+    statistics = after(*[0.005] * 90, *[Loss.RADIO] * 10)
+    assert 'on the radio' in statistics.quality(0.0, NOTHING).text
+    statistics.explain_losses()
+    quality = statistics.quality(0.0, NOTHING)
+    assert (quality.text, quality.lost, quality.lost_share) == ('', 10, 0.0)
+    for _ in range(6):
+        statistics.add_cycle(Loss.RADIO)
+    assert '6.2 % of the cycles are lost on the radio' in statistics.quality(0.0, NOTHING).text

@@ -151,7 +151,9 @@ def a_handshake(source):
     """Lost and foreign answers keep the text of the reason only."""
     parameters, robot, now_ns = LinkParameters(), FakeRobot(), 5 * SECOND
     session = Session(b'', source.randbytes, 0, now_ns)
-    used, fresh = (Handshake(session, parameters, 'because') for _ in range(2))
+    used, fresh = (
+        Handshake(session, parameters, 'because', 'absent', 'no reply') for _ in range(2)
+    )
     while fresh.state is not LinkState.RUN:
         for _ in range(source.randrange(45)):
             request, _ = used.next_request(now_ns)

@@ -118,7 +118,7 @@ def the_dongle_is_pulled_out(bench):
     bench.run(0.5)
 
 
-@cause('the dongle stopped answering: did it restart?')
+@cause(reasons.DONGLE_TIMEOUT)
 def the_line_is_dead(bench):
     driving(bench)
     bench.inject('silence')

@@ -216,6 +216,35 @@ class RobotBench(Bench):
         self.robot.apply(command, self.now_ns)
 
 
+class CablePort:
+    """The USB port of the robot board of an emulator, or of one with its interface."""
+
+    def __init__(self, emulator):
+        self._emulator = emulator
+        self.unplugged = False
+
+    def __getattr__(self, name):
+        return getattr(self._emulator, name)
+
+    def feed(self, data, now_ns):
+        if not self.unplugged:
+            self._emulator.feed_console(data, now_ns)
+
+    def run_to(self, now_ns):
+        self._emulator.run_to(now_ns)
+        blocks = self._emulator.take_console()
+        return [] if self.unplugged else blocks
+
+
+def cable_bench(flat=None, key=b'', robot_key=None, seed=1, kind=Bench, **given):
+    """Return a bench at the USB port of the robot board."""
+    parameters = EmulatorParameters.from_dict(flat or {})
+    emulator = Emulator(parameters, key if robot_key is None else robot_key, seed, START_NS)
+    made = kind(key=key, seed=seed, emulator=CablePort(emulator), **given)
+    made.clock_error = parameters.robot_clock_error
+    return made
+
+
 def sent_commands(*benches):
     """Return time and content of every command in the writes of the hosts, each host in order."""
     found = []

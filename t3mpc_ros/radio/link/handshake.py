@@ -134,13 +134,21 @@ class Session:
 class Handshake:
     """Handshake from HELLO to RUN.
 
-    ``reason`` for it is reported until there is a newer one.
+    ``reason`` for it is reported until there is a newer one; ``absent`` and ``no_reply`` are those
+    for a robot, and for the board at the port, that does not answer.
     """
 
-    def __init__(self, session: Session, parameters: LinkParameters, reason: str) -> None:
+    def __init__(
+        self,
+        session: Session,
+        parameters: LinkParameters,
+        reason: str,
+        absent: str,
+        no_reply: str,
+    ) -> None:
         self._session = session
         self._targets = parameters.robot.to_wire()
-        self._channel = parameters.channel
+        self._absent, self._no_reply = absent, no_reply
         self.state = LinkState.HELLO
         """HELLO, INFO or PARAMS; RUN when the handshake is complete."""
         self.reason = reason
@@ -174,9 +182,9 @@ class Handshake:
             self.reason = (
                 reasons.robot_version(result.foreign_version)
                 if result.foreign_version
-                else reasons.NO_REPLY
+                else self._no_reply
                 if result.reply is None
-                else reasons.robot_absent(self._channel)
+                else self._absent
             )
             return _RETRY_NS
         self.state = LinkState.INFO
@@ -188,7 +196,7 @@ class Handshake:
             self.state, self.reason = LinkState.HELLO, problem
             return _RETRY_NS
         self.info = info
-        self.state = LinkState.PARAMS
+        self.state, self.reason = LinkState.PARAMS, LinkState.PARAMS.value
         self._queue_parameters(info.parameters)
         return 0
 
@@ -213,7 +221,9 @@ class Handshake:
             self._attempts += 1
             if self._attempts >= _MAX_ATTEMPTS:
                 self._attempts, self.state = 0, LinkState.HELLO
-                self.reason = reasons.robot_absent(self._channel)
+                self.reason = self._absent
+            elif result.reply is None:
+                self.reason = self._no_reply
             return 0 if result.uplink is not None else _RETRY_NS // 5
         self._attempts = 0
         name = frames.BOARD_PARAMETERS[number].name

@@ -98,8 +98,7 @@ class ActiveSession:
         self._counts_boots = counts_boots
         self._cycles = 0
         self._accepted_ns = self._answered_ns = now_ns
-        # With slow cycles a single answer is a cycle old when the next command is due.
-        self._silence_ns = max(round(parameters.ttl * NANOSECONDS), 2 * self._period_ns)
+        self._silence_ns = _silence_ns(parameters)
         self._status = frames.StatusFlag(0)
         self._lost = 0
         self._stops: int | None = None
@@ -109,6 +108,11 @@ class ActiveSession:
     def is_silent(self, now_ns: int) -> bool:
         """Return whether the robot has not answered for the time to live of a command."""
         return now_ns - self._answered_ns > self._silence_ns
+
+    @property
+    def out_of_reach(self) -> bool:
+        """Whether so many cycles were lost that the robot may reject the numbers of new ones."""
+        return self._lost >= _MAX_LOST_CYCLES
 
     @property
     def finished(self) -> bool:
@@ -153,8 +157,6 @@ class ActiveSession:
             self._lost = 0 if isinstance(result.uplink, frames.State) else self._lost + 1
         if isinstance(result.uplink, frames.State):
             return self._check_state(result, result.uplink)
-        if self._lost >= _MAX_LOST_CYCLES:
-            return self._statistics.silence_reason(self._parameters.channel)
         return ''
 
     def _continue_cycles(self, result: TransactionResult) -> None:
@@ -231,6 +233,14 @@ class ActiveSession:
         return ''
 
 
+def _silence_ns(parameters: LinkParameters) -> int:
+    """Return the time without an answer after which the robot is silent.
+
+    With slow cycles a single answer is a cycle old when the next command is due.
+    """
+    return round(NANOSECONDS * max(parameters.ttl, 2.0 / parameters.cycle_rate))
+
+
 def _find_loss(result: TransactionResult, command: frames.Command) -> Loss | None:
     """Return where a cycle was lost; None if it returned a STATE that was sampled in it.
 
@@ -296,6 +306,11 @@ class Link:
         self.telemetry: Telemetry | None = None
         """Newest measurement."""
         self._received_ns: int | None = None
+        self._silence_ns = _silence_ns(parameters)
+        self._longest_pause_ns = 3 * self._silence_ns // 4
+        """Time without a call of step after which the host was suspended."""
+        self._stepped_ns = self._resumed_ns = self._pause_ns = 0
+        """Time of the last call; of the one after a suspension, and its duration; in a session."""
         self._shutting_down = False
 
     # -- status -----------------------------------------------------------------------------------
@@ -353,9 +368,9 @@ class Link:
             return self._handshake.reason
         if self.state is not LinkState.RUN:
             return self._reason
-        silence = min(self._age(now_ns), (now_ns - self._since_ns) / NANOSECONDS)
-        if silence > self._parameters.ttl:
-            return self._statistics.silence_reason(self._parameters.channel)
+        silence_ns = min(self._age(now_ns) * NANOSECONDS, now_ns - self._since_ns)
+        if silence_ns > self._silence_ns:
+            return self._silence_reason(now_ns)
         status = self.telemetry.raw.status if self.telemetry is not None else frames.StatusFlag(0)
         if reason := self._arbiter.reason(bool(status & frames.StatusFlag.ESTOP)):
             return reason
@@ -367,6 +382,27 @@ class Link:
             return reasons.DRIVES_DISABLED
         absent = self.battery is not None and self.battery.voltage < _MIN_BATTERY_VOLTAGE
         return reasons.BATTERY_ABSENT if absent else reasons.BATTERY_CUTOFF
+
+    def _silence_reason(self, now_ns: int) -> str:
+        """Return why nothing has come from the robot; it was not asked by a suspended host."""
+        pause_ns = now_ns - self._stepped_ns
+        if pause_ns <= self._longest_pause_ns and now_ns - self._resumed_ns <= self._silence_ns:
+            pause_ns = self._pause_ns
+        if pause_ns > self._longest_pause_ns:
+            return reasons.host_suspended(pause_ns / NANOSECONDS)
+        return self._no_reply if self._statistics.lost_before_radio() else self._absent
+
+    @property
+    def _absent(self) -> str:
+        """Text for a robot that does not answer."""
+        if self.over_cable:
+            return reasons.ROBOT_SILENT
+        return reasons.robot_absent(self._parameters.channel)
+
+    @property
+    def _no_reply(self) -> str:
+        """Text for a board at the port that does not reply."""
+        return reasons.BOARD_TIMEOUT if self.over_cable else reasons.NO_REPLY
 
     # -- commands ---------------------------------------------------------------------------------
 
@@ -424,6 +460,9 @@ class Link:
 
     def step(self, now_ns: int, received: bytes = b'') -> list[PortAction]:
         """Return the actions to execute now; the last one is the time of the next call."""
+        if self._active is not None and now_ns - self._stepped_ns > self._longest_pause_ns:
+            self._resumed_ns, self._pause_ns = now_ns, now_ns - self._stepped_ns
+        self._stepped_ns = now_ns
         for result in self._transactions.feed(received, now_ns):
             self._handle(result, now_ns)
         silence = self._transactions.expire(now_ns)
@@ -503,6 +542,8 @@ class Link:
     def _handle(self, result: TransactionResult, now_ns: int) -> None:
         restarted = result.dongle_restarted or self._lost_configuration(result)
         self._statistics.dongle_resets += restarted and not self.over_cable
+        if restarted:
+            self._statistics.explain_losses()
         self._statistics.count_host_errors(self._transactions.frame_counts)
         if isinstance(result.reply, frames.Pong):
             self._statistics.add_pong(result.reply, restarted)
@@ -535,6 +576,8 @@ class Link:
         """Process the answer of the robot in a session, or in the handshake before it."""
         if self._active is not None:
             reason = self._active.handle(result)
+            if self._active.out_of_reach:
+                reason = self._silence_reason(now_ns)
             if self._active.finished:
                 self._close(LinkState.DONE, reasons.SHUT_DOWN)
             elif self._counts_differ(result.uplink):
@@ -617,17 +660,18 @@ class Link:
             self._use_cable(False)
             if not reply.chip_ok:
                 self._reason = reasons.NO_CHIP
+                self._statistics.explain_losses()
                 self._due_ns = now_ns + _DEFECT_RETRY_NS
                 return
             if reply[:-1] == tuple(result.request):
-                self._start_handshake(reasons.robot_absent(self._parameters.channel), now_ns)
+                self._start_handshake(LinkState.HELLO.value, now_ns)
                 return
             self._reason = reasons.RADIO_NOT_CONFIGURED
         elif isinstance(reply, frames.Refusal) and reply.code == frames.UNKNOWN:
             # Its console answers PING as well. The port stays open: opening it resets the robot.
             if self._cable_allowed and self._speaks_over_cable():
                 self._use_cable(True)
-                self._start_handshake(reasons.ROBOT_SILENT, now_ns)
+                self._start_handshake(LinkState.HELLO.value, now_ns)
                 return
             self._reason = reasons.ROBOT_USB
             self._due_ns = now_ns + _DEFECT_RETRY_NS
@@ -655,7 +699,9 @@ class Link:
         self._session = Session(self._key, self._entropy, before, now_ns)
         self._lost_session = before if reason == reasons.SESSION_LOST else 0
         self._enter(LinkState.HELLO, reason)
-        self._handshake = Handshake(self._session, self._parameters, reason)
+        self._handshake = Handshake(
+            self._session, self._parameters, reason, self._absent, self._no_reply
+        )
         self._due_ns = now_ns
 
     def _start_session(self, handshake: Handshake, now_ns: int) -> None:
@@ -668,9 +714,12 @@ class Link:
         except ValueError as error:
             self._start_handshake(f'the robot reports invalid information: {error}', now_ns)
             return
-        self._statistics.robot_resets += self._decoder.start_session(
+        restarts = self._decoder.start_session(
             self._session.number, self._board_parameters.get(BOOTS_ID), now_ns
         )
+        self._statistics.robot_resets += restarts
+        if restarts:
+            self._statistics.explain_losses()
         self._note_collision(self._decoder.two_robots, now_ns)
         self._lost_session = 0
         self._enter(LinkState.RUN, '')
@@ -701,6 +750,7 @@ class Link:
     def _enter(self, state: LinkState, reason: str) -> None:
         self.state, self._reason = state, reason
         self._handshake = self._active = None
+        self._resumed_ns = self._pause_ns = 0
 
     def _age(self, now_ns: int) -> float:
         """Return the time since the last telemetry, s."""

@@ -17,9 +17,10 @@ from t3mpc_ros.radio.protocol import frames
 
 NO_COMMAND = 'no command yet'
 DONGLE_STARTING = 'the dongle does not answer yet: it takes 1.5 s to start'
-DONGLE_TIMEOUT = 'the dongle stopped answering: did it restart?'
+DONGLE_TIMEOUT = 'the dongle stopped answering: did it restart, is its cable good?'
 BOARD_TIMEOUT = 'the robot board stopped answering: did it restart, is its cable good?'
 ROBOT_SILENT = 'the robot board does not answer HELLO'
+ANSWERS_AGAIN = 'no command since the robot answers again'
 NO_DONGLE = 'no dongle answers on this port: is it the right port?'
 NO_REPLY = 'the dongle does not reply: is its cable loose or damaged?'
 NO_CHIP = 'the radio chip of the dongle does not answer: check its wiring and supply'
@@ -137,6 +138,11 @@ def two_robots(address: str, channel: int) -> str:
         f'two robots answer on address {address}, channel {channel}: give each an address of its '
         'own, t3mpc robot setup --address'
     )
+
+
+def host_suspended(seconds: float) -> str:
+    """Return the text for a host that was not executed for a time."""
+    return f'this program was not executed for {seconds:.1f} s: was it suspended?'
 
 
 def robot_absent(channel: int) -> str:

@@ -173,14 +173,20 @@ class LinkStatistics:
         errors = self._recent[-1][1] - self._recent[0][1]
         return reasons.lost_cycles(worst.value, errors.host, errors.dongle)
 
-    def silence_reason(self, channel: int) -> str:
-        """Return why nothing has come from the robot, by the cycles since its last state."""
+    def explain_losses(self) -> None:
+        """Leave the cycles lost so far out of the judgement: their cause is known."""
+        kept = [each for each in self._recent if not isinstance(each[0], Loss)]
+        self._recent.clear()
+        self._recent.extend(kept)
+
+    def lost_before_radio(self) -> bool:
+        """Return whether most cycles since the last state were lost before the radio."""
         unanswered = 0
         for outcome, _ in reversed(self._recent):
             if not isinstance(outcome, Loss):
                 break
             unanswered += 1 if outcome is Loss.NO_REPLY else -1
-        return reasons.NO_REPLY if unanswered > 0 else reasons.robot_absent(channel)
+        return unanswered > 0
 
     def quality(self, age: float, host: FrameCounts) -> LinkQuality:
         """Return the quality of the link at telemetry age ``age`` (s)."""

@@ -79,7 +79,7 @@ class TransactionLayer:
         self._dongle: tuple[int, int, int] | None = None
         """Dongle clock (us) in its last reply, and when that was requested and read (host, ns)."""
         self.timeouts = 0
-        """Number of consecutive requests without a reply."""
+        """Number of requests without a reply since the last one, without those dropped as busy."""
         self.over_cable = False
         """Whether the robot itself replies, without a radio between."""
 
@@ -133,7 +133,9 @@ class TransactionLayer:
             pending = self._pending
             if pending is not None and frames.is_reply(reply, pending.frame):
                 self._pending = None
-                self.timeouts = 0
+                # A dongle whose radio chip is dead is busy between two timeouts.
+                if not isinstance(reply, frames.Refusal) or reply.code != frames.DONGLE_BUSY:
+                    self.timeouts = 0
                 results.append(self._result(pending, reply, now_ns))
         return results
 

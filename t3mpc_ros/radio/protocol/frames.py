@@ -374,11 +374,15 @@ class Pong(NamedTuple):
     """Digest of the sources and build settings of the firmware."""
 
 
+DONGLE_BUSY = 3
+"""Code of a Refusal: another transaction runs."""
+
+
 class Refusal(NamedTuple):
     """ERR: the dongle rejects a frame."""
 
     code: int
-    """1: unknown kind, 2: malformed, 3: busy."""
+    """1: unknown kind, 2: malformed, 3: busy (DONGLE_BUSY)."""
     argument: int
     """First byte of the rejected frame; its id for code 3."""
 
