@@ -146,7 +146,16 @@ def serial_ports(sysfs: Path) -> list[str]:
 
 
 def ask_port(port: str) -> Programmer | None:
-    """Return the programmer at a serial port, None if none answers."""
+    """Return the programmer at a serial port, None if none answers; FlashError if it is closed."""
+    if not os.path.exists(port):
+        raise FlashError(
+            f'{port} does not exist: is the board plugged in? ls -l /dev/serial/by-id'
+        )
+    if not os.access(port, os.R_OK | os.W_OK):
+        raise FlashError(
+            f'{port} cannot be opened: permission denied; sudo usermod -aG dialout $USER, log in '
+            'again'
+        )
     for question in QUESTIONS.values():
         if question.answer in _ask(port, question):
             return question.programmer(port)
@@ -198,6 +207,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--sysfs', type=Path, default=Path('/sys'), help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     try:
+        if not options.dry_run and not options.file.is_file():
+            raise FlashError(f'{options.file} does not exist: make -C firmware avr writes it')
         programmer = find_programmer(options.sysfs, options.port or None)
     except FlashError as error:
         print(f'flash: {error}', file=sys.stderr)

@@ -258,6 +258,47 @@ def test_defaults_of_the_robot_in_its_pages():
             assert float(default) == pytest.approx(1e3 * getattr(host, name.lower()))
 
 
+# -- warnings -------------------------------------------------------------------------------------
+
+SUPPLIES = r'(?i)S1\b[^.]{0,40}\boff|switch S1|red wire'
+HAZARDS = {
+    'two supplies, by USB': (r'/dev/ttyACM0|--robot-port|over the USB of the robot', SUPPLIES),
+    'two supplies, by a programmer': (r'make -C firmware flash |avrdude -c', SUPPLIES),
+    'a port that is written to': (r'make -C firmware flash|flash\.py', r'\*\*Name the port\*\*'),
+    'wheels that turn': (
+        r'robot jog (left|right)|radio_bridge --ros-args|--drive',
+        r'(?i)wheels (in the air|off the ground)',
+    ),
+    'a robot that drives away': (r'calibrate --port \S+$', r'moves only after a `yes`'),
+    'a robot that does not stop': (r'on the ground, fenced', r'\*\*do not continue\*\*'),
+    'a motor under power': (r'\| motors, ', r'supply off'),
+}
+"""Steps of a builder, and the warning that stands before them in their section."""
+BUILD = ('robot.md', 'calibration.md', 'hardware.md')
+EMULATED = r'^## Try it without a robot\n.*?(?=^## )'
+
+
+def _steps_without_warning(text, step, warning):
+    """Return the number of steps, and those before which their section has no warning."""
+    sections = re.split(r'^(?=##+ )', re.sub(EMULATED, '', text, flags=re.M | re.S), flags=re.M)
+    steps = [(section, each) for section in sections for each in re.finditer(step, section, re.M)]
+    return len(steps), [
+        each[0] for section, each in steps if not re.search(warning, section[: each.start()])
+    ]
+
+
+@pytest.mark.parametrize('hazard', HAZARDS)
+def test_a_warning_stands_before_the_step_that_needs_it(hazard):
+    """Flashing over USB stood two sections before the warning of the two supplies."""
+    found = 0
+    for page in BUILD:
+        text = (ROOT / 'docs' / page).read_text()
+        count, unwarned = _steps_without_warning(text, *HAZARDS[hazard])
+        assert not unwarned, page
+        found += count
+    assert found
+
+
 # -- links ----------------------------------------------------------------------------------------
 
 PAGES = [

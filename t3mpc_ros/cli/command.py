@@ -15,11 +15,13 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+import os
 import select
 import sys
 from typing import Any
 
 from t3mpc_ros.evaluation.api.one_sentence import sentence
+from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.version import VERSION
 
 
@@ -89,3 +91,12 @@ def ask_line(question: str, stop: Callable[[], bool]) -> str:
         if ready:
             return sys.stdin.readline()
     return ''
+
+
+def check_two_ports(dongle: str, robot: str) -> None:
+    """Raise ParameterError if both ports are one device."""
+    if os.path.realpath(dongle) == os.path.realpath(robot):
+        raise ParameterError(
+            f'--port is that of the dongle, --robot-port that of the robot board: got {dongle} '
+            f'and {robot}, one device; ls -l /dev/serial/by-id lists both'
+        )

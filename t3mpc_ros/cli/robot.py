@@ -23,7 +23,7 @@ import sys
 from typing import Any, TypeVar
 
 from t3mpc_ros.cli import robot_calibrate
-from t3mpc_ros.cli.command import ArgumentParser, ask_line
+from t3mpc_ros.cli.command import ArgumentParser, ask_line, check_two_ports
 from t3mpc_ros.parameters.command_line import (
     bounded_float,
     bounded_int,
@@ -264,6 +264,7 @@ def _doctor(options: argparse.Namespace, stop: StopSignal) -> int:
     from t3mpc_ros.radio.tool.bench_checklist import FAIL
 
     check_writable(options.report)
+    check_two_ports(options.port, options.robot_port)
     if not options.no_questions and not sys.stdin.isatty():
         raise ProcedureError('the checklist asks questions at a terminal: or use --no-questions')
 
@@ -385,7 +386,8 @@ def program_parser() -> argparse.ArgumentParser:
         command: argparse.ArgumentParser = commands.add_parser(name, help=text)
         command.set_defaults(run=run)
         add = command.add_argument
-        add('--port', required=True, help='port of the dongle, /dev/…')
+        optional = name == 'calibrate'  # which may have the port of the robot alone
+        add('--port', required=not optional, default='', help='port of the dongle, /dev/…')
         text = 'link parameters: a ROS parameter file'
         add('--params-file', type=Path, metavar='FILE', help=text)
         text = 'link parameter, e.g. channel=100 or robot.invert_left=true'

@@ -22,7 +22,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from t3mpc_ros.cli.command import ask_line
+from t3mpc_ros.cli.command import ask_line, check_two_ports
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_writable
 from t3mpc_ros.parameters.table import ParameterError
@@ -36,6 +36,7 @@ from t3mpc_ros.radio.tool.calibration_wizard import (
     CalibrationWizard,
     Interrupted,
     WizardOptions,
+    available_steps,
 )
 from t3mpc_ros.radio.tool.procedure import ProcedureError
 from t3mpc_ros.robot.calibration import (
@@ -148,10 +149,13 @@ def calibrate(
     stop: Callable[[], bool],
 ) -> int:
     """Run the wizard; save what it found, also if the user ends it; return the exit code."""
+    if not (options.port or options.robot_port):
+        raise ProcedureError('give --port of the dongle, --robot-port of the robot board, or both')
+    check_two_ports(options.port, options.robot_port)
+    _check_steps(options.steps or (), available_steps(options.port, options.robot_port))
     check_writable(options.save)
     if not sys.stdin.isatty():
         raise ProcedureError('calibrating a robot needs a person: run it at a terminal')
-    _check_steps(options)
     path: Path = options.save
     robot = CalibrationRobot(
         options.port, options.robot_port, parameters, key, os.urandom, stop, _report
@@ -179,17 +183,17 @@ def calibrate(
     return code
 
 
-def _check_steps(options: argparse.Namespace) -> None:
+def _check_steps(steps: Sequence[str], available: Sequence[str]) -> None:
     """Raise ProcedureError for a step that needs the other pass: a cable, or none."""
-    cable = bool(options.robot_port)
-    for step in options.steps or ():
-        if cable and step not in USB_STEPS:
-            raise ProcedureError(
-                f'the step {step} moves or turns the robot: unplug its cable, and run it without '
-                '--robot-port'
-            )
-        if not cable and step in USB_STEPS:
+    for step in steps:
+        if step in available:
+            continue
+        if step in USB_STEPS:
             raise ProcedureError(f'the step {step} needs --robot-port, at rest')
+        raise ProcedureError(
+            f'the step {step} needs a robot without cables: unplug its USB, and give --port of '
+            'the dongle alone'
+        )
 
 
 def _show(text: str) -> None:
@@ -233,7 +237,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
     usual = WizardOptions()
     geometry = usual.geometry
-    add('--robot-port', default='', help='USB port of the robot board: the second pass, at rest')
+    add(
+        '--robot-port',
+        default='',
+        help='USB port of the robot board: the second pass, at rest; without --port, the steps '
+        'that need no radio',
+    )
     add(
         '--save',
         type=Path,
@@ -247,7 +256,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         type=_steps,
         metavar='STEP,…',
         help=f'some of {", ".join(STEPS)}; default: with --robot-port {" and ".join(USB_STEPS)}, '
-        'without it the others',
+        'without it the others, without --port rest as well',
     )
     for flag, kind, default, text in (
         ('--wheel-radius', bounded_float(0.005, 1.0), geometry.wheel_radius, 'nominal, m'),

@@ -11,13 +11,14 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""From an erased board to a calibrated, driving robot with the commands of docs/robot.md.
+"""From an erased board to a calibrated, driving robot with the commands of the pages.
 
 Virtual time, on the emulated boards and on the firmware of both boards in simavr.
 """
 
 from contextlib import ExitStack
 import math
+import os
 from pathlib import Path
 import re
 import shlex
@@ -27,7 +28,7 @@ import numpy as np
 import pytest
 from support.avr_bench import on_avr
 from support.calibration_bench import CalibrationBench, Person
-from support.emulator_bench import RobotBench
+from support.emulator_bench import CablePort, RobotBench
 from support.missing_tools import AVR, needing
 from support.tool_bench import START_NS
 import yaml
@@ -36,6 +37,7 @@ from t3mpc_ros.cli import emulator as emulator_cli
 from t3mpc_ros.cli import robot as cli
 from t3mpc_ros.cli import robot_calibrate
 from t3mpc_ros.emulator.emulator import Emulator
+from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.protocol.authentication import read_key
 from t3mpc_ros.radio.radio_robot import RadioRobotParameters
 from t3mpc_ros.radio.tool import procedure
@@ -49,21 +51,62 @@ ERRORS = {
     'twin.wheel_separation_multiplier': 1.03,
     'twin.imu.gyro_scale_error': 0.03,
 }
-CALIBRATE = 'calibrate --port dongle --params-file robot.yaml --key robot.key '
-PASSES = (
-    '--steps rest,radius,track --turns 5 --speed 8',
-    '--robot-port robot_usb --steps battery',
-)
-"""The robot drives free of cables; what was found is then stored over its own USB."""
+DONGLE, ROBOT = {'/dev/t3mpc_dongle', 'dongle'}, {'/dev/ttyACM0', 'robot_usb'}
+"""Names of the two ports in the pages."""
+SHORTENED = {
+    'jog left 50 ': 'jog left 2 ',
+    'calibrate --port /dev/t3mpc_dongle': (
+        'calibrate --port /dev/t3mpc_dongle --steps rest,radius,track --turns 5 --speed 8'
+    ),
+    'calibrate --port /dev/t3mpc_dongle --robot-port /dev/ttyACM0': (
+        'calibrate --port /dev/t3mpc_dongle --robot-port /dev/ttyACM0 --steps battery'
+    ),
+    'calibrate --robot-port /dev/ttyACM0': (
+        'calibrate --robot-port /dev/ttyACM0 --steps rest --save cable.yaml'
+    ),
+}
+"""What takes many minutes, with fewer turns or steps."""
 
 
 def documented_commands():
-    """Return the commands of the section that needs no robot, each as a list of words."""
+    """Return the commands from a new board to a calibrated robot, in the order of the pages.
+
+    As the pages say, those of the checklist and of the calibration get file and key; the section
+    that needs no robot is left out.
+    """
     text = (ROOT / 'docs' / 'robot.md').read_text()
-    (section,) = re.findall(r'^## Try it without a robot\n(.*?)^## ', text, re.M | re.S)
-    blocks = re.findall(r'```console\n(.*?)```', section, re.S)
-    lines = ''.join(blocks).splitlines()
-    return [shlex.split(line.removeprefix('scripts/run ')) for line in lines]
+    text = re.sub(r'^## Try it without a robot\n.*?(?=^## )', '', text, flags=re.M | re.S)
+    before, _, checklist = text.partition('## Bench checklist')
+    commands = _commands(before)
+    more = '--params-file robot.yaml --key ~/.t3mpc_key'
+    commands += _commands(checklist.partition('| # |')[0])
+    for line in re.findall(r'^\| \d+ \|.*', checklist, re.M):
+        _, _, step, _, otherwise, _ = line.split('|')
+        (channel,) = re.findall(r'`t3mpc robot (setup --channel.*?)`', otherwise) or ['']
+        if channel:
+            commands.append(f't3mpc robot {channel} --port /dev/ttyACM0 --yes')
+        for command in re.findall(r'`(t3mpc robot .*?)`', step):
+            if 'calibrate' not in command:
+                command = command.replace(' [--key FILE]', '').replace('…', '/dev/t3mpc_dongle')
+                keyed = 'jog' in command or 'parameters' in command
+                commands.append(f'{command} {more if keyed else more.partition(" --key")[0]}')
+    commands += _commands(checklist.partition('| # |')[2])
+    calibration = _commands((ROOT / 'docs' / 'calibration.md').read_text())
+    commands += [f'{command} {more}' for command in map(_shortened, calibration)]
+    return [shlex.split(_shortened(command)) for command in commands]
+
+
+def _commands(text):
+    """Return the commands of the package in the blocks of a text."""
+    blocks = ''.join(re.findall(r'```(?:sh|console)\n(.*?)```', text, re.S))
+    return re.findall(r'^scripts/run (.*)', blocks, re.M)
+
+
+def _shortened(command):
+    for long, short in SHORTENED.items():
+        if command.endswith(long) or (long.endswith(' ') and long in command):
+            return command.replace(long, short)
+    return command
 
 
 class Walk:
@@ -79,23 +122,24 @@ class Walk:
         self.bench = CalibrationBench(emulator=emulator)
         self.person = person = Person(self.bench)
         self._capsys = capsys
-        self._ports = {}
+        self.questions = []
         monkeypatch.setattr(procedure, 'run_at_port', self._run_at_port)
         monkeypatch.setattr(robot_calibrate, '_asker', lambda stop: person.ask)
         monkeypatch.setattr(robot_calibrate, '_show', person.show)
+        monkeypatch.setattr(cli, 'ask_line', self._agree)
         monkeypatch.setattr(sys.stdin, 'isatty', lambda: True)
 
-    def _run_at_port(self, task, path, interrupted, device='the dongle'):
-        self.bench.run(task, robot=path == self._ports['robot_link'])
+    def _agree(self, question, stop):
+        self.questions.append(question)
+        return 'yes'
 
-    def emulator(self, arguments):
-        options = emulator_cli._parser().parse_args(arguments)
-        assert options.erased
-        assert options.key is None
-        self._ports = {'link': str(options.link), 'robot_link': str(options.robot_link)}
+    def _run_at_port(self, task, path, interrupted, device='the dongle'):
+        assert path in DONGLE | ROBOT
+        self.bench.run(task, robot=path in ROBOT)
 
     def robot(self, arguments):
         """Execute a command of the bench tool; return its output."""
+        arguments = [os.path.expanduser(word) for word in arguments]
         assert cli.main(arguments) == 0, self._capsys.readouterr()
         return self._capsys.readouterr().out
 
@@ -103,7 +147,7 @@ class Walk:
         """Return the host of radio_bridge with these arguments, at the same boards."""
         marker, *rest = arguments
         assert marker == '--ros-args'
-        values, key = {}, b''
+        values, key, emulator = {}, b'', self.bench.emulator
         for option, text in zip(rest[::2], rest[1::2], strict=True):
             if option == '--params-file':
                 content = yaml.safe_load(Path(text).read_text())['/**']['ros__parameters']
@@ -112,11 +156,18 @@ class Walk:
             name, value = text.split(':=')
             assert option == '-p'
             if name == 'key_file':
-                key = read_key(Path(value))
+                key = read_key(Path(os.path.expandvars(value)))
             else:
-                assert (name, value) == ('port', self._ports['link'])
+                assert name == 'port'
+                emulator = CablePort(emulator) if value in ROBOT else emulator
         RadioRobotParameters.from_dict(values)
-        return RobotBench(values, key=key, emulator=self.bench.emulator)
+        return RobotBench(values, key=key, emulator=emulator)
+
+    def leave(self, host):
+        """End a host of radio_bridge as by Ctrl-C: it disables the drives."""
+        host.robot.shut_down()
+        host.run(5.0, lambda: host.link.state is LinkState.DONE)
+        self.bench.now_ns = host.now_ns
 
 
 @pytest.fixture(
@@ -133,6 +184,7 @@ class Walk:
 )
 def walk(request, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv('HOME', str(tmp_path))
     with ExitStack() as stack:
         if request.param == 'avr':
             emulator = stack.enter_context(on_avr(flat=ERRORS, erased=True)).emulator
@@ -149,51 +201,69 @@ def test_documented_commands_lead_to_a_driving_robot(walk):
     unset.run(2.0)
     assert 'no settings' in unset.link.reason(unset.now_ns)
     assert walk.bench.board.counters == (0, 0)
-    unset.kill()
-    walk.bench.now_ns = unset.now_ns
+    walk.leave(unset)
 
-    outputs = {}
+    # Not stored twice: after the start of the robot, its gyro has another bias.
+    walk.person.answers = {'Voltage of the meter': ['skip'], 'Store these': ['yes', 'no']}
+    turned = np.zeros(2)
     for words in documented_commands():
         match words:
-            case ['t3mpc', 'emulator', *arguments]:
-                walk.emulator(arguments)
+            case ['t3mpc', 'robot', 'jog', wheel, turns, *_]:
+                before = np.array(walk.bench.board.counters)
+                output = walk.robot(words[2:])
+                turned += np.array([wheel == 'left', wheel == 'right']) * float(turns)
+                after = np.array(walk.bench.board.counters) - before
+                wanted = 3200 * float(turns) * np.array([wheel == 'left', wheel == 'right'])
+                # At 0.2 rad/s, the last state is up to a cycle old, and the stop takes another.
+                assert after == pytest.approx(wanted, abs=8)
+                assert f'target {wanted.max():.0f}' in output
+                assert 'in the air' in walk.questions[-1]
             case ['t3mpc', 'robot', *arguments]:
-                outputs[arguments[0]] = walk.robot(arguments)
+                walk.robot(arguments)
             case ['radio_bridge', *arguments]:
-                bench = walk.bridge(arguments)
+                expect_a_driving_robot(walk, walk.bridge(arguments))
             case _:
                 raise AssertionError(f'the command must be known: got {words}')
-    assert 'target 3200' in outputs['jog']
-    left, right = walk.bench.board.counters
-    # At 0.2 rad/s, the last state is up to a cycle old, and the stop takes another: 4 microsteps.
-    # One turn over the cable, one over the radio.
-    assert (left, right) == (pytest.approx(2 * 3200, abs=8), 0)
-
-    start = bench.plant.pose
-    bench.connect()
-    bench.run(1.5)
-    bench.drive(4.0, 4.0)
-    bench.run(2.0)
-    assert bench.link.reason(bench.now_ns) == ''
-    assert bench.link.authenticated
-    bench.drive(0.0, 0.0)
-    bench.run(0.5)
-    end = bench.plant.pose
-    driven = ((end.x - start.x) ** 2 + (end.y - start.y) ** 2) ** 0.5
-    assert driven == pytest.approx(2.0 * 4.0 * WHEEL_CIRCUMFERENCE / 6.2832, rel=0.1)
-    assert bench.link.telemetry.status.enabled
-    bench.kill()
-    walk.bench.now_ns = bench.now_ns
-
-    walk.person.answers = {'Voltage of the meter': ['skip']}
-    for each in PASSES:
-        walk.robot((CALIBRATE + each).split())
+    assert turned.tolist() == [4.0, 2.0]  # over the cable and the radio
+    settings = yaml.safe_load(Path('robot.yaml').read_text())
+    assert settings['/**']['ros__parameters']['link']['channel'] == 100
     values = yaml.safe_load(Path('calibration.yaml').read_text())
     values = values['/**/radio_bridge']['ros__parameters']
-    host = RobotBench(values, key=read_key(Path('robot.key')), emulator=walk.bench.emulator)
+    over_cable = yaml.safe_load(Path('cable.yaml').read_text())
+    over_cable = over_cable['/**/radio_bridge']['ros__parameters']
+    for name in ('wheel_radius', 'wheel_separation'):  # as stored in the robot
+        assert over_cable[name] == pytest.approx(values[name], rel=1e-4)
+    host = RobotBench(values, key=read_key(Path('.t3mpc_key')), emulator=walk.bench.emulator)
     host.connect()
     host.run(3.0)
+    bias = over_cable['calibration.gyro_bias']
+    assert host.robot._odometry.bias == pytest.approx(bias, abs=1e-3)
     expect_exact_odometry(host)
+
+
+def expect_a_driving_robot(walk, host):
+    """It drives as commanded; over the cable, it rests in time when that is unplugged."""
+    start = host.plant.pose
+    host.connect()
+    host.run(1.5)
+    host.drive(4.0, 4.0)
+    host.run(2.0)
+    assert host.link.reason(host.now_ns) == ''
+    assert host.link.authenticated
+    if host.link.over_cable:
+        host.emulator.unplugged = True
+        host.run(0.45)
+        assert walk.bench.board.speeds == (0, 0)
+        host.emulator.unplugged = False
+        host.run(3.0)
+    else:
+        end = host.plant.pose
+        driven = math.hypot(end.x - start.x, end.y - start.y)
+        assert driven == pytest.approx(2.0 * 4.0 * WHEEL_CIRCUMFERENCE / 6.2832, rel=0.1)
+    host.drive(0.0, 0.0)
+    host.run(0.5)
+    assert host.link.telemetry.status.enabled
+    walk.leave(host)
 
 
 def expect_exact_odometry(host):

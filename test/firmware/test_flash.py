@@ -113,6 +113,25 @@ def test_none_and_several_programmers_have_a_remedy(sysfs):
         flash.find_programmer(folder, None, fail)
 
 
+@pytest.mark.parametrize(
+    'port, text', [('no-port', 'no-port does not exist'), ('closed', 'permission denied; sudo')]
+)
+def test_a_port_that_cannot_be_opened_is_named(port, text, tmp_path, monkeypatch, capsys):
+    """It said that no programmer answers, and asked whether another program uses the port."""
+    monkeypatch.chdir(tmp_path)
+    Path('closed').touch()
+    Path('robot.hex').touch()
+    monkeypatch.setattr(flash.os, 'access', lambda path, mode: False)  # also for root
+    assert flash.main(['robot', 'robot.hex', '--port', port]) == 2
+    assert text in capsys.readouterr().err
+
+
+def test_an_image_that_was_not_built_is_named_before_a_port_is_opened(sysfs, capsys):
+    folder, _ = sysfs
+    assert flash.main(['robot', 'no.hex', '--port', 'x', '--sysfs', str(folder)]) == 2
+    assert 'no.hex does not exist: make -C firmware avr writes it' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize('name', flash.QUESTIONS)
 def test_programmers_at_a_port_are_distinguished(name, monkeypatch):
     """Each answers its own protocol at its own baud rate, and nothing to the others."""

@@ -48,7 +48,10 @@ STEPS = {
 }
 """Title of each step, which the method ``measure_`` and its name runs, in their order."""
 USB_STEPS = 'ranges', 'battery'
-"""Steps over the USB port of the robot board, at rest; the others need a robot without cables."""
+"""Steps over the USB port of the robot board, at rest; the others need a robot without cables.
+
+Without a dongle, the step ``rest`` is one of them.
+"""
 _REST_TIME = 10.0
 _RESTS = (4.0, 4.0)
 """Before and after a turn, s."""
@@ -60,14 +63,22 @@ _SIDES = (('front', 0), ('left', 2), ('rear', 4), ('right', 6))
 """Side, and the number of the first of its two sensors."""
 
 
+def available_steps(port: str, robot_port: str) -> tuple[str, ...]:
+    """Return the steps that can be run at the ports of dongle and robot, in their order."""
+    if not robot_port:
+        return tuple(step for step in STEPS if step not in USB_STEPS)
+    return USB_STEPS if port else ('rest', *USB_STEPS)
+
+
 class Interrupted(Exception):
     """The user ends the wizard: Ctrl-C, or the end of the input."""
 
 
 @dataclass
 class CalibrationRobot:
-    """The robot behind a dongle and, for raw counts, behind its own USB port, which may be empty.
+    """The robot behind a dongle and, for raw counts, behind its own USB port.
 
+    Either port may be empty: without a dongle, a rest is recorded over the USB port of the robot.
     A measurement raises ProcedureError with a reason and a remedy, or :class:`Interrupted`:
     ``interrupted``, whether the user has ended the wizard, is polled. ``report`` receives the
     reasons for waiting.
@@ -131,7 +142,7 @@ class CalibrationRobot:
             raise
 
     def _record(self, task: Manoeuvre) -> calibration.Recording:
-        procedure.run_at_port(task, self.port, self.interrupted)
+        procedure.run_at_port(task, self.port or self.robot_port, self.interrupted)
         if self.interrupted():
             raise Interrupted
         if task.error:
@@ -185,8 +196,8 @@ class CalibrationWizard:
 
     def run(self) -> calibration.Calibration:
         """Run the steps; return the calibration."""
-        steps = [step for step in STEPS if step in self._options.steps]
-        steps = [step for step in steps if (step in USB_STEPS) == self._robot.has_usb]
+        steps = available_steps(self._robot.port, self._robot.robot_port)
+        steps = tuple(step for step in steps if step in self._options.steps)
         for number, step in enumerate(steps):
             self._show(f'Step {number + 1} of {len(steps)}: {STEPS[step]}')
             self._repeat(getattr(self, f'measure_{step}'))
@@ -224,7 +235,7 @@ class CalibrationWizard:
 
     def measure_rest(self) -> None:
         """Measure the bias of the gyro."""
-        self._do(f'Put the robot on the floor, and do not touch it for {_REST_TIME:g} s.')
+        self._do(f'Put the robot down level, and do not touch it for {_REST_TIME:g} s.')
         self._wait_for_enter()
         recording = self._robot.rest(_REST_TIME)
         rates = recording.rates

@@ -51,7 +51,7 @@ _TIME_MARGIN = 15.0
 """Additional time for acceleration and approach, s."""
 SETTLING_TIME = 0.3
 """Standstill until the rotors have settled, s."""
-_POWER_ON_TIME = 0.5
+_POWER_ON_TIME = 1.5
 """Time until the rotors have settled after the drivers were switched on, s."""
 _TURNING_RATE, _RESTING_RATE = 0.1, 0.03
 """A turn by hand begins above the one and ends below the other, rad/s."""
@@ -186,7 +186,7 @@ class Manoeuvre:
             self._move(telemetry, now_ns)
 
     _over_cable = False
-    """Whether the robot may be driven over its own USB: with its wheels in the air."""
+    """Whether it may run over the USB of the robot: at rest, or with the wheels in the air."""
     _ends_when_silent = True
     """Whether a robot that does not answer for the time to live ends the manoeuvre."""
     _late_reason = 'the wheels do not reach their target: does the board count its steps?'
@@ -275,6 +275,8 @@ class Rest(Manoeuvre):
     ) -> None:
         none = WheelAngles(0.0, 0.0)
         super().__init__(parameters, key, entropy, none, 1.0, report, (seconds, 0.0))
+
+    _over_cable = True  # it does not move
 
     def _move(self, telemetry: Telemetry, now_ns: int) -> None:
         self._end()
