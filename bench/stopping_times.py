@@ -37,12 +37,14 @@ from typing import NamedTuple
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 import rclpy
+from sensor_msgs.msg import JointState
 from support.waiting import Processes, WaitTimeoutError, wait_until
 
 from t3mpc_ros.cli.private_graph import PrivateGraph
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.emulator.pty_port import PtyPort, serve
 from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.nodes import qos
 
 FULL = 0.35
 """Speed with both wheels at their maximum of 10 rad/s, m/s."""
@@ -54,6 +56,10 @@ CREEP = 0.002
 """Way of the rotors while they settle at the field that stands, m."""
 DURATIONS = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
 """Durations of a suspension, s."""
+COUNTED = (0.3, 1.2, 2.0, 10.0)
+"""Durations of a suspension after which the microsteps are compared, s."""
+STEP = math.tau / 3200
+"""Turn of a wheel by a microstep, rad."""
 _MAX_LAG = 0.01
 """Lag of the emulator's time during a trial, s."""
 _SETTLING = 1.0
@@ -82,6 +88,8 @@ class Trial(NamedTuple):
     """Distance from there to rest, m."""
     after: float = 0.0
     """Distance on commands that had expired, m."""
+    missed: int | None = None
+    """Microsteps that the bridge has not counted, of the worse wheel; None: not compared."""
 
 
 class Disturbed(RuntimeError):
@@ -103,6 +111,10 @@ class DrivenRobot:
         self._faults = []
         self._ended = False
         self._publisher = node.create_publisher(Twist, f'{self._namespace}/cmd_vel', 1)
+        self._node, self._joints = node, []
+        node.create_subscription(
+            JointState, f'{self._namespace}/joint_states', self._joints.append, qos.SCALARS
+        )
         self.speed = None
         """Commanded speed, m/s; None: the publisher is gone."""
         self._published = []
@@ -162,6 +174,22 @@ class DrivenRobot:
         if lag > _MAX_LAG or samples[0].wall - begin > 0.05:
             raise Disturbed(f'the emulator lagged by {lag:.3f} s')
         return samples
+
+    def count(self):
+        """Let the robot rest; return the microsteps counted by the bridge, and the true ones."""
+        self.speed = None
+        wait_until(self._rests, f'{self.name} does not rest')
+        del self._joints[:]
+        end = time.monotonic() + 0.3
+        while time.monotonic() < end or not self._joints:
+            rclpy.spin_once(self._node, timeout_sec=0.1)
+        angles = dict(zip(self._joints[-1].name, self._joints[-1].position, strict=True))
+        counted = [round(angles[f'{side}_wheel_joint'] / STEP) for side in ('left', 'right')]
+        return counted, self._emulator.plant.pulses
+
+    def _rests(self):
+        since = time.monotonic() - 0.3
+        return not any(each.speed for each in self._samples[-2000:] if each.wall >= since)
 
     def forget(self):
         """Discard old samples."""
@@ -261,6 +289,16 @@ def suspend(robot, duration, publishing):
     if resumed - valid > LIMIT:
         after = way(robot.observe(resumed, end))
     return Trial(rest, distance, after)
+
+
+def count_pulses(robot, duration, publishing):
+    """Return the trial of a suspension with the microsteps that the bridge has not counted."""
+    counted, true = robot.count()
+    trial = suspend(robot, duration, publishing)
+    after, after_true = robot.count()
+    changes = zip(counted, after, true, after_true, strict=True)
+    missed = [(now - then) - (end - begin) for then, now, begin, end in changes]
+    return trial._replace(missed=max(map(abs, missed)))
 
 
 def break_link(robot, fault, *values):
@@ -403,6 +441,8 @@ def rows(node, processes, folder, trials, durations=DURATIONS, kinds=('all',)):
                     f'bridge suspended {duration:g} s, {who}',
                     *repeat(partial(suspend, robot, duration, publishing), trials, [robot]),
                 )
+        if wanted('count'):
+            yield from _counted_rows(robot, trials)
         for name, kind, fault in links:
             if wanted(kind):
                 yield name, *repeat(partial(break_link, robot, *fault), trials, [robot])
@@ -422,8 +462,8 @@ def rows(node, processes, folder, trials, durations=DURATIONS, kinds=('all',)):
                 other.close()
     finally:
         robot.close()
-    if wanted('cable'):
-        yield from _cable_rows(node, processes, folder, trials)
+    if wanted('cable') or wanted('count'):
+        yield from _cable_rows(node, processes, folder, trials, wanted)
     if wanted('sim'):
         twin = SimulatedRobot(node, processes)
         for duration in [each for each in durations if each >= 1.0]:
@@ -433,10 +473,22 @@ def rows(node, processes, folder, trials, durations=DURATIONS, kinds=('all',)):
             )
 
 
-def _cable_rows(node, processes, folder, trials):
+def _counted_rows(robot, trials, where=''):
+    """Yield rows of suspensions with the microsteps that the bridge has not counted."""
+    for publishing, who in ((True, 'publisher goes on'), (False, 'publisher ends')):
+        for duration in COUNTED:
+            row = repeat(partial(count_pulses, robot, duration, publishing), trials, [robot])
+            yield f'{where}bridge suspended {duration:g} s, {who}', *row
+
+
+def _cable_rows(node, processes, folder, trials, wanted):
     """Yield rows of a robot that is driven over the USB of its board."""
     robot = DrivenRobot(node, processes, folder, '_c', cable=True)
     try:
+        if wanted('count'):
+            yield from _counted_rows(robot, trials, 'over the cable: ')
+        if not wanted('cable'):
+            return
         for name, measure in (
             ('publisher ends', end_publisher),
             ('bridge killed', kill_host),
@@ -457,7 +509,8 @@ def format_row(name, trials, disturbed):
     worst = f'{max(times):.3f}' if times else '-'
     distance = f'{max(trial.way for trial in trials):.3f}' if any(t.way for t in trials) else '-'
     after = f'{max(trial.after for trial in trials):.4f}'
-    return f'| {name} | {worst} | {distance} | {after} | {len(trials)} | {disturbed} |'
+    missed = max((trial.missed for trial in trials if trial.missed is not None), default='-')
+    return f'| {name} | {worst} | {distance} | {after} | {missed} | {len(trials)} | {disturbed} |'
 
 
 def main():
@@ -471,8 +524,8 @@ def main():
         PrivateGraph() as graph,
         bench(Path(name), graph.environment()) as made,
     ):
-        print('| fault | rest, s | way, m | after, m | trials | repeated |')
-        print('|---' * 6 + '|')
+        print('| fault | rest, s | way, m | after, m | missed | trials | repeated |')
+        print('|---' * 7 + '|')
         for row in rows(*made, Path(name), options.trials, kinds=options.kinds):
             print(format_row(*row), flush=True)
 

@@ -126,7 +126,7 @@ def test_a_port_that_cannot_be_opened_is_named(port, text, tmp_path, monkeypatch
     assert text in capsys.readouterr().err
 
 
-def test_an_image_that_was_not_built_is_named_before_a_port_is_opened(sysfs, capsys):
+def test_an_image_that_was_not_built_is_named(sysfs, capsys):
     folder, _ = sysfs
     assert flash.main(['robot', 'no.hex', '--port', 'x', '--sysfs', str(folder)]) == 2
     assert 'no.hex does not exist: make -C firmware avr writes it' in capsys.readouterr().err
