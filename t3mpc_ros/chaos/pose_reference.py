@@ -14,8 +14,9 @@
 """Sources of a reference with a pose: the chaotic path, a given path, and commanded twists."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+import itertools
 import math
 from typing import Protocol
 
@@ -24,7 +25,8 @@ import numpy as np
 from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose
-from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
+from t3mpc_ros.geometry.path_smoothing import LEAST_TOLERANCE, SmoothedPath
+from t3mpc_ros.geometry.path_timing import MotionLimits, PathEnd, PathTiming, check_points
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, Array, BodyTwist, Pose
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
@@ -74,6 +76,28 @@ class WaitParameters(Parameters):
 
 
 @dataclass(frozen=True)
+class SmoothingParameters(Parameters):
+    """Smoothing of a given path."""
+
+    tolerance: float = parameter(
+        0.02,
+        'sources file and topic: how far from the given path the reference may be where that '
+        'saves time, because its points lie on a grid or have noise; 0: the path is driven as '
+        'given, its corners rounded within 2 mm',
+        'm',
+        (0.0, 1.0),
+    )
+
+    def check_consistency(self) -> None:
+        """Raise :class:`ParameterError` for a tolerance below that of the smoothing."""
+        if 0.0 < self.tolerance < LEAST_TOLERANCE:
+            raise ParameterError(
+                f'path.tolerance must be 0 or at least {LEAST_TOLERANCE:g} m: '
+                f'got {self.tolerance:g}'
+            )
+
+
+@dataclass(frozen=True)
 class PathReferenceParameters(ReferenceParameters):
     """Source of the reference, and the limits of a motion along a path."""
 
@@ -81,18 +105,25 @@ class PathReferenceParameters(ReferenceParameters):
         'signals',
         'signals: two chaotic signals are the speeds of the wheels, as in the paper; portrait: a '
         'chaotic path in an arena; file: the path of path_file; topic: each nav_msgs/Path on '
-        'path, appended to the one before; twist: the twists on target_twist. All but signals '
-        'begin at the pose of the first odom message and need pose.enabled of the controller',
+        'path; twist: the twists on target_twist. All but signals begin at the pose of the first '
+        'odom message and need pose.enabled of the controller',
         choices=('signals', 'portrait', 'file', 'topic', 'twist'),
     )
     path_file: str = parameter('', 'path of source file: .csv or .yaml, m')
     repeat: bool = parameter(False, 'source file: drive the path again and again')
+    path_mode: str = parameter(
+        'replace',
+        'source topic: replace: a path is joined where it is nearest, and replaces the one that '
+        'is under way; append: it is driven after those before. An empty path stops the robot',
+        choices=('replace', 'append'),
+    )
     twist_timeout: float = parameter(
         0.5,
         'source twist: age at which a twist expires, and the reference stops',
         's',
         (0.05, 10.0),
     )
+    path: SmoothingParameters = group(SmoothingParameters)
     portrait: PortraitParameters = group(PortraitParameters)
     reseed: ReseedParameters = group(ReseedParameters)
     wait: WaitParameters = group(WaitParameters)
@@ -172,6 +203,30 @@ def _distance(one: Pose, other: Pose) -> float:
     return math.hypot(one.x - other.x, one.y - other.y)
 
 
+class PauseRamp:
+    """Scales a twist down to rest, and up again, within limits of acceleration."""
+
+    def __init__(self, limits: MotionLimits, geometry: WheelGeometry, period: float) -> None:
+        self._changes = (
+            limits.linear_acceleration * period,
+            limits.angular_acceleration * period,
+            limits.wheel_acceleration * geometry.wheel_radius * period,
+        )
+        self._half = geometry.half_separation
+        self.share = 1.0
+        """Share of the twist, from 0 at rest to 1."""
+
+    def step(self, twist: BodyTwist, *, paused: bool) -> BodyTwist:
+        """Return the twist of the next period; while the share is below 1, ``twist`` must stay."""
+        linear, angular = map(abs, twist)
+        speeds = linear, angular, linear + self._half * angular
+        change = min(
+            limit / max(speed, 1e-12) for limit, speed in zip(self._changes, speeds, strict=True)
+        )
+        self.share = max(self.share - change, 0.0) if paused else min(self.share + change, 1.0)
+        return BodyTwist(self.share * twist.linear, self.share * twist.angular)
+
+
 class PathSource(Protocol):
     """Source of one sample of the reference in each period."""
 
@@ -225,9 +280,10 @@ class PortraitSource:
 
 
 class GivenPathSource:
-    """A path of which points arrive now and then; the robot rests where no more are known.
+    """Paths that arrive now and then, one after the other or each in place of the one before.
 
-    First points: m, shape (n, 2); with ``repeat`` they are driven again and again.
+    Each is smoothed within the tolerance of the parameters. The robot rests at the end of the
+    last one. First path: points, m, shape (n, 2); with ``repeat`` it is driven again and again.
     """
 
     def __init__(
@@ -238,22 +294,92 @@ class GivenPathSource:
         points: Array | None = None,
         repeat: bool = False,
     ) -> None:
+        self._parameters, self._geometry = parameters, geometry
         self._timing = PathTiming(parameters.motion, geometry, 1.0 / parameters.rate, start)
-        self._again = points if repeat else None
-        if points is not None:
-            self.add_points(points)
+        self._paths: deque[Iterator[Array]] = deque()
+        """Rest of the path that is driven, and further ones."""
+        self._newest: Array | None = None
+        """Points of the last path."""
+        self._canceled = False
+        if points is not None and len(points):
+            self._begin(points, PathEnd(start), repeat)
 
-    def add_points(self, points: Array) -> None:
-        """Append points (m), shape (n, 2)."""
-        self._timing.add_points(points)
-        self._timing.drive_to_last_point()
+    @property
+    def under_way(self) -> bool:
+        """Whether the reference has not reached the end of the last path."""
+        return bool(self._paths) or not self._timing.arrived
+
+    def append(self, points: Array) -> None:
+        """Drive a path (m, shape (n, 2)) after those that are known."""
+        check_points(points)
+        if self.under_way and not self._canceled and len(points):
+            self._newest = points
+            self._paths.append(self._smoothed(points).pieces())
+        else:
+            self._newest = None
+            self.replace(points)
+
+    def replace(self, points: Array) -> None:
+        """Drive another path (m, shape (n, 2)) from now on, without a jump of the speed.
+
+        A path that is under way is left where the robot could stop, and the new one is joined
+        where it is nearest; from rest it is begun at its first point. The same path again changes
+        nothing.
+        """
+        check_points(points)
+        if not len(points):
+            self.cancel()
+        elif self._newest is None or not np.array_equal(points, self._newest):
+            under_way = self.under_way and not self._canceled
+            self._paths.clear()
+            self._canceled = False
+            self._begin(points, self._timing.cut(), under_way=under_way)
+
+    def cancel(self) -> None:
+        """Stop as soon as the limits allow, and forget every path."""
+        self._canceled = self.under_way
+        self._newest = None
 
     def advance(self, rate: float = 1.0) -> tuple[Pose, BodyTwist]:
         """Return pose and twist of the next period, for a rate of :class:`PathClock`."""
-        if self._again is not None:
-            while self._timing.needs_points:
-                self._timing.add_points(self._again)
-        return self._timing.advance(rate)
+        if self._canceled and self._timing.standing:
+            self._paths.clear()
+            self._timing.cut()
+            self._canceled = False
+        while self._paths and self._timing.needs_points:
+            piece = next(self._paths[0], None)
+            if piece is not None:
+                self._timing.add_points(piece)
+            else:
+                self._paths.popleft()
+                self._timing.drive_to_last_point()
+        return self._timing.advance(0.0 if self._canceled else rate)
+
+    def _smoothed(self, points: Array, *, closed: bool = False) -> SmoothedPath:
+        parameters = self._parameters
+        tolerance = parameters.path.tolerance
+        return SmoothedPath(points, tolerance, parameters.motion, self._geometry, closed=closed)
+
+    def _begin(
+        self, points: Array, end: PathEnd, repeat: bool = False, *, under_way: bool = False
+    ) -> None:
+        """Drive a path from where the reference can leave what it drives."""
+        self._newest = points
+        tolerance = self._parameters.path.tolerance
+        closed = repeat and math.hypot(*(points[-1] - points[0])) < LEAST_TOLERANCE
+        path = self._smoothed(points, closed=closed)
+        along, distance = path.nearest(end)
+        first = math.hypot(*(points[0] - end.pose[:2]))
+        if not tolerance or not (under_way or first <= tolerance):
+            pieces = path.pieces(along if under_way else 0.0)
+        elif path.length - along < LEAST_TOLERANCE and distance <= tolerance and not end.moving:
+            return  # the reference rests at its end
+        else:
+            pieces = path.joined_pieces(end, along)
+        self._paths.append(pieces)
+        if repeat and path.length > LEAST_TOLERANCE:
+            again = (path.pieces() for _ in itertools.repeat(None))
+            self._paths[-1] = itertools.chain(pieces, itertools.chain.from_iterable(again))
 
 
 class TwistSource:

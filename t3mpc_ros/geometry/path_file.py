@@ -19,14 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from t3mpc_ros.geometry.path_timing import PathError
+from t3mpc_ros.geometry.path_timing import MAX_COORDINATE, PathError
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters import yaml_files
 
 MAX_FILE_SIZE = 20_000_000
 """Bytes."""
-MAX_COORDINATE = 10_000.0
-"""m"""
 
 
 def load_path(file: str | Path) -> Array:

@@ -32,6 +32,7 @@ because accelerations are :math:`s^2` times the planned ones, and the twist is l
 the rates possible in the next period are an interval that contains the present one.
 """
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 import math
@@ -40,10 +41,12 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import STANDSTILL, Array, BodyTwist, Pose
+from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, Array, BodyTwist, Pose
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 
+MAX_COORDINATE = 10_000.0
+"""m"""
 STEP = 0.004
 """Grid of the path parameter u, m."""
 TURN_LENGTH = 0.12
@@ -54,6 +57,9 @@ CORNER = 0.6
 """Turn of the path at one point from which the robot stops and turns on the spot, rad."""
 RESOLUTION = 0.002
 """Points nearer than this to the one before are left out, m."""
+CREEP = 2e-3
+"""Least sum of the speeds du/dt at both ends of an interval, m/s. With less, as between a corner
+and an end right behind it, the robot goes from rest to rest."""
 WINDOW, COMMIT = 600, 100
 """Nodes planned ahead, and nodes after which the plan is renewed."""
 SHARE = 0.97
@@ -119,17 +125,41 @@ class CurveLimits(NamedTuple):
     half_separation: float
 
 
+class PathEnd(NamedTuple):
+    """Where a path ends that goes on elsewhere."""
+
+    pose: Pose
+    bend: float = 0.0
+    """Curvature there, 1/m."""
+    moving: bool = False
+    """Whether the robot may pass without a stop."""
+
+
 class PathError(ValueError):
     """A path that cannot be followed; the text contains the point, the bound and the value."""
 
 
 def check_points(points: Array) -> None:
-    """Raise :class:`PathError` unless ``points`` has the shape (n, 2) and is finite."""
+    """Raise :class:`PathError` unless ``points`` has the shape (n, 2) and is within bounds."""
     if points.ndim != 2 or points.shape[1] != 2:
         raise PathError(f'points must have the shape (n, 2): got {points.shape}')
     if not np.isfinite(points).all():
         row = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
         raise PathError(f'points must be finite: point {row} is {points[row].tolist()}')
+    beyond = np.abs(points).max(axis=1, initial=0.0) > MAX_COORDINATE
+    if beyond.any():
+        row = int(np.argmax(beyond))
+        raise PathError(
+            f'coordinates must be at most {MAX_COORDINATE:g} m: '
+            f'point {row} is {points[row].tolist()}'
+        )
+
+
+def transformed(points: Array, frame: Pose) -> Array:
+    """Return points (m) of a frame, shape (n, 2), in the frame in which its pose is given."""
+    cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
+    found: Array = points @ np.array([[cosine, sine], [-sine, cosine]]) + np.array(frame[:2])
+    return found
 
 
 class PathTiming:
@@ -158,6 +188,8 @@ class PathTiming:
         """x, y, yaw of the nodes from the first one planned."""
         self._squares = np.zeros(1)
         """b at the nodes of the plan."""
+        self._dropped = 0
+        """Number of nodes before the first one that is kept."""
         self._place, self._elapsed = 0, 0.0
         """Interval between two nodes, and time since its beginning, s."""
         self._changes = (
@@ -172,6 +204,10 @@ class PathTiming:
         """Rate at which the time of the plan passed in the last period."""
         self._sample = np.empty(3)
         self._ended = False
+        self._renew = False
+        """Whether the rest of the plan is that of a path that no longer leads there."""
+        self._pose = start
+        """Last pose returned."""
 
     @property
     def needs_points(self) -> bool:
@@ -198,14 +234,63 @@ class PathTiming:
 
     def finish(self) -> None:
         """End the path at its last point."""
-        if not self._ended:
-            self._curve.finish()
-            self._ended = True
+        self._curve.run_to_last()
+        self._ended = True
 
     @property
     def finished(self) -> bool:
         """Whether the robot is at the end of the path."""
-        return self._ended and self._place >= len(self._nodes) - 1 and not self._curve.ready
+        return self._ended and self.arrived
+
+    @property
+    def arrived(self) -> bool:
+        """Whether the motion is at the end of what is known."""
+        return self._place >= len(self._nodes) - 1 and not self._curve.ready
+
+    @property
+    def standing(self) -> bool:
+        """Whether the last twist was that of a robot at rest."""
+        return self._twist == STANDSTILL
+
+    @property
+    def _braking(self) -> bool:
+        """Whether the robot can no longer rest before the last node of the plan."""
+        last = len(self._nodes) - 1
+        if self.standing or self._place >= last or self._squares.size <= last:
+            return False
+        # The accelerations of an interval depend on the next one, too.
+        return self._stop() + 1 > last
+
+    def _stop(self) -> int:
+        return stopping_node(self._nodes, self._limits, self._place + 1, self._squares)
+
+    def cut(self) -> PathEnd:
+        """Remove the rest of the path from where the robot can stop; return where that is.
+
+        The motion goes on without a jump whatever points are added, or stops there without any. A
+        path whose end is nearer than that keeps it.
+        """
+        if self._renew:
+            self._plan()
+        self._ended = False
+        if self.standing:
+            pose = self._pose or self._curve.first or ORIGIN
+            self._curve = _CurveBuilder(pose)
+            self._nodes, self._squares = np.empty((0, 3)), np.zeros(1)
+            self._dropped, self._place, self._elapsed, self.rate = 0, 0, 0.0, 1.0
+            return PathEnd(pose)
+        if self._braking:
+            pose = Pose(*self._nodes[-1].tolist())
+            self._curve = _CurveBuilder(pose)
+            self._curve.take()
+            self._dropped = 1 - len(self._nodes)
+            return PathEnd(pose)
+        self._nodes = np.vstack([self._nodes, self._curve.take()])
+        count = self._curve.rewind(self._dropped + max(self._stop(), self._place + 1) + 2)
+        self._nodes = self._nodes[: count - self._dropped]
+        self._squares = self._squares[: self._place + 2]
+        self._renew = True
+        return self._curve.end()
 
     def advance(self, rate: float = 1.0) -> tuple[Pose, BodyTwist]:
         """Return pose (yaw in the range of floats, not wrapped) and twist, and go on by a period.
@@ -218,17 +303,21 @@ class PathTiming:
         count = len(self._nodes)
         if count < 2:
             self._twist = STANDSTILL
+            if count:
+                self._pose = Pose(*self._nodes[0].tolist())
             return self._curve.pose(), STANDSTILL
         if self._place >= count - 1:
             self._twist = STANDSTILL
-            return Pose(*self._nodes[-1].tolist()), STANDSTILL
+            self._pose = Pose(*self._nodes[-1].tolist())
+            return self._pose, STANDSTILL
         sample = sample_curve(self._nodes, self._squares, self._place, self._elapsed, self._sample)
+        self._pose = Pose(*sample[:3])
         planned = BodyTwist(*sample[3:])
         self.rate = self._reachable_rate(rate, planned)
         self._elapsed += self.rate * self._period
         self._place, self._elapsed = skip_intervals(self._squares, self._place, self._elapsed)
         self._twist = BodyTwist(self.rate * planned.linear, self.rate * planned.angular)
-        return Pose(*sample[:3]), self._twist
+        return self._pose, self._twist
 
     def _reachable_rate(self, wanted: float, planned: BodyTwist) -> float:
         """Return the rate nearest to a wanted one that the limits allow after the last twist."""
@@ -260,11 +349,19 @@ class PathTiming:
         """Renew the plan once enough of it is driven, or when the path has grown."""
         planned = len(self._squares) - 1
         short = planned < WINDOW and self._curve.ready
-        if self._place < COMMIT and len(self._nodes) > 1 and not short:
+        if self._place < COMMIT and len(self._nodes) > 1 and not short and not self._renew:
             return
+        # Further nodes would change the curve on which the robot comes to rest.
+        if self._braking:
+            return
+        arrived = self._place >= len(self._nodes) - 1
+        self._renew = False
         new = self._curve.take()
-        drop = max(min(self._place - 1, len(self._nodes) - 2), 0)
+        drop = len(self._nodes) - 1 if arrived else self._place - 1
+        drop = max(drop, 0)
         self._nodes = np.vstack([self._nodes[drop:], new])
+        self._curve.forget(self._place + self._dropped)
+        self._dropped += drop
         squares = self._squares[drop : self._place + 2]
         self._place -= drop
         if len(self._nodes) < 2:
@@ -304,6 +401,17 @@ def time_path(
     return TimedPath(period * np.arange(len(rows), dtype=np.float64), *columns)
 
 
+class _Mark(NamedTuple):
+    """State of a :class:`_CurveBuilder` after a point."""
+
+    nodes: int
+    """Number of nodes up to there."""
+    last: tuple[float, float]
+    before: tuple[float, float, float]
+    carried: float
+    segment: float
+
+
 class _CurveBuilder:
     """Turns points into the nodes of the pose curve, evenly spaced in u."""
 
@@ -317,6 +425,9 @@ class _CurveBuilder:
         """Length of u since the last node, m."""
         self._segment = 0.0
         """Rest of the last segment, from ``_before`` to ``_last``, m."""
+        self._taken = 0
+        self._marks: deque[_Mark] = deque()
+        """States after points, to go back to."""
         if start is not None:
             self._last = start.x, start.y
             self._before = start.x, start.y, start.yaw
@@ -327,6 +438,11 @@ class _CurveBuilder:
         """Number of nodes not taken."""
         return len(self._nodes)
 
+    @property
+    def first(self) -> Pose | None:
+        """The first node that is not taken."""
+        return Pose(*self._nodes[0]) if self._nodes else None
+
     def pose(self) -> Pose:
         """Return the last pose known, the origin without one."""
         return Pose(*(self._before or (0.0, 0.0, 0.0)))
@@ -334,8 +450,46 @@ class _CurveBuilder:
     def take(self) -> Array:
         """Return the new nodes, shape (n, 3), and forget them."""
         nodes = np.array(self._nodes).reshape(-1, 3)
+        self._taken += len(self._nodes)
         self._nodes.clear()
         return nodes
+
+    def rewind(self, count: int) -> int:
+        """Go back to the first point with ``count`` nodes; return how many there are then.
+
+        All nodes are taken before. Without such a point nothing changes.
+        """
+        for index, mark in enumerate(self._marks):
+            if mark.nodes >= count:
+                while len(self._marks) > index + 1:
+                    self._marks.pop()
+                self._taken, self._last, self._before, self._carried, self._segment = mark
+                break
+        return self._taken
+
+    def forget(self, count: int) -> None:
+        """Forget the points with less than ``count`` nodes, but for what :meth:`end` needs."""
+        while len(self._marks) > 3 and self._marks[3].nodes < count:
+            self._marks.popleft()
+
+    def end(self) -> PathEnd:
+        """Return where the next point continues the curve."""
+        assert self._last is not None
+        assert self._before is not None
+        yaw, bend = self._before[2], 0.0
+        if self._segment > 0.0:
+            yaw = math.atan2(self._last[1] - self._before[1], self._last[0] - self._before[0])
+            points = [mark.last for mark in list(self._marks)[-3:]]
+            if len(points) == 3 and points[-1] == self._last:
+                (x0, y0), (x1, y1), (x2, y2) = points
+                turn = math.atan2(
+                    (x1 - x0) * (y2 - y1) - (y1 - y0) * (x2 - x1),
+                    (x1 - x0) * (x2 - x1) + (y1 - y0) * (y2 - y1),
+                )
+                one, other = math.hypot(x1 - x0, y1 - y0), math.hypot(x2 - x1, y2 - y1)
+                bend = 2.0 * turn / (one + other)
+                yaw += 0.5 * bend * other
+        return PathEnd(Pose(*self._last, yaw), bend, moving=self._segment > 0.0)
 
     def add(self, x: float, y: float) -> None:
         """Append a point: the curve then is known up to shortly before it."""
@@ -352,20 +506,24 @@ class _CurveBuilder:
             self._nodes.append(self._before)
         self._turn_to(direction, run_x / length, run_y / length, length)
         self._last = x, y
+        self._marks.append(
+            _Mark(
+                self._taken + len(self._nodes),
+                self._last,
+                self._before,
+                self._carried,
+                self._segment,
+            )
+        )
 
     def run_to_last(self) -> None:
         """Make the curve known up to the last point."""
         if self._before is not None and self._last is not None:
             self._run_to(*self._last, self._before[2])
             self._segment = 0.0
-
-    def finish(self) -> None:
-        """End the curve at the last point."""
-        self.run_to_last()
-        if self._before is None or self._last is None:
-            return
-        if self._carried > 1e-9:
-            self._nodes.append((*self._last, self._before[2]))
+            if self._carried > 1e-9:
+                self._nodes.append(self._before)
+                self._carried = 0.0
 
     def _turn_to(self, direction: float, ahead_x: float, ahead_y: float, length: float) -> None:
         """Go to the last point, turn there, and go to the middle or to the end of the rounding."""
@@ -519,11 +677,26 @@ def plan_speeds(nodes: Array, limits: CurveLimits, begin: int, squares: Array) -
 
 
 @kernel
+def stopping_node(nodes: Array, limits: CurveLimits, begin: int, squares: Array) -> int:
+    """Return the first node at which a motion can rest that is planned up to ``begin``.
+
+    squares : b of a plan, which every slower motion may follow
+    """
+    last = squares.size - 1
+    b = squares[min(begin, last)]
+    for k in range(begin, last):
+        if b < 1e-9:
+            return k
+        lowest, highest = step_range(nodes, limits, k, b, squares[k + 1])
+        b = min(max(b + 2.0 * STEP * min(lowest, highest), 0.0), squares[k + 1])
+    return last
+
+
+@kernel
 def interval_time(squares: Array, k: int) -> float:
     """Return the time from node ``k`` to the next, s."""
     speeds = math.sqrt(squares[k]) + math.sqrt(squares[k + 1])
-    # Two nodes at rest do not follow each other; rounding must not stop the motion for ever.
-    return 2.0 * STEP / max(speeds, 2e-3)
+    return 2.0 * STEP / max(speeds, CREEP)
 
 
 @kernel
@@ -551,8 +724,12 @@ def sample_curve(
     duration = interval_time(squares, place)
     begin, end = math.sqrt(squares[place]), math.sqrt(squares[place + 1])
     share = elapsed / duration
-    speed = begin + share * (end - begin)
-    along = min(max((begin + 0.5 * share * (end - begin)) * elapsed / STEP, 0.0), 1.0)
+    if begin + end < CREEP:
+        speed = 6.0 * share * (1.0 - share) * STEP / duration
+        along = share * share * (3.0 - 2.0 * share)
+    else:
+        speed = begin + share * (end - begin)
+        along = min(max((begin + 0.5 * share * (end - begin)) * elapsed / STEP, 0.0), 1.0)
     middle = place if along < 0.5 else place + 1
     offset = along if along < 0.5 else along - 1.0
     weights = (

@@ -22,13 +22,21 @@ import time
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, Quaternion, TransformStamped, Twist, TwistStamped
-from nav_msgs.msg import Odometry
+from geometry_msgs.msg import (
+    PoseStamped,
+    Quaternion,
+    Transform,
+    TransformStamped,
+    Twist,
+    TwistStamped,
+)
+from nav_msgs.msg import Odometry, Path
+import numpy as np
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
+from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 MAX_CLOCK_LEAD_NS = NANOSECONDS // 20
@@ -226,6 +234,18 @@ def twist_from_body(twist: BodyTwist) -> Twist:
 def stamped_twist(twist: BodyTwist, stamp_ns: int, frame: str) -> TwistStamped:
     """Return a command as a message with a header."""
     return TwistStamped(header=header(stamp_ns, frame), twist=twist_from_body(twist))
+
+
+def points_from_path(message: Path) -> Array:
+    """Return the points of a path, m, shape (n, 2)."""
+    places = [each.pose.position for each in message.poses]
+    return np.array([(each.x, each.y) for each in places], dtype=np.float64).reshape(-1, 2)
+
+
+def pose_from_transform(transform: Transform) -> Pose:
+    """Return the pose in the plane of a frame in its parent."""
+    place, turn = transform.translation, transform.rotation
+    return Pose(place.x, place.y, yaw_from_quaternion(turn.x, turn.y, turn.z, turn.w))
 
 
 def pose_stamped(state: State, frame: str) -> PoseStamped:

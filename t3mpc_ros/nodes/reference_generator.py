@@ -13,6 +13,7 @@
 # limitations under the License.
 """``ros2 run t3mpc_ros reference_generator``: publishes the reference, chaotic or given."""
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 import secrets
@@ -20,7 +21,7 @@ from typing import Any, ClassVar
 
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry, Path
-import numpy as np
+from rclpy.time import Time
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -29,14 +30,15 @@ from t3mpc_ros.chaos.pose_reference import (
     PathClock,
     PathReferenceParameters,
     PathSource,
+    PauseRamp,
     PortraitSource,
     TwistSource,
 )
-from t3mpc_ros.chaos.reference import ChaoticReference
+from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceSample
 from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY, SALT_BYTES, fingerprint_seed
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose
 from t3mpc_ros.geometry.path_file import load_path
-from t3mpc_ros.geometry.path_timing import PathError, check_points
+from t3mpc_ros.geometry.path_timing import PathError, check_points, transformed
 from t3mpc_ros.geometry.timing import SampleScheduler
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, Pose, State
 from t3mpc_ros.nodes import conversions, qos
@@ -113,6 +115,8 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             self._generator = ChaoticReference(parameters, parameters.geometry)
             self._generator.advance()  # compile here, not within a step
             self._generator.reset(self._seed)
+            self._sample: ReferenceSample | None = None
+            self._ramp = PauseRamp(parameters.motion, parameters.geometry, 1.0 / parameters.rate)
         else:
             self._make_source(ORIGIN).advance()
             self._subscribe()
@@ -127,6 +131,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             for name in (parameters.frame_id, parameters.child_frame_id)
         )
         self._path.header.frame_id = frame
+        """Path driven so far, in the frame of the reference."""
         self._serialized = conversions.SerializedOdometry(frame, child)
         self._reference_publisher = self.create_publisher(Odometry, 'reference', qos.STREAM)
         self._path_publisher = self.create_publisher(Path, 'reference/path', qos.LATCHED)
@@ -156,7 +161,13 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             Odometry, 'odom', None, qos.STREAM, raw=True
         )
         if parameters.source == 'topic':
-            self.create_matching_subscription(Path, 'path', self._on_path, qos.LATCHED)
+            # A volatile subscription receives from every publisher, but not what a latched one has
+            # published before; only a transient-local one does, and only from those.
+            self.create_matching_subscription(Path, 'path', self._on_path, qos.LATEST)
+            if qos.overriding_options(self, 'path', 'subscription') is None:
+                qos.MatchingSubscription(self, Path, 'path', self._on_path, qos.LATCHED)
+            self._path_stamps: deque[int] = deque(maxlen=8)
+            self._transforms = self._make_transform_buffer()
         elif parameters.source == 'twist':
             kind = TwistStamped if parameters.enable_stamped_target_twist else Twist
             self.create_matching_subscription(kind, 'target_twist', self._on_twist, qos.COMMAND)
@@ -172,19 +183,48 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 self._pose = state.pose
             self._path_clock.observe(state.stamp_ns, state.pose)
 
-    def _on_path(self, message: Path, info: dict[str, Any]) -> None:
-        places = [(each.pose.position.x, each.pose.position.y) for each in message.poses]
-        points = np.array(places, dtype=np.float64).reshape(-1, 2)
+    def _make_transform_buffer(self) -> Any:
+        """Return the transforms known to tf2, None without tf2_ros."""
         try:
+            import tf2_ros
+        except ImportError:
+            return None
+        buffer = tf2_ros.Buffer()
+        self._transform_listener = tf2_ros.TransformListener(buffer, self)
+        return buffer
+
+    def _on_path(self, message: Path, info: dict[str, Any]) -> None:
+        stamp = int(info['source_timestamp'])
+        if stamp and stamp in self._path_stamps:
+            return  # both subscriptions receive it
+        self._path_stamps.append(stamp)
+        try:
+            points = conversions.points_from_path(message)
             check_points(points)
+            if len(points):
+                points = transformed(points, self._frame_pose(message.header.frame_id))
+                check_points(points)
         except PathError as error:
             self._rejected += 1
             self.get_logger().warning(f'path is ignored: {error}')
             return
-        if isinstance(self._source, GivenPathSource):
-            self._source.add_points(points)
-        else:  # the robot has not reported where it is
-            self._points = points
+        if not isinstance(self._source, GivenPathSource):
+            self._points = points  # the robot has not reported where it is
+        elif self.parameters.path_mode == 'append':
+            self._source.append(points)
+        else:
+            self._source.replace(points)
+
+    def _frame_pose(self, frame: str) -> Pose:
+        """Return the pose of a frame in that of the reference, or raise PathError."""
+        own = self._path.header.frame_id
+        if frame.lstrip('/') in ('', own):
+            return ORIGIN
+        if self._transforms is not None and self._transforms.can_transform(own, frame, Time()):
+            return conversions.pose_from_transform(
+                self._transforms.lookup_transform(own, frame, Time()).transform
+            )
+        raise PathError(f'its frame is {frame}, and no transform from it to {own} is known')
 
     def _on_twist(self, message: Twist | TwistStamped, info: dict[str, Any]) -> None:
         twist = message.twist if isinstance(message, TwistStamped) else message
@@ -213,14 +253,17 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         """Publish a sample, and keep some as the path driven so far."""
         twist, count = STANDSTILL, None
         if self._source is not None:
-            if not self._paused:
-                self._pose, twist = self._source.advance(self._path_clock.rate)
+            rate = 0.0 if self._paused else self._path_clock.rate
+            self._pose, twist = self._source.advance(rate)
             self._path_clock.add_reference(stamp_ns, self._pose)
             self._samples = count = self._samples + 1
-        elif not self._paused:
-            sample = self._generator.advance()
-            twist, count = sample.twist, sample.index
-            self._publish_signals((sample.mode, *sample.selected))
+        else:
+            if self._ramp.share == 1.0 and not self._paused:
+                self._sample = sample = self._generator.advance()
+                count = sample.index
+                self._publish_signals((sample.mode, *sample.selected))
+            if self._sample is not None:
+                twist = self._ramp.step(self._sample.twist, paused=self._paused)
         state = State(stamp_ns, self._pose, twist)
         self._reference_publisher.publish(self._serialized.with_state(state))
         if count is not None and count % max(1, round(PATH_PERIOD * self.parameters.rate)) == 0:
@@ -268,6 +311,8 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         if self.parameters.source != 'signals':
             values['rejected_inputs'] = self._rejected
             values['path_rate'] = self._path_clock.rate
+            if isinstance(self._source, GivenPathSource):
+                values['path_under_way'] = self._source.under_way
             if self._source is None:
                 return WARN, 'no odom yet: the path begins where the robot is', values
         if self._scheduler.skipped:

@@ -111,7 +111,7 @@ def _send_twist(source, _):
 
 
 def _send_points(source, k):
-    source.add_points(np.array([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0]]) + [0.3 * k, 0.0])
+    source.append(np.array([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0]]) + [0.3 * k, 0.0])
 
 
 SOURCES = {

@@ -14,9 +14,11 @@
 """Grid, latched topics, pause and seeds of the reference generator node."""
 
 import secrets
+import sys
+from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, Twist
+from geometry_msgs.msg import PoseStamped, TransformStamped, Twist
 from nav_msgs.msg import Odometry, Path
 import numpy as np
 import pytest
@@ -104,6 +106,40 @@ def test_reseed_changes_the_reference_and_hides_the_seed(harness, logged):
     assert reference.get_parameter('seed').value == seed
 
 
+def _speeds(received):
+    return np.array([message.twist.twist.linear.x for message in received])
+
+
+def _largest_change(received):
+    """Return the largest change of the speed from one sample to the next, m/s."""
+    return np.abs(np.diff(_speeds(received))).max()
+
+
+@pytest.mark.parametrize('source', ['signals', 'portrait'])
+def test_a_pause_and_its_end_are_ramps(harness, source):
+    """The reference jumped from 0.24 m/s to 0 and back; twice paused is as once."""
+    reference = harness.add(ReferenceGeneratorNode, source=source, ramp=0.0)
+    received = harness.subscribe(Odometry, 'reference')
+    places = harness.create_publisher(Odometry, 'odom')
+
+    def reached(condition):
+        def done():
+            places.publish(received[-1] if received else _odometry())
+            return received and condition(speed(received[-1]))
+
+        return done
+
+    harness.spin_until(reached(lambda v: v > 0.1))
+    first = len(received)
+    for on, condition in ((True, lambda v: v == 0.0), (False, lambda v: v > 0.1)):
+        for _ in range(2):
+            assert harness.call(SetBool, 'reference_generator/pause', data=on).success
+        harness.spin_until(reached(condition))
+    limit = reference.parameters.motion.linear_acceleration / reference.parameters.rate
+    assert _largest_change(received[first:]) <= limit * (1 + 1e-9)
+    assert on_grid(received, 100)
+
+
 PATH_LIMIT = 0.25
 
 
@@ -111,6 +147,104 @@ def _odometry(stamp_ns=0):
     message = odometry(stamp_ns)
     message.pose.pose.position.x, message.pose.pose.position.y = 0.5, -0.2
     return message
+
+
+def _path(points, frame='odom'):
+    message = Path(poses=[PoseStamped() for _ in points])
+    message.header.frame_id = frame
+    for (x, y), pose in zip(points, message.poses, strict=True):
+        pose.pose.position.x, pose.pose.position.y = float(x), float(y)
+    return message
+
+
+class _PathDrive:
+    """A generator with source topic, whose robot is where its reference is."""
+
+    def __init__(self, harness, **parameters):
+        self._harness = harness
+        self.node = harness.add(ReferenceGeneratorNode, source='topic', **parameters)
+        self.received = harness.subscribe(Odometry, 'reference')
+        self._places = harness.create_publisher(Odometry, 'odom')
+
+    def until(self, condition):
+        """Drive until a condition holds for the last sample."""
+
+        def done():
+            self._places.publish(self.received[-1] if self.received else _odometry())
+            return self.received and condition(self.received[-1])
+
+        self._harness.spin_until(done)
+
+
+def test_paths_of_volatile_and_latched_publishers_drive_once(harness):
+    """Planners are volatile, and got no connection; RViz and scripts latch."""
+    harness.create_publisher(Path, 'path', LATCHED).publish(_path([(0.5, -0.2), (1.0, -0.2)]))
+    drive = _PathDrive(harness, path_mode='append')
+    drive.until(lambda m: speed(m) > 0.1)
+    drive.until(lambda m: speed(m) == 0.0)
+    assert drive.received[-1].pose.pose.position.x == pytest.approx(1.0, abs=1e-6)
+    planner = harness.connected_publisher(Path, 'path')
+    planner.publish(_path([(1.0, -0.2), (1.5, -0.2)]))
+    drive.until(lambda m: speed(m) > 0.1)
+    drive.until(lambda m: speed(m) == 0.0)
+    assert drive.received[-1].pose.pose.position.x == pytest.approx(1.5, abs=1e-6)
+    assert min(_speeds(drive.received)) >= 0.0
+    assert 'no message passes' not in reason(drive.node)
+    assert diagnostic(drive.node, 'path_under_way') is False
+
+
+def test_a_path_replaces_the_one_before_and_an_empty_one_stops(harness):
+    """Each path was appended: the robot went back to the beginning of the next one."""
+    drive = _PathDrive(harness)
+    planner = harness.connected_publisher(Path, 'path')
+    for end in (2.0, 2.1, 2.2):
+        planner.publish(_path([(0.5, -0.2), (end, -0.2)]))
+        drive.until(lambda m, end=end: m.pose.pose.position.x > end - 1.4)
+    drive.until(lambda m: speed(m) > 0.2)
+    planner.publish(Path())
+    drive.until(lambda m: speed(m) == 0.0)
+    places = np.array([message.pose.pose.position.x for message in drive.received])
+    assert (np.diff(places) >= 0.0).all()
+    assert places[-1] < 1.3
+    limit = drive.node.parameters.motion.linear_acceleration * 0.01
+    assert _largest_change(drive.received) <= limit * (1 + 1e-9)
+
+
+def test_a_path_in_another_frame_needs_a_transform(harness, logged, monkeypatch):
+    """A path in map was taken as one in odom, wherever that was."""
+    known = {}
+    buffer = SimpleNamespace(
+        can_transform=lambda target, source, time: (target, source) in known,
+        lookup_transform=lambda target, source, time: known[target, source],
+    )
+    tf2_ros = SimpleNamespace(Buffer=lambda: buffer, TransformListener=lambda buffer, node: None)
+    monkeypatch.setitem(sys.modules, 'tf2_ros', tf2_ros)
+    drive = _PathDrive(harness)
+    drive.until(lambda m: True)
+    planner = harness.connected_publisher(Path, 'path')
+    refused = (
+        (
+            _path([(3.0, 2.0)], 'map'),
+            'its frame is map, and no transform from it to odom is known',
+        ),
+        (_path([(0.0, 0.0), (float('nan'), 0.0)]), 'points must be finite: point 1'),
+        (_path([(1e6, 0.0)]), 'at most 10000 m: point 0'),
+    )
+    for count, (message, text) in enumerate(refused, 1):
+        planner.publish(message)
+        harness.spin_until(lambda count=count: diagnostic(drive.node, 'rejected_inputs') == count)
+        assert any(text in line for line in logged('path is ignored'))
+    assert speed(drive.received[-1]) == 0.0
+    # The map is turned by a quarter, its origin is at (1, -1): (0.8, 0.5) is at (0.5, -0.2).
+    transform = TransformStamped().transform
+    transform.translation.x, transform.translation.y = 1.0, -1.0
+    transform.rotation.z = transform.rotation.w = np.sqrt(0.5)
+    known['odom', 'map'] = SimpleNamespace(transform=transform)
+    planner.publish(_path([(0.8, 0.5), (0.8, 0.2)], 'map'))
+    drive.until(lambda m: m.pose.pose.position.x > 0.79)
+    drive.until(lambda m: speed(m) == 0.0)
+    place = drive.received[-1].pose.pose.position
+    assert (place.x, place.y) == pytest.approx((0.8, -0.2), abs=1e-6)
 
 
 def _drive(harness, topic, message, until, **parameters):

@@ -970,7 +970,7 @@ NEVER_RESET = {
     ),
     **dict.fromkeys(('PtyPort', '_ConsolePort', 'StopTimeMonitor'), 'one process, never reset'),
     **dict.fromkeys(
-        ('InputMonitor', 'Gaps', 'ResponseGain', 'GivenPathSource'),
+        ('InputMonitor', 'Gaps', 'ResponseGain', 'GivenPathSource', 'SmoothedPath', 'PauseRamp'),
         'made anew for each run or path',
     ),
     **dict.fromkeys(('NoisyPlant', 'PlantRobot'), 'one run, no reset'),
