@@ -19,9 +19,13 @@ its count of steps since the last snapshot and the place at which range readings
 the map.
 """
 
+from dataclasses import replace
+
 import pytest
 from support.fresh_state import check_configured, check_fresh, check_round_trip, classes_of, leaves
 from support.stateful_objects import CONFIGURED, FRESH, NEVER_RESET
+
+from t3mpc_ros.mpc.predictive_controller import PredictiveParameters
 
 PACKAGES = 'control', 'mpc', 'fuzzy', 'chaos', 'robot', 'geometry', 'simulation', 'emulator'
 
@@ -42,6 +46,13 @@ CASES = [
     for name, operation in entry.operations.items()
 ]
 OF_PARAMETERS = [pytest.param(entry, id=_name(kind)) for kind, entry in CONFIGURED.items()]
+
+
+@pytest.fixture(autouse=True)
+def short_pretraining(monkeypatch):
+    """Each new controller pretrains its networks: on a shorter run their state is as complete."""
+    short = replace(PredictiveParameters.excitation, duration=15.0, epochs=1)
+    monkeypatch.setattr(PredictiveParameters, 'excitation', short)
 
 
 def held_classes(table):

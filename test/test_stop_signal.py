@@ -20,6 +20,7 @@ import subprocess
 import sys
 
 import pytest
+from support.long_tests import few_of
 from support.signals import attended
 from support.waiting import wait_until
 
@@ -102,7 +103,7 @@ def test_a_signal_before_the_imports_is_quiet(number, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('number', [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize('number', few_of([signal.SIGKILL, signal.SIGTERM]))
 def test_the_workers_of_a_killed_process_end_with_it(number, tmp_path):
     """``t3mpc compare`` that was terminated left its workers computing, for minutes."""
     program = tmp_path / 'study.py'

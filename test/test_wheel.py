@@ -22,6 +22,7 @@ import zipfile
 
 import pytest
 from support.checkout import EXECUTABLES, ROOT, clean_environment, copy_package
+from support.long_tests import few_of
 from support.waiting import run
 
 from t3mpc_ros.nodes.registry import NODES
@@ -97,7 +98,8 @@ def test_the_distributions_hold_every_file_of_the_package(source, archive, wheel
     assert not [name for name in names if name.startswith(('test/', 'docs/'))], 'some of them'
 
 
-def test_equal_sources_give_equal_distributions(source, archive, wheel, tmp_path):
+@pytest.mark.parametrize('kind', few_of(['sdist', 'wheel']))
+def test_equal_sources_give_equal_distributions(kind, source, request, tmp_path):
     """At another time and place, with another umask, for another time zone and owner of files."""
     (tmp_path / 'Übung mit Blank').mkdir()
     other = Path(shutil.copytree(source, tmp_path / 'Übung mit Blank' / 'copy', symlinks=True))
@@ -107,13 +109,16 @@ def test_equal_sources_give_equal_distributions(source, archive, wheel, tmp_path
     before = os.umask(0o077)
     try:
         zone = {'TZ': 'Pacific/Auckland', 'PYTHONHASHSEED': '7'}
-        _run(sys.executable, 'setup.py', '-q', 'sdist', '-d', tmp_path, cwd=other, **zone)
-        words = ['-q', '--no-deps', '--no-build-isolation', '--no-index', '-w', tmp_path, other]
-        _run(sys.executable, '-m', 'pip', 'wheel', *words, cwd=tmp_path, **zone)
+        if kind == 'sdist':
+            words = ['setup.py', '-q', 'sdist', '-d', tmp_path]
+        else:
+            options = ['-q', '--no-deps', '--no-build-isolation', '--no-index']
+            words = ['-m', 'pip', 'wheel', *options, '-w', tmp_path, other]
+        _run(sys.executable, *words, cwd=other, **zone)
     finally:
         os.umask(before)
-    for made in (archive, wheel):
-        assert (tmp_path / made.name).read_bytes() == made.read_bytes()
+    made = request.getfixturevalue('archive' if kind == 'sdist' else 'wheel')
+    assert (tmp_path / made.name).read_bytes() == made.read_bytes()
 
 
 def test_the_extras_are_declared(wheel):
@@ -134,6 +139,8 @@ def test_the_extras_are_declared(wheel):
         assert f'Provides-Extra: {extra}\n' in text
 
 
+# .ci/run installs the wheel every day as well.
+@pytest.mark.long
 def test_an_installation_by_pip_runs_in_any_folder(installed, tmp_path):
     on_path = {path.name for path in (installed / 'bin').iterdir()}
     assert on_path & EXECUTABLES == {'t3mpc'}, 'generic names collide there'

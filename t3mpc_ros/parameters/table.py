@@ -269,7 +269,7 @@ class Parameters:
 
         They were parameters once: older files and bags may hold them, with this value alone.
         """
-        return dict(_constants(cls))
+        return _constants(cls).copy()
 
     @classmethod
     def from_dict(cls, values: Mapping[str, object]) -> Self:
@@ -291,7 +291,7 @@ class Parameters:
             if name in known:
                 # Before the group checks itself, so that the error contains the full name.
                 checked[known[name].path] = known[name].spec.check(value)
-            elif (constant := self.class_constants().get(name)) is None:
+            elif (constant := _constants(type(self)).get(name)) is None:
                 raise ParameterError(f'there is no parameter {name}{nearest_hint(name, known)}')
             elif (tuple(value) if isinstance(value, list) else value) != constant:
                 raise ParameterError(
@@ -354,7 +354,17 @@ def _entries(table: type[Parameters]) -> tuple[_Entry, ...]:
     return _tables[table]
 
 
-def _constants(table: type[Parameters]) -> Iterator[tuple[str, Value]]:
+_constant_tables: dict[object, dict[str, Value]] = {}
+"""Constants of each table, collected when they are first asked for."""
+
+
+def _constants(table: type[Parameters]) -> dict[str, Value]:
+    if table not in _constant_tables:
+        _constant_tables[table] = dict(_declared_constants(table))
+    return _constant_tables[table]
+
+
+def _declared_constants(table: type[Parameters]) -> Iterator[tuple[str, Value]]:
     groups = {item.name: item for item in fields(table)}
     for name, hint in get_type_hints(table).items():
         if get_origin(hint) is ClassVar:
@@ -364,7 +374,7 @@ def _constants(table: type[Parameters]) -> Iterator[tuple[str, Value]]:
         elif isinstance(hint, type) and issubclass(hint, Parameters):
             defaults = groups[name].default_factory().to_dict()  # type: ignore[operator]
             fixed = ((key, defaults[key]) for key in groups[name].metadata['fixed'])
-            held = (*fixed, *_constants(hint))
+            held = (*fixed, *_constants(hint).items())
         else:
             continue
         inline = name in groups and groups[name].metadata.get('inline')

@@ -259,7 +259,7 @@ class Player(RuleBasedStateMachine):
 
 
 TestPlayer = Player.TestCase
-TestPlayer.settings = settings(STATEFUL, max_examples=200)
+TestPlayer.settings = settings(STATEFUL, max_examples=60)
 
 
 @given(

@@ -26,6 +26,7 @@ from types import SimpleNamespace
 
 import pytest
 from support.bag_messages import START, diagnostics, twist_message
+from support.long_tests import few_of
 from support.robot_bags import following_rows, write
 from support.signals import attend
 from support.waiting import communicate, run, wait_until
@@ -269,7 +270,7 @@ RUNS = [
 ]
 
 
-@pytest.mark.parametrize('ends, rows, unfinished, code, words', RUNS)
+@pytest.mark.parametrize('ends, rows, unfinished, code, words', few_of(RUNS, len(RUNS) - 3))
 def test_the_exit_code_says_what_became_of_the_run(
     ends, rows, unfinished, code, words, tmp_path, monkeypatch, capsys
 ):

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from support import waiting
 from support.control_loops import GEOMETRY, LEAD, PERIOD, Loop, ServoLoop, make_state
+from support.long_tests import few_of
 
 from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
 from t3mpc_ros.control.controller import (
@@ -90,7 +91,7 @@ def test_a_repeated_message_does_not_move_a_disabled_robot(late):
     assert twist == BodyTwist(0.0, 0.0)
 
 
-@pytest.mark.parametrize('composition', ['body', 'paper'])
+@pytest.mark.parametrize('composition', few_of(['body', 'paper']))
 @pytest.mark.slow
 def test_the_first_command_is_within_the_acceleration_limits(composition):
     """A standing robot with noise of 0.2 rad/s was commanded a step to the noise at once."""
@@ -99,7 +100,7 @@ def test_the_first_command_is_within_the_acceleration_limits(composition):
         ControllerParameters.from_dict({'composition': composition, 'law.gain': 0.0})
     )
     limits = controller.parameters.limits
-    for run in range(40):
+    for run in range(20):
         controller.reset()
         linear, angular = generator.uniform((-0.3, -3.0), (0.3, 3.0)).tolist()
         for k in range(41):
@@ -478,15 +479,15 @@ def test_after_the_warm_up_no_step_compiles(parameters):
 @pytest.mark.parametrize(
     'changes, words',
     [
-        ({'law.gain': 10.0}, 'law.gain must be from 77.1 to 115 1/s'),
+        ({'law.gain': 10.0}, 'law.gain must be from 77.2 to 115 1/s'),
         ({'law.gain': 0.02}, 'got 0.02; law.gain 0 chooses'),
         ({'law.gain': 140.0}, 'got 140'),
-        ({'law.gain': 95.0, 'rate': 50.0}, 'from 39.9 to 59.9 1/s at this rate'),
+        ({'law.gain': 95.0, 'rate': 50.0}, 'from 40 to 59.9 1/s at this rate'),
         (
             {'law.gain': 200.0, 'composition': 'paper'},
             'law.gain plus the slope of the compensator',
         ),
-        ({'law.gain': 60.0, 'composition': 'paper', 'speed_filter.lag': 0.02}, 'to 55.1 1/s'),
+        ({'law.gain': 60.0, 'composition': 'paper', 'speed_filter.lag': 0.02}, 'to 55 1/s'),
         (
             {'predictive.v_max': 1e4, 'composition': 'paper'},
             'law.error_bound plus predictive.v_max',

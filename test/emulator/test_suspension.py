@@ -13,7 +13,6 @@
 # limitations under the License.
 """Odometry and restarts: a suspended host, a stalled line, resets of robot and dongle."""
 
-from itertools import product
 import math
 
 import numpy as np
@@ -26,7 +25,7 @@ from t3mpc_ros.radio.link.standstill_reasons import ANSWERS_AGAIN
 
 CYCLE_NS = 20 * MS
 PHASES = 20
-USUAL_PHASES = 5
+USUAL_PHASES = 3
 """Of them, those of a short check."""
 
 
@@ -106,7 +105,7 @@ def test_a_suspended_host_repeats_no_command():
 
 
 def test_a_stalled_line_is_neither_a_restart_nor_a_lost_distance():
-    for phase, seconds in product((0, 7, 13), (0.8, 2.0)):
+    for phase, seconds in ((0, 0.8), (7, 2.0), (13, 0.8)):
         bench = a_moving_robot()
         bench.run(phase / PHASES * CYCLE_NS / 1e9 + 1e-6)
         bench.inject('stall', seconds)

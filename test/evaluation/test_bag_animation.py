@@ -21,6 +21,7 @@ from matplotlib.colors import to_hex
 import numpy as np
 from PIL import Image
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main
@@ -101,7 +102,7 @@ def test_the_panels_show_the_quantities_of_their_titles(measured, figures, tmp_p
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('follows', [True, False])
+@pytest.mark.parametrize('follows', few_of([True, False]))
 def test_the_floor_shows_the_robot_its_way_and_what_it_sees(
     follows, figures, tmp_path, monkeypatch
 ):

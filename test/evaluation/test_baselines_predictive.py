@@ -19,6 +19,7 @@ import sys
 import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
+from support.long_tests import few_of
 
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
@@ -158,7 +159,7 @@ def _random_program(generator):
 
 def test_programs_satisfy_karush_kuhn_tucker():
     generator = np.random.default_rng(8)
-    for _ in range(300):
+    for _ in range(100):
         program, hessian, slope = _random_program(generator)
         for last in (0.3 * slope, slope):  # the second one starts from the first
             x = program.solve(last)
@@ -347,7 +348,7 @@ def test_bounds_are_never_left(kind, drive):
 
 @pytest.mark.parametrize('drive', DRIVES)
 @pytest.mark.parametrize('kind', EVERY)
-@pytest.mark.parametrize('seen', [0.0, 0.5])
+@pytest.mark.parametrize('seen', few_of([0.5, 0.0]))
 def test_no_offset_under_disturbance_and_model_error(kind, drive, seen):
     """Whatever share of the disturbance the shared estimate sees."""
     push = np.array([5.0, -3.0])
@@ -369,7 +370,7 @@ def test_offset_stays_while_its_own_errors_are_ignored(kind):
     assert np.abs(speeds[-1] - reference[0]).min() > 0.5 * LAG * 3.0
 
 
-@pytest.mark.parametrize('drive', DRIVES)
+@pytest.mark.parametrize('drive', few_of(DRIVES))
 @pytest.mark.parametrize('kind', EVERY)
 def test_knowing_the_friction_helps_where_the_estimate_is_late(kind, drive):
     """The estimate of a filter comes late by a tenth of a second, the sign of r does not."""
@@ -388,7 +389,7 @@ def test_knowing_the_friction_helps_where_the_estimate_is_late(kind, drive):
     assert errors[0] < 0.7 * errors[1]
 
 
-@pytest.mark.parametrize('drive', DRIVES)
+@pytest.mark.parametrize('drive', few_of(DRIVES))
 @pytest.mark.parametrize('kind', [LinearMpc, LinearMpcPreview, CasadiNmpc])
 def test_observer_parts_noise_from_following(kind, drive):
     """With a true model a slow observer follows as sharply, and feeds back far less noise."""

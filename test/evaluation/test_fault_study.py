@@ -211,9 +211,9 @@ def test_a_known_delay_costs_little():
     errors = []
     for dead_time, estimated in ((0.01, False), (0.01, True), (0.11, True)):
         changes = {'speed_filter.dead_time': dead_time, 'estimate_dead_time': estimated}
-        scenario = Scenario('twin', 'nominal', 1, 15.0, own=own)
+        scenario = Scenario('twin', 'nominal', 1, 10.0, own=own)
         record = run(scenario, NodeMethod('changed', changes))
-        rows = record.rows(5.0, 15.0)
+        rows = record.rows(5.0, 10.0)
         errors.append(np.sqrt(np.mean(record.error[rows] ** 2)))
     assert errors[0] > 0.1
     assert errors[1] < 0.2 * errors[0]

@@ -45,7 +45,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope='module')
 def results():
-    return compare(seeds=4, duration=40.0, variances=(0.0, 0.1))
+    return compare(seeds=4, duration=24.0, variances=(0.0, 0.1))
 
 
 def _fuzzy(seed=None, **adaptation):

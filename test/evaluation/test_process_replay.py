@@ -32,6 +32,7 @@ from support.golden_bags import (
     RecordedController,
     run_golden_scenario,
 )
+from support.long_tests import few_of
 from support.other_parameters import with_other_value
 from support.robot_bags import write_with_records
 
@@ -73,6 +74,9 @@ GOLDEN = sorted((Path(__file__).parents[1] / 'golden').glob('*.mcap'))
 JOURNAL = '/controller/journal'
 
 
+golden_inputs = functools.cache(load_inputs)
+
+
 def golden(stem):
     (path,) = (path for path in GOLDEN if path.stem == stem)
     return path
@@ -100,7 +104,7 @@ def bag():
 
 @pytest.fixture(scope='module')
 def inputs(bag):
-    return load_inputs(bag)
+    return golden_inputs(bag)
 
 
 @pytest.fixture(scope='module')
@@ -123,7 +127,7 @@ def without(bag, folder, drop):
 @pytest.mark.parametrize('path', GOLDEN, ids=lambda path: path.stem)
 def test_golden_runs_come_out_as_they_were_recorded(path):
     """If this fails on purpose: renew them with ``test/support/golden_bags.py``, and say why."""
-    inputs = load_inputs(path)
+    inputs = golden_inputs(path)
     assert inputs.notes == ()
     assert inputs.exact.all()
     outcome = compare(inputs, replay_controller(inputs), Tolerances(ELSEWHERE, ELSEWHERE))
@@ -131,7 +135,7 @@ def test_golden_runs_come_out_as_they_were_recorded(path):
     assert {row.field for row in outcome.rows} == set(FIELDS)
 
 
-@pytest.mark.parametrize('path', GOLDEN, ids=lambda path: path.stem)
+@pytest.mark.parametrize('path', few_of(GOLDEN))
 def test_a_report_without_scalars_has_those_of_the_journal(path, tmp_path):
     """The recorder leaves them out; the golden bags hold every second one of them."""
     bare = without(path, tmp_path / 'bare', lambda topic, k: topic.removeprefix('/') in SCALARS)
@@ -177,17 +181,18 @@ def test_the_golden_runs_have_all_that_they_are_for(inputs, again):
         Reason.TRACKING, Reason.DISABLED, Reason.REFERENCE_STALE, Reason.NO_ODOMETRY,
         Reason.NO_REFERENCE, Reason.ODOMETRY_BAD,
     }  # fmt: skip
-    changed = load_inputs(golden('changes'))
+    changed = golden_inputs(golden('changes'))
     assert list(changed.events).count(Event.CONFIGURE) == 5
     gains = {name: each.law.gain for name, each in changed.sessions[0].parameters.items()}
     assert gains[0] != 20.0
     assert gains[1] == gains[5] == 20.0
     assert Reason.NOT_FOLLOWING in replay_controller(changed).reasons
-    references = load_inputs(golden('switches')).references.numbers
+    references = golden_inputs(golden('switches')).references.numbers
     linear, angular = np.abs(np.diff(references[:, 6:], axis=0)).T
     assert np.count_nonzero((linear > 0.022) | (angular > 0.31)) >= 3, 'jumps as the track has it'
 
 
+@pytest.mark.long
 def test_equal_recipes_give_equal_bags(tmp_path):
     recipe = GOLDEN_SCENARIOS['stops']
     made = [run_golden_scenario(recipe, tmp_path / name) for name in ('one', 'other')]
@@ -401,11 +406,11 @@ def record_late(folder, lost, republished):
     return copied_bag(golden('switches'), folder, late)
 
 
-@pytest.mark.parametrize('lost, republished', [(0, 200), (150, 200), (150, 150)])
+@pytest.mark.parametrize('lost, republished', few_of([(150, 200), (0, 200), (150, 150)]))
 def test_initial_inputs_complete_a_late_recording(lost, republished, tmp_path):
     inputs, complete = (
         load_inputs(record_late(tmp_path / 'bag', lost, republished)),
-        load_inputs(golden('switches')),
+        golden_inputs(golden('switches')),
     )
     for name in ('odometry', 'references'):
         one, other = getattr(inputs, name), getattr(complete, name)
@@ -417,10 +422,10 @@ def test_initial_inputs_complete_a_late_recording(lost, republished, tmp_path):
     assert outcome.same, outcome.table()
 
 
-@pytest.mark.parametrize('republished', [0, 100])
+@pytest.mark.parametrize('republished', few_of([100, 0]))
 def test_without_all_initial_inputs_a_recording_is_not_exact(republished, tmp_path):
     inputs = load_inputs(record_late(tmp_path / 'bag', 150, republished))
-    complete = load_inputs(golden('switches'))
+    complete = golden_inputs(golden('switches'))
     assert not inputs.exact.all()
     assert len(inputs.odometry) == len(complete.odometry) - 150 + republished
     assert any('odometry messages' in note for note in inputs.notes)
@@ -510,8 +515,8 @@ BUILT = {
     'wheels': (PAPER, OF_WHEELS),
     'keep-out': ({}, {**KEEP_OUT, 'command_shaper.straight_frequency': 3.0}),
     'sensors and map': (KEEP_OUT, {'keep_out.mounts': (0.1, 0.0, 2.0), 'keep_out.map.range': 0.4}),
-    'bundled world': (KEEP_OUT, {'keep_out.world': 'corridor'}),
     'world of a file': (KEEP_OUT, {'keep_out.world': 'walls.yaml'}),
+    'bundled world': (KEEP_OUT, {'keep_out.world': 'corridor'}),
 }
 """Parameters of two controllers that are built in different ways, the second ones besides."""
 
@@ -547,7 +552,7 @@ def built_run(folder, changes):
     return load_inputs(folder)
 
 
-@pytest.mark.parametrize('name', BUILT)
+@pytest.mark.parametrize('name', few_of(BUILT, 5))
 def test_a_replay_builds_the_controller_as_its_node_did(name, plain_runs, tmp_path, monkeypatch):
     """Each parameter that is fixed when a controller is built has its effect in a replay, too."""
     monkeypatch.chdir(tmp_path)

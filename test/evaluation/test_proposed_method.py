@@ -80,7 +80,7 @@ def _as_the_nodes_close_it(scenario, **changes):
     return np.array(speeds)
 
 
-@pytest.mark.parametrize('noise', [0.0, 0.04])
+@pytest.mark.parametrize('noise', few_of([0.04, 0.0]))
 def test_the_offline_loop_is_the_loop_of_the_nodes(noise):
     """The evaluation of the full controller equals the behaviour of the node, jump for jump."""
     scenario = Scenario('servo', 'nominal', 2, 30.0, noise=noise)
@@ -109,7 +109,7 @@ def _dead_times(scenario):
 
 
 @pytest.mark.parametrize('case', few_of(['friction x3', 'nominal', 'disturbance', 'load change']))
-@pytest.mark.parametrize('noise', [0.0, 0.04])
+@pytest.mark.parametrize('noise', few_of([0.04, 0.0]))
 def test_known_dead_time_is_kept_with_friction_and_disturbances(case, noise):
     """Offsets alone took the friction for 20 to 110 ms in the first seconds of a run."""
     for seed in (1, 2, 3):
@@ -117,8 +117,10 @@ def test_known_dead_time_is_kept_with_friction_and_disturbances(case, noise):
         np.testing.assert_array_equal(late, 1)
 
 
-@pytest.mark.parametrize(('noise', 'seed'), [(0.04, 1), (0.0, 2)])
-@pytest.mark.parametrize(('case', 'periods'), [('', 3), (' 60 ms', 6)])
+@pytest.mark.parametrize(
+    ('case', 'periods', 'noise', 'seed'),
+    few_of([('', 3, 0.04, 1), (' 60 ms', 6, 0.0, 2), ('', 3, 0.0, 2), (' 60 ms', 6, 0.04, 1)], 2),
+)
 def test_unknown_dead_time_is_found_and_used(case, periods, noise, seed):
     record, late = _dead_times(Scenario('servo', f'unknown dead time{case}', seed, noise=noise))
     found = 100 * 13
@@ -195,7 +197,7 @@ PARTS = {
 }
 
 
-@pytest.mark.parametrize('robot', PLANTS)
+@pytest.mark.parametrize('robot', few_of(PLANTS))
 @pytest.mark.parametrize('part', few_of(PARTS))
 def test_leaving_out_a_part_costs_accuracy_on_the_same_seeds(part, robot):
     more = paired(_errors(robot, 0.0, **PARTS[part]), _errors(robot, 0.0))

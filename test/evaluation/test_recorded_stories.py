@@ -22,6 +22,14 @@ from html import unescape
 import re
 
 import pytest
+from support.bag_messages import (
+    START,
+    odometry_message,
+    serialised,
+    serialised_odometry,
+    serialised_twist,
+    twist_message,
+)
 from support.page_data import read_all
 from support.recorded_stories import STORIES, TWIN, Story
 
@@ -31,6 +39,12 @@ from t3mpc_ros.evaluation.bag_report.report_page import write_report
 
 LOSSES = {'losses': {'undiscovered': '25', 'undiscovered /imu/data_raw': '25'}}
 HEADLINE = re.compile(r'<div class="verdict (\w+)"><p class="headline">(.*?)</p>')
+
+
+def test_quick_messages_of_the_stories_are_those_of_the_library():
+    motion = START + 987_654_321, (0.1, -0.2), (-1.0, 2.0, 3.0)
+    assert serialised_odometry(*motion).data == serialised(odometry_message(*motion))
+    assert serialised_twist(motion[1]).data == serialised(twist_message(motion[1]))
 
 
 @pytest.mark.slow

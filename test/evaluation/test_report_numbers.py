@@ -17,8 +17,10 @@ By the words of docs/metrics.md, to the last printed digit. Nothing of the packa
 page that it writes.
 """
 
+from functools import cache
 from html import unescape
 from importlib import import_module
+from itertools import accumulate
 import math
 from pathlib import Path
 import re
@@ -120,6 +122,7 @@ def drive_of(bag):
     return moving[0], moving[-1]
 
 
+@cache
 def switches_of(bag):
     if '/reference/signals' not in bag.time:
         return []
@@ -182,6 +185,7 @@ def held(time, values, at):
     return values[np.maximum(np.searchsorted(time, at, 'right') - 1, 0)]
 
 
+@cache
 def stops_of(bag, measured):
     """Return start and end of each stop of a run whose nodes report no other ones."""
     time, twist = bag.time[measured], bag.twist(measured)
@@ -215,6 +219,7 @@ def stops_of(bag, measured):
     return found
 
 
+@cache
 def errors_of(bag, source, measured):
     """Return rows (driven, settled) and the error of both wheels at the stamps of a motion."""
     time, wanted = bag.time[source], wanted_at(bag, bag.time[source])
@@ -260,6 +265,7 @@ def busiest_part(time, commanded_at, commanded):
     return max(parts, key=lambda part: np.diff(np.interp(part, commanded_at, moved))[0])
 
 
+@cache
 def response(bag, measured, wheel):
     """Return dead time, lag (s), gain and explained share of one wheel, by exhaustion."""
     time, speed = bag.time[measured], bag.wheels(measured)[wheel]
@@ -272,20 +278,19 @@ def response(bag, measured, wheel):
     y = y[shifts:] - y[shifts:].mean()
 
     def explained(lag):
-        x = u.copy() - u.mean()
+        x = u - u.mean()
         if lag > 0.0:
-            keep, out = math.exp(-step / lag), x.copy()
-            for k in range(1, x.size):
-                out[k] = keep * out[k - 1] + (1.0 - keep) * x[k - 1]
-            x = out
-        best = (-math.inf, 0, 0.0)
-        for shift in range(shifts):
-            seen = x[shifts - shift : x.size - shift]
-            seen = seen - seen.mean()
-            product, energy = seen @ y, seen @ seen
-            if product > 0.0:
-                best = max(best, (product**2 / (energy * (y @ y)), -shift, product / energy))
-        return best
+            keep, before = math.exp(-step / lag), [x[0], *x[:-1].tolist()]
+            filtered = accumulate(before, lambda out, new: keep * out + (1.0 - keep) * new)
+            x = np.array([*filtered])
+        # For each shift the part of x beside y, which has a mean of zero.
+        product = np.correlate(x, y, 'valid')[:0:-1]
+        sums = [np.concatenate([[0.0], np.cumsum(each)]) for each in (x, x**2)]
+        total, squares = ((each[y.size :] - each[: -y.size])[:0:-1] for each in sums)
+        energy = squares - total**2 / y.size
+        shares = np.where(product > 0.0, product**2 / (energy * (y @ y)), -math.inf)
+        shift = int(shares.argmax())
+        return float(shares[shift]), -shift, float(product[shift] / energy[shift])
 
     lags = [0.0, *np.geomspace(0.5 * step, 3.0, 30).tolist()]
     coarse = [explained(lag) for lag in lags]

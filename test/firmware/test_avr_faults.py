@@ -40,13 +40,12 @@ LONG_AVR = pytest.param('avr', marks=[NEEDS_TOOLS, pytest.mark.long])
 KEY = bytes(range(16))
 
 
-def on_both_targets(names, faults):
-    """Parametrize a test: each fault on both targets, all but the first on the boards as long."""
+def on_both_targets(names, faults, on_boards=0):
+    """Parametrize a test: each fault on both targets; some on the boards, the others as long."""
     rows = [pytest.param('emulator', *fault) for fault in faults]
-    rows.append(pytest.param('avr', *faults[0], marks=NEEDS_TOOLS))
-    rows += [
-        pytest.param('avr', *fault, marks=[NEEDS_TOOLS, pytest.mark.long]) for fault in faults[1:]
-    ]
+    for number, fault in enumerate(faults):
+        marks = [NEEDS_TOOLS] if number < on_boards else [NEEDS_TOOLS, pytest.mark.long]
+        rows.append(pytest.param('avr', *fault, marks=marks))
     return pytest.mark.parametrize(f'build, {names}', rows, indirect=['build'])
 
 
@@ -199,6 +198,7 @@ def next_commands(bench, count):
         ('button', 0.2),
         ('close_port', 0.3),
     ],
+    on_boards=1,
 )
 def test_a_fault_at_full_speed_stops_the_robot_and_it_recovers(build, name, seconds):
     bench = driving(build, 10.0, 10.0, flat={'dongle_boot_time': 0.3})

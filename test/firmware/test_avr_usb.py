@@ -190,6 +190,7 @@ def boards_at_rate(request: pytest.FixtureRequest) -> Iterator[tuple[Boards, Lin
     pair.close()
 
 
+@pytest.mark.long
 def test_cycles_work_at_every_rate(boards_at_rate: tuple[Boards, LinkParameters]) -> None:
     boards, parameters = boards_at_rate
     greeting = Hello(boards.session, 0)

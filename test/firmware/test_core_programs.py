@@ -19,6 +19,7 @@ import subprocess
 
 import pytest
 from support.firmware_core import FIRMWARE, run_make
+from support.long_tests import few_of
 from support.missing_tools import needing, needs
 
 pytestmark = needing('gcc')
@@ -45,15 +46,16 @@ def search(folder, firmware=FIRMWARE, slots=2, depth=1000):
     return subprocess.run([program, str(depth)], capture_output=True, text=True)
 
 
-def test_no_order_of_three_frames_breaks_a_session(tmp_path):
-    """Three made and delivered in every order, or fewer with time, resets, button and battery.
+@pytest.mark.parametrize('slots, depth', few_of([(2, 5), (3, 6)]))
+def test_no_order_of_frames_breaks_a_session(tmp_path, slots, depth):
+    """All made and delivered in every order, or fewer with time, resets, button and battery.
 
     ``make test`` goes on with two frames until there is no new state.
     """
-    run = search(tmp_path, slots=3, depth=6)
+    run = search(tmp_path, slots=slots, depth=depth)
     print(f'\n{run.stdout}')
     assert run.returncode == 0, run.stderr
-    assert run.stdout.count('6 deep') == 2
+    assert run.stdout.count(f'{depth} deep') == 2
 
 
 ROBOT, SESSION = 't3_robot.c', 't3_session.c'

@@ -35,6 +35,7 @@ def release(source, build):
     return {path.name: path.read_bytes() for path in (Path(build) / 'release').iterdir()}
 
 
+@pytest.mark.long
 def test_a_release_is_reproducible_and_has_its_hashes(tmp_path):
     """Another folder, other times of the files, another folder of the results."""
     copy = tmp_path / 'copy' / 'firmware'

@@ -192,7 +192,7 @@ def test_turns_that_are_refused_count_for_nothing(person, monkeypatch):
     monkeypatch.setattr(calibration, 'estimate_track', refuse_once)
     person.answers = {'Degrees from the mark': ['90', '-90'], 'Enter to repeat': ['']}
     start = Calibration(wheel_radius=Estimate(RADIUS, 1e-5))
-    found = wizard(person, 'track', start=start).run()
+    found = wizard(person, 'track', start=start, speed=8.0).run()
     assert refused
     true = 1.0 / (1.0 + 0.03 * person.plant._imu._scale)
     error = abs(found.gyro_scale.value - true)

@@ -166,7 +166,7 @@ class Arbiter(RuleBasedStateMachine):
 
 
 TestArbiter = Arbiter.TestCase
-TestArbiter.settings = settings(STATEFUL, max_examples=200)
+TestArbiter.settings = settings(STATEFUL, max_examples=60)
 
 
 class History(RuleBasedStateMachine):

@@ -19,6 +19,7 @@ import re
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.geometry.types import RANGE_SENSORS, Pose, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
@@ -118,9 +119,10 @@ def test_request_rate_does_not_change_the_state():
 
 @pytest.mark.compiled
 @pytest.mark.slow
-def test_halving_the_step_changes_a_minute_by_less_than_10_um():
+@pytest.mark.parametrize('periods', few_of([2000, 6000]))
+def test_halving_the_step_changes_a_path_by_less_than_10_um(periods):
     """Pulses evaluated at the stages alone were half a step late: 0.36 mm after a minute."""
-    speeds = course(4, 6000)
+    speeds = course(4, periods)
     coarse, fine = (
         np.array(
             [
@@ -130,7 +132,7 @@ def test_halving_the_step_changes_a_minute_by_less_than_10_um():
         )
         for step in (0.001, 0.0005)
     )
-    assert np.ptp(coarse, axis=0).max() > 0.5  # the robot moved
+    assert np.ptp(coarse, axis=0).max() > 0.2  # the robot moved
     assert np.hypot(*(coarse - fine).T).max() < 0.01e-3
 
 

@@ -13,7 +13,9 @@
 # limitations under the License.
 """Messages of bags that are made up, without a ROS installation."""
 
+from functools import cache
 import math
+import struct
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
@@ -23,11 +25,45 @@ from t3mpc_ros.geometry.types import ORIGIN
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types
 START = 1_700_000_000_000_000_000
+ODOMETRY, TWIST = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist'
+CDR, NO_COVARIANCE = b'\0\1\0\0', bytes(8 * 36)
+
+
+class Serialised:
+    """A message in CDR, made once where many are written."""
+
+    def __init__(self, kind, data):
+        self.__msgtype__, self.data = kind, data
 
 
 def serialised(message):
     """Return a message in CDR."""
+    if isinstance(message, Serialised):
+        return message.data
     return bytes(STORE.serialize_cdr(message, message.__msgtype__))
+
+
+def serialised_twist(twist):
+    """Return :func:`twist_message` in CDR, twenty times as fast."""
+    linear, angular = map(float, twist)
+    return Serialised(TWIST, CDR + struct.pack('<6d', linear, 0.0, 0.0, 0.0, 0.0, angular))
+
+
+@cache
+def _odometry_frame():
+    """Return the bytes of a message between its stamp and its pose: the names of both frames."""
+    data = serialised(odometry_message(0, (1.0, 2.0), (3.0, 4.0, 0.0)))
+    return data[12 : data.index(struct.pack('<d', 3.0))]
+
+
+def serialised_odometry(stamp_ns, twist, pose=ORIGIN):
+    """Return :func:`odometry_message` in CDR, twenty times as fast."""
+    (x, y, yaw), (linear, angular) = map(float, pose), map(float, twist)
+    stamp = struct.pack('<iI', *divmod(stamp_ns, 10**9))
+    place = struct.pack('<7d', x, y, 0.0, 0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
+    moves = struct.pack('<6d', linear, 0.0, 0.0, 0.0, 0.0, angular)
+    data = CDR + stamp + _odometry_frame() + place + NO_COVARIANCE + moves + NO_COVARIANCE
+    return Serialised(ODOMETRY, data)
 
 
 def header(stamp_ns, frame='odom'):

@@ -36,10 +36,10 @@ def clean_environment(**extra):
     return kept | {key: str(value) for key, value in extra.items()}
 
 
-def copy_package(destination):
-    """Copy the package without the files that version control ignores."""
+def copy_package(destination, *without):
+    """Copy the package without some folders and the files that version control ignores."""
     ignored = [line.rstrip('/') for line in (ROOT / '.gitignore').read_text().split()]
-    shutil.copytree(ROOT, destination, ignore=shutil.ignore_patterns('.git', *ignored))
+    shutil.copytree(ROOT, destination, ignore=shutil.ignore_patterns('.git', *ignored, *without))
     return destination
 
 

@@ -23,6 +23,7 @@ import functools
 import importlib
 import inspect
 import itertools
+import operator
 import pkgutil
 import random
 import re
@@ -173,6 +174,18 @@ def different(one: Any, other: Any, ignored: tuple[str, ...] = ()) -> list[str]:
     return [path for path in found if not matches(path, ignored)]
 
 
+def fingerprint(thing: Any) -> Any:
+    """Return what is equal for objects that do not differ, sooner than their leaves by path."""
+    kind = type(thing)
+    if kind is np.ndarray and not thing.dtype.names:
+        return thing.dtype.str, thing.shape, thing.tobytes()
+    if isinstance(thing, list | tuple):
+        return kind.__name__, [fingerprint(part) for part in thing]
+    if kind is dict:
+        return [(key, fingerprint(part)) for key, part in thing.items()]
+    return tuple(leaves(thing))
+
+
 def expect_equal(one: Any, other: Any, what: str, ignored: tuple[str, ...] = ()) -> None:
     """Raise an AssertionError that names the paths at which two objects differ."""
     paths = different(one, other, ignored)
@@ -240,7 +253,7 @@ class Stateful(NamedTuple):
     operations: Mapping[str, Operation]
 
 
-def check_fresh(entry: Stateful, operation: Operation, seeds: int = 4) -> None:
+def check_fresh(entry: Stateful, operation: Operation, seeds: int = 2) -> None:
     """Assert that a used object is as a new one after the operation, but for what is kept.
 
     The whole state is compared, then all answers to further inputs. An exception that no history
@@ -327,7 +340,8 @@ def check_configured(entry: Configured) -> None:
             paths = different(replaced, built, entry.late)
             if not shown:
                 answers = [entry.drive(each, random.Random(1)) for each in (replaced, built)]
-                paths += different(*answers)
+                if operator.ne(*map(fingerprint, answers)):
+                    paths += different(*answers) or ['order']
             if paths:
                 wrong[spec.name] = paths[:5]
             effects = shown or _takes_effect(entry, changed, usual)
@@ -337,12 +351,13 @@ def check_configured(entry: Configured) -> None:
     assert not idle, f'without effect: {idle}'
 
 
-def _takes_effect(entry: Configured, changed: Any, usual: list[object]) -> bool:
+def _takes_effect(entry: Configured, changed: Any, usual: list[list[object]]) -> bool:
     """Return whether parameters that are replaced after some use change what follows."""
     thing = entry.make(entry.parameters)
     entry.drive(thing, random.Random(1))
     entry.replace(thing, changed)
-    return bool(different(entry.drive(thing, random.Random(2)), usual[1]))
+    pairs = itertools.zip_longest(entry.drive(thing, random.Random(2)), usual[1])
+    return any(fingerprint(now) != fingerprint(before) for now, before in pairs)
 
 
 def check_round_trip(entry: Configured) -> None:

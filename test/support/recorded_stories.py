@@ -23,7 +23,7 @@ import math
 
 import numpy as np
 
-from support.bag_messages import START, TYPES, diagnostics, odometry_message, twist_message
+from support.bag_messages import START, TYPES, diagnostics, serialised_odometry, serialised_twist
 from support.robot_bags import write_with_records
 
 DURATION, RATE, LEAD = 20.0, 100.0, 0.4
@@ -98,15 +98,16 @@ class Story:
             stamp = START + round(t * 1e9)
             measured = stamp + self.apart
             target = place if self.path else (0.0, 0.0, 0.0)
-            ahead = odometry_message(stamp, wanted, target)
+            ahead = serialised_odometry(stamp, wanted, target)
+            motion = serialised_odometry(measured, speed, shown)
             rows += [
                 (max(received - LEAD, 0.0), '/reference', ahead),
-                (received + 2e-4, '/odom', odometry_message(measured, speed, shown)),
-                (received + 3e-4, '/ground_truth/odom', odometry_message(measured, speed, shown)),
-                (received + 1e-3, '/cmd_vel', twist_message(self._command(t))),
+                (received + 2e-4, '/odom', motion),
+                (received + 3e-4, '/ground_truth/odom', motion),
+                (received + 1e-3, '/cmd_vel', serialised_twist(self._command(t))),
             ]
             if self.second_robot and k % 2:
-                other = odometry_message(stamp + 5_000_000, (0.1, 0.0), (5.0, 0.001 * k, 0.0))
+                other = serialised_odometry(stamp + 5_000_000, (0.1, 0.0), (5.0, 0.001 * k, 0.0))
                 rows.append((received + 6e-3, '/odom', other))
         for mode, t in enumerate((0.0, *self.switches) if self.switches else ()):
             rows.append((max(t - LEAD, 1e-4), '/reference/signals', _signals(mode)))

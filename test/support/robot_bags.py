@@ -44,7 +44,7 @@ def write_with_records(folder, rows, records, empty=()):
             bag.add_topic(topic, kind)
         for received, topic, message in sorted(rows, key=lambda row: row[0]):
             stamp = START + round(received * 1e9)
-            bag.write(topic, stamp, stamp, bytes(STORE.serialize_cdr(message, kinds[topic])))
+            bag.write(topic, stamp, stamp, serialised(message))
     return folder
 
 

@@ -278,7 +278,35 @@ def test_the_command_writes_the_same_rows(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_cluster_and_a_lost_worker_give_the_same_numbers(tmp_path, capsys):
+def test_a_cluster_gives_the_same_numbers(tmp_path, capsys):
+    """Its workers are threads here, which need no import of their own."""
+    distributed = pytest.importorskip('distributed')
+    pytest.importorskip('pyarrow')
+    alone = t3.sweep(Proportional, GAINS, seeds=(1, 2), executor=1, **SHORT)
+    options = {'n_workers': 2, 'threads_per_worker': 1, 'dashboard_address': None}
+    with (
+        distributed.LocalCluster(
+            **options, processes=False, protocol='tcp', host='127.0.0.1'
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        together = t3.sweep(Proportional, GAINS, seeds=(1, 2), executor=client, **SHORT)
+        assert _numbers(together) == _numbers(alone)
+        run_by_command(cluster.scheduler_address, tmp_path, capsys)
+
+
+def run_by_command(address, folder, capsys):
+    """Run a sweep by its command on a cluster."""
+    words = ['--set', 'gain=10.0,20.0', '--robot', 'servo', '--duration', '2']
+    output = ['--seeds', '1-2', '--output', str(folder / 'shell.parquet')]
+    assert main(['sweep', 'ADRC', *words, *output, '--scheduler', address]) == 0
+    found = t3.sweep('ADRC', GAINS, seeds=[1, 2], executor=1, **SHORT)
+    assert found.table() in capsys.readouterr().out
+
+
+@pytest.mark.long
+@pytest.mark.slow
+def test_processes_and_a_lost_worker_give_the_same_numbers(tmp_path, capsys):
     """A worker that is killed in mid-run loses nothing: its runs are begun again elsewhere."""
     distributed = pytest.importorskip('distributed')
     pytest.importorskip('pyarrow')
@@ -303,12 +331,7 @@ def test_a_cluster_and_a_lost_worker_give_the_same_numbers(tmp_path, capsys):
         assert len(lost.rows) == 16
         assert _numbers(lost)[:4] == _numbers(alone)[:4]
         assert not any(math.isnan(row['overall']) for row in lost.rows)
-        address = cluster.scheduler_address
-        words = ['--set', 'gain=10.0,20.0', '--robot', 'servo', '--duration', '2']
-        output = ['--seeds', '1-2', '--output', str(tmp_path / 'shell.parquet')]
-        assert main(['sweep', 'ADRC', *words, *output, '--scheduler', address]) == 0
-    found = t3.sweep('ADRC', GAINS, seeds=[1, 2], executor=1, **SHORT)
-    assert found.table() in capsys.readouterr().out
+        run_by_command(cluster.scheduler_address, tmp_path, capsys)
 
 
 def _kill_later():
