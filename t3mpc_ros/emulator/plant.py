@@ -241,7 +241,9 @@ class Plant:
 
     def _measure_ranges(self, dt: float) -> None:
         due = self._ranges.due(dt)
-        world = self._world
+        if self._world.moving:
+            self._drivetrain.world = self._world.at(self.elapsed)
+        world = self._drivetrain.world.seen
         if due and (world.segments.size or world.circles.size):
             pose, which = self._drivetrain.pose, np.array(due)
             walls = world.segments, world.circles

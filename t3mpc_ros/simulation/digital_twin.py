@@ -52,7 +52,7 @@ from t3mpc_ros.simulation.sensors.range_sensor import (
     SimulatedRangeSensors,
 )
 from t3mpc_ros.simulation.transport_delay import TransportDelay
-from t3mpc_ros.simulation.world import cast_rays, clearance, grip_at, load_world
+from t3mpc_ros.simulation.world import MovingDisc, cast_rays, clearance, grip_at, load_world
 
 BROWN_OUT_REASON = 'brown-out: the board restarts'
 _NO_OBSTACLE = (math.inf,) * len(RANGE_SENSORS)
@@ -288,13 +288,17 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         """
         check_pose(pose)
         radius = self._parameters.bumper.radius
-        if not self._world.is_free(pose.x, pose.y, radius):
+        if not self._drivetrain.world.is_free(pose.x, pose.y, radius):
             raise ValueError(
                 f'pose must be at least {radius:g} m away from every obstacle of the world '
                 f'{self._world.name}: got x {pose.x:g} m, y {pose.y:g} m'
             )
         self._drivetrain.pose = pose
         self._refresh_state()
+
+    def add_obstacle(self, disc: MovingDisc) -> None:
+        """Add a disc to the world, at a time since the start."""
+        self._world = replace(self._world, moving=(*self._world.moving, disc))
 
     def warm_up(self) -> None:
         """Compile every kernel of a step, on a separate robot."""
@@ -369,6 +373,8 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         self._counters = (0, 0)
 
     def _integrate(self, count: int) -> None:
+        if self._world.moving:
+            self._drivetrain.world = self._world.at(self._elapsed)
         done = 0
         while done < count:
             now_ns = self._stamp_after(self._steps_since_origin + done)
@@ -428,7 +434,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
 
     def _update_ranges(self, dt: float) -> None:
         """Measure with the range sensors that are due."""
-        world = self._world
+        world = self._drivetrain.world.seen
         empty = not (world.segments.size or world.circles.size)
         if empty and self._ranges.readings == _NO_OBSTACLE:
             return  # the readings cannot change

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""World: walls, boxes, pillars and slippery patches from a YAML file, and ray casting in them.
+"""World: walls, boxes, pillars, moving discs and slippery patches from a YAML file; ray casting.
 
 A file with an error is rejected, never repaired; the error names the entry. The kernels read the
 arrays of a :class:`World`: ``segments`` (n, 4: ax, ay, bx, by), ``circles`` (m, 3: x, y, radius),
@@ -20,10 +20,10 @@ may be empty.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -44,12 +44,45 @@ MAX_SEGMENTS = 2000
 """Straight wall segments, those of boxes included: every ray and every step visits each."""
 MAX_CIRCLES = 500
 MAX_PATCHES = 100
+MAX_MOVING = 100
+MAX_SPEED = 5.0
+"""m/s, of a disc that moves."""
 JOIN_TOLERANCE = 1e-4
 """m: ends nearer than this to each other, or to a wall, touch."""
 
 
 class WorldError(ValueError):
     """An invalid world; the text contains the file, the entry, the bound and the value."""
+
+
+class MovingDisc(NamedTuple):
+    """A round obstacle that follows a polyline at one speed, and stays at its end."""
+
+    radius: float
+    """m"""
+    points: Array
+    """m, shape (n, 2)"""
+    speed: float
+    """m/s"""
+    start: float
+    """Time at which it leaves its first point, s."""
+    appears: float
+    """Time before which it is nowhere, s."""
+    vanishes: float = math.inf
+    """Time from which on it is nowhere, s."""
+    repeat: bool = False
+    """Whether it goes back and forth."""
+    unseen: bool = False
+    """Whether the range sensors do not see it."""
+
+    def position(self, time: float) -> tuple[float, float]:
+        """Return where its centre is at a time (s), m."""
+        lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(self.points, axis=0).T)))
+        along, whole = max(time - self.start, 0.0) * self.speed, float(lengths[-1])
+        if self.repeat and whole > 0.0:
+            along = whole - abs(along % (2.0 * whole) - whole)
+        x, y = (float(np.interp(along, lengths, axis)) for axis in self.points.T)
+        return x, y
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +101,37 @@ class World:
     """Slippery floor, shape (k, 4): x, y, radius (m), grip (factor on the tyre grip, 0 to 1)."""
     boxes: Array
     """Interior of the boxes, shape (b, 5): x, y, length, width (m), yaw of the length (rad)."""
+    unseen: Obstacles = Obstacles()
+    """Which of them the range sensors do not see."""
+    moving: tuple[MovingDisc, ...] = ()
+    """They are in :attr:`circles` of :meth:`at` only."""
 
     @property
     def obstacles(self) -> Obstacles:
         """What a robot must not touch."""
         return Obstacles(self.segments, self.circles)
+
+    @property
+    def seen(self) -> Obstacles:
+        """What the beams of the range sensors meet."""
+        return Obstacles(
+            _without(self.segments, self.unseen.segments),
+            _without(self.circles, self.unseen.circles),
+        )
+
+    def at(self, time: float) -> 'World':
+        """Return the world with its moving discs where they are at a time (s)."""
+        if not self.moving:
+            return self
+        there = [each for each in self.moving if each.appears <= time < each.vanishes]
+        circles = [(*each.position(time), each.radius) for each in there]
+        hidden = [disc for disc, each in zip(circles, there, strict=True) if each.unseen]
+        unseen = np.vstack([self.unseen.circles, _rows(hidden, 3)])
+        return replace(
+            self,
+            circles=np.vstack([self.circles, _rows(circles, 3)]),
+            unseen=Obstacles(self.unseen.segments, unseen),
+        )
 
     def is_free(self, x: float, y: float, radius: float) -> bool:
         """Decide whether a disc at (x, y) touches no wall and is in no box or circle, all in m.
@@ -169,33 +228,82 @@ def parse_world(text: str, source: str) -> World:
 
 
 def _world(content: object, stem: str) -> World:
-    lists = ('walls', 'boxes', 'circles', 'patches')
+    lists = ('walls', 'boxes', 'circles', 'patches', 'moving')
     read = yaml_files.check_entry(content, 'the world', (), ('name', *lists))
     name = read.get('name', stem)
     if not isinstance(name, str) or not name:
         raise yaml_files.EntryError(f'name must be a text: got {yaml_files.shortened(name)}')
-    pieces: list[tuple[float, ...]] = []
-    for where, wall in _entries(read, 'walls', MAX_SEGMENTS, ('points',), 'closed'):
-        pieces += _wall(wall, where)
-        _check_count(len(pieces))
+    pieces: dict[bool, list[tuple[float, ...]]] = {False: [], True: []}
+    """Walls by whether they are unseen."""
     boxes = []
-    for where, box in _entries(read, 'boxes', MAX_SEGMENTS // 4, ('center', 'size'), 'yaw'):
+    size = 'center', 'size'
+    for where, wall in _entries(read, 'walls', MAX_SEGMENTS, ('points',), 'closed', 'unseen'):
+        pieces[_flag(wall, where, 'unseen')] += _wall(wall, where)
+        _check_count(sum(map(len, pieces.values())))
+    for where, box in _entries(read, 'boxes', MAX_SEGMENTS // 4, size, 'yaw', 'unseen'):
         boxes.append(_box(box, where))
-        pieces += _sides(*boxes[-1])
-        _check_count(len(pieces))
-    segments = join_walls(_rows(pieces, 4))
+        pieces[_flag(box, where, 'unseen')] += _sides(*boxes[-1])
+        _check_count(sum(map(len, pieces.values())))
+    seen, unseen = (join_walls(_rows(pieces[key], 4)) for key in (False, True))
+    segments = np.vstack([seen, unseen])
     _check_count(len(segments))
     disc = 'center', 'radius'
-    circles = [_disc(*each) for each in _entries(read, 'circles', MAX_CIRCLES, disc)]
+    found = [*_entries(read, 'circles', MAX_CIRCLES, disc, 'unseen')]
+    circles = [_disc(*each) for each in found]
+    hidden = [
+        row for row, each in zip(circles, found, strict=True) if _flag(*each[::-1], 'unseen')
+    ]
+    way = 'radius', 'points', 'speed'
+    options = 'start', 'appears', 'vanishes', 'repeat', 'unseen'
+    moving = [_moving(*each) for each in _entries(read, 'moving', MAX_MOVING, way, *options)]
     patches = [
         (*_disc(where, each), yaml_files.check_number(each['grip'], f'{where}.grip', 0.0, 1.0))
         for where, each in _entries(read, 'patches', MAX_PATCHES, (*disc, 'grip'))
     ]
-    return World(name, segments, _rows(circles, 3), _rows(patches, 4), _rows(boxes, 5))
+    return World(
+        name,
+        segments,
+        _rows(circles, 3),
+        _rows(patches, 4),
+        _rows(boxes, 5),
+        Obstacles(unseen, _rows(hidden, 3)),
+        tuple(moving),
+    )
+
+
+def _flag(read: dict[str, Any], where: str, key: str) -> bool:
+    return yaml_files.check_flag(read.get(key, False), f'{where}.{key}')
+
+
+def _moving(where: str, read: dict[str, Any]) -> MovingDisc:
+    def number(key: str, low: float, high: float, unit: str, default: float = 0.0) -> float:
+        value = read.get(key, default)
+        return yaml_files.check_number(value, f'{where}.{key}', low, high, unit)
+
+    given = yaml_files.check_list(read['points'], f'{where}.points', 1, MAX_SEGMENTS)
+    points = [_pair(point, f'{where}.points[{index}]') for index, point in enumerate(given)]
+    return MovingDisc(
+        number('radius', MIN_SIZE, MAX_COORDINATE, 'm'),
+        _rows(points, 2),
+        number('speed', 0.0, MAX_SPEED, 'm/s'),
+        number('start', 0.0, math.inf, 's'),
+        number('appears', 0.0, math.inf, 's'),
+        number('vanishes', 0.0, math.inf, 's', math.inf),
+        _flag(read, where, 'repeat'),
+        _flag(read, where, 'unseen'),
+    )
+
+
+def _without(rows: Array, others: Array) -> Array:
+    """Return the rows that are none of the others; the same array where there are no others."""
+    if not len(others):
+        return rows
+    kept: Array = rows[~(rows[:, None, :] == others[None, :, :]).all(axis=2).any(axis=1)]
+    return kept
 
 
 def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:
-    closed = yaml_files.check_flag(read.get('closed', False), f'{where}.closed')
+    closed = _flag(read, where, 'closed')
     given = yaml_files.check_list(
         read['points'], f'{where}.points', 3 if closed else 2, MAX_SEGMENTS + 1
     )

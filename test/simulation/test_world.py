@@ -21,11 +21,15 @@ import shutil
 import numpy as np
 import pytest
 
+from t3mpc_ros.evaluation.patrol.patrol_run import world_file
+from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
 from t3mpc_ros.simulation.world import (
     JOIN_TOLERANCE,
     MAX_CIRCLES,
     MAX_COORDINATE,
+    MAX_MOVING,
     MAX_PATCHES,
     MAX_SEGMENTS,
     MIN_SIZE,
@@ -72,7 +76,7 @@ def test_documentation_lists_bounds_worlds_and_error():
     assert f'| -{MAX_COORDINATE:g} to {MAX_COORDINATE:g} m |' in page
     assert f'| {MIN_SIZE:g} to {MAX_COORDINATE:g} m |' in page
     assert f'| {MAX_SEGMENTS} together |' in page
-    assert f'| {MAX_CIRCLES}, {MAX_PATCHES} |' in page
+    assert f'| {MAX_CIRCLES}, {MAX_PATCHES}, {MAX_MOVING} |' in page
     assert f'nearer than {1e3 * JOIN_TOLERANCE:g} mm' in page
     assert set(re.findall(r'^\| `(\w+)` \| a ', page, re.MULTILINE)) == set(bundled_worlds())
     wrong = EXAMPLE.replace('[0.4, 0.4]', '[-0.4, 0.4]')
@@ -234,7 +238,7 @@ BAD = {
     'circles: [{center: [0], radius: 1}]': 'circles[0].center must have 2 entries: got 1',
     'circles: [{center: 3, radius: 1}]': 'circles[0].center must be a list: got 3',
     'circles: [{center: [0, 0]}]': 'circles[0] must have radius',
-    'circles: [7]': 'circles[0] must hold center, radius by name: got 7',
+    'circles: [7]': 'circles[0] must hold center, radius, unseen by name: got 7',
     f'patches: [{{{CIRCLE}, grip: 1.2}}]': 'patches[0].grip must be a number from 0 to 1: got 1.2',
     f'patches: [{{{CIRCLE}}}]': 'patches[0] must have grip',
     f'circles: [{{{CIRCLE}, grip: 1}}]': "circles[0] has no 'grip'",
@@ -254,12 +258,12 @@ BAD = {
         'walls[0].points[0] must be at least 0.01 m from the point before it: got 0 m; leave the '
         'last point out'
     ),
-    'walls: [[0, 0], [1, 1]]': 'walls[0] must hold points, closed by name: got [0, 0]',
+    'walls: [[0, 0], [1, 1]]': 'walls[0] must hold points, closed, unseen by name: got [0, 0]',
     'walls:': 'walls must be a list: got None',
     'name: 7': 'name must be a text: got 7',
     'name: a\nwalls: []\nname: b': 'is not YAML: line 3: name is given twice in one entry',
-    '': 'the world must hold name, walls, boxes, circles, patches by name: got None',
-    'circles: &a [*a]': 'circles[0] must hold center, radius by name: got [',
+    '': 'the world must hold name, walls, boxes, circles, patches, moving by name: got None',
+    'circles: &a [*a]': 'circles[0] must hold center, radius, unseen by name: got [',
 }
 
 
@@ -338,3 +342,52 @@ def test_damaged_file_is_parsed_or_rejected():
         read += 1
         assert np.isfinite(world.segments).all()
     assert 10 < read < 290
+
+
+MOVING = """
+walls: [{points: [[2, -1], [2, 1]]}]
+boxes: [{center: [1, 1], size: [0.2, 0.2], unseen: true}]
+circles: [{center: [-1, 0], radius: 0.2, unseen: true}, {center: [-2, 0], radius: 0.2}]
+moving:
+  - {radius: 0.1, points: [[1, 0], [1, 1], [2, 1]], speed: 0.5, start: 2}
+  - {radius: 0.2, points: [[0, -1], [0.6, -1]], speed: 0.3, repeat: true}
+  - {radius: 0.3, points: [[0, 3]], speed: 0, appears: 5, vanishes: 6, unseen: true}
+"""
+
+
+def _discs(time):
+    return np.round(parse_world(MOVING, 'a').at(time).circles[2:], 9).tolist()
+
+
+def test_moving_discs_are_where_their_way_and_time_say():
+    first, second, third = [1.0, 0.0, 0.1], [0.0, -1.0, 0.2], [0.0, 3.0, 0.3]
+    assert _discs(0.0) == [first, second]
+    assert _discs(2.0) == [first, [0.6, -1.0, 0.2]]
+    assert _discs(3.0) == [[1.0, 0.5, 0.1], [0.3, -1.0, 0.2]]
+    assert _discs(5.0) == [[1.5, 1.0, 0.1], [0.3, -1.0, 0.2], third]
+    assert _discs(6.0) == [[2.0, 1.0, 0.1], [0.6, -1.0, 0.2]]  # the second went back and returned
+    assert _discs(1e5)[0] == [2.0, 1.0, 0.1]
+
+
+def test_unseen_things_collide_and_are_not_measured():
+    world = parse_world(MOVING, 'a').at(5.5)
+    seen = world.seen
+    assert len(seen.segments) == 1
+    assert seen.circles[:, 0] == pytest.approx([-2.0, 1.75, 0.45])
+    assert cast_ray(0.0, 0.0, math.pi, *seen) == pytest.approx(1.8)
+    assert cast_ray(0.0, 0.0, math.pi, *world.obstacles) == pytest.approx(0.8)
+    assert not world.is_free(0.0, 2.6, 0.11)
+    assert parse_world(MOVING, 'a').at(6.0).is_free(0.0, 2.6, 0.11)
+    plain = load_world('room')
+    assert plain.at(3.0) is plain
+    assert plain.seen.segments is plain.segments  # as before there were unseen things
+
+
+def test_a_disc_that_comes_pushes_a_robot_that_stands():
+    text = 'moving: [{radius: 0.1, points: [[1, 0], [0.15, 0]], speed: 1}]'
+    with world_file(text) as path:
+        twin = DigitalTwin(DigitalTwinParameters.from_dict({'world': path}))
+        states = [twin.step(WheelSpeeds(0.0, 0.0)) for _ in range(120)]
+    assert abs(states[70].truth.pose.x) < 1e-5
+    assert states[-1].truth.pose.x < -0.03
+    assert min(state.ranges[0] for state in states[20:]) < 0.2

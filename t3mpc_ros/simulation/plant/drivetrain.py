@@ -129,7 +129,8 @@ class Drivetrain:
         self._cycle = 2.0 * math.pi / motor.teeth
         self._bumper = bumper
         self._radius = bumper.radius
-        self._world = world
+        self.world = world
+        """Replaceable: its obstacles may move."""
         self._share = share
         self._arrays = DrivetrainArrays(
             state=np.zeros(9),
@@ -280,7 +281,7 @@ class Drivetrain:
 
     def _integrate(self, target: PulseTarget, disturbance: Disturbance, count: int) -> None:
         x, y = self._now[0], self._now[1]
-        world = self._world
+        world = self.world
         obstacles = _NO_OBSTACLES
         if world.segments.size or world.circles.size:
             near = self._radius + 2.0 * self.step * count  # 2 m/s: faster than any wheel
