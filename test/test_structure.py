@@ -90,7 +90,7 @@ SHARED_BASENAMES = {
     'node': 'the node of a folder in nodes/',
     'qos': 'QoS profiles, in bags and of publishers and subscriptions',
 }
-MAX_CLOSURE = 41
+MAX_CLOSURE = 42
 """Maximum number of modules of the package that the controller node imports."""
 
 

@@ -332,7 +332,7 @@ class Controller:
         self._steps_since_snapshot = 0
         self._place = ORIGIN
         self._last_stamp_ns: int | None = None
-        self.drive_monitor = DriveMonitor()
+        self.drive_monitor = DriveMonitor(feels=self.keep_out is not None)
         """Pauses of the commands."""
         self.odometry_twist = OdometryTwist()
         """Whether the odometry has a twist."""
@@ -353,6 +353,8 @@ class Controller:
     def problems(self) -> list[str]:
         """Return what does not fit in odometry and response, each with its remedy."""
         found = [self.drive_monitor.problem()]
+        if self.keep_out is not None and self._last_stamp_ns is not None:
+            found.append(self.keep_out.ranges.problem())
         if self.odometry_twist.missing:
             found.append('odom has no twist: its poses are differentiated; publish the twist')
         configured = self.parameters.speed_filter.dead_time
@@ -428,10 +430,14 @@ class Controller:
         if self.keep_out is not None:
             self.keep_out.reset()
 
-    def add_range(self, sensor: int, reading: float) -> None:
-        """Add a range reading (m, REP 117) of a sensor, taken at the pose of the last odometry."""
-        if self.keep_out is not None and self._last_stamp_ns is not None:
-            self.keep_out.map.add_reading(sensor, reading, self._place)
+    def add_range(self, sensor: int, reading: float, stamp_ns: int | None = None) -> bool:
+        """Add a range reading (m, REP 117) of a sensor, taken at the pose of the last odometry.
+
+        Return False for one that changes no decision: late, repeated or impossible.
+        """
+        if self.keep_out is None or self._last_stamp_ns is None:
+            return False
+        return self.keep_out.add_reading(sensor, reading, self._place, stamp_ns)
 
     def add_reference(self, reference: State) -> bool:
         """Store a reference sample; return False if it is not finite and therefore ignored."""
@@ -486,6 +492,8 @@ class Controller:
                 odometry, self.actuation.twist, elapsed or 0.0, following=self._response.responsive
             )
         speeds, reference, begin, end = self._sampled
+        if self.keep_out is not None and odometry.is_finite():
+            reason = self._check_keep_out(odometry, reason, begin)
         if not reason.moves:
             self._stop()
             self.status = self._make_status(stamp, reason, speeds - reference)
@@ -523,6 +531,23 @@ class Controller:
         self._take_snapshot()
         self.status = self._make_status(stamp, reason, actuation.speeds - reference, applied)
         return actuation.twist, self.status
+
+    def _check_keep_out(self, odometry: State, reason: Reason, begin: Array) -> Reason:
+        """Return the reason after contact and range sensors were considered.
+
+        begin : planned wheel speeds, rad/s
+        """
+        keep_out = self.keep_out
+        assert keep_out is not None
+        keep_out.ranges.update(odometry.stamp_ns, odometry.pose)
+        if self.drive_monitor.held and self.status.reason.moves:
+            astern = self.actuation.twist.linear < 0.0
+            keep_out.touch(self.drive_monitor.held_motion.furthest, astern=astern)
+        rejoins = self.pose_controller.rejoining
+        astern = keep_out.retreats or (not rejoins and float(begin.sum()) < 0.0)
+        if reason.moves and keep_out.ranges.is_blind(astern=astern):
+            return Reason.TOO_FEW_RANGES
+        return reason
 
     def _wait(self, odometry: State) -> tuple[BodyTwist, Status]:
         """Return the last command at an odometry that comes before the period has passed."""

@@ -49,18 +49,24 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.control.range_monitor import RangeMonitor
 from t3mpc_ros.geometry.arena import Obstacles
-from t3mpc_ros.geometry.types import Array, BodyTwist, Pose, has_moved, wrap_angle
+from t3mpc_ros.geometry.types import STANDSTILL, Array, BodyTwist, Pose, has_moved, wrap_angle
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
 Cells = NDArray[np.int8]
 
 UNKNOWN, FREE, OCCUPIED, KNOWN = 0, 1, 2, 3
-"""States of a cell; KNOWN is an obstacle of the world file."""
+"""States of a cell; KNOWN is an obstacle of the world file, or one that the robot has touched: no
+ray clears it."""
 NEAREST_TRUSTED = 0.08
 """Distance from the face of a sensor below which a ray neither clears nor marks: a Sharp sensor
 reads 13 cm for an object at 3 cm."""
+STANDING_ROOM = 0.12
+"""Radius of the floor that is free because the robot stands there, m."""
+MEMORY = 20.0
+"""Default time after which floor that was seen to be free counts as unseen, s."""
 CLEARINGS = 4
 """Rays that must pass over an occupied cell to clear it."""
 DIRECTIONS = 48
@@ -71,6 +77,21 @@ SECTORS = 16
 """Sectors around the robot, each with its nearest unsafe cell."""
 SEARCH_RADIUS = 0.5
 """Distance from the centre up to which cells are considered, m."""
+CAUTIOUS_SPEED = 0.12
+"""Largest speed of a robot that sees less than usual, m/s."""
+TOUCHED_SIZE = 0.15
+"""Half the width, and the depth, that a thing is taken to have which the robot has touched and
+cannot see, m."""
+TOUCHED_NEAR = 1.0
+"""Distance from such a thing within which the robot drives cautiously, m."""
+TRAIL_SPACING, TRAIL_LENGTH = 0.02, 8
+"""Distance between two poses of the way that the robot came (m), and their number: it backs off
+so far."""
+RETREAT_MARGIN = 0.035
+"""Distance that it then may be nearer to obstacles than otherwise, m."""
+RETREAT_SPEED, RETREAT_TURN, RETREAT_TIME = 0.08, 0.5, 6.0
+"""Speed (m/s) and longest time (s) of backing off, and the angle to the way back (rad) above which
+the robot turns first."""
 TURN_WEIGHT = 0.12
 """Change of v (m/s) that is as bad as a change of omega by 1 rad/s: turning is preferred."""
 
@@ -97,6 +118,13 @@ class FreeSpaceMapParameters(Parameters):
     """Growth of the error with the square of the distance, 1/m, assumed; noise and offset of 10 mV
     each make 0.08."""
     range: float = parameter(0.80, 'distance up to which a sensor sees', 'm', (0.1, 10.0))
+    memory: float = parameter(
+        MEMORY,
+        'time after which floor that was seen to be free counts as unseen: the robot looks at it '
+        'again before it drives there',
+        's',
+        (1.0, 1e6),
+    )
 
 
 class MapGrid(NamedTuple):
@@ -106,6 +134,8 @@ class MapGrid(NamedTuple):
     """State of each cell, shape (n, n), row by y."""
     cleared: Cells
     """Rays that passed over an occupied cell, shape (n, n)."""
+    seen: NDArray[np.float32]
+    """When a cell was last seen to be free, s, shape (n, n)."""
     low: float
     """Coordinate of the first edge, m."""
     size: float
@@ -136,6 +166,7 @@ class FreeSpaceMap:
         self.grid = MapGrid(
             np.zeros((count, count), dtype=np.int8),
             np.zeros((count, count), dtype=np.int8),
+            np.zeros((count, count), dtype=np.float32),
             low,
             parameters.resolution,
         )
@@ -145,8 +176,11 @@ class FreeSpaceMap:
 
     def clear(self) -> None:
         """Forget everything but the known obstacles."""
+        self.now = 0.0
+        """Time since then, s."""
         self.grid.cells[:] = UNKNOWN
         self.grid.cleared[:] = 0
+        self.grid.seen[:] = 0.0
         low, size = self.grid.low, self.grid.size
         count = len(self.grid.cells)
         spacing = 0.5 * size
@@ -165,15 +199,41 @@ class FreeSpaceMap:
 
     def mark_free(self, x: float, y: float, radius: float) -> None:
         """Mark the floor below a robot that stands there as free."""
-        low, size = self.grid.low, self.grid.size
-        centres = low + size * (np.arange(len(self.grid.cells)) + 0.5)
-        near = (centres[None, :] - x) ** 2 + (centres[:, None] - y) ** 2 <= radius**2
-        self.grid.cells[near & (self.grid.cells == UNKNOWN)] = FREE
+        window, near = self._near(x, y, radius)
+        cells = self.grid.cells[window]
+        cells[near & (cells == UNKNOWN)] = FREE
+        self.grid.seen[window][near] = self.now
+
+    def mark_touched(self, pose: Pose, sign: float, distance: float) -> None:
+        """Mark what the robot at ``pose`` touches ahead (``sign`` 1) or behind (-1).
+
+        distance : from the centre of the robot, which stands on free floor, m
+        """
+        depth, low, size = distance + TOUCHED_SIZE, self.grid.low, self.grid.size
+        window, near = self._near(pose.x, pose.y, math.hypot(depth, TOUCHED_SIZE))
+        rows, columns = (np.arange(each.start, each.stop) + 0.5 for each in window)
+        x, y = low + size * columns[None, :] - pose.x, low + size * rows[:, None] - pose.y
+        ahead = sign * (math.cos(pose.yaw) * x + math.sin(pose.yaw) * y)
+        left = math.cos(pose.yaw) * y - math.sin(pose.yaw) * x
+        thing = (ahead > size) & (ahead < depth) & (abs(left) < TOUCHED_SIZE)
+        self.grid.cells[window][near & thing & (x * x + y * y > distance**2)] = KNOWN
+
+    def _near(
+        self, x: float, y: float, radius: float
+    ) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
+        """Return the rows and columns around a disc, and which of their cells are in it."""
+        low, size, count = self.grid.low, self.grid.size, len(self.grid.cells)
+        spans, squares = [], []
+        for middle in (y, x):
+            first = min(max(math.floor((middle - radius - low) / size), 0), count)
+            last = min(max(math.floor((middle + radius - low) / size) + 1, first), count)
+            spans.append(slice(first, last))
+            squares.append((low + size * (np.arange(first, last) + 0.5) - middle) ** 2)
+        near: NDArray[np.bool_] = squares[0][:, None] + squares[1][None, :] <= radius**2
+        return (spans[0], spans[1]), near
 
     def add_reading(self, sensor: int, reading: float, pose: Pose) -> None:
-        """Add a reading (m, REP 117) of a sensor of the robot at ``pose``; NaN changes nothing."""
-        if reading != reading:
-            return
+        """Add a reading (m, REP 117) of a sensor of the robot at ``pose``."""
         ahead, aside, direction = self._mounts[sensor].tolist()
         cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
         parameters = self.parameters
@@ -183,6 +243,7 @@ class FreeSpaceMap:
         error = parameters.error_floor + parameters.error_growth * hit * hit
         self._add_ray(
             self.grid,
+            self.now,
             pose.x + cosine * ahead - sine * aside,
             pose.y + sine * ahead + cosine * aside,
             pose.yaw + direction,
@@ -206,6 +267,7 @@ def has_obstacle(cells: Cells, row: int, column: int, reach: int) -> bool:
 @kernel
 def add_ray(
     grid: MapGrid,
+    now: float,
     x: float,
     y: float,
     direction: float,
@@ -230,6 +292,7 @@ def add_ray(
             if column < 0 or row < 0 or column >= count or row >= count:
                 continue
             state = grid.cells[row, column]
+            grid.seen[row, column] = now
             if state == UNKNOWN:
                 grid.cells[row, column] = FREE
             elif (
@@ -278,6 +341,14 @@ class KeepOutParameters(Parameters):
         '1/s',
         (0.1, 20.0),
     )
+    range_timeout: float = parameter(
+        0.2,
+        'time without a valid reading after which a range sensor is lost; the robot brakes after '
+        'half of it. With one lost it drives slowly, without any in the direction of motion it '
+        'stops',
+        's',
+        (0.05, 5.0),
+    )
     scan_rate: float = parameter(
         1.2, 'yaw rate at which the robot looks around', 'rad/s', (0.1, 5.0)
     )
@@ -324,6 +395,8 @@ class Activity(enum.Enum):
     STUCK_OBSTACLE = 'stuck: obstacles block the way to the path'
     STUCK_UNSEEN = 'stuck: floor that cannot be seen blocks the way to the path'
     STUCK_DRIVE = 'stuck: commands do not move the robot'
+    BACKING_OFF = 'backing off from something that the range sensors do not see'
+    WAITING = 'waiting for a reading of the range sensors'
 
     @property
     def stuck(self) -> bool:
@@ -348,6 +421,8 @@ class KeepOut:
         mounts = np.array(parameters.mounts).reshape(-1, 3)
         self.map = FreeSpaceMap(parameters.map, mounts, known.segments, known.circles)
         """What is known of the floor."""
+        self.ranges = RangeMonitor(mounts, parameters.range_timeout, parameters.map.range)
+        """Which range sensors can be relied on."""
         self.limits = limits
         """Replaceable at run time."""
         self._nearest = np.zeros((SECTORS, 4))
@@ -358,17 +433,38 @@ class KeepOut:
     def reset(self) -> None:
         """Begin at a new place: the robot looks around first."""
         self.map.clear()
+        self.ranges.reset()
         self.activity = Activity.FREE
         """What it does."""
         self.changed = False
         """Whether the last twist was changed."""
-        self._standing_room = False
+        self._standing_room = self._cautious = False
         self._targets: deque[float] = deque()
         self._seen_from: Pose | None = None
         self._blocked_for = 0.0
         self._detour: float | None = None
         self._progress: Pose | None = None
         self._waited = 0.0
+        self._looked_at = 0.0
+        """Time of the map at which the robot began to look around, s."""
+        self.touched: list[tuple[float, float]] = []
+        """Where the robot was when it touched something that it cannot see, m."""
+        self._trail: deque[Pose] = deque(maxlen=TRAIL_LENGTH)
+        """The way that the robot came."""
+        self._retreat_time = 0.0
+        """Time left to back off, s."""
+
+    def add_reading(
+        self, sensor: int, reading: float, pose: Pose, stamp_ns: int | None = None
+    ) -> bool:
+        """Add a reading (m, REP 117) of a sensor of the robot at ``pose``.
+
+        Return whether it was used: its stamp, if it has one, is new, and it is possible.
+        """
+        if not self.ranges.accept(sensor, reading, stamp_ns):
+            return False
+        self.map.add_reading(sensor, reading, pose)
+        return True
 
     def step(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist nearest to ``wanted``, or one that looks around.
@@ -383,16 +479,76 @@ class KeepOut:
             room = self.parameters.distance + self.parameters.ahead + 0.06
             self.map.mark_free(pose.x, pose.y, room)
             self._look_around(pose, math.pi)
+        self.map.now += elapsed
+        self.map.mark_free(pose.x, pose.y, STANDING_ROOM)
+        if self.ranges.waits(astern=wanted.linear < 0.0):
+            # A stop of the fastest robot takes longer than what then is left of half a second.
+            self.changed, self.activity = True, Activity.WAITING
+            return STANDSTILL
+        if self.retreats:
+            return self._back_off(pose, elapsed)
+        if wanted.linear > 0.0 and has_moved(
+            self._trail[-1] if self._trail else None, pose, TRAIL_SPACING, math.inf
+        ):
+            self._trail.append(pose)
         return self._reshaped(wanted, pose, elapsed)
+
+    @property
+    def retreats(self) -> bool:
+        """Whether the robot backs off from what it has touched."""
+        return self._retreat_time > 0.0
+
+    def touch(self, pose: Pose, *, astern: bool) -> None:
+        """Remember that something holds the robot at ``pose``; then back off the way it came."""
+        self.map.mark_touched(
+            pose, -1.0 if astern else 1.0, self.parameters.distance - RETREAT_MARGIN - 0.005
+        )
+        self.touched.append((pose.x, pose.y))
+        self._targets.clear()
+        self._retreat_time = 0.0 if astern else RETREAT_TIME
+
+    def _back_off(self, pose: Pose, elapsed: float) -> BodyTwist:
+        """Return the twist back along the trail, as far as the floor behind is free."""
+        self._retreat_time -= elapsed
+        gap = 0.0
+        while self._trail:
+            x, y = self._trail[-1].x - pose.x, self._trail[-1].y - pose.y
+            gap = wrap_angle(math.atan2(y, x) - pose.yaw - math.pi)
+            if math.hypot(x, y) > TRAIL_SPACING:
+                break
+            self._trail.pop()
+        if not self._trail:
+            self._retreat_time = 0.0
+        if not self.retreats:
+            self._trail.clear()
+            self._look_around(pose, self.parameters.scan_angle)
+            return STANDSTILL
+        self.changed, self.activity = True, Activity.BACKING_OFF
+        # It came over this floor, and the sensors at its back see what has come there since.
+        self._update_nearest(pose, OCCUPIED)
+        if abs(gap) > RETREAT_TURN:  # what it touched has turned it
+            limit = self.parameters.scan_rate
+            return BodyTwist(0.0, min(max(4.0 * gap, -limit), limit))
+        distance = self.parameters.distance - RETREAT_MARGIN
+        return self._permitted(BodyTwist(-RETREAT_SPEED, 2.0 * gap), distance)
+
+    def _update_nearest(self, pose: Pose, least: int) -> None:
+        """Find the nearest unsafe cells around a pose, see :func:`find_nearest`."""
+        oldest = self.map.now - self.parameters.map.memory
+        self._find_nearest(self.map.grid, *pose, oldest, self._nearest, least)
+
+    def _is_near_touched(self, pose: Pose) -> bool:
+        return any(math.hypot(x - pose.x, y - pose.y) < TOUCHED_NEAR for x, y in self.touched)
 
     def _reshaped(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist, or one that looks around."""
-        self._find_nearest(self.map.grid, pose.x, pose.y, pose.yaw, self._nearest)
+        self._update_nearest(pose, UNKNOWN)
+        self._cautious = self.ranges.lost or self._is_near_touched(pose)
         if self._targets:
             self.changed = True
             self.activity = Activity.LOOKING
             return self._look(pose)  # a round robot may turn anywhere
-        permitted = self._permitted(wanted)
+        permitted = self._permitted(wanted, self.parameters.distance)
         if abs(permitted.linear) < TURNING_SPEED:
             # The point ahead is a means to steer; a round robot that stands may turn anywhere.
             limit = self.parameters.scan_rate
@@ -429,15 +585,18 @@ class KeepOut:
         self._detour = pose.yaw + chosen
         return speed * math.cos(chosen), speed * math.sin(chosen)
 
-    def _permitted(self, wanted: BodyTwist) -> BodyTwist:
-        """Return the permitted twist nearest to ``wanted``."""
+    def _permitted(self, wanted: BodyTwist, distance: float) -> BodyTwist:
+        """Return the twist nearest to ``wanted`` that keeps a distance (m) from what is near."""
         parameters = self.parameters
         count = write_conditions(
-            self._nearest, parameters.distance, parameters.ahead, parameters.rate, self._rows
+            self._nearest, distance, parameters.ahead, parameters.rate, self._rows
         )
         limits = self.limits
-        for sign in (1.0, -1.0):
-            self._rows[count] = sign, 0.0, limits.linear
+        fastest = min(limits.linear, CAUTIOUS_SPEED) if self._cautious else limits.linear
+        # Where no sensor looks behind it, the robot does not back away from what is ahead.
+        astern = 0.0 if self.ranges.is_blind(astern=True) else fastest
+        for sign, most in ((1.0, fastest), (-1.0, astern)):
+            self._rows[count] = sign, 0.0, most
             self._rows[count + 1] = 0.0, sign / TURN_WEIGHT, limits.angular
             count += 2
         v, turn = nearest_permitted(
@@ -451,7 +610,7 @@ class KeepOut:
         if angle >= math.pi:
             half = [pose.yaw + math.tau * share for share in (0.25, 0.5, 0.75, 1.0)]
         self._targets = deque(map(wrap_angle, half))
-        self._seen_from = pose
+        self._seen_from, self._looked_at = pose, self.map.now
 
     def _look(self, pose: Pose) -> BodyTwist:
         """Return the turn towards the next direction."""
@@ -469,15 +628,18 @@ class KeepOut:
         blocked = self.changed and speed > 0.05 and abs(permitted.linear) < 0.3 * speed
         self._blocked_for = self._blocked_for + elapsed if blocked else 0.0
         self.activity = Activity.AVOIDING if self.changed else Activity.FREE
-        if (
-            self._blocked_for > 0.2
-            and self._blocked_by_unseen()
-            and has_moved(self._seen_from, pose, 0.04, 0.6)
-        ):
+        if self._blocked_for > 0.2 and self._blocked_by_unseen() and self._may_look(pose):
             self._blocked_for = 0.0
             self._look_around(pose, self.parameters.scan_angle)
             return
         self._update_stuck(wanted, pose, elapsed)
+
+    def _may_look(self, pose: Pose) -> bool:
+        """Whether it is of use to look around: the robot has moved, or what it saw is old."""
+        return (
+            has_moved(self._seen_from, pose, 0.04, 0.6)
+            or self.map.now - self._looked_at > self.parameters.map.memory
+        )
 
     def _blocked_by_unseen(self) -> bool:
         """Whether the nearest cell ahead is one that has not been seen."""
@@ -509,9 +671,19 @@ class KeepOut:
 
 
 @kernel
-def find_nearest(grid: MapGrid, x: float, y: float, yaw: float, nearest: Array) -> None:
+def find_nearest(
+    grid: MapGrid,
+    x: float,
+    y: float,
+    yaw: float,
+    oldest: float,
+    nearest: Array,
+    least: int,
+) -> None:
     """Write the nearest unsafe cell of each sector.
 
+    least : UNKNOWN; OCCUPIED if floor that has not been seen is no reason
+    oldest : time before which a cell must have been seen to count as unseen, s
     nearest : shape (SECTORS, 4), overwritten: direction to the cell in the frame of the robot
         (2 numbers), its state, its distance in m; a distance of inf without one
     """
@@ -527,6 +699,10 @@ def find_nearest(grid: MapGrid, x: float, y: float, yaw: float, nearest: Array) 
             outside = row < 0 or column < 0 or row >= count or column >= count
             state = UNKNOWN if outside else int(grid.cells[row, column])
             if state == FREE:
+                if grid.seen[row, column] >= oldest:
+                    continue
+                state = UNKNOWN
+            if state < least:
                 continue
             away_x, away_y = low + (column + 0.5) * size - x, low + (row + 0.5) * size - y
             square = away_x * away_x + away_y * away_y

@@ -19,7 +19,15 @@ import enum
 import math
 from typing import ClassVar
 
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State, has_moved, wrap_angle
+from t3mpc_ros.geometry.types import (
+    NANOSECONDS,
+    ORIGIN,
+    BodyTwist,
+    Pose,
+    State,
+    has_moved,
+    wrap_angle,
+)
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 
@@ -70,6 +78,7 @@ class Reason(enum.Enum):
     DIVERGING = 'state is diverging'
     NOT_FOLLOWING = 'the robot does not follow commands'
     PAUSED = 'commands pause because the robot does not follow them'
+    TOO_FEW_RANGES = 'too few range sensors work to drive on'
     STOPPED_AGAIN = 'the robot has stopped again after each of three pauses'
 
     def __init__(self, text: str) -> None:
@@ -279,8 +288,72 @@ time constant of its means, s; at the earliest after STANDING_TIME."""
 OPPOSED_EXCITATION = 0.004, 0.13
 """Integral of the squared command from which that is known, m²/s and rad²/s: 0.05 m/s and 0.3
 rad/s for 1.5 s."""
+CONTACT_MOTION, CONTACT_LEAD = 0.05, 0.15
+"""Commanded motion (m) of which too little leads anywhere where the robot is held, and the time by
+which the pose is behind the commands, s."""
+CONTACT_WINDOW = 4.0
+"""Longest time in which that motion is commanded, s."""
+CONTACT_SHARES = 0.3, 0.4
+"""Share of the commanded motion below which the robot is held, and share above which it moves
+sideways, as along what it touches."""
+CONTACT_TURN = 0.25
+"""Difference of the turns by pose and by wheels within that motion (rad): what the robot touches
+turns it."""
 RECOVERY_TIME = 5.0
 """Time of driving as commanded after which earlier pauses do not count, s."""
+
+
+class HeldMotion:
+    """Compares what was commanded of a robot with the change of its pose, piece by piece.
+
+    Wheels that slip, and motors that lose steps, count a motion that the pose does not make, if
+    it comes from elsewhere; the gyro of the odometry alone sees the turn of a robot that touches
+    something with one side.
+    """
+
+    def __init__(self) -> None:
+        self._pose: Pose | None = None
+        self.furthest = ORIGIN
+        """Where the robot came, the last time that it advanced: what holds it may turn it."""
+        self.restart(None)
+
+    def restart(self, pose: Pose | None) -> None:
+        """Begin a new piece at a pose."""
+        self._pose = pose
+        self._most = 0.0
+        self._asked = self._ahead = self._left = self._turn = self._time = 0.0
+        self._fastest = self._fastest_turn = 0.0
+
+    def is_held(self, odometry: State, command: BodyTwist, elapsed: float) -> bool:
+        """Whether something holds, turns or pushes aside a robot that is commanded to drive."""
+        pose, last = odometry.pose, self._pose
+        if last is None or command.linear * self._asked < 0.0:
+            self.restart(pose)
+            return False
+        turn = wrap_angle(pose.yaw - last.yaw)
+        middle = last.yaw + 0.5 * turn
+        x, y = pose.x - last.x, pose.y - last.y
+        self._pose = pose
+        self._ahead += math.cos(middle) * x + math.sin(middle) * y
+        if abs(self._ahead) >= self._most:
+            self._most, self.furthest = abs(self._ahead), pose
+        self._left += math.cos(middle) * y - math.sin(middle) * x
+        self._turn += odometry.twist.angular * elapsed - turn
+        self._asked += command.linear * elapsed
+        self._fastest = max(self._fastest, abs(command.linear))
+        self._fastest_turn = max(self._fastest_turn, abs(command.angular))
+        self._time += elapsed
+        asked = abs(self._asked) - CONTACT_LEAD * self._fastest
+        if asked < CONTACT_MOTION:
+            if self._time > CONTACT_WINDOW:
+                self.restart(pose)
+            return False
+        least, most = CONTACT_SHARES
+        held = math.copysign(self._ahead, self._ahead * self._asked) < least * asked
+        held |= abs(self._left) > most * asked
+        held |= abs(self._turn) > CONTACT_TURN + CONTACT_LEAD * self._fastest_turn
+        self.restart(pose)
+        return held
 
 
 class DriveMonitor:
@@ -291,13 +364,19 @@ class DriveMonitor:
     released, its board may start. One that moves and then stops again gets three pauses.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, feels: bool = False) -> None:
+        """``feels``: also pause them where the change of the pose says that the robot is held."""
+        self._feels = feels
+        self.held_motion = HeldMotion()
+        """Where something holds the robot."""
         self.reset()
 
     def reset(self) -> None:
         """Forget all pauses."""
         self.pauses = 0
         """Pauses since the robot drove as commanded."""
+        self.held = False
+        """Whether this pause began because something held the robot."""
         self._trials = 0
         self._ended = False
         self._pause = 0.0
@@ -310,6 +389,8 @@ class DriveMonitor:
         self._well = self._astray = 0.0
         self._power, self._product = [0.0, 0.0], [0.0, 0.0]
         self._time = 0.0
+        self.held = False
+        self.held_motion.restart(None)
         self._restart(None)
 
     def _restart(self, pose: Pose | None) -> None:
@@ -335,7 +416,8 @@ class DriveMonitor:
                 return Reason.PAUSED
             self.begin()
             return Reason.TRACKING
-        stands = self._stands(odometry, command, elapsed)
+        self.held = self._feels and self.held_motion.is_held(odometry, command, elapsed)
+        stands = self._stands(odometry, command, elapsed) or self.held
         if stands or self._is_opposed(odometry.twist, command, elapsed):
             return self._begin_pause()
         if following:
@@ -351,8 +433,15 @@ class DriveMonitor:
 
     def problem(self) -> str:
         """Return what to do about a robot that does not follow, or nothing."""
+        if self._ended and self.held:
+            return (
+                'something that the range sensors do not see holds the robot: free it, move what '
+                'is in its way or keep it out by keep_out.world, then call ~/enable'
+            )
         if self._ended:
             return 'free the wheels, look at the diagnostics of the robot, then call ~/enable'
+        if self.held:
+            return 'the robot touches something that the range sensors do not see: it backs off'
         if self.pauses:
             return (
                 f'{self.pauses} pauses of the commands, each followed by another attempt: look at '

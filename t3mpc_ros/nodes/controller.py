@@ -140,6 +140,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._steps = 0
         self._rejected_references = 0
         self._rejected_odometry = 0
+        self._rejected_ranges = 0
         self._reported_ignored = 0
         self._odometry_problem = ''
         self._logged_reason = self._controller.status.reason
@@ -214,8 +215,11 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
     def _take_ranges(self) -> None:
         for sensor, subscription in enumerate(self._ranges):
             for message in subscription.take_waiting():
-                self._controller.add_range(sensor, message.range)
-                self._publish_journal(self._journal.range(sensor, message.range))
+                stamp_ns = conversions.ns_from_time(message.header.stamp) or None
+                if self._controller.add_range(sensor, message.range, stamp_ns):
+                    self._publish_journal(self._journal.range(sensor, message.range))
+                else:
+                    self._rejected_ranges += 1
 
     def _on_odometry(self, message: bytes, info: dict[str, Any]) -> None:
         # Without a step, the watchdog stops the robot and the journal has no row.
@@ -344,6 +348,9 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             values['rejoining'] = self._controller.pose_controller.rejoining
         if self._controller.keep_out is not None:
             values['keep_out'] = self._controller.keep_out.activity.value
+            values['ranges_rejected'] = self._rejected_ranges
+            for name, fault in self._controller.keep_out.ranges.faults().items():
+                values[f'range_{name}'] = fault.value
         if self._odometry_problem:
             return ERROR, f'stopped: odom {self._odometry_problem}', values
         waiting = self._steps == 0

@@ -13,6 +13,7 @@
 # limitations under the License.
 """Keep-out: the nearest permitted twist, conditions that hold, floor that must be seen first."""
 
+from itertools import pairwise
 import math
 
 import numpy as np
@@ -22,6 +23,8 @@ from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.keep_out import (
     CLEARINGS,
     FREE,
+    KNOWN,
+    MEMORY,
     OCCUPIED,
     UNKNOWN,
     Activity,
@@ -29,6 +32,7 @@ from t3mpc_ros.control.keep_out import (
     KeepOutParameters,
     nearest_permitted,
 )
+from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import advance_pose
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State
@@ -134,7 +138,6 @@ def test_rays_clear_and_mark():
     for _ in range(6):
         keep_out.map.add_reading(0, math.inf, ORIGIN)
     assert _state(keep_out, 0.601, 0.051) == FREE
-    keep_out.map.add_reading(0, math.nan, ORIGIN)
 
 
 def test_an_obstacle_seen_again_must_be_cleared_anew():
@@ -163,3 +166,113 @@ def test_a_reading_counts_at_the_pose_of_the_last_odometry():
     wanted = KeepOut(KeepOutParameters(), BodyTwist(0.35, 4.5))
     wanted.map.add_reading(0, 0.4, place)
     assert np.array_equal(controller.keep_out.map.grid.cells, wanted.map.grid.cells)
+
+
+@pytest.mark.compiled
+def test_floor_that_was_seen_long_ago_is_looked_at_again():
+    """A cell was free for ever: what was placed there later was driven into."""
+    keep_out = _seen()
+    keep_out.map.grid.seen[:] = 0.0
+    wanted = BodyTwist(0.3, 0.0)
+    keep_out.map.now = MEMORY - 1.0
+    assert keep_out.step(wanted, ORIGIN, PERIOD) == pytest.approx(wanted)
+    keep_out.map.now = MEMORY + 1.0
+    looked = False
+    for _ in range(100):
+        assert keep_out.step(wanted, ORIGIN, PERIOD).linear < 0.1
+        looked |= keep_out.activity is Activity.LOOKING
+    assert looked
+    keep_out.map.grid.seen[:] = keep_out.map.now  # as the rays of a look would
+    keep_out._targets.clear()
+    assert keep_out.step(wanted, ORIGIN, PERIOD) == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize('yaw', [0.0, 0.7, 2.5, -1.6])
+def test_what_was_touched_is_marked_ahead_and_no_ray_clears_it(yaw):
+    keep_out = KeepOut(PARAMETERS, LIMITS)
+    pose = Pose(0.3, -0.2, yaw)
+
+    def at(ahead, left):
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        x, y = pose.x + cosine * ahead - sine * left, pose.y + sine * ahead + cosine * left
+        return _state(keep_out, x, y)
+
+    keep_out.touch(pose, astern=False)
+    for _ in range(CLEARINGS + 2):
+        for sensor in range(8):
+            keep_out.map.add_reading(sensor, math.inf, pose)
+    assert [at(0.2, 0.0), at(0.1, 0.12), at(0.1, -0.12)] == 3 * [KNOWN]
+    assert KNOWN not in [at(0.0, 0.0), at(-0.2, 0.0), at(0.2, 0.2), at(-0.05, 0.12), at(0.4, 0.0)]
+    keep_out.reset()
+    assert at(0.2, 0.0) == UNKNOWN
+    assert not keep_out.touched
+    assert not keep_out.retreats
+
+
+class Touching:
+    """A controller whose robot sees nothing, and is held at a circle around the origin."""
+
+    def __init__(self, radius, side=math.pi):
+        self.controller = Controller(
+            StepperControllerParameters.from_dict({'pose.enabled': True, 'keep_out.enabled': True})
+        )
+        self.radius, self.side = radius, side
+        self.k, self.pose, self.twist = 0, ORIGIN, STANDSTILL
+        self.touches, self.reasons, self.astern = [], [], []
+        self.wall = -math.inf
+        """Coordinate of a wall behind the robot, m."""
+
+    def run(self, seconds):
+        generator = np.random.default_rng(3)
+        for _ in range(round(seconds / PERIOD)):
+            self.k += 1
+            now = self.k * 10_000_000
+            target = self.pose._replace(x=self.pose.x + 0.3)
+            self.controller.add_reference(
+                State(now + 400_000_000, target._replace(yaw=0.0), BodyTwist(0.2, 0.0))
+            )
+            for sensor in range(8) if self.k % 4 == 0 else ():
+                reading = self.pose.x - self.wall - 0.1 if sensor in (4, 5) else math.inf
+                self.controller.add_range(sensor, reading, now)
+            moved = advance_pose(self.pose, self.twist, PERIOD)
+            outside = math.hypot(moved.x, moved.y) > self.radius
+            held = outside and abs(math.atan2(moved.y, moved.x)) < self.side
+            if held and math.hypot(moved.x, moved.y) > math.hypot(self.pose.x, self.pose.y):
+                self.touches.append((self.k, self.pose, self.twist.linear))
+                moved = self.pose._replace(yaw=moved.yaw)
+            self.pose = moved
+            x, y = (0.002 * generator.standard_normal(2)).tolist()
+            measured = Pose(moved.x + x, moved.y + y, moved.yaw)
+            self.twist, status = self.controller.step(State(now, measured, self.twist))
+            self.reasons.append(status.reason)
+            if self.controller.keep_out.activity is Activity.BACKING_OFF:
+                self.astern.append(self.twist.linear)
+        return self
+
+
+@pytest.mark.compiled
+def test_a_held_robot_backs_off_and_does_not_touch_again():
+    """It pressed against a box below its beams for five minutes."""
+    robot = Touching(0.35, side=0.8).run(30.0)
+    rows = np.array([k for k, _, _ in robot.touches])
+    ends = [0, *(np.flatnonzero(np.diff(rows) > 100) + 1).tolist(), len(rows)]
+    spans = [robot.touches[begin:end] for begin, end in pairwise(ends)]
+    first, *later = spans
+    assert first[-1][0] - first[0][0] < 60  # it pushed for 0.6 s
+    assert Reason.PAUSED in robot.reasons
+    assert min(robot.astern) < -0.05
+    for each in later:
+        assert math.dist(each[0][1][:2], first[0][1][:2]) > 0.1
+        assert each[0][2] < 0.15
+
+
+@pytest.mark.compiled
+def test_a_robot_does_not_back_off_into_what_it_sees():
+    robot = Touching(0.35, side=0.8)
+    while not robot.controller.keep_out.touched:
+        robot.run(0.05)
+    robot.wall = robot.pose.x - 0.16
+    while robot.controller.keep_out.retreats or robot.reasons[-1] is Reason.PAUSED:
+        robot.run(0.05)
+        assert robot.pose.x - robot.wall > 0.12
+    assert min(robot.astern) > -0.06

@@ -38,7 +38,7 @@ from t3mpc_ros.control.watchdog import (
     ResponseMonitor,
     WatchdogParameters,
 )
-from t3mpc_ros.geometry.kinematics import wheels_from_twist
+from t3mpc_ros.geometry.kinematics import advance_pose, wheels_from_twist
 from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, Pose, State
 
 MS = 1_000_000
@@ -544,3 +544,60 @@ def test_a_robot_that_is_asked_for_nothing_shows_no_recovery():
     course.wanted = STANDSTILL
     course.run(3.0 * RECOVERY_TIME)
     assert course.monitor.pauses > 0
+
+
+def _feel(drive, seconds, feels=True, noise=0.003):
+    """Return a monitor and its reasons; ``drive``: pose at a time (s), command, measured twist."""
+    monitor, reasons = DriveMonitor(feels=feels), []
+    generator = np.random.default_rng(5)
+    for k in range(round(100 * seconds)):
+        (x, y, yaw), command, measured = drive(0.01 * k)
+        x, y = (np.array([x, y]) + noise * generator.standard_normal(2)).tolist()
+        state = State(k * PERIOD, Pose(x, y, yaw), measured)
+        reasons.append(monitor.decide(state, command, 0.01, following=True))
+    return monitor, reasons
+
+
+@pytest.mark.parametrize('speed', [0.02, 0.1, 0.35, -0.08])
+def test_wheels_that_turn_under_a_pose_that_stands_are_a_contact(speed):
+    """A robot pushed a box that it does not see for five minutes: its wheels turned."""
+    command = BodyTwist(speed, 0.0)
+    monitor, reasons = _feel(lambda t: ((0.0, 0.0, 0.3), command, command), 30.0)
+    assert 0.01 * reasons.index(Reason.PAUSED) < 4.2
+    assert monitor.held
+    assert reasons[-1] is Reason.STOPPED_AGAIN
+    assert 'call ~/enable' in monitor.problem()
+    begins = [k for k in range(1, len(reasons)) if reasons[k - 1] is not reasons[k]]
+    assert len(begins) == 2 * TRIALS + 1  # three pauses, then the end
+    assert _feel(lambda t: ((0.0, 0.0, 0.3), command, command), 30.0, feels=False)[1] == (
+        3000 * [Reason.TRACKING]
+    )
+
+
+def test_a_robot_turned_or_pushed_aside_touches_something():
+    command = BodyTwist(0.2, 0.0)
+    turned = _feel(lambda t: ((0.2 * t, 0.0, 0.9 * t), command, command), 2.0)[1]
+    assert Reason.PAUSED in turned
+    slides = _feel(lambda t: ((0.12 * t, 0.12 * t, 0.0), command, command), 2.0)[1]
+    assert Reason.PAUSED in slides
+
+
+@pytest.mark.parametrize('late', [0.0, 0.1])
+@pytest.mark.parametrize('turn', [0.0, 1.0, 4.0])
+def test_free_motion_is_no_contact(turn, late):
+    """With noise of 3 mm, late poses, stops, turns on the spot and backing off."""
+    pose, now, poses, twists = Pose(0.0, 0.0, 0.0), STANDSTILL, [], []
+    for k in range(4000):
+        phase = (k // 200) % 4
+        wanted = BodyTwist((0.35, 0.0, 0.02, -0.1)[phase], turn if phase % 2 else 0.3 * turn)
+        step = [min(max(w - n, -a), a) for w, n, a in zip(wanted, now, (0.01, 0.14), strict=True)]
+        now = BodyTwist(now.linear + step[0], now.angular + step[1])
+        pose = advance_pose(pose, now, 0.01)
+        poses.append(pose)
+        twists.append(now)
+
+    def drive(t):
+        k = round(100 * t)
+        return poses[max(k - round(100 * late), 0)], twists[k], twists[k]
+
+    assert set(_feel(drive, 40.0)[1]) == {Reason.TRACKING}

@@ -546,7 +546,7 @@ def built_run(folder, changes):
                 pose = Pose(way + 0.02, 0.3, 0.0)
                 recorded.add_reference(now, State(now + 200_000_000, pose, twist))
             if k % 4 == 0:
-                recorded.add_range(now + 1000, 0, 0.7)
+                recorded.add_range(now + 1000, 0, math.inf)
             speeds = BodyTwist(0.2 + 0.02 * math.sin(0.2 * k), 0.3 * math.sin(0.1 * k - 0.2))
             recorded.step(now + 500_000, State(now, Pose(way, 0.3, turn), speeds))
     return load_inputs(folder)
@@ -556,7 +556,7 @@ def built_run(folder, changes):
 def test_a_replay_builds_the_controller_as_its_node_did(name, plain_runs, tmp_path, monkeypatch):
     """Each parameter that is fixed when a controller is built has its effect in a replay, too."""
     monkeypatch.chdir(tmp_path)
-    Path('walls.yaml').write_text('name: walls\nwalls:\n  - points: [[0.4, -1.0], [0.4, 1.0]]\n')
+    Path('walls.yaml').write_text('name: walls\nwalls:\n  - points: [[0.3, -1.0], [0.3, 1.0]]\n')
     usual, changes = BUILT[name]
     plain, built = plain_runs(usual), built_run(tmp_path / 'built', usual | changes)
     assert built.exact.all()

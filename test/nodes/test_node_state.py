@@ -32,6 +32,7 @@ from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.chaos.pose_reference import PortraitSource
 from t3mpc_ros.chaos.reference import ChaoticReference
 from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
+from t3mpc_ros.control.range_monitor import RangeFault
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist
 from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN
@@ -302,9 +303,12 @@ def test_levels_of_the_controller(start):
             assert report(node) == (ERROR, text)
     status = controller.status._replace(reason=Reason.TRACKING)
     for stuck, level in ((False, OK), (True, WARN)):
-        keep_out = SimpleNamespace(activity=SimpleNamespace(stuck=stuck, value='what it does'))
+        ranges = SimpleNamespace(faults=lambda: {'front_left': RangeFault.FROZEN})
+        activity = SimpleNamespace(stuck=stuck, value='what it does')
+        keep_out = SimpleNamespace(activity=activity, ranges=ranges)
         node._controller = Instead(controller, status=status, keep_out=keep_out)
         assert diagnostic_level(node) == level
+        assert node.produce_diagnostics()[2]['range_front_left'].startswith('frozen')
     node._controller = Instead(controller, status=status)
     node._rejected_references = 1
     assert diagnostic_level(node) == WARN

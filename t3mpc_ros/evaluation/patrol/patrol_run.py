@@ -17,12 +17,14 @@ The loop has the timing of the nodes: the reference is stamped ahead by its lead
 the robot leads to one command, which arrives after the dead time of the link or is lost.
 """
 
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
 import tempfile
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +40,7 @@ from t3mpc_ros.evaluation.scenario import KINDS, LEAD
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
 from t3mpc_ros.geometry.types import (
+    NANOSECONDS,
     ORIGIN,
     STANDSTILL,
     Array,
@@ -49,7 +52,7 @@ from t3mpc_ros.geometry.types import (
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.plant_robot import Signals
-from t3mpc_ros.simulation.world import load_world
+from t3mpc_ros.simulation.world import MovingDisc, load_world
 
 START = KINDS['twin'].start
 """Standstill before the drive, s."""
@@ -65,6 +68,66 @@ POSITION_NOISE, YAW_NOISE = 0.003, 0.005
 """Standard deviation of the given position in each coordinate (m), and of the given yaw (rad)."""
 GRIP = 0.25
 """Share of the grip that slippery patches of floor have."""
+
+
+Visitors = Callable[[float, State], MovingDisc | None]
+"""Returns what comes at a time of the twin (s), given the true state of the robot."""
+
+
+class SensorFault(NamedTuple):
+    """A range sensor that fails for a time of the twin."""
+
+    sensor: int
+    kind: Literal['silent', 'frozen', 'nan', 'negative', 'far', 'late', 'repeated', 'disordered']
+    """``late``: stamps are 0.5 s old; ``repeated``: stamps stay; ``disordered``: every second
+    reading comes after the next one."""
+    begin: float
+    """s"""
+    end: float = math.inf
+    """s"""
+
+
+LATE = 0.5
+"""Age of late readings, s."""
+IMPOSSIBLE = {'nan': math.nan, 'negative': -0.3, 'far': 3.0}
+"""Readings that are impossible, m."""
+
+
+class FaultyRanges:
+    """Range readings on their way to the controller, with the faults of a scenario."""
+
+    def __init__(self, faults: tuple[SensorFault, ...]) -> None:
+        self._faults = faults
+        self._frozen: dict[int, tuple[float, int]] = {}
+        self._waiting: dict[int, deque[tuple[float, int]]] = {}
+
+    def received(self, sensor: int, reading: float, stamp_ns: int) -> list[tuple[float, int]]:
+        """Return which readings (m) with which stamps arrive instead of one of a sensor."""
+        time = stamp_ns / NANOSECONDS
+        kinds = [
+            each.kind
+            for each in self._faults
+            if each.sensor == sensor and each.begin <= time < each.end
+        ]
+        if not kinds:
+            self._frozen[sensor] = reading, stamp_ns
+            return [(reading, stamp_ns)]
+        kind, (frozen, frozen_ns) = kinds[0], self._frozen.get(sensor, (reading, stamp_ns))
+        if kind == 'silent':
+            return []
+        if kind == 'late':
+            return [(reading, stamp_ns - round(LATE * NANOSECONDS))]
+        if kind == 'disordered':
+            waiting = self._waiting.setdefault(sensor, deque())
+            waiting.appendleft((reading, stamp_ns))
+            if len(waiting) < 2:
+                return []
+            found = [*waiting]
+            waiting.clear()
+            return found
+        if kind == 'repeated':
+            return [(reading, frozen_ns)]
+        return [(IMPOSSIBLE.get(kind, frozen), stamp_ns)]
 
 
 @dataclass(frozen=True)
@@ -85,6 +148,8 @@ class PatrolScenario:
     """Further parameters of the robot by name."""
     controller: Mapping[str, object] = field(default_factory=dict)
     """Further parameters of the controller by name."""
+    faults: tuple[SensorFault, ...] = ()
+    """Faults of the range sensors."""
 
 
 def portrait_points(seed: int, parameters: PortraitParameters) -> Iterator[Array]:
@@ -114,7 +179,10 @@ def contact_count(record: Record) -> int:
 
 
 def run_patrol(
-    points: Iterator[Array], scenario: PatrolScenario, tracker: PathTracker | None = None
+    points: Iterator[Array],
+    scenario: PatrolScenario,
+    tracker: PathTracker | None = None,
+    visitors: Visitors | None = None,
 ) -> Record:
     """Return the record of a robot that follows a path; equal arguments give equal runs.
 
@@ -129,6 +197,8 @@ def run_patrol(
         World and robot.
     tracker
         Law in place of the controller; the path is then only recorded as the reference.
+    visitors
+        What comes while the robot drives.
     """
     parameters = DigitalTwinParameters.from_dict(
         {
@@ -139,11 +209,14 @@ def run_patrol(
             **scenario.robot,
         }
     )
+    robot = DigitalTwin(parameters)
     driver = PathDriver(points, scenario, parameters.geometry, tracker)
+    if visitors is not None:
+        driver.on_state = lambda state: _visit(robot, visitors, state)
     rest = round(START * RATE)
     count = round(scenario.duration * RATE)
     record = run_loop(
-        DigitalTwin(parameters),
+        robot,
         driver,
         rest + count,
         start=START,
@@ -158,6 +231,14 @@ def run_patrol(
         robot_reasons=record.robot_reasons[rest:],
         driver_reasons=record.driver_reasons[rest:],
     )
+
+
+def _visit(robot: DigitalTwin, visitors: Visitors, state: RobotState) -> None:
+    """Let come what comes at a state of the robot."""
+    assert state.truth is not None
+    found = visitors(state.stamp_ns / NANOSECONDS, state.truth)
+    if found is not None:
+        robot.add_obstacle(found)
 
 
 class PathDriver:
@@ -189,6 +270,9 @@ class PathDriver:
         self._controller.enable(False)
         self._pose, self._twist = ORIGIN, STANDSTILL
         self.reason = ''
+        self.on_state: Callable[[RobotState], None] | None = None
+        """Called with each report of the robot."""
+        self._faulty = FaultyRanges(scenario.faults)
 
     def begin(self, k: int, *, enabled: bool) -> None:
         """Extend the reference up to its lead."""
@@ -207,9 +291,13 @@ class PathDriver:
     def step(self, state: RobotState) -> RobotCommand:
         """Return the command that follows from a report of the robot."""
         self._pose = self._localised(state)
+        if self.on_state is not None:
+            self.on_state(state)
         for sensor, reading in enumerate(state.ranges):
-            if not self._ranges or reading != self._ranges[sensor] or self._k % 4 == 0:
-                self._controller.add_range(sensor, reading)
+            due = not self._ranges or reading != self._ranges[sensor] or self._k % 4 == 0
+            if due and not math.isnan(reading):  # as the nodes publish them
+                for received in self._faulty.received(sensor, reading, state.stamp_ns):
+                    self._controller.add_range(sensor, *received)
         self._ranges = state.ranges
         if self._tracker is None:
             measured = State(state.stamp_ns, self._pose, state.odometry.twist)

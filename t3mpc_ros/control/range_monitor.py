@@ -1,0 +1,192 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Which range sensors can be relied on: they report in time, plausibly, and see that they move."""
+
+import enum
+import math
+
+from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, Array, Pose, wrap_angle
+
+LOOKS_ALONG = 0.7
+"""Cosine of the direction of a sensor from which on it looks along the motion of the robot."""
+BEYOND_RANGE = 1.05
+"""Finite readings above this multiple of the range of a sensor are impossible."""
+REPEATS = 8
+"""Equal readings in a row from which on a sensor may be frozen: 0.3 s of a Sharp sensor."""
+FROZEN_MOTION, FROZEN_TURN = 0.08, 0.8
+"""Motion along its beam (m), or turn (rad), during which a sensor must not read one distance. Its
+noise of 10 mV changes a reading beyond 0.25 m even of a robot that stands, but not a nearer one of
+a robot that drives along a wall: that moves no face along its beam."""
+LEAP = 0.1
+"""Change of the pose (m) within a step that is no motion: the robot was carried, or found."""
+
+
+class RangeFault(enum.Enum):
+    """Why a sensor cannot be relied on."""
+
+    SILENT = 'silent'
+    LATE = 'late: stamps of another time than those of odom'
+    REPEATED = 'repeated: no newer stamps'
+    IMPOSSIBLE = 'impossible: not a number, negative or beyond its range'
+    FROZEN = 'frozen: one distance while the robot moves'
+
+
+class SensorRecord:
+    """What is known of one sensor."""
+
+    def __init__(self, mount: tuple[float, float, float]) -> None:
+        x, y, direction = mount
+        cosine, sine = math.cos(direction), math.sin(direction)
+        self._share = cosine, sine, sine * x - cosine * y
+        """Motion of its face along its beam by the motion of the robot: forward, left, turn."""
+        self.looks = cosine
+        """1 ahead, -1 astern."""
+        self.stamp_ns: int | None = None
+        self.received_ns: int | None = None
+        """Stamp of the odometry after the last valid reading."""
+        self.pending = False
+        """Whether a valid reading has come since the last odometry."""
+        self.cause = RangeFault.SILENT
+        """What a sensor without valid readings is."""
+        self.fault: RangeFault | None = None
+        self.age = 0.0
+        """Time since the last valid reading, s."""
+        self._reading = math.nan
+        self._repeats = 0
+        self._along = self._turn = 0.0
+
+    def add(self, reading: float) -> None:
+        """Add a valid reading."""
+        self.pending = True
+        if reading == self._reading:
+            self._repeats += 1
+            return
+        self._reading, self._repeats, self._along, self._turn = reading, 0, 0.0, 0.0
+
+    def move(self, forward: float, left: float, turn: float) -> None:
+        """Add a motion of the robot in its frame (m, rad)."""
+        ahead, aside, around = self._share
+        self._along += ahead * forward + aside * left + around * turn
+        self._turn += turn
+
+    def update(self, now_ns: int, timeout: float) -> None:
+        """Decide about the sensor at the stamp of an odometry."""
+        if self.pending:
+            self.pending, self.received_ns, self.cause = False, now_ns, RangeFault.SILENT
+        elapsed = math.inf if self.received_ns is None else now_ns - self.received_ns
+        self.age = elapsed / NANOSECONDS
+        moved = abs(self._along) > FROZEN_MOTION or abs(self._turn) > FROZEN_TURN
+        self.fault = None
+        if self.age > timeout:
+            self.fault = self.cause
+        elif moved and self._repeats >= REPEATS and math.isfinite(self._reading):
+            self.fault = RangeFault.FROZEN
+
+
+class RangeMonitor:
+    """Decides which range sensors can be relied on, by the stamps of odometry and readings.
+
+    "Nothing in range" and "too near" are no distances: a sensor that is frozen there cannot be
+    told from one before a large room.
+
+    mounts : x, y (m) and direction (rad) of each face in the frame of the robot, shape (s, 3)
+    timeout : time without a valid reading after which a sensor is lost, s
+    limit : distance up to which a sensor sees, m
+    """
+
+    def __init__(self, mounts: Array, timeout: float, limit: float) -> None:
+        self._mounts = [(x, y, direction) for x, y, direction in mounts.tolist()]
+        self._timeout, self._limit = timeout, limit
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all readings."""
+        self._sensors = [SensorRecord(mount) for mount in self._mounts]
+        self._now_ns: int | None = None
+        self._pose: Pose | None = None
+
+    def accept(self, sensor: int, reading: float, stamp_ns: int | None) -> bool:
+        """Return whether a reading (m, REP 117) is to be used.
+
+        stamp_ns : None of a reading without a stamp
+        """
+        record = self._sensors[sensor]
+        if stamp_ns is not None and self._now_ns is not None:
+            timeout_ns = self._timeout * NANOSECONDS
+            if abs(stamp_ns - self._now_ns) > timeout_ns:
+                record.cause = RangeFault.LATE
+                return False
+            if record.stamp_ns is not None and 0 <= record.stamp_ns - stamp_ns <= timeout_ns:
+                record.cause = RangeFault.REPEATED
+                return False
+            record.stamp_ns = stamp_ns
+        impossible = math.isfinite(reading) and not 0.0 <= reading <= BEYOND_RANGE * self._limit
+        if impossible or math.isnan(reading):
+            record.cause = RangeFault.IMPOSSIBLE
+            return False
+        record.add(reading)
+        return True
+
+    def update(self, now_ns: int, pose: Pose) -> None:
+        """Decide about each sensor at an odometry."""
+        last, self._pose, self._now_ns = self._pose, pose, now_ns
+        if last is not None and math.hypot(pose.x - last.x, pose.y - last.y) < LEAP:
+            x, y = pose.x - last.x, pose.y - last.y
+            cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
+            forward, left = cosine * x + sine * y, cosine * y - sine * x
+            for record in self._sensors:
+                record.move(forward, left, wrap_angle(pose.yaw - last.yaw))
+        for record in self._sensors:
+            record.update(now_ns, self._timeout)
+
+    @property
+    def lost(self) -> bool:
+        """Whether any sensor cannot be relied on."""
+        return any(record.fault for record in self._sensors)
+
+    def is_blind(self, *, astern: bool) -> bool:
+        """Return whether too few sensors are left to drive ahead or astern."""
+        looking = self._looking(astern)
+        return all(record.fault for record in looking) if looking else self._all_lost()
+
+    def waits(self, *, astern: bool) -> bool:
+        """Return whether no sensor that looks there has reported for half the time-out."""
+        looking = [record for record in self._looking(astern) if not record.fault]
+        return bool(looking) and min(each.age for each in looking) > 0.5 * self._timeout
+
+    def faults(self) -> dict[str, RangeFault]:
+        """Return the faults of the sensors by name."""
+        names = RANGE_SENSORS if len(self._sensors) == len(RANGE_SENSORS) else ()
+        return {
+            names[index] if names else f'sensor {index}': record.fault
+            for index, record in enumerate(self._sensors)
+            if record.fault is not None
+        }
+
+    def problem(self) -> str:
+        """Return which sensors are lost, and why; '' if all work."""
+        found = self.faults()
+        if not found:
+            return ''
+        if len(found) == len(self._sensors) and len(set(found.values())) == 1:
+            return f'all range sensors {next(iter(found.values())).value}'
+        texts = (f'{name} {fault.value}' for name, fault in found.items())
+        return f'range sensors lost, the robot drives slowly: {", ".join(texts)}'
+
+    def _looking(self, astern: bool) -> list[SensorRecord]:
+        sign = -1.0 if astern else 1.0
+        return [record for record in self._sensors if sign * record.looks > LOOKS_ALONG]
+
+    def _all_lost(self) -> bool:
+        return bool(self._sensors) and all(record.fault for record in self._sensors)

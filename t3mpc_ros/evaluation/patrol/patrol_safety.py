@@ -1,0 +1,323 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Safety of a patrol: sensors that fail, things that are placed later, people, what is not seen.
+
+Each case is a patrol (:mod:`t3mpc_ros.evaluation.patrol.patrol_run`) with a fault of the sensors
+or with obstacles that depend on where the robot is; its row says what the robot touched, how
+often, how fast and for how long, and how it came to rest.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.chaos.portrait import PortraitParameters
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, digest, run_experiment
+from t3mpc_ros.evaluation.patrol.patrol_run import (
+    START,
+    PatrolScenario,
+    SensorFault,
+    portrait_points,
+    room_with_boxes,
+    run_patrol,
+    world_file,
+)
+from t3mpc_ros.evaluation.record import RATE, Record
+from t3mpc_ros.evaluation.result_file import Row
+from t3mpc_ros.geometry.types import Array, State
+from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
+from t3mpc_ros.simulation.world import MovingDisc, World, clearance, parse_world
+
+ROOM = (4.0, 3.0)
+"""Size of the room, m."""
+BOXES = 3
+"""Boxes that the sensors see."""
+PERSON_SPEED, PERSON_RADIUS, PERSON_GAP = 0.3, 0.12, 0.15
+"""Speed of a person (m/s), radius of the legs (m), and distance ahead of the robot at which the
+person stops (m)."""
+PERSON_STAYS = 6.0
+"""s"""
+PUSHES = 1e-4
+"""Dent of the bumper from which on something pushes it, m: 2 N."""
+SAME_PLACE = 0.3
+"""Distance between two contacts that are at one place, m."""
+BOUNCE = 1.0
+"""Longest gap within one contact, s: a bumper bounces."""
+REST = 0.005, 0.05
+"""Speeds below which the robot rests, m/s and rad/s."""
+RADIUS = BumperParameters().radius
+
+
+class PlacedThings:
+    """Pillars that appear around the robot, one every 8 s, and go after 20 s."""
+
+    def __init__(self, seed: int) -> None:
+        self._generator = np.random.default_rng((seed, 41))
+
+    def __call__(self, time: float, state: State) -> MovingDisc | None:
+        """Return what appears at a time of the twin (s), given the true state of the robot."""
+        if round(time * RATE) % (8 * RATE) or time < 10.0:
+            return None
+        draw = self._generator.uniform
+        radius, gap = float(draw(0.03, 0.15)), float(draw(0.25, 1.0))
+        angle = state.pose.yaw + float(draw(-0.7, 0.7))
+        away = RADIUS + gap + radius
+        point = (
+            state.pose.x + away * math.cos(angle),
+            state.pose.y + away * math.sin(angle),
+        )
+        return MovingDisc(radius, np.array([point]), 0.0, 0.0, time, time + 20.0)
+
+
+class People:
+    """A person who comes from a side or from ahead, and stops closely ahead of the robot."""
+
+    def __init__(self, seed: int) -> None:
+        self._generator = np.random.default_rng((seed, 42))
+        self._next = 10.0
+
+    def __call__(self, time: float, state: State) -> MovingDisc | None:
+        """Return a person who sets off at a time of the twin (s) towards a robot that drives."""
+        pose, twist = state.pose, state.twist
+        if time < self._next or twist.linear < 0.1 or abs(twist.angular) > 0.5:
+            return None
+        self._next = time + PERSON_STAYS + 6.0
+        walk = float(self._generator.uniform(0.3, 0.9))
+        side = float(self._generator.choice([-1.0, 0.0, 1.0])) * 0.5 * math.pi
+        away = walk / PERSON_SPEED * twist.linear + RADIUS + PERSON_GAP + PERSON_RADIUS
+        end = np.array([math.cos(pose.yaw), math.sin(pose.yaw)]) * away + pose[:2]
+        heading = pose.yaw + side
+        begin = end + walk * np.array([math.cos(heading), math.sin(heading)])
+        leaves = time + walk / PERSON_SPEED + PERSON_STAYS
+        points = np.array([begin, end])
+        return MovingDisc(PERSON_RADIUS, points, PERSON_SPEED, time, time, leaves)
+
+
+def unseen_boxes(seed: int) -> str:
+    """Return boxes and a pillar below the beams, as entries of a world file."""
+    generator = np.random.default_rng((seed, 43))
+    places: list[tuple[float, float]] = []
+    while len(places) < 3:
+        x, y = generator.uniform([-1.6, -1.1], [1.6, 1.1]).tolist()
+        if min(math.dist((x, y), each) for each in [(0.0, 0.0), *places]) > 0.7:
+            places.append((x, y))
+    boxes = [
+        f'  - {{center: [{x:.3f}, {y:.3f}], size: [0.3, 0.2], yaw: {y:.3f}, unseen: true}}'
+        for x, y in places[:2]
+    ]
+    x, y = places[2]
+    pillar = f'  - {{center: [{x:.3f}, {y:.3f}], radius: 0.08, unseen: true}}'
+    return '\n'.join([*boxes, 'circles:', pillar])
+
+
+@dataclass(frozen=True)
+class SafetyCase:
+    """What is special about a patrol."""
+
+    visitors: Callable[[int], Callable[[float, State], MovingDisc | None]] | None = None
+    """By seed, what comes while the robot drives."""
+    unseen: bool = False
+    """Whether there are boxes that the sensors do not see."""
+    faults: Callable[[int], Sequence[SensorFault]] | None = None
+    """By seed, the faults of the range sensors."""
+
+
+def cut_time(seed: int) -> float:
+    """Return when the sensors of a seed fail, s of the twin."""
+    return float(np.random.default_rng((seed, 44)).uniform(8.0, 38.0))
+
+
+def _all_silent(seed: int) -> Sequence[SensorFault]:
+    return [SensorFault(sensor, 'silent', cut_time(seed)) for sensor in range(8)]
+
+
+def _front_frozen(seed: int) -> Sequence[SensorFault]:
+    return [SensorFault(sensor, 'frozen', cut_time(seed)) for sensor in range(2)]
+
+
+CASES: Mapping[str, SafetyCase] = {
+    'standing': SafetyCase(),
+    'placed later': SafetyCase(visitors=PlacedThings),
+    'people': SafetyCase(visitors=People),
+    'unseen': SafetyCase(unseen=True),
+    'sensors silent': SafetyCase(faults=_all_silent),
+    'front sensors frozen': SafetyCase(faults=_front_frozen),
+}
+"""The cases by name."""
+
+
+class Contact(NamedTuple):
+    """One contact, with the bounces of the bumper."""
+
+    begin: float
+    """s of the record"""
+    pushing: float
+    """Longest time without release, s."""
+    speed: float
+    """Speed of the robot towards what it touches at the begin, m/s; 0 where it was run into."""
+    place: tuple[float, float]
+    """Where the robot was, m."""
+
+
+def gaps(record: Record, world: World) -> tuple[Array, Array]:
+    """Return the gap between bumper and obstacles (m), and its rate by the robot's own motion.
+
+    world : with all that moved; its time is that of the twin, ``START`` before that of the record
+    """
+    truth, twist = record['truth'], record['twist']
+    gap, closing = np.empty(len(record)), np.zeros(len(record))
+    for row, ((x, y, yaw), (speed, _)) in enumerate(
+        zip(truth.tolist(), twist.tolist(), strict=True)
+    ):
+        now = world.at(START + float(record.time[row]))
+        gap[row] = clearance(x, y, *now.obstacles) - RADIUS
+        if gap[row] < 0.01:
+            step = 1e-3 * math.copysign(1.0, speed)
+            ahead = clearance(x + step * math.cos(yaw), y + step * math.sin(yaw), *now.obstacles)
+            closing[row] = abs(speed) * (gap[row] + RADIUS - ahead) / 1e-3
+    return gap, closing
+
+
+def contacts(record: Record, world: World) -> list[Contact]:
+    """Return the contacts of a run, in their order."""
+    gap, closing = gaps(record, world)
+    apart = np.flatnonzero(gap < 0.0)
+    touches = gap < 0.0
+    for last, following in zip(apart, apart[1:], strict=False):
+        if following - last < BOUNCE * RATE:
+            touches[last:following] = True
+    touching = np.concatenate([[False], touches, [False]]).astype(np.int8)
+    begins, ends = (np.flatnonzero(np.diff(touching) == sign) for sign in (1, -1))
+    return [
+        Contact(
+            begin / RATE,
+            _longest(gap[begin:end] < -PUSHES) / RATE,
+            max(float(closing[max(begin - 3, 0) : begin + 1].max()), 0.0),
+            tuple(record['truth'][begin, :2].tolist()),
+        )
+        for begin, end in zip(begins.tolist(), ends.tolist(), strict=True)
+    ]
+
+
+def _longest(flags: NDArray[np.bool_]) -> int:
+    """Return the length of the longest run of rows that are set."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return int(np.diff(ends)[::2].max()) if ends.size else 0
+
+
+def at_places(found: Sequence[Contact]) -> list[list[Contact]]:
+    """Return the contacts by place."""
+    places: list[list[Contact]] = []
+    for each in found:
+        for known in places:
+            if math.dist(known[0].place, each.place) < SAME_PLACE:
+                known.append(each)
+                break
+        else:
+            places.append([each])
+    return places
+
+
+def safety_run(case: str, seed: int, duration: float) -> tuple[Record, World]:
+    """Return the record of a case, and its world with all that came."""
+    kind = CASES[case]
+    text = room_with_boxes(seed, ROOM, BOXES)
+    if kind.unseen:
+        walls, _, patches = text.partition('patches:')
+        text = f'{walls}{unseen_boxes(seed)}\npatches:{patches}'
+    came: list[MovingDisc] = []
+    visitors = kind.visitors(seed) if kind.visitors else None
+
+    def visit(time: float, state: State) -> MovingDisc | None:
+        found = visitors(time, state) if visitors else None
+        came.extend([found] if found else [])
+        return found
+
+    with world_file(text) as path:
+        scenario = PatrolScenario(
+            seed, duration, world=path, faults=tuple(kind.faults(seed)) if kind.faults else ()
+        )
+        record = run_patrol(portrait_points(seed, PortraitParameters()), scenario, visitors=visit)
+    world = parse_world(text, 'room')
+    return record, World(
+        world.name,
+        world.segments,
+        world.circles,
+        world.patches,
+        world.boxes,
+        world.unseen,
+        tuple(came),
+    )
+
+
+def measured_safety(job: tuple[tuple[str, float], int]) -> Row:
+    """Return the row of a case.
+
+    ``contacts``, those to which the robot moved; ``run_into``, those to which it did not;
+    ``most_at_a_place``; ``fastest_again``, speed of the fastest contact after the first at its
+    place (m/s); ``pushing``, longest time of pushing (s); ``driven`` (m); ``ended``, reason of a
+    stop that lasts to the end. Of a case with faults ``rest``, time from the fault to rest (s),
+    NaN without, and ``after``, distance driven after it (m).
+    """
+    (case, duration), seed = job
+    record, world = safety_run(case, seed, duration)
+    found = contacts(record, world)
+    own = [each for each in found if each.speed > REST[0]]
+    places = at_places(own)
+    again = [each.speed for known in places for each in known[1:]]
+    steps = np.hypot(*np.diff(record['truth'][:, :2], axis=0).T)
+    row: Row = {
+        'contacts': len(own),
+        'places': len(places),
+        'run_into': len(found) - len(own),
+        'most_at_a_place': max(map(len, places), default=0),
+        'fastest': max((each.speed for each in own), default=0.0),
+        'fastest_again': max(again, default=0.0),
+        'pushing': max((each.pushing for each in found), default=0.0),
+        'driven': float(steps.sum()),
+        'ended': record.driver_reasons[-1],
+        'stopped': float(np.mean([bool(each) for each in record.driver_reasons])),
+        'came': len(world.moving),
+    }
+    if CASES[case].faults:
+        first = round((cut_time(seed) - START) * RATE)
+        over = np.abs(record['twist'][first:]) > np.array(REST)
+        moving = np.flatnonzero(over.any(axis=1))
+        rests = 0.0 if not moving.size else float(moving[-1] + 1) / RATE
+        row['rest'] = math.nan if moving.size and moving[-1] + 1 == len(over) else rests
+        row['after'] = float(steps[first:].sum())
+    return row
+
+
+def compare_safety(
+    cases: Sequence[str],
+    seeds: Sequence[int],
+    duration: float,
+    store: Path | None = None,
+    workers: int | Executor = 1,
+    report: Report | None = None,
+) -> ResultTable:
+    """Return one row a case and seed; arguments as of :func:`run_experiment`."""
+    runs = []
+    for case in cases:
+        for seed in seeds:
+            job = (case, duration), seed
+            runs.append(Run(job, {'controller': case, 'case': case, 'seed': seed}, digest(job)))
+    return run_experiment(runs, measured_safety, workers, store=store, report=report)

@@ -1,0 +1,262 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Range sensors that are silent, frozen, late or impossible: noticed by name, and what follows."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.controller import Controller, StepperControllerParameters
+from t3mpc_ros.control.keep_out import CAUTIOUS_SPEED, Activity, KeepOutParameters
+from t3mpc_ros.control.range_monitor import RangeFault, RangeMonitor
+from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.geometry.kinematics import advance_pose
+from t3mpc_ros.geometry.types import ORIGIN, RANGE_SENSORS, STANDSTILL, BodyTwist, State
+
+PERIOD_NS = 10_000_000
+TIMEOUT = KeepOutParameters().range_timeout
+MOUNTS = np.array(KeepOutParameters().mounts).reshape(-1, 3)
+FRONT, SIDES, REAR = (0, 1), (2, 3, 6, 7), (4, 5)
+
+
+def _monitor():
+    return RangeMonitor(MOUNTS, TIMEOUT, 0.8)
+
+
+class Drive:
+    """A monitor on a robot that drives with a twist; sensors report every 40 ms."""
+
+    def __init__(self, twist=STANDSTILL):
+        self.monitor, self.twist, self.pose, self.k = _monitor(), twist, ORIGIN, 0
+        self.noise = np.random.default_rng(7)
+
+    def run(self, seconds, readings=lambda sensor, time: 0.3):
+        """Drive; ``readings`` returns a reading, a pair with a stamp, or None."""
+        for _ in range(round(seconds / 0.01)):
+            self.k += 1
+            self.pose = advance_pose(self.pose, self.twist, 0.01)
+            for sensor in range(8) if self.k % 4 == 0 else ():
+                found = readings(sensor, 0.01 * self.k)
+                if found is not None:
+                    reading, stamp = found if isinstance(found, tuple) else (found, None)
+                    self.monitor.accept(sensor, reading, stamp)
+            self.monitor.update(self.k * PERIOD_NS, self.pose)
+        return self.monitor
+
+
+def _noisy(drive):
+    """Return readings of a robot amid things: another one each time."""
+    return lambda sensor, time: 0.3 + 0.005 * int(drive.noise.integers(-5, 5))
+
+
+def test_before_the_first_reading_every_sensor_is_silent():
+    monitor = _monitor()
+    monitor.update(0, ORIGIN)
+    assert monitor.faults() == dict.fromkeys(RANGE_SENSORS, RangeFault.SILENT)
+    assert monitor.is_blind(astern=False)
+    assert monitor.is_blind(astern=True)
+    assert monitor.problem() == 'all range sensors silent'
+
+
+@pytest.mark.parametrize('sensor', range(8))
+def test_one_silent_sensor_is_named_after_the_time_out(sensor):
+    drive = Drive()
+    assert not drive.run(1.0).lost
+
+    def others(one, time):
+        return None if one == sensor else 0.3
+
+    assert not drive.run(TIMEOUT - 0.05, others).lost
+    monitor = drive.run(0.1, others)
+    assert monitor.faults() == {RANGE_SENSORS[sensor]: RangeFault.SILENT}
+    assert RANGE_SENSORS[sensor] in monitor.problem()
+    assert not monitor.is_blind(astern=False)
+    assert not monitor.is_blind(astern=True)
+    assert not drive.run(0.1).lost  # it comes back
+
+
+@pytest.mark.parametrize(
+    ('lost', 'ahead', 'astern'),
+    [(FRONT, True, False), (REAR, False, True), (SIDES, False, False), (range(8), True, True)],
+)
+def test_too_few_sensors_are_those_of_the_direction_of_motion(lost, ahead, astern):
+    drive = Drive()
+    drive.run(1.0)
+    drive.run(0.5, lambda sensor, time: None if sensor in lost else 0.3)
+    assert drive.monitor.is_blind(astern=False) is ahead
+    assert drive.monitor.is_blind(astern=True) is astern
+
+
+def test_a_robot_brakes_after_half_of_the_time_out():
+    drive = Drive()
+    drive.run(1.0)
+    drive.run(0.08, lambda sensor, time: None)
+    assert not drive.monitor.waits(astern=False)
+    drive.run(0.04, lambda sensor, time: None if sensor in FRONT else 0.3)
+    assert drive.monitor.waits(astern=False)
+    assert not drive.monitor.waits(astern=True)
+    drive.run(0.04, lambda sensor, time: 0.3 if sensor == 1 else None)
+    assert not drive.monitor.waits(astern=False)  # one of both is enough
+
+
+@pytest.mark.parametrize(
+    ('reading', 'fault'),
+    [
+        *[(value, RangeFault.IMPOSSIBLE) for value in (math.nan, -0.01, -1e9, 0.85, 65.0)],
+        *[(value, None) for value in (0.0, 0.1, 0.8, float(np.float32(0.8)), math.inf, -math.inf)],
+    ],
+)
+def test_impossible_readings_are_those_that_no_sensor_gives(reading, fault):
+    drive = Drive()
+    drive.run(1.0)
+    monitor = drive.run(0.5, lambda sensor, time: reading if sensor == 3 else 0.3)
+    assert monitor.faults() == ({'left_back': fault} if fault else {})
+
+
+def test_one_bad_reading_among_good_ones_is_no_fault():
+    drive = Drive()
+    drive.run(1.0)
+    assert not drive.run(1.0, lambda sensor, time: math.nan if round(25 * time) % 2 else 0.3).lost
+
+
+def _stamped(age):
+    return lambda sensor, time: (0.3, round(1e9 * (time - age)))
+
+
+def test_late_repeated_and_overtaken_readings():
+    """A reading counts by its stamp: old ones, and those that come again, are none."""
+    drive = Drive()
+    assert not drive.run(1.0, _stamped(0.0)).lost
+    assert set(drive.run(0.5, _stamped(0.5)).faults().values()) == {RangeFault.LATE}
+    assert set(drive.run(0.5, _stamped(-5.0)).faults().values()) == {RangeFault.LATE}
+    assert not drive.run(0.2, _stamped(0.0)).lost
+    last = round(1e9 * 0.01 * drive.k)
+    found = drive.run(0.5, lambda sensor, time: (0.3, last)).faults()
+    assert len(found) == 8
+    assert set(found.values()) <= {RangeFault.REPEATED, RangeFault.LATE}
+    assert not drive.run(0.2, _stamped(0.0)).lost
+    used = [
+        drive.monitor.accept(0, 0.3, round(1e9 * 0.01 * drive.k) + ns) for ns in (20, 10, 20, 30)
+    ]
+    assert used == [True, False, False, True]
+
+
+@pytest.mark.parametrize('twist', [BodyTwist(0.2, 0.0), BodyTwist(0.0, 1.0), BodyTwist(-0.1, 0.3)])
+@pytest.mark.parametrize('sensor', [0, 5])
+def test_a_sensor_that_freezes_in_motion_is_found(twist, sensor):
+    drive = Drive(twist)
+    drive.run(1.0, _noisy(drive))
+    noisy = _noisy(drive)
+    drive.run(2.0, lambda one, time: 0.35 if one == sensor else noisy(one, time))
+    assert drive.monitor.faults() == {RANGE_SENSORS[sensor]: RangeFault.FROZEN}
+    assert not drive.run(0.2, _noisy(drive)).lost
+
+
+@pytest.mark.parametrize(
+    ('twist', 'readings'),
+    [
+        (STANDSTILL, lambda sensor, time: 0.3),  # a robot that stands sees one thing
+        (BodyTwist(0.3, 1.0), lambda sensor, time: math.inf),  # the middle of a hall
+        (BodyTwist(0.3, 0.0), lambda sensor, time: 0.12 if sensor in SIDES else math.inf),
+    ],
+)
+def test_constant_readings_that_are_no_fault(twist, readings):
+    """The last: along a wall near enough that the noise is below the step of the reading."""
+    assert not Drive(twist).run(5.0, readings).lost
+
+
+class KeptOut:
+    """A controller with keep-out and an ideal robot on a straight reference of 0.3 m/s."""
+
+    def __init__(self):
+        self.controller = Controller(
+            StepperControllerParameters.from_dict(
+                {'pose.enabled': True, 'keep_out.enabled': True, 'keep_out.map.half_size': 6.0}
+            )
+        )
+        self.k, self.pose, self.twist = 0, ORIGIN, STANDSTILL
+        self.speeds, self.reasons = [], []
+
+    def run(self, seconds, sensors=range(8), reading=math.inf, fresh=True):
+        for _ in range(round(seconds / 0.01)):
+            self.k += 1
+            now = self.k * PERIOD_NS
+            ahead = now + 40 * PERIOD_NS
+            place = ORIGIN._replace(x=self.pose.x + 0.3 * 0.4)
+            self.controller.add_reference(State(ahead, place, BodyTwist(0.3, 0.0)))
+            for sensor in sensors if self.k % 4 == 0 else ():
+                self.controller.add_range(sensor, reading, now if fresh else now - 500_000_000)
+            self.pose = advance_pose(self.pose, self.twist, 0.01)
+            self.twist, status = self.controller.step(State(now, self.pose, self.twist))
+            self.speeds.append(self.twist.linear)
+            self.reasons.append(status.reason)
+        return self
+
+    def run_until_fast(self):
+        """Drive on until the robot is fast: it looks around first, and now and then."""
+        while not self.speeds or self.speeds[-1] < 0.25:
+            assert self.run(0.05).k < 4000
+        return len(self.speeds)
+
+
+def test_all_silent_brakes_stops_and_goes_on_by_itself():
+    robot = KeptOut().run(0.5, sensors=())
+    assert robot.reasons[-1] is Reason.TOO_FEW_RANGES  # none before the first reading
+    assert robot.pose == ORIGIN
+    cut = robot.run_until_fast()
+    robot.run(1.0, sensors=())
+    fastest = max(robot.speeds)
+    assert max(robot.speeds[cut + 18 :]) < fastest - 0.05  # it brakes before the time-out
+    assert robot.reasons[cut + 30] is Reason.TOO_FEW_RANGES
+    assert set(robot.speeds[cut + 30 :]) == {0.0}
+    assert 'all range sensors silent' in robot.controller.problems()
+    robot.run(4.0, fresh=False)
+    assert robot.reasons[-1] is Reason.TOO_FEW_RANGES
+    robot.run_until_fast()
+    assert robot.reasons[-1] is Reason.TRACKING
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize('lost', range(8))
+def test_with_one_sensor_lost_the_robot_drives_slowly(lost):
+    robot = KeptOut()
+    begin = robot.run_until_fast()
+    robot.run(2.0, sensors=[each for each in range(8) if each != lost])
+    assert max(robot.speeds[begin + 60 :]) < CAUTIOUS_SPEED + 0.01
+    assert RANGE_SENSORS[lost] in ' '.join(robot.controller.problems())
+    assert Reason.TOO_FEW_RANGES not in robot.reasons[begin:]
+
+
+def test_rejected_readings_change_no_command():
+    """A replay has only those that were used: its commands must be those of the run."""
+    one, other = KeptOut(), KeptOut()
+    for robot, extra in ((one, True), (other, False)):
+        for _ in range(30):
+            robot.run(0.1)
+            if extra:
+                now = robot.k * PERIOD_NS
+                for stamp in (now - 600_000_000, now - 100_000_000, now):
+                    robot.controller.add_range(0, math.nan, stamp)
+                assert not robot.controller.add_range(1, 5.0)
+    assert one.speeds == other.speeds
+    assert one.pose == other.pose
+
+
+def test_without_keep_out_ranges_change_nothing():
+    controller = Controller(StepperControllerParameters())
+    controller.step(State(PERIOD_NS, ORIGIN, STANDSTILL))
+    assert not controller.add_range(0, 0.3)
+    assert controller.problems() == []
+    assert Activity.WAITING.stuck is False
