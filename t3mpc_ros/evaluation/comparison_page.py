@@ -40,7 +40,7 @@ from t3mpc_ros.evaluation.metrics import (
     YAW_RATE_SETTLED,
     Metric,
 )
-from t3mpc_ros.evaluation.plotting import new_figure, png_of
+from t3mpc_ros.evaluation.plotting import new_figure, rendered, scale_by_size
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
     Block,
@@ -296,8 +296,8 @@ def page(plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | Non
     for case in plan.cases:
         blocks.append(Heading(case))
         for caption, draw in figures.items():
-            if picture := png_of(partial(draw, plan, results), case):
-                blocks.append(Picture(f'{caption}: {case}', picture, caption))
+            if figure := rendered(partial(draw, plan, results), case):
+                blocks.append(Picture(f'{caption}: {case}', figure.svg, caption))
             if draw is _draw_differences and case == plan.cases[0]:
                 summary = summary_table(plan, results, step_times)
                 blocks += [Contents(), Paragraph(description(plan)), summary]
@@ -389,7 +389,12 @@ def _draw_differences(plan: ComparisonPlan, results: ResultTable, case: str) -> 
         axis.errorbar(found.mean, place, xerr=half, fmt='o', color=colour, markersize=4)
     axis.axvline(0.0, color='#1f2937', linewidth=0.8)
     axis.set_yticks(places, [name for name, _ in rows])
-    axis.set_xscale('symlog', linthresh=0.01)
+    ends = [
+        found.mean + sign * (found.half if math.isfinite(found.half) else 0.0)
+        for _, found in rows
+        for sign in (-1.0, 1.0)
+    ]
+    scale_by_size(axis, 'x', ends, near=0.01)
     axis.set_xlabel(f'{metric.heading} / ({metric.unit})')
     return figure
 
@@ -424,8 +429,8 @@ def draw_pareto(plan: ComparisonPlan, results: ResultTable, case: str) -> Any:
     for i, (method, point) in enumerate(zip(chosen, points, strict=True)):
         axis.plot(*point, 'o', color='#15803d' if i in best else '#6b7280', markersize=4)
         axis.annotate(method, point, xytext=(3, 3), textcoords='offset points', fontsize=6)
-    axis.set_xscale('log')
-    axis.set_yscale('log')
+    for name, values in zip('xy', zip(*points, strict=True), strict=True):
+        scale_by_size(axis, name, values)
     axis.set_xlabel(f'{VARIATION.heading} / ({VARIATION.unit})')
     axis.set_ylabel(f'{metric.heading} / ({metric.unit})')
     return figure
@@ -449,6 +454,6 @@ def draw_seeds(plan: ComparisonPlan, results: ResultTable, case: str) -> Any:
         axis.plot(values, np.full(len(values), place), '|', color='#0284c7', markersize=8)
         axis.plot(mean(values), place, 'o', color='#1f2937', markersize=4)
     axis.set_yticks(places, list(rows))
-    axis.set_xscale('log')
+    scale_by_size(axis, 'x', [each for values in rows.values() for each in values])
     axis.set_xlabel(f'{metric.heading} / ({metric.unit})')
     return figure

@@ -22,7 +22,13 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.evaluation.fault_study import ALLOWED, BEGIN, DURATION, ODOMETRY_WRONG
-from t3mpc_ros.evaluation.plotting import COLOURS, legend_above, new_figure, png_of
+from t3mpc_ros.evaluation.plotting import (
+    COLOURS,
+    legend_above,
+    new_figure,
+    rendered,
+    scale_by_size,
+)
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
     Block,
@@ -179,8 +185,8 @@ def page(rows: Sequence[Row]) -> str:
             f'during one is {worst["during"]:.2f} rad/s, of {worst["name"]}.'
         )
         blocks.append(Heading(title))
-        if picture := png_of(_draw_errors, chosen):
-            blocks.append(Picture(seen, picture, seen))
+        if figure := rendered(_draw_errors, chosen):
+            blocks.append(Picture(seen, figure.svg, seen))
         if number == 0:
             blocks.append(Contents())
         cells = [[cell.replace('`', '').replace('**', '') for cell in table_row(row)]
@@ -218,7 +224,8 @@ def _draw_errors(rows: Sequence[Row]) -> Any:
                  if row[name] is not None]  # fmt: skip
         if known:
             axis.plot(*zip(*known, strict=True), 'o', color=colour, markersize=4, label=name)
-    axis.set_xscale('log')
+    scale_by_size(axis, 'x', [row[name] for row in rows for name in _COLOURS if row[name]])
+    axis.margins(y=0.5 / len(rows))
     axis.set_yticks(places, [row['name'] for row in rows])
     axis.set_xlabel('error of the wheels / (rad/s)')
     legend_above(figure, axis)

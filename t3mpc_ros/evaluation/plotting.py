@@ -13,7 +13,7 @@
 # limitations under the License.
 """Style and layout of all figures."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 import io
 import math
 from pathlib import Path
@@ -24,7 +24,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
@@ -72,9 +72,17 @@ STYLE = {
 }
 
 
-def png_of(draw: Callable[[Subject], Any], subject: Subject) -> bytes | None:
-    """Return the PNG of what ``draw`` returns for ``subject``; None when it returns None."""
-    with matplotlib.rc_context(STYLE):
+class Rendered(NamedTuple):
+    """A figure as files: a bitmap for a folder, and lines for a page."""
+
+    png: bytes
+    svg: bytes
+
+
+def rendered(draw: Callable[[Subject], Any], subject: Subject) -> Rendered | None:
+    """Return what ``draw`` returns for ``subject`` as files; None when it returns None."""
+    # Equal figures are equal files: no random names of parts, no date.
+    with matplotlib.rc_context({**STYLE, 'svg.hashsalt': 't3mpc_ros'}):
         figure = draw(subject)
         if figure is None:
             return None
@@ -82,9 +90,10 @@ def png_of(draw: Callable[[Subject], Any], subject: Subject) -> bytes | None:
         # savefig would draw the whole figure once more for its layout.
         figure.get_layout_engine().execute(figure)
         figure.set_layout_engine('none')
-        buffer = io.BytesIO()
-        figure.canvas.print_png(buffer)
-        return buffer.getvalue()
+        png, svg = io.BytesIO(), io.BytesIO()
+        figure.canvas.print_png(png)
+        figure.savefig(svg, format='svg', metadata={'Date': None})
+        return Rendered(png.getvalue(), svg.getvalue())
 
 
 class TitledDrawing(NamedTuple, Generic[Subject]):
@@ -97,14 +106,14 @@ class TitledDrawing(NamedTuple, Generic[Subject]):
 
 def write_pictures(
     drawings: Mapping[str, Callable[[Subject], Any]], subject: Subject, folder: Path
-) -> dict[str, bytes]:
+) -> dict[str, Rendered]:
     """Write the figures with something to draw as PNG files, and return them by their stems."""
     folder.mkdir(parents=True, exist_ok=True)
     found = {}
     for stem, draw in drawings.items():
-        if (png := png_of(draw, subject)) is not None:
-            found[stem] = png
-            (folder / f'{stem}.png').write_bytes(png)
+        if (figure := rendered(draw, subject)) is not None:
+            found[stem] = figure
+            (folder / f'{stem}.png').write_bytes(figure.png)
     return found
 
 
@@ -166,6 +175,24 @@ def name_time(axes: list[Any]) -> None:
         axis.margins(x=0.01)
         axis.xaxis.set_major_locator(MaxNLocator(steps=(1, 2, 5, 10)))
     axes[-1].set_xlabel('time / s')
+
+
+def scale_by_size(panel: Any, name: str, values: Sequence[float], near: float = 0.0) -> None:
+    """Make axis ``name`` (x or y) logarithmic, if its values differ much, with plain numbers.
+
+    With ``near`` values of both signs are shown, and those below it on a linear part.
+    """
+    axis = {'x': panel.xaxis, 'y': panel.yaxis}[name]
+    sizes = [max(abs(value), near) for value in values if value or near]
+    if not sizes or max(sizes) <= 3.0 * min(sizes):
+        axis.set_major_locator(MaxNLocator(5))
+        return
+    scale = {'value': 'symlog', 'linthresh': near} if near else {'value': 'log'}
+    {'x': panel.set_xscale, 'y': panel.set_yscale}[name](**scale)
+    axis.set_major_formatter(lambda value, _: f'{value:.3g}')
+    if not near:
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+        axis.set_minor_formatter(NullFormatter())
 
 
 def add_legend(axis: Any) -> None:

@@ -194,17 +194,17 @@ class Items:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A PNG file, contained in the page."""
+    """An SVG file, contained in the page: sharp at every size, and on paper."""
 
     show: ClassVar[str] = 'picture'
     title: str
-    png: bytes
+    svg: bytes
     caption: str = ''
 
     @property
     def base64(self) -> str:
         """The file in the alphabet of a data URL."""
-        return base64.b64encode(self.png).decode()
+        return base64.b64encode(self.svg).decode()
 
 
 @dataclass(frozen=True, slots=True)

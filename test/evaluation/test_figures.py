@@ -404,7 +404,7 @@ def caught(monkeypatch):
             figures.append(figure)
 
     for module in (comparison_page, fault_page, plotting):
-        monkeypatch.setattr(module, 'png_of', instead)
+        monkeypatch.setattr(module, 'rendered', instead)
     return figures
 
 
@@ -705,7 +705,7 @@ def test_divergences_are_marked_at_their_time_and_field(caught, tmp_path):
 def test_solutions_of_the_chaotic_system_are_drawn_by_state():
     time = np.linspace(0.0, 1.0, 50)
     states = np.column_stack([np.sin(time), 2.0 + time, time**2])
-    solution = ChaosSolution(time, states, SimpleNamespace(size=3))
+    solution = ChaosSolution(time, states, SimpleNamespace(size=3), 0.001)
     axes = solution.plot().axes
     for k, axis in enumerate(axes):
         assert title(axis) == f'y{k + 1}'
@@ -714,3 +714,40 @@ def test_solutions_of_the_chaotic_system_are_drawn_by_state():
     (axis,) = solution.plot(plane=True).axes
     assert axis.lines[0].get_xydata() == pytest.approx(states[:, :2])
     assert texts(axis)[1:] == ('y1', 'y2')
+
+
+def test_a_figure_of_a_page_is_made_of_lines_and_repeatable():
+    def draw(values):
+        figure = plotting.new_figure(2.0)
+        figure.subplots().plot(values)
+        return figure
+
+    first, again = (plotting.rendered(draw, [1.0, 3.0, 2.0]) for _ in range(2))
+    assert first == again
+    assert first.png.startswith(b'\x89PNG')
+    assert b'<path' in first.svg
+    assert b'<image' not in first.svg
+
+
+@pytest.mark.parametrize(
+    ('values', 'near', 'scale'),
+    [
+        ([0.0090, 0.0095], 0.0, 'linear'),
+        ([0.0, 0.0], 0.0, 'linear'),
+        ([0.003, 2.2], 0.0, 'log'),
+        ([-0.005, 0.0057], 0.01, 'linear'),
+        ([-0.3, 0.02], 0.01, 'symlog'),
+    ],
+)
+def test_the_ticks_of_an_axis_are_plain_numbers(values, near, scale):
+    """Differences within 0.01 rad/s had ticks like -5.07817 x 10^-3."""
+    figure = plotting.new_figure(2.0)
+    panel = figure.subplots()
+    panel.plot(values, values, 'o')
+    plotting.scale_by_size(panel, 'x', values, near)
+    assert panel.get_xscale() == scale
+    figure.canvas.draw()
+    shown = [text.get_text() for text in panel.get_xticklabels() if text.get_text()]
+    assert len(shown) >= 2
+    for text in shown:
+        assert re.fullmatch(r'[-\u2212]?[0-9.e-]{1,7}', text), text

@@ -19,11 +19,11 @@ from t3mpc_ros.evaluation import plotting
 
 
 def draw_only(draw, subject):
-    """Return an empty PNG file in place of the figure, None where there is nothing to draw."""
-    return None if draw(subject) is None else b'\x89PNG'
+    """Return empty files in place of the figure, None where there is nothing to draw."""
+    return None if draw(subject) is None else plotting.Rendered(b'\x89PNG', b'<svg/>')
 
 
 @pytest.fixture
 def unrendered(monkeypatch):
     """Draw figures without rendering them."""
-    monkeypatch.setattr(plotting, 'png_of', draw_only)
+    monkeypatch.setattr(plotting, 'rendered', draw_only)

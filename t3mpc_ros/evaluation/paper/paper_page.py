@@ -22,6 +22,7 @@ from t3mpc_ros.evaluation.paper.claims import Claim
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.results import Results
 from t3mpc_ros.evaluation.paper.study import WITHOUT
+from t3mpc_ros.evaluation.plotting import Rendered
 from t3mpc_ros.evaluation.reporting import (
     Block,
     Contents,
@@ -241,7 +242,7 @@ _KINDS = {
 }
 
 
-def page(title: str, origin: str, material: ExhibitData, pictures: Mapping[str, bytes]) -> str:
+def page(title: str, origin: str, material: ExhibitData, pictures: Mapping[str, Rendered]) -> str:
     """Return the page as HTML that loads nothing from anywhere.
 
     ``origin`` says where the numbers come from; pictures (PNG) are by the stem of their exhibit.
@@ -277,7 +278,7 @@ def _claims(title: str, claims: Sequence[Claim], origin: str) -> Details:
     return Details(f'{title}: {counted(chosen)}', [table], opened=True)
 
 
-def _exhibit(exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, bytes]) -> Group:
+def _exhibit(exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, Rendered]) -> Group:
     claims = exhibit.decided_by(material.claims)
     found: list[Sequence[str | Mark]] = [
         (f'{claim.text}: {claim.found}', _mark(claim.verdict)) for claim in claims
@@ -292,8 +293,8 @@ def _exhibit(exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, byt
         Heading(exhibit.title, _mark(exhibit.mark(material.claims))),
         Group(sides, 'div', 'sides'),
     ]
-    if png := pictures.get(exhibit.stem):
-        blocks.append(Picture(exhibit.title, png, exhibit.caption))
+    if figure := pictures.get(exhibit.stem):
+        blocks.append(Picture(exhibit.title, figure.svg, exhibit.caption))
     elif exhibit.stem:
         blocks.append(Paragraph('Left out: nothing of it was measured.', 'quiet'))
     shown = material.tables.get(exhibit.tables, ())

@@ -302,9 +302,9 @@ def _format_values(values: Sequence[object]) -> str:
 
 def write_divergence_figure(outcome: Comparison, path: Path) -> None:
     """Write a PNG of the first divergence of the replay from the recording."""
-    content = plotting.png_of(_draw, outcome)
-    if content is not None:
-        path.write_bytes(content)
+    figure = plotting.rendered(_draw, outcome)
+    if figure is not None:
+        path.write_bytes(figure.png)
 
 
 def _draw(outcome: Comparison) -> Any:
