@@ -640,7 +640,9 @@ class Controller:
         pose = advance_pose(odometry.pose, twist_from_wheels(command, geometry), horizon)
         now, later = WheelSpeeds(*begin.tolist()), WheelSpeeds(*end.tolist())
         planned = twist_from_wheels(now, geometry)
-        twist, keep_out = self.pose_controller.step(reference, pose, planned), self.keep_out
+        keep_out = self.keep_out
+        learn = not self.disturbed and not (keep_out is not None and keep_out.changed)
+        twist = self.pose_controller.step(reference, pose, planned, elapsed, learn=learn)
         if keep_out is not None:
             if self.pose_controller.rejoining:
                 velocity = keep_out.guide(self.pose_controller.closing_velocity(planned), pose)

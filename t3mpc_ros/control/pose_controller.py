@@ -27,6 +27,15 @@ whose :math:`\sin\theta_e` in place of the last term has a second equilibrium at
 With :math:`V = \frac12 (x_e^2 + y_e^2 + \theta_e^2/k_y)` it gives
 :math:`\dot V = -k_x x_e^2 - (k_\theta/k_y)\,\theta_e^2 \le 0` for any reference twist.
 
+Wheels that differ by a share :math:`\delta` bend the path by :math:`d = \delta/(2b)`, which E22
+alone answers with an offset :math:`d/k_y`. An integral over the distance removes it,
+
+.. math:: \omega \mathrel{+}= v_r z, \qquad \dot z = k_i\,|v_r|\,y_e,
+
+which over the distance gives :math:`\lambda^3 + (k_\theta/|v_r|)\lambda^2 + k_y\lambda + k_i`:
+stable if and only if :math:`k_i |v_r| < k_y k_\theta` (Routh and Hurwitz). :math:`z` is
+bounded, and rests far from the reference: there it is a bounded disturbance of E22.
+
 Far from its reference, after a detour, the robot drives to it (*rejoining*): it turns towards the
 velocity that closes the gap, and drives on as far as it faces it.
 """
@@ -38,6 +47,11 @@ from typing import NamedTuple
 
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, wrap_angle
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
+
+CURVATURE_LIMIT = 0.3
+"""Largest curvature of the integral, 1/m: wheels that differ by 4 % at a separation of 0.15 m."""
+LEARNT_ERROR = 0.02
+"""Error across beyond which the integral rests, m: more is an obstacle, a slip or a new path."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +77,14 @@ class PoseLoopParameters(Parameters):
     gain_yaw: float = parameter(
         4.0, 'k_theta: yaw rate per error of yaw', '1/s', (0.0, 50.0), dynamic=True
     )
+    gain_integral: float = parameter(
+        150.0,
+        'k_i: curvature per error across and distance, for wheels that differ; the offset falls '
+        'to a third over k_y/k_i m. Less than k_y k_theta / rejoin_speed. 0: an offset stays',
+        '1/m³',
+        (0.0, 1e4),
+        dynamic=True,
+    )
     rejoin_distance: float = parameter(
         0.15,
         'distance from the reference at which the robot leaves it, and drives to where it is',
@@ -83,11 +105,17 @@ class PoseLoopParameters(Parameters):
     )
 
     def check_consistency(self) -> None:
-        """Raise :class:`ParameterError` if following begins where it ends."""
+        """Raise :class:`ParameterError` for an unstable loop, or bounds that contradict."""
         if self.rejoined_distance >= self.rejoin_distance:
             raise ParameterError(
                 f'rejoined_distance must be less than rejoin_distance, {self.rejoin_distance:g} '
                 f'm: got {self.rejoined_distance:g}'
+            )
+        highest = self.gain_across * self.gain_yaw / self.rejoin_speed
+        if self.gain_integral and self.gain_integral >= highest:
+            raise ParameterError(
+                'gain_integral must be less than gain_across * gain_yaw / rejoin_speed, '
+                f'{highest:g} 1/m³: got {self.gain_integral:g}'
             )
 
 
@@ -184,13 +212,25 @@ class PoseController:
         """Whether the robot is on its way to the reference."""
         self.error = PoseError(*ORIGIN)
         """Error of the last step."""
+        self.curvature = 0.0
+        """Integral of the error across, 1/m."""
 
-    def step(self, reference: Pose, pose: Pose, twist: BodyTwist) -> BodyTwist:
+    def step(
+        self,
+        reference: Pose,
+        pose: Pose,
+        twist: BodyTwist,
+        elapsed: float = 0.0,
+        *,
+        learn: bool = True,
+    ) -> BodyTwist:
         """Return the twist to track.
 
         reference, twist : pose and twist of the reference at the instant at which the result takes
             effect
         pose : predicted pose of the robot at that instant
+        elapsed : time since the last step, s
+        learn : whether the robot did what it was to do, so that its error counts
         """
         parameters = self.parameters
         self.error = error = pose_error(reference, pose)
@@ -199,7 +239,12 @@ class PoseController:
         elif error.distance < parameters.rejoined_distance:
             self.rejoining = False
         if not self.rejoining:
-            return follow_pose(error, twist, parameters)
+            if learn and abs(error.across) < LEARNT_ERROR:
+                change = parameters.gain_integral * abs(twist.linear) * error.across * elapsed
+                limit = CURVATURE_LIMIT
+                self.curvature = min(max(self.curvature + change, -limit), limit)
+            linear, angular = follow_pose(error, twist, parameters)
+            return BodyTwist(linear, angular + self.curvature * twist.linear)
         return self.drive_along(self.closing_velocity(twist))
 
     def closing_velocity(self, twist: BodyTwist) -> tuple[float, float]:

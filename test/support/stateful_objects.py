@@ -194,7 +194,8 @@ def drive_pose_controller(controller, r):
     found = []
     for k in range(20):
         away = Pose(*(0.1 * pair(r, 1.0)).tolist(), 0.1) if k < 19 else Pose(1.0, 0.0, 0.0)
-        found += [controller.step(ORIGIN, away, BodyTwist(0.2, 0.1)), controller.rejoining]
+        twist = controller.step(ORIGIN, away, BodyTwist(0.2, 0.1), 0.01)
+        found += [twist, controller.rejoining]
         found.append(controller.error)
     return found
 
