@@ -37,6 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the emulator until a stop signal; return the exit code."""
     options = program_parser().parse_args(arguments)
     try:
+        if options.robot_link and options.robot_link.absolute() == options.link.absolute():
+            raise PtyPortError(f'--link and --robot-link must be two paths: got {options.link}')
         key = read_key(options.key) if options.key is not None else b''
         values: dict[str, object] = {'twin.world': options.world, 'twin.seed': options.seed}
         values |= parse_assignments(EmulatorParameters, options.set)
@@ -46,7 +48,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         emulator = Emulator(parameters, key, options.seed, erased=options.erased)
         for fault in faults:
             emulator.schedule_fault(fault)
-    except (FaultError, FirmwareLibraryError, KeyFileError, ParameterError, WorldError) as error:
+    except (
+        FaultError,
+        FirmwareLibraryError,
+        KeyFileError,
+        ParameterError,
+        PtyPortError,
+        WorldError,
+    ) as error:
         return _fail(error)
     with StopSignal() as stop:
         _print('starting')

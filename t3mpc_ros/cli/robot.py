@@ -242,7 +242,7 @@ def _jog(options: argparse.Namespace, stop: StopSignal) -> int:
         options.wheel,
         options.revolutions,
         options.speed,
-        lambda text: print(f't3mpc robot: {text}', file=sys.stderr),
+        lambda text: print(f't3mpc robot: waiting, because {text}', file=sys.stderr),
     )
     procedure.run_at_port(task, options.port, stop)
     if task.result is not None:

@@ -22,6 +22,7 @@ from contextlib import suppress
 import errno
 import glob
 import os
+import stat
 import termios
 from typing import NoReturn
 
@@ -127,4 +128,6 @@ def _describe_error(path: str, device: str, error: Exception) -> PortError:
         return PortError(
             f'{path} is busy: another program has it open; lsof {path} names it', False
         )
+    if not stat.S_ISCHR(os.stat(path).st_mode):
+        return PortError(f'{path} is no serial port: ls -l /dev/serial/by-id lists them', False)
     return PortError(f'{path} failed: {error}', False)

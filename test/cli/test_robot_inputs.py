@@ -94,6 +94,22 @@ def test_a_folder_in_place_of_a_file_is_answered_by_one_sentence(words, tmp_path
     assert 'Errno' not in shown
 
 
+@pytest.mark.parametrize('command', ['doctor', 'calibrate'])
+def test_one_port_for_both_boards_is_refused(command, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'link').symlink_to('port')
+    words = f'{command} --port port --robot-port link'.split()
+    code, shown = answer([*words, *['--no-questions'] * (command == 'doctor')], capsys)
+    assert code == 2
+    assert 'got port and link, one device' in shown
+
+
+def test_a_calibration_needs_a_port(capsys):
+    code, shown = answer(['calibrate'], capsys)
+    assert code == 2
+    assert 'give --port of the dongle, --robot-port of the robot board, or both' in shown
+
+
 STRANGE = [
     '4 V',
     '',

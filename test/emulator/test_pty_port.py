@@ -284,6 +284,13 @@ def test_invalid_arguments_are_reported_before_the_start(arguments, text, tmp_pa
     assert not path.is_symlink()
 
 
+def test_one_path_for_both_boards_is_refused(tmp_path, monkeypatch, capsys):
+    """The second terminal took the place of the first, whose board nobody could reach."""
+    monkeypatch.chdir(tmp_path)
+    assert emulator.main(['--link', 'a', '--robot-link', str(tmp_path / 'a')]) == 2
+    assert 'must be two paths: got a' in capsys.readouterr().err
+
+
 def test_a_failed_robot_link_removes_the_other_link(tmp_path, capsys):
     needs('C compiler')
     thesis, path = tmp_path / 'thesis', tmp_path / 'dongle'

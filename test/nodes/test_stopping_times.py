@@ -22,7 +22,8 @@ pytestmark = [pytest.mark.ros, pytest.mark.timed, pytest.mark.slow]
 
 
 @pytest.mark.parametrize(
-    'kind', few_of(['suspend', 'publisher', 'uplink', 'downlink', 'unplug', 'kill'])
+    'kind',
+    few_of(['suspend', 'publisher', 'uplink', 'downlink', 'unplug', 'kill', 'cable', 'two']),
 )
 def test_the_robot_rests_in_time_whatever_fails(kind, processes, ros, tmp_path):
     """A bridge suspended for seconds executed an old command when it went on.

@@ -116,9 +116,10 @@ def test_a_missing_port_is_absent(tmp_path):
 
 
 def test_a_file_is_rejected_as_port(tmp_path):
+    """It said: Could not configure port: (25, 'Inappropriate ioctl for device')."""
     path = tmp_path / 'file'
     path.write_text('no port')
-    with pytest.raises(PortError, match='failed: ') as error:
+    with pytest.raises(PortError, match='file is no serial port: ls -l /dev/serial') as error:
         SerialPort(str(path))
     assert not error.value.absent
 

@@ -147,4 +147,4 @@ def host_suspended(seconds: float) -> str:
 
 def robot_absent(channel: int) -> str:
     """Return the text for a robot that does not answer on a radio channel."""
-    return f'the robot does not answer: is it on, in range, on channel {channel}?'
+    return f'the robot does not answer: is it on, in range, on channel {channel}, at this address?'

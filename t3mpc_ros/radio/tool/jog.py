@@ -76,7 +76,6 @@ def format_result(result: JogResult, wheel: str, revolutions: float) -> str:
     """Return the result as text, with the expected motion and remedies."""
     way, top = ('forward', 'front') if revolutions > 0 else ('backward', 'back')
     other = RIGHT if wheel == LEFT else LEFT
-    invert = f'robot.invert_{wheel}'
     return '\n'.join(
         (
             f'{wheel}: {result.counted} microsteps counted, target {result.target}; '
@@ -84,9 +83,9 @@ def format_result(result: JogResult, wheel: str, revolutions: float) -> str:
             f'Expected: {abs(revolutions):g} turns {way} of the {wheel} wheel (its top moves to '
             f'the {top}), standstill of the {other} wheel. Otherwise:',
             '  the other wheel turned: swap the cables of the two drivers',
-            f'  reverse direction: set link.{invert} of the bridge (--set {invert}=true here), or '
-            'swap the wires of one motor coil',
-            '  more or fewer turns: microsteps of driver and board (t3mpc robot parameters)',
+            f'  reverse direction: t3mpc robot setup --invert {wheel} (or both), over the USB of '
+            'the robot board, or swap the wires of one motor coil',
+            '  more or fewer turns: t3mpc robot setup --microsteps as the jumpers of the drivers',
             '  humming or lost steps: more motor current, or a lower --speed',
         )
     )

@@ -27,7 +27,7 @@ from t3mpc_ros.radio.tool.procedure import Script
 SETTINGS_TEXTS = (
     'settings stored in both copies',
     'settings stored, one of their two copies is damaged: t3mpc robot setup writes both',
-    'no settings: the robot does not move until t3mpc robot setup',
+    'no settings: the robot does not move until t3mpc robot setup --microsteps N stores them',
     'settings damaged: the robot does not move until t3mpc robot setup',
     'settings of an older firmware: the robot does not move until t3mpc robot setup',
     'calibration damaged: the robot does not move until it is written again',
