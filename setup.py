@@ -43,6 +43,7 @@ NODES = (
     'radio_bridge',
     'recorder',
     'player',
+    'localizer',
     'composed',
 )
 EXECUTABLES = (*NODES, 't3mpc')

@@ -34,6 +34,9 @@ def nodes(launched):
     known = {'keep_out.world': known} if known else {}
     # With a given place, the pose of both nodes is that of the simulator.
     place = [('odom', 'ground_truth/odom')] if launched.flag('localised') else []
+    # The pose on the map takes the place of odom, for recorder, replay and report, too.
+    localized = launched.flag('localizer')
+    raw = [('odom', 'odom/raw')] if localized else []
     path = {'pose.enabled': True, 'keep_out.enabled': True}
     if launched.flag('robot'):
         path |= CALIBRATED_GYRO
@@ -50,7 +53,12 @@ def nodes(launched):
             'publish_clock': launched.flag('use_sim_time'),
         }
         given = {**launched.given('world'), **seed}
-        made.insert(0, launched.node('sim_robot', given, defaults=robot))
+        made.insert(0, launched.node('sim_robot', given, defaults=robot, remappings=raw))
+    if localized:
+        world = launched.text('known_world') or launched.text('world')
+        start = {'world': world or 'room', 'set_initial_pose': True}
+        filtered = ('odometry/filtered', 'odom')
+        made.append(launched.node('localizer', defaults=start, remappings=[*raw, filtered]))
     return [*made, launched.node('recorder')] if launched.flag('record') else made
 
 
@@ -72,6 +80,11 @@ def generate_launch_description():
             'else a secret one from the operating system',
         ),
         flag('localised', 'use the true pose of the simulator in place of the odometry'),
+        flag(
+            'localizer',
+            'find the place on known_world, else on world, by the range sensors; the pose on the '
+            'map is odom, the odometry of the robot odom/raw',
+        ),
         flag('robot', 'start the simulated robot', 'true'),
         USE_SIM_TIME,
         RECORD,

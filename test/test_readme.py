@@ -69,6 +69,7 @@ SHORTENED = {
     'scripts/demo --robot emulator --loss 0.1': '--duration 5 --headless --output OUTPUT/emulator',
     'scripts/run controller --ros-args -p law.gain:=90.0': 'Ctrl-C',
     'scripts/run reference_generator --ros-args -p seed:=7': 'Ctrl-C',
+    'scripts/run localizer --ros-args -p world:=room -p set_initial_pose:=true': 'Ctrl-C',
     'scripts/run composed': '--ros-args -p storage.uri:=OUTPUT/bag Ctrl-C',
     'scripts/demo --view': '--duration 8 --headless --output OUTPUT/view',
     'scripts/run t3mpc view': '--headless --port 0 Ctrl-C',

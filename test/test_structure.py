@@ -54,10 +54,12 @@ PACKAGES = {
     'control': BASE | {'fuzzy', 'mpc'},
     'simulation': BASE | {'robot', 'script_error'},
     'radio': BASE | {'robot'},
+    'localization': BASE | {'simulation'},
     'emulator': BASE | {'robot', 'simulation', 'radio'},
     'evaluation': CORE
-    | {'page', 'atomic_file', 'stop_signal', 'parent_process', 'missing_library', 'script_error'},
-    'nodes': CORE | {'radio', 'stop_signal', 'missing_library'},
+    | {'localization', 'page', 'atomic_file', 'stop_signal', 'parent_process', 'missing_library'}
+    | {'script_error'},
+    'nodes': CORE | {'radio', 'localization', 'stop_signal', 'missing_library'},
     'cli': CORE
     | {'radio', 'stop_signal', 'parent_process', 'missing_library'}
     | {'emulator', 'evaluation', 'nodes', 'view'},
@@ -85,6 +87,7 @@ SHARED_BASENAMES = {
     'controller': 'the controller, and the node that runs it',
     'emulator': 'the emulator, and the command that starts it',
     'fault_injection': 'faults injected into the twin, and into the emulated board',
+    'localizer': 'the localizer, and the node that runs it',
     'metrics': 'the metrics of a simulated run, and those of a bag',
     'metadata': 'the metadata of a bag, and their collection in the recorder',
     'node': 'the node of a folder in nodes/',

@@ -60,6 +60,11 @@ def player() -> None:
     _main('player')
 
 
+def localizer() -> None:
+    """Run the localizer."""
+    _main('localizer')
+
+
 def composed() -> None:
     """Run several nodes in this process."""
     _main('composed')

@@ -105,6 +105,20 @@ INTERFACES = {
             '~/set_rate',
         ),
     ),
+    'localizer': NodeInterface(
+        'localizer:LocalizerNode',
+        'Finds the pose on a map by odometry and ranges, or a scan (particle filter).',
+        subscribes=('odom', 'range/*', 'map', 'initialpose'),
+        publishes=(
+            'odometry/filtered',
+            'pose',
+            'map_to_odom',
+            'particlecloud',
+            '/tf',
+            '/diagnostics',
+        ),
+        services=('reinitialize_global_localization',),
+    ),
     'composed': NodeInterface(
         'composed:ComposedNode',
         'Runs the nodes that its parameter nodes lists in one process.',

@@ -160,6 +160,7 @@ def test_an_unknown_parameter_is_rejected_with_a_suggestion(harness):
 
 CHANGED = {
     'controller': ('terms_rate', 12.5),
+    'localizer': ('max_particles', 2000),
     'recorder': ('storage.chunk_size', 4096),
     'player': ('play.rate', 2.5),
     'radio_bridge': ('port', '/dev/other'),

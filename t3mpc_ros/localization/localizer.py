@@ -1,0 +1,347 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Localizer: the pose on the map, and the frame of the odometry, from odometry and ranges.
+
+The filter is updated when the robot has moved, as in nav2_amcl: readings of a robot at rest
+repeat their errors. Each reading counts once, along the beam on which it was taken: in the frame
+of the odometry at that instant.
+"""
+
+from dataclasses import dataclass
+import enum
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from t3mpc_ros.geometry.kinematics import frame_between
+from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, Array, Pose, has_moved, wrap_angle
+from t3mpc_ros.localization.occupancy_map import LocalizationMap, map_of_grid
+from t3mpc_ros.localization.particle_filter import (
+    KNOWN_SHARE,
+    ParticleFilter,
+    ParticleFilterParameters,
+)
+from t3mpc_ros.localization.range_model import (
+    NAMES,
+    Beams,
+    RangeModel,
+    RangeModelParameters,
+    explained_readings,
+    no_beams,
+)
+from t3mpc_ros.parameters.table import Parameters, group, parameter
+
+SCAN = -1
+"""Number of a scan among the sensors."""
+LARGEST_STEP = 1.0
+"""Distance between two messages of the odometry from which on it has restarted, m."""
+SYSTEMATIC = 0.01, 0.01, 0.007
+"""Standard deviations (m, m, rad) of what particles do not know, because it repeats: offsets of
+the sensors and the age of their readings; the errors measured on the twin."""
+CORRECTION_TIME = 0.5
+"""Time constant with which the used pose approaches that of the localizer, s."""
+CORRECTION_SPEED, CORRECTION_RATE = 0.05, 0.2
+"""Largest speed of that (m/s, rad/s)."""
+JUMP_DISTANCE, JUMP_ANGLE = 0.25, 0.5
+"""Distance (m) and angle (rad) from which on the pose is taken at once."""
+AGREEMENT_DECAY = 0.05
+"""Decay of the share of readings that fit, per telling reading."""
+
+
+@dataclass(frozen=True)
+class StartPoseParameters(Parameters):
+    """Pose at the start, with its variances."""
+
+    x: float = parameter(0.0, 'x at the start', 'm', (-1e4, 1e4), source=NAMES)
+    y: float = parameter(0.0, 'y at the start', 'm', (-1e4, 1e4), source=NAMES)
+    yaw: float = parameter(0.0, 'yaw at the start', 'rad', (-7.0, 7.0), source=NAMES)
+    covariance_x: float = parameter(
+        0.0025, 'variance of x at the start', 'm²', (0.0, 1e4), source='beluga_amcl'
+    )
+    covariance_y: float = parameter(
+        0.0025, 'variance of y at the start', 'm²', (0.0, 1e4), source='beluga_amcl'
+    )
+    covariance_yaw: float = parameter(
+        0.0025, 'variance of the yaw at the start', 'rad²', (0.0, 10.0), source='beluga_amcl'
+    )
+
+
+@dataclass(frozen=True)
+class LocalizerParameters(ParticleFilterParameters):
+    """When the filter is updated, where it begins, and when the robot is lost."""
+
+    update_min_d: float = parameter(
+        0.05, 'travel after which the filter is updated', 'm', (1e-3, 10.0), source=NAMES
+    )
+    update_min_a: float = parameter(
+        0.1, 'turn after which the filter is updated', 'rad', (1e-3, 3.2), source=NAMES
+    )
+    set_initial_pose: bool = parameter(
+        False,
+        'begin at initial_pose; false: anywhere on the map, until initialpose is received',
+        source=NAMES,
+    )
+    initial_pose: StartPoseParameters = group(StartPoseParameters)
+    robot_radius: float = parameter(
+        0.1,
+        'smallest distance of the centre from an obstacle',
+        'm',
+        (0.0, 5.0),
+    )
+    localized_deviation: float = parameter(
+        0.15,
+        'standard deviation of x and y up to which the pose counts; that of the yaw in rad is '
+        'the same',
+        bounds=(1e-3, 10.0),
+    )
+    lost_agreement: float = parameter(
+        0.5, 'share of fitting readings below which the robot is lost', bounds=(0.0, 1.0)
+    )
+    ranges: RangeModelParameters = group(RangeModelParameters, inline=True)
+
+
+class Localization(enum.Enum):
+    """What is known of the place, in words for the diagnostics."""
+
+    NO_ODOMETRY = 'no odometry yet'
+    SEARCHING = 'searching: the particles are in several places'
+    LOCALIZED = 'the place is known'
+    LOST = 'lost: the readings do not fit to the map'
+
+
+class LocalizedPose(NamedTuple):
+    """Pose on the map at the stamp of the odometry."""
+
+    stamp_ns: int
+    pose: Pose
+    covariance: Array
+    """Of x, y (m), yaw (rad), shape (3, 3); of all particles unless the place is known."""
+    odometry_frame: Pose
+    """Origin of the odometry on the map."""
+
+
+class Localizer:
+    """Pose on a map from odometry and range readings; equal calls give equal poses.
+
+    mounts : x, y (m), direction (rad) of each range sensor in the frame of the robot, shape (s, 3)
+    limits : smallest and largest distance of these sensors, m
+    """
+
+    def __init__(
+        self,
+        parameters: LocalizerParameters,
+        known: LocalizationMap,
+        mounts: Array,
+        limits: tuple[float, float],
+    ) -> None:
+        self.parameters = parameters
+        self._mounts, self._limits = mounts, limits
+        self._model = RangeModel.of(parameters.ranges, parameters.robot_radius)
+        self._field = known.field
+        self.filter = ParticleFilter(
+            parameters, known.field, known.free_places(parameters.robot_radius), self._model
+        )
+        """The particles."""
+        self.result: LocalizedPose | None = None
+        """Pose of the last update; None before the first."""
+        self.agreement = 1.0
+        """Share of the telling readings that fit to the map, of the last 20 or so."""
+        self.share = 0.0
+        """Share of the weight in the heaviest cluster."""
+        self._stamp_ns = 0
+        self._odometry: Pose | None = None
+        """Of the last message."""
+        self._updated: Pose | None = None
+        """Odometry at the last update."""
+        self._pending: dict[int, Beams] = {}
+        """Beams since the last update by sensor, in the frame of the odometry."""
+        if parameters.set_initial_pose:
+            initial = parameters.initial_pose
+            variances = initial.covariance_x, initial.covariance_y, initial.covariance_yaw
+            self.set_pose(Pose(initial.x, initial.y, initial.yaw), np.diag(variances))
+
+    def set_pose(self, pose: Pose, covariance: Array) -> None:
+        """Begin at a pose with a covariance of x, y (m), yaw (rad), shape (3, 3)."""
+        self.filter.place(pose, covariance)
+        self._restart()
+
+    def scatter(self) -> None:
+        """Begin anywhere on the map."""
+        self.filter.scatter()
+        self._restart()
+
+    def _restart(self) -> None:
+        self.agreement, self.share = 1.0, 0.0
+        self._pending.clear()
+        self._updated = None  # the next odometry is an update without a motion
+
+    @property
+    def state(self) -> Localization:
+        """What is known of the place."""
+        if self.result is None:
+            return Localization.NO_ODOMETRY
+        if self.agreement < self.parameters.lost_agreement:
+            return Localization.LOST
+        largest = float(np.diag(self.result.covariance).max())
+        known = math.sqrt(largest) <= self.parameters.localized_deviation
+        return Localization.LOCALIZED if known else Localization.SEARCHING
+
+    def add_range(self, sensor: int, reading: float) -> None:
+        """Add a reading (m, REP 117) taken where the last odometry was; NaN changes nothing."""
+        if reading != reading:
+            return
+        mount = self._mounts[sensor : sensor + 1]
+        self._add(sensor, Beams(mount, np.array([reading]), np.array([self._limits])))
+
+    def add_scan(self, beams: Beams) -> None:
+        """Add a scan taken where the last odometry was; it replaces one that was not used yet."""
+        self._add(SCAN, beams)
+
+    def _add(self, sensor: int, beams: Beams) -> None:
+        if self._odometry is not None:
+            origin = transformed(self._odometry, beams.origin)
+            self._pending[sensor] = beams._replace(origin=origin)
+
+    def add_odometry(self, stamp_ns: int, pose: Pose) -> bool:
+        """Add a pose of the odometry; return whether there is a new :attr:`result`.
+
+        A pose that is not finite is ignored. After a restart of the odometry, seen by a stamp or
+        a pose that jumps, the robot is where it was.
+        """
+        if not all(map(math.isfinite, pose)):
+            return False
+        last, last_ns = self._odometry, self._stamp_ns
+        self._odometry, self._stamp_ns = pose, stamp_ns
+        restarted = last is not None and (
+            stamp_ns < last_ns or has_moved(last, pose, LARGEST_STEP, math.inf)
+        )
+        if restarted:
+            self._pending.clear()
+            self._updated = pose
+            return False
+        if self._updated is None:
+            return self._publish(pose)
+        parameters = self.parameters
+        if not has_moved(self._updated, pose, parameters.update_min_d, parameters.update_min_a):
+            return False
+        self.filter.predict(self._updated, pose)
+        beams = self._beams(pose)
+        # Averages of the likelihood get used to a wrong place; the share that fits does not.
+        doubt = 1.0 - self.agreement / max(parameters.lost_agreement, 1e-9)
+        self.filter.correct(beams, max(doubt, 0.0))
+        found = self._publish(pose)
+        self._compare(beams)
+        return found
+
+    def _beams(self, pose: Pose) -> Beams:
+        """Return the beams since the last update in the frame of the robot."""
+        back = frame_between(ORIGIN, pose)
+        parts = [self._pending[sensor] for sensor in sorted(self._pending)]
+        self._pending.clear()
+        if not parts:
+            return no_beams()
+        origin, reading, limits = map(np.concatenate, zip(*parts, strict=True))
+        return Beams(transformed(back, origin), reading, limits)
+
+    def _publish(self, odometry: Pose) -> bool:
+        self._updated = odometry
+        estimate = self.filter.estimate()
+        self.share = estimate.share
+        covariance = estimate.covariance + np.diag(np.square(SYSTEMATIC))
+        if estimate.share < KNOWN_SHARE:
+            covariance = self.filter.spread(estimate.pose)
+        frame = frame_between(estimate.pose, odometry)
+        self.result = LocalizedPose(self._stamp_ns, estimate.pose, covariance, frame)
+        return True
+
+    def _compare(self, beams: Beams) -> None:
+        """Update the share of readings that fit to the map at the estimate."""
+        assert self.result is not None
+        pose = np.array(self.result.pose)
+        telling, fitting = explained_readings(pose, self._field, beams, self._model)
+        if telling:
+            decay = 1.0 - (1.0 - AGREEMENT_DECAY) ** telling
+            self.agreement += decay * (fitting / telling - self.agreement)
+
+
+class PoseCorrection:
+    """Pose on the map at every message of the odometry, without jumps a robot must not follow.
+
+    It approaches the localizer's as a first-order lag of bounded speed, and takes it at once where
+    they are far apart: after the robot was carried. Until the place is known there is none, and
+    while the robot is lost it goes on by the odometry.
+    """
+
+    def __init__(self) -> None:
+        self._frame: Pose | None = None
+        """Origin of the odometry on the map, as used."""
+        self._target: Pose | None = None
+        """As last known."""
+        self._stamp_ns = 0
+
+    def step(self, stamp_ns: int, odometry: Pose, localizer: Localizer) -> Pose | None:
+        """Return the pose on the map of a pose of the odometry; None: the place is not known."""
+        elapsed = min(max((stamp_ns - self._stamp_ns) / NANOSECONDS, 0.0), CORRECTION_TIME)
+        self._stamp_ns = stamp_ns
+        result = localizer.result
+        if result is not None and localizer.state is Localization.LOCALIZED:
+            self._target = result.odometry_frame
+        if self._target is None:
+            return None
+        wanted = pose_in(self._target, odometry)
+        if self._frame is None:
+            self._frame = self._target
+            return wanted
+        pose = pose_in(self._frame, odometry)
+        x, y, turn = wanted.x - pose.x, wanted.y - pose.y, wrap_angle(wanted.yaw - pose.yaw)
+        away = math.hypot(x, y)
+        if away > JUMP_DISTANCE or abs(turn) > JUMP_ANGLE:
+            self._frame = self._target
+            return wanted
+        share = elapsed / CORRECTION_TIME
+        move = min(share, CORRECTION_SPEED * elapsed / max(away, 1e-9))
+        rotate = min(share, CORRECTION_RATE * elapsed / max(abs(turn), 1e-9))
+        pose = Pose(pose.x + move * x, pose.y + move * y, wrap_angle(pose.yaw + rotate * turn))
+        self._frame = frame_between(pose, odometry)
+        return pose
+
+
+def pose_in(frame: Pose, pose: Pose) -> Pose:
+    """Return a pose of a frame outside of it."""
+    x, y, yaw = transformed(frame, np.array([pose]))[0].tolist()
+    return Pose(x, y, wrap_angle(yaw))
+
+
+def warm_up(parameters: LocalizerParameters) -> None:
+    """Compile every kernel of an update, on a small map."""
+    cells = np.zeros((8, 8), dtype=np.int8)
+    cells[0] = 100
+    small = map_of_grid(cells, max(0.1, parameters.robot_radius), (0.0, 0.0, 0.0))
+    made = Localizer(parameters, small, np.zeros((1, 3)), (0.1, 0.8))
+    made.scatter()
+    for k in range(3):
+        made.add_odometry(k, Pose(k * 2.0 * parameters.update_min_d, 0.0, 0.0))
+        made.add_range(0, 0.5)
+    made.filter.resample(0.5, Beams(np.zeros((1, 3)), np.full(1, 0.5), np.array([[0.1, 0.8]])))
+
+
+def transformed(frame: Pose, beams: Array) -> Array:
+    """Return beams (x, y in m, direction in rad), shape (n, 3), of a frame outside of it."""
+    cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
+    result = np.empty_like(beams)
+    result[:, 0] = frame.x + cosine * beams[:, 0] - sine * beams[:, 1]
+    result[:, 1] = frame.y + sine * beams[:, 0] + cosine * beams[:, 1]
+    result[:, 2] = frame.yaw + beams[:, 2]
+    return result

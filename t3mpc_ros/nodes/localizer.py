@@ -1,0 +1,358 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""``ros2 run t3mpc_ros localizer``: publishes the pose on a map, and map to odom."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import geometry_msgs.msg
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import OccupancyGrid, Odometry
+import numpy as np
+from sensor_msgs.msg import LaserScan, Range
+from std_srvs.srv import Empty
+
+from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, Pose, State
+from t3mpc_ros.localization.localizer import (
+    Localization,
+    Localizer,
+    LocalizerParameters,
+    PoseCorrection,
+    transformed,
+    warm_up,
+)
+from t3mpc_ros.localization.occupancy_map import (
+    LocalizationMap,
+    MapError,
+    load_grid,
+    map_of_grid,
+    map_of_world,
+)
+from t3mpc_ros.localization.range_model import NAMES, Beams
+from t3mpc_ros.nodes import conversions, qos
+from t3mpc_ros.nodes.base_node import NO_CLOCK, OK, WARN, BaseNode
+from t3mpc_ros.nodes.conversions import FrameParameters
+from t3mpc_ros.parameters.table import ParameterError, group, parameter
+from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.simulation.world import WorldError, load_world
+
+TRANSFORM_PERIOD = 0.1
+"""Time between two transforms of a robot at rest, s."""
+CLOUD_PERIOD = 0.5
+"""Time between two clouds of particles, s."""
+
+
+@dataclass(frozen=True)
+class LocalizerNodeParameters(LocalizerParameters):
+    """Parameters of the localizer node."""
+
+    world: str = parameter(
+        '', 'map: name of a bundled world, or path of a YAML file of one; empty: another source'
+    )
+    yaml_filename: str = parameter(
+        '',
+        'map: YAML file of map_server with its image as PGM; empty, as world: the topic map',
+        source='nav2_map_server',
+    )
+    scan_topic: str = parameter(
+        '', 'topic of a LaserScan in place of range/*; empty: the range sensors', source=NAMES
+    )
+    max_beams: int = parameter(
+        60, 'number of beams of a scan that are used', bounds=(1, 2000), source=NAMES
+    )
+    laser_min_range: float = parameter(
+        -1.0,
+        'smallest distance of the scan; -1: that of the message',
+        'm',
+        (-1.0, 1e3),
+        source=NAMES,
+    )
+    laser_max_range: float = parameter(
+        -1.0,
+        'largest distance of the scan; -1: that of the message',
+        'm',
+        (-1.0, 1e3),
+        source=NAMES,
+    )
+    laser_pose: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0),
+        'x (m), y (m) and yaw (rad) of the laser in the frame of the robot',
+        bounds=(-10.0, 10.0),
+    )
+    global_frame_id: str = parameter('map', 'frame of the map', source=NAMES)
+    odom_frame_id: str = parameter('odom', 'frame of the odometry', source=NAMES)
+    base_frame_id: str = parameter('base_link', 'frame of the robot', source=NAMES)
+    frames: FrameParameters = group(FrameParameters, inline=True)
+    tf_broadcast: bool = parameter(
+        True,
+        'publish the transform from global_frame_id to odom_frame_id, if tf2_ros is installed',
+        source=NAMES,
+    )
+    transform_tolerance: float = parameter(
+        1.0, 'how far in the future that transform is stamped', 's', (0.0, 10.0), source=NAMES
+    )
+    range_sensor: RangeSensorParameters = group(RangeSensorParameters)
+
+    def check_consistency(self) -> None:
+        """Raise :class:`ParameterError` for two maps, or an incomplete pose of the laser."""
+        super().check_consistency()
+        if self.world and self.yaml_filename:
+            raise ParameterError(f'yaml_filename must be empty with world {self.world}: got both')
+        if len(self.laser_pose) != 3:
+            raise ParameterError(
+                f'laser_pose must be x, y, yaw: got {len(self.laser_pose)} numbers'
+            )
+
+
+class LocalizerNode(BaseNode[LocalizerNodeParameters]):
+    """Publishes the pose on a map by odometry and ranges each time the robot has moved."""
+
+    parameter_class = LocalizerNodeParameters
+    configuration_errors = (MapError, WorldError)
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__('localizer', **options)
+        parameters, namespace = self.parameters, self.get_namespace()
+        warm_up(parameters)
+        self._mounts = sensor_mounts(parameters.range_sensor)
+        self._localizer: Localizer | None = None
+        self._map_problem = 'no map yet: set world or yaml_filename, or publish map'
+        self._rejected = 0
+        self._updates = 0
+        self._odometry_ns = 0
+        self._map_frame = parameters.frames.prefixed(parameters.global_frame_id, namespace)
+        self._odometry_frame = parameters.frames.prefixed(parameters.odom_frame_id, namespace)
+        self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
+        self._frame = self.create_publisher(TransformStamped, 'map_to_odom', qos.LATCHED)
+        self._filtered = self.create_publisher(Odometry, 'odometry/filtered', qos.STREAM)
+        base = parameters.frames.prefixed(parameters.base_frame_id, namespace)
+        self._serialized = conversions.SerializedOdometry(self._map_frame, base)
+        self._correction = PoseCorrection()
+        self._cloud = self.create_publisher(PoseArray, 'particlecloud', qos.SCALARS)
+        self._broadcaster = self._make_broadcaster() if parameters.tf_broadcast else None
+        self._scan: qos.MatchingSubscription | None = None
+        self._ranges: list[qos.MatchingSubscription] = []
+        if parameters.scan_topic:
+            self._scan = self.create_matching_subscription(
+                LaserScan, parameters.scan_topic, None, qos.SCALARS
+            )
+        else:
+            self._ranges = [
+                self.create_matching_subscription(Range, f'range/{name}', None, qos.SCALARS)
+                for name in RANGE_SENSORS
+            ]
+        if parameters.world:
+            self._use_map(map_of_world(load_world(parameters.world)))
+        elif parameters.yaml_filename:
+            self._use_map(load_grid(parameters.yaml_filename))
+        else:
+            self.create_matching_subscription(OccupancyGrid, 'map', self._on_map, qos.LATCHED)
+        self._odometry = self.create_matching_subscription(
+            Odometry, 'odom', self._on_odometry, qos.STREAM, raw=True
+        )
+        self.create_matching_subscription(
+            PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, qos.COMMAND
+        )
+        self.create_service(
+            Empty, 'reinitialize_global_localization', self._reinitialize_global_localization
+        )
+        self.create_steady_timer(TRANSFORM_PERIOD, self._publish_transform)
+        self.create_steady_timer(CLOUD_PERIOD, self._publish_cloud)
+
+    def _make_broadcaster(self) -> Any:
+        try:
+            import tf2_ros
+        except ImportError:
+            self.get_logger().info('tf2_ros is not installed: the transform is map_to_odom alone')
+            return None
+        return tf2_ros.TransformBroadcaster(self)
+
+    def _use_map(self, known: LocalizationMap) -> None:
+        """Begin on a map; MapError: the robot fits nowhere."""
+        limits = self.parameters.range_sensor.minimum, self.parameters.range_sensor.maximum
+        self._localizer = Localizer(self.parameters, known, self._mounts, limits)
+        self._map_problem = ''
+
+    def _on_map(self, message: OccupancyGrid, info: dict[str, Any]) -> None:
+        """Begin on another map: from the last pose, where it was known."""
+        before = self._localizer
+        place = message.info.origin
+        orientation = place.orientation
+        yaw = conversions.yaw_from_quaternion(
+            orientation.x, orientation.y, orientation.z, orientation.w
+        )
+        cells = np.array(message.data, dtype=np.int8)
+        try:
+            if cells.size != message.info.width * message.info.height:
+                raise MapError(
+                    f'map must have width x height cells, {message.info.width} x '
+                    f'{message.info.height}: got {cells.size}'
+                )
+            grid = cells.reshape(message.info.height, message.info.width)
+            origin = place.position.x, place.position.y, yaw
+            self._use_map(map_of_grid(grid, message.info.resolution, origin))
+        except MapError as error:
+            self._rejected += 1
+            self._map_problem = '' if before else f'map is rejected: {error}'
+            self.get_logger().warning(f'map is rejected: {error}')
+            return
+        assert self._localizer is not None
+        if before is not None and before.state is Localization.LOCALIZED:
+            assert before.result is not None
+            self._localizer.set_pose(before.result.pose, before.result.covariance)
+
+    def _on_odometry(self, message: bytes, info: dict[str, Any]) -> None:
+        for each in (message, *self._odometry.take_waiting()):
+            state = conversions.state_from_odometry(each)
+            if self._localizer is None:
+                self._take_readings()
+                continue
+            # Readings belong to the pose before this one, during which they arrived.
+            self._take_readings()
+            self._odometry_ns = state.stamp_ns
+            self._publish_filtered(state)  # first: a controller waits for it
+            if self._localizer.add_odometry(state.stamp_ns, state.pose):
+                self._updates += 1
+                self._publish_pose()
+                self._publish_transform()
+
+    def _publish_filtered(self, state: State) -> None:
+        """Publish the odometry with its pose on the map, by what was known before it."""
+        if self._localizer is None or not state.is_finite():
+            return
+        pose = self._correction.step(state.stamp_ns, state.pose, self._localizer)
+        if pose is not None:
+            self._filtered.publish(self._serialized.with_state(state._replace(pose=pose)))
+
+    def _take_readings(self) -> None:
+        localizer = self._localizer
+        for sensor, subscription in enumerate(self._ranges):
+            for message in subscription.take_waiting():
+                if localizer is not None:
+                    localizer.add_range(sensor, message.range)
+        if self._scan is not None:
+            for message in self._scan.take_waiting()[-1:]:
+                if localizer is not None:
+                    localizer.add_scan(self._beams(message))
+
+    def _beams(self, message: LaserScan) -> Beams:
+        """Return evenly spaced beams of a scan in the frame of the robot; NaN is left out."""
+        parameters = self.parameters
+        reading = np.array(message.ranges, dtype=np.float64)
+        chosen = np.unique(
+            np.linspace(0, max(reading.size - 1, 0), parameters.max_beams).astype(np.int64)
+        )
+        chosen = chosen[~np.isnan(reading[chosen])] if reading.size else chosen[:0]
+        least, most = parameters.laser_min_range, parameters.laser_max_range
+        least = message.range_min if least < 0.0 else least
+        most = message.range_max if most < 0.0 else most
+        rays = np.zeros((chosen.size, 3))
+        rays[:, 2] = message.angle_min + message.angle_increment * chosen
+        return Beams(
+            transformed(Pose(*parameters.laser_pose), rays),
+            reading[chosen],
+            np.tile([least, most], (chosen.size, 1)),
+        )
+
+    def _on_initial_pose(self, message: PoseWithCovarianceStamped, info: dict[str, Any]) -> None:
+        pose, problem = message.pose.pose, ''
+        yaw = conversions.yaw_from_quaternion(
+            pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w
+        )
+        place = Pose(pose.position.x, pose.position.y, yaw)
+        rows = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
+        covariance = rows[np.ix_((0, 1, 5), (0, 1, 5))]
+        frame = message.header.frame_id
+        if self._localizer is None:
+            problem = self._map_problem
+        elif frame not in ('', self._map_frame):
+            problem = f'its frame must be {self._map_frame}: got {frame}'
+        elif not (all(map(math.isfinite, place)) and np.isfinite(covariance).all()):
+            problem = 'it is not finite'
+        elif np.linalg.eigvalsh(0.5 * (covariance + covariance.T)).min() < -1e-9:
+            problem = 'its covariance is not positive semi-definite'
+        if self._localizer is None or problem:
+            self._rejected += 1
+            self.get_logger().warning(f'initialpose is ignored: {problem}')
+            return
+        self._localizer.set_pose(place, 0.5 * (covariance + covariance.T))
+
+    def _reinitialize_global_localization(
+        self, request: Empty.Request, response: Empty.Response
+    ) -> Empty.Response:
+        if self._localizer is not None:
+            self._localizer.scatter()
+        return response
+
+    def _publish_pose(self) -> None:
+        assert self._localizer is not None
+        result = self._localizer.result
+        assert result is not None
+        message = PoseWithCovarianceStamped(
+            header=conversions.header(result.stamp_ns, self._map_frame)
+        )
+        message.pose.pose.position.x = result.pose.x
+        message.pose.pose.position.y = result.pose.y
+        message.pose.pose.orientation = conversions.quaternion_from_yaw(result.pose.yaw)
+        message.pose.covariance = conversions.planar_covariance(
+            result.covariance.tolist(), conversions.MIN_VARIANCE
+        )
+        self._serialized.set_pose_covariance(message.pose.covariance)
+        self._pose.publish(message)
+
+    def _publish_transform(self) -> None:
+        if self._localizer is None or self._localizer.result is None:
+            return
+        message = conversions.transform(
+            self._odometry_ns + round(self.parameters.transform_tolerance * NANOSECONDS),
+            self._localizer.result.odometry_frame,
+            self._map_frame,
+            self._odometry_frame,
+        )
+        self._frame.publish(message)
+        if self._broadcaster is not None:
+            self._broadcaster.sendTransform(message)
+
+    def _publish_cloud(self) -> None:
+        if self._localizer is None or not self._cloud.get_subscription_count():
+            return
+        message = PoseArray(header=conversions.header(self._odometry_ns, self._map_frame))
+        for x, y, yaw in self._localizer.filter.poses.tolist():
+            pose = geometry_msgs.msg.Pose(orientation=conversions.quaternion_from_yaw(yaw))
+            pose.position.x, pose.position.y = x, y
+            message.poses.append(pose)
+        self._cloud.publish(message)
+
+    def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
+        """Return whether the place is known; a warning if the robot is lost, or inputs lack."""
+        values: dict[str, object] = {'updates': self._updates, 'rejected_inputs': self._rejected}
+        if not self.clock_started():
+            return WARN, NO_CLOCK, values
+        localizer = self._localizer
+        if localizer is None:
+            return WARN, self._map_problem, values
+        values |= {
+            'particles': len(localizer.filter.poses),
+            'share': localizer.share,
+            'agreement': localizer.agreement,
+        }
+        if localizer.result is not None:
+            x, y, yaw = np.sqrt(np.diag(localizer.result.covariance)).tolist()
+            values |= {'x_std_m': x, 'y_std_m': y, 'yaw_std_rad': yaw}
+        state = localizer.state
+        level = OK if state is Localization.LOCALIZED else WARN
+        return level, state.value, values

@@ -1,0 +1,333 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A robot in a room that the tests simulate: odometry with drift, eight ranges with noise."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.geometry.types import ORIGIN, Pose, wrap_angle
+from t3mpc_ros.localization.localizer import (
+    Localization,
+    Localizer,
+    LocalizerParameters,
+    PoseCorrection,
+)
+from t3mpc_ros.localization.occupancy_map import map_of_world
+from t3mpc_ros.localization.particle_filter import moved_pose, odometry_motion
+from t3mpc_ros.localization.range_model import Beams
+from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.simulation.world import cast_rays, parse_world
+
+MOUNTS = sensor_mounts(RangeSensorParameters())
+LEAST, MOST = 0.1, 0.8
+PERIOD = 0.05
+ROOM = parse_world(
+    """
+walls: [{points: [[-1.3, -1.0], [1.3, -1.0], [1.3, 1.0], [-1.3, 1.0]], closed: true}]
+boxes: [{center: [0.1, 0.05], size: [0.5, 0.3], yaw: 0.4}]
+circles: [{center: [1.15, 0.8], radius: 0.12}]
+""",
+    'cell',
+)
+SEEN = map_of_world(ROOM)
+EVERY = np.arange(len(MOUNTS))
+
+
+class Drive:
+    """A robot on an ellipse in the room, with an odometry that is too long and drifts in yaw."""
+
+    def __init__(self, seed=1, drift=0.004, noise=0.01, start=None):
+        self.generator = np.random.default_rng(seed)
+        self.phase = 0.0
+        self.truth = on_ellipse(0.0) if start is None else start
+        self.odometry = ORIGIN
+        self.drift, self.noise = drift, noise
+        self.stamp_ns = 0
+
+    def distances(self, mounts=MOUNTS):
+        out = np.empty(len(mounts))
+        which = np.arange(len(mounts))
+        cast_rays(*self.truth, mounts, which, ROOM.segments, ROOM.circles, out)
+        return out
+
+    def ranges(self):
+        """Return readings with noise, beyond the limits infinite (REP 117)."""
+        exact = self.distances()
+        found = exact + self.noise * self.generator.standard_normal(exact.size)
+        return np.where(found < LEAST, -math.inf, np.where(found > MOST, math.inf, found))
+
+    def step(self):
+        before = on_ellipse(self.phase)
+        self.phase += 0.2 * PERIOD / 0.75
+        turn, travel, second = odometry_motion(before, on_ellipse(self.phase))
+        self.truth = moved_pose(self.truth, (turn, travel, second))
+        counted = turn, 1.03 * travel, second + self.drift * PERIOD
+        self.odometry = moved_pose(self.odometry, counted)
+        self.stamp_ns += round(PERIOD * 1e9)
+
+    def carry(self, by):
+        """Put the robot elsewhere on the ellipse; the odometry does not notice."""
+        self.phase += by
+        self.truth = on_ellipse(self.phase)
+
+
+def on_ellipse(phase):
+    """Return the pose at a phase, counter-clockwise, clear of everything in the room."""
+    yaw = math.atan2(0.62 * math.cos(phase), -0.85 * math.sin(phase))
+    return Pose(0.85 * math.cos(phase), 0.62 * math.sin(phase), yaw)
+
+
+def make_localizer(**values):
+    start = on_ellipse(0.0)
+    given = {f'initial_pose.{name}': value for name, value in start._asdict().items()}
+    parameters = LocalizerParameters.from_dict({'set_initial_pose': True, **given, **values})
+    return Localizer(parameters, SEEN, MOUNTS, (LEAST, MOST))
+
+
+def follow(localizer, drive, seconds, loss=0.0):
+    """Drive; return distance (m) and angle (rad) of each result from the truth, shape (n, 2)."""
+    errors = []
+    for _ in range(round(seconds / PERIOD)):
+        drive.step()
+        for sensor, reading in enumerate(drive.ranges().tolist()):
+            if drive.generator.random() >= loss:
+                localizer.add_range(sensor, reading)
+        if localizer.add_odometry(drive.stamp_ns, drive.odometry):
+            errors.append(error(localizer, drive))
+    return np.array(errors)
+
+
+def error(localizer, drive):
+    pose, truth = localizer.result.pose, drive.truth
+    away = math.hypot(pose.x - truth.x, pose.y - truth.y)
+    return away, abs(wrap_angle(pose.yaw - truth.yaw))
+
+
+def rms(values):
+    return np.sqrt((values**2).mean(axis=0))
+
+
+def test_a_known_start_is_tracked_while_the_odometry_drifts():
+    localizer, drive = make_localizer(), Drive()
+    away, turned = rms(follow(localizer, drive, 60.0)[40:])
+    assert abs(wrap_angle(drive.odometry.yaw + 0.5 * math.pi - drive.truth.yaw)) > 0.2
+    assert away < 0.025
+    assert turned < math.radians(1.7)
+    assert localizer.state is Localization.LOCALIZED
+
+
+def test_the_covariance_covers_the_error():
+    localizer, drive = make_localizer(), Drive(seed=3)
+    inside = []
+    for _ in range(40):
+        follow(localizer, drive, 1.0)
+        pose, truth = localizer.result.pose, drive.truth
+        gap = np.array([pose.x - truth.x, pose.y - truth.y])
+        inside.append(gap @ np.linalg.solve(localizer.result.covariance[:2, :2], gap) < 13.8)
+    assert np.mean(inside) >= 0.9  # 99.9 % of a normal distribution; readings repeat their errors
+
+
+def test_the_frame_of_the_odometry_leads_to_the_pose():
+    localizer, drive = make_localizer(), Drive()
+    follow(localizer, drive, 10.0)
+    while not localizer.add_odometry(drive.stamp_ns, drive.odometry):
+        drive.step()
+    frame, inner = localizer.result.odometry_frame, drive.odometry
+    x = frame.x + math.cos(frame.yaw) * inner.x - math.sin(frame.yaw) * inner.y
+    y = frame.y + math.sin(frame.yaw) * inner.x + math.cos(frame.yaw) * inner.y
+    assert (x, y) == pytest.approx(localizer.result.pose[:2])
+    assert wrap_angle(frame.yaw + inner.yaw - localizer.result.pose.yaw) == pytest.approx(0.0)
+
+
+def test_an_unknown_start_is_found():
+    localizer = make_localizer(set_initial_pose=False)
+    drive = Drive()
+    drive.phase, drive.truth = 2.5, on_ellipse(2.5)
+    follow(localizer, drive, 0.2)
+    assert localizer.state is Localization.SEARCHING
+    assert np.diag(localizer.result.covariance).max() > 0.3
+    follow(localizer, drive, 60.0)
+    assert localizer.state is Localization.LOCALIZED
+    assert error(localizer, drive)[0] < 0.05
+
+
+def test_a_robot_that_is_carried_is_lost_and_found_again():
+    localizer, drive = make_localizer(), Drive()
+    follow(localizer, drive, 20.0)
+    drive.carry(2.5)
+    states = set()
+    for _ in range(60):
+        follow(localizer, drive, 1.0)
+        states.add(localizer.state)
+    assert states - {Localization.LOCALIZED}
+    assert localizer.state is Localization.LOCALIZED
+    assert error(localizer, drive)[0] < 0.05
+
+
+def test_without_recovery_a_carried_robot_stays_lost():
+    """The recovery is what finds it: without random particles nothing does."""
+    localizer, drive = make_localizer(recovery_alpha_slow=0.0), Drive()
+    follow(localizer, drive, 20.0)
+    drive.carry(2.5)
+    follow(localizer, drive, 60.0)
+    assert localizer.state is Localization.LOST
+
+
+def test_a_pose_that_is_given_is_taken():
+    localizer, drive = make_localizer(set_initial_pose=False), Drive(start=on_ellipse(1.0))
+    follow(localizer, drive, 1.0)
+    localizer.set_pose(drive.truth, np.diag([1e-4, 1e-4, 1e-4]))
+    localizer.add_odometry(drive.stamp_ns + 1, drive.odometry)
+    assert error(localizer, drive) == pytest.approx((0.0, 0.0), abs=5e-3)
+    assert localizer.state is Localization.LOCALIZED
+
+
+@pytest.mark.parametrize('restart', ['pose', 'stamp'])
+def test_a_restart_of_the_odometry_moves_no_particle(restart):
+    """A board that restarts counts from zero again; the robot has not moved."""
+    localizer, drive = make_localizer(), Drive()
+    follow(localizer, drive, 20.0)
+    before = localizer.filter.poses.copy()
+    drive.odometry = Pose(3.0, -2.0, 1.0) if restart == 'pose' else drive.odometry
+    drive.stamp_ns = drive.stamp_ns if restart == 'pose' else 0
+    assert not localizer.add_odometry(drive.stamp_ns, drive.odometry)
+    assert np.array_equal(localizer.filter.poses, before)
+    assert rms(follow(localizer, drive, 10.0))[0] < 0.03
+
+
+def test_bad_inputs_change_nothing():
+    localizer, drive = make_localizer(), Drive()
+    for sensor in EVERY.tolist():
+        localizer.add_range(sensor, 0.3)  # before any odometry
+    follow(localizer, drive, 5.0)
+    result = localizer.result
+    assert not localizer.add_odometry(drive.stamp_ns, Pose(math.nan, 0.0, 0.0))
+    localizer.add_range(0, math.nan)
+    assert localizer.result is result
+    assert rms(follow(localizer, drive, 10.0))[0] < 0.03
+
+
+def test_silent_sensors_leave_odometry_and_growing_covariance():
+    localizer, drive = make_localizer(), Drive(drift=0.0)
+    follow(localizer, drive, 5.0)
+    before = np.trace(localizer.result.covariance[:2, :2])
+    follow(localizer, drive, 20.0, loss=1.0)
+    assert np.trace(localizer.result.covariance[:2, :2]) > 2.0 * before
+
+
+def test_readings_that_are_lost_cost_little():
+    errors = follow(make_localizer(), Drive(seed=5), 40.0, loss=0.5)
+    assert rms(errors[40:])[0] < 0.03
+
+
+def test_things_that_the_map_lacks_do_not_lead_it_away():
+    """A person goes along at the right: two of the eight ranges are short."""
+    localizer, drive = make_localizer(), Drive()
+    follow(localizer, drive, 5.0)
+    worst = 0.0
+    for _ in range(400):
+        drive.step()
+        ranges = drive.ranges()
+        ranges[6:] = np.minimum(ranges[6:], 0.2)
+        for sensor, reading in enumerate(ranges.tolist()):
+            localizer.add_range(sensor, reading)
+        if localizer.add_odometry(drive.stamp_ns, drive.odometry):
+            worst = max(worst, error(localizer, drive)[0])
+    assert worst < 0.15
+
+
+def test_a_scan_is_used_like_the_ranges():
+    localizer, drive = make_localizer(sigma_hit_growth=0.0), Drive(seed=7)
+    angles = np.linspace(-math.pi, math.pi, 24, endpoint=False)
+    beams = np.column_stack([np.zeros(24), np.zeros(24), angles])
+    limits = np.tile([0.05, 3.0], (24, 1))
+    errors = []
+    for _ in range(400):
+        drive.step()
+        found = drive.distances(beams) + 0.01 * drive.generator.standard_normal(24)
+        localizer.add_scan(Beams(beams, np.where(found > 3.0, math.inf, found), limits))
+        if localizer.add_odometry(drive.stamp_ns, drive.odometry):
+            errors.append(error(localizer, drive))
+    away, turned = rms(np.array(errors)[20:])
+    assert away < 0.015
+    assert turned < math.radians(1.0)
+
+
+def test_equal_inputs_give_equal_bits():
+    results = []
+    for _ in range(2):
+        localizer, drive = make_localizer(set_initial_pose=False, seed=4), Drive()
+        follow(localizer, drive, 5.0)
+        results.append((localizer.result.pose, localizer.filter.poses.tobytes()))
+    assert results[0] == results[1]
+    other, drive = make_localizer(set_initial_pose=False, seed=5), Drive()
+    follow(other, drive, 5.0)
+    assert other.filter.poses.tobytes() != results[0][1]
+
+
+def test_a_robot_at_rest_updates_nothing():
+    localizer, drive = make_localizer(), Drive()
+    assert localizer.state is Localization.NO_ODOMETRY
+    assert localizer.add_odometry(0, ORIGIN)
+    for k in range(20):
+        for sensor in EVERY.tolist():
+            localizer.add_range(sensor, 0.2)
+        assert not localizer.add_odometry(k + 1, drive.odometry)
+
+
+def drive_corrected(localizer, drive, correction, seconds):
+    """Drive; return the changes of the corrected pose less those of the odometry, and it."""
+    changes, before, previous = [], None, None
+    for _ in range(round(seconds / PERIOD)):
+        drive.step()
+        pose = correction.step(drive.stamp_ns, drive.odometry, localizer)
+        for sensor, reading in enumerate(drive.ranges().tolist()):
+            localizer.add_range(sensor, reading)
+        localizer.add_odometry(drive.stamp_ns, drive.odometry)
+        if before is not None and pose is not None:
+            motion = odometry_motion(previous, drive.odometry)
+            expected = moved_pose(before, motion)
+            away = math.hypot(pose.x - expected.x, pose.y - expected.y)
+            changes.append((away, abs(wrap_angle(pose.yaw - expected.yaw))))
+        before, previous = pose, drive.odometry
+    return np.array(changes), before
+
+
+def test_the_corrected_pose_is_exact_and_moves_slowly():
+    """The corrections of the filter are up to centimetres at once; the wheels feel none."""
+    localizer, drive, correction = make_localizer(), Drive(), PoseCorrection()
+    follow(localizer, drive, 1.0)
+    changes, pose = drive_corrected(localizer, drive, correction, 40.0)
+    assert changes[:, 0].max() <= 0.05 * PERIOD + 1e-9
+    assert changes[:, 1].max() <= 0.2 * PERIOD + 1e-9
+    assert math.hypot(pose.x - drive.truth.x, pose.y - drive.truth.y) < 0.06
+
+
+def test_the_corrected_pose_jumps_where_the_robot_is_found():
+    localizer, drive, correction = make_localizer(), Drive(), PoseCorrection()
+    drive_corrected(localizer, drive, correction, 10.0)
+    drive.carry(2.5)
+    changes, pose = drive_corrected(localizer, drive, correction, 60.0)
+    assert changes[:, 0].max() > 0.25
+    assert math.hypot(pose.x - drive.truth.x, pose.y - drive.truth.y) < 0.06
+
+
+def test_there_is_no_corrected_pose_before_the_place_is_known():
+    localizer, drive = make_localizer(set_initial_pose=False), Drive()
+    drive.step()
+    localizer.add_odometry(drive.stamp_ns, drive.odometry)
+    assert PoseCorrection().step(drive.stamp_ns, drive.odometry, localizer) is None

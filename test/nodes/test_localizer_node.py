@@ -1,0 +1,179 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Localizer node: its pose and transform, maps, scans, given poses, and what it rejects."""
+
+import math
+
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import OccupancyGrid, Odometry
+import numpy as np
+import pytest
+from sensor_msgs.msg import LaserScan, Range
+from std_srvs.srv import Empty
+from support.ros_graph import LATCHED, diagnostic, odometry, reason
+
+from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
+from t3mpc_ros.localization.localizer import Localization
+from t3mpc_ros.localization.occupancy_map import MapError
+from t3mpc_ros.nodes.localizer import LocalizerNode
+from t3mpc_ros.parameters.table import ParameterError
+
+pytestmark = pytest.mark.ros
+
+AHEAD = 0.05
+"""Distance by which the robot starts ahead of where it is said to start, m."""
+START = {
+    'set_initial_pose': True,
+    'initial_pose__x': 1.0,
+    'initial_pose__y': -0.2,
+}
+
+
+class Robot:
+    """A robot that drives along x towards the wall of the room at x = 2 m, with exact ranges."""
+
+    def __init__(self, harness, scan=''):
+        self.harness = harness
+        self.travel, self.stamp_ns = 0.0, NANOSECONDS
+        self.scan = scan
+        self.publishers = {'odom': harness.connected_publisher(type(odometry(0)), 'odom')}
+        if scan:
+            self.publishers['scan'] = harness.connected_publisher(LaserScan, scan)
+            return
+        for name in RANGE_SENSORS:
+            self.publishers[name] = harness.connected_publisher(Range, f'range/{name}')
+
+    def step(self, node, travel=0.03):
+        """Publish ranges, then the odometry after some more travel; wait until it is used."""
+        distance = 2.0 - (1.0 + AHEAD + self.travel) - (0.0 if self.scan else 0.1)
+        if self.scan:
+            message = LaserScan(angle_min=-0.2, angle_increment=0.2, range_min=0.05, range_max=3.0)
+            message.ranges = [distance / math.cos(0.2), distance, distance / math.cos(0.2)]
+            self.publishers['scan'].publish(message)
+        else:
+            for name in RANGE_SENSORS:
+                ahead = name.startswith('front') and distance < 0.8
+                self.publishers[name].publish(Range(range=distance if ahead else math.inf))
+        self.travel += travel
+        self.stamp_ns += NANOSECONDS // 10
+        message = odometry(self.stamp_ns)
+        message.pose.pose.position.x = self.travel
+        self.publishers['odom'].publish(message)
+        self.harness.spin_until(lambda: node._odometry_ns >= self.stamp_ns)
+
+
+@pytest.mark.parametrize('scan', ['', 'scan'])
+def test_the_pose_is_that_of_the_readings(harness, scan):
+    node = harness.add(LocalizerNode, world='room', scan_topic=scan, **START)
+    poses = harness.subscribe(PoseWithCovarianceStamped, 'pose')
+    frames = harness.subscribe(TransformStamped, 'map_to_odom')
+    filtered = harness.subscribe(Odometry, 'odometry/filtered')
+    robot = Robot(harness, scan)
+    for _ in range(20):
+        robot.step(node)
+    for _ in range(15):  # the corrected pose approaches that of the filter
+        robot.step(node, travel=0.0)
+    harness.spin_until(lambda: poses and frames and diagnostic(node, 'updates') > 5)
+    harness.spin_until(lambda: len(poses) >= diagnostic(node, 'updates'))
+    found = poses[-1]
+    assert found.header.frame_id == 'map'
+    assert found.pose.pose.position.x == pytest.approx(1.0 + AHEAD + robot.travel, abs=0.03)
+    assert found.pose.covariance[0] < 0.04**2
+    place = filtered[-1].pose.pose.position
+    assert filtered[-1].header.frame_id == 'map'
+    assert place.x == pytest.approx(1.0 + AHEAD + robot.travel, abs=0.04)
+    origin = frames[-1].transform.translation
+    assert origin.x == pytest.approx(1.0 + AHEAD, abs=0.03)
+    assert (frames[-1].header.frame_id, frames[-1].child_frame_id) == ('map', 'odom')
+    assert reason(node) == Localization.LOCALIZED.value
+
+
+def test_a_pose_is_given_and_one_in_another_frame_is_ignored(harness):
+    node = harness.add(LocalizerNode, world='room', **START)
+    given = harness.connected_publisher(PoseWithCovarianceStamped, 'initialpose')
+    robot = Robot(harness)
+    robot.step(node)
+    message = PoseWithCovarianceStamped()
+    message.pose.pose.orientation.w = 1.0
+    message.pose.pose.position.x = -0.5
+    message.header.frame_id = 'odom'
+    given.publish(message)
+    harness.spin_until(lambda: diagnostic(node, 'rejected_inputs') == 1)
+    message.pose.pose.position.x = math.nan
+    message.header.frame_id = 'map'
+    given.publish(message)
+    harness.spin_until(lambda: diagnostic(node, 'rejected_inputs') == 2)
+    message.pose.pose.position.x = -0.5
+    message.pose.covariance[0] = -1.0
+    given.publish(message)
+    harness.spin_until(lambda: diagnostic(node, 'rejected_inputs') == 3)
+    assert node._localizer.result.pose.x == pytest.approx(1.0, abs=0.05)
+    message.pose.covariance[0] = 1e-4
+    given.publish(message)
+    harness.spin_until(lambda: abs(np.mean(node._localizer.filter.poses[:, 0]) + 0.5) < 0.01)
+    assert diagnostic(node, 'rejected_inputs') == 3
+
+
+def test_the_service_scatters_the_particles(harness):
+    node = harness.add(LocalizerNode, world='room', **START)
+    cloud = harness.subscribe(PoseArray, 'particlecloud')
+    robot = Robot(harness)
+    robot.step(node)
+    harness.spin_until(lambda: cloud)
+    assert len(cloud[-1].poses) == 500
+    harness.call(Empty, 'reinitialize_global_localization')
+    robot.step(node)
+    assert reason(node) == Localization.SEARCHING.value
+    harness.spin_until(lambda: len(cloud[-1].poses) == 5000)
+
+
+def grid_message(width=60, height=40):
+    message = OccupancyGrid()
+    message.info.resolution, message.info.width, message.info.height = 0.05, width, height
+    message.info.origin.orientation.w = 1.0
+    cells = np.zeros((height, width), dtype=np.int8)
+    cells[[0, -1]] = 100
+    cells[:, [0, -1]] = 100
+    message.data = cells.ravel().tolist()
+    return message
+
+
+def test_a_map_of_a_topic_is_used_and_a_broken_one_is_not(harness):
+    node = harness.add(LocalizerNode, **START)
+    assert 'no map yet' in reason(node)
+    robot = Robot(harness)
+    maps = harness.connected_publisher(OccupancyGrid, 'map', LATCHED)
+    broken = grid_message()
+    del broken.data[5:]
+    maps.publish(broken)
+    harness.spin_until(lambda: 'width x height' in reason(node))
+    maps.publish(grid_message())
+    harness.spin_until(lambda: node._localizer is not None)
+    robot.step(node)
+    assert node._localizer.result.pose.x == pytest.approx(1.0, abs=0.05)
+    # A map that grows, as of SLAM, does not lose the place.
+    first = node._localizer
+    maps.publish(grid_message(width=80))
+    harness.spin_until(lambda: node._localizer is not first)
+    robot.step(node)
+    assert node._localizer.state is Localization.LOCALIZED
+
+
+def test_wrong_maps_end_the_node(harness, tmp_path):
+    with pytest.raises(ParameterError, match='yaml_filename must be empty'):
+        harness.add(LocalizerNode, world='room', yaml_filename='map.yaml')
+    with pytest.raises(MapError, match='cannot be read'):
+        harness.add(LocalizerNode, namespace='a', yaml_filename=str(tmp_path / 'map.yaml'))
+    with pytest.raises(ParameterError, match='laser_pose must be'):
+        harness.add(LocalizerNode, namespace='b', laser_pose=[0.0, 1.0])
