@@ -58,6 +58,7 @@ COLUMNS: Mapping[str, tuple[str, str]] = {
     'reference_twist': ('m/s, rad/s', 'its twist'),
     'pose': ('m, m, rad', 'pose that the controller received'),
     'command': ('m/s, rad/s', 'twist that the controller commanded'),
+    'localized': ('', 'whether the localisation knows the place'),
     'activity': ('', 'what the keep-out does, an index into its activities'),
     'avoiding': ('', 'whether the keep-out changed the command, or the robot is on its way back'),
 }

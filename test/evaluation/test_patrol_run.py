@@ -45,6 +45,26 @@ def test_a_patrol_with_a_seed_is_repeatable():
 
 
 @pytest.mark.slow
+def test_a_patrol_by_the_particle_filter_knows_its_place():
+    """Own sensors only, known walls; later the robot is carried, and the pose is wrong at once."""
+    scenario = PatrolScenario(
+        seed=2, duration=11.1, known_world='room', localization='filter', carried_at=11.0
+    )
+    record = run_patrol(portrait_points(2, PortraitParameters()), scenario)
+    error = np.hypot(*(record['pose'] - record['truth'])[:, :2].T)
+    assert error[: round(10.9 * RATE)].max() < 0.05
+    row = round(11.02 * RATE)
+    assert error[row] == pytest.approx(1.0, abs=0.1)
+    turned = record['truth'][row, 2] - record['pose'][row, 2]
+    assert abs(np.cos(turned)) < 0.1
+
+
+def test_an_unknown_localization_is_rejected():
+    with pytest.raises(ValueError, match='localization must be one of given'):
+        PatrolScenario(localization='gps')
+
+
+@pytest.mark.slow
 def test_a_patrol_keeps_limits_and_touches_nothing():
     """The robot looks around, drives off and reaches its path, with 10 % of commands lost."""
     record, limits = _run(3, 15.0), LimitParameters()

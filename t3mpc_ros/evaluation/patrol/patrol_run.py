@@ -49,7 +49,16 @@ from t3mpc_ros.geometry.types import (
     State,
     wrap_angle,
 )
+from t3mpc_ros.localization.localizer import (
+    Localization,
+    Localizer,
+    LocalizerParameters,
+    PoseCorrection,
+)
+from t3mpc_ros.localization.occupancy_map import map_of_world
+from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
+from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.plant_robot import Signals
 from t3mpc_ros.simulation.world import MovingDisc, load_world
@@ -66,8 +75,14 @@ COMMAND_LOSS = 0.1
 """Share of commands that are lost."""
 POSITION_NOISE, YAW_NOISE = 0.003, 0.005
 """Standard deviation of the given position in each coordinate (m), and of the given yaw (rad)."""
+CARRIED_DISTANCE = 1.0
+"""Distance by which a robot is carried, within the walls, m."""
 GRIP = 0.25
 """Share of the grip that slippery patches of floor have."""
+
+
+LOCALIZATIONS = 'given', 'odometry', 'filter'
+"""Sources of the pose: the true one with noise; the odometry; a particle filter on the world."""
 
 
 Visitors = Callable[[float, State], MovingDisc | None]
@@ -150,6 +165,18 @@ class PatrolScenario:
     """Further parameters of the controller by name."""
     faults: tuple[SensorFault, ...] = ()
     """Faults of the range sensors."""
+    localization: str = 'given'
+    """One of :data:`LOCALIZATIONS`."""
+    range_loss: float = 0.0
+    """Share of the range readings that are lost."""
+    carried_at: float = math.inf
+    """When the robot is carried by 1 m and turned by 90 degrees, s."""
+
+    def __post_init__(self) -> None:
+        if self.localization not in LOCALIZATIONS:
+            raise ValueError(
+                f'localization must be one of {", ".join(LOCALIZATIONS)}: got {self.localization}'
+            )
 
 
 def portrait_points(seed: int, parameters: PortraitParameters) -> Iterator[Array]:
@@ -209,7 +236,8 @@ def run_patrol(
             **scenario.robot,
         }
     )
-    robot = DigitalTwin(parameters)
+    carried_ns = stamp_of(round((START + min(scenario.carried_at, 1e6)) * RATE))
+    robot = CarriedTwin(parameters, carried_ns)
     driver = PathDriver(points, scenario, parameters.geometry, tracker)
     if visitors is not None:
         driver.on_state = lambda state: _visit(robot, visitors, state)
@@ -241,6 +269,30 @@ def _visit(robot: DigitalTwin, visitors: Visitors, state: RobotState) -> None:
         robot.add_obstacle(found)
 
 
+class CarriedTwin(DigitalTwin):
+    """A twin that somebody carries by 1 m and turns by 90 degrees at an instant (ns)."""
+
+    def __init__(self, parameters: DigitalTwinParameters, instant_ns: int) -> None:
+        super().__init__(parameters)
+        self._instant_ns = instant_ns
+
+    def advance(self, now_ns: int) -> RobotState:
+        """Return the state at an instant."""
+        state = super().advance(now_ns)
+        if now_ns != self._instant_ns or state.truth is None:
+            return state
+        x, y, yaw = state.truth.pose
+        radius = self._parameters.bumper.radius + 0.02
+        places = map_of_world(self._world).free_places(radius)
+        apart = np.abs(np.hypot(places[:, 0] - x, places[:, 1] - y) - CARRIED_DISTANCE)
+        near = places[apart < 0.02]
+        generator = np.random.default_rng((self._parameters.seed, 17))
+        there_x, there_y = near[generator.integers(0, len(near))].tolist()
+        side = generator.choice([-0.5, 0.5]) * math.pi
+        self.set_pose(Pose(there_x, there_y, wrap_angle(yaw + float(side))))
+        return state
+
+
 class PathDriver:
     """The controller of the node on a path, with a localisation; or a law in its place.
 
@@ -263,6 +315,19 @@ class PathDriver:
         self._controller.warm_up()
         self._timing = PathTiming(LIMITS, geometry, 1.0 / RATE, ORIGIN)
         self._generator = np.random.default_rng((scenario.seed, 7))
+        self._losses = np.random.default_rng((scenario.seed, 19))
+        self._range_loss = scenario.range_loss
+        self._localization = scenario.localization
+        self._localizer: Localizer | None = None
+        if scenario.localization == 'filter':
+            sensors = RangeSensorParameters()
+            self._localizer = Localizer(
+                LocalizerParameters.from_dict({'set_initial_pose': True, 'seed': scenario.seed}),
+                map_of_world(load_world(scenario.world or scenario.known_world)),
+                sensor_mounts(sensors),
+                (sensors.minimum, sensors.maximum),
+            )
+        self._correction = PoseCorrection()
         self._references: list[tuple[Pose, BodyTwist]] = []
         self._ranges: tuple[float, ...] = ()
         self._k = 0
@@ -295,9 +360,13 @@ class PathDriver:
             self.on_state(state)
         for sensor, reading in enumerate(state.ranges):
             due = not self._ranges or reading != self._ranges[sensor] or self._k % 4 == 0
+            if self._range_loss and self._losses.random() < self._range_loss:
+                continue
             if due and not math.isnan(reading):  # as the nodes publish them
                 for received in self._faulty.received(sensor, reading, state.stamp_ns):
                     self._controller.add_range(sensor, *received)
+                    if self._localizer is not None:
+                        self._localizer.add_range(sensor, received[0])
         self._ranges = state.ranges
         if self._tracker is None:
             measured = State(state.stamp_ns, self._pose, state.odometry.twist)
@@ -310,6 +379,16 @@ class PathDriver:
     def _localised(self, state: RobotState) -> Pose:
         """Return the pose that the controller receives."""
         noise = self._generator.standard_normal(3).tolist()
+        odometry = state.odometry
+        if self._localizer is not None:
+            # As in the node: the pose of this message is by the correction known so far.
+            if odometry.stamp_ns == 0:
+                self._localizer.add_odometry(0, odometry.pose)
+            pose = self._correction.step(odometry.stamp_ns, odometry.pose, self._localizer)
+            self._localizer.add_odometry(odometry.stamp_ns, odometry.pose)
+            return pose or ORIGIN
+        if self._localization == 'odometry':
+            return odometry.pose
         if not self._driving:
             return ORIGIN
         assert state.truth is not None
@@ -334,6 +413,8 @@ class PathDriver:
             'command': self._twist,
             'activity': ACTIVITIES.index(activity),
             'avoiding': changed or self._controller.pose_controller.rejoining,
+            'localized': self._localizer is None
+            or self._localizer.state is Localization.LOCALIZED,
         }
 
 
