@@ -35,7 +35,6 @@ NAME = 't3mpc_ros'
 with open(f'{NAME}/version.py', encoding='utf-8') as source:
     VERSION = re.search(r"^VERSION = '([^']+)'", source.read(), re.MULTILINE).group(1)
 
-ROS = 'ros-jazzy-'
 NODES = (
     'reference_generator',
     'controller',
@@ -120,7 +119,25 @@ if bdist_wheel:
 
     COMMANDS['bdist_wheel'] = Wheel
 
-NEEDED = requirements('requirements.txt')
+EXTRAS = {
+    'bags': ('mcap', 'zstandard', 'lz4', 'rosbags', 'pillow', 'jinja2'),
+    'compare': ('cma', 'jinja2'),
+    'ros': ('pyserial', 'ros-jazzy-rclpy', 'ros-jazzy-common-interfaces'),
+}
+"""Libraries that a simulation does without, by the extra that installs them."""
+
+
+def of_extra(extra):
+    """Return the requirements of an extra; those of '' are needed by every installation."""
+    found = []
+    for each in requirements('requirements.txt'):
+        name = re.split('[<>=[]', each)[0]
+        extras = [key for key, names in EXTRAS.items() if name in names] or ['']
+        if extra in extras:
+            found.append(each)
+    return found
+
+
 FOR_PIP = bool(PIP_COMMANDS.intersection(sys.argv))
 
 
@@ -158,11 +175,12 @@ setup(
         f'{NAME}.simulation': ['worlds/*.yaml', 'schedules/*.yaml'],
         f'{NAME}.view': ['page/*'],
     },
-    install_requires=[each for each in NEEDED if not each.startswith(ROS)],
+    install_requires=of_extra(''),
     # colcon test runs pytest only where it is a test dependency.
     extras_require={
-        'ros': [each for each in NEEDED if each.startswith(ROS)],
-        'compare': ['casadi>=3.6,<4', 'pyarrow>=15,<30'],
+        'bags': of_extra('bags'),
+        'ros': [*of_extra('ros'), *of_extra('bags')],
+        'compare': [*of_extra('compare'), 'casadi>=3.6,<4', 'pyarrow>=15,<30'],
         'cluster': ['distributed>=2024.5,<2028', 'pyarrow>=15,<30'],
         'dev': requirements('requirements-dev.txt'),
         'test': ['pytest'],

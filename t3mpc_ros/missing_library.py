@@ -38,14 +38,26 @@ REQUIREMENTS = {
 """Requirement of each imported library, as in the requirements files."""
 
 
+EXTRAS = {
+    'bags': ('mcap', 'zstandard', 'lz4', 'rosbags', 'PIL', 'jinja2'),
+    'ros': ('serial',),
+    'compare': ('casadi', 'pyarrow', 'cma'),
+    'cluster': ('distributed',),
+}
+"""Extra of the package that installs a library which a simulation does without."""
+
+
 def remedy(error: ModuleNotFoundError) -> str:
     """Return one line that names a missing library and the remedy; empty for other modules."""
     library = (error.name or '').partition('.')[0]
     if requirement := REQUIREMENTS.get(library):
-        return f'the library {library} is missing: {sys.executable} -m pip install "{requirement}"'
+        command = f'{sys.executable} -m pip install "{requirement}"'
+        extra = next((name for name, parts in EXTRAS.items() if library in parts), '')
+        also = f', or the package with its extra [{extra}]' if extra else ''
+        return f'the library {library} is missing: {command}{also}'
     if library in ('rclpy', 'rcl_interfaces') or library.endswith('_msgs'):
         return (
-            f'the ROS 2 package {library} is missing: source the setup file of ROS 2 Jazzy, or '
-            'start through scripts/run'
+            f'the ROS 2 package {library} is missing: source the setup file of ROS 2 Jazzy, start '
+            'through scripts/run, or install the package by pip with its extra [ros]'
         )
     return ''

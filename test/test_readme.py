@@ -155,7 +155,11 @@ def test_blocks_can_be_pasted(page):
 
 TOOLS = {'rosdep', 'pip', 'python3', '.', 'touch', 'sudo', 'avrdude', 'cd', 'chronyc', 'export'}
 """Programs that are not parts of the package; of their arguments, files of the package exist."""
-PARSERS = {'bag': bag._bag_parser, 'robot': robot._parser, 'emulator': emulator._parser}
+PARSERS = {
+    'bag': bag.program_parser,
+    'robot': robot.program_parser,
+    'emulator': emulator.program_parser,
+}
 PLACEHOLDERS = {
     'N': '1',
     'REVOLUTIONS': '1',

@@ -25,6 +25,7 @@ from support.checkout import EXECUTABLES, ROOT, clean_environment, copy_package
 from support.long_tests import few_of
 from support.waiting import run
 
+from t3mpc_ros.missing_library import EXTRAS
 from t3mpc_ros.nodes.registry import NODES
 
 pytestmark = pytest.mark.slow
@@ -132,10 +133,14 @@ def test_the_extras_are_declared(wheel):
     assert 'Description-Content-Type: text/markdown' in text
     assert '](docs/' not in text.partition('\n\n')[2], 'a relative link leads nowhere'
     # The environment of the demo stays small, and apt ROS 2 stays the ROS of its users.
-    for library in ('pyarrow', 'distributed', 'casadi', 'ros-jazzy'):
-        assert not any(library in line for line in plain)
-        assert any(library in line for line in needed)
-    for extra in ('ros', 'compare', 'cluster', 'dev'):
+    for extra, libraries in EXTRAS.items():
+        for library in libraries:
+            name = {'PIL': 'pillow', 'serial': 'pyserial'}.get(library, library)
+            found = [line for line in needed if line.startswith(f'Requires-Dist: {name}')]
+            assert any(f"extra == '{extra}'" in line.replace('"', "'") for line in found), library
+            assert not any('extra ==' not in line for line in found), library
+    assert not any('ros-jazzy' in line for line in plain)
+    for extra in ('bags', 'ros', 'compare', 'cluster', 'dev'):
         assert f'Provides-Extra: {extra}\n' in text
 
 

@@ -24,9 +24,8 @@ import math
 from pathlib import Path
 import re
 import sys
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
-import jinja2
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -261,7 +260,7 @@ def html_page(title: str, blocks: Sequence[Block]) -> str:
     events = [event for each in every if isinstance(each, Timeline) for event in each.events]
     data = {**content, 'columns': found.columns, 'events': events, 'packed': found.packed()}
     drawn = any(content.values())
-    return _template().render(
+    written: str = _template().render(
         title=title,
         blocks=blocks,
         headings=headings,
@@ -272,6 +271,7 @@ def html_page(title: str, blocks: Sequence[Block]) -> str:
         if drawn
         else '',
     )
+    return written
 
 
 def _all_blocks(blocks: Sequence[Block]) -> Iterator[Block]:
@@ -286,7 +286,9 @@ def _slug(text: str) -> str:
 
 
 @cache
-def _template() -> jinja2.Template:
+def _template() -> Any:
+    import jinja2  # a simulation does without pages
+
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(loader=loader, autoescape=True)
     environment.globals['own'] = _own_file

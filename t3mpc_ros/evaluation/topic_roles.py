@@ -16,10 +16,13 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from t3mpc_ros.bag.metadata import TopicInformation
-from t3mpc_ros.bag.reader import BagReader
 from t3mpc_ros.control.controller import SCALAR_NAMES
+
+if TYPE_CHECKING:  # a figure of a simulated run needs the names only
+    from t3mpc_ros.bag.metadata import TopicInformation
+    from t3mpc_ros.bag.reader import BagReader
 
 TRUTH, ODOMETRY, REFERENCE, COMMAND = 'ground_truth/odom', 'odom', 'reference', 'cmd_vel'
 SIGNALS = 'reference/signals'
@@ -78,7 +81,7 @@ class TopicChoice:
     notes: tuple[str, ...]
 
 
-def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
+def choose_topics(recording: 'BagReader', wanted: ReportOptions) -> TopicChoice:
     """Return the topic of each role."""
     names, namespaces = find_topics(recording.topics, wanted.namespace)
     filled = {name: topic for name, topic in recording.topics.items() if topic.message_count}
@@ -122,7 +125,7 @@ def choose_topics(recording: BagReader, wanted: ReportOptions) -> TopicChoice:
 
 def _candidates(
     name: str,
-    topics: Iterable[TopicInformation],
+    topics: 'Iterable[TopicInformation]',
     chosen: Mapping[str, str],
     namespace: str | None,
     preferred: str,
@@ -145,7 +148,7 @@ def _candidates(
     return [topic.name for topic in found]
 
 
-def _requested_topic(recording: BagReader, name: str, full: str) -> str:
+def _requested_topic(recording: 'BagReader', name: str, full: str) -> str:
     """Return the full name of a given topic, after checking that it is usable."""
     topic = recording.topics.get(full) or recording.topics.get(f'/{full}')
     if topic is None:
@@ -164,7 +167,7 @@ def _requested_topic(recording: BagReader, name: str, full: str) -> str:
 _MAX_LISTED = 20  # further topics are only counted
 
 
-def _listing(recording: BagReader) -> str:
+def _listing(recording: 'BagReader') -> str:
     topics = list(recording.topics.values())
     words = [f'{t.name} ({t.type_name}, {t.message_count} messages)' for t in topics[:_MAX_LISTED]]
     more = [f'{len(topics) - _MAX_LISTED} more'] if len(topics) > _MAX_LISTED else []

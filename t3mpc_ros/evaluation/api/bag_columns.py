@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.geometry.types import NANOSECONDS, read_only
 from t3mpc_ros.parameters.table import nearest_hint
@@ -50,6 +49,8 @@ class BagColumns(Mapping[str, Mapping[str, Array]]):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).expanduser()
         """The bag."""
+        from t3mpc_ros.bag.reader import open_bag
+
         with open_bag(self.path) as bag:
             self.types = {name: topic.type_name for name, topic in bag.topics.items()}
             """Type of each topic by name."""
@@ -97,6 +98,8 @@ class FieldColumns(dict[str, Array]):
 
 def _read(path: Path, topic: str) -> dict[str, Array]:
     rows: list[dict[str, Any]] = []
+    from t3mpc_ros.bag.reader import open_bag  # the interface is there without its libraries
+
     with open_bag(path) as bag:
         for received, message in bag.messages(topic):
             row: dict[str, Any] = {RECEIVED: received}
