@@ -87,6 +87,19 @@ def test_without_commands_over_the_cable_the_robot_rests_in_time(bench, how):
     assert still_ns[-1] == bench.now_ns
 
 
+def test_over_the_cable_a_silence_is_that_of_the_board(bench):
+    """It was a dongle that did not reply, or a robot out of range on channel 82."""
+    received_ns = bench.link._received_ns
+    bench.link._received_ns = bench.link._since_ns = bench.now_ns - 10**9
+    assert bench.link.reason(bench.now_ns) == reasons.ROBOT_SILENT
+    bench.link._received_ns = received_ns
+    bench.emulator.unplugged = True
+    found = set()
+    bench.each = lambda: found.add(bench.link.reason(bench.now_ns))
+    bench.run(0.24)
+    assert found == {'', reasons.BOARD_TIMEOUT}
+
+
 def test_the_emergency_stop_works_over_the_cable(bench):
     bench.link.latch_estop('test')
     bench.run(0.4)

@@ -14,6 +14,7 @@
 """What the host knows after a fault: path, restarts, and the hop that it names."""
 
 from pathlib import Path
+import re
 
 import pytest
 
@@ -33,6 +34,9 @@ def expect_right(fault, trials):
         if 'unplugged' not in fault.name:  # the port is closed, and opened anew
             assert trial.counted == trial.happened
         assert link_faults.named(trial) == fault.hop, trial.shown
+        for text in trial.shown:
+            assert 'restarted' not in text or 'are lost' not in text, 'the restart explains it'
+            assert not fault.cable or not re.search('dongle|radio|channel', text), text
 
 
 @pytest.mark.slow

@@ -222,8 +222,6 @@ class Handshake:
             if self._attempts >= _MAX_ATTEMPTS:
                 self._attempts, self.state = 0, LinkState.HELLO
                 self.reason = self._absent
-            elif result.reply is None:
-                self.reason = self._no_reply
             return 0 if result.uplink is not None else _RETRY_NS // 5
         self._attempts = 0
         name = frames.BOARD_PARAMETERS[number].name
