@@ -112,7 +112,7 @@ if bdist_wheel:
                     os.chmod(os.path.join(folder, file), mode_of(folder=False))
             # PATH gets t3mpc only; ros2 run finds the nodes in lib.
             place = f'{self.bdist_dir}/{NAME}-{VERSION}.data/data/lib/{NAME}'
-            os.makedirs(place)
+            os.makedirs(place, exist_ok=True)  # left by a build that was interrupted
             for name in EXECUTABLES:
                 shutil.copyfile('resource/executable', f'{place}/{name}')
                 os.chmod(f'{place}/{name}', 0o755)

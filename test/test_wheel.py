@@ -17,6 +17,7 @@ import os
 from pathlib import Path
 import shutil
 import sys
+from sysconfig import get_platform
 import tarfile
 import zipfile
 
@@ -73,6 +74,14 @@ def installed(wheel, tmp_path_factory):
     words = ['--python', folder / 'env', 'install', '-q', '--no-deps', '--no-index', wheel]
     _run(sys.executable, '-m', 'pip', *words, cwd=folder)
     return folder / 'env'
+
+
+def test_a_build_that_was_interrupted_can_be_repeated(source, tmp_path):
+    """Ctrl-C in a set-up left a folder behind, at which every later set-up ended."""
+    left = f'build/bdist.{get_platform()}/wheel/t3mpc_ros-0.1.0.data/data/lib/t3mpc_ros'
+    (source / left).mkdir(parents=True)
+    _run(sys.executable, 'setup.py', '-q', 'bdist_wheel', '-d', tmp_path, cwd=source)
+    assert [*tmp_path.glob('*.whl')]
 
 
 def test_the_distributions_hold_every_file_of_the_package(source, archive, wheel):
