@@ -150,7 +150,7 @@ def stationary_gain(transition: Array, parameters: SpeedFilterParameters, period
         predicted = transition @ covariance @ transition.T + process
         gain_next = predicted[:, 0] / (predicted[0, 0] + noise)
         covariance = predicted - np.outer(gain_next, predicted[0])
-        if np.allclose(gain_next, gain, rtol=1e-12, atol=1e-15):
+        if (np.abs(gain_next - gain) <= 1e-15 + 1e-12 * np.abs(gain)).all():
             break
         gain = gain_next
     return gain

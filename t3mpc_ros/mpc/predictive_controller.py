@@ -14,7 +14,9 @@
 """Predictive controller: v_p of every wheel from its tracking error, equations (34)-(63)."""
 
 from collections.abc import Mapping
+import copy
 from dataclasses import dataclass, replace
+from functools import lru_cache
 import math
 from typing import ClassVar, NamedTuple, Self
 
@@ -424,6 +426,38 @@ def predictive_step(
     end_control_period(signals, constants.decay)
 
 
+@lru_cache(maxsize=8)
+def _pretrained(
+    parameters: PredictiveParameters,
+    excitation: ExcitationParameters,
+    loop: NominalLoopParameters,
+    timing: SampleTiming,
+    learning: LearningConstants,
+    outputs: int,
+) -> list[Predictor]:
+    """Return new machines, pretrained on the simulated nominal loop; the caller copies them.
+
+    A process builds many controllers with equal parameters: a node warms up with one of its own,
+    a study has one for each run.
+    """
+    generator = np.random.default_rng(parameters.seed)
+    predictors: list[Predictor] = []
+    sizes = LayerSizes(parameters.delta_lags, parameters.move_lags, parameters.hidden)
+    trial = replace(excitation, duration=max(0.25 * excitation.duration, 10.0))
+    for _ in range(outputs):
+        machine = make_machine(
+            sizes, parameters.delta_scale, parameters.move_scale, parameters.spread, generator
+        )
+        runs = [
+            simulate_excitation(loop, each, timing, parameters.move_scale, generator)
+            for each in (excitation, trial)
+        ]
+        predictor = Predictor(machine, parameters.horizon, runs[1])
+        predictor.fit(*runs[0], excitation, parameters.trust / timing.span, learning)
+        predictors.append(predictor)
+    return predictors
+
+
 class PredictiveController:
     """Computes v_p of each output from its tracking error, equations (34)-(63).
 
@@ -494,33 +528,17 @@ class PredictiveController:
 
     def pretrain(self) -> None:
         """Create new machines, pretrain them on the simulated nominal loop, then :meth:`reset`."""
-        parameters, outputs = self.parameters, self.status.size
-        generator = np.random.default_rng(parameters.seed)
-        predictors: list[Predictor] = []
-        sizes = LayerSizes(parameters.delta_lags, parameters.move_lags, parameters.hidden)
-        trial = replace(
-            parameters.excitation, duration=max(0.25 * parameters.excitation.duration, 10.0)
+        parameters = self.parameters
+        made = _pretrained(
+            parameters,
+            parameters.excitation,
+            self._loop,
+            self._timing,
+            self._learning,
+            self.status.size,
         )
-        for _ in range(outputs):
-            machine = make_machine(
-                sizes, parameters.delta_scale, parameters.move_scale, parameters.spread, generator
-            )
-            runs = [
-                simulate_excitation(
-                    self._loop, learning, self._timing, parameters.move_scale, generator
-                )
-                for learning in (parameters.excitation, trial)
-            ]
-            predictor = Predictor(machine, parameters.horizon, runs[1])
-            predictor.fit(
-                *runs[0],
-                parameters.excitation,
-                parameters.trust / self._timing.span,
-                self._learning,
-            )
-            predictors.append(predictor)
-        self._predictors = predictors
-        self._wheels = tuple(predictor.state for predictor in predictors)
+        self._predictors = copy.deepcopy(made)
+        self._wheels = tuple(predictor.state for predictor in self._predictors)
         self.reset()
 
     def reset(self) -> None:
