@@ -16,6 +16,7 @@
 import numpy as np
 import pytest
 from support.constants import with_constants
+from support.long_tests import few_of
 
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.chaos.solver import FractionalSolver
@@ -74,8 +75,10 @@ def test_wheels_are_the_selected_scaled_states():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize('output', ['wheels', 'body'])
-@pytest.mark.parametrize('blend', [0.0, 4.0])
+@pytest.mark.parametrize(
+    'output, blend',
+    few_of([('body', 0.0), ('wheels', 4.0), ('wheels', 0.0), ('body', 4.0)], 2),
+)
 @pytest.mark.slow
 def test_rate_is_the_derivative_of_the_wheels_away_from_jumps(output, blend):
     """Finite differences over 60 s with ramp, transitions and constant modes, without jumps."""

@@ -521,10 +521,10 @@ def test_an_odometry_faster_than_the_rate_is_thinned_out():
     fast = ServoLoop(lambda t: (0.12 + 0.1 * math.sin(2.0 * t), math.sin(1.7 * t)), rate=50.0)
     commands = []
     for one in (loop, fast):
-        one.run(300)
-        commands.append([(one.step().stamp_ns, one.twist) for _ in range(200)])
+        one.run(200)
+        commands.append([(one.step().stamp_ns, one.twist) for _ in range(100)])
     stamps = {stamp for stamp, _ in commands[1]}
-    assert len(stamps) == pytest.approx(100, abs=1)
+    assert len(stamps) == pytest.approx(50, abs=1)
     difference = np.array([twist for _, twist in commands[0]]) - [t for _, t in commands[1]]
     assert np.abs(difference).max() < 0.06
     early = make_state(fast.now - PERIOD + 1_000_000, math.nan)

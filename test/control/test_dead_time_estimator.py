@@ -317,7 +317,7 @@ def run_servo(
 
 @pytest.mark.compiled
 @pytest.mark.parametrize('friction', few_of([4.0, 0.0, 1.0, 3.0], 2))
-@pytest.mark.parametrize('dead_time', few_of([0.03, 0.06], 2))
+@pytest.mark.parametrize('dead_time', few_of([0.03, 0.06]))
 @pytest.mark.slow
 def test_dead_time_of_a_servo_is_found_with_friction(dead_time, friction):
     for seed in range(3):

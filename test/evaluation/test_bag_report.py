@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 from support.bag_messages import START, TYPES, diagnostics, header, odometry_message, twist_message
+from support.long_tests import few_of
 from support.report_run import sections_of
 from support.robot_bags import following_rows, write
 import yaml
@@ -509,17 +510,18 @@ def response_of(seed):
 
 
 @pytest.mark.slow
-def test_a_delay_that_is_shown_is_the_true_one():
+@pytest.mark.parametrize('seeds', few_of([20, 60]))
+def test_a_delay_that_is_shown_is_the_true_one(seeds):
     """Of 300 drives 38 were shown with errors of up to 0.49 s."""
     shown = 0
-    for seed in range(60):
+    for seed in range(seeds):
         command, motion, delay = response_of(seed)
         fit = fit_response(command, motion, 'linear')
         if fit is not None and fit.clear:
             shown += 1
             assert fit.delay == pytest.approx(delay, abs=max(0.02, 0.3 * delay)), seed
             assert fit.shortest <= fit.delay <= fit.longest
-    assert shown >= 45, 'most of these runs determine their delay'
+    assert shown >= 0.75 * seeds, 'most of these runs determine their delay'
 
 
 def test_a_slow_command_in_a_short_run_determines_no_delay(tmp_path, capsys):

@@ -316,7 +316,7 @@ def test_the_error_of_the_inertia_reaches_the_torques():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('name', [FULL, LMS, PI])
+@pytest.mark.parametrize('name', few_of([LMS, FULL, PI]))
 def test_a_repeated_report_changes_nothing(name):
     method = methods_for('twin')[name]
     plain = Scenario('twin', 'nominal', 2001, 6.0)
@@ -336,7 +336,7 @@ class Dropping(ReportLink):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('name', [FULL, LMS, 'linear MPC preview'])
+@pytest.mark.parametrize('name', few_of([FULL, LMS, 'linear MPC preview']))
 def test_an_overtaken_report_is_a_lost_one(monkeypatch, name):
     method, scenario = methods_for('twin')[name], Scenario('twin', 'swapped', 2001, 6.0)
     swapped = run(scenario, method)
@@ -408,7 +408,7 @@ def test_every_method_states_what_it_knows(robot):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('name', [FEED_FORWARD, SHAPED, LMS])
+@pytest.mark.parametrize('name', few_of([LMS, FEED_FORWARD, SHAPED]))
 def test_what_is_not_stated_as_measured_does_not_matter(name):
     """Without the wheel speeds in its statement, commands do not depend on their noise."""
     method = methods_for('twin')[name]

@@ -104,6 +104,8 @@ def test_gyro_odometry_agrees_with_the_true_pose(build):
     assert not bench.states[-1].status.slipping
 
 
+# That ranges arrive: test_ranges_battery_and_temperature_reach_the_host.
+@pytest.mark.long
 def test_ranges_agree_with_the_distance_to_a_wall(build):
     """Backwards to the end of the corridor; the distance to both sides is constant."""
     bench = build(flat={'twin.world': 'corridor'})

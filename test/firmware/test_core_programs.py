@@ -104,6 +104,8 @@ def test_the_search_finds_each_broken_rule(tmp_path, name):
     assert 'not so' in run.stderr
 
 
+# Golden frames and every rule on the boards: test_avr_*.
+@pytest.mark.long
 @needing('make', 'avr-gcc', 'simavr')
 def test_results_are_independent_of_the_int_width(tmp_path):
     """2250 packets through robot and dongle, on this machine and on a simulated ATmega2560."""

@@ -17,6 +17,7 @@ import struct
 
 import pytest
 from support import firmware_core as core
+from support.long_tests import few_of
 
 from t3mpc_ros.emulator.robot_board import CELL_US
 from t3mpc_ros.radio.protocol.frames import (
@@ -77,7 +78,7 @@ RECORDS = {
 USABLE = (SETTINGS_GOOD, SETTINGS_ONE_COPY)
 
 
-@pytest.mark.parametrize('name', RECORDS)
+@pytest.mark.parametrize('name', few_of(RECORDS))
 @pytest.mark.parametrize('before', ['nothing', 'old', 'first damaged', 'second damaged'])
 def test_a_write_torn_at_any_byte_leaves_no_mixture(library, name, before):
     """Power fails after each cell: the old values, the new ones, or a lock with its reason."""

@@ -467,7 +467,7 @@ def test_slip_detection_has_hysteresis():
         assert odometry.slipping == slipping
 
 
-@pytest.mark.parametrize('tolerance', [0.003, 0.03])
+@pytest.mark.parametrize('tolerance', few_of([0.003, 0.03]))
 @pytest.mark.slow
 def test_scale_error_within_tolerance_is_not_slip(tolerance):
     robots, odometries = Robots(1, 22), make_odometries(gyro_scale_tolerance=tolerance)

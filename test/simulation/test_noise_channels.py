@@ -156,7 +156,7 @@ def test_no_parameter_shifts_the_numbers_of_a_channel(table):
     usual, tried = drive(make(parameters)), 0
     assert len(usual) >= (5 if make is DigitalTwin else 2)
     for spec in table.specs():
-        for changed in alternatives(parameters, spec):
+        for changed in itertools.islice(alternatives(parameters, spec), 3):
             if not spec.name.startswith(OTHER_EVENTS):
                 tried += 1
                 assert drive(make(changed)) == usual, spec.name

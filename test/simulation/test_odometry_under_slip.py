@@ -23,6 +23,7 @@ import re
 import numpy as np
 import pytest
 from support.checkout import ROOT, load_example
+from support.long_tests import few_of
 
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent
@@ -105,7 +106,7 @@ def test_yaw_errors_are_those_of_the_documentation(slip, course, steps, gyro):
         assert np.all(np.abs(errors[certain, 1]) <= np.abs(errors[certain, 0]) / 5.0)
 
 
-@pytest.mark.parametrize('course', COURSES)
+@pytest.mark.parametrize('course', few_of(COURSES))
 def test_without_slip_both_headings_are_good(course):
     steps, gyro, bound = yaw_errors('none', course, 1)
     assert abs(steps) < math.radians(4.0)
