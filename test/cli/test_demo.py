@@ -138,11 +138,14 @@ PHASES = {
 
 @pytest.mark.parametrize(
     ('phase', 'number'),
-    [
-        *((phase, signal.SIGTERM) for phase in PHASES),
-        ('run', signal.SIGINT),
-        ('run', signal.SIGHUP),
-    ],
+    few_of(
+        [
+            *((phase, signal.SIGTERM) for phase in PHASES),
+            ('run', signal.SIGINT),
+            ('run', signal.SIGHUP),
+        ],
+        len(PHASES),
+    ),
 )
 def test_a_signal_ends_the_demo_and_all_nodes(phase, number, tmp_path):
     """SIGTERM and SIGHUP once left four processes that recorded for ever."""

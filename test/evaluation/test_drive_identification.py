@@ -112,7 +112,6 @@ def assert_within(estimate, truth):
             (0.1, 0.05, 0.1, 4),
             (0.03, 0.06, 0.01, 7),
         ],
-        2,
     ),
 )
 def test_a_known_drive_is_recovered(tmp_path, lag, dead_time, noise, seed):

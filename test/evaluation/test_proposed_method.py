@@ -119,7 +119,7 @@ def test_known_dead_time_is_kept_with_friction_and_disturbances(case, noise):
 
 @pytest.mark.parametrize(
     ('case', 'periods', 'noise', 'seed'),
-    few_of([('', 3, 0.04, 1), (' 60 ms', 6, 0.0, 2), ('', 3, 0.0, 2), (' 60 ms', 6, 0.04, 1)], 2),
+    few_of([(' 60 ms', 6, 0.04, 1), ('', 3, 0.04, 1), (' 60 ms', 6, 0.0, 2), ('', 3, 0.0, 2)]),
 )
 def test_unknown_dead_time_is_found_and_used(case, periods, noise, seed):
     record, late = _dead_times(Scenario('servo', f'unknown dead time{case}', seed, noise=noise))

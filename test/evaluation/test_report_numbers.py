@@ -29,6 +29,7 @@ import struct
 from mcap.reader import make_reader
 import numpy as np
 import pytest
+from support.long_tests import few_of
 from support.recorded_stories import SIGNALS_STORY, STORIES
 
 from t3mpc_ros.evaluation.bag_report.metrics import (
@@ -317,7 +318,7 @@ def table_after(page, heading):
 BAGS = ['demo', 'switches', 'slip stop', 'gap', 'good']
 
 
-@pytest.fixture(scope='module', params=BAGS)
+@pytest.fixture(scope='module', params=few_of(BAGS, 4))
 def reported(request, tmp_path_factory):
     """Return the page of a report, and the messages of its bag."""
     folder = tmp_path_factory.mktemp('numbers')

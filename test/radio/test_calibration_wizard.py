@@ -178,6 +178,8 @@ def test_a_mark_distance_of_zero_is_refused_and_repeated(person):
     assert found.wheel_radius.value == pytest.approx(RADIUS, rel=0.01)
 
 
+# Repeated after a refusal: test_a_mark_distance_of_zero_is_refused_and_repeated.
+@pytest.mark.long
 @pytest.mark.slow
 def test_turns_that_are_refused_count_for_nothing(person, monkeypatch):
     """Their marks were misread: by 90 degrees in ten turns, 2.5 % of the scale of the gyro."""
