@@ -26,6 +26,8 @@ from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.patrol import tracking_page
 from t3mpc_ros.evaluation.patrol.path_trackers import (
+    FeedbackLinearisation,
+    LinearisationParameters,
     PurePursuitParameters,
     Pursuit,
     RegulatedParameters,
@@ -213,3 +215,33 @@ def test_an_unknown_path_or_method_is_refused(capsys, tmp_path):
     assert 'did you mean square?' in capsys.readouterr().err
     with pytest.raises(ValueError, match='method must be one of'):
         TrackingPlan(methods=('pursuit',))
+
+
+def test_regulated_pursuit_turns_on_the_spot_where_it_may():
+    """Without the turn it drives an arc away from a path behind it."""
+    points, behind = straight_line(), Pose(0.0, 0.0, 3.0)
+    for rotate_from, farthest in ((0.785, 0.01), (math.inf, 0.1)):
+        parameters = RegulatedParameters(rotate_from=rotate_from)
+        poses, _ = _follow(points, parameters, behind)
+        away = distance_to_path(poses[:, :2], np.array([[0.0, 0.0], [2.0, 0.0]]))
+        assert (away.max() < farthest) == (rotate_from < 1.0)
+
+
+@pytest.mark.parametrize('points', [straight_line(), figure_of_eight()], ids=['line', 'eight'])
+def test_feedback_linearisation_brings_its_point_to_the_path(points):
+    """The point ahead converges at rate k; the axle cuts curves by about d² times half of it."""
+    parameters = LinearisationParameters()
+    tracker, pose, rows = FeedbackLinearisation(points, parameters), Pose(0.0, 0.02, 0.5), []
+    for _ in range(2000):
+        command = tracker.step(pose)
+        pose = advance_pose(pose, command, PERIOD)
+        rows.append((*pose, *command))
+    found = np.array(rows)
+    ahead = found[:, :2] + parameters.ahead * np.column_stack(
+        [np.cos(found[:, 2]), np.sin(found[:, 2])]
+    )
+    assert distance_to_path(ahead[200:700], points).max() < 2e-3
+    assert distance_to_path(found[200:700, :2], points).max() < 0.01
+    assert np.hypot(*(found[-1, :2] - points[-1])) < 3e-3
+    limits = LimitParameters()
+    assert np.abs(np.diff(found[:, 3])).max() <= limits.linear_acceleration * PERIOD * 1.001
