@@ -39,6 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.reference import ReferenceParameters
+from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.types import Array
@@ -67,8 +68,8 @@ class PortraitParameters(Parameters):
     )
     switching: SwitchingParameters = group(
         SwitchingParameters,
-        fixed=('kind', 'modes', 'times'),
-        kind='random',
+        fixed=('kind', 'modes', 'times', 'shortest_dwell', 'longest_dwell'),
+        kind='memoryless',
         modes=(2, 3, 3, 4, 4, 2, 3, 2, 4, 3, 2, 4),
         blend=2.0,
     )
@@ -129,14 +130,18 @@ class PortraitPath:
 
         The seed is not published or logged.
         """
-        initial = self._system.initial_state(seed)
+        system = self._system
+        initial = np.array(system.initial)
+        if seed:
+            drawn = SecretRandom(seed, 'initial state').uniform(initial.size)
+            initial += system.perturbation * (2.0 * drawn - 1.0)
         self._schedule = SwitchingSchedule(self._parameters.switching, seed)
-        self._mirrors = np.random.default_rng((seed, 2))
+        self._mirrors = SecretRandom(seed, 'mirrors')
         self._mirrored = self._mirrored_before = self._draw_mirror()
         self._switches = 0
         self._length = 0.0
         self._solver.reset(initial)
-        self._solver.advance(math.ceil(self._system.settle / self._solver_step))
+        self._solver.advance(math.ceil(system.settle / self._solver_step))
 
     def advance(self, length: float = 1.0) -> Array:
         """Return the next points (m), shape (n, 2), at least ``length`` m of the path."""
@@ -203,7 +208,7 @@ class PortraitPath:
         return [number - 1 for number in self._pairs[mode]]
 
     def _draw_mirror(self) -> NDArray[np.bool_]:
-        drawn: NDArray[np.bool_] = self._mirrors.integers(0, 2, 2) == 1
+        drawn: NDArray[np.bool_] = self._mirrors.uniform(2) < 0.5
         return drawn
 
     def _line_to(self, point: Array) -> list[Array]:

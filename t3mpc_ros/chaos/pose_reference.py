@@ -24,6 +24,7 @@ import numpy as np
 
 from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
 from t3mpc_ros.chaos.reference import ReferenceParameters
+from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose
 from t3mpc_ros.geometry.path_smoothing import LEAST_TOLERANCE, SmoothedPath
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathEnd, PathTiming, check_points
@@ -252,7 +253,7 @@ class PortraitSource:
         self._path = PortraitPath(parameters, parameters.portrait, parameters.motion.linear, seed)
         self._timing = PathTiming(parameters.motion, geometry, 1.0 / parameters.rate, start)
         self._period = 1.0 / parameters.rate
-        self._times = np.random.default_rng((seed, 3))
+        self._times = SecretRandom(seed, 'reseed')
         self._left = self._draw_time()
 
     def advance(self, rate: float = 1.0) -> tuple[Pose, BodyTwist]:
@@ -268,7 +269,7 @@ class PortraitSource:
     def reseed(self, seed: int) -> None:
         """Continue with another seed, from where the path planned so far ends."""
         self._path.reseed(seed)
-        self._times = np.random.default_rng((seed, 3))
+        self._times = SecretRandom(seed, 'reseed')
         self._left = self._draw_time()
 
     def _draw_time(self) -> float:
@@ -276,7 +277,8 @@ class PortraitSource:
         reseed = self._reseed
         if reseed.longest <= 0.0:
             return math.inf
-        return float(self._times.uniform(reseed.shortest, reseed.longest))
+        share = float(self._times.uniform(1)[0])
+        return reseed.shortest + share * (reseed.longest - reseed.shortest)
 
 
 class GivenPathSource:

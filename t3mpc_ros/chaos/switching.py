@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 
@@ -30,8 +31,9 @@ class SwitchingParameters(Parameters):
 
     kind: str = parameter(
         'fixed',
-        'fixed: at the times listed; random: dwells and next modes drawn from the seed',
-        choices=('fixed', 'random'),
+        'fixed: at the times listed; random: dwells and next modes drawn from the seed; '
+        'memoryless: the first mode, too, and dwells of any length, by a cryptographic generator',
+        choices=('fixed', 'random', 'memoryless'),
     )
     modes: tuple[int, ...] = parameter(
         (1, 2, 2, 3, 3, 4, 4, 1),
@@ -48,6 +50,7 @@ class SwitchingParameters(Parameters):
     )
     shortest_dwell: float = parameter(8.0, 'minimum dwell time, kind random', 's', (0.1, 86400.0))
     longest_dwell: float = parameter(16.0, 'maximum dwell time, kind random', 's', (0.1, 86400.0))
+    mean_dwell: float = parameter(8.0, 'mean dwell time, kind memoryless', 's', (0.1, 86400.0))
     blend: float = parameter(
         0.0,
         'duration of the smooth transition between two modes; 0: sudden, as in the paper',
@@ -72,6 +75,8 @@ class SwitchingParameters(Parameters):
         least = min(dwells[1:] or dwells, default=math.inf)
         if self.kind == 'random':
             least = self.shortest_dwell
+        if self.kind == 'memoryless':
+            least = math.inf  # a switch may interrupt a transition
         if self.blend > least:
             raise ParameterError(
                 f'blend must be at most the shortest dwell, {least:g} s: got {self.blend:g}'
@@ -107,7 +112,9 @@ class SwitchingSchedule:
 
     At a switch time itself the new mode is active. Kind *fixed* takes the modes in turn; kind
     *random* draws each dwell uniformly between its bounds and each next mode uniformly among the
-    others, so that neither can be predicted without the seed. With one mode there are no switches.
+    others. Its bounds are public: right after a switch no other one comes. Kind *memoryless* draws
+    exponential dwells, so that the time since the last switch says nothing of the next one, the
+    first mode as well, and all from :class:`SecretRandom`. With one mode there are no switches.
 
     Only the current dwell is kept: memory is constant, each switch passed costs one draw, and
     a query about an earlier dwell restarts at time zero. The seed has any length; kind *fixed*
@@ -146,15 +153,21 @@ class SwitchingSchedule:
     def _walk(self) -> Iterator[SwitchingMode]:
         """Yield every dwell, its transition completed; the last one may be infinite."""
         generator = np.random.default_rng(self._seed)
-        mode = previous = 0
+        secret = SecretRandom(self._seed, 'switching')
+        memoryless = self._parameters.kind == 'memoryless'
+        mode = previous = secret.below(len(self.pairs)) if memoryless else 0
         since = 0.0
         for switches in count():
             until = self._end(switches, since, generator)
+            if memoryless and len(self.pairs) > 1:
+                until = since + secret.exponential(self._parameters.mean_dwell)
             yield SwitchingMode(mode, previous, 1.0, 0.0, switches, since, until)
             previous, since = mode, until
             step = 1
             if self._parameters.kind == 'random':
                 step = int(generator.integers(1, len(self.pairs)))
+            elif memoryless and len(self.pairs) > 1:
+                step = 1 + secret.below(len(self.pairs) - 1)
             mode = (mode + step) % len(self.pairs)
 
     def _end(self, switches: int, since: float, generator: np.random.Generator) -> float:

@@ -13,6 +13,7 @@
 # limitations under the License.
 """Switching signal: deterministic, unbounded in time, with smooth transitions."""
 
+from dataclasses import replace
 import math
 
 from hypothesis import given
@@ -76,7 +77,7 @@ TIMES = st.floats(0.0, 300.0) | st.integers(0, 25).map(lambda n: 12.0 * n)
 @pytest.mark.slow
 @PROPERTY
 @given(
-    st.sampled_from((SwitchingParameters(blend=1.0), RANDOM)),
+    st.sampled_from((SwitchingParameters(blend=1.0), RANDOM, replace(RANDOM, kind='memoryless'))),
     st.integers(0, 2**128),
     st.lists(TIMES, min_size=5),
 )
@@ -157,3 +158,27 @@ def test_inconsistent_parameters_are_rejected_by_name(values, name):
 def test_times_outside_the_run_are_rejected(time):
     with pytest.raises(ValueError, match='time'):
         SwitchingSchedule(SwitchingParameters()).at(time)
+
+
+MEMORYLESS = SwitchingParameters(kind='memoryless', mean_dwell=4.0, blend=2.0)
+
+
+def test_a_dwell_without_memory_has_no_bound():
+    """With dwells of at least 8 s the next seconds after a switch were known."""
+    dwells = np.diff([0.0, *_switches(SwitchingSchedule(MEMORYLESS, seed=2), 8000.0)[0]])
+    assert kstest(dwells, 'expon', args=(0.0, 4.0)).pvalue > 0.01
+    assert dwells.min() < 0.05
+    assert (dwells[1:] < MEMORYLESS.blend).mean() > 0.3
+    # Given that a dwell has lasted, its rest is as long as any.
+    assert np.mean(dwells[dwells > 4.0] - 4.0) == pytest.approx(4.0, abs=0.5)
+
+
+def test_the_first_mode_is_as_any_other():
+    """It was pair 1 for every seed."""
+    first = [SwitchingSchedule(MEMORYLESS, seed).at(0.0).mode for seed in range(400)]
+    np.testing.assert_allclose(np.bincount(first) / 400, 0.25, atol=0.07)
+    times, modes = _switches(SwitchingSchedule(MEMORYLESS, seed=3), 8000.0)
+    assert (np.diff(modes) != 0).all()
+    np.testing.assert_allclose(np.bincount(modes) / len(modes), 0.25, atol=0.03)
+    one = SwitchingSchedule(SwitchingParameters(kind='memoryless', modes=(2, 4)))
+    assert one.at(1e7).until == math.inf

@@ -71,7 +71,11 @@ def test_a_patrol_keeps_limits_and_touches_nothing():
     assert contact_count(record) == 0
     largest = np.abs(record['command']).max(axis=0)
     sent = np.vstack([np.zeros(2), record['command']])  # the robot stands before
-    change = np.abs(np.diff(sent, axis=0)).max(axis=0) * RATE
+    change = np.abs(np.diff(sent, axis=0)) * RATE
+    # A slippery patch leads to a stop, which is sudden.
+    stopped = np.array([bool(reason) for reason in record.driver_reasons])
+    change = change[~stopped].max(axis=0)
+    assert stopped.mean() < 0.1
     assert (largest <= np.array([limits.linear, limits.angular]) + 1e-9).all()
     accelerations = np.array([limits.linear_acceleration, limits.angular_acceleration])
     assert (change <= accelerations * (1.0 + 1e-9)).all()
