@@ -74,6 +74,8 @@ class Trial(NamedTuple):
     """The true ones."""
     shown: Counter[str]
     """Texts of the diagnostics, by the number of samples that had them."""
+    unknown: float
+    """Longest path that the host says it does not know, m."""
 
 
 class Fault(NamedTuple):
@@ -157,6 +159,7 @@ def measure(fault: Fault, phase: float) -> Trial:
         (quality.robot_resets, quality.dongle_resets),
         tuple(observer.restarts),
         observer.shown,
+        bench.robot.unknown_travel,
     )
 
 

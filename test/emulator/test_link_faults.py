@@ -17,6 +17,7 @@ from pathlib import Path
 import re
 
 import pytest
+from support.emulator_bench import STEP
 
 from bench import link_faults
 
@@ -30,6 +31,8 @@ def expect_right(fault, trials):
     in_motion = 'robot resets' in fault.name and 'rest' not in fault.name.split()
     for trial in trials:
         assert trial.missed == 0 or in_motion, fault.name
+        missed = STEP * link_faults.GEOMETRY.wheel_radius * abs(trial.missed)
+        assert missed < trial.unknown if in_motion else trial.unknown == 0.0
         assert trial.error < 1e-9
         if 'unplugged' not in fault.name:  # the port is closed, and opened anew
             assert trial.counted == trial.happened
