@@ -52,6 +52,10 @@ def test_a_release_is_reproducible_and_has_its_hashes(tmp_path):
     assert sorted(first) == sorted(['COMPILER', 'SHA256SUMS', *images])
     sums = dict(line.split()[::-1] for line in first['SHA256SUMS'].decode().splitlines())
     assert sums == {name: hashlib.sha256(first[name]).hexdigest() for name in images}
+    check = ['sha256sum', '-c', 'SHA256SUMS']  # as on the page
+    assert not subprocess.run(
+        check, cwd=tmp_path / 'one' / 'release', capture_output=True
+    ).returncode
     assert first['COMPILER'].startswith(b'avr-gcc')
     for name in images:
         assert first[name].startswith(b':')

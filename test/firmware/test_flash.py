@@ -183,6 +183,15 @@ def test_make_prints_what_it_found_and_the_command(sysfs):
     assert 'avrdude -c usbasp -p m328p' in done.stdout
 
 
+@pytest.mark.parametrize('goal, board', [('flash', 'robot'), ('flash-dongle', 'dongle')])
+def test_make_passes_the_port_of_the_page(goal, board):
+    done = run_make('-n', goal, 'PORT=/dev/ttyUSB0', 'DRY_RUN=1')
+    last = done.stdout.splitlines()[-1]
+    assert f' {board} build/{board}.hex' in last
+    assert '--port /dev/ttyUSB0' in last
+    assert '--dry-run' in last
+
+
 @pytest.mark.parametrize('goal', ['flash', 'flash-dongle', 'avr', 'core'])
 def test_make_without_the_compiler_of_the_boards_has_a_remedy(goal, tmp_path):
     """It said ``avr-gcc: No such file or directory``."""
