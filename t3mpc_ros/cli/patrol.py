@@ -69,6 +69,12 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         'figure of eight and a recorded path, with and without each part of the controller and '
         'by pure pursuit; tune: errors of the choices of gains and lookaheads on another path',
     )
+    parser.add_argument(
+        '--safety',
+        action='store_true',
+        help='instead: what the simulated robot touches when its range sensors fail, things are '
+        'placed in its way, people step in or boxes are below its beams',
+    )
     add_workers(parser)
     parser.add_argument(
         '--output', type=Path, default=OUTPUT, help=f'folder of the page (default {OUTPUT})'
@@ -83,6 +89,8 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.reporting import strict_json
     from t3mpc_ros.evaluation.result_file import ResultFile
 
+    if options.safety:
+        return _safety(options)
     figures = options.output / 'figures'
     figures.mkdir(parents=True, exist_ok=True)  # an error before the runs, not after them
     if options.tracking == 'tune':
@@ -110,6 +118,17 @@ def _tune_tracking(options: argparse.Namespace) -> int:
 
     with executor_of(options) as executor:
         print(tracking_page.tuning_markdown(tune_trackers(executor, print_report)))
+    return 0
+
+
+def _safety(options: argparse.Namespace) -> int:
+    from t3mpc_ros.evaluation.experiment import print_report
+    from t3mpc_ros.evaluation.patrol.patrol_safety import compare_safety, safety_table
+
+    seconds = 60.0 * options.minutes
+    with executor_of(options) as executor:
+        measured = compare_safety(options.seeds, seconds, executor, print_report)
+    print(safety_table(measured).markdown())
     return 0
 
 

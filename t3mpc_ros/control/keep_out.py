@@ -65,7 +65,7 @@ NEAREST_TRUSTED = 0.08
 reads 13 cm for an object at 3 cm."""
 STANDING_ROOM = 0.12
 """Radius of the floor that is free because the robot stands there, m."""
-MEMORY = 20.0
+MEMORY = 60.0
 """Default time after which floor that was seen to be free counts as unseen, s."""
 CLEARINGS = 4
 """Rays that must pass over an occupied cell to clear it."""
@@ -344,7 +344,7 @@ class KeepOutParameters(Parameters):
     range_timeout: float = parameter(
         0.2,
         'time without a valid reading after which a range sensor is lost; the robot brakes after '
-        'half of it. With one lost it drives slowly, without any in the direction of motion it '
+        '0.4 of it. With one lost it drives slowly, without any in the direction of motion it '
         'stops',
         's',
         (0.05, 5.0),
@@ -526,6 +526,7 @@ class KeepOut:
         self.changed, self.activity = True, Activity.BACKING_OFF
         # It came over this floor, and the sensors at its back see what has come there since.
         self._update_nearest(pose, OCCUPIED)
+        self._nearest[self._nearest[:, 0] > -0.5, 3] = math.inf  # beside it, as on its way here
         if abs(gap) > RETREAT_TURN:  # what it touched has turned it
             limit = self.parameters.scan_rate
             return BodyTwist(0.0, min(max(4.0 * gap, -limit), limit))

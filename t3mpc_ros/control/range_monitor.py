@@ -28,6 +28,8 @@ FROZEN_MOTION, FROZEN_TURN = 0.08, 0.8
 """Motion along its beam (m), or turn (rad), during which a sensor must not read one distance. Its
 noise of 10 mV changes a reading beyond 0.25 m even of a robot that stands, but not a nearer one of
 a robot that drives along a wall: that moves no face along its beam."""
+BRAKES = 0.4
+"""Share of the time-out after which the robot brakes."""
 LEAP = 0.1
 """Change of the pose (m) within a step that is no motion: the robot was carried, or found."""
 
@@ -161,9 +163,9 @@ class RangeMonitor:
         return all(record.fault for record in looking) if looking else self._all_lost()
 
     def waits(self, *, astern: bool) -> bool:
-        """Return whether no sensor that looks there has reported for half the time-out."""
+        """Return whether no sensor that looks there has reported for so long that it brakes."""
         looking = [record for record in self._looking(astern) if not record.fault]
-        return bool(looking) and min(each.age for each in looking) > 0.5 * self._timeout
+        return bool(looking) and min(each.age for each in looking) > BRAKES * self._timeout
 
     def faults(self) -> dict[str, RangeFault]:
         """Return the faults of the sensors by name."""

@@ -299,6 +299,8 @@ sideways, as along what it touches."""
 CONTACT_TURN = 0.25
 """Difference of the turns by pose and by wheels within that motion (rad): what the robot touches
 turns it."""
+DRIVING = 0.05
+"""Commanded speed (m/s) above which that difference counts."""
 RECOVERY_TIME = 5.0
 """Time of driving as commanded after which earlier pauses do not count, s."""
 
@@ -338,7 +340,8 @@ class HeldMotion:
         if abs(self._ahead) >= self._most:
             self._most, self.furthest = abs(self._ahead), pose
         self._left += math.cos(middle) * y - math.sin(middle) * x
-        self._turn += odometry.twist.angular * elapsed - turn
+        if abs(command.linear) > DRIVING:  # a tyre may slip on the spot without any contact
+            self._turn += odometry.twist.angular * elapsed - turn
         self._asked += command.linear * elapsed
         self._fastest = max(self._fastest, abs(command.linear))
         self._fastest_turn = max(self._fastest_turn, abs(command.angular))

@@ -165,6 +165,8 @@ PATROL = {
         table=SimpleNamespace(keys=())
     ),
     'evaluation.patrol.path_tracking.tune_trackers': {},
+    'evaluation.patrol.patrol_safety.compare_safety': {},
+    'evaluation.patrol.patrol_safety.safety_table': SimpleNamespace(markdown=str),
     'evaluation.patrol.tracking_page.tuning_markdown': '',
 }
 TUNE = {
@@ -385,6 +387,14 @@ TABLE = {
             '--paths square': {'compare_trackers.plan.paths': ('square',)},
             '--output new': {'write_pictures.folder': 'new/figures'},
             **workers('compare_trackers.workers'),
+        },
+    ),
+    'patrol --safety': (
+        PATROL | SHARED,
+        {
+            '--seeds 3-4': {'compare_safety.seeds': (3, 4)},
+            '--minutes 2': {'compare_safety.duration': 120.0},
+            **workers('compare_safety.workers'),
         },
     ),
     'patrol --tracking tune': (PATROL | SHARED, workers('tune_trackers.workers')),

@@ -275,4 +275,3 @@ def test_a_robot_does_not_back_off_into_what_it_sees():
     while robot.controller.keep_out.retreats or robot.reasons[-1] is Reason.PAUSED:
         robot.run(0.05)
         assert robot.pose.x - robot.wall > 0.12
-    assert min(robot.astern) > -0.06

@@ -99,10 +99,10 @@ def test_too_few_sensors_are_those_of_the_direction_of_motion(lost, ahead, aster
     assert drive.monitor.is_blind(astern=True) is astern
 
 
-def test_a_robot_brakes_after_half_of_the_time_out():
+def test_a_robot_brakes_before_the_time_out():
     drive = Drive()
     drive.run(1.0)
-    drive.run(0.08, lambda sensor, time: None)
+    drive.run(0.07, lambda sensor, time: None)
     assert not drive.monitor.waits(astern=False)
     drive.run(0.04, lambda sensor, time: None if sensor in FRONT else 0.3)
     assert drive.monitor.waits(astern=False)

@@ -22,14 +22,13 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 import math
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.portrait import PortraitParameters
-from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, digest, run_experiment
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     START,
     PatrolScenario,
@@ -40,6 +39,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     world_file,
 )
 from t3mpc_ros.evaluation.record import RATE, Record
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.geometry.types import Array, State
 from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
@@ -60,30 +60,31 @@ SAME_PLACE = 0.3
 """Distance between two contacts that are at one place, m."""
 BOUNCE = 1.0
 """Longest gap within one contact, s: a bumper bounces."""
-REST = 0.005, 0.05
-"""Speeds below which the robot rests, m/s and rad/s."""
+OWN_SPEED = 0.005
+"""Speed towards what it touches above which the robot has run into it, m/s."""
 RADIUS = BumperParameters().radius
 
 
 class PlacedThings:
-    """Pillars that appear around the robot, one every 8 s, and go after 20 s."""
+    """Pillars that appear and go after 30 s, one every 4 s: ahead of the robot, or anywhere."""
 
     def __init__(self, seed: int) -> None:
         self._generator = np.random.default_rng((seed, 41))
 
     def __call__(self, time: float, state: State) -> MovingDisc | None:
         """Return what appears at a time of the twin (s), given the true state of the robot."""
-        if round(time * RATE) % (8 * RATE) or time < 10.0:
+        if round(time * RATE) % (4 * RATE) or time < 10.0:
             return None
         draw = self._generator.uniform
         radius, gap = float(draw(0.03, 0.15)), float(draw(0.25, 1.0))
         angle = state.pose.yaw + float(draw(-0.7, 0.7))
         away = RADIUS + gap + radius
-        point = (
-            state.pose.x + away * math.cos(angle),
-            state.pose.y + away * math.sin(angle),
-        )
-        return MovingDisc(radius, np.array([point]), 0.0, 0.0, time, time + 20.0)
+        x, y = state.pose.x + away * math.cos(angle), state.pose.y + away * math.sin(angle)
+        if round(time) % 8:
+            x, y = draw(-0.5, 0.5, 2) * np.array(ROOM)
+            if math.dist((x, y), state.pose[:2]) < RADIUS + radius + 0.25:
+                return None
+        return MovingDisc(radius, np.array([[x, y]]), 0.0, 0.0, time, time + 30.0)
 
 
 class People:
@@ -273,13 +274,13 @@ def measured_safety(job: tuple[tuple[str, float], int]) -> Row:
     ``contacts``, those to which the robot moved; ``run_into``, those to which it did not;
     ``most_at_a_place``; ``fastest_again``, speed of the fastest contact after the first at its
     place (m/s); ``pushing``, longest time of pushing (s); ``driven`` (m); ``ended``, reason of a
-    stop that lasts to the end. Of a case with faults ``rest``, time from the fault to rest (s),
-    NaN without, and ``after``, distance driven after it (m).
+    stop that lasts to the end. Of a case with faults ``rest``, time from the fault to the last
+    pulse of a motor (s), NaN without, and ``after``, distance driven after it (m).
     """
     (case, duration), seed = job
     record, world = safety_run(case, seed, duration)
     found = contacts(record, world)
-    own = [each for each in found if each.speed > REST[0]]
+    own = [each for each in found if each.speed > OWN_SPEED]
     places = at_places(own)
     again = [each.speed for known in places for each in known[1:]]
     steps = np.hypot(*np.diff(record['truth'][:, :2], axis=0).T)
@@ -298,26 +299,69 @@ def measured_safety(job: tuple[tuple[str, float], int]) -> Row:
     }
     if CASES[case].faults:
         first = round((cut_time(seed) - START) * RATE)
-        over = np.abs(record['twist'][first:]) > np.array(REST)
-        moving = np.flatnonzero(over.any(axis=1))
-        rests = 0.0 if not moving.size else float(moving[-1] + 1) / RATE
-        row['rest'] = math.nan if moving.size and moving[-1] + 1 == len(over) else rests
+        moves = (record['commanded'][first:] != 0.0).any(axis=1)
+        ends = float(np.flatnonzero(moves)[-1] + 1) / RATE if moves.any() else 0.0
+        row['rest'] = math.nan if moves[-1] else ends
         row['after'] = float(steps[first:].sum())
     return row
 
 
 def compare_safety(
-    cases: Sequence[str],
     seeds: Sequence[int],
     duration: float,
-    store: Path | None = None,
     workers: int | Executor = 1,
     report: Report | None = None,
 ) -> ResultTable:
     """Return one row a case and seed; arguments as of :func:`run_experiment`."""
-    runs = []
-    for case in cases:
-        for seed in seeds:
-            job = (case, duration), seed
-            runs.append(Run(job, {'controller': case, 'case': case, 'seed': seed}, digest(job)))
-    return run_experiment(runs, measured_safety, workers, store=store, report=report)
+    runs = [
+        Run(((case, duration), seed), {'controller': case, 'seed': seed})
+        for case in CASES
+        for seed in seeds
+    ]
+    return run_experiment(runs, measured_safety, workers, report=report)
+
+
+HEAD = (
+    'case',
+    'runs',
+    'runs with contact',
+    'places touched',
+    'most contacts at a place',
+    'fastest after the first, m/s',
+    'longest push, s',
+    'rest after the fault, s',
+    'driven after it, m',
+)
+
+
+def safety_table(table: ResultTable) -> Table:
+    """Return the worst of each case."""
+    lines = []
+    for case in table.unique('controller'):
+        rows = table.where(controller=case)
+
+        def worst(column: str, digits: int, rows: Sequence[Row] = rows) -> str:
+            values = [float(row[column]) for row in rows if column in row]
+            if not values:
+                return EMPTY_CELL
+            goes_on = sum(map(math.isnan, values))
+            if goes_on:
+                return f'{goes_on} of {len(rows)} drive on'
+            return f'{max(values):.{digits}f}'
+
+        touched = sum(bool(row['contacts']) for row in rows)
+        places = sum(row['places'] for row in rows)
+        lines.append(
+            [
+                case,
+                str(len(rows)),
+                str(touched),
+                str(places),
+                worst('most_at_a_place', 0),
+                worst('fastest_again', 3),
+                worst('pushing', 2),
+                worst('rest', 2),
+                worst('after', 3),
+            ]
+        )
+    return Table('', HEAD, lines)
