@@ -252,6 +252,33 @@ def test_a_path_back_is_joined_after_a_stop():
     assert rows[-1, :2] == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
+@pytest.mark.compiled
+@pytest.mark.parametrize('given', [LINE, CIRCLE], ids=['line', 'circle'])
+def test_the_robot_can_stop_where_it_leaves_its_path(given):
+    """The corner there changes the accelerations before it: braking was up to a quarter harder."""
+    for periods in range(40, 340, 25):
+        source = GivenPathSource(PARAMETERS, GEOMETRY, ORIGIN, given)
+        rows = [drive(source, periods)]
+        source.replace(rows[-1][-1, :2] + np.array([[-0.1, 0.0], [-0.5, 0.1]]))
+        rows.append(drive(source, 150))
+        check_motion(np.vstack(rows))
+
+
+@pytest.mark.compiled
+def test_an_end_right_behind_a_corner_is_reached_without_a_jump():
+    """From rest to rest within one step of the grid: the robot stood, and then was there."""
+    for length in np.arange(0.0025, 0.009, 0.0005).tolist():
+        timing = PathTiming(LIMITS, GEOMETRY, PERIOD)
+        timing.add_points(np.array([[0.0, 0.0], [0.2, 0.0], [0.2, length]]))
+        timing.finish()
+        rows = []
+        while not timing.finished:
+            pose, twist = timing.advance()
+            rows.append((*pose, *twist))
+        check_motion(np.array(rows))
+        assert rows[-1][:2] == pytest.approx((0.2, length), abs=1e-3)
+
+
 def test_a_path_that_comes_while_the_robot_waits_begins_there():
     """Stopped by an obstacle or paused, it does not drive on before it turns away."""
     source = GivenPathSource(PARAMETERS, GEOMETRY, ORIGIN, LINE)
