@@ -71,6 +71,7 @@ from t3mpc_ros.geometry.types import (
     BodyTwist,
     State,
     WheelSpeeds,
+    has_moved,
 )
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import (
@@ -103,6 +104,8 @@ are reported, s."""
 EARLY = 0.6
 """Share of the period before which an odometry is too early for a step."""
 
+POSE_JUMP = 0.25, 0.5
+"""Change of the pose (m, rad) from one message to the next that is no motion."""
 SNAPSHOT_PERIOD = 0.25
 """Time between two snapshots of the weights, s."""
 SNAPSHOT_COUNT = 3
@@ -482,6 +485,8 @@ class Controller:
             self._clear_reference()
             if self.keep_out is not None:
                 self.keep_out.reset()
+        elif self.keep_out is not None and last is not None and self._is_elsewhere(odometry):
+            self.keep_out.reset()  # what it has marked was marked at another place
         plan_ns, reason = self._sample_plan(odometry)
         if reason.moves and restarted:
             reason = Reason.ODOMETRY_RESTARTED
@@ -548,6 +553,10 @@ class Controller:
         if reason.moves and keep_out.ranges.is_blind(astern=astern):
             return Reason.TOO_FEW_RANGES
         return reason
+
+    def _is_elsewhere(self, odometry: State) -> bool:
+        """Return whether the pose has jumped: a localisation has found the robot elsewhere."""
+        return odometry.is_finite() and has_moved(self._place, odometry.pose, *POSE_JUMP)
 
     def _wait(self, odometry: State) -> tuple[BodyTwist, Status]:
         """Return the last command at an odometry that comes before the period has passed."""

@@ -168,6 +168,19 @@ def test_a_reading_counts_at_the_pose_of_the_last_odometry():
     assert np.array_equal(controller.keep_out.map.grid.cells, wanted.map.grid.cells)
 
 
+@pytest.mark.parametrize(
+    ('x', 'yaw', 'forgotten'), [(0.2, 0.0, False), (0.3, 0.0, True), (0.0, 0.6, True)]
+)
+def test_a_robot_found_elsewhere_forgets_what_it_marked(x, yaw, forgotten):
+    """A localisation finds a carried robot: the marks would block free floor."""
+    parameters = {'pose.enabled': True, 'keep_out.enabled': True}
+    controller = Controller(StepperControllerParameters.from_dict(parameters))
+    controller.step(State(0, ORIGIN, STANDSTILL))
+    controller.keep_out.map.grid.cells[10, 10] = OCCUPIED
+    controller.step(State(10_000_000, Pose(x, 0.0, yaw), STANDSTILL))
+    assert bool(controller.keep_out.map.grid.cells[10, 10] == UNKNOWN) is forgotten
+
+
 @pytest.mark.compiled
 def test_floor_that_was_seen_long_ago_is_looked_at_again():
     """A cell was free for ever: what was placed there later was driven into."""
