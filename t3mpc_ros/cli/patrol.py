@@ -75,6 +75,12 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         help='instead: what the simulated robot touches when its range sensors fail, things are '
         'placed in its way, people step in or boxes are below its beams',
     )
+    parser.add_argument(
+        '--localization',
+        action='store_true',
+        help='instead: how well the simulated robot knows its place in a known room, by odometry '
+        'and by the particle filter, also with more noise and after it was carried; a table',
+    )
     add_workers(parser)
     parser.add_argument(
         '--output', type=Path, default=OUTPUT, help=f'folder of the page (default {OUTPUT})'
@@ -93,6 +99,8 @@ def run(options: argparse.Namespace) -> int:
         return _safety(options)
     figures = options.output / 'figures'
     figures.mkdir(parents=True, exist_ok=True)  # an error before the runs, not after them
+    if options.localization:
+        return _compare_localizations(options)
     if options.tracking == 'tune':
         return _tune_tracking(options)
     name = 'tracking' if options.tracking else 'patrol'
@@ -129,6 +137,21 @@ def _safety(options: argparse.Namespace) -> int:
     with executor_of(options) as executor:
         measured = compare_safety(options.seeds, seconds, executor, print_report)
     print(safety_table(measured).markdown())
+    return 0
+
+
+def _compare_localizations(options: argparse.Namespace) -> int:
+    from t3mpc_ros.evaluation.experiment import print_report
+    from t3mpc_ros.evaluation.patrol.localization_study import (
+        LocalizationPlan,
+        compare_localizations,
+        markdown,
+    )
+
+    plan = LocalizationPlan(seeds=options.seeds, duration=60.0 * options.minutes)
+    runs = options.output / f'localization{RUNS}'
+    with executor_of(options) as executor:
+        print(markdown(plan, compare_localizations(plan, runs, executor, print_report)))
     return 0
 
 

@@ -50,6 +50,8 @@ LARGEST_STEP = 1.0
 SYSTEMATIC = 0.01, 0.01, 0.007
 """Standard deviations (m, m, rad) of what particles do not know, because it repeats: offsets of
 the sensors and the age of their readings; the errors measured on the twin."""
+FOUND_AGREEMENT = 0.9
+"""Share of fitting readings from which on a search ends: about 30 in a row from a half."""
 CORRECTION_TIME = 0.5
 """Time constant with which the used pose approaches that of the localizer, s."""
 CORRECTION_SPEED, CORRECTION_RATE = 0.05, 0.2
@@ -107,7 +109,7 @@ class LocalizerParameters(ParticleFilterParameters):
         bounds=(1e-3, 10.0),
     )
     lost_agreement: float = parameter(
-        0.5, 'share of fitting readings below which the robot is lost', bounds=(0.0, 1.0)
+        0.4, 'share of fitting readings below which the robot is lost', bounds=(0.0, 1.0)
     )
     ranges: RangeModelParameters = group(RangeModelParameters, inline=True)
 
@@ -116,7 +118,7 @@ class Localization(enum.Enum):
     """What is known of the place, in words for the diagnostics."""
 
     NO_ODOMETRY = 'no odometry yet'
-    SEARCHING = 'searching: the particles are in several places'
+    SEARCHING = 'searching: the readings fit to several places, or not for long enough'
     LOCALIZED = 'the place is known'
     LOST = 'lost: the readings do not fit to the map'
 
@@ -156,8 +158,10 @@ class Localizer:
         """The particles."""
         self.result: LocalizedPose | None = None
         """Pose of the last update; None before the first."""
-        self.agreement = 1.0
+        self.agreement = 1.0 if parameters.set_initial_pose else parameters.lost_agreement
         """Share of the telling readings that fit to the map, of the last 20 or so."""
+        self._searching = not parameters.set_initial_pose
+        """Whether random particles are added until the readings fit for some time."""
         self.share = 0.0
         """Share of the weight in the heaviest cluster."""
         self._stamp_ns = 0
@@ -175,15 +179,16 @@ class Localizer:
     def set_pose(self, pose: Pose, covariance: Array) -> None:
         """Begin at a pose with a covariance of x, y (m), yaw (rad), shape (3, 3)."""
         self.filter.place(pose, covariance)
-        self._restart()
+        self._restart(searching=False)
 
     def scatter(self) -> None:
         """Begin anywhere on the map."""
         self.filter.scatter()
-        self._restart()
+        self._restart(searching=True)
 
-    def _restart(self) -> None:
-        self.agreement, self.share = 1.0, 0.0
+    def _restart(self, *, searching: bool) -> None:
+        self._searching, self.share = searching, 0.0
+        self.agreement = self.parameters.lost_agreement if searching else 1.0
         self._pending.clear()
         self._updated = None  # the next odometry is an update without a motion
 
@@ -194,13 +199,18 @@ class Localizer:
             return Localization.NO_ODOMETRY
         if self.agreement < self.parameters.lost_agreement:
             return Localization.LOST
+        if self._searching:
+            return Localization.SEARCHING
         largest = float(np.diag(self.result.covariance).max())
         known = math.sqrt(largest) <= self.parameters.localized_deviation
         return Localization.LOCALIZED if known else Localization.SEARCHING
 
     def add_range(self, sensor: int, reading: float) -> None:
-        """Add a reading (m, REP 117) taken where the last odometry was; NaN changes nothing."""
-        if reading != reading:
+        """Add a reading (m, REP 117) taken where the last odometry was.
+
+        NaN and a finite distance below zero change nothing.
+        """
+        if not (reading >= 0.0 or reading == -math.inf):
             return
         mount = self._mounts[sensor : sensor + 1]
         self._add(sensor, Beams(mount, np.array([reading]), np.array([self._limits])))
@@ -239,8 +249,7 @@ class Localizer:
         self.filter.predict(self._updated, pose)
         beams = self._beams(pose)
         # Averages of the likelihood get used to a wrong place; the share that fits does not.
-        doubt = 1.0 - self.agreement / max(parameters.lost_agreement, 1e-9)
-        self.filter.correct(beams, max(doubt, 0.0))
+        self.filter.correct(beams, 1.0 - self.agreement if self._searching else 0.0)
         found = self._publish(pose)
         self._compare(beams)
         return found
@@ -274,6 +283,10 @@ class Localizer:
         if telling:
             decay = 1.0 - (1.0 - AGREEMENT_DECAY) ** telling
             self.agreement += decay * (fitting / telling - self.agreement)
+        if self.agreement < self.parameters.lost_agreement:
+            self._searching = True
+        elif self.agreement >= FOUND_AGREEMENT and self.share >= KNOWN_SHARE:
+            self._searching = False
 
 
 class PoseCorrection:

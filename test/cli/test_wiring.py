@@ -168,6 +168,8 @@ PATROL = {
     'evaluation.patrol.patrol_safety.compare_safety': {},
     'evaluation.patrol.patrol_safety.safety_table': SimpleNamespace(markdown=str),
     'evaluation.patrol.tracking_page.tuning_markdown': '',
+    'evaluation.patrol.localization_study.compare_localizations': {},
+    'evaluation.patrol.localization_study.markdown': '',
 }
 TUNE = {
     'evaluation.methods.require_libraries': None,
@@ -395,6 +397,15 @@ TABLE = {
             '--seeds 3-4': {'compare_safety.seeds': (3, 4)},
             '--minutes 2': {'compare_safety.duration': 120.0},
             **workers('compare_safety.workers'),
+        },
+    ),
+    'patrol --localization': (
+        PATROL | SHARED,
+        {
+            '--seeds 3-4': {'compare_localizations.plan.seeds': (3, 4)},
+            '--minutes 2': {'compare_localizations.plan.duration': 120.0},
+            '--output new': {'compare_localizations.store': 'new/localization.runs.jsonl'},
+            **workers('compare_localizations.workers'),
         },
     ),
     'patrol --tracking tune': (PATROL | SHARED, workers('tune_trackers.workers')),

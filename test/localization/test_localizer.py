@@ -216,7 +216,6 @@ def test_bad_inputs_change_nothing():
     follow(localizer, drive, 5.0)
     result = localizer.result
     assert not localizer.add_odometry(drive.stamp_ns, Pose(math.nan, 0.0, 0.0))
-    localizer.add_range(0, math.nan)
     assert localizer.result is result
     assert rms(follow(localizer, drive, 10.0))[0] < 0.03
 
@@ -331,3 +330,19 @@ def test_there_is_no_corrected_pose_before_the_place_is_known():
     drive.step()
     localizer.add_odometry(drive.stamp_ns, drive.odometry)
     assert PoseCorrection().step(drive.stamp_ns, drive.odometry, localizer) is None
+
+
+@pytest.mark.parametrize('impossible', [math.nan, -0.3])
+def test_impossible_readings_are_no_readings(impossible):
+    poses = []
+    for reading in ((), (impossible,)):
+        localizer, drive = make_localizer(), Drive()
+        for _ in range(100):
+            drive.step()
+            for sensor in range(2):
+                localizer.add_range(sensor, 0.4)
+            for each in reading:
+                localizer.add_range(5, each)
+            localizer.add_odometry(drive.stamp_ns, drive.odometry)
+        poses.append(localizer.result.pose)
+    assert poses[0] == poses[1]

@@ -1,0 +1,188 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""How well a patrol knows its place: odometry alone against the particle filter, in a known room.
+
+The simulated robot drives its chaotic path by the pose in question, with the noise of its sensors,
+oil on the floor, and a tenth of the commands lost.
+"""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+import math
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from t3mpc_ros.chaos.portrait import PortraitParameters
+from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, digest, run_experiment
+from t3mpc_ros.evaluation.patrol.patrol_run import (
+    PatrolScenario,
+    contact_count,
+    path_error,
+    portrait_points,
+    run_patrol,
+)
+from t3mpc_ros.evaluation.record import RATE, Record
+from t3mpc_ros.evaluation.reporting import Table
+from t3mpc_ros.evaluation.result_file import Row
+from t3mpc_ros.geometry.types import Array
+
+CARRIED_AT = 30.0
+"""When the robot is carried, s."""
+LOST_DISTANCE, LOST_TIME = 0.3, 10.0
+"""A robot is lost whose pose is so far off (m) for so long (s)."""
+FOUND_WITHIN = 60.0
+"""Time in which a robot that was carried is to be found, s."""
+ON_PATH = 0.05
+"""Distance from the reference up to which a robot is on its path, m."""
+TRIPLED = MappingProxyType(
+    {
+        'noise.variance': 9.0 * 0.04,
+        'imu.gyro_noise': 3.0 * 0.005,
+        'range_sensor.voltage_noise': 3.0 * 0.01,
+        'range_sensor.voltage_offset': 3.0 * 0.01,
+    }
+)
+"""Parameters of a twin with three times the noise of wheels, gyro and ranges."""
+CASES: Mapping[str, PatrolScenario] = {
+    'odometry alone': PatrolScenario(localization='odometry'),
+    'particle filter': PatrolScenario(localization='filter'),
+    'noise x 3, 20 % of the readings lost': PatrolScenario(
+        localization='filter', range_loss=0.2, robot=dict(TRIPLED)
+    ),
+    'carried by 1 m and 90 degrees': PatrolScenario(localization='filter', carried_at=CARRIED_AT),
+}
+"""The cases by name."""
+
+
+@dataclass(frozen=True)
+class LocalizationPlan:
+    """What is compared."""
+
+    cases: Sequence[str] = tuple(CASES)
+    seeds: Sequence[int] = tuple(range(101, 121))
+    duration: float = 1800.0
+    """s"""
+    world: str = 'room'
+    """Known room: a name or a file."""
+
+    def __post_init__(self) -> None:
+        if self.duration < CARRIED_AT + FOUND_WITHIN:
+            raise ValueError(
+                f'duration must be at least {CARRIED_AT + FOUND_WITHIN:g} s, so that a robot that '
+                f'is carried may be found: got {self.duration:g}'
+            )
+
+
+def compare_localizations(
+    plan: LocalizationPlan,
+    store: Path | None = None,
+    workers: int | Executor = 1,
+    report: Report | None = None,
+) -> ResultTable:
+    """Return a row for each case and seed; arguments as of :func:`run_experiment`."""
+    runs = []
+    for name in plan.cases:
+        for seed in plan.seeds:
+            case = replace(CASES[name], seed=seed, duration=plan.duration, known_world=plan.world)
+            job = case, name
+            runs.append(Run(job, {'controller': name, 'seed': seed}, digest(job)))
+    return run_experiment(runs, measured_localization, workers, store=store, report=report)
+
+
+def measured_localization(job: tuple[PatrolScenario, str]) -> Row:
+    """Return the row of one patrol, see :func:`localization_errors`."""
+    case, _ = job
+    points = portrait_points(case.seed, PortraitParameters())
+    return localization_errors(run_patrol(points, case), case.carried_at)
+
+
+def localization_errors(record: Record, carried_at: float = math.inf) -> Row:
+    """Return how far the pose in use was from the true one.
+
+    ``position`` and ``yaw``, root mean squares (m, rad), up to when the robot is carried;
+    ``largest`` position error up to then (m); ``lost``, time in which the robot was lost (s);
+    ``found``, time from carrying until it was lost no more (s), infinite if it still was at the
+    end; ``deceived``, time in which it was off by :data:`LOST_DISTANCE` and took its place for
+    known (s); ``on_path``, share of the time on the path; ``contacts``.
+    """
+    apart = record['pose'] - record['truth']
+    position = np.hypot(apart[:, 0], apart[:, 1])
+    yaw = np.abs(np.remainder(apart[:, 2] + math.pi, math.tau) - math.pi)
+    before = record.time < carried_at
+    off = (position > LOST_DISTANCE) | (yaw > LOST_DISTANCE)
+    after = np.flatnonzero(off & ~before)
+    found = (float(record.time[after[-1]]) - carried_at) if after.size else 0.0
+    if after.size and after[-1] == len(record) - 1:
+        found = math.inf
+    return {
+        'position': rms(position[before]),
+        'yaw': rms(yaw[before]),
+        'largest': float(position[before].max()),
+        'lost': lost_time(position),
+        'found': found if math.isfinite(carried_at) else math.nan,
+        'deceived': float((off & record['localized'].astype(np.bool_)).sum()) / RATE,
+        'on_path': float((path_error(record) < ON_PATH).mean()),
+        'contacts': contact_count(record),
+    }
+
+
+def lost_time(position: Array) -> float:
+    """Return the time (s) of all spans of an error above the distance that last long enough."""
+    off = np.concatenate([[False], position > LOST_DISTANCE, [False]])
+    edges = np.flatnonzero(np.diff(off.astype(np.int8)))
+    spans = (edges[1::2] - edges[::2]) / RATE
+    return float(spans[spans > LOST_TIME].sum())
+
+
+def markdown(plan: LocalizationPlan, table: ResultTable) -> str:
+    """Return the medians, with the largest of all seeds in brackets, as a table in Markdown."""
+    rows = []
+    for name in plan.cases:
+        found = table.where(controller=name)
+
+        def cell(column: str, scale: float, digits: int, found: Sequence[Row] = found) -> str:
+            values = [scale * float(row[column]) for row in found]
+            return f'{np.median(values):.{digits}f} ({max(values):.{digits}f})'
+
+        again = [row for row in found if row['found'] <= FOUND_WITHIN]
+        carried = math.isfinite(CASES[name].carried_at)
+        rows.append(
+            (
+                name,
+                cell('position', 1e3, 1),
+                cell('yaw', 180.0 / math.pi, 2),
+                cell('largest', 1e3, 0),
+                '' if carried else cell('lost', 1.0, 0),
+                f'{len(again)} of {len(found)}' if carried else '',
+                cell('deceived', 1.0, 1),
+            )
+        )
+    head = (
+        'pose',
+        'position rms, mm',
+        'yaw rms, degrees',
+        'largest, mm',
+        'lost, s',
+        f'found within {FOUND_WITHIN:g} s',
+        'wrong and sure, s',
+    )
+    title = (
+        f'{plan.duration / 60.0:g} min in {plan.world}, {len(plan.seeds)} seeds from '
+        f'{plan.seeds[0]}: median (largest)'
+    )
+    return Table(title, head, rows).markdown()

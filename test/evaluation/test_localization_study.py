@@ -1,0 +1,112 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Numbers of the localisation study, by records whose errors are known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.evaluation.experiment import ResultTable
+from t3mpc_ros.evaluation.patrol.localization_study import (
+    CASES,
+    LocalizationPlan,
+    localization_errors,
+    lost_time,
+    markdown,
+    measured_localization,
+)
+from t3mpc_ros.evaluation.record import RATE, Record
+
+
+def make_record(offset, yaw=0.0, localized=True):
+    """Return a record with position errors along x (m), shape (n,), and a constant yaw error."""
+    count = len(offset)
+    truth = np.zeros((count, 3))
+    truth[:, 2] = math.pi - 0.01  # an error of yaw leads past half a turn
+    pose = truth + np.column_stack([offset, np.zeros(count), np.full(count, yaw)])
+    columns = {
+        'time': np.arange(count) / RATE,
+        'truth': truth,
+        'pose': pose,
+        'reference_pose': truth,
+        'localized': np.full(count, localized),
+        'contact_force': np.zeros(count),
+    }
+    return Record(columns)
+
+
+def seconds(*pieces):
+    """Return errors (m) that last for some seconds each."""
+    return np.concatenate([np.full(round(duration * RATE), error) for error, duration in pieces])
+
+
+def test_errors_are_those_before_the_robot_is_carried():
+    record = make_record(seconds((0.01, 5), (0.02, 5), (1.0, 7), (0.01, 5)), yaw=0.02)
+    row = localization_errors(record, carried_at=10.0)
+    assert row['position'] == pytest.approx(math.sqrt(0.5 * (1e-4 + 4e-4)))
+    assert row['largest'] == pytest.approx(0.02)
+    assert row['yaw'] == pytest.approx(0.02)
+    assert row['found'] == pytest.approx(7.0, abs=0.02)
+    assert row['deceived'] == pytest.approx(7.0)
+    assert row['on_path'] == 1.0
+
+
+def test_a_robot_found_and_lost_again_is_found_at_last():
+    record = make_record(seconds((0.0, 2), (1.0, 3), (0.0, 3), (1.0, 2), (0.0, 1)))
+    assert localization_errors(record, 2.0)['found'] == pytest.approx(8.0, abs=0.02)
+    record = make_record(seconds((0.0, 2), (1.0, 3)), localized=False)
+    row = localization_errors(record, 2.0)
+    assert row['found'] == math.inf
+    assert row['deceived'] == 0.0
+
+
+def test_without_carrying_nothing_is_found():
+    assert math.isnan(localization_errors(make_record(seconds((0.0, 2))))['found'])
+
+
+def test_lost_is_far_off_for_long():
+    assert lost_time(seconds((0.0, 1), (0.4, 9), (0.1, 1), (0.4, 12), (0.0, 1))) == 12.0
+    assert lost_time(seconds((0.4, 11))) == 11.0
+    assert lost_time(np.zeros(10)) == 0.0
+
+
+def test_the_table_has_medians_and_counts():
+    plan = LocalizationPlan(duration=120.0, seeds=(1, 2))
+    row = {'position': 0.01, 'yaw': 0.01, 'largest': 0.03, 'lost': 0.0, 'deceived': 0.0}
+    rows = [
+        {**row, 'controller': name, 'seed': seed, 'found': 50.0 * seed}
+        for name in CASES
+        for seed in plan.seeds
+    ]
+    lines = markdown(plan, ResultTable(rows)).splitlines()
+    assert '2 min in room' in lines[0]
+    assert '| 10.0 (10.0) | 0.57 (0.57) | 30 (30) |' in lines[-1]
+    assert '1 of 2' in lines[-1]
+    with pytest.raises(ValueError, match='duration must be at least 90 s'):
+        LocalizationPlan(duration=60.0)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_the_filter_knows_what_the_odometry_does_not():
+    for name, (least, most) in {
+        'odometry alone': (0.02, 9.0),
+        'particle filter': (0.0, 0.02),
+    }.items():
+        case = CASES[name]
+        changed = type(case)(
+            seed=3, duration=120.0, known_world='room', localization=case.localization
+        )
+        assert least < measured_localization((changed, name))['position'] < most
