@@ -52,13 +52,17 @@ REACH = 3.5
 """Half a window in standard deviations."""
 RAMP = 12
 """Points over which the width changes from one of the list to the next."""
+LEVEL = 36
+"""Points over which it falls by one where a wider one is not needed: a change bends the curve."""
 BLUR = 8
 """Points before and after over which the width is averaged."""
 NEAR = 12
 """Points before and after whose time counts for a choice."""
 PIECE = 400
 """Points of the smoothed path made at a time."""
-MARGIN = math.ceil(REACH * WIDTHS[-1] / SPACING) + 2 * RAMP * len(WIDTHS) + 2 * BLUR + NEAR + 4
+MARGIN = (
+    math.ceil(REACH * WIDTHS[-1] / SPACING) + (RAMP + LEVEL) * len(WIDTHS) + 2 * BLUR + NEAR + 4
+)
 """Points before and after a piece that determine it."""
 SLOWER = 1.03
 """Local time of a width, as a multiple of the least, from which on a larger one is needed."""
@@ -315,7 +319,7 @@ def _convolved(points: Array, window: Array) -> Array:
 def _sloped(needed: Array, allowed: Array) -> Array:
     """Return a smooth function from ``needed``, where it can be, to ``allowed``, never above."""
     along = np.arange(needed.size) / RAMP
-    raised = -_lower_envelope(-needed, along)
+    raised = -_lower_envelope(-needed, np.arange(needed.size) / LEVEL)
     padded = np.pad(allowed, BLUR, mode='edge')
     bound = sliding_window_view(padded, 2 * BLUR + 1).min(axis=1)
     level = _lower_envelope(np.minimum(raised, bound), along)
