@@ -182,6 +182,7 @@ setup(
         'ros': [*of_extra('ros'), *of_extra('bags')],
         'compare': [*of_extra('compare'), 'casadi>=3.6,<4', 'pyarrow>=15,<30'],
         'cluster': ['distributed>=2024.5,<2028', 'pyarrow>=15,<30'],
+        'gym': ['gymnasium>=1.0,<2'],
         'dev': requirements('requirements-dev.txt'),
         'test': ['pytest'],
     },

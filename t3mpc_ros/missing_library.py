@@ -34,6 +34,7 @@ REQUIREMENTS = {
     'casadi': 'casadi>=3.6,<4',
     'pyarrow': 'pyarrow>=15,<30',
     'distributed': 'distributed>=2024.5,<2028',
+    'gymnasium': 'gymnasium>=1.0,<2',
 }
 """Requirement of each imported library, as in the requirements files."""
 
@@ -43,6 +44,7 @@ EXTRAS = {
     'ros': ('serial',),
     'compare': ('casadi', 'pyarrow', 'cma'),
     'cluster': ('distributed',),
+    'gym': ('gymnasium',),
 }
 """Extra of the package that installs a library which a simulation does without."""
 

@@ -54,6 +54,14 @@ def _own_noise(module, folder):
     assert np.abs(runs['blocked wheel'].error).max() > 1.0
 
 
+def _policy(module, folder):
+    """The policy of the environment is the controller of the comparison."""
+    pytest.importorskip('gymnasium')
+    table = module.main(3.0, generations=1, episodes=2.0, executor=1)
+    assert tuple(table.plan.methods) == ('PI + feed-forward', 'policy', 'feed-forward')
+    assert max(table.values('policy')) < 1.0
+
+
 def _read_bag(module, folder):
     assert module.main(BAG, folder)['/odom']['stamp'].size > 100
 

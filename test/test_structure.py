@@ -45,6 +45,7 @@ PACKAGES = {
     'atomic_file': set(),
     'version': set(),
     'script_error': set(),
+    'gym': set(),
     'geometry': {'parameters', 'kernels'},
     'chaos': BASE,
     'fuzzy': BASE,
@@ -75,9 +76,10 @@ LIBRARIES = {
     'radio': {'serial'},
     'bag': {'mcap', 'rosbags', 'yaml'},
     'evaluation': {'matplotlib', 'PIL', 'yaml', 'cma', 'casadi', 'jinja2', 'tqdm', 'daqp'}
-    | {'pyarrow', 'distributed'},
+    | {'pyarrow', 'distributed', 'gymnasium'},
     'nodes': {'yaml'},
     'cli': {'yaml', 'shtab'},
+    'gym': {'gymnasium'},
 }
 ROS = re.compile(
     r'^(rclpy|rcl_interfaces|builtin_interfaces|tf2_ros|std_srvs|\w+_msgs|launch\w*|ament_index_python)$'
@@ -399,6 +401,7 @@ def test_package_xml_names_the_rosdep_keys_of_the_libraries():
         'casadi',
         'pyarrow',
         'distributed',
+        'gymnasium',
     }
 
 

@@ -187,6 +187,9 @@ class MethodDriver:
         self._acceleration = np.zeros(2)
         self._limited = False
         self._sent = ZERO_WHEEL_SPEEDS
+        self._elapsed = 1
+        self.held = RobotCommand(ZERO_WHEEL_SPEEDS, 0)
+        """Command after a report that the method does not get."""
 
     @property
     def signals(self) -> Signals:
@@ -211,12 +214,21 @@ class MethodDriver:
 
     def step(self, state: RobotState) -> RobotCommand:
         """Return the command that follows from a report; NaN if the answer is not finite."""
+        observation = self.observe(state)
+        if observation is None or self._controller is None:
+            return self.held
+        return self.answer(self._controller.step(observation))
+
+    def observe(self, state: RobotState) -> Observation | None:
+        """Return what the method gets for a report; None where :attr:`held` is the command."""
         if not self._enabled:
-            return RobotCommand(ZERO_WHEEL_SPEEDS, state.stamp_ns)
+            self.held = RobotCommand(ZERO_WHEEL_SPEEDS, state.stamp_ns)
+            return None
         k = round(state.stamp_ns * RATE / NANOSECONDS)
         elapsed = k - self._observed if self._observed >= 0 else 1
         if elapsed <= 0:  # repeated, or overtaken by a later one
-            return RobotCommand(self._sent, self._observed_ns)
+            self.held = RobotCommand(self._sent, self._observed_ns)
+            return None
         self._yaw_rate = math.nan
         if self._observed >= 0:
             turned = wrap_angle(state.odometry.pose.yaw - self._yaw)
@@ -229,18 +241,24 @@ class MethodDriver:
             self._update_dead_time(self._dead_time, measured, elapsed)
         self._observed, self._observed_ns = k, state.stamp_ns
         self._yaw = state.odometry.pose.yaw
-        asked, cut = self._limited_torque(self._answer(self._controller, k, measured, elapsed))
+        self._elapsed = elapsed
+        return self._observation(k, measured, elapsed)
+
+    def answer(self, acceleration: Array) -> RobotCommand:
+        """Return the command that an acceleration (rad/s²), chosen for the observation, makes."""
+        asked, cut = self._limited_torque(acceleration)
         if not np.isfinite(asked).all():
-            return RobotCommand(WheelSpeeds(math.nan, math.nan), state.stamp_ns)
-        elapsed_s = elapsed * self._model.period
+            return RobotCommand(WheelSpeeds(math.nan, math.nan), self._observed_ns)
+        elapsed_s = self._elapsed * self._model.period
         self._acceleration = self._actuation.send_acceleration(asked, elapsed_s)
         self._limited = self._actuation.limited or cut
-        self._controller.applied(self._acceleration, limited=self._limited)
+        if self._controller is not None:
+            self._controller.applied(self._acceleration, limited=self._limited)
         sent = self._actuation.command
         if self._model.drive == 'torque':
             sent = np.dot(self._believed_inertia, self._acceleration)
         self._sent = WheelSpeeds(*sent.tolist())
-        return RobotCommand(self._sent, state.stamp_ns)
+        return RobotCommand(self._sent, self._observed_ns)
 
     def _new_controller(self, measured: Array) -> BaselineController:
         controller, seam = self._method(self._model), self._actuation
@@ -288,25 +306,21 @@ class MethodDriver:
             self._late = round(periods)
             self._actuation.set_dead_time(self._late * period)
 
-    def _answer(
-        self, controller: BaselineController, k: int, measured: Array, elapsed: int
-    ) -> Array:
-        """Return what the method makes of the speeds (rad/s) measured in period ``k``."""
+    def _observation(self, k: int, measured: Array, elapsed: int) -> Observation:
+        """Return what the method gets for the speeds (rad/s) measured in period ``k``."""
         seam = self._actuation
         seam.observe(measured, elapsed * self._model.period)
         now, following, future = self._reference.at(k, self._late)
-        return controller.step(
-            Observation(
-                seam.predicted,
-                seam.disturbance,
-                now,
-                following,
-                seam.command,
-                future,
-                elapsed,
-                self._late,
-                self._yaw_rate,
-            )
+        return Observation(
+            seam.predicted,
+            seam.disturbance,
+            now,
+            following,
+            seam.command,
+            future,
+            elapsed,
+            self._late,
+            self._yaw_rate,
         )
 
     def _limited_torque(self, asked: Array) -> tuple[Array, bool]:

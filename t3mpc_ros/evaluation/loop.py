@@ -18,7 +18,7 @@ once, carries that stamp back, and the robot follows it when it has arrived. Rep
 or lost on their way; what happens to a command on its way is a matter of the robot.
 """
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 import math
 from typing import Any, Protocol
@@ -88,6 +88,12 @@ def run(scenario: Scenario, method: Method) -> Record:
         links=scenario.links,
         seed=scenario.seed,
     )
+    return with_reference(record, scenario)
+
+
+def with_reference(record: Record, scenario: Scenario) -> Record:
+    """Return the record of a loop with the reference of its scenario."""
+    reference, steps = scenario.reference(), scenario.steps
     columns = {
         **record.columns,
         'reference': reference.speeds[:steps],
@@ -114,6 +120,40 @@ def run_loop(
     until ``start``, and in the ``pauses`` (s) of a person. ``links`` and their ``seed`` are those
     of the reports; ``latency_ns`` is from the arrival of a report to the departure of the command.
     """
+    loop = reports_of(
+        robot,
+        driver,
+        periods,
+        start=start,
+        pauses=pauses,
+        links=links,
+        seed=seed,
+        latency_ns=latency_ns,
+    )
+    try:
+        report = next(loop)
+        while True:
+            report = loop.send(driver.step(report))
+    except StopIteration as end:
+        record: Record = end.value
+        return record
+
+
+def reports_of(
+    robot: SimulatedRobot,
+    driver: Driver,
+    periods: int,
+    *,
+    start: float = 0.0,
+    pauses: Sequence[tuple[float, float]] = (),
+    links: LinkFaults = NO_FAULTS,
+    seed: int = 0,
+    latency_ns: int = 0,
+) -> Generator[RobotState, RobotCommand, Record]:
+    """Yield each report that arrives at the driver, take its command, and return the record.
+
+    For who answers the reports himself; arguments as of :func:`run_loop`.
+    """
     reports = ReportLink(links, seed, periods / RATE)
     paused = [(0.0, start), *pauses]
     columns: dict[str, list[Any]] = {'time': []}
@@ -128,7 +168,7 @@ def run_loop(
         if whole:
             reports.send(state)
             for arrival_ns, report in reports.arrived(stamp_of(k + 1) - 1):
-                command = driver.step(report)
+                command = yield report
                 sent = command.wheels
                 whole = whole and all(map(math.isfinite, sent))
                 if whole:

@@ -13,7 +13,6 @@
 # limitations under the License.
 """What a shell completes is what the program takes."""
 
-import shutil
 import subprocess
 
 import pytest
@@ -62,5 +61,4 @@ def test_the_script_for_zsh_is_one(capsys):
     assert main(['completion', 'zsh']) == 0
     script = capsys.readouterr().out
     assert script.startswith('#compdef t3mpc')
-    if zsh := shutil.which('zsh'):
-        subprocess.run([zsh, '-n'], input=script, text=True, check=True)
+    assert '\n    completion:' in script
