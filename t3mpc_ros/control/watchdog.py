@@ -299,6 +299,10 @@ sideways, as along what it touches."""
 CONTACT_TURN = 0.25
 """Difference of the turns by pose and by wheels within that motion (rad): what the robot touches
 turns it."""
+OWN_ODOMETRY = 0.001
+"""Difference of a step of the pose from that of the wheels (m, rms) up to which the pose is
+counted by the wheels: only then that difference of the turns says more than the way does. A tyre
+that slips turns a robot, too."""
 DRIVING = 0.05
 """Commanded speed (m/s) above which that difference counts."""
 RECOVERY_TIME = 5.0
@@ -322,7 +326,8 @@ class HeldMotion:
     def restart(self, pose: Pose | None) -> None:
         """Begin a new piece at a pose."""
         self._pose = pose
-        self._most = 0.0
+        self._most = self._unlike = 0.0
+        self._steps = 0
         self._asked = self._ahead = self._left = self._turn = self._time = 0.0
         self._fastest = self._fastest_turn = 0.0
 
@@ -336,7 +341,10 @@ class HeldMotion:
         middle = last.yaw + 0.5 * turn
         x, y = pose.x - last.x, pose.y - last.y
         self._pose = pose
-        self._ahead += math.cos(middle) * x + math.sin(middle) * y
+        ahead = math.cos(middle) * x + math.sin(middle) * y
+        self._ahead += ahead
+        self._unlike += (ahead - odometry.twist.linear * elapsed) ** 2
+        self._steps += 1
         if abs(self._ahead) >= self._most:
             self._most, self.furthest = abs(self._ahead), pose
         self._left += math.cos(middle) * y - math.sin(middle) * x
@@ -354,7 +362,8 @@ class HeldMotion:
         least, most = CONTACT_SHARES
         held = math.copysign(self._ahead, self._ahead * self._asked) < least * asked
         held |= abs(self._left) > most * asked
-        held |= abs(self._turn) > CONTACT_TURN + CONTACT_LEAD * self._fastest_turn
+        if self._unlike <= self._steps * OWN_ODOMETRY**2:
+            held |= abs(self._turn) > CONTACT_TURN + CONTACT_LEAD * self._fastest_turn
         self.restart(pose)
         return held
 
