@@ -191,6 +191,7 @@ def test_a_closed_curve_is_predicted_exactly():
     skills = predictability(t, np.cos(t / 3.0), np.sin(2.0 * t / 3.0))
     assert [each.horizon for each in skills] == list(HORIZONS)
     assert min(each.best for each in skills) > 0.999
+    assert {each.known for each in skills} == {1.0}
 
 
 @pytest.mark.slow
@@ -219,6 +220,10 @@ def test_skill_of_a_gauss_markov_process_is_its_correlation():
     # Two coordinates of variance 1 each.
     errors = [skill.error for skill in skills]
     assert errors == pytest.approx([math.sqrt(2.0 * (1.0 - each)) for each in exact], rel=0.12)
+    # Its error has the distribution of Rayleigh.
+    for each in skills:
+        assert each.median == pytest.approx(each.error * math.sqrt(math.log(2.0)), rel=0.1)
+        assert each.known == pytest.approx(1.0 - math.exp(-((0.25 / each.error) ** 2)), abs=0.02)
 
 
 def test_a_robot_at_rest_is_predicted_and_a_short_path_refused():

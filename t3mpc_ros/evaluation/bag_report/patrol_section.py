@@ -77,6 +77,13 @@ def patrol_blocks(run: Run) -> Iterator[Block]:
     for horizon in HORIZONS if observed else ():
         skill, predictor = found[f'skill_{horizon:g}'], found[f'predictor_{horizon:g}']
         rows.append([f'skill of an observer, {horizon:g} s ahead', f'{skill:.3f} ({predictor})'])
+        median, known = found[f'prediction_median_{horizon:g}'], found[f'known_{horizon:g}']
+        rows.append(
+            [
+                'median error of it, and share of the moments known to 25 cm',
+                f'{median:.2f} m, {100.0 * known:.0f} %',
+            ]
+        )
     for name, column, unit in (
         ('permutation entropy', 'permutation_entropy', ''),
         ('spectral entropy', 'spectral_entropy', ''),

@@ -63,8 +63,9 @@ def patrol_metrics(
     not; ``evenness``, see :func:`~t3mpc_ros.evaluation.patrol.coverage.evenness`; ``exponent``,
     largest Lyapunov exponent of the path (1/s); ``permutation_entropy`` of patterns of 4 positions
     1 s apart and ``spectral_entropy`` of the displacements per second, means of x and y;
-    ``skill_5``, ``prediction_error_5`` (m) and ``predictor_5``, the best predictor, of an observer
-    5 s ahead, for each of :data:`HORIZONS`, absent for a path that is too short; ``path_error``,
+    ``skill_5``, ``prediction_error_5`` (m), ``prediction_median_5`` (m), ``known_5`` (share of the
+    moments known to 25 cm) and ``predictor_5``, the best predictor, of an observer 5 s ahead, for
+    each of :data:`HORIZONS`, absent for a path that is too short; ``path_error``,
     root mean square distance from the reference at the same time (m).
 
     Parameters
@@ -99,6 +100,8 @@ def patrol_metrics(
         for name, of in (
             ('skill', 'best'),
             ('prediction_error', 'error'),
+            ('prediction_median', 'median'),
+            ('known', 'known'),
             ('predictor', 'predictor'),
         ):
             observed |= {f'{name}_{each.horizon:g}': getattr(each, of) for each in skills}

@@ -180,6 +180,8 @@ def surprise_table(study: PatrolStudy) -> Table:
     numbers = {
         **{f'skill at {horizon:g} s': f'skill_{horizon:g}' for horizon in HORIZONS},
         'error at 5 s, m': 'prediction_error_5',
+        'median error at 5 s, m': 'prediction_median_5',
+        'known to 25 cm at 5 s, share': 'known_5',
         'best predictor at 5 s': 'predictor_5',
         'permutation entropy': 'permutation_entropy',
         'spectral entropy': 'spectral_entropy',

@@ -50,6 +50,8 @@ STEP = 0.25
 HORIZONS = (1.0, 2.0, 5.0, 10.0)
 """s; multiples of :data:`STEP`"""
 CLIMATOLOGY = 'climatology'
+KNOWN = 0.25
+"""Error below which a place is known, m."""
 
 _LAGS = ((0, 1, 2, 4), (0, 1, 2, 4, 8, 12, 16), (0, 1, 2, 4, 8, 12, 16, 24, 32, 40, 48))
 """Past of the delay vectors, in steps: 1, 4 and 12 s."""
@@ -72,6 +74,10 @@ class Skill(NamedTuple):
     """Root mean square error of the best predictor, m. Unlike the skill it does not depend on how
     far the path spreads: of two paths that surprise equally, the one that covers more of the room
     has the higher skill."""
+    median: float
+    """Median error of it, m."""
+    known: float
+    """Share of the moments at which its error is below :data:`KNOWN`."""
 
 
 def predictability(t: Array, x: Array, y: Array) -> tuple[Skill, ...]:
@@ -98,11 +104,13 @@ def predictability(t: Array, x: Array, y: Array) -> tuple[Skill, ...]:
     target = _positions(path, origins, steps)
     climatology = _square_errors(path[:half].mean(axis=0), target)
     if climatology.min() <= 0.0:  # a robot that stands where it stood
-        return tuple(Skill(h, 1.0, CLIMATOLOGY, 0.0) for h in HORIZONS)
+        return tuple(Skill(h, 1.0, CLIMATOLOGY, 0.0, 0.0, 1.0) for h in HORIZONS)
     each = {CLIMATOLOGY: np.zeros(steps.size)}
+    errors = {CLIMATOLOGY: np.hypot(*(path[:half].mean(axis=0) - target).transpose(2, 0, 1))}
     for name, predict in _PREDICTORS.items():
         found = predict(path, half, origins, steps)
         each[name] = 1.0 - _square_errors(found, target) / climatology
+        errors[name] = np.hypot(*(found - target).transpose(2, 0, 1))
     best = [max(each, key=lambda name: each[name][row]) for row in range(steps.size)]
     return tuple(
         Skill(
@@ -110,6 +118,8 @@ def predictability(t: Array, x: Array, y: Array) -> tuple[Skill, ...]:
             float(each[best[row]][row]),
             best[row],
             float(np.sqrt((1.0 - each[best[row]][row]) * climatology[row])),
+            float(np.median(errors[best[row]][row])),
+            float((errors[best[row]][row] < KNOWN).mean()),
         )
         for row, horizon in enumerate(HORIZONS)
     )
