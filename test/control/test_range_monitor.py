@@ -260,3 +260,17 @@ def test_without_keep_out_ranges_change_nothing():
     assert not controller.add_range(0, 0.3)
     assert controller.problems() == []
     assert Activity.WAITING.stuck is False
+
+
+def test_a_few_equal_readings_of_a_fast_robot_are_chance():
+    drive = Drive(BodyTwist(0.5, 0.0))
+    drive.run(1.0, _noisy(drive))
+    assert not drive.run(0.24, lambda sensor, time: 0.5).lost  # 12 cm, six readings
+    assert drive.run(0.4, lambda sensor, time: 0.5).lost
+
+
+def test_a_robot_that_is_disabled_says_so_whatever_its_sensors():
+    robot = KeptOut().run(0.6, sensors=())
+    assert robot.reasons[-1] is Reason.TOO_FEW_RANGES
+    robot.controller.enable(False)
+    assert robot.run(0.2, sensors=()).reasons[-1] is Reason.DISABLED
