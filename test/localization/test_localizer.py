@@ -202,7 +202,10 @@ def test_a_restart_of_the_odometry_moves_no_particle(restart):
     localizer, drive = make_localizer(), Drive()
     follow(localizer, drive, 20.0)
     before = localizer.filter.poses.copy()
-    drive.odometry = Pose(3.0, -2.0, 1.0) if restart == 'pose' else drive.odometry
+    drive.odometry = Pose(3.0, -2.0, 1.0)
+    if restart == 'stamp':  # counted from zero again, near where it was
+        x, y, yaw = localizer._odometry
+        drive.odometry = Pose(x - 0.4, y + 0.2, yaw)
     drive.stamp_ns = drive.stamp_ns if restart == 'pose' else 0
     assert not localizer.add_odometry(drive.stamp_ns, drive.odometry)
     assert np.array_equal(localizer.filter.poses, before)
@@ -346,3 +349,21 @@ def test_impossible_readings_are_no_readings(impossible):
             localizer.add_odometry(drive.stamp_ns, drive.odometry)
         poses.append(localizer.result.pose)
     assert poses[0] == poses[1]
+
+
+def test_a_search_ends_when_readings_fit_for_some_time():
+    """Where half of them happened to fit, a carried robot took the place for known."""
+    localizer, drive = make_localizer(seed=3), Drive(seed=3)
+    follow(localizer, drive, 20.0)
+    drive.carry(2.5)
+    lost = early = False
+    for _ in range(600):
+        follow(localizer, drive, 0.1)
+        lost = lost or localizer.state is Localization.LOST
+        known = localizer.state is Localization.LOCALIZED
+        early = early or (lost and known and localizer.agreement < 0.85)
+        if lost and known and localizer.agreement >= 0.9:
+            break
+    assert lost
+    assert known
+    assert not early
