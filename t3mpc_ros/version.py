@@ -13,4 +13,4 @@
 # limitations under the License.
 """Version of the package."""
 
-VERSION = '0.1.0'
+VERSION = '0.2.0'

@@ -96,7 +96,10 @@ def test_the_image_follows_the_readme():
         (None, ''),
         (('package.xml', '<version>', '<version>9'), 'package.xml is not of version'),
         (('CITATION.cff', '\nversion: ', '\nversion: 9'), 'CITATION.cff is not of version'),
-        (('CHANGELOG.rst', 'Forthcoming', 'Forthcoming'), 'changes that are forthcoming'),
+        (
+            ('CHANGELOG.rst', '\n0.1.0 (', '\nForthcoming\n\n0.1.0 ('),
+            'changes that are forthcoming',
+        ),
         (('README.md', 't3mpc', 'T3MPC'), 'not committed'),
     ],
 )

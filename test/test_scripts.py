@@ -30,6 +30,7 @@ from support.signals import attend
 from support.waiting import communicate, run, wait_until
 
 from t3mpc_ros.cli.main import _parser as cli_parser
+from t3mpc_ros.version import VERSION
 
 pytestmark = pytest.mark.slow
 
@@ -411,7 +412,7 @@ def test_executables_are_written_and_files_linked(tmp_path):
     # The path of an editable installation, in any locale and from any folder.
     packages = tmp_path / 'lib' / 'python3.11' / 'site-packages'
     packages.mkdir(parents=True)
-    path = packages / '__editable__.t3mpc_ros-0.1.0.pth'
+    path = packages / f'__editable__.t3mpc_ros-{VERSION}.pth'
     finish['shorten_path'](tmp_path, source := tmp_path / 'Übung')
     assert not path.exists()
     path.write_text(f'{source}\n')

@@ -28,6 +28,7 @@ from support.waiting import run
 
 from t3mpc_ros.missing_library import EXTRAS
 from t3mpc_ros.nodes.registry import NODES
+from t3mpc_ros.version import VERSION
 
 pytestmark = pytest.mark.slow
 
@@ -78,7 +79,7 @@ def installed(wheel, tmp_path_factory):
 
 def test_a_build_that_was_interrupted_can_be_repeated(source, tmp_path):
     """Ctrl-C in a set-up left a folder behind, at which every later set-up ended."""
-    left = f'build/bdist.{get_platform()}/wheel/t3mpc_ros-0.1.0.data/data/lib/t3mpc_ros'
+    left = f'build/bdist.{get_platform()}/wheel/t3mpc_ros-{VERSION}.data/data/lib/t3mpc_ros'
     (source / left).mkdir(parents=True)
     _run(sys.executable, 'setup.py', '-q', 'bdist_wheel', '-d', tmp_path, cwd=source)
     assert [*tmp_path.glob('*.whl')]
