@@ -66,6 +66,7 @@ from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
+from t3mpc_ros.version import VERSION
 
 pytestmark = pytest.mark.slow
 
@@ -488,6 +489,8 @@ def test_training_on_the_command_line(tmp_path, capsys):
     defaults = ProposedParameters().to_dict()
     newer = made['parameters'].keys() - header['parameters']
     header['parameters'] |= {name: defaults[name] for name in newer}
+    # It was made by an earlier version.
+    assert (header.pop('version'), made.pop('version')) == ('0.1.0', VERSION)
     assert header == made
     for name, values in load_model(packaged).items():
         np.testing.assert_allclose(values, loaded[name], rtol=1e-6, atol=1e-9, err_msg=name)
