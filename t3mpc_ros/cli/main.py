@@ -157,18 +157,26 @@ def _compile(options: argparse.Namespace) -> int:
 
 
 def _compile_robots() -> None:
-    """Compile those parts of a controller that it uses last, robots and reference."""
+    """Compile parts of a controller before it needs them, robots and reference."""
     import numpy as np
 
     from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
     from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
+    from t3mpc_ros.control.command_shaper import CommandShaper
+    from t3mpc_ros.control.controller import StepperControllerParameters
     from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
     from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
-    from t3mpc_ros.control.speed_filter import SpeedFilterParameters
+    from t3mpc_ros.control.speed_filter import SpeedFilterParameters, SpeedKalmanFilter
+    from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
     from t3mpc_ros.geometry.kinematics import WheelGeometry
     from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters, make_robot
 
-    zero = np.zeros(2)
+    zero, controller = np.zeros(2), StepperControllerParameters()
+    FuzzyEstimator(controller.fuzzy, controller.adaptation, outputs=2).warm_up()
+    SpeedKalmanFilter(controller.speed_filter, 'velocity', 0.01).update(
+        zero, zero, 0.01, sent=True
+    )
+    CommandShaper(controller.command_shaper, 0.01).step(zero, 0.01)
     DeadTimeEstimator(SpeedFilterParameters(), 0.01).step(zero, zero, 0.01)
     BodyCorrection(BodyCorrectionParameters(), 0.04, 0.1, 0.01).step(
         0.0, 0.01, zero, zero, zero, 0.0
