@@ -121,6 +121,7 @@ def rms(values):
     return np.sqrt((values**2).mean(axis=0))
 
 
+@pytest.mark.compiled
 def test_a_known_start_is_tracked_while_the_odometry_drifts():
     localizer, drive = make_localizer(), Drive()
     away, turned = rms(follow(localizer, drive, 60.0)[40:])
@@ -153,6 +154,7 @@ def test_the_frame_of_the_odometry_leads_to_the_pose():
     assert wrap_angle(frame.yaw + inner.yaw - localizer.result.pose.yaw) == pytest.approx(0.0)
 
 
+@pytest.mark.compiled
 def test_an_unknown_start_is_found():
     localizer = make_localizer(set_initial_pose=False)
     drive = Drive()
@@ -165,6 +167,7 @@ def test_an_unknown_start_is_found():
     assert error(localizer, drive)[0] < 0.05
 
 
+@pytest.mark.compiled
 def test_a_robot_that_is_carried_is_lost_and_found_again():
     localizer, drive = make_localizer(), Drive()
     follow(localizer, drive, 20.0)
@@ -178,6 +181,7 @@ def test_a_robot_that_is_carried_is_lost_and_found_again():
     assert error(localizer, drive)[0] < 0.05
 
 
+@pytest.mark.compiled
 def test_without_recovery_a_carried_robot_stays_lost():
     """The recovery is what finds it: without random particles nothing does."""
     localizer, drive = make_localizer(recovery_alpha_slow=0.0), Drive()
@@ -252,6 +256,7 @@ def test_things_that_the_map_lacks_do_not_lead_it_away():
     assert worst < 0.15
 
 
+@pytest.mark.compiled
 def test_a_scan_is_used_like_the_ranges():
     localizer, drive = make_localizer(sigma_hit_growth=0.0), Drive(seed=7)
     angles = np.linspace(-math.pi, math.pi, 24, endpoint=False)
@@ -269,6 +274,7 @@ def test_a_scan_is_used_like_the_ranges():
     assert turned < math.radians(1.0)
 
 
+@pytest.mark.compiled
 def test_equal_inputs_give_equal_bits():
     results = []
     for _ in range(2):
@@ -309,6 +315,7 @@ def drive_corrected(localizer, drive, correction, seconds):
     return np.array(changes), before
 
 
+@pytest.mark.compiled
 def test_the_corrected_pose_is_exact_and_moves_slowly():
     """The corrections of the filter are up to centimetres at once; the wheels feel none."""
     localizer, drive, correction = make_localizer(), Drive(), PoseCorrection()
@@ -319,6 +326,7 @@ def test_the_corrected_pose_is_exact_and_moves_slowly():
     assert math.hypot(pose.x - drive.truth.x, pose.y - drive.truth.y) < 0.06
 
 
+@pytest.mark.compiled
 def test_the_corrected_pose_jumps_where_the_robot_is_found():
     localizer, drive, correction = make_localizer(), Drive(), PoseCorrection()
     drive_corrected(localizer, drive, correction, 10.0)
