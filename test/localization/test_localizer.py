@@ -131,6 +131,7 @@ def test_a_known_start_is_tracked_while_the_odometry_drifts():
     assert localizer.state is Localization.LOCALIZED
 
 
+@pytest.mark.compiled
 def test_the_covariance_covers_the_error():
     localizer, drive = make_localizer(), Drive(seed=3)
     inside = []
@@ -200,6 +201,7 @@ def test_a_pose_that_is_given_is_taken():
     assert localizer.state is Localization.LOCALIZED
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('restart', ['pose', 'stamp'])
 def test_a_restart_of_the_odometry_moves_no_particle(restart):
     """A board that restarts counts from zero again; the robot has not moved."""
@@ -235,11 +237,13 @@ def test_silent_sensors_leave_odometry_and_growing_covariance():
     assert np.trace(localizer.result.covariance[:2, :2]) > 2.0 * before
 
 
+@pytest.mark.compiled
 def test_readings_that_are_lost_cost_little():
     errors = follow(make_localizer(), Drive(seed=5), 40.0, loss=0.5)
     assert rms(errors[40:])[0] < 0.03
 
 
+@pytest.mark.compiled
 def test_things_that_the_map_lacks_do_not_lead_it_away():
     """A person goes along at the right: two of the eight ranges are short."""
     localizer, drive = make_localizer(), Drive()
@@ -359,6 +363,7 @@ def test_impossible_readings_are_no_readings(impossible):
     assert poses[0] == poses[1]
 
 
+@pytest.mark.compiled
 def test_a_search_ends_when_readings_fit_for_some_time():
     """Where half of them happened to fit, a carried robot took the place for known."""
     localizer, drive = make_localizer(seed=3), Drive(seed=3)
