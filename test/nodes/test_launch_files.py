@@ -355,16 +355,20 @@ def test_sim_starts_tracks_and_ends_with_ctrl_c(to_group, start, slow, tmp_path)
 @pytest.mark.timed
 @pytest.mark.ros
 @pytest.mark.long
-def test_patrol_drives_its_path(start, slow):
+@pytest.mark.parametrize(
+    'place', [{'localised': 'true'}, {'localizer': 'true', 'known_world': 'room'}], ids=' '.join
+)
+def test_patrol_drives_its_path(place, start, slow):
     """All that the launch file starts."""
-    file, given = 'patrol.launch.py', {'localised': 'true', 'params_file': slow}
+    file, given = 'patrol.launch.py', {**place, 'params_file': slow}
     words = [launch_file(file), *(f'{name}:={value}' for name, value in given.items())]
     with start('launch_files', *words) as launch:
         launch.wait_for('tracking')
         time.sleep(15.0)
         assert not launch.ends(), launch.output()
         codes = end(launch)
-    assert codes == dict.fromkeys((*LOOP, 'recorder'), 0)
+    names = (*LOOP, 'recorder', *(['localizer'] if 'localizer' in place else []))
+    assert codes == dict.fromkeys(names, 0)
     with open_bag(only_bag(Path(slow).parent)) as recording:
         for node in launched(file, **given):
             values = recording.metadata_records.get(node.name, {})
