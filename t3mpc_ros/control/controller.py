@@ -545,9 +545,9 @@ class Controller:
         keep_out = self.keep_out
         assert keep_out is not None
         keep_out.ranges.update(odometry.stamp_ns, odometry.pose)
-        if self.drive_monitor.held and self.status.reason.moves:
+        if self.drive_monitor.contact and self.status.reason.moves:
             astern = self.actuation.twist.linear < 0.0
-            keep_out.touch(self.drive_monitor.held_motion.furthest, astern=astern)
+            keep_out.touch(self.drive_monitor.contact_monitor.furthest, astern=astern)
         rejoins = self.pose_controller.rejoining
         astern = keep_out.retreats or (not rejoins and float(begin.sum()) < 0.0)
         if reason.moves and keep_out.ranges.is_blind(astern=astern):

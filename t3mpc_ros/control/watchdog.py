@@ -26,6 +26,7 @@ from t3mpc_ros.geometry.types import (
     Pose,
     State,
     has_moved,
+    is_out_of_order,
     wrap_angle,
 )
 from t3mpc_ros.parameters.table import Parameters, parameter
@@ -110,14 +111,9 @@ class InputWatchdog:
         self._reference_pending = True
 
     def is_out_of_order(self, stamp_ns: int) -> bool:
-        """Whether an odometry is the last one again, or was overtaken by it on the way.
-
-        A stamp that is older by more than the time-out is a clock that was set back.
-        """
-        if self._odometry_ns is None:
-            return False
-        late = (self._odometry_ns - stamp_ns) / NANOSECONDS
-        return 0.0 <= late <= self._parameters.odometry_timeout
+        """Whether an odometry is the last one again, or was overtaken by it on the way."""
+        last, timeout = self._odometry_ns, self._parameters.odometry_timeout
+        return last is not None and is_out_of_order(stamp_ns, last, timeout)
 
     def elapsed(self, stamp_ns: int) -> float | None:
         """Return the time since the previous odometry, s; None if integration must restart.
@@ -309,7 +305,7 @@ RECOVERY_TIME = 5.0
 """Time of driving as commanded after which earlier pauses do not count, s."""
 
 
-class HeldMotion:
+class ContactMonitor:
     """Compares what was commanded of a robot with the change of its pose, piece by piece.
 
     Wheels that slip, and motors that lose steps, count a motion that the pose does not make, if
@@ -331,7 +327,7 @@ class HeldMotion:
         self._asked = self._ahead = self._left = self._turn = self._time = 0.0
         self._fastest = self._fastest_turn = 0.0
 
-    def is_held(self, odometry: State, command: BodyTwist, elapsed: float) -> bool:
+    def is_in_contact(self, odometry: State, command: BodyTwist, elapsed: float) -> bool:
         """Whether something holds, turns or pushes aside a robot that is commanded to drive."""
         pose, last = odometry.pose, self._pose
         if last is None or command.linear * self._asked < 0.0:
@@ -360,12 +356,12 @@ class HeldMotion:
                 self.restart(pose)
             return False
         least, most = CONTACT_SHARES
-        held = math.copysign(self._ahead, self._ahead * self._asked) < least * asked
-        held |= abs(self._left) > most * asked
+        touches = math.copysign(self._ahead, self._ahead * self._asked) < least * asked
+        touches |= abs(self._left) > most * asked
         if self._unlike <= self._steps * OWN_ODOMETRY**2:
-            held |= abs(self._turn) > CONTACT_TURN + CONTACT_LEAD * self._fastest_turn
+            touches |= abs(self._turn) > CONTACT_TURN + CONTACT_LEAD * self._fastest_turn
         self.restart(pose)
-        return held
+        return touches
 
 
 class DriveMonitor:
@@ -379,7 +375,7 @@ class DriveMonitor:
     def __init__(self, *, feels: bool = False) -> None:
         """``feels``: also pause them where the change of the pose says that the robot is held."""
         self._feels = feels
-        self.held_motion = HeldMotion()
+        self.contact_monitor = ContactMonitor()
         """Where something holds the robot."""
         self.reset()
 
@@ -387,7 +383,7 @@ class DriveMonitor:
         """Forget all pauses."""
         self.pauses = 0
         """Pauses since the robot drove as commanded."""
-        self.held = False
+        self.contact = False
         """Whether this pause began because something held the robot."""
         self._trials = 0
         self._ended = False
@@ -401,8 +397,8 @@ class DriveMonitor:
         self._well = self._astray = 0.0
         self._power, self._product = [0.0, 0.0], [0.0, 0.0]
         self._time = 0.0
-        self.held = False
-        self.held_motion.restart(None)
+        self.contact = False
+        self.contact_monitor.restart(None)
         self._restart(None)
 
     def _restart(self, pose: Pose | None) -> None:
@@ -428,8 +424,10 @@ class DriveMonitor:
                 return Reason.PAUSED
             self.begin()
             return Reason.TRACKING
-        self.held = self._feels and self.held_motion.is_held(odometry, command, elapsed)
-        stands = self._stands(odometry, command, elapsed) or self.held
+        self.contact = self._feels and self.contact_monitor.is_in_contact(
+            odometry, command, elapsed
+        )
+        stands = self._stands(odometry, command, elapsed) or self.contact
         if stands or self._is_opposed(odometry.twist, command, elapsed):
             return self._begin_pause()
         if following:
@@ -445,14 +443,14 @@ class DriveMonitor:
 
     def problem(self) -> str:
         """Return what to do about a robot that does not follow, or nothing."""
-        if self._ended and self.held:
+        if self._ended and self.contact:
             return (
                 'something that the range sensors do not see holds the robot: free it, move what '
                 'is in its way or keep it out by keep_out.world, then call ~/enable'
             )
         if self._ended:
             return 'free the wheels, look at the diagnostics of the robot, then call ~/enable'
-        if self.held:
+        if self.contact:
             return 'the robot touches something that the range sensors do not see: it backs off'
         if self.pauses:
             return (

@@ -16,7 +16,9 @@
 from dataclasses import dataclass
 import math
 
-from t3mpc_ros.geometry.types import BodyTwist, Pose, WheelSpeeds, wrap_angle
+import numpy as np
+
+from t3mpc_ros.geometry.types import Array, BodyTwist, Pose, WheelSpeeds, wrap_angle
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 
@@ -94,3 +96,10 @@ def frame_between(outer: Pose, inner: Pose) -> Pose:
         outer.y - sine * inner.x - cosine * inner.y,
         yaw,
     )
+
+
+def points_from_frame(frame: Pose, points: Array) -> Array:
+    """Return points (m) of a frame, shape (n, 2), in the frame in which its pose is given."""
+    cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
+    x, y = points.T
+    return np.column_stack([frame.x + cosine * x - sine * y, frame.y + sine * x + cosine * y])

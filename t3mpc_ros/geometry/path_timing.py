@@ -155,13 +155,6 @@ def check_points(points: Array) -> None:
         )
 
 
-def transformed(points: Array, frame: Pose) -> Array:
-    """Return points (m) of a frame, shape (n, 2), in the frame in which its pose is given."""
-    cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
-    found: Array = points @ np.array([[cosine, sine], [-sine, cosine]]) + np.array(frame[:2])
-    return found
-
-
 class PathTiming:
     """Returns pose and twist period by period along a path that grows while it is driven.
 

@@ -155,3 +155,11 @@ class StateArray:
         twists = map(make, repeat(BodyTwist), self.twists.tolist())
         table = zip(self.stamps_ns.tolist(), poses, twists, strict=True)
         return map(make, repeat(State), table)
+
+
+def is_out_of_order(stamp_ns: int, last_ns: int, timeout: float) -> bool:
+    """Return whether a message is the last one again, or was overtaken by it on the way.
+
+    A stamp that is older by more than ``timeout`` s is one of a clock that was set back.
+    """
+    return 0 <= last_ns - stamp_ns <= timeout * NANOSECONDS

@@ -25,8 +25,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.geometry.kinematics import frame_between
-from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, Array, Pose, has_moved, wrap_angle
+from t3mpc_ros.geometry.kinematics import frame_between, points_from_frame
+from t3mpc_ros.geometry.types import (
+    NANOSECONDS,
+    ORIGIN,
+    Array,
+    Pose,
+    has_moved,
+    is_out_of_order,
+    wrap_angle,
+)
 from t3mpc_ros.localization.occupancy_map import LocalizationMap, map_of_grid
 from t3mpc_ros.localization.particle_filter import (
     KNOWN_SHARE,
@@ -43,6 +51,9 @@ from t3mpc_ros.localization.range_model import (
 )
 from t3mpc_ros.parameters.table import Parameters, group, parameter
 
+DISORDER = 0.2
+"""Age up to which odometry was overtaken, and readings belong to it, s: the time-outs of the
+controller."""
 SCAN = -1
 """Number of a scan among the sensors."""
 LARGEST_STEP = 1.0
@@ -205,19 +216,24 @@ class Localizer:
         known = math.sqrt(largest) <= self.parameters.localized_deviation
         return Localization.LOCALIZED if known else Localization.SEARCHING
 
-    def add_range(self, sensor: int, reading: float) -> None:
+    def add_range(self, sensor: int, reading: float, stamp_ns: int | None = None) -> None:
         """Add a reading (m, REP 117) taken where the last odometry was.
 
-        NaN and a finite distance below zero change nothing.
+        NaN and a finite distance below zero change nothing, nor does a stamp of another time.
         """
-        if not (reading >= 0.0 or reading == -math.inf):
+        if not (reading >= 0.0 or reading == -math.inf) or self._is_late(stamp_ns):
             return
         mount = self._mounts[sensor : sensor + 1]
         self._add(sensor, Beams(mount, np.array([reading]), np.array([self._limits])))
 
-    def add_scan(self, beams: Beams) -> None:
+    def add_scan(self, beams: Beams, stamp_ns: int | None = None) -> None:
         """Add a scan taken where the last odometry was; it replaces one that was not used yet."""
-        self._add(SCAN, beams)
+        if not self._is_late(stamp_ns):
+            self._add(SCAN, beams)
+
+    def _is_late(self, stamp_ns: int | None) -> bool:
+        """Whether a reading was taken elsewhere than where the last odometry was."""
+        return stamp_ns is not None and abs(stamp_ns - self._stamp_ns) > DISORDER * NANOSECONDS
 
     def _add(self, sensor: int, beams: Beams) -> None:
         if self._odometry is not None:
@@ -227,12 +243,15 @@ class Localizer:
     def add_odometry(self, stamp_ns: int, pose: Pose) -> bool:
         """Add a pose of the odometry; return whether there is a new :attr:`result`.
 
-        A pose that is not finite is ignored. After a restart of the odometry, seen by a stamp or
-        a pose that jumps, the robot is where it was.
+        A pose that is not finite is ignored, as one that comes again or was overtaken on its way.
+        After a restart of the odometry, seen by a stamp or a pose that jumps, the robot is where
+        it was.
         """
+        last, last_ns = self._odometry, self._stamp_ns
         if not all(map(math.isfinite, pose)):
             return False
-        last, last_ns = self._odometry, self._stamp_ns
+        if last is not None and is_out_of_order(stamp_ns, last_ns, DISORDER):
+            return False
         self._odometry, self._stamp_ns = pose, stamp_ns
         restarted = last is not None and (
             stamp_ns < last_ns or has_moved(last, pose, LARGEST_STEP, math.inf)
@@ -352,9 +371,4 @@ def warm_up(parameters: LocalizerParameters) -> None:
 
 def transformed(frame: Pose, beams: Array) -> Array:
     """Return beams (x, y in m, direction in rad), shape (n, 3), of a frame outside of it."""
-    cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
-    result = np.empty_like(beams)
-    result[:, 0] = frame.x + cosine * beams[:, 0] - sine * beams[:, 1]
-    result[:, 1] = frame.y + sine * beams[:, 0] + cosine * beams[:, 1]
-    result[:, 2] = frame.yaw + beams[:, 2]
-    return result
+    return np.column_stack([points_from_frame(frame, beams[:, :2]), frame.yaw + beams[:, 2]])

@@ -243,11 +243,11 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         for sensor, subscription in enumerate(self._ranges):
             for message in subscription.take_waiting():
                 if localizer is not None:
-                    localizer.add_range(sensor, message.range)
+                    localizer.add_range(sensor, message.range, _stamp_ns(message))
         if self._scan is not None:
             for message in self._scan.take_waiting()[-1:]:
                 if localizer is not None:
-                    localizer.add_scan(self._beams(message))
+                    localizer.add_scan(self._beams(message), _stamp_ns(message))
 
     def _beams(self, message: LaserScan) -> Beams:
         """Return evenly spaced beams of a scan in the frame of the robot; NaN is left out."""
@@ -356,3 +356,8 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         state = localizer.state
         level = OK if state is Localization.LOCALIZED else WARN
         return level, state.value, values
+
+
+def _stamp_ns(message: Range | LaserScan) -> int | None:
+    """Return the stamp of a reading, None of one without."""
+    return conversions.ns_from_time(message.header.stamp) or None

@@ -36,9 +36,9 @@ from t3mpc_ros.chaos.pose_reference import (
 )
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceSample
 from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY, SALT_BYTES, fingerprint_seed
-from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose
+from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, points_from_frame
 from t3mpc_ros.geometry.path_file import load_path
-from t3mpc_ros.geometry.path_timing import PathError, check_points, transformed
+from t3mpc_ros.geometry.path_timing import PathError, check_points
 from t3mpc_ros.geometry.timing import SampleScheduler
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, Pose, State
 from t3mpc_ros.nodes import conversions, qos
@@ -202,7 +202,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             points = conversions.points_from_path(message)
             check_points(points)
             if len(points):
-                points = transformed(points, self._frame_pose(message.header.frame_id))
+                points = points_from_frame(self._frame_pose(message.header.frame_id), points)
                 check_points(points)
         except PathError as error:
             self._rejected += 1

@@ -564,7 +564,7 @@ def test_wheels_that_turn_under_a_pose_that_stands_are_a_contact(speed):
     command = BodyTwist(speed, 0.0)
     monitor, reasons = _feel(lambda t: ((0.0, 0.0, 0.3), command, command), 30.0)
     assert 0.01 * reasons.index(Reason.PAUSED) < 4.2
-    assert monitor.held
+    assert monitor.contact
     assert reasons[-1] is Reason.STOPPED_AGAIN
     assert 'call ~/enable' in monitor.problem()
     begins = [k for k in range(1, len(reasons)) if reasons[k - 1] is not reasons[k]]

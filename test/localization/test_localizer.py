@@ -218,6 +218,41 @@ def test_a_restart_of_the_odometry_moves_no_particle(restart):
     assert rms(follow(localizer, drive, 10.0))[0] < 0.03
 
 
+@pytest.mark.parametrize('disorder', ['a pair each 0.2 s', 'every pair', 'each twice', 'one late'])
+def test_odometry_out_of_order_is_no_restart(disorder):
+    """A swapped pair each 0.2 s was a restart each time: the robot drove, the estimate stood."""
+    poses = [(10_000_000 * k, Pose(0.002 * k, 0.0, 0.0)) for k in range(1, 301)]
+    if disorder == 'each twice':
+        sent = [each for each in poses for _ in range(2)]
+    else:
+        sent, every = (
+            [*poses],
+            {'a pair each 0.2 s': 20, 'every pair': 2, 'one late': 300}[disorder],
+        )
+        for k in range(every - 1, len(sent), every):
+            sent[k - 1], sent[k] = sent[k], sent[k - 1]
+        if disorder == 'one late':
+            sent.insert(150, poses[140])
+    ordered, localizer = make_localizer(), make_localizer()
+    updates = sum(ordered.add_odometry(*each) for each in poses)
+    assert abs(sum(localizer.add_odometry(*each) for each in sent) - updates) <= 1
+    assert localizer.result.pose.x == pytest.approx(ordered.result.pose.x, abs=0.03)
+    assert updates >= 10
+
+
+@pytest.mark.parametrize('late', [-500_000_000, 500_000_000])
+def test_readings_of_another_time_are_not_used(late):
+    """Half a second late, they were taken where the robot no longer is."""
+    localizer = make_localizer()
+    localizer.add_odometry(10**9, Pose(0.0, 0.0, 0.0))
+    localizer.add_range(0, 0.3, 10**9 + late)
+    assert localizer._pending == {}
+    for stamp_ns in (None, 10**9, 10**9 - 100_000_000):
+        localizer._pending.clear()
+        localizer.add_range(0, 0.3, stamp_ns)
+        assert set(localizer._pending) == {0}
+
+
 def test_bad_inputs_change_nothing():
     localizer, drive = make_localizer(), Drive()
     for sensor in EVERY.tolist():
