@@ -16,8 +16,10 @@
 from contextlib import suppress
 from glob import glob
 import gzip
+import itertools
 import os
 import re
+import runpy
 import shutil
 import sys
 import tarfile
@@ -119,23 +121,20 @@ if bdist_wheel:
 
     COMMANDS['bdist_wheel'] = Wheel
 
+ROS = [each for each in requirements('requirements.txt') if each.startswith('ros-jazzy-')]
+LIBRARIES = runpy.run_path(
+    os.path.join(os.path.dirname(os.path.realpath(__file__)), NAME, 'missing_library.py')
+)
 EXTRAS = {
-    'bags': ('mcap', 'zstandard', 'lz4', 'rosbags', 'pillow', 'jinja2'),
-    'compare': ('cma', 'jinja2'),
-    'ros': ('pyserial', 'ros-jazzy-rclpy', 'ros-jazzy-common-interfaces'),
+    extra: [LIBRARIES['REQUIREMENTS'][name] for name in names]
+    for extra, names in LIBRARIES['EXTRAS'].items()
 }
-"""Libraries that a simulation does without, by the extra that installs them."""
-
-
-def of_extra(extra):
-    """Return the requirements of an extra; those of '' are needed by every installation."""
-    found = []
-    for each in requirements('requirements.txt'):
-        name = re.split('[<>=[]', each)[0]
-        extras = [key for key, names in EXTRAS.items() if name in names] or ['']
-        if extra in extras:
-            found.append(each)
-    return found
+"""Requirements that a simulation does without, by the extra that installs them."""
+NEEDED = [
+    each
+    for each in requirements('requirements.txt')
+    if each not in [*ROS, *itertools.chain(*EXTRAS.values())]
+]
 
 
 FOR_PIP = bool(PIP_COMMANDS.intersection(sys.argv))
@@ -175,14 +174,11 @@ setup(
         f'{NAME}.simulation': ['worlds/*.yaml', 'schedules/*.yaml'],
         f'{NAME}.view': ['page/*'],
     },
-    install_requires=of_extra(''),
+    install_requires=NEEDED,
     # colcon test runs pytest only where it is a test dependency.
     extras_require={
-        'bags': of_extra('bags'),
-        'ros': [*of_extra('ros'), *of_extra('bags')],
-        'compare': [*of_extra('compare'), 'casadi>=3.6,<4', 'pyarrow>=15,<30'],
-        'cluster': ['distributed>=2024.5,<2028', 'pyarrow>=15,<30'],
-        'gym': ['gymnasium>=1.0,<2'],
+        **EXTRAS,
+        'ros': [*ROS, *EXTRAS['ros'], *EXTRAS['bags']],
         'dev': requirements('requirements-dev.txt'),
         'test': ['pytest'],
     },

@@ -42,11 +42,11 @@ REQUIREMENTS = {
 EXTRAS = {
     'bags': ('mcap', 'zstandard', 'lz4', 'rosbags', 'PIL', 'jinja2'),
     'ros': ('serial',),
-    'compare': ('casadi', 'pyarrow', 'cma'),
-    'cluster': ('distributed',),
+    'compare': ('casadi', 'pyarrow', 'cma', 'jinja2'),
+    'cluster': ('distributed', 'pyarrow'),
     'gym': ('gymnasium',),
 }
-"""Extra of the package that installs a library which a simulation does without."""
+"""Libraries that a simulation does without, by the extra of the package that installs them."""
 
 
 def remedy(error: ModuleNotFoundError) -> str:

@@ -40,7 +40,7 @@ from t3mpc_ros.evaluation.metrics import (
     YAW_RATE_SETTLED,
     Metric,
 )
-from t3mpc_ros.evaluation.plotting import new_figure, rendered, scale_by_size
+from t3mpc_ros.evaluation.plotting import drawing, file_of, new_figure, scale_by_size
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
     Block,
@@ -296,8 +296,8 @@ def page(plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | Non
     for case in plan.cases:
         blocks.append(Heading(case))
         for caption, draw in figures.items():
-            if figure := rendered(partial(draw, plan, results), case):
-                blocks.append(Picture(f'{caption}: {case}', figure.svg, caption))
+            if figure := drawing(partial(draw, plan, results), case):
+                blocks.append(Picture(f'{caption}: {case}', file_of(figure, 'svg'), caption))
             if draw is _draw_differences and case == plan.cases[0]:
                 summary = summary_table(plan, results, step_times)
                 blocks += [Contents(), Paragraph(description(plan)), summary]
@@ -383,17 +383,14 @@ def _draw_differences(plan: ComparisonPlan, results: ResultTable, case: str) -> 
     places = np.arange(len(rows))[::-1]
     colours = {BETTER: '#15803d', WORSE: '#be123c', INCONCLUSIVE: '#6b7280'}
     judgement = case_verdicts(plan, results, case)
+    ends: list[float] = []
     for place, (method, found) in zip(places, rows, strict=True):
         half = found.half if math.isfinite(found.half) else 0.0
+        ends += [found.mean - half, found.mean + half]
         colour = colours[judgement[method, metric]]
         axis.errorbar(found.mean, place, xerr=half, fmt='o', color=colour, markersize=4)
     axis.axvline(0.0, color='#1f2937', linewidth=0.8)
     axis.set_yticks(places, [name for name, _ in rows])
-    ends = [
-        found.mean + sign * (found.half if math.isfinite(found.half) else 0.0)
-        for _, found in rows
-        for sign in (-1.0, 1.0)
-    ]
     scale_by_size(axis, 'x', ends, near=0.01)
     axis.set_xlabel(f'{metric.heading} / ({metric.unit})')
     return figure

@@ -188,7 +188,7 @@ class MethodDriver:
         self._limited = False
         self._sent = ZERO_WHEEL_SPEEDS
         self._elapsed = 1
-        self.held = RobotCommand(ZERO_WHEEL_SPEEDS, 0)
+        self.unchanged = RobotCommand(ZERO_WHEEL_SPEEDS, 0)
         """Command after a report that the method does not get."""
 
     @property
@@ -216,18 +216,18 @@ class MethodDriver:
         """Return the command that follows from a report; NaN if the answer is not finite."""
         observation = self.observe(state)
         if observation is None or self._controller is None:
-            return self.held
-        return self.answer(self._controller.step(observation))
+            return self.unchanged
+        return self.command_for(self._controller.step(observation))
 
     def observe(self, state: RobotState) -> Observation | None:
-        """Return what the method gets for a report; None where :attr:`held` is the command."""
+        """Return what the method gets for a report; None: the command is :attr:`unchanged`."""
         if not self._enabled:
-            self.held = RobotCommand(ZERO_WHEEL_SPEEDS, state.stamp_ns)
+            self.unchanged = RobotCommand(ZERO_WHEEL_SPEEDS, state.stamp_ns)
             return None
         k = round(state.stamp_ns * RATE / NANOSECONDS)
         elapsed = k - self._observed if self._observed >= 0 else 1
         if elapsed <= 0:  # repeated, or overtaken by a later one
-            self.held = RobotCommand(self._sent, self._observed_ns)
+            self.unchanged = RobotCommand(self._sent, self._observed_ns)
             return None
         self._yaw_rate = math.nan
         if self._observed >= 0:
@@ -244,7 +244,7 @@ class MethodDriver:
         self._elapsed = elapsed
         return self._observation(k, measured, elapsed)
 
-    def answer(self, acceleration: Array) -> RobotCommand:
+    def command_for(self, acceleration: Array) -> RobotCommand:
         """Return the command that an acceleration (rad/s²), chosen for the observation, makes."""
         asked, cut = self._limited_torque(acceleration)
         if not np.isfinite(asked).all():

@@ -24,9 +24,10 @@ import numpy as np
 from t3mpc_ros.evaluation.fault_study import ALLOWED, BEGIN, DURATION, ODOMETRY_WRONG
 from t3mpc_ros.evaluation.plotting import (
     COLOURS,
+    drawing,
+    file_of,
     legend_above,
     new_figure,
-    rendered,
     scale_by_size,
 )
 from t3mpc_ros.evaluation.reporting import (
@@ -185,8 +186,8 @@ def page(rows: Sequence[Row]) -> str:
             f'during one is {worst["during"]:.2f} rad/s, of {worst["name"]}.'
         )
         blocks.append(Heading(title))
-        if figure := rendered(_draw_errors, chosen):
-            blocks.append(Picture(seen, figure.svg, seen))
+        if figure := drawing(_draw_errors, chosen):
+            blocks.append(Picture(seen, file_of(figure, 'svg'), seen))
         if number == 0:
             blocks.append(Contents())
         cells = [[cell.replace('`', '').replace('**', '') for cell in table_row(row)]

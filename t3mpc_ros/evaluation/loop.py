@@ -32,6 +32,8 @@ from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
 from t3mpc_ros.simulation.plant_robot import Signals, SimulatedRobot
 
+Loop = Generator[RobotState, RobotCommand, Record]
+"""Closed loop that yields reports and takes commands."""
 _NO_RANGES = (math.nan,) * len(RANGE_SENSORS)
 
 
@@ -79,16 +81,21 @@ def run(scenario: Scenario, method: Method) -> Record:
     known = steps + round(LEAD * RATE)
     if len(reference.speeds) < known:
         raise ValueError(f'reference must have at least {known} rows: got {len(reference.speeds)}')
-    record = run_loop(
+    driver = method.driver(scenario)
+    return with_reference(run_loop(scenario_reports(scenario, driver), driver), scenario)
+
+
+def scenario_reports(scenario: Scenario, driver: Driver) -> Loop:
+    """Return the loop of a driver and the robot of a scenario, see :func:`reports_of`."""
+    return reports_of(
         scenario.simulation(),
-        method.driver(scenario),
-        steps,
+        driver,
+        scenario.steps,
         start=scenario.kind.start,
         pauses=scenario.own.pauses,
         links=scenario.links,
         seed=scenario.seed,
     )
-    return with_reference(record, scenario)
 
 
 def with_reference(record: Record, scenario: Scenario) -> Record:
@@ -103,33 +110,8 @@ def with_reference(record: Record, scenario: Scenario) -> Record:
     return replace(record, columns=columns, drive=scenario.kind.drive, switches=switches)
 
 
-def run_loop(
-    robot: SimulatedRobot,
-    driver: Driver,
-    periods: int,
-    *,
-    start: float = 0.0,
-    pauses: Sequence[tuple[float, float]] = (),
-    links: LinkFaults = NO_FAULTS,
-    seed: int = 0,
-    latency_ns: int = 0,
-) -> Record:
-    """Return the record of a driver and a robot; equal arguments give equal records, bit for bit.
-
-    Robot and driver are new; the columns of the reference are the caller's. The driver is disabled
-    until ``start``, and in the ``pauses`` (s) of a person. ``links`` and their ``seed`` are those
-    of the reports; ``latency_ns`` is from the arrival of a report to the departure of the command.
-    """
-    loop = reports_of(
-        robot,
-        driver,
-        periods,
-        start=start,
-        pauses=pauses,
-        links=links,
-        seed=seed,
-        latency_ns=latency_ns,
-    )
+def run_loop(loop: Loop, driver: Driver) -> Record:
+    """Return the record of a loop whose every report goes to its driver."""
     try:
         report = next(loop)
         while True:
@@ -149,10 +131,13 @@ def reports_of(
     links: LinkFaults = NO_FAULTS,
     seed: int = 0,
     latency_ns: int = 0,
-) -> Generator[RobotState, RobotCommand, Record]:
-    """Yield each report that arrives at the driver, take its command, and return the record.
+) -> Loop:
+    """Yield each report that arrives at the driver, take the command, and return the record.
 
-    For who answers the reports himself; arguments as of :func:`run_loop`.
+    Equal arguments and commands give equal records, bit for bit. Robot and driver are new; the
+    columns of the reference are the caller's. The driver is disabled until ``start``, and in the
+    ``pauses`` (s) of a person. ``links`` and their ``seed`` are those of the reports;
+    ``latency_ns`` is from the arrival of a report to the departure of the command.
     """
     reports = ReportLink(links, seed, periods / RATE)
     paused = [(0.0, start), *pauses]

@@ -69,31 +69,32 @@ STYLE = {
     'ytick.color': '#374151',
     'legend.frameon': False,
     'legend.fontsize': 8,
+    'svg.hashsalt': 't3mpc_ros',  # no random names of parts
 }
 
 
-class Rendered(NamedTuple):
-    """A figure as files: a bitmap for a folder, and lines for a page."""
-
-    png: bytes
-    svg: bytes
-
-
-def rendered(draw: Callable[[Subject], Any], subject: Subject) -> Rendered | None:
-    """Return what ``draw`` returns for ``subject`` as files; None when it returns None."""
-    # Equal figures are equal files: no random names of parts, no date.
-    with matplotlib.rc_context({**STYLE, 'svg.hashsalt': 't3mpc_ros'}):
+def drawing(draw: Callable[[Subject], Any], subject: Subject) -> Any:
+    """Return the figure of ``subject`` in the style of the package, laid out; None without one."""
+    with matplotlib.rc_context(STYLE):
         figure = draw(subject)
-        if figure is None:
-            return None
-        figure.set_dpi(150)
-        # savefig would draw the whole figure once more for its layout.
-        figure.get_layout_engine().execute(figure)
-        figure.set_layout_engine('none')
-        png, svg = io.BytesIO(), io.BytesIO()
-        figure.canvas.print_png(png)
-        figure.savefig(svg, format='svg', metadata={'Date': None})
-        return Rendered(png.getvalue(), svg.getvalue())
+        if figure is not None:
+            figure.set_dpi(150)
+            # savefig would draw the whole figure once more for its layout.
+            figure.get_layout_engine().execute(figure)
+            figure.set_layout_engine('none')
+        return figure
+
+
+DATES = {'png': '', 'pdf': 'CreationDate', 'svg': 'Date'}
+"""Kinds of files, each with what dates it and is left out: equal figures are equal files."""
+
+
+def file_of(figure: Any, kind: str) -> bytes:
+    """Return a figure as a file of :data:`DATES`."""
+    buffer, dated = io.BytesIO(), DATES[kind]
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(buffer, format=kind, dpi=150, metadata={dated: None} if dated else None)
+    return buffer.getvalue()
 
 
 class TitledDrawing(NamedTuple, Generic[Subject]):
@@ -106,14 +107,14 @@ class TitledDrawing(NamedTuple, Generic[Subject]):
 
 def write_pictures(
     drawings: Mapping[str, Callable[[Subject], Any]], subject: Subject, folder: Path
-) -> dict[str, Rendered]:
-    """Write the figures with something to draw as PNG files, and return them by their stems."""
+) -> dict[str, bytes]:
+    """Write the figures with something to draw as PNG, and return them as SVG by their stems."""
     folder.mkdir(parents=True, exist_ok=True)
     found = {}
     for stem, draw in drawings.items():
-        if (figure := rendered(draw, subject)) is not None:
-            found[stem] = figure
-            (folder / f'{stem}.png').write_bytes(figure.png)
+        if (figure := drawing(draw, subject)) is not None:
+            found[stem] = file_of(figure, 'svg')
+            (folder / f'{stem}.png').write_bytes(file_of(figure, 'png'))
     return found
 
 

@@ -29,6 +29,8 @@ from t3mpc_ros.robot.interface import RobotStatus
 
 RATE = 100.0
 """Control periods a second in every run."""
+ON_PATH = 0.05
+"""Largest distance from its reference of a robot that is on its path, m."""
 STATUS_FLAGS = RobotStatus._fields
 """Meaning of the column ``flags``."""
 CROSSING = (0.5, 0.5)
@@ -209,6 +211,12 @@ def away_from_switches(
     for switch in switches.tolist():
         away &= (time < switch - before) | (time >= switch + behind)
     return away
+
+
+def spans_of(rows: NDArray[np.bool_]) -> list[slice]:
+    """Return the stretches of rows that are true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(np.int8), [0]])))
+    return [slice(*each) for each in edges.reshape(-1, 2).tolist()]
 
 
 def switch_times(time: Array, modes: NDArray[np.generic]) -> Array:

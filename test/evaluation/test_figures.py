@@ -404,7 +404,7 @@ def caught(monkeypatch):
             figures.append(figure)
 
     for module in (comparison_page, fault_page, plotting):
-        monkeypatch.setattr(module, 'rendered', instead)
+        monkeypatch.setattr(module, 'drawing', instead)
     return figures
 
 
@@ -722,11 +722,15 @@ def test_a_figure_of_a_page_is_made_of_lines_and_repeatable():
         figure.subplots().plot(values)
         return figure
 
-    first, again = (plotting.rendered(draw, [1.0, 3.0, 2.0]) for _ in range(2))
-    assert first == again
-    assert first.png.startswith(b'\x89PNG')
-    assert b'<path' in first.svg
-    assert b'<image' not in first.svg
+    files = {
+        kind: [plotting.file_of(plotting.drawing(draw, [1.0, 3.0, 2.0]), kind) for _ in range(2)]
+        for kind in plotting.DATES
+    }
+    assert all(first == again for first, again in files.values())
+    assert files['png'][0].startswith(b'\x89PNG')
+    assert files['pdf'][0].startswith(b'%PDF')
+    assert b'<path' in files['svg'][0]
+    assert b'<image' not in files['svg'][0]
 
 
 @pytest.mark.parametrize(

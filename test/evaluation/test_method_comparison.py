@@ -47,7 +47,7 @@ from t3mpc_ros.evaluation.comparison_page import (
 )
 from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeDriver
 from t3mpc_ros.evaluation.experiment import ResultTable, measured_run
-from t3mpc_ros.evaluation.loop import run, run_loop
+from t3mpc_ros.evaluation.loop import reports_of, run, run_loop
 from t3mpc_ros.evaluation.methods import (
     FEED_FORWARD,
     FULL,
@@ -293,7 +293,8 @@ def test_reports_arrive_late_in_order_and_not_at_all():
     scenario = Scenario('twin', NOMINAL, 3, 3.0)
     controller = Controller(StepperControllerParameters())
     driver = Spy(controller, noisy_twin().geometry, scenario.reference().speeds)
-    run_loop(scenario.simulation(), driver, 300, start=1.5, links=faults, seed=3)
+    loop = reports_of(scenario.simulation(), driver, 300, start=1.5, links=faults, seed=3)
+    run_loop(loop, driver)
     stamps = [stamp for stamp, _ in received]
     assert stamps == sorted(stamps)
     during = [now - stamp for stamp, now in received if 1_000_000_000 <= stamp < 2_000_000_000]

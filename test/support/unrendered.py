@@ -19,11 +19,12 @@ from t3mpc_ros.evaluation import plotting
 
 
 def draw_only(draw, subject):
-    """Return empty files in place of the figure, None where there is nothing to draw."""
-    return None if draw(subject) is None else plotting.Rendered(b'\x89PNG', b'<svg/>')
+    """Return a figure that is not laid out, None where there is nothing to draw."""
+    return draw(subject)
 
 
 @pytest.fixture
 def unrendered(monkeypatch):
     """Draw figures without rendering them."""
-    monkeypatch.setattr(plotting, 'rendered', draw_only)
+    monkeypatch.setattr(plotting, 'drawing', draw_only)
+    monkeypatch.setattr(plotting, 'file_of', lambda figure, kind: kind.encode())

@@ -24,8 +24,8 @@ from t3mpc_ros.evaluation.api.controllers import as_controllers
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.result_tables import ShownAsTables, data_frame
-from t3mpc_ros.evaluation.api.table_files import columns_of, writable, write_csv, write_parquet
+from t3mpc_ros.evaluation.api.result_tables import ShownAsTables
+from t3mpc_ros.evaluation.api.table_files import Columns, columns_of, writable
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, run_plan
 from t3mpc_ros.evaluation.confidence_intervals import Difference
@@ -60,6 +60,9 @@ class Comparison(ShownAsTables):
         plan, count = self.plan, len(self.results)
         names, cases = ', '.join(plan.methods), ', '.join(plan.cases)
         return f'{names}; {cases}; {len(plan.seeds)} seeds, {count} runs'
+
+    def _columns(self) -> Columns:
+        return columns_of(self.rows())
 
     def _tables(self, chosen: str | None = None) -> list[Table]:
         from t3mpc_ros.evaluation.comparison_page import case_table
@@ -100,21 +103,6 @@ class Comparison(ShownAsTables):
         """Return one row for each run: controller, case, seed, setting, metrics, provenance."""
         origin = provenance() | machine()
         return [row | origin for row in self.results]
-
-    @one_sentence
-    def to_frame(self) -> Any:
-        """Return one row for each run as a data frame of pandas, if that is installed."""
-        return data_frame(columns_of(self.rows()))
-
-    @one_sentence
-    def to_csv(self, path: str | os.PathLike[str]) -> Path:
-        """Write one row for each run as CSV and return the path."""
-        return write_csv(path, columns_of(self.rows()))
-
-    @one_sentence
-    def to_parquet(self, path: str | os.PathLike[str]) -> Path:
-        """Write one row for each run as Parquet; needs the extra ``[compare]``."""
-        return write_parquet(path, columns_of(self.rows()))
 
     @one_sentence
     def to_html(self, path: str | os.PathLike[str]) -> Path:

@@ -25,8 +25,10 @@ from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.plotting import (
     COLOURS,
+    DATES,
     STYLE,
     add_legend,
+    file_of,
     name_time,
     new_figure,
     new_panels,
@@ -42,16 +44,10 @@ def drawn(draw: Callable[[], Any], path: str | os.PathLike[str] | None) -> Any:
         figure = draw()
     if path is not None:
         target = writable(path)
-        if target.suffix not in PICTURES:
-            raise ScriptError(f'path must end in {", ".join(PICTURES)}: got {target}')
-        with matplotlib.rc_context({**STYLE, 'svg.hashsalt': 't3mpc_ros'}):
-            dated = PICTURES[target.suffix]
-            figure.savefig(target, dpi=150, metadata={dated: None} if dated else None)
+        if target.suffix not in (suffixes := [f'.{kind}' for kind in DATES]):
+            raise ScriptError(f'path must end in {", ".join(suffixes)}: got {target}')
+        target.write_bytes(file_of(figure, target.suffix.removeprefix('.')))
     return figure
-
-
-PICTURES = {'.png': '', '.pdf': 'CreationDate', '.svg': 'Date'}
-"""Kinds of files, each with what dates it and is left out: equal figures are equal files."""
 
 
 def run_figure(name: str, columns: Mapping[str, Array]) -> Any:

@@ -29,8 +29,8 @@ from t3mpc_ros.evaluation.api.controllers import as_controllers
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence, sentence
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.result_tables import ShownAsTables, data_frame
-from t3mpc_ros.evaluation.api.table_files import columns_of, writable, write_csv, write_parquet
+from t3mpc_ros.evaluation.api.result_tables import ShownAsTables
+from t3mpc_ros.evaluation.api.table_files import Columns, columns_of, writable, write_parquet
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.experiment import (
@@ -88,6 +88,9 @@ class Sweep(ShownAsTables):
     def _summary(self) -> str:
         return f'{", ".join(self.parameters)}; {len(self.rows)} runs'
 
+    def _columns(self) -> Columns:
+        return self.columns
+
     def _tables(self, chosen: str | None = None) -> list[Table]:
         metric = find_metric(chosen or 'overall')
         names = ('controller', *self.parameters, 'case')
@@ -118,21 +121,6 @@ class Sweep(ShownAsTables):
             lines.setdefault(str(line), {})[value] = numbers
         label = f'{wanted.heading} / ({wanted.unit})'
         return drawn(lambda: sweep_figure(lines, name, label), path)
-
-    @one_sentence
-    def to_frame(self) -> Any:
-        """Return one row for each run as a data frame of pandas, if that is installed."""
-        return data_frame(self.columns)
-
-    @one_sentence
-    def to_csv(self, path: str | os.PathLike[str]) -> Path:
-        """Write one row for each run as CSV and return the path."""
-        return write_csv(path, self.columns)
-
-    @one_sentence
-    def to_parquet(self, path: str | os.PathLike[str]) -> Path:
-        """Write one row for each run as Parquet; needs the extra ``[compare]``."""
-        return write_parquet(path, self.columns)
 
 
 @one_sentence

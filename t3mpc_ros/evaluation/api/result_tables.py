@@ -16,10 +16,13 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from importlib import import_module
+import os
+from pathlib import Path
 import sys
 from typing import Any
 
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
+from t3mpc_ros.evaluation.api.table_files import Columns, write_csv, write_parquet
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.script_error import ScriptError
 
@@ -39,6 +42,14 @@ class ShownAsTables(ABC):
     def _tables(self, chosen: str | None = None) -> list[Table]:
         """Return the tables of what is chosen, or of all."""
 
+    @abstractmethod
+    def _columns(self) -> Columns:
+        """Return what the files hold."""
+
+    def _details(self) -> Mapping[str, str]:
+        """Return what a Parquet file says beside version and commit."""
+        return {}
+
     def __repr__(self) -> str:
         return f'<{type(self).__name__}: {self._summary()}>'
 
@@ -56,14 +67,23 @@ class ShownAsTables(ABC):
         """
         return '\n'.join(table.latex() for table in self._tables(chosen))
 
+    @one_sentence
+    def to_frame(self) -> Any:
+        """Return the columns as a data frame of pandas, which no extra of the package installs."""
+        try:
+            # No requirement of the package, which makes no frame itself.
+            pandas = import_module('pandas')
+        except ModuleNotFoundError:
+            text = f'a data frame needs pandas: {sys.executable} -m pip install pandas'
+            raise ScriptError(text) from None
+        return pandas.DataFrame(dict(self._columns()))
 
-def data_frame(columns: Mapping[str, Any]) -> Any:
-    """Return columns as a data frame of pandas, which no extra of the package installs."""
-    try:
-        # No requirement of the package, which makes no frame itself.
-        pandas = import_module('pandas')
-    except ModuleNotFoundError:
-        raise ScriptError(
-            f'a data frame needs pandas: {sys.executable} -m pip install pandas'
-        ) from None
-    return pandas.DataFrame(dict(columns))
+    @one_sentence
+    def to_csv(self, path: str | os.PathLike[str]) -> Path:
+        """Write the columns as CSV, one row for each run or period, and return the path."""
+        return write_csv(path, self._columns())
+
+    @one_sentence
+    def to_parquet(self, path: str | os.PathLike[str]) -> Path:
+        """Write them as Parquet and return the path; needs the extra ``[compare]``."""
+        return write_parquet(path, self._columns(), self._details())

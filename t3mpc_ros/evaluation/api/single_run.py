@@ -16,7 +16,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,8 +24,8 @@ from t3mpc_ros.evaluation.api.controllers import as_controllers
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.result_tables import ShownAsTables, data_frame
-from t3mpc_ros.evaluation.api.table_files import write_csv, write_parquet
+from t3mpc_ros.evaluation.api.result_tables import ShownAsTables
+from t3mpc_ros.evaluation.api.table_files import Columns
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.loop import run
@@ -91,6 +90,12 @@ class RunResult(ShownAsTables):
         settled = self.metrics['settled']
         return f'{self.controller}: {self.scenario}, settled RMSE {settled:.4f} rad/s'
 
+    def _columns(self) -> Columns:
+        return self.columns
+
+    def _details(self) -> Mapping[str, str]:
+        return {'controller': self.controller, 'scenario': str(self.scenario)}
+
     def _tables(self, chosen: str | None = None) -> list[Table]:
         rows = [
             (metric.heading, f'{self.metrics[metric.name]:.{metric.digits}f}', metric.unit)
@@ -98,11 +103,6 @@ class RunResult(ShownAsTables):
             if metric.name in self.metrics
         ]
         return [Table(f'{self.controller}: {self.scenario}', ('metric', 'value', 'unit'), rows)]
-
-    @one_sentence
-    def to_frame(self) -> Any:
-        """Return the columns as a data frame of pandas, if that is installed."""
-        return data_frame(self.columns)
 
     @one_sentence
     def plot(self, path: str | os.PathLike[str] | None = None) -> Any:
@@ -113,17 +113,6 @@ class RunResult(ShownAsTables):
         from t3mpc_ros.evaluation.api.figures import drawn, run_figure
 
         return drawn(lambda: run_figure(self.controller, self.columns), path)
-
-    @one_sentence
-    def to_csv(self, path: str | os.PathLike[str]) -> Path:
-        """Write the columns as CSV and return the path."""
-        return write_csv(path, self.columns)
-
-    @one_sentence
-    def to_parquet(self, path: str | os.PathLike[str]) -> Path:
-        """Write the columns as Parquet and return the path; needs the extra ``[compare]``."""
-        details = {'controller': self.controller, 'scenario': str(self.scenario)}
-        return write_parquet(path, self.columns, details)
 
 
 @one_sentence

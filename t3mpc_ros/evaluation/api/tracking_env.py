@@ -17,7 +17,7 @@ It is the loop of every other run, with its state estimate, limits, links and no
 reaches here is what :func:`t3mpc_ros.compare` measures of it.
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -31,13 +31,13 @@ from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
 from t3mpc_ros.evaluation.drivers import MethodDriver
-from t3mpc_ros.evaluation.loop import reports_of, with_reference
+from t3mpc_ros.evaluation.loop import scenario_reports, with_reference
 from t3mpc_ros.evaluation.metrics import measure
 from t3mpc_ros.evaluation.record import RATE, Record
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
-from t3mpc_ros.robot.interface import RobotCommand, RobotState
+from t3mpc_ros.robot.interface import RobotCommand
 from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
@@ -88,7 +88,7 @@ class _Previewing:
     preview = True
 
     def step(self, observation: Observation) -> Array:
-        """Not called: the policy answers outside of the loop."""
+        """Not called: the policy chooses outside of the loop."""
         raise NotImplementedError
 
 
@@ -156,22 +156,14 @@ class TrackingEnv(gymnasium.Env[Vector, Vector]):
 
 
 class _Episode:
-    """One run, answered from outside."""
+    """One run, in which a policy chooses the accelerations."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         method = Controller(_Previewing).method(scenario.robot)
         assert isinstance(method, OwnMethod)
         self._driver: MethodDriver = method.driver(scenario)
-        self._robot = scenario.simulation()
-        self._reports: Generator[RobotState, RobotCommand, Record] = reports_of(
-            self._robot,
-            self._driver,
-            scenario.steps,
-            start=scenario.kind.start,
-            links=scenario.links,
-            seed=scenario.seed,
-        )
+        self._reports = scenario_reports(scenario, self._driver)
         self._reference = scenario.reference().speeds
         self._before: Array = np.zeros(2)
         self.record: Record | None = None
@@ -185,7 +177,7 @@ class _Episode:
         if given.shape != (2,) or not np.isfinite(given).all():
             raise ScriptError(f'action must be two finite numbers: got {action!r}')
         asked = np.clip(given, -1.0, 1.0)
-        self._send(self._driver.answer(ACCELERATION * asked))
+        self._send(self._driver.command_for(ACCELERATION * asked))
         change, self._before = asked - self._before, asked
         info: dict[str, Any] = {}
         if self.record is not None:
@@ -199,7 +191,7 @@ class _Episode:
         return self.observation, reward, False, self.record is not None, info
 
     def _send(self, command: RobotCommand) -> None:
-        """Send a command, and go on to the next report that a policy answers, or to the end."""
+        """Send a command, and go on to the next report that a policy gets, or to the end."""
         try:
             self._state = self._reports.send(command)
             self._observe()
@@ -209,5 +201,5 @@ class _Episode:
     def _observe(self) -> None:
         """Skip the reports that a method does not get: at standstill, and repeated ones."""
         while (observation := self._driver.observe(self._state)) is None:
-            self._state = self._reports.send(self._driver.held)
+            self._state = self._reports.send(self._driver.unchanged)
         self.observation = vector_of(observation)

@@ -30,6 +30,7 @@ from t3mpc_ros.evaluation.bag_report.continuity import (
     several_robots,
 )
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, moves
+from t3mpc_ros.evaluation.record import spans_of
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 
@@ -196,12 +197,6 @@ def still_rows(linear: Array, angular: Array, factor: float = 1.0) -> NDArray[np
         & (np.abs(angular) < factor * STILL['angular'])
     )
     return still
-
-
-def spans_of(rows: NDArray[np.bool_]) -> list[slice]:
-    """Return the stretches of rows that are true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], rows.astype(np.int8), [0]])))
-    return [slice(*each) for each in edges.reshape(-1, 2).tolist()]
 
 
 def standstills(motion: Series) -> list[Span]:

@@ -20,11 +20,11 @@ from t3mpc_ros.evaluation.bag_report.incidents import (
     PAUSE,
     STILL,
     smooth,
-    spans_of,
     still_rows,
 )
 from t3mpc_ros.evaluation.bag_report.run_data import Run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import format_number
+from t3mpc_ros.evaluation.record import spans_of
 from t3mpc_ros.evaluation.topic_roles import COMMAND
 
 

@@ -36,6 +36,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     settled_rmse,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.record import ON_PATH
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
 
@@ -51,8 +52,6 @@ CALMER = 0.9
 """Error without the time after stalls, as a share of that with it, below which both are stated."""
 NEVER = 0.95
 """Share of the drive in which a robot stands that never moved."""
-ON_PATH = 0.05
-"""Largest distance from its reference of a robot that is on its path, m."""
 MIN_ON_PATH = 0.02
 """Least share of the drive on the path for a robot that follows it at all. Detours around
 obstacles, looking around and the way back are no errors; the path itself goes on meanwhile."""

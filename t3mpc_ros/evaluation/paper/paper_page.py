@@ -22,7 +22,6 @@ from t3mpc_ros.evaluation.paper.claims import Claim
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.results import Results
 from t3mpc_ros.evaluation.paper.study import WITHOUT
-from t3mpc_ros.evaluation.plotting import Rendered
 from t3mpc_ros.evaluation.reporting import (
     Block,
     Contents,
@@ -242,7 +241,7 @@ _KINDS = {
 }
 
 
-def page(title: str, origin: str, material: ExhibitData, pictures: Mapping[str, Rendered]) -> str:
+def page(title: str, origin: str, material: ExhibitData, pictures: Mapping[str, bytes]) -> str:
     """Return the page as HTML that loads nothing from anywhere.
 
     ``origin`` says where the numbers come from; pictures (PNG) are by the stem of their exhibit.
@@ -278,7 +277,7 @@ def _claims(title: str, claims: Sequence[Claim], origin: str) -> Details:
     return Details(f'{title}: {counted(chosen)}', [table], opened=True)
 
 
-def _exhibit(exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, Rendered]) -> Group:
+def _exhibit(exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, bytes]) -> Group:
     claims = exhibit.decided_by(material.claims)
     found: list[Sequence[str | Mark]] = [
         (f'{claim.text}: {claim.found}', _mark(claim.verdict)) for claim in claims
@@ -294,7 +293,7 @@ def _exhibit(exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, Ren
         Group(sides, 'div', 'sides'),
     ]
     if figure := pictures.get(exhibit.stem):
-        blocks.append(Picture(exhibit.title, figure.svg, exhibit.caption))
+        blocks.append(Picture(exhibit.title, figure, exhibit.caption))
     elif exhibit.stem:
         blocks.append(Paragraph('Left out: nothing of it was measured.', 'quiet'))
     shown = material.tables.get(exhibit.tables, ())

@@ -36,7 +36,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     portrait_points,
     run_patrol,
 )
-from t3mpc_ros.evaluation.record import RATE, Record
+from t3mpc_ros.evaluation.record import ON_PATH, RATE, Record, spans_of
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.geometry.types import Array
@@ -47,8 +47,6 @@ LOST_DISTANCE, LOST_TIME = 0.3, 10.0
 """A robot is lost whose pose is so far off (m) for so long (s)."""
 FOUND_WITHIN = 60.0
 """Time in which a robot that was carried is to be found, s."""
-ON_PATH = 0.05
-"""Distance from the reference up to which a robot is on its path, m."""
 TRIPLED = MappingProxyType(
     {
         'noise.variance': 9.0 * 0.04,
@@ -143,10 +141,8 @@ def localization_errors(record: Record, carried_at: float = math.inf) -> Row:
 
 def lost_time(position: Array) -> float:
     """Return the time (s) of all spans of an error above the distance that last long enough."""
-    off = np.concatenate([[False], position > LOST_DISTANCE, [False]])
-    edges = np.flatnonzero(np.diff(off.astype(np.int8)))
-    spans = (edges[1::2] - edges[::2]) / RATE
-    return float(spans[spans > LOST_TIME].sum())
+    spans = [(each.stop - each.start) / RATE for each in spans_of(position > LOST_DISTANCE)]
+    return float(sum(span for span in spans if span > LOST_TIME))
 
 
 def markdown(plan: LocalizationPlan, table: ResultTable) -> str:

@@ -32,7 +32,6 @@ from t3mpc_ros.evaluation.patrol.patrol_figures import PICTURES
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
-from t3mpc_ros.evaluation.plotting import Rendered
 from t3mpc_ros.evaluation.reporting import (
     Block,
     Contents,
@@ -246,9 +245,9 @@ def markdown(study: PatrolStudy) -> str:
     return '\n\n'.join(texts)
 
 
-def page(study: PatrolStudy, drawn: Mapping[str, Rendered]) -> str:
+def page(study: PatrolStudy, drawn: Mapping[str, bytes]) -> str:
     """Return the page as self-contained HTML, with pictures by their stems."""
-    shown = {each.stem: [Picture(each.title, drawn[each.stem].svg, each.title)]
+    shown = {each.stem: [Picture(each.title, drawn[each.stem], each.title)]
              for each in PICTURES if each.stem in drawn}  # fmt: skip
     blocks: list[Block] = [*shown.get('coverage', ()), Contents()]
     blocks.append(Paragraph(description(study.plan)))

@@ -33,7 +33,7 @@ from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.keep_out import Activity
-from t3mpc_ros.evaluation.loop import run_loop
+from t3mpc_ros.evaluation.loop import reports_of, run_loop
 from t3mpc_ros.evaluation.patrol.path_trackers import PathTracker
 from t3mpc_ros.evaluation.record import RATE, Record, stamp_of
 from t3mpc_ros.evaluation.scenario import KINDS, LEAD
@@ -243,13 +243,8 @@ def run_patrol(
         driver.on_state = lambda state: _visit(robot, visitors, state)
     rest = round(START * RATE)
     count = round(scenario.duration * RATE)
-    record = run_loop(
-        robot,
-        driver,
-        rest + count,
-        start=START,
-        latency_ns=stamp_of(1) - 1,
-    )
+    loop = reports_of(robot, driver, rest + count, start=START, latency_ns=stamp_of(1) - 1)
+    record = run_loop(loop, driver)
     columns = {name: values[rest:] for name, values in record.columns.items()}
     columns['time'] = np.arange(count) / RATE
     return replace(
@@ -366,7 +361,7 @@ class PathDriver:
                 for received in self._faulty.received(sensor, reading, state.stamp_ns):
                     self._controller.add_range(sensor, *received)
                     if self._localizer is not None:
-                        self._localizer.add_range(sensor, received[0])
+                        self._localizer.add_range(sensor, *received)
         self._ranges = state.ranges
         if self._tracker is None:
             measured = State(state.stamp_ns, self._pose, state.odometry.twist)

@@ -20,12 +20,11 @@ often, how fast and for how long, and how it came to rest.
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.portrait import PortraitParameters
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
@@ -38,7 +37,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     run_patrol,
     world_file,
 )
-from t3mpc_ros.evaluation.record import RATE, Record
+from t3mpc_ros.evaluation.record import RATE, Record, spans_of
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.geometry.types import Array, State
@@ -204,23 +203,14 @@ def contacts(record: Record, world: World) -> list[Contact]:
     for last, following in zip(apart, apart[1:], strict=False):
         if following - last < BOUNCE * RATE:
             touches[last:following] = True
-    touching = np.concatenate([[False], touches, [False]]).astype(np.int8)
-    begins, ends = (np.flatnonzero(np.diff(touching) == sign) for sign in (1, -1))
-    return [
-        Contact(
-            begin / RATE,
-            _longest(gap[begin:end] < -PUSHES) / RATE,
-            max(float(closing[max(begin - 3, 0) : begin + 1].max()), 0.0),
-            tuple(record['truth'][begin, :2].tolist()),
-        )
-        for begin, end in zip(begins.tolist(), ends.tolist(), strict=True)
-    ]
-
-
-def _longest(flags: NDArray[np.bool_]) -> int:
-    """Return the length of the longest run of rows that are set."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return int(np.diff(ends)[::2].max()) if ends.size else 0
+    found = []
+    for rows in spans_of(touches):
+        begin = rows.start
+        pushes = [each.stop - each.start for each in spans_of(gap[rows] < -PUSHES)]
+        speed = max(float(closing[max(begin - 3, 0) : begin + 1].max()), 0.0)
+        place = tuple(record['truth'][begin, :2].tolist())
+        found.append(Contact(begin / RATE, max(pushes, default=0) / RATE, speed, place))
+    return found
 
 
 def at_places(found: Sequence[Contact]) -> list[list[Contact]]:
@@ -257,15 +247,7 @@ def safety_run(case: str, seed: int, duration: float) -> tuple[Record, World]:
         )
         record = run_patrol(portrait_points(seed, PortraitParameters()), scenario, visitors=visit)
     world = parse_world(text, 'room')
-    return record, World(
-        world.name,
-        world.segments,
-        world.circles,
-        world.patches,
-        world.boxes,
-        world.unseen,
-        tuple(came),
-    )
+    return record, replace(world, moving=tuple(came))
 
 
 def measured_safety(job: tuple[tuple[str, float], int]) -> Row:

@@ -29,7 +29,7 @@ from t3mpc_ros.evaluation.patrol.path_tracking import (
     TrackingStudy,
 )
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
-from t3mpc_ros.evaluation.plotting import Rendered, TitledDrawing, new_figure
+from t3mpc_ros.evaluation.plotting import TitledDrawing, new_figure
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
     Block,
@@ -121,11 +121,11 @@ def markdown(study: TrackingStudy) -> str:
     return '\n\n'.join([description(study.plan), *tables, EXPLANATION])
 
 
-def page(study: TrackingStudy, drawn: Mapping[str, Rendered]) -> str:
+def page(study: TrackingStudy, drawn: Mapping[str, bytes]) -> str:
     """Return the page as self-contained HTML, with the picture (PNG) by its stem."""
     blocks: list[Block] = [Contents(), Paragraph(description(study.plan))]
     if 'tracks' in drawn:
-        blocks.append(Picture(PICTURES[0].title, drawn['tracks'].svg, PICTURES[0].title))
+        blocks.append(Picture(PICTURES[0].title, drawn['tracks'], PICTURES[0].title))
     for path in study.plan.paths:
         blocks += [Heading(path.capitalize()), path_table(study, path)]
     blocks.append(Paragraph(EXPLANATION, 'quiet'))

@@ -302,9 +302,9 @@ def _format_values(values: Sequence[object]) -> str:
 
 def write_divergence_figure(outcome: Comparison, path: Path) -> None:
     """Write a PNG of the first divergence of the replay from the recording."""
-    figure = plotting.rendered(_draw, outcome)
+    figure = plotting.drawing(_draw, outcome)
     if figure is not None:
-        path.write_bytes(figure.png)
+        path.write_bytes(plotting.file_of(figure, 'png'))
 
 
 def _draw(outcome: Comparison) -> Any:

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""The environment of Gymnasium is the loop of every other run, answered from outside."""
+"""The environment of Gymnasium is the loop of every other run, with a policy as its controller."""
 
 import warnings
 
