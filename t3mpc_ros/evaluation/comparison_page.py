@@ -25,6 +25,7 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import EXACT_INERTIA, FR
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
 from t3mpc_ros.evaluation.comparison import ComparisonPlan, StepTimes
 from t3mpc_ros.evaluation.confidence_intervals import Difference, holm, interval, mean
+from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.drivers import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, MODEL_ERROR
@@ -33,7 +34,6 @@ from t3mpc_ros.evaluation.metrics import (
     METRICS,
     OVERALL,
     SETTLED,
-    START,
     STOPPED,
     VARIATION,
     YAW_RATE,

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.counted_time import counted_from
 from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.kinematics import twist_from_wheels
@@ -28,8 +29,6 @@ from t3mpc_ros.geometry.types import Array, WheelSpeeds
 
 Rows = NDArray[np.bool_]
 
-START = 3.0
-"""Time of control at the start that no metric counts, s: the reference grows from zero."""
 AFTER = 2.0
 """Time after faults before the error after them counts, s."""
 
@@ -39,7 +38,7 @@ class MeasuredRun:
 
     def __init__(self, scenario: Scenario, record: Record) -> None:
         self.scenario, self.record = scenario, record
-        start = min(START, 0.5 * (float(record.time[-1]) - record.start))
+        start = counted_from(0.0, float(record.time[-1]) - record.start)
         self.start = record.start + start
         """From when on rows count, s."""
         self.counted = record.counted(start)

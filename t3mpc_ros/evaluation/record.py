@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.counted_time import EVERYTHING, START, counted_rows
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheel_speeds
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.robot.interface import RobotStatus
@@ -33,8 +34,6 @@ ON_PATH = 0.05
 """Largest distance from its reference of a robot that is on its path, m."""
 STATUS_FLAGS = RobotStatus._fields
 """Meaning of the column ``flags``."""
-CROSSING = (0.5, 0.5)
-"""Time before and after a switch within which methods cross from one reference to the other, s."""
 
 COLUMNS: Mapping[str, tuple[str, str]] = {
     'time': ('s', 'since the robot was switched on'),
@@ -152,16 +151,20 @@ class Record:
         return slice(first, last)
 
     def counted(
-        self, after: float = 3.0, margins: tuple[float, float] = (0.0, 0.0)
+        self, after: float = START, margins: tuple[float, float] = EVERYTHING
     ) -> NDArray[np.bool_]:
-        """Return which rows count, from ``after`` s of control on, see :func:`counted_rows`."""
-        return counted_rows(self.time, self.switches, self.start + after, margins)
+        """Return which rows count, from ``after`` s of control on.
 
-    def rmse(self, after: float = 3.0, *, margins: tuple[float, float] = (0.0, 0.0)) -> float:
+        ``margins`` (s) about a switch do not, see
+        :func:`t3mpc_ros.evaluation.counted_time.counted_rows`. ValueError if none is left.
+        """
+        return some_rows(self.time, self.switches, self.start + after, margins)
+
+    def rmse(self, after: float = START, *, margins: tuple[float, float] = EVERYTHING) -> float:
         """Return the tracking RMSE over both wheels, rad/s; NaN when the run diverged."""
         return rms(self.error[self.counted(after, margins)])
 
-    def largest_error(self, after: float = 3.0) -> float:
+    def largest_error(self, after: float = START) -> float:
         """Return the largest tracking error of a wheel from ``after`` (s) on, rad/s."""
         return float(np.max(np.abs(self.error[self.counted(after)])))
 
@@ -179,38 +182,18 @@ def stamp_of(k: int) -> int:
     return round(k * NANOSECONDS / RATE)
 
 
-def counted_rows(
-    time: Array, switches: Array, after: float, margins: tuple[float, float] = (0.0, 0.0)
+def some_rows(
+    time: Array, switches: Array, after: float, margins: tuple[float, float] = EVERYTHING
 ) -> NDArray[np.bool_]:
-    """Return which rows of a run count: from ``after`` on, without ``margins`` about a switch.
-
-    All in s. Margins are before a switch, where methods with preview have already left the old
-    reference, and after it. Rows from a switch on whose crossing the run does not contain whole
-    never count, nor those before it in which preview leaves the old reference: what that costs
-    would count, and not what it gains.
-    """
-    counted = (time >= after) & away_from_switches(time, switches, *margins)
-    leaving, crossed = CROSSING
-    for switch in switches.tolist():
-        if time.size and switch + crossed > time[-1]:
-            counted &= time < switch - leaving
+    """Return which rows of a run count, up to its end; ValueError if there is none."""
+    end = float(time[-1]) if time.size else 0.0
+    counted = counted_rows(time, switches, after, end, margins)
     if not counted.any():
-        end = time[-1] if time.size else 0.0
         raise ValueError(
             f'after and margins must leave rows of a run that ends at {end:g} s: '
             f'got {after:g} s, {margins[0]:g} s and {margins[1]:g} s'
         )
     return counted
-
-
-def away_from_switches(
-    time: Array, switches: Array, before: float, behind: float
-) -> NDArray[np.bool_]:
-    """Return which instants are not from ``before`` a switch to ``behind`` it, all in s."""
-    away = np.ones(time.size, dtype=np.bool_)
-    for switch in switches.tolist():
-        away &= (time < switch - before) | (time >= switch + behind)
-    return away
 
 
 def spans_of(rows: NDArray[np.bool_]) -> list[slice]:

@@ -28,6 +28,7 @@ from t3mpc_ros.control.controller import ControllerParameters, StepperController
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL, ROBOTS, Case, cases_for
+from t3mpc_ros.evaluation.counted_time import PLANT_WINDOW, ROBOT_WINDOW
 from t3mpc_ros.evaluation.record import RATE, stamp_of
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.kinematics import WheelGeometry
@@ -264,7 +265,7 @@ class RobotKind:
 
     start = 0.0
     """Standstill before the run, s."""
-    settling = (0.4, 0.6)
+    settling = PLANT_WINDOW
     """Time before and after each switch that the settled errors leave out, s."""
     shortest = 1.0 / RATE
     """Lower bound of the duration of a run, s."""
@@ -348,7 +349,7 @@ class TwinKind(RobotKind):
     """What is particular to the digital twin; its reference is that of ``scripts/demo``."""
 
     start = 1.5  # odometry uses the gyro only after a standstill of this length
-    settling = (0.5, 1.0)  # its rotors ring longer than the wheels of the plant
+    settling = ROBOT_WINDOW
     shortest = 2.0
     has_gyro = True
     mean_speeds = True

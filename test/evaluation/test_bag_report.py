@@ -437,7 +437,9 @@ def test_runs_are_compared_with_the_first(offset, verdict, words, tmp_path, caps
     assert f'B, two against A, one: {verdict}: right wheel: ' in printed
     assert words in printed
     page = (tmp_path / 'out' / 'comparison.html').read_text(encoding='utf-8')
-    assert page.index(verdict) < page.index('Good run') < page.index('RMSE settled')
+    assert (
+        page.index(verdict) < page.index('Good run') < page.index('RMSE while driven and settled')
+    )
     kind = {'Larger': 'bad', 'Smaller': 'good'}.get(verdict.split()[0], 'apart')
     assert re.search(r'<div class="verdict (\w+)"', page)[1] == kind
     rows = dict(re.findall(r'<td[^>]*>(odometry to command, [^<]*)</td>\s*<td>([^<]*)</td>', page))

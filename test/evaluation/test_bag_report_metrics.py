@@ -49,13 +49,16 @@ from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Series, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
-    SETTLING,
     driven,
-    preview_before_switch,
+    settled,
+    settled_rmse,
     statistics,
     tracking_error,
 )
 from t3mpc_ros.evaluation.charts import MAX_POINTS, PageData, thinned
+from t3mpc_ros.evaluation.metrics import SETTLED, MeasuredRun
+from t3mpc_ros.evaluation.record import Record
+from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     NAMES,
@@ -192,12 +195,11 @@ def page_of(figures):
 def test_the_error_statistics_are_those_of_the_run(report):
     """Computed here from what was made up, there from bytes, twists and interpolation."""
     error = OFFSETS / GEOMETRY.wheel_radius
-    # The first command comes 3 ms after the first odometry, and a second later the robot has
-    # caught up. The reference is received 199 ms ahead.
-    moving = TIMES > 1.005
+    # The first command comes 3 ms after the first odometry; then the start does not count.
+    moving = TIMES > 3.005
     calm = moving.copy()
     for switch in SWITCHES:
-        calm &= (switch - 0.195 > TIMES) | (switch + 1.0 <= TIMES)
+        calm &= (switch - 0.505 > TIMES) | (switch + 1.0 <= TIMES)
     for wheel in WHEELS:
         found = report.wheels[wheel]
         for part, expected in ((found.overall, error[moving]), (found.settled, error[calm])):
@@ -286,7 +288,15 @@ def test_a_path_is_judged_by_the_distance_from_it(run):
     reference = replace(pose, values={**pose.values, 'x': pose['x'] + 0.02})
     beside = {**run.motions, REFERENCE: reference}
     followed = replace(run, motions=beside, follows_path=True)
-    verdict = compute_metrics(followed, None, 0).verdict
+    figures = compute_metrics(followed, None, 0)
+    verdict = figures.verdict
+    # Its reference is a path: errors of the speeds say nothing about it.
+    said = [title for _, title in figures.numbers()]
+    assert [title for title in said if 'RMSE' in title or 'error,' in title] == [
+        'path error, root mean square',
+        'path error, 99 % below',
+    ]
+    assert figures.numbers()[2] == ('100 %', 'of the drive within 50 mm of the path')
     assert verdict.sound
     assert verdict.on_path == 1.0
     assert (verdict.label, verdict.kind) == ('Good run', 'good')
@@ -303,11 +313,36 @@ def test_a_path_is_judged_by_the_distance_from_it(run):
     assert 'for only 0 % of the drive' in compute_metrics(lost, None, 0).verdict.text()
 
 
-def test_no_more_is_left_out_before_a_switch_than_after_it(run):
-    """A reference may be stamped ten seconds ahead: then nothing would be left."""
-    assert run.lead == pytest.approx(LEAD - 0.001)
-    assert preview_before_switch(run) == run.lead
-    assert preview_before_switch(replace(run, lead=10.0)) == SETTLING
+@pytest.mark.parametrize(
+    ('duration', 'switches'),
+    [(2.5, ()), (6.0, (4.6, 5.8)), (20.0, (3.0, 8.0, 8.9, 19.2, 19.7)), (20.0, (10.0, 19.5))],
+)
+def test_a_bag_and_a_simulated_run_have_the_same_settled_error(run, duration, switches):
+    """The one counted from 1 s on and from 0.4 s before a switch, the other from 3 s and 0.5 s."""
+    generator = np.random.default_rng(len(switches))
+    time = np.arange(round(100.0 * duration)) / 100.0
+    wanted, error = generator.normal(size=(2, time.size, 2))
+    columns = {'time': time, 'reference': wanted, 'speeds': wanted + error}
+    record = Record(columns, start=1.5, switches=np.array(switches))
+    simulated = MeasuredRun(Scenario('twin', 'nominal', 1, duration), record)
+
+    def series(wheels, twist):
+        right, left = wheels.T
+        named = {'right': right, 'left': left, 'linear': twist, 'angular': twist}
+        return Series(time, named)
+
+    drives = np.where(time >= record.start, 1.0, 0.0)
+    motions = {
+        REFERENCE: series(wanted, drives),
+        TRUTH: series(wanted + error, drives),
+        COMMAND: series(wanted, drives),
+    }
+    recorded = replace(run, motions=motions, switches=record.switches)
+    truth = tracking_error(recorded, TRUTH).time
+    np.testing.assert_array_equal(driven(truth, recorded), simulated.counted)
+    np.testing.assert_array_equal(settled(truth, recorded), simulated.settled)
+    both = math.hypot(*settled_rmse(recorded)) / math.sqrt(2.0)
+    assert both == pytest.approx(SETTLED.value(simulated))
 
 
 def test_the_drive_spans_the_first_to_the_last_nonzero_command(run):
@@ -315,15 +350,17 @@ def test_the_drive_spans_the_first_to_the_last_nonzero_command(run):
     time = np.arange(8.0)
     linear = np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     angular = np.array([0.0, -0.0, 0.0, 0.0, 0.0, -0.2, 0.0, 0.0])
-    made = replace(run, motions={COMMAND: Series(time, {'linear': linear, 'angular': angular})})
+    motions = {COMMAND: Series(time, {'linear': linear, 'angular': angular})}
+    made = replace(run, motions=motions, switches=np.empty(0))
     assert driving(made) == (2.0, 5.0)
-    assert time[driven(time, made)].tolist() == [3.0, 4.0, 5.0]
+    # The first half of a short drive is its start.
+    assert time[driven(time, made)].tolist() == [4.0, 5.0]
     # Where the reference comes later than the command, the robot has to catch up then.
-    late = time[2:] + 0.5
-    assert late[driven(late, made)].tolist() == [3.5, 4.5]
+    late = time[2:] + 1.5
+    assert late[driven(late, made)].tolist() == [4.5]
     assert not driven(np.empty(0), made).size
     # A bag without commands does not say when the robot was driven.
-    assert time[driven(time, replace(run, motions={}))].tolist() == time[1:].tolist()
+    assert time[driven(time, replace(made, motions={}))].tolist() == time[3:].tolist()
 
 
 def test_a_long_line_keeps_its_extremes():

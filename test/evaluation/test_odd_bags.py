@@ -259,9 +259,9 @@ ODD_BAGS = {
             (t, topic, twist_message((0.0, 0.0)) if topic == '/cmd_vel' and t > 0.9 else m)
             for t, topic, m in ROWS
         ],
-        'No settled motion was measured.',
+        'Only 0.4 of 0.4 s count: settled RMSE 0.571 / 0.571 rad/s.',
         (),
-        False,
+        True,
     ),
     'receipt out of order': (
         lambda: [(t - 3.0 * (i % 60 == 7), *row) for i, (t, *row) in enumerate(ROWS)],

@@ -73,7 +73,7 @@ def test_what_a_recorder_misses_at_its_start_is_usual(late, tmp_path):
     """
     story = STORIES['good']
     if late:
-        story = replace(story, kept=lambda t, topic: topic != '/ground_truth/odom' or t > 1.5)
+        story = replace(story, kept=lambda t, topic: topic != '/ground_truth/odom' or t > 4.0)
     story = replace(story, records={**TWIN, **LOSSES})
     page = write_report(story.write(tmp_path / 'bag')).report.read_text(encoding='utf-8')
     assert '25 messages of /imu/data_raw are missing: published before the recorder' in page

@@ -35,6 +35,7 @@ from support.recorded_stories import SIGNALS_STORY, STORIES
 from t3mpc_ros.evaluation.bag_report.metrics import (
     CHANNEL_NUMBERS,
     LINK_NUMBERS,
+    PATH_NUMBERS,
     RUN_NUMBERS,
 )
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
@@ -222,19 +223,23 @@ def stops_of(bag, measured):
 
 @cache
 def errors_of(bag, source, measured):
-    """Return rows (driven, settled) and the error of both wheels at the stamps of a motion."""
+    """Return the rows that count, and the error of both wheels, at the stamps of a motion."""
     time, wanted = bag.time[source], wanted_at(bag, bag.time[source])
     error = np.array(bag.wheels(source)) - wanted
     known = ~np.isnan(wanted[0])
     first, last = drive_of(bag)
-    driven = known & (time <= last) & (time - max(first, time[known][0]) >= 1.0)
+    first, last = max(first, time[known][0]), min(last, time[known][-1])
+    driven = known & (time <= last) & (time >= first + min(3.0, 0.5 * (last - first)))
     for start, end in stops_of(bag, measured):
         driven &= (time < start - 0.5) | (time >= end + 1.0)
+    for switch in switches_of(bag):
+        if last < switch + 0.5:
+            driven &= time < switch - 0.5
     settled = driven.copy()
     for switch in switches_of(bag):
-        settled &= (time < switch - min(bag.lead, 1.0)) | (time >= switch + 1.0)
+        settled &= (time < switch - 0.5) | (time >= switch + 1.0)
     period = np.median(np.diff(time[known]))
-    return {'driven': driven, 'settled': settled}, error, period
+    return {'driven': driven, 'driven, settled': settled}, error, period
 
 
 def variation(time, values):
@@ -347,7 +352,10 @@ def test_the_main_figures(reported):
     def both(title, values, unit):
         expected[f'{title}, right / left'] = f'{" / ".join(map(shown, values))} {unit}'
 
-    for name, title in (('driven', 'RMSE while driven'), ('settled', 'RMSE settled')):
+    for name, title in (
+        ('driven', 'RMSE while driven'),
+        ('driven, settled', 'RMSE while driven and settled'),
+    ):
         both(title, [math.sqrt(np.mean(each[rows[name]] ** 2)) for each in error], 'rad/s')
     both('largest error', [np.abs(each[rows['driven']]).max() for each in error], 'rad/s')
     for topic, title in ((COMMAND, 'command'), (REFERENCE, 'reference')):
@@ -375,7 +383,7 @@ def test_the_main_figures(reported):
             assert text == shown(1e3 * (dead_time + lag))
     sentence = unescape(re.search(r'<p class="headline">(.*?)</p>', page)[1])
     if 'settled RMSE' in sentence and 'until then' not in sentence:
-        pair = expected['RMSE settled, right / left']
+        pair = expected['RMSE while driven and settled, right / left']
         assert f'settled RMSE {pair}' in sentence
 
 
@@ -473,13 +481,15 @@ def test_the_definitions_are_those_of_the_code():
     }
     for title, unit, _ in CHANNEL_NUMBERS:
         assert rows[title] == unit.format('that of the channel')
-    for title, unit, _ in RUN_NUMBERS:
+    for title, unit, _ in (*PATH_NUMBERS, *RUN_NUMBERS):
         assert rows[title] == unit
     for title, unit, _ in LINK_NUMBERS:
         assert f'{title} ({unit})' in text
     constants = re.findall(r'^\| `(\w+)` \| ([\d.]+) \| `(\w+)` \|$', text, re.MULTILINE)
     assert len(constants) > 15
     for name, value, module in constants:
-        place = 'evaluation' if module == 'drive_response' else 'evaluation.bag_report'
+        place = 'evaluation.bag_report'
+        if module in ('drive_response', 'counted_time'):
+            place = 'evaluation'
         found = getattr(import_module(f't3mpc_ros.{place}.{module}'), name)
         assert found == float(value), name

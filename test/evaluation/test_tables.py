@@ -21,8 +21,9 @@ import pytest
 from support.records import record_of
 
 from t3mpc_ros.evaluation.confidence_intervals import interval
+from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.metrics import METRICS, START, measure
+from t3mpc_ros.evaluation.metrics import METRICS, measure
 from t3mpc_ros.evaluation.paper.results import Results, estimation
 from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolStudy
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES

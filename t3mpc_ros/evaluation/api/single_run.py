@@ -28,9 +28,10 @@ from t3mpc_ros.evaluation.api.result_tables import ShownAsTables
 from t3mpc_ros.evaluation.api.table_files import Columns
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.metrics import METRICS, START, Numbers, measure
-from t3mpc_ros.evaluation.record import Record, counted_rows
+from t3mpc_ros.evaluation.metrics import METRICS, Numbers, measure
+from t3mpc_ros.evaluation.record import Record, some_rows
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
@@ -80,7 +81,7 @@ class RunResult(ShownAsTables):
         """
         none: Array = np.zeros(0)
         begin = after + self.record.start
-        return rms(self.error[counted_rows(self.columns['time'], none, begin)])
+        return rms(self.error[some_rows(self.columns['time'], none, begin)])
 
     def table(self) -> str:
         """Return the metrics as a Markdown table."""

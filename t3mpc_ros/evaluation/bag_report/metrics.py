@@ -34,6 +34,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
+from t3mpc_ros.evaluation.record import ON_PATH
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
 
@@ -175,15 +176,13 @@ class ReportMetrics:
         Those of the path come first where the robot follows one.
         """
         found = [
-            (f'{format_number(1e3 * value)} mm', title)
-            for title, value in (
-                ('path error, root mean square', self.path_error),
-                ('path error, 99 % below', self.path_error_99),
-            )
-            if math.isfinite(value)
+            (f'{format_number(number)} {unit}', title)
+            for title, unit, value in PATH_NUMBERS
+            if math.isfinite(number := value(self))
         ]
         names = ' / '.join(each.short for each in self.channels)
-        for title, unit, value in CHANNEL_NUMBERS:
+        follows_path = self.verdict.on_path is not None
+        for title, unit, value in CHANNEL_NUMBERS[len(SPEED_ERRORS) if follows_path else 0 :]:
             pair = [value(self, each.name) for each in self.channels]
             if any(map(math.isfinite, pair)):
                 units = [unit.format(each.unit) for each in self.channels]
@@ -207,10 +206,24 @@ class ReportMetrics:
         return f'{numbers}: {self.report}'
 
 
-CHANNEL_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics, str], float]], ...] = (
+PATH_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics], float]], ...] = (
+    ('path error, root mean square', 'mm', lambda run: 1e3 * run.path_error),
+    ('path error, 99 % below', 'mm', lambda run: 1e3 * run.path_error_99),
+    (
+        f'of the drive within {1e3 * ON_PATH:g} mm of the path', '%',
+        lambda run: math.nan if run.verdict.on_path is None else 100.0 * run.verdict.on_path,
+    ),
+)  # fmt: skip
+"""Main numbers of a robot that follows a path."""
+ChannelNumber = tuple[str, str, Callable[[ReportMetrics, str], float]]
+SPEED_ERRORS: tuple[ChannelNumber, ...] = (
     ('RMSE while driven', '{}', lambda run, name: run.wheels[name].overall.rmse),
-    ('RMSE settled', '{}', lambda run, name: run.wheels[name].settled.rmse),
+    ('RMSE while driven and settled', '{}', lambda run, name: run.wheels[name].settled.rmse),
     ('largest error', '{}', lambda run, name: run.wheels[name].overall.largest),
+)
+"""Main numbers of the error of each channel, which mean nothing where the reference is a path."""
+CHANNEL_NUMBERS: tuple[ChannelNumber, ...] = (
+    *SPEED_ERRORS,
     ('variation of the command per second', '{}', lambda run, name: run.wheels[name].chatter),
     ('variation of the reference per second', '{}', lambda run, name: run.wheels[name].demand),
     ('command to motion', 'ms', lambda run, name: 1e3 * run.delay(name)),

@@ -105,6 +105,8 @@ def tracking(run: Run, metrics: ReportMetrics) -> Shown:
             if settled.count
             else f'the settled error is {UNMEASURED}'
         )
+        if run.follows_path:
+            follows = 'the robot follows its poses'
         seen = f'The reference runs {_extent(reference[name], unit)}; {follows}.'
         yield Chart(title, unit, lines, seen)
 
@@ -125,8 +127,8 @@ def distance(run: Run, metrics: ReportMetrics) -> Shown:
 
 
 def error(run: Run, metrics: ReportMetrics) -> Shown:
-    """Yield the tracking error of both channels over time."""
-    series = tracking_error(run, run.measured)
+    """Yield the tracking error of both channels over time, of a robot that follows speeds."""
+    series = None if run.follows_path else tracking_error(run, run.measured)
     if not is_long(series):
         return
     moving = driven(series.time, run)
@@ -139,8 +141,8 @@ def error(run: Run, metrics: ReportMetrics) -> Shown:
             row = int(np.argmax(size))
             text = (
                 f'RMSE {format_number(found.overall.rmse)} {unit} while driven, '
-                f'{format_number(found.settled.rmse)} {unit} settled; the largest error is '
-                f'{format_number(size[row])} {unit} at {series.time[row]:.1f} s'
+                f'{format_number(found.settled.rmse)} {unit} while driven and settled; the '
+                f'largest error is {format_number(size[row])} {unit} at {series.time[row]:.1f} s'
             )
         lines.append(line(title, wheel, series, name, dash=WHEEL_DASHES[wheel]))
         seen.append(f'{title.capitalize()}: {text}.')

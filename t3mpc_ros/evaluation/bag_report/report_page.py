@@ -38,13 +38,12 @@ from t3mpc_ros.evaluation.bag_report.report_charts import (
 )
 from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
-    SETTLING,
     errors_of,
     format_number,
-    preview_before_switch,
 )
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
+from t3mpc_ros.evaluation.counted_time import ROBOT_WINDOW, START, counted_from
 from t3mpc_ros.evaluation.drive_response import ResponseFit
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
@@ -147,7 +146,7 @@ def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
     events = _events(run, figures)
     quiet = Paragraph('No switch, no stop, no warning.', 'quiet')
     blocks += [Heading('Events'), Timeline(events) if events else quiet]
-    if run.ours or figures.measured:
+    if (run.ours or figures.measured) and not run.follows_path:
         blocks += [Heading('Tracking error'), *_errors(run)]
     blocks += _response(run, figures)
     blocks += _sections(run, figures, [each for each in others if each not in soon])
@@ -187,7 +186,8 @@ def _losses(recording: BagReader, run: Run) -> tuple[list[str], list[str]]:
     """
     unusual, usual = [], []
     record = recording.metadata_records.get(LOSSES, {})
-    counted = driving(run)[0] + SETTLING
+    first, last = driving(run)
+    counted = counted_from(first, last) if first < last else math.inf
     early = all(float(each.time[0]) <= counted for each in run.motions.values())
     for cause, text in LOSS_CAUSES.items():
         topics = {
@@ -238,7 +238,7 @@ def _errors(run: Run) -> list[Block]:
         if source not in run.motions or REFERENCE not in run.motions:
             continue
         for channel, pair in zip(run.channels, errors_of(run, source).values(), strict=True):
-            for extent, values in zip(('driven', 'settled'), pair, strict=True):
+            for extent, values in zip(('driven', 'driven, settled'), pair, strict=True):
                 numbers = (values.rmse, values.mae, values.largest)
                 cells = [
                     format_number(number) if values.count else UNMEASURED for number in numbers
@@ -254,28 +254,26 @@ def _errors(run: Run) -> list[Block]:
 def extents(run: Run) -> str:
     """Return the description of the time in which errors are counted."""
     first, last = driving(run)
+    start = f'its first {START:g} s, of less than {2 * START:g} s the first half'
     if COMMAND not in run.motions:
         extent = (
-            f'Driven: the whole reference without its first {SETTLING:g} s; the bag holds '
-            'no command that would show when the robot was driven.'
+            f'Driven: the whole reference without {start}; the bag holds no command that would '
+            'show when the robot was driven.'
         )
     elif first > last:
         return 'Every command was zero: the robot was not driven, and no error is counted.'
     else:
         extent = (
             f'Driven: from the first command other than zero, at {first:.1f} s, to the last, at '
-            f'{last:.1f} s. Excluded: standstill before and after; each stop, from {BRAKING:g} s '
-            f'before to {SETTLING:g} s after it; and the transient, the first {SETTLING:g} s with '
-            'a command and a reference.'
+            f'{last:.1f} s, without {start}, and without each stop, from {BRAKING:g} s before to '
+            f'{ROBOT_WINDOW.after:g} s after it.'
         )
-    before = preview_before_switch(run)
-    ahead = (
-        f'the {before:.2g} s before each switch, in which a controller may already leave the '
-        'old reference because the new one is known in advance, and without '
-        if before > 0.0
-        else ''
+    return (
+        f'{extent} Settled: also without the {ROBOT_WINDOW.before:g} s before each switch, in '
+        'which a controller may already leave the old reference because the new one is known in '
+        f'advance, and without the {ROBOT_WINDOW.after:g} s after it. Errors at switches that the '
+        'drive does not contain whole do not count.'
     )
-    return f'{extent} Settled: also without {ahead}the {SETTLING:g} s after each switch.'
 
 
 def _response(run: Run, figures: ReportMetrics) -> Iterator[Block]:

@@ -24,13 +24,9 @@ from t3mpc_ros.evaluation.bag_report.continuity import within_gaps
 from t3mpc_ros.evaluation.bag_report.incidents import BRAKING, Span, driving, find_stops
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.record import away_from_switches
+from t3mpc_ros.evaluation.counted_time import ROBOT_WINDOW, counted_from, counted_rows
 from t3mpc_ros.evaluation.topic_roles import REFERENCE
 from t3mpc_ros.geometry.types import Array
-
-SETTLING = 1.0
-"""Settling time (s): left out after the start of the drive, after each stop and each switch; also
-the longest time left out before a switch."""
 
 
 @dataclass(frozen=True)
@@ -85,46 +81,44 @@ def tracking_error(run: Run, measured: str) -> Series | None:
     return Series(time, errors)
 
 
-def driven(time: Array, run: Run) -> NDArray[np.bool_]:
-    """Return the mask of ``time`` (stamps of an error, s) in which the robot was driven.
+def counted_span(time: Array, run: Run) -> Span:
+    """Return from when to when errors at ``time`` (s) count; (inf, -inf) if they never do.
 
-    The first :data:`SETTLING` seconds with a command and a reference are excluded, because the
-    robot has yet to catch up, and likewise each stop, from :data:`BRAKING` s before standstill
-    to :data:`SETTLING` seconds after it.
+    The robot is controlled while it is driven and has a reference; the start of that time does not
+    count, see :func:`t3mpc_ros.evaluation.counted_time.counted_from`.
     """
     first, last = driving(run)
-    since: Array = time - np.maximum(first, time[:1])
+    if not time.size or not first < last:
+        return math.inf, -math.inf
+    last = min(last, float(time[-1]))
+    return counted_from(max(first, float(time[0])), last), last
+
+
+def driven(time: Array, run: Run) -> NDArray[np.bool_]:
+    """Return which stamps of an error (s) count while the robot was driven, switches included.
+
+    Each stop is left out, from :data:`BRAKING` s before standstill to the end of the settling
+    after it.
+    """
     stops = [(stop.start - BRAKING, stop.end) for stop in find_stops(run)]
-    return (since >= SETTLING) & (time <= last) & apart_from(time, stops)
+    return counted_rows(time, run.switches, *counted_span(time, run)) & apart_from(time, stops)
 
 
 def apart_from(time: Array, spans: Sequence[Span]) -> NDArray[np.bool_]:
-    """Return which instants are in no span, nor in the :data:`SETTLING` seconds after one."""
+    """Return which instants are in no span, nor in the time in which a robot settles after it."""
     away = np.ones(time.size, dtype=np.bool_)
     for start, end in spans:
-        away &= (time < start) | (time >= end + SETTLING)
+        away &= (time < start) | (time >= end + ROBOT_WINDOW.after)
     return away
 
 
-def preview_before_switch(run: Run) -> float:
-    """Return how long before a switch a controller may leave the old reference, s.
-
-    A switch is known in advance by the lead of the reference stamps. The interval is at most
-    :data:`SETTLING`, whatever the lead.
-    """
-    return min(run.lead, SETTLING)
-
-
 def settled(time: Array, run: Run) -> NDArray[np.bool_]:
-    """Return the mask of ``time`` (s) that excludes the window around each switch.
-
-    The window is from :func:`preview_before_switch` before it to :data:`SETTLING` seconds after.
-    """
-    return away_from_switches(time, run.switches, preview_before_switch(run), SETTLING)
+    """Return which stamps of an error (s) are settled, as those of a simulated run."""
+    return counted_rows(time, run.switches, *counted_span(time, run), ROBOT_WINDOW)
 
 
 def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, ErrorStatistics]]:
-    """Return the statistics while driven and those when settled, by wheel."""
+    """Return the statistics while driven and those while driven and settled, by wheel."""
     error = tracking_error(run, measured)
     if error is None:
         nothing = statistics(np.empty(0))
@@ -162,9 +156,9 @@ def path_distance(run: Run) -> Series | None:
 def settled_rmse(
     run: Run, until: float = math.inf, spared: Sequence[Span] = ()
 ) -> tuple[float, float]:
-    """Return the settled RMSE of both channels up to a time, s, apart from some spans.
+    """Return the settled RMSE of both channels while driven, up to a time, apart from some spans.
 
-    In the units of the channels; NaN without a sample.
+    Times in s, errors in the units of the channels; NaN without a sample.
     """
     error = tracking_error(run, run.measured)
     if error is None:

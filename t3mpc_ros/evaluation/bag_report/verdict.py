@@ -36,6 +36,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     settled_rmse,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.counted_time import counted_from
 from t3mpc_ros.evaluation.record import ON_PATH
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
@@ -47,7 +48,9 @@ MAX_MISSING = 0.02
 MAX_ERROR = 0.25
 """Largest RMSE, settled, as a share of the root mean square of the reference."""
 MIN_COUNTED = 0.5
-"""Least share of the drive in which errors count."""
+"""Least share of the drive after its start in which errors count."""
+MIN_SECONDS = 1.0
+"""Least time in which errors count, s."""
 CALMER = 0.9
 """Error without the time after stalls, as a share of that with it, below which both are stated."""
 NEVER = 0.95
@@ -140,7 +143,7 @@ def judge(
         on_path = share_on_path(run)
         error, reached = _path_finding(on_path, None if distance is None else distance['value'])
     else:
-        error, reached = _error_finding(run, counted, last - first)
+        error, reached = _error_finding(run, counted, last - counted_from(first, last))
     if error is not None:
         findings.append(error)
     return _verdict(
@@ -399,7 +402,7 @@ def _error_finding(run: Run, counted: float, length: float) -> tuple[_Finding | 
     if known is not None and worst > MAX_RATIO * known.settled:
         text = f'poor run: {reached}'
         return _Finding(text, 'Poor run', spoils=True), reached
-    if counted < MIN_COUNTED * length:
+    if counted < max(MIN_COUNTED * length, MIN_SECONDS):
         text = f'only {counted:.1f} of {length:.1f} s count: {reached}'
         return _Finding(text, 'No valid measurement', spoils=True), reached
     return None, reached

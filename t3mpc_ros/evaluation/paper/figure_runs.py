@@ -23,9 +23,9 @@ import numpy as np
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.cases import NOMINAL
+from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, methods
-from t3mpc_ros.evaluation.metrics import START
 from t3mpc_ros.evaluation.open_loop_estimation import (
     KINDS,
     NORMALISED_GAIN,

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import rms
+from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.methods import FULL
-from t3mpc_ros.evaluation.metrics import START
 from t3mpc_ros.evaluation.paper.figure_runs import (
     FigureRuns,
     broken_at_switches,

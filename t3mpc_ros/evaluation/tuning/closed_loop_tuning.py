@@ -27,10 +27,11 @@ import numpy as np
 
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired, rms
+from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.experiment import Report
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, further_methods, methods, twin_start
-from t3mpc_ros.evaluation.metrics import START, VARIATION, measure
+from t3mpc_ros.evaluation.metrics import VARIATION, measure
 from t3mpc_ros.evaluation.proposed_method import ProposedController
 from t3mpc_ros.evaluation.record import rolling_speeds
 from t3mpc_ros.evaluation.scenario import KINDS, TUNING_SEEDS, Scenario

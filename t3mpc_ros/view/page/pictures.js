@@ -5,7 +5,7 @@
 
 const FRAME = 100; // ms between two pictures
 const PATH = 120; // s of the path on the floor
-const BEFORE = 0.4; // s before a switch that are not settled, as in the reports
+const BEFORE = 0.5; // s before a switch that are not settled, as in reports: ROBOT_WINDOW
 const AFTER = 1.0; // s after a switch, and after the robot has begun to move
 
 const floor = new Floor(place('floor'));
