@@ -80,6 +80,7 @@ def recorded_run(bag: Path, namespace: str | None = None) -> LiveData:
         data.report(when, 'note', f'{node}: {text}')
     data.set('absent', absent)
     data.set('channels', [[each.title.capitalize(), each.unit] for each in run.channels])
+    data.set('follows_path', run.follows_path)
     data.set('terms', list(TERM_NAMES))
     if run.geometry is not None:
         size = {

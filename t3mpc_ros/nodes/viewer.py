@@ -141,6 +141,7 @@ class ViewNode(Node):
         self._polled: dict[str, Subscription] = {}
         self._subscribe_all()
         sink.set('terms', list(TERM_NAMES))
+        sink.set('sensors', list(RANGE_SENSORS))
         sink.set('mounts', sensor_mounts(RangeSensorParameters()).tolist())
 
     # -- loop -------------------------------------------------------------------------------------

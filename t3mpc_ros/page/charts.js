@@ -79,7 +79,7 @@ class ChartGroup {
     const chart = { title, unit, series, plot, legend, tables: [empty], data: empty, limits: null };
     chart.values = series.map((each) => {
       const value = element('b', { textContent: '–' });
-      legend.append(element('span', {}, sample(each.colour, each.dash), `${each.label} `, value));
+      legend.append(legendEntry(each, value));
       return value;
     });
     plot.addEventListener('keydown', (key) => this.press(chart, key));
@@ -88,19 +88,51 @@ class ChartGroup {
     return chart;
   }
 
+  // Add a line to a chart; one of another unit has an axis of its own. removed(): called when it
+  // is taken out again by its button.
+  extend(chart, series, removed = () => {}) {
+    const value = element('b', { textContent: '–' });
+    const made = legendEntry(series, value);
+    const change = (act) => {
+      act();
+      chart.tables = [[[], ...chart.series.map(() => [])]];
+      [chart.data] = chart.tables;
+      this.build(chart);
+    };
+    made.append(element('button', { type: 'button', className: 'remove', textContent: '×',
+      ariaLabel: `Remove ${series.label}`, onclick: () => {
+        made.remove();
+        change(() => {
+          const row = chart.series.indexOf(series);
+          chart.series.splice(row, 1);
+          chart.values.splice(row, 1);
+        });
+        removed();
+      } }));
+    chart.legend.append(made);
+    change(() => {
+      chart.series.push(series);
+      chart.values.push(value);
+    });
+  }
+
   build(chart) {
     chart.uplot?.destroy();
+    const scaleOf = ({ unit = chart.unit }) => (unit === chart.unit ? 'y' : 'other');
+    const other = chart.series.find((each) => scaleOf(each) === 'other');
+    const whole = (u, low, high) => (low === null ? [low, high] : uPlot.rangeNum(low, high, 0.1, true));
     const axis = { stroke: colour('ink'), grid: { stroke: colour('line'), width: 1 },
       ticks: { stroke: colour('line') }, font: '12px system-ui, sans-serif' };
     chart.uplot = new uPlot({
       width: Math.max(200, chart.plot.clientWidth), height: 160,
       legend: { show: false }, cursor: { sync: { key: this.key }, y: false, drag: { x: true, y: false }, points: { size: 6 } },
       scales: { x: { time: false, range: (u, low, high) => this.range || [low, high] },
-        y: { range: (u, low, high) => chart.limits
-          || (low === null ? [low, high] : uPlot.rangeNum(low, high, 0.1, true)) } },
+        y: { range: (u, low, high) => chart.limits || whole(u, low, high) }, other: { range: whole } },
       axes: [{ ...axis, size: 30, space: 70, values: (u, ticks) => ticks.map((each) => this.words(each)) },
-        { ...axis, size: 52 }],
-      series: [{}, ...chart.series.map((each) => ({ label: each.label, stroke: colour(each.colour),
+        { ...axis, size: 52 },
+        ...(other ? [{ ...axis, scale: 'other', side: 1, size: 52, grid: { show: false },
+          label: other.unit, labelSize: 18, labelGap: 0, labelFont: axis.font }] : [])],
+      series: [{}, ...chart.series.map((each) => ({ label: each.label, scale: scaleOf(each), stroke: colour(each.colour),
         dash: each.dash, width: 1.6, points: { show: false },
         ...style(each.style, colour(each.colour)) }))],
       hooks: {
@@ -206,6 +238,11 @@ class ChartGroup {
     for (const chart of this.charts) this.build(chart);
     this.draw(this.range);
   }
+}
+
+// A line of a legend, and its value.
+function legendEntry({ colour: name, dash, label }, value) {
+  return element('span', {}, sample(name, dash), `${label} `, value);
 }
 
 // How a line is drawn: joined by straight lines if nothing else is said.

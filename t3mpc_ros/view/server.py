@@ -48,6 +48,7 @@ _SCRIPTS = (
     'commands.js',
     'parameters.js',
     'pictures.js',
+    'signals.js',
     'draw.js',
     'events.js',
     'share.js',

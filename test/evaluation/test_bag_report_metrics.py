@@ -317,7 +317,7 @@ def test_a_path_is_judged_by_the_distance_from_it(run):
     ('duration', 'switches'),
     [(2.5, ()), (6.0, (4.6, 5.8)), (20.0, (3.0, 8.0, 8.9, 19.2, 19.7)), (20.0, (10.0, 19.5))],
 )
-def test_a_bag_and_a_simulated_run_have_the_same_settled_error(run, duration, switches):
+def test_a_bag_and_a_run_have_the_same_settled_error(run, duration, switches):
     """The one counted from 1 s on and from 0.4 s before a switch, the other from 3 s and 0.5 s."""
     generator = np.random.default_rng(len(switches))
     time = np.arange(round(100.0 * duration)) / 100.0

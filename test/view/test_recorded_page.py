@@ -133,8 +133,11 @@ def test_a_gap_is_one_in_lines_and_legend(browser, show):
     """)
     assert len(holes) == 1
     assert 1.98 < holes[0] < 6.0
-    instant, shown = legends(browser, 3.0)
-    assert instant in (pytest.approx(1.98, abs=1e-3), pytest.approx(6.0, abs=1e-3))
+    for at in (2.5, 3.0, 5.0):
+        instant, shown = legends(browser, at)
+        # A measurement, not the null after it that interrupts the lines.
+        assert instant in (1.98, 6.0)
+        assert shown['Right wheel']['odometry'] == 1.0
 
 
 def test_a_bag_of_any_robot_with_odometry_is_shown(browser, show, tmp_path):
@@ -339,3 +342,136 @@ def test_a_changed_parameter_is_compared_before_and_after(browser, show):
     assert 'law.gain = 8.0' in text
     assert 'right: 0.2000 before, 0.05' in text
     assert 'left: 0.4000 before, 0.10' in text
+
+
+IN_CHART = """
+const {chart, lines} = shownCharts.find(({chart}) => chart.title === arguments[0]);
+return lines.map(({label}) => label);
+"""
+CENTRE = """
+const {left, top, width, height} = arguments[0].getBoundingClientRect();
+return [left + width / 2, top + height / 2];
+"""
+
+
+def signal_button(browser, name):
+    (found,) = (
+        each
+        for each in browser.driver.find_elements('css selector', '#signals button')
+        if each.text == name
+    )
+    return found
+
+
+def test_a_signal_is_put_into_a_chart(browser, show):
+    from selenium.webdriver import ActionChains, Keys
+
+    show(recorded_run(GOLDEN))
+    browser.select('#signals-box summary').click()
+    plots = browser.driver.find_elements('css selector', '.u-over')
+
+    # By mouse: a line of the same unit, with its values beside those that are there.
+    before = browser.run(IN_CHART, 'Right wheel')
+    drag = ActionChains(browser.driver).move_to_element(signal_button(browser, 'Left wheel, odometry'))
+    drag.click_and_hold().move_to_element(plots[0]).release().perform()
+    assert browser.run(IN_CHART, 'Right wheel') == [*before, 'Left wheel, odometry']
+    assert browser.run('return chosen') is None, 'a drag is no choice'
+    browser.wait(lambda: not browser.run('return changed'), 'not drawn')
+    _, shown = legends(browser, 4.0)
+    values = shown['Right wheel']['Left wheel, odometry'], shown['Left wheel']['odometry']
+    assert values[0] == values[1] is not None
+
+    # By touch: another unit, which has an axis of its own; the page does not scroll meanwhile.
+    plots = browser.driver.find_elements('css selector', '.u-over')
+    places = [
+        dict(zip('xy', browser.run(CENTRE, each), strict=True))
+        for each in (signal_button(browser, 'x, odometry'), plots[0])
+    ]
+    for kind, points in (
+        ('touchStart', places[:1]), ('touchMove', places[1:]), ('touchEnd', []),
+    ):  # fmt: skip
+        browser.driver.execute_cdp_cmd(
+            'Input.dispatchTouchEvent', {'type': kind, 'touchPoints': points}
+        )
+    assert browser.run(IN_CHART, 'Right wheel')[-1] == 'x, odometry'
+    scale = 'const s = charts.charts[0].uplot.series.at(-1); return [s.scale, s.label]'
+    assert browser.run(scale) == ['other', 'x, odometry']
+    ActionChains(browser.driver).send_keys(Keys.ESCAPE).perform()
+
+    # By keys: chosen, then the chart; a third unit is refused, and says why.
+    for name, words in (('yaw, odometry', 'two units already'), ('y, odometry', 'is in Right')):
+        signal_button(browser, name).send_keys(Keys.ENTER)
+        browser.select('.here').send_keys(Keys.ENTER)
+        browser.wait(lambda words=words: words in browser.text('signal-text'), words)
+    assert browser.run(IN_CHART, 'Right wheel')[-2:] == ['x, odometry', 'y, odometry']
+    assert browser.driver.find_elements('css selector', '.here') == []
+
+    # Out again, with the axis; the others stay.
+    for _ in range(2):
+        browser.driver.find_elements('css selector', '.remove')[-1].click()
+    assert browser.run(IN_CHART, 'Right wheel') == [*before, 'Left wheel, odometry']
+    assert browser.run('return charts.charts[0].uplot.axes.length') == 2
+    assert browser.run('return added') == [['Right wheel', 'Left wheel, odometry']]
+    # Where the finger leaves the charts, nothing is added.
+    drag = ActionChains(browser.driver).move_to_element(signal_button(browser, 'yaw, odometry'))
+    drag.click_and_hold().move_to_element(browser.find('floor')).release().perform()
+    assert browser.run('return [added.length, drag]') == [1, None]
+    assert browser.errors() == []
+
+
+def test_a_patrol_is_shown_by_its_distance_from_the_path(browser, show):
+    """Beside a path, the errors of the speeds were drawn, which are none."""
+    data = LiveRun()
+    data.set('terms', [])
+    for k in range(200):
+        at = 0.02 * k
+        data.add('odometry', at, [1.0, 2.0, 0.1 * at, 0.03, 0.0])
+        data.add('reference', at + 0.4, [3.0, 1.0, 0.1 * (at + 0.4), 0.0, 0.0])
+    data.tick(0.0)
+    show(data)
+    titles = 'return shownCharts.filter((e) => !figureOf(e).hidden).map(({chart}) => chart.title)'
+    assert browser.run(titles) == ['Right wheel', 'Left wheel', 'Error']
+    follows = {'name': 'pose.enabled', 'value': True, 'dynamic': False}
+    data.set('parameters/controller', [follows])
+    browser.wait(lambda: 'Distance from the path' in browser.run(titles), 'no distance')
+    assert 'Error' not in browser.run(titles)
+    browser.wait(lambda: not browser.run('return changed'), 'not drawn')
+    _, shown = legends(browser, 2.0)
+    assert shown['Distance from the path']['distance'] == pytest.approx(30.0, abs=0.01)
+
+
+def test_a_stop_is_confirmed_however_slow_the_program_is(browser, show):
+    """Each attempt was given up after a second: one that takes longer was never confirmed."""
+    data = LiveData()
+    data.set('banner', {'kind': 'good', 'headline': 'Tracking the reference', 'detail': ''})
+
+    def command(name, arguments, asked):
+        time.sleep(1.6)
+        return 'latched'
+
+    show(data, command)
+    # A browser that keeps nothing is not in the way: the stop was not sent, and no later one was.
+    browser.run("Storage.prototype.setItem = () => { throw new Error('refused'); }")
+    browser.find('e-stop').click()
+    browser.wait(lambda: browser.text('headline').startswith('STOP NOT CONFIRMED'), 'no warning')
+    browser.wait(lambda: browser.text('headline').startswith('Tracking'), 'not confirmed')
+    assert browser.text('answer') == 'latched'
+
+
+def test_a_robot_that_says_that_it_stands_is_believed(browser, show):
+    data, answers = LiveData(), []
+    data.set('banner', {'kind': 'good', 'headline': 'Tracking the reference', 'detail': ''})
+
+    def command(name, arguments, asked):
+        while not answers:
+            time.sleep(0.02)
+        return answers[0]
+
+    show(data, command)
+    browser.find('e-stop').click()
+    browser.wait(lambda: browser.text('headline').startswith('STOP NOT CONFIRMED'), 'no warning')
+    data.set('banner', {'kind': 'stopped', 'headline': 'E-STOP', 'detail': 'sim_robot: latched'})
+    browser.wait(lambda: browser.text('headline') == 'E-STOP', 'not believed')
+    answers.append('latched')
+    browser.wait(lambda: browser.text('answer') == 'latched', 'no answer')
+    assert browser.run('return pressed') is None

@@ -4,9 +4,12 @@
 'use strict';
 
 const CONFIRM = 500; // ms within which a stop must be confirmed, and between two attempts
+const STOP_PATIENCE = 5000; // ms that an attempt waits: longer than the program does for the robot
+const ATTEMPTS = 3; // that wait at a time, of the six connections of a browser
 const RELOAD = 30000; // ms for which a stop is asked for again after the page loads itself anew
 
-let stopping = ''; // why a stop is not confirmed yet
+let pressed = null; // s, when the stop was asked for that is not confirmed yet
+let stopping = ''; // why it is not
 
 // -- banner --------------------------------------------------------------------------------------
 
@@ -14,7 +17,8 @@ function showBanner() {
   let shown = connected ? facts.banner || { kind: 'lost', headline: 'Connected', detail: '' }
     : { kind: 'lost', headline: 'This page has lost its program',
       detail: 'It connects again by itself as soon as t3mpc view runs.' };
-  if (stopping) {
+  // What the robot says itself counts, if it was asked after the press.
+  if (stopping && !(shown.headline === 'E-STOP' && heard > pressed)) {
     shown = { kind: 'unconfirmed', headline: 'STOP NOT CONFIRMED: use the switch on the robot',
       detail: `${stopping}; asking again` };
   }
@@ -58,33 +62,49 @@ async function command(name, args = {}, patience = 5000) {
   }
 }
 
-// Ask for a stop until it is confirmed. What asks may overlap: a stop may arrive twice.
-let attempts = null;
-
-async function emergencyStop() {
-  if (readOnly || attempts) return;
-  const time = asked();
-  attempts = setTimeout(() => unconfirmed('no answer yet'), CONFIRM);
-  sessionStorage.setItem('stop', Date.now());
-  for (;;) {
-    const next = new Promise((resume) => { setTimeout(resume, CONFIRM); });
-    try {
-      const done = await send('e_stop', { on: true }, time, 2 * CONFIRM);
-      place('answer').className = '';
-      place('answer').textContent = done;
-      break;
-    } catch (error) {
-      unconfirmed(error.name === 'TimeoutError' ? 'no answer' : error.message);
-    }
-    await next;
-  }
-  clearTimeout(attempts);
-  attempts = null;
-  sessionStorage.removeItem('stop');
-  unconfirmed('');
+// When a stop was asked for that is not confirmed, for the page that loads itself anew. A browser
+// may refuse to keep anything: that must not be in the way of the stop.
+function keptStop(time) {
+  try {
+    if (time === undefined) return sessionStorage.getItem('stop');
+    if (time === null) sessionStorage.removeItem('stop'); else sessionStorage.setItem('stop', time);
+  } catch { /* then it is not asked for again after a reload */ }
+  return null;
 }
 
-function unconfirmed(why) {
+// Ask for a stop until one attempt is confirmed. They overlap: a machine may be so slow that each
+// takes longer than the time to the next, and a stop may arrive twice.
+async function emergencyStop() {
+  if (readOnly || pressed !== null) return;
+  const begun = pressed = steady();
+  const time = asked();
+  const late = setTimeout(() => unconfirmed(begun, 'no answer yet'), CONFIRM);
+  keptStop(Date.now());
+  let again;
+  const done = await new Promise((confirm) => {
+    let waiting = 0;
+    const ask = () => {
+      if (waiting >= ATTEMPTS) return;
+      waiting += 1;
+      send('e_stop', { on: true }, time, STOP_PATIENCE)
+        .then(confirm, (error) => unconfirmed(begun, error.name === 'TimeoutError' ? 'no answer' : error.message))
+        .finally(() => { waiting -= 1; });
+    };
+    ask();
+    again = setInterval(ask, CONFIRM);
+  });
+  clearTimeout(late);
+  clearInterval(again);
+  unconfirmed(begun, '');
+  pressed = null;
+  keptStop(null);
+  place('answer').className = '';
+  place('answer').textContent = done;
+}
+
+// Show why the stop that was asked for at an instant is not confirmed; '' for one that is.
+function unconfirmed(begun, why) {
+  if (begun !== pressed) return; // of an attempt at a stop that another one has confirmed
   stopping = why;
   showBanner();
 }

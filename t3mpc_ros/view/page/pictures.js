@@ -18,6 +18,7 @@ let playing = false;
 
 // -- charts ----------------------------------------------------------------------------------------
 
+const CHANNELS = [['Right wheel', 'rad/s'], ['Left wheel', 'rad/s']];
 const TERM_DASHES = [[], [6, 3], [2, 3], [8, 3, 2, 3], [1, 4]];
 
 // Charts of the streams that there are: a recording may have no reference and no terms.
@@ -33,7 +34,7 @@ function makeCharts() {
     snap: nearestMeasurement,
     words: timeText,
   });
-  const channels = facts.channels || [['Right wheel', 'rad/s'], ['Left wheel', 'rad/s']];
+  const channels = facts.channels || CHANNELS;
   const line = (stream, column, colour, label = colour, look = {}) => ({ stream, column, colour, label, ...look });
   channels.forEach(([title, unit], i) => addChart(title, unit, [
     line('reference', i, 'reference', 'reference', { dash: [6, 4] }),
@@ -49,14 +50,34 @@ function makeCharts() {
   ['right', 'left'].forEach((wheel, i) => addChart(`Terms of the control law, ${wheel} wheel`, 'rad/s²',
     facts.terms.map((name, k) => line('terms', 2 * k + i, name, name, { dash: TERM_DASHES[k] }))));
   markEvents();
+  addAgain(facts.added || []);
+}
+
+const followsPath = () => Boolean(facts.follows_path) || (facts['parameters/controller'] || [])
+  .some(({ name, value }) => name === 'pose.enabled' && value === true);
+
+// A robot that follows a path is shown by its distance from it: its speeds leave those of the path.
+function showDistance() {
+  if (!followsPath() || shownCharts.some(({ lines }) => lines[0].stream === 'distance')) return;
+  const errors = shownCharts.filter(({ lines }) => lines[0].stream === 'error').map(figureOf);
+  addChart('Distance from the path', 'mm', [{ stream: 'distance', column: 0, colour: 'c1', label: 'distance' }]);
+  if (!errors.length || shownCharts.at(-1).lines[0].stream !== 'distance') return;
+  errors[0].before(figureOf(shownCharts.at(-1)));
+  for (const each of errors) each.hidden = true;
 }
 
 function addChart(title, unit, lines) {
-  const derived = { error: 'reference', preview: 'reference' };
+  const derived = { error: 'reference', preview: 'reference', distance: 'reference' };
   const absent = new Set(facts.absent);
   const kept = lines.filter(({ stream }) => !absent.has(stream) && !absent.has(derived[stream]));
   if (kept.some(({ stream }) => stream !== 'command')) {
-    shownCharts.push({ chart: charts.add(title, unit, kept), lines: kept });
+    const entry = { chart: charts.add(title, unit, [...kept]), lines: kept };
+    shownCharts.push(entry);
+    // With a mouse, a line is dragged from one chart to another by its legend, too.
+    kept.forEach((line, i) => {
+      const signal = signals().find(({ stream, column }) => stream === line.stream && column === line.column);
+      if (signal) dragged(entry.chart.legend.children[i], signal, ({ pointerType }) => pointerType === 'mouse');
+    });
   }
 }
 
@@ -70,7 +91,7 @@ function rows(name, [from, to]) {
 // The reference is sent ahead of its time: what is later than the last measurement is its preview.
 function shownStreams(range) {
   const found = {};
-  for (const name of ['odometry', 'command', 'terms', 'reference']) found[name] = rows(name, range);
+  for (const name of ['odometry', 'truth', 'command', 'terms', 'ranges', 'reference']) found[name] = rows(name, range);
   const { time, values } = found.reference;
   const now = rowAt(time, newest()) + 1;
   found.preview = { time: time.slice(Math.max(0, now - 1)), values: values.map((each) => each.slice(Math.max(0, now - 1))) };
@@ -80,18 +101,34 @@ function shownStreams(range) {
     const [value, wanted] = [odometry.values[i]?.[row] ?? null, valueAt(time, values[i] || [], at)];
     return value === null || wanted === null ? null : value - wanted;
   })) };
+  found.distance = distance(streams.truth ? found.truth : odometry, time, values);
   return found;
+}
+
+// How far the robot is from the place of its reference at the same time, mm.
+function distance(motion, time, values) {
+  const away = (row, axis) => {
+    const [at, wanted] = [motion.values[axis]?.[row] ?? null, valueAt(time, values[axis] || [], motion.time[row])];
+    return at === null || wanted === null ? NaN : at - wanted;
+  };
+  return { time: motion.time, values: [motion.time.map((_, row) => {
+    const found = 1000 * Math.hypot(away(row, 2), away(row, 3));
+    return Number.isNaN(found) ? null : found;
+  })] };
 }
 
 function drawCharts() {
   const range = shownRange();
   if (!charts || !range) return;
+  showDistance();
+  showSignals();
   const found = shownStreams(range);
   const driven = isDriven(found.command);
   for (const { chart, lines } of shownCharts) {
     const tables = lines.map(({ stream, column }) =>
       [found[stream].time, found[stream].values[column] || []]);
-    charts.set(chart, tables, ['error', 'terms'].includes(lines[0].stream) ? limits(tables, driven) : null);
+    const own = tables.filter((_, i) => (lines[i].unit ?? chart.unit) === chart.unit);
+    charts.set(chart, tables, ['error', 'terms'].includes(lines[0].stream) ? limits(own, driven) : null);
   }
   charts.draw(range);
   const over = place('charts').querySelector('.u-over:hover');
@@ -130,9 +167,9 @@ function limits(tables, driven) {
 }
 
 function nearestMeasurement(time) {
-  const times = streams.odometry?.time || [];
+  const { time: times, values } = streams.odometry || { time: [] };
   const row = rowAt(times, time);
-  const [before, after] = [times[row], times[row + 1]];
+  const [before, after] = [times[values?.[0][row] === null ? row - 1 : row], times[row + 1]]; // a null is a gap
   if (before === undefined || after - time < time - before) return after ?? null;
   return before;
 }

@@ -17,7 +17,7 @@ function newsOf([from, to]) {
   return {
     facts: { ...Object.fromEntries(kept), recording: { live: true, ...facts.recording, duration: to - from },
       banner: { kind: 'good', headline: `${shown}: ${timeText(from, 1)} to ${timeText(to, 1)}`,
-        detail: `${number(to - from, 1)} s${begins}` } },
+        detail: `${number(to - from, 1)} s${begins}` }, added, follows_path: followsPath() },
     streams: Object.fromEntries(parts.filter(([, { time }]) => time.length)),
     events: events.filter(({ time }) => time >= from && time <= to),
   };

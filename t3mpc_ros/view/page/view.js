@@ -16,6 +16,7 @@ const facts = {};
 const events = [];
 let lastId = '';
 let clock = null; // s to add to the time of the page for the clock of the program
+let heard = -Infinity; // s, when the newest request was sent that the program has answered
 let connected = false;
 let changed = true; // whether the charts must be drawn
 let moved = true; // whether the floor must be drawn
@@ -32,15 +33,19 @@ async function poll() {
   for (;;) {
     let more = false;
     try {
+      const sent = steady();
       const patience = AbortSignal.timeout(lastId ? PATIENCE : 30 * PATIENCE);
-      const reply = await fetch(`events?last=${encodeURIComponent(lastId)}`, { signal: patience });
+      // With a cache, equal requests of several tabs would wait for each other.
+      const reply = await fetch(`events?last=${encodeURIComponent(lastId)}`, { signal: patience, cache: 'no-store' });
       const { id, now, ...news } = await reply.json();
       const start = (text) => text.replace(/-\d+-\d+$/, '');
       if (lastId && start(id) !== start(lastId)) location.reload(); // another start of the program
       lastId = id;
       clock = Math.max(now - steady(), (clock ?? -Infinity) - 1e-4); // the fastest answer
+      heard = sent;
       setConnected(true);
       take(news);
+      if (stopping) showBanner();
       more = news.more;
     } catch {
       setConnected(false);
@@ -118,7 +123,7 @@ function start() {
     return;
   }
   poll();
-  if (Date.now() - sessionStorage.getItem('stop') < RELOAD) emergencyStop(); // not confirmed before
+  if (Date.now() - keptStop() < RELOAD) emergencyStop(); // not confirmed before
 }
 
 document.addEventListener('DOMContentLoaded', start); // after the other scripts
