@@ -98,7 +98,7 @@ def build(tmp_path_factory):
     return built
 
 
-@pytest.fixture(scope='module', params=['copied', 'symlinked'])
+@pytest.fixture(scope='module', params=few_of(['copied', 'symlinked']))
 def tree(request, build):
     """Return the package built by ``colcon build``, and again with ``--symlink-install``."""
     return build() if request.param == 'copied' else build('--symlink-install')

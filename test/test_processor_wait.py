@@ -140,7 +140,7 @@ def run_pytest(folder, text, *words, shares=''):
     return done, {name.rpartition('::')[2]: outcome for outcome, name in found}
 
 
-@pytest.mark.parametrize('workers', [0, 1])
+@pytest.mark.parametrize('workers', few_of([1, 0]))
 def test_only_a_timeout_of_a_wait_is_inconclusive(workers, tmp_path):
     """With worker processes nothing was listed at the end: the failure was a mere skip."""
     done, outcomes = run_pytest(tmp_path, CERTAIN.format(busy=0.0) + WAITS, '-n', workers)

@@ -172,6 +172,7 @@ def test_kinds_at_equal_rates_differ_by_a_few_percent(results):
     assert max(growth) - min(growth) < 0.1
 
 
+@pytest.mark.long
 def test_the_program_prints_the_table_and_writes_the_numbers(tmp_path, capsys):
     path = tmp_path / 'figures.json'
     assert main(['estimation', '--seeds', '2', '--duration', '11', '--json', str(path)]) == 0

@@ -119,6 +119,7 @@ def test_three_recorded_bags_train_as_well_as_three_simulations(tmp_path):
     assert np.all(bag_share > 0.9 * lab_share)
 
 
+@pytest.mark.long
 def test_every_bag_is_judged_by_the_others(model):
     assert [fold.name for fold in model.folds] == [f'run{seed}/bag' for seed in RECORDED]
     assert min(fold.judged for fold in model.folds) > 0.7 * SECONDS

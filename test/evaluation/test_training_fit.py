@@ -324,6 +324,7 @@ def test_feedback_alone_does_not_show_the_effect():
 # -- what cannot be learnt ----------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_coefficients_can_be_learnt_without_the_predictor(calm):
     kept = fit_bags([calm], keep_predictor=True)
     learnt = kept.learnt

@@ -75,6 +75,7 @@ def wizard(person, *steps, start=None, robot_port='', **options):
     return CalibrationWizard(robot, person.ask, person.show, options, start or Calibration())
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_whole_run_finds_the_errors_of_the_twin(person, monkeypatch, tmp_path):
     """The command of docs/calibration.md: transcript, file, and record of the robot."""

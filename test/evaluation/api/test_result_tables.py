@@ -13,6 +13,7 @@
 # limitations under the License.
 """How results are shown in a terminal, a notebook and a paper."""
 
+from functools import cache, partial
 from html.parser import HTMLParser
 import re
 import sys
@@ -24,17 +25,30 @@ import pytest
 import t3mpc_ros as t3
 
 SHORT = {'plant': 'servo', 'duration': 4.0}
-RUN = t3.simulate('full', **SHORT)
-RESULTS = {
-    'run': RUN,
-    'comparison': t3.compare(
-        ['full', 'PI + feed-forward'], seeds=[1, 2], cases=['nominal', 'friction x3'], **SHORT,
+MAKERS = {
+    'run': partial(t3.simulate, 'full'),
+    'comparison': partial(
+        t3.compare,
+        ['full', 'PI + feed-forward'],
+        seeds=[1, 2],
+        cases=['nominal', 'friction x3'],
         executor=1,
     ),
-    'sweep': t3.sweep('PI + feed-forward', {'gain': [10.0, 20.0]}, seeds=[1, 2], **SHORT,
-                      executor=1),
-}  # fmt: skip
-each_result = pytest.mark.parametrize('result', RESULTS.values(), ids=RESULTS)
+    'sweep': partial(
+        t3.sweep, 'PI + feed-forward', {'gain': [10.0, 20.0]}, seeds=[1, 2], executor=1
+    ),
+}
+
+
+@cache
+def made(name):
+    """Return a result, made for the first test that needs it."""
+    return MAKERS[name](**SHORT)
+
+
+@pytest.fixture(params=MAKERS)
+def result(request):
+    return made(request.param)
 
 
 class Cells(HTMLParser):
@@ -66,7 +80,6 @@ def cells_of(markdown):
     return [[cell.strip(' *') for cell in line.strip('|').split('|')] for line in lines]
 
 
-@each_result
 def test_a_result_in_a_notebook_is_small_and_its_tables(result):
     """The repr of a run had 256 110 characters."""
     assert len(repr(result)) < 200
@@ -76,7 +89,6 @@ def test_a_result_in_a_notebook_is_small_and_its_tables(result):
     assert Cells(shown).rows == cells_of(str(result))
 
 
-@each_result
 def test_the_latex_of_a_result_has_its_cells(result):
     text = result.to_latex()
     rows = [line for line in text.splitlines() if line.endswith(r'\\')]
@@ -94,7 +106,7 @@ def test_the_latex_of_a_result_has_its_cells(result):
 
 
 def test_one_case_or_metric_is_chosen_by_its_name():
-    comparison, swept = RESULTS['comparison'], RESULTS['sweep']
+    comparison, swept = made('comparison'), made('sweep')
     assert comparison.to_latex().count('tabular}') == 4
     assert comparison.to_latex('friction x3').count('tabular}') == 2
     assert swept.to_latex('variation') != swept.to_latex()
@@ -103,30 +115,30 @@ def test_one_case_or_metric_is_chosen_by_its_name():
 
 
 def test_a_figure_shows_itself_and_is_written_in_three_forms(tmp_path):
-    figure = RUN.plot()
+    figure = made('run').plot()
     assert figure._repr_png_().startswith(b'\x89PNG')
     for suffix, begin in (('.png', b'\x89PNG'), ('.pdf', b'%PDF'), ('.svg', b'<?xml')):
         path = tmp_path / f'run{suffix}'
         written = []
         for _ in range(2):
-            RUN.plot(path)
+            made('run').plot(path)
             written.append(path.read_bytes())
         assert written[0].startswith(begin)
         assert written[0] == written[1], 'an equal figure is an equal file'
 
 
 def test_a_result_as_a_data_frame(monkeypatch):
-    made = []
-    monkeypatch.setitem(sys.modules, 'pandas', SimpleNamespace(DataFrame=made.append))
-    for result in RESULTS.values():
-        result.to_frame()
-    run, comparison, swept = made
-    assert set(run) == set(RUN.columns)
+    frames = []
+    monkeypatch.setitem(sys.modules, 'pandas', SimpleNamespace(DataFrame=frames.append))
+    for name in MAKERS:
+        made(name).to_frame()
+    run, comparison, swept = frames
+    assert set(run) == set(made('run').columns)
     assert len(comparison['seed']) == 8
     assert swept['gain'] == [10.0, 20.0, 10.0, 20.0]
     monkeypatch.setitem(sys.modules, 'pandas', None)
     with pytest.raises(t3.ScriptError, match='needs pandas: .* -m pip install pandas'):
-        RUN.to_frame()
+        made('run').to_frame()
 
 
 @pytest.mark.parametrize('alpha', [1.0, 0.98, 0.9])
