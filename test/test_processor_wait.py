@@ -23,6 +23,7 @@ import time
 
 import pytest
 from support import processor_wait, waiting
+from support.long_tests import few_of
 from support.processor_wait import ProcessorWait, descendants
 from support.signals import attended
 

@@ -243,7 +243,8 @@ def errors_of(bag, source, measured):
 
 
 def variation(time, values):
-    counted = [k for k in range(time.size - 1) if time[k] not in [a for a, _ in gaps_of(time)]]
+    before_gaps = {a for a, _ in gaps_of(time)}
+    counted = [k for k in range(time.size - 1) if time[k] not in before_gaps]
     steps = np.diff(time)
     return np.abs(np.diff(values))[counted].sum() / steps[counted].sum()
 
@@ -259,13 +260,14 @@ def missing(stamps):
 def busiest_part(time, commanded_at, commanded):
     """Return start and end of the part without a gap in which the command varies most."""
     edges = [max(time[0], commanded_at[0]), min(time[-1], commanded_at[-1])]
-    for gap in gaps_of(time) + gaps_of(commanded_at):
+    gaps = gaps_of(time) + gaps_of(commanded_at)
+    for gap in gaps:
         edges[1:1] = gap
     edges = sorted(edges)
     parts = [
         (a, b)
         for a, b in zip(edges, edges[1:], strict=False)
-        if not any(a < high and low < b for low, high in gaps_of(time) + gaps_of(commanded_at))
+        if not any(a < high and low < b for low, high in gaps)
     ]
     moved = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(commanded)))])
     return max(parts, key=lambda part: np.diff(np.interp(part, commanded_at, moved))[0])
