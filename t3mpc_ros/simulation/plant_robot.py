@@ -14,6 +14,7 @@
 """A plant of two wheels as a robot: no board, limits or pose, but a link that loses commands."""
 
 from collections.abc import Mapping
+from heapq import heappop, heappush
 import math
 from typing import Any, NamedTuple, Protocol
 
@@ -30,7 +31,6 @@ from t3mpc_ros.robot.interface import (
 )
 from t3mpc_ros.simulation.plant.disturbances import MeasurementNoise
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
-from t3mpc_ros.simulation.transport_delay import TransportDelay
 
 _STATUS = RobotStatus(True, True, False, False, False)
 _NO_POSE = Pose(math.nan, math.nan, math.nan)
@@ -121,17 +121,25 @@ class PlantRobot:
         self._plant, self._parameters = plant, parameters
         self._changed, self._change_ns = changed, change_ns
         self._link = link or LinkDelay()
-        self._channel = TransportDelay(np.random.default_rng((seed, 4)))
+        self._generator = np.random.default_rng((seed, 4))
+        self._in_transit: list[tuple[int, int, RobotCommand]] = []
+        """A heap of (arrival, number, command); the number keeps ties in the order of sending."""
+        self._sent = 0
         self._command = RobotCommand(ZERO_WHEEL_SPEEDS, -1)
         self._now_ns: int | None = None
         self.signals: Signals = {}
 
     def apply(self, command: RobotCommand, now_ns: int) -> str:
         """Send a command: wheel speeds (rad/s), or with a torque drive torques (N m)."""
-        link = self._link
-        if not link.begin * NANOSECONDS <= now_ns < link.end * NANOSECONDS:
-            link = LinkDelay()
-        self._channel.send(command, now_ns, link.delay, link.jitter, link.loss)
+        link, arrival_ns = self._link, now_ns
+        # Two numbers for each command, so that a change of loss does not shift delays.
+        lost, late = self._generator.random(2).tolist()
+        self._sent += 1
+        if link.begin * NANOSECONDS <= now_ns < link.end * NANOSECONDS:
+            if lost < link.loss:
+                return ''
+            arrival_ns += round((link.delay + link.jitter * late) * NANOSECONDS)
+        heappush(self._in_transit, (arrival_ns, self._sent, command))
         return ''
 
     def advance(self, now_ns: int) -> RobotState:
@@ -162,17 +170,17 @@ class PlantRobot:
     def _integrate(self, start_ns: int, substeps: int, step_ns: float) -> None:
         """Run the steps of one period, in pieces where commands arrive."""
         done = 0
-        while (arrival_ns := self._channel.next_ns) is not None:
+        while self._in_transit:
             # The step at or after the arrival; an instant on the grid is not the next one.
-            arrival = math.ceil((arrival_ns - start_ns) / step_ns - 1e-6)
+            arrival = math.ceil((self._in_transit[0][0] - start_ns) / step_ns - 1e-6)
             if arrival >= substeps:
                 break
             if arrival > done:
                 self._plant.run(self._command.wheels, arrival - done)
                 done = arrival
-            for command in self._channel.arrived(max(arrival_ns, start_ns)):
-                if command.stamp_ns > self._command.stamp_ns:
-                    self._command = command
+            command = heappop(self._in_transit)[2]
+            if command.stamp_ns > self._command.stamp_ns:
+                self._command = command
         self._plant.run(self._command.wheels, substeps - done)
 
 

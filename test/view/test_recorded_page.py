@@ -372,7 +372,8 @@ def test_a_signal_is_put_into_a_chart(browser, show):
 
     # By mouse: a line of the same unit, with its values beside those that are there.
     before = browser.run(IN_CHART, 'Right wheel')
-    drag = ActionChains(browser.driver).move_to_element(signal_button(browser, 'Left wheel, odometry'))
+    drag = ActionChains(browser.driver)
+    drag.move_to_element(signal_button(browser, 'Left wheel, odometry'))
     drag.click_and_hold().move_to_element(plots[0]).release().perform()
     assert browser.run(IN_CHART, 'Right wheel') == [*before, 'Left wheel, odometry']
     assert browser.run('return chosen') is None, 'a drag is no choice'
