@@ -41,6 +41,12 @@ from t3mpc_ros.geometry.types import Array, BodyTwist
 from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 
+SHORTFALL, LEAST_SHORTFALL = 0.25, 0.3
+"""Share of the command, and speed (rad/s), by which a wheel at a limit is slower than commanded:
+an offset of friction is smaller, a wrong geometry is less."""
+REACH, REACH_MEMORY = 0.85, 20.0
+"""Share of the largest speed of a wheel from which it may be at a limit, and the time constant
+with which that speed is forgotten, s."""
 REST_FACTOR = 5.0
 """A wheel within this multiple of the standard deviation of its measurement may be at rest."""
 
@@ -189,7 +195,10 @@ class VelocityActuation:
             self.command[:] = speeds * limit_scale(right, left, self._limits[0])
 
     def observe(self, measured: Array, dt: float) -> None:
-        """Update the filter with wheel speeds (rad/s) measured ``dt`` s after the last ones."""
+        """Update the filter with wheel speeds (rad/s) measured ``dt`` s after the last update.
+
+        NaN: there is no measurement, the wheels are where the commands have led them.
+        """
         applied = self.command if self.takes_speeds else self.applied
         self.speed_filter.update(applied, measured, dt, sent=self._sent)
 
@@ -233,6 +242,34 @@ class VelocityActuation:
         self.limited = False
         self.command[:] = wheels
         self.applied[:] = (self.command - self.predicted) * (self._servo_step / self._period)
+
+
+class ReachMonitor:
+    """Whether a wheel is at a limit of the robot that the controller does not know.
+
+    The error is then no estimation error: an estimate that learns it pushes the wheel on when it
+    is long asked for less, as any integral does that winds up.
+    """
+
+    def __init__(self) -> None:
+        self._largest = [0.0, 0.0]
+
+    def update(
+        self, speeds: list[float], command: list[float], unexplained: list[float], elapsed: float
+    ) -> bool:
+        """Return whether a wheel is at a limit; all rad/s, ``elapsed`` s since the last call.
+
+        speeds      : estimated
+        command     : sent last
+        unexplained : by which the wheel is faster than its commands explain
+        """
+        kept, at_limit = max(1.0 - elapsed / REACH_MEMORY, 0.0), False
+        for i, (speed, given, excess) in enumerate(zip(speeds, command, unexplained, strict=True)):
+            self._largest[i] = max(abs(speed), kept * self._largest[i])
+            short = max(SHORTFALL * abs(given), LEAST_SHORTFALL)
+            slower = excess * given < 0.0 and abs(excess) > short
+            at_limit |= slower and abs(speed) > REACH * self._largest[i]
+        return at_limit
 
 
 def wheel_limits(parameters: LimitParameters, geometry: WheelGeometry) -> Array:

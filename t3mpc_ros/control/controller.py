@@ -22,7 +22,12 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
+from t3mpc_ros.control.actuation import (
+    LimitParameters,
+    ReachMonitor,
+    VelocityActuation,
+    wheel_limits,
+)
 from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
 from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParameters
 from t3mpc_ros.control.control_law import (
@@ -37,7 +42,7 @@ from t3mpc_ros.control.control_law import (
     servo_gain,
 )
 from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
-from t3mpc_ros.control.jump_transition import JumpTransition, MotorLimit
+from t3mpc_ros.control.jump_transition import CommandLimit, JumpTransition, MotorLimit
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
@@ -291,6 +296,7 @@ class Controller:
         )
         """The keep-out, None unless it is enabled."""
         self._tracker = SwitchingTracker(parameters.resolved(), 'velocity')
+        self._tracker.transition.limit = _command_limit(parameters)
         self._period = 1.0 / parameters.rate
         self._period_ns = round(self._period * NANOSECONDS)
         self.actuation = VelocityActuation(
@@ -301,6 +307,7 @@ class Controller:
             self._period,
         )
         """Speed filter and last command; a replay sets the recorded commands here."""
+        self._lag = parameters.speed_filter.lag
         self._shaper = CommandShaper(parameters.command_shaper, self._period)
         geometry = parameters.geometry
         self.body = BodyCorrection(
@@ -335,6 +342,9 @@ class Controller:
         self._steps_since_snapshot = 0
         self._place = ORIGIN
         self._last_stamp_ns: int | None = None
+        self._step_ns = 0
+        """Instant of the last step, with odometry or without."""
+        self._reach = ReachMonitor()
         self.drive_monitor = DriveMonitor(feels=self.keep_out is not None)
         """Pauses of the commands."""
         self.odometry_twist = OdometryTwist()
@@ -406,6 +416,7 @@ class Controller:
         self.body.configure(parameters.body)
         self.pose_controller.parameters = parameters.pose
         self.actuation.configure(parameters.limits)
+        self._tracker.transition.limit = _command_limit(parameters)
         self._trajectory.set_jump(_least_jump(parameters.limits))
         if self.keep_out is not None:
             self.keep_out.limits = _largest(parameters.limits)
@@ -474,11 +485,11 @@ class Controller:
                 self._stop()
                 self.status = self._make_status(stamp, Reason.DISABLED, self.status.error)
             return self.actuation.twist, self.status
-        last = self._last_stamp_ns
-        if last is not None and 0 < stamp - last < EARLY * self._period_ns:
+        last, step_ns = self._last_stamp_ns, self._step_ns
+        if last is not None and last < stamp < step_ns + EARLY * self._period_ns:
             return self._wait(odometry)
         restarted = last is not None and stamp < last
-        self._last_stamp_ns = stamp
+        self._last_stamp_ns = self._step_ns = stamp
         elapsed = self._watchdog.elapsed(stamp)
         odometry = self.odometry_twist.measured(odometry, restart=elapsed is None)
         if restarted:
@@ -504,7 +515,8 @@ class Controller:
             self.status = self._make_status(stamp, reason, speeds - reference)
             return STANDSTILL, self.status
 
-        actuation, dt = self.actuation, elapsed or self._period
+        actuation = self.actuation
+        dt = self._period if elapsed is None else (stamp - step_ns) / NANOSECONDS
         if self.status.reason is Reason.PAUSED and not self._response.responsive:
             # Commands go on as before the pause: nothing is learnt until the robot responds.
             actuation.reset(speeds)
@@ -531,10 +543,67 @@ class Controller:
             self._announce_jumps(stamp, plan_ns)
         acceleration = self._acceleration(plan_ns, odometry.pose.yaw, begin, end, dt)
         applied = actuation.send_acceleration(acceleration, dt).copy()
-        self.law.set_applied(applied, saturated=actuation.limited)
+        short = self.parameters.composition == 'paper' and self._reach.update(
+            actuation.speeds.tolist(),
+            actuation.command.tolist(),
+            (self._lag * actuation.speed_filter.state.disturbance).tolist(),
+            dt,
+        )
+        self.law.set_applied(applied, saturated=actuation.limited or short)
         self._response.add_command(*actuation.command.tolist())
         self._take_snapshot()
         self.status = self._make_status(stamp, reason, actuation.speeds - reference, applied)
+        return actuation.twist, self.status
+
+    @property
+    def drives_through_gaps(self) -> bool:
+        """Whether :meth:`step_without_odometry` may command anything.
+
+        The pose decides where a robot with a pose loop goes, and what the body correction learns.
+        """
+        return self.parameters.composition == 'paper' and not self.parameters.pose.enabled
+
+    def step_without_odometry(self, stamp_ns: int) -> tuple[BodyTwist, Status] | None:
+        """Return the command for an instant whose odometry is missing; None if there is none.
+
+        A tracking robot follows the known reference on until ``watchdog.odometry_timeout``: the
+        wheels are taken to be where the commands have led them, and nothing is learnt. It stops
+        where it would with odometry. Odometry of earlier instants that comes later changes no
+        command.
+
+        stamp_ns : that instant, by the clock of the odometry
+        """
+        last, period_ns = self._last_stamp_ns, self._period_ns
+        timeout_ns = self.parameters.watchdog.odometry_timeout * NANOSECONDS
+        if last is None or not (self._moving and self.drives_through_gaps):
+            return None
+        if self.status.reason is not Reason.TRACKING:
+            return None
+        if stamp_ns < self._step_ns + EARLY * period_ns or stamp_ns > last + timeout_ns:
+            return None
+        actuation, unknown = self.actuation, np.full(2, math.nan)
+        dt = (stamp_ns - self._step_ns) / NANOSECONDS
+        self._step_ns = stamp_ns
+        actuation.observe(unknown, dt)
+        if self.parameters.estimate_dead_time:
+            self.dead_time.step(unknown, actuation.command, dt)
+        wheels = WheelSpeeds(*actuation.speeds.tolist())
+        twist = twist_from_wheels(wheels, self.parameters.geometry)
+        plan_ns, reason = self._sample_plan(State(stamp_ns, self._place, twist))
+        _, reference, begin, end = self._sampled
+        if not reason.moves:
+            self._stop()
+            self.status = self._make_status(stamp_ns, reason, actuation.speeds - reference)
+            return STANDSTILL, self.status
+        if self._jumps or self._announced:
+            self._announce_jumps(stamp_ns, plan_ns)
+        self.law.saturated = True  # the error is assumed: nothing is learnt from it
+        acceleration = self._acceleration(plan_ns, self._place.yaw, begin, end, dt)
+        applied = actuation.send_acceleration(acceleration, dt).copy()
+        self.law.set_applied(applied, saturated=True)
+        self._response.add_command(*actuation.command.tolist())
+        error = actuation.speeds - reference
+        self.status = self._make_status(stamp_ns, reason, error, applied)
         return actuation.twist, self.status
 
     def _check_keep_out(self, odometry: State, reason: Reason, begin: Array) -> Reason:
@@ -1003,6 +1072,12 @@ def _least_jump(limits: LimitParameters) -> BodyTwist:
         JUMP_DETECTION_FACTOR * limits.linear_acceleration,
         JUMP_DETECTION_FACTOR * limits.angular_acceleration,
     )
+
+
+def _command_limit(parameters: ControllerParameters) -> CommandLimit:
+    """Return the acceleration limits of the command for the ramps of jumps."""
+    mean, half, wheel = wheel_limits(parameters.limits, parameters.geometry)[1].tolist()
+    return CommandLimit(mean, half, wheel, parameters.jump_transition.acceleration)
 
 
 def _as_array(wheels: WheelSpeeds) -> Array:

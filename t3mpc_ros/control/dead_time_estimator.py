@@ -280,7 +280,8 @@ class DeadTimeEstimator:
         """Update the estimate with one measurement; return whether the response is disturbed.
 
         measured, command : wheel speeds, rad/s, shape (2,); the command was sent at the previous
-        step, after the limits, and the robot keeps it until the next one arrives
+        step, after the limits, and the robot keeps it until the next one arrives; ``measured`` is
+        NaN where there is no measurement
 
         dt : time since the previous measurement, s, positive; after a gap that stops the robot,
         call :meth:`reset` instead
@@ -305,6 +306,8 @@ def update_dead_time(
     """
     estimate = state[0]
     follow_command(estimate, history, drive, command, dt)
+    if math.isnan(measured[0]):
+        return bool(estimate.disturbed)
     measure_errors(estimate, history, measured, dt)
     spread = remove_friction(estimate, drive, measured, dt) if drive.friction else 0.0
     add_evidence(estimate, drive.noise_variance + spread, dt)

@@ -15,7 +15,7 @@
 
 from dataclasses import dataclass
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,25 @@ class JumpTransitionParameters(Parameters):
     )
 
 
+class RampLimit(Protocol):
+    """What limits the ramp of a jump."""
+
+    def accelerations(self, jump: Array) -> Array:
+        """Return the accelerations for a jump (rad/s), rad/s², shape (2,); NaN: the parameter."""
+        ...
+
+
+def in_one_direction(jump: Array, time: float) -> Array:
+    """Return the accelerations with which both wheels cross a jump in one time (s), rad/s².
+
+    The body keeps one direction then. A wheel that hardly jumps may be a little faster than
+    that, since it is soon across.
+    """
+    alike = np.abs(jump) / time
+    found: Array = np.maximum(alike, 0.25 * alike.max())
+    return found
+
+
 class MotorLimit(NamedTuple):
     """What the motors of a torque drive have for a jump."""
 
@@ -67,15 +86,44 @@ class MotorLimit(NamedTuple):
         .. math:: t = \max_i |(\bar\theta J)_i| / \tau, \qquad a_i = |J_i| / t
 
         Two wheels that turn the body need more torque for the same acceleration than two that
-        push it. A wheel that hardly jumps may be a little faster than that, since it is soon
-        across.
+        push it.
         """
         needed = float(np.max(np.abs(self.inertia @ jump))) / self.torque
-        if needed == 0.0:
+        return in_one_direction(jump, needed) if needed > 0.0 else np.full(2, math.nan)
+
+
+ALMOST = 0.9
+"""Share of the acceleration of the ramp from which a limit of the command does not shape it."""
+
+
+class CommandLimit(NamedTuple):
+    """Acceleration limits of the command, rad/s², all positive.
+
+    A ramp that is steeper than the command may be begins too late, and ends late. The wheels
+    cross together, as with :class:`MotorLimit`.
+    """
+
+    mean: float
+    """Of the mean of both wheels."""
+    half: float
+    """Of half of their difference."""
+    wheel: float
+    """Of each wheel."""
+    ramp: float
+    """Acceleration of the ramp by the parameter."""
+
+    def accelerations(self, jump: Array) -> Array:
+        """Return those for a jump (rad/s), rad/s², shape (2,); NaN where they limit nothing."""
+        right, left = jump.tolist()
+        most = max(abs(right), abs(left))
+        time = max(
+            0.5 * abs(right + left) / self.mean,
+            0.5 * abs(right - left) / self.half,
+            most / self.wheel,
+        )
+        if most >= ALMOST * self.ramp * time:
             return np.full(2, math.nan)
-        alike = np.abs(jump) / needed
-        found: Array = np.maximum(alike, 0.25 * alike.max())
-        return found
+        return in_one_direction(jump, time)
 
 
 class JumpTransition:
@@ -98,8 +146,8 @@ class JumpTransition:
     at once. The *command* crosses with a, one servo lag in advance, and rbar is the response of
     the servo to it.
 
-    ``lag`` (s) is the time constant of the servo, 0 for a torque drive; there, ``motor_limit``
-    determines the ramps. ``period`` is that of control, s.
+    ``lag`` (s) is the time constant of the servo, 0 for a torque drive. ``limit`` determines
+    the ramps where it has an answer. ``period`` is that of control, s.
     """
 
     def __init__(
@@ -107,10 +155,11 @@ class JumpTransition:
         parameters: JumpTransitionParameters,
         lag: float,
         period: float,
-        motor_limit: MotorLimit | None = None,
+        limit: RampLimit | None = None,
     ) -> None:
         self.parameters = parameters
-        self._motor_limit = motor_limit
+        self.limit = limit
+        """What limits the ramps of the next jumps."""
         self._lag = lag
         self._period = period
         self.count = 0
@@ -164,8 +213,7 @@ class JumpTransition:
         if k == len(self._transitions.instants):
             longer = (np.concatenate((rows, np.zeros_like(rows))) for rows in self._transitions)
             self._transitions = Transitions._make(longer)
-        limit = self._motor_limit
-        ramp = (math.nan, math.nan) if limit is None else limit.accelerations(jump)
+        ramp = (math.nan, math.nan) if self.limit is None else self.limit.accelerations(jump)
         added = (jump, slope_after, 0.0, ramp, instant_ns, False)
         for rows, value in zip(self._transitions, added, strict=True):
             rows[k] = value
@@ -209,7 +257,7 @@ class Transitions(NamedTuple):
     covered: Array
     """Commanded part of the jump, rad/s, shape (n, 2)."""
     accelerations: Array
-    """Of the ramp of a torque drive, else NaN, rad/s², shape (n, 2)."""
+    """Of the ramp where a limit determines it, else NaN, rad/s², shape (n, 2)."""
     instants: NDArray[np.int64]
     """When r jumps, ns, shape (n,)."""
     passed: NDArray[np.bool_]

@@ -129,7 +129,7 @@ class SpeedKalmanFilter:
         """Propagate over ``dt`` s, if a command was ``sent``, and correct by a measurement.
 
         applied  : commanded wheel speeds (rad/s) or accelerations (rad/s²), shape (2,)
-        measured : wheel speeds, rad/s, shape (2,)
+        measured : wheel speeds, rad/s, shape (2,); NaN: there is no measurement
         """
         self._update(
             self.state, self._commands, applied, contiguous(measured), sent, dt, self.model
@@ -236,7 +236,9 @@ def update_filter(
     if sent:
         propagate(state, commands, applied, dt, model)
     for i in range(measured.size):
-        if model.filtered:
+        if math.isnan(measured[i]):
+            pass
+        elif model.filtered:
             innovation = measured[i] - state.speeds[i]
             state.speeds[i] += model.speed_gain * innovation
             state.disturbance[i] += model.disturbance_gain * innovation

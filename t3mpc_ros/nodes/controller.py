@@ -53,8 +53,11 @@ from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
 INITIAL_INPUT_TIME_NS = 10 * NANOSECONDS
 """Time from the first input for which inputs are republished on ``~/initial_inputs/*``."""
-WATCHDOG_PERIOD = 0.05
-"""Time between two checks for an odometry timeout, s."""
+WATCHDOG_PERIOD, SHORTEST_WATCHDOG_PERIOD = 0.05, 0.01
+"""Time between two checks of the odometry, s; one period of a controller that drives through gaps,
+but no less than the second."""
+GAP_PERIODS = 2.0
+"""Silence of the odometry that is a gap, in periods."""
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._publish_parameters()
         self._load_model()
         self._last_odometry_ns: int | None = None
+        self._received_ns = self._stamp_ns = 0
         self._input_monitor = InputMonitor(self.parameters.rate)
         self._last_command: BodyTwist | None = None
         self._steps = 0
@@ -174,7 +178,10 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self.offer(SetBool, '~/enable', self._enable)
         self.offer(Trigger, '~/reset', self._reset)
         self.offer(Trigger, '~/save_model', self._save_model)
-        self.create_steady_timer(WATCHDOG_PERIOD, self._on_watchdog)
+        period = WATCHDOG_PERIOD
+        if self._controller.drives_through_gaps:
+            period = min(max(1.0 / self.parameters.rate, SHORTEST_WATCHDOG_PERIOD), period)
+        self.create_steady_timer(period, self._on_watchdog)
         if self.parameters.detect_cmd_vel_type:
             self.create_steady_timer(ADAPT_PERIOD, self._adapt_command_type)
 
@@ -235,6 +242,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         command, status = self._controller.step(measured)
         if self._controller.ignored_odometry == ignored or self._last_odometry_ns is None:
             self._last_odometry_ns = self.steady_ns()
+            # Stamps are ahead of their receipt by a constant, but for the time on the way.
+            self._received_ns, self._stamp_ns = self.now_ns(), measured.stamp_ns
         self._publish_command(command, status.stamp_ns)
         # Poses alone are differentiated, which says little about a gain.
         known = None if self._controller.odometry_twist.missing else self._last_command
@@ -276,6 +285,19 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             self._publish_command(STANDSTILL, self.now_ns())
             self._publish_journal(self._journal.odometry_timeout(self._controller.status.stamp_ns))
             self._log_reason(self._controller.status)
+        elif self._controller.drives_through_gaps:
+            self._drive_through_gap()
+
+    def _drive_through_gap(self) -> None:
+        silence_ns = self.now_ns() - self._received_ns
+        if silence_ns < GAP_PERIODS * NANOSECONDS / self.parameters.rate:
+            return
+        stamp_ns = self._stamp_ns + silence_ns
+        if (found := self._controller.step_without_odometry(stamp_ns)) is not None:
+            self._last_command, status = found
+            self._publish_command(self._last_command, stamp_ns)
+            self._publish_journal(self._journal.step_without_odometry(stamp_ns))
+            self._log_reason(status)
 
     def _publish_command(self, command: BodyTwist, stamp_ns: int) -> None:
         self._command_publisher.publish(self._command_message(command, stamp_ns))

@@ -127,6 +127,13 @@ class RecordedController:
                     self._bag.number(now_ns + 3 * LATER, name, value)
         return command
 
+    def step_without_odometry(self, now_ns):
+        """Pass an instant in a gap of the odometry."""
+        found = self.controller.step_without_odometry(now_ns)
+        if found is not None:
+            self._bag.command(now_ns + LATER, found[0])
+            self._bag.row(now_ns + 2 * LATER, self._journal.step_without_odometry(now_ns))
+
     def add_range(self, now_ns, sensor, reading):
         """Pass a range reading (m) to the controller."""
         self._bag.row(now_ns, self._journal.range(sensor, reading))

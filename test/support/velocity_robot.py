@@ -41,6 +41,14 @@ class VelocityRobot:
     wheel_separation: float = 0.160
     lag: float = 0.05
     dead_time: float = 0.03
+    command_tick: float = COMMAND_TICK
+    """Resolution of a command, m/s and rad/s; 0: as it is."""
+    yaw_gain: float = 1.0
+    """Yaw rate as a share of that of the wheels."""
+    sideways: float = 0.0
+    """Velocity to the left that no wheel has, as on a slope, m/s."""
+    fastest: float = math.inf
+    """Limit of the wheel speeds, rad/s."""
     pose: list = field(default_factory=lambda: [0.0, 0.0, 0.0])
     speeds: list = field(default_factory=lambda: [0.0, 0.0])
     """Wheel speeds, right wheel first, rad/s."""
@@ -53,12 +61,15 @@ class VelocityRobot:
 
     def command(self, linear, angular):
         """Receive a twist, which takes effect after the dead time."""
-        linear, angular = (
-            math.trunc(round(value / COMMAND_TICK, 9)) * COMMAND_TICK
-            for value in (linear, angular)
-        )
+        if (tick := self.command_tick) > 0.0:
+            linear, angular = (
+                math.trunc(round(value / tick, 9)) * tick for value in (linear, angular)
+            )
         half = 0.5 * self.wheel_separation
-        goal = [(linear + sign * half * angular) / self.wheel_radius for sign in (1, -1)]
+        goal = [
+            min(max((linear + sign * half * angular) / self.wheel_radius, -most), most)
+            for sign, most in ((1, self.fastest), (-1, self.fastest))
+        ]
         self._commands.append((self._time + self.dead_time, goal))
 
     def advance(self, duration):
@@ -71,11 +82,17 @@ class VelocityRobot:
             for i in range(2):
                 self.speeds[i] = self._goal[i] + (self.speeds[i] - self._goal[i]) * decay
                 self._angles[i] += STEP * self.speeds[i]
-            right, left = (self.wheel_radius * speed for speed in self.speeds)
-            linear = 0.5 * (right + left)
-            self.pose[2] += STEP * (right - left) / self.wheel_separation
-            self.pose[0] += STEP * linear * math.cos(self.pose[2])
-            self.pose[1] += STEP * linear * math.sin(self.pose[2])
+            linear, angular = self.twist
+            self.pose[2] += STEP * angular
+            cosine, sine = math.cos(self.pose[2]), math.sin(self.pose[2])
+            self.pose[0] += STEP * (linear * cosine - self.sideways * sine)
+            self.pose[1] += STEP * (linear * sine + self.sideways * cosine)
+
+    @property
+    def twist(self):
+        """True velocities: forward (m/s) and yaw (rad/s)."""
+        right, left = (self.wheel_radius * speed for speed in self.speeds)
+        return 0.5 * (right + left), self.yaw_gain * (right - left) / self.wheel_separation
 
     def odometry(self):
         """Return pose and measured velocities: (x, y, yaw), linear, angular."""

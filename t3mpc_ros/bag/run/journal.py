@@ -35,7 +35,7 @@ event
     An :class:`Event`.
 stamp_ns
     Stamp of the odometry message of a STEP, or of the last one before an ODOMETRY_TIMEOUT; the
-    sensor of a RANGE; else 0.
+    instant of a STEP_WITHOUT_ODOMETRY; the sensor of a RANGE; else 0.
 references
     Number of reference messages that the controller received since the start of the node.
 value
@@ -64,9 +64,16 @@ class Event(enum.IntEnum):
     RANGE = 7
     """A range reading was used by the keep-out; stamp_ns: number of the sensor from 0; value: the
     bits of the reading as a 64-bit float."""
+    STEP_WITHOUT_ODOMETRY = 8
+    """A command was published in a gap of the odometry."""
 
 
-COMMAND_EVENTS = (Event.STEP, Event.ODOMETRY_TIMEOUT, Event.FINISH)
+COMMAND_EVENTS = (
+    Event.STEP,
+    Event.STEP_WITHOUT_ODOMETRY,
+    Event.ODOMETRY_TIMEOUT,
+    Event.FINISH,
+)
 """Events that publish a command, before the row of the journal is published."""
 
 
@@ -91,6 +98,10 @@ class Journal:
     def step(self, stamp_ns: int) -> 'array[int]':
         """Return the row of a step with the stamp of its odometry message."""
         return self._append(Event.STEP, stamp_ns, self._newest_ns)
+
+    def step_without_odometry(self, stamp_ns: int) -> 'array[int]':
+        """Return the row of a command in a gap of the odometry, for an instant."""
+        return self._append(Event.STEP_WITHOUT_ODOMETRY, stamp_ns, 0)
 
     def odometry_timeout(self, stamp_ns: int) -> 'array[int]':
         """Return the row of a stop after an odometry timeout, with the last odometry stamp."""

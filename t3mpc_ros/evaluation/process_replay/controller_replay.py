@@ -111,6 +111,9 @@ def replay_steps(
                     yield row, controller, *controller.step(odometry[received])
             elif event == Event.RANGE:
                 controller.add_range(stamp, reading_from_value(value))
+            elif event == Event.STEP_WITHOUT_ODOMETRY:
+                if (found := controller.step_without_odometry(stamp)) is not None:
+                    yield row, controller, *found
             elif event in (Event.ODOMETRY_TIMEOUT, Event.FINISH):
                 if event == Event.ODOMETRY_TIMEOUT:
                     controller.check_odometry(None, 0)
