@@ -18,6 +18,7 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from support.long_tests import few_of
@@ -100,6 +101,36 @@ def test_a_signal_before_the_imports_is_quiet(number, tmp_path):
     with attended():
         done = subprocess.run([program], capture_output=True, text=True, env=environment)
     assert (done.returncode, done.stdout, done.stderr) == (0, 'here\n', '')
+
+
+@pytest.mark.parametrize(
+    'delay', few_of([0.02, 0.005, 0.0, 0.01, 0.015, 0.03, 0.04, 0.06, 0.1, 0.2, 0.5], 2)
+)
+@pytest.mark.parametrize('name', few_of(['controller', 't3mpc']))
+def test_ctrl_c_while_python_starts_is_quiet(name, delay, tmp_path):
+    """It ended with 16 lines, or 34, where Python had its own handler and not ours yet."""
+    root = Path(__file__).resolve().parent.parent
+    for folder in ('bin', 'lib/t3mpc_ros'):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / 'bin' / 'python3').symlink_to(sys.executable)
+    program = tmp_path / 'lib' / 't3mpc_ros' / name
+    program.write_bytes((root / 'resource' / 'executable').read_bytes())
+    program.chmod(0o755)
+    environment = os.environ | {'PYTHONPATH': str(root)}
+    with attended():
+        done = subprocess.Popen(
+            [program, 'topic', 'list'],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        time.sleep(delay)
+        done.send_signal(signal.SIGINT)
+        errors = done.communicate()[1]
+    assert errors.count('\n') <= 1
+    # The shell, which is there for the first milliseconds, is ended by the signal.
+    assert done.returncode in (-signal.SIGINT, 0, 1, 130)
 
 
 @pytest.mark.slow
