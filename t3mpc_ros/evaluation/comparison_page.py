@@ -49,6 +49,7 @@ from t3mpc_ros.evaluation.reporting import (
     Paragraph,
     Picture,
     Table,
+    VerdictBox,
     format_interval,
     html_page,
 )
@@ -130,14 +131,7 @@ def summary_table(
     Beside it the variation of the command in the first case, and the time of a step, µs.
     """
     firsts = {case: judged_metrics(case)[0] for case in plan.cases}
-    judged = verdicts(
-        {
-            (method, case): difference(plan, results, case, method, metric)
-            for method in plan.methods
-            for case, metric in firsts.items()
-        },
-        len(plan.seeds),
-    )
+    judged = _first_verdicts(plan, results)
     rows = []
     for method in plan.methods:
         cells = [method]
@@ -157,6 +151,42 @@ def summary_table(
     head = ['method', *plan.cases, f'{VARIATION.heading}, {plan.cases[0]}, {VARIATION.unit}']
     head += ['step, µs'] if step_times else []
     return Table(title, head, rows, (FULL,), wrap=True)
+
+
+def _first_verdicts(plan: ComparisonPlan, results: ResultTable) -> dict[tuple[str, str], str]:
+    """Return the verdict on the first judged metric of every method and case."""
+    return verdicts(
+        {
+            (method, case): difference(plan, results, case, method, judged_metrics(case)[0])
+            for method in plan.methods
+            for case in plan.cases
+        },
+        len(plan.seeds),
+    )
+
+
+def verdict_box(plan: ComparisonPlan, results: ResultTable) -> VerdictBox:
+    """Return in one sentence how the first method does beside the one it is compared with."""
+    case = plan.cases[0]
+    own = next((each for each in plan.methods if each != plan.against), plan.against)
+    metric = judged_metrics(case)[0]
+    named = [own, *(each for each in plan.methods if each == plan.against != own)]
+    numbers = [results.values(metric.name, case=case, controller=name) for name in named]
+    text = ', '.join(
+        f'{name} {format_interval(mean(each), interval(each), "", metric.digits)}'
+        for name, each in zip(named, numbers, strict=True)
+    )
+    judged = _first_verdicts(plan, results)
+    verdict = judged.get((own, case), '')
+    counts = [
+        f'{other}: {judged[own, other]}.' for other in plan.cases[1:] if (own, other) in judged
+    ]
+    return VerdictBox(
+        f'{metric.heading.capitalize()} error ({metric.unit}): {text}'
+        f'{f": {verdict}" if verdict else ""}.',
+        [f'{case}, {len(plan.seeds)} seeds of {plan.scenario.duration:g} s.', *counts],
+        {BETTER: 'good', WORSE: 'bad'}.get(verdict, 'apart'),
+    )
 
 
 def _cell(values: Sequence[float], metric: Metric) -> str:
@@ -287,7 +317,7 @@ def markdown(
 
 def page(plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | None = None) -> str:
     """Return the page as self-contained HTML."""
-    blocks: list[Block] = []
+    blocks: list[Block] = [verdict_box(plan, results)]
     figures: Mapping[str, Callable[[ComparisonPlan, ResultTable, str], Any]] = {
         f'Difference from {plan.against}, with 95 % interval': _draw_differences,
         'Error against variation of the command; joined: no method is better in both': draw_pareto,

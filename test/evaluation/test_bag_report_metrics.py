@@ -47,6 +47,7 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 )
 from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
+from t3mpc_ros.evaluation.bag_report.run_comparison import error_differences
 from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Series, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     driven,
@@ -301,6 +302,12 @@ def test_a_path_is_judged_by_the_distance_from_it(run):
     assert verdict.on_path == 1.0
     assert (verdict.label, verdict.kind) == ('Good run', 'good')
     assert 'within 50 mm of its path for 100 % of the drive, path error 20.0 mm' in verdict.text()
+    (difference,) = error_differences(followed, replace(followed, motions=run.motions | {
+        REFERENCE: replace(pose, values={**pose.values, 'y': pose['y'] + 0.03}),
+    }))  # fmt: skip
+    assert difference.channel.title == 'distance from the path'
+    assert difference.difference == pytest.approx(0.03**2 - 0.02**2)
+    assert difference.verdict == 'larger error'
     detour = pose.time > np.quantile(pose.time, 0.4)
     wide = replace(pose, values={**pose.values, 'x': pose['x'] + np.where(detour, 0.3, 0.02)})
     half = replace(followed, motions={**run.motions, REFERENCE: wide})

@@ -450,6 +450,12 @@ def test_the_command_writes_tables_json_and_page(tmp_path, capsys):
     assert mean == pytest.approx(sum(run[SETTLED.name] for run in runs) / 2)
     assert re.search(rf'\| {re.escape(PI)} \| {mean:.4f} ', text.out)
     page = files[1].read_text()
+    headline = re.search(r'<p class="headline">(.*?)</p>', page)[1]
+    assert re.fullmatch(
+        rf'Settled error \(rad/s\): {re.escape(PI)} {mean:.4f} ± [\d.]+, '
+        r'feed-forward [\d.]+ ± [\d.]+: (better|worse|inconclusive)\.',
+        headline,
+    ), headline
     assert page.count('<img ') == 6
     assert page.index('<img ') < page.index('<nav') < page.index('<table')
     assert 'http' not in page.replace('http-equiv', '')

@@ -16,6 +16,7 @@
 import numpy as np
 import pytest
 from support.browser import SIZES, Browser
+from support.page_data import check_legends
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.view import PAGE_AT
@@ -157,15 +158,16 @@ SWITCHES = "return events.filter(({kind}) => kind === 'switch').map(({time}) => 
 
 
 def test_a_recording_agrees_with_the_page_and_ends_in_a_report(page, browser, tmp_path):
-    """Switches were marked 0.4 s before the report marks them."""
+    """Legends mixed instants, and switches were marked 0.4 s before the report marks them."""
     browser.show_as(1440, 1000)
     browser.find('record').click()
     browser.wait(lambda: browser.run('return facts.recorder.state') == 'recording', 'no recording')
-    known = len(browser.run(SWITCHES))
+    begun, known = newest(browser), len(browser.run(SWITCHES))
     browser.wait(lambda: len(browser.run(SWITCHES)) >= known + 2, 'no two switches')
     marked = browser.run(SWITCHES)[known:]
     browser.wait(lambda: newest(browser) > marked[-1] + 1.0, 'no new samples')
     browser.find('hold').click()
+    ended = newest(browser)
     browser.find('record').click()
     browser.wait(lambda: browser.find('report').is_displayed(), 'no report')
     (bag,) = tmp_path.glob('view_*/bag')
@@ -173,6 +175,11 @@ def test_a_recording_agrees_with_the_page_and_ends_in_a_report(page, browser, tm
     with open_bag(bag) as recording:
         run = load_run(recording)
         origin = recording.start_ns / NANOSECONDS - browser.run('return facts.origin')
+    browser.run('selection = arguments', begun, ended)
+    browser.run('changed = true')
+    browser.wait(lambda: not browser.run('return changed'), 'nothing is drawn')
+    span = begun + 0.5 - origin, ended - 0.5 - origin
+    check_legends(browser, run, 30, origin, span, delay=0.2)
     for time in marked:
         assert np.min(np.abs(run.switches + origin - time)) < 0.02
 

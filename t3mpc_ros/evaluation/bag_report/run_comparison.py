@@ -25,7 +25,9 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.evaluation.bag_report.incidents import driving
 from t3mpc_ros.evaluation.bag_report.metrics import (
     CHANNEL_NUMBERS,
+    PATH_NUMBERS,
     RUN_NUMBERS,
+    SPEED_ERRORS,
     ReportMetrics,
     compute_metrics,
 )
@@ -35,6 +37,7 @@ from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, load_
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     driven,
     format_number,
+    path_distance,
     settled,
     tracking_error,
 )
@@ -72,6 +75,8 @@ MAX_SAMPLES = 2000
 """Samples of a reference that are compared."""
 MAX_RUNS = len(TERM_COLOURS)
 """Runs that a page compares."""
+DISTANCE = Channel('distance', 'distance from the path', 'distance', 'm')
+"""What is compared of two robots that follow poses."""
 BETTER, WORSE, INCONCLUSIVE = 'smaller error', 'larger error', 'inconclusive'
 
 
@@ -116,12 +121,17 @@ class ErrorDifference(NamedTuple):
 
 def block_errors(run: Run, name: str) -> list[float]:
     """Return the mean squared settled error of each :data:`BLOCK` seconds of one channel."""
-    error = tracking_error(run, run.measured)
+    if name == DISTANCE.name:
+        away = path_distance(run)
+        error = None if away is None else Series(away.time, {name: away['value']})
+    else:
+        error = tracking_error(run, run.measured)
     if error is None or len(error) < 2:
         return []
-    counted = driven(error.time, run)
-    counted &= settled(error.time, run)
-    squares = error[name][counted & np.isfinite(error[name])] ** 2
+    counted = np.isfinite(error[name])
+    if name != DISTANCE.name:
+        counted &= driven(error.time, run) & settled(error.time, run)
+    squares = error[name][counted] ** 2
     size = max(1, round(BLOCK / float(np.median(np.diff(error.time)))))
     count = squares.size // size
     means: list[float] = squares[: count * size].reshape(count, size).mean(axis=1).tolist()
@@ -129,9 +139,9 @@ def block_errors(run: Run, name: str) -> list[float]:
 
 
 def error_differences(first: Run, other: Run) -> list[ErrorDifference]:
-    """Return how the settled error of ``other`` differs from that of ``first``, by channel."""
+    """Return how the settled error, or path error, of ``other`` differs, by channel."""
     found = []
-    for channel in other.channels:
+    for channel in (DISTANCE,) if first.follows_path else other.channels:
         a, b = block_errors(first, channel.name), block_errors(other, channel.name)
         # Independent intervals, with the fewer degrees of freedom in each.
         half = math.hypot(interval(a), interval(b))
@@ -188,6 +198,8 @@ def why_not_comparable(first: ComparedRun, other: ComparedRun) -> str:
             return f'{each.label}: {each.metrics.verdict.label}'
     if first.run.channels != other.run.channels:
         return 'the wheels of one robot are unknown'
+    if first.run.follows_path != other.run.follows_path:
+        return 'the one follows a path, the other one speeds'
     share, text = reference_difference(first, other)
     if share > SAME_REFERENCE:
         return f'the references differ, so the runs had different tasks ({text})'
@@ -245,21 +257,23 @@ def _verdict(first: ComparedRun, other: ComparedRun) -> VerdictBox:
     found = error_differences(first.run, other.run)
     verdicts = {each.verdict for each in found} - {INCONCLUSIVE}
     headline, kind = 'Inconclusive', 'apart'
+    error = 'path error' if first.run.follows_path else 'settled error'
     if verdicts == {BETTER}:
-        headline, kind = 'Smaller settled error', 'good'
+        headline, kind = f'Smaller {error}', 'good'
     elif verdicts == {WORSE}:
-        headline, kind = 'Larger settled error', 'bad'
+        headline, kind = f'Larger {error}', 'bad'
     return VerdictBox(headline, [f'{each.text()}.' for each in found], kind, subject)
 
 
 def _metrics_table(runs: Sequence[ComparedRun]) -> Table:
     """Return the main numbers of all runs side by side."""
     cells = []
-    for title, unit, number in RUN_NUMBERS:
+    follow = [each.run.follows_path for each in runs]
+    for title, unit, number in (*(PATH_NUMBERS if any(follow) else ()), *RUN_NUMBERS):
         heading = f'{title} / {unit}' if unit else title
         cells.append([heading, *(format_number(number(each.metrics)) for each in runs)])
     for channel in runs[0].run.channels:
-        for title, unit, value in CHANNEL_NUMBERS:
+        for title, unit, value in CHANNEL_NUMBERS[len(SPEED_ERRORS) if all(follow) else 0 :]:
             numbers = [
                 format_number(value(each.metrics, channel.name))
                 if channel.name in each.metrics.wheels
@@ -276,7 +290,11 @@ def _shifted(each: ComparedRun, series: Series) -> Series:
 
 
 OVERLAID: tuple[tuple[str, str, Callable[[Run], Series | None]], ...] = (
-    ('Tracking errors', 'Error', lambda run: tracking_error(run, run.measured)),
+    (
+        'Tracking errors',
+        'Error',
+        lambda run: None if run.follows_path else tracking_error(run, run.measured),
+    ),
     ('Speeds', 'Speeds', lambda run: run.motions.get(run.measured)),
     ('Commands', 'Commands', lambda run: run.motions.get(COMMAND)),
 )

@@ -180,7 +180,8 @@ def _verdict(
     first, *others = findings
     tail = reached if first.tail is None else first.tail
     text = first.text if tail in first.text else f'{first.text}; {tail}'
-    more = (f'{_capital(each.text)}.' for each in others if each.text not in text)
+    further = (each.text.removesuffix(f': {reached}') for each in others)
+    more = (f'{_capital(each)}.' for each in further if each not in text)
     return replace(
         good,
         sentence=f'{_capital(text)}.',

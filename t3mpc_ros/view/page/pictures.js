@@ -96,12 +96,13 @@ function shownStreams(range) {
   const now = rowAt(time, newest()) + 1;
   found.preview = { time: time.slice(Math.max(0, now - 1)), values: values.map((each) => each.slice(Math.max(0, now - 1))) };
   found.reference = { time: time.slice(0, now), values: values.map((each) => each.slice(0, now)) };
-  const { odometry } = found;
-  found.error = { time: odometry.time, values: [0, 1].map((i) => odometry.time.map((at, row) => {
-    const [value, wanted] = [odometry.values[i]?.[row] ?? null, valueAt(time, values[i] || [], at)];
+  // As in reports: of the true motion where it is known, else of the odometry.
+  const motion = streams.truth ? found.truth : found.odometry;
+  found.error = { time: motion.time, values: [0, 1].map((i) => motion.time.map((at, row) => {
+    const [value, wanted] = [motion.values[i]?.[row] ?? null, valueAt(time, values[i] || [], at)];
     return value === null || wanted === null ? null : value - wanted;
   })) };
-  found.distance = distance(streams.truth ? found.truth : odometry, time, values);
+  found.distance = distance(motion, time, values);
   return found;
 }
 
