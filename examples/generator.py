@@ -22,6 +22,7 @@ import t3mpc_ros as t3
 
 def main(folder=Path('runs/examples'), duration=20.0):
     """Draw the attractor, and print the distance of two solutions that begin almost alike."""
+    folder.mkdir(parents=True, exist_ok=True)
     solution = t3.chaos(alpha=0.98, tspan=(0.0, duration), dt=0.001, every=2)
     solution.plot(folder / 'generator.png', plane=True)
     solution.to_csv(folder / 'generator.csv')

@@ -38,6 +38,7 @@ class Pi:
 
 def main(folder=Path('runs/examples'), duration=30.0, executor=None):
     """Print the table, and write it with a figure as a page."""
+    folder.mkdir(parents=True, exist_ok=True)
     controllers = ['full', Pi, t3.Controller(Pi, {'gain': 40.0, 'integral': 400.0})]
     table = t3.compare(controllers, seeds=range(1, 4), duration=duration, executor=executor)
     print(table)

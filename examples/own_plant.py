@@ -31,6 +31,7 @@ def flexible_shafts(time, state, command):
 
 def main(folder=Path('runs/examples'), duration=20.0):
     """Run two methods on a plant with flexible shafts, and on its rigid approximation."""
+    folder.mkdir(parents=True, exist_ok=True)
     lag = np.eye(2) / LAG
     plants = {
         'flexible': t3.OdePlant(flexible_shafts, states=6),

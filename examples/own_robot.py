@@ -30,6 +30,7 @@ ROBOT = t3.Robot(
 
 def main(folder=Path('runs/examples'), duration=30.0, executor=None):
     """Compare three methods on it, tracking a path that it can drive."""
+    folder.mkdir(parents=True, exist_ok=True)
     path = t3.Waypoints([(0.0, 0.0), (0.8, 0.2), (1.0, 1.0), (0.2, 0.8)], speed=0.15)
     table = t3.compare(
         ['full', 'PI + feed-forward', 'ADRC'],

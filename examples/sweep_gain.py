@@ -20,6 +20,7 @@ import t3mpc_ros as t3
 
 def main(folder=Path('runs/examples'), duration=26.0, executor=None):
     """Print the table and draw the error over the gain; run it again: nothing is left to do."""
+    folder.mkdir(parents=True, exist_ok=True)
     found = t3.sweep(
         ['PI + feed-forward', 'ADRC'],
         {'gain': [5.0, 10.0, 20.0, 40.0], 'noise': [0.0, 0.04]},

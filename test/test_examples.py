@@ -109,7 +109,8 @@ CHECKS = {
 
 @pytest.mark.parametrize('name', [path.stem for path in EXAMPLES])
 def test_an_example_runs_and_shows_what_it_says(name, tmp_path):
-    CHECKS[name](load_example(name), tmp_path)
+    """Also where its folder is not there yet: those that a reader starts ended with an error."""
+    CHECKS[name](load_example(name), tmp_path / 'made')
 
 
 def test_the_tutorial_shows_the_controller_of_the_example():
