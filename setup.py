@@ -180,6 +180,7 @@ setup(
         **EXTRAS,
         'ros': [*ROS, *EXTRAS['ros'], *EXTRAS['bags']],
         'dev': requirements('requirements-dev.txt'),
+        'docs': requirements('requirements-docs.txt'),
         'test': ['pytest'],
     },
     python_requires='>=3.11',

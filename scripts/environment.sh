@@ -1,7 +1,7 @@
 # Copyright 2026 The t3mpc_ros developers
 # SPDX-License-Identifier: Apache-2.0
 # Sourced by every script: creates or updates the local environment .venv, and sets $PYTHON.
-# PARTS are the parts of it that the script needs: run, and check for lint, types and tests.
+# PARTS are the parts of it that the script needs: run, check for lint, types and tests, docs.
 # Requires Python 3.11 to 3.14 and a package index; a system ROS is neither required nor used.
 # $ROOT is the folder of the checkout: the scripts resolve a symlink to themselves before.
 
@@ -12,7 +12,7 @@ VENV="$ROOT/.venv"
 PYTHON="$VENV/bin/python"
 LOG="$ROOT/.venv.log"
 PARTS=("${PARTS[@]:-run}")
-declare -A REQUIREMENTS=([run]=requirements.txt [check]=requirements-dev.txt)
+declare -A REQUIREMENTS=([run]=requirements.txt [check]=requirements-dev.txt [docs]=requirements-docs.txt)
 CHILDREN=()
 
 say() { printf '%s\n' "$*" >&2; }
@@ -73,7 +73,7 @@ wanted_stamp() {
     case "$1" in
     run) cat "$ROOT"/{requirements.txt,setup.py,setup.cfg,package.xml,resource/executable,t3mpc_ros/version.py} \
       "$ROOT"/{config/*.*,launch/*.launch.py} "$ROOT"/scripts/{environment.sh,finish_install.py} ;;
-    check) cat "$ROOT"/requirements-*.txt ;;
+    check | docs) cat "$ROOT"/requirements-*.txt ;;
     esac
   } | sha256sum)"
   printf '%s\n' "$1 ${hash%% *}"
