@@ -76,7 +76,7 @@ LIBRARIES = {
     'radio': {'serial'},
     'bag': {'mcap', 'rosbags', 'yaml'},
     'evaluation': {'matplotlib', 'PIL', 'yaml', 'cma', 'casadi', 'jinja2', 'tqdm', 'daqp'}
-    | {'pyarrow', 'distributed', 'gymnasium'},
+    | {'pyarrow', 'distributed', 'gymnasium', 'cloudpickle'},
     'nodes': {'yaml'},
     'cli': {'yaml', 'shtab'},
     'gym': {'gymnasium'},

@@ -19,20 +19,24 @@ import csv
 from dataclasses import dataclass
 from functools import cache
 import html
+from importlib import import_module
+from importlib.util import find_spec
 import json
 import math
 from pathlib import Path
 import re
 import sys
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from t3mpc_ros.evaluation.charts import Chart, PageData, Plane, Timeline
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.page.page_files import page_file
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 EMPTY_CELL = '–'
 
@@ -305,10 +309,13 @@ def progress_bar(
 ) -> 'tqdm[int]':
     """Return a line on standard error with pace and time left; ``update()`` counts.
 
-    A terminal gets one line that is rewritten, anything else a line at intervals; nothing is
-    shown before ``delay``, s.
+    A terminal or a notebook gets one line that is rewritten, or the widget of a notebook that has
+    ipywidgets; anything else a line at intervals. Nothing is shown before ``delay``, s.
     """
-    return tqdm(
+    notebook = type(sys.stderr).__module__.startswith('ipykernel')
+    widget = notebook and find_spec('ipywidgets') is not None
+    kind = import_module('tqdm.notebook' if widget else 'tqdm').tqdm
+    bar: tqdm[int] = kind(
         total=total,
         unit=f' {unit}',
         unit_scale=unit == 'B',
@@ -316,8 +323,9 @@ def progress_bar(
         delay=delay,
         disable=not show,
         dynamic_ncols=True,
-        mininterval=0.5 if sys.stderr.isatty() else 15.0,
+        mininterval=0.5 if notebook or sys.stderr.isatty() else 15.0,
     )
+    return bar
 
 
 def write_columns(

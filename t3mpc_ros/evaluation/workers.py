@@ -20,8 +20,10 @@ work by ``if __name__ == '__main__':``.
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 import multiprocessing
+from multiprocessing.context import SpawnContext, SpawnProcess
 import os
 import pickle
+import signal
 import sys
 from typing import Any, Self, TypeVar
 
@@ -29,6 +31,7 @@ from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForward
 from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
 from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.loop import Method, run
+from t3mpc_ros.evaluation.own_modules import ModuleCarrier
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.parent_process import end_with_parent
@@ -48,6 +51,35 @@ class JobError(RuntimeError):
     """A run that failed; the text names method and scenario."""
 
 
+class _WorkerProcess(SpawnProcess):
+    """A worker process: Ctrl-C, which a terminal sends to all, is for its parent."""
+
+    def start(self) -> None:
+        """Start it with the signal blocked, which it inherits and so is from its first moment."""
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _WorkerContext(SpawnContext):
+    """Makes worker processes, spawned and not forked, and knows them.
+
+    A fork would copy whatever threads and locks this process has.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.processes: list[SpawnProcess] = []
+
+    def Process(self, *arguments: Any, **options: Any) -> SpawnProcess:  # type: ignore[override]
+        """Return a new worker process."""
+        process = _WorkerProcess(*arguments, **options)
+        self.processes.append(process)
+        return process
+
+
 class WorkerPool:
     """Executor that runs jobs, kept warm from one batch to the next.
 
@@ -60,18 +92,23 @@ class WorkerPool:
             raise ValueError(f'workers must be at least 1: got {workers}')
         self._workers = workers
         self._pool: Executor | None = None
+        self._context = _WorkerContext()
 
     def __enter__(self) -> Self:
         if isinstance(self._workers, Executor):
             self._pool = self._workers
         elif self._workers > 1:
-            # Spawned, not forked: a fork would copy whatever threads and locks this process has.
             self._pool = ProcessPoolExecutor(
-                self._workers, multiprocessing.get_context('spawn'), _start_worker, (os.getpid(),)
+                self._workers, self._context, _start_worker, (os.getpid(),)
             )
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object = None, *_: object) -> None:
+        if kind is not None:
+            # After Ctrl-C or an error nobody waits for the runs that have begun.
+            for process in self._context.processes:
+                if process.is_alive():
+                    process.terminate()
         if self._pool is not None and self._pool is not self._workers:
             self._pool.shutdown(cancel_futures=True)
         self._pool = None
@@ -149,12 +186,11 @@ def workers_for(executor: Any, jobs: Sequence[Any]) -> int | Executor:
     One run, and runs of an interactive session, which other processes cannot import, are made
     in this process unless an executor is given.
     """
-    if isinstance(executor, Executor):
-        return executor
     if callable(make := getattr(executor, 'get_executor', None)):  # a Dask client
-        found = make(pure=False)
-        assert isinstance(found, Executor)
-        return found
+        executor = make(pure=False)
+    if isinstance(executor, Executor):
+        other_machines = type(executor).__module__.startswith('distributed.')
+        return ModuleCarrier(executor) if other_machines else executor
     if executor is not None and (isinstance(executor, bool) or not isinstance(executor, int)):
         raise ValueError(
             'executor must be None, a number of processes, a concurrent.futures.Executor or a '

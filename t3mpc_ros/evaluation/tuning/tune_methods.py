@@ -20,7 +20,7 @@ from dataclasses import asdict
 from functools import partial
 import math
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from tqdm import tqdm
 
@@ -71,8 +71,8 @@ class ClosedLoopObjective:
         self.workers.__enter__()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.workers.__exit__()
+    def __exit__(self, *error: Any) -> None:
+        self.workers.__exit__(*error)
 
     def __call__(
         self, method: MethodDefinition, drive: str, candidates: Sequence[Parameters]
