@@ -144,7 +144,7 @@ RESULTS: dict[str, Callable[[], object]] = {
     'compare_twin': lambda: command('compare', '--seeds', '201-202'),
     'compare_servo': lambda: command('compare', '--robot', 'servo', '--seeds', '201-202'),
     'compare_torque': lambda: command('compare', '--robot', 'torque', '--seeds', '201-202'),
-    'paper': lambda: command('paper', '--seeds', str(SEEDS)),
+    'paper': lambda: command('paper', '--seeds', f'101-{100 + SEEDS}'),
 }
 
 

@@ -52,6 +52,10 @@ EMULATOR = 'scripts/run t3mpc emulator --link dongle'
 BRIDGE = 'scripts/run radio_bridge --ros-args -p port:=dongle'
 CHANGES = '--set twin.faults.load_change=1.5 --set robot_clock_error=0.005'
 FAULTS = '--fault jam:10:1 --fault robot_reset:20 --fault loss:30:10:0.3'
+REPRODUCED = (
+    'scripts/run t3mpc compare --seeds 2001-2002 --cases nominal --methods full "feed-forward" '
+    '--csv runs.csv'
+)
 OWN = 'scripts/run t3mpc compare my_controller.py:Pi --robot twin --seeds 1-5 --html pi.html'
 SWEEP = (
     'scripts/run t3mpc sweep my_controller.py:Pi --set gain=10,20,40 --robot servo --seeds 1-5 '
@@ -78,14 +82,15 @@ SHORTENED = {
     'scripts/run t3mpc patrol --tracking': (
         '--seeds 101 --paths recorded-path --output OUTPUT/tracking'
     ),
-    'scripts/run t3mpc paper --quick': '--seeds 1 --output OUTPUT/paper',
+    'scripts/run t3mpc paper --quick': '--seeds 101-101 --output OUTPUT/paper',
     'scripts/run t3mpc compare': '--seeds 201 --duration 3 --methods full --cases nominal',
+    REPRODUCED: '--seeds 2001-2001 --duration 3',
     OWN: '--seeds 1 --duration 3',
     SWEEP: '--seeds 1 --duration 3',
     'scripts/run t3mpc tune': '"PI + feed-forward" --evaluations 2 --output OUTPUT/tuned.json',
-    'scripts/run t3mpc train': '--seeds 1 --output OUTPUT/model.npz',
+    'scripts/run t3mpc train': '--seeds 101-101 --output OUTPUT/model.npz',
     'scripts/run t3mpc exponents': '--duration 20',
-    'scripts/run t3mpc estimation': '--seeds 2',
+    'scripts/run t3mpc estimation': '--seeds 1-2',
     BOARDS: 'Ctrl-C',
     SET: '',
     'scripts/run t3mpc robot setup --port robot_usb --diff robot.yaml': '',
@@ -153,7 +158,10 @@ def test_blocks_can_be_pasted(page):
 
 # -- commands that are only parsed ----------------------------------------------------------------
 
-TOOLS = {'rosdep', 'pip', 'python3', '.', 'touch', 'sudo', 'avrdude', 'cd', 'chronyc', 'export'}
+TOOLS = {
+    *('rosdep', 'pip', 'python3', '.', 'touch', 'sudo', 'avrdude', 'cd', 'chronyc', 'export'),
+    '.venv/bin/python',
+}
 """Programs that are not parts of the package; of their arguments, files of the package exist."""
 PARSERS = {
     'bag': bag.program_parser,
@@ -244,12 +252,12 @@ def _check(command, capsys, complete=True):
             _check_node(name, arguments)
     elif words[0] == 't3mpc':
         _parse(words[1:], capsys, complete)
-    elif words[0] not in ('scripts/check', 'make'):  # make: a test of its own
+    elif words[0] not in ('scripts/check', 'scripts/docs', 'scripts/tag', 'make'):  # make: a test of its own
         assert words[0] in TOOLS, command
         assert all(
             (ROOT / word).exists()
             for word in words
-            if re.match(r'(config|launch|test|scripts)/', word)
+            if re.match(r'(config|launch|test|scripts|bench)/', word)
         )
 
 

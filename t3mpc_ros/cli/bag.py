@@ -16,33 +16,23 @@
 import argparse
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-import json
 import math
 from pathlib import Path
 import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from t3mpc_ros.bag.mcap_file import McapFile
-from t3mpc_ros.bag.metadata import TopicInformation
-from t3mpc_ros.bag.qos import QosProfile
-from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.bag.recording.message_losses import message_loss_notes
-from t3mpc_ros.bag.recovery import (
-    Damage,
-    FileResult,
-    RecoveryOutputError,
-    RecoveryResult,
-    default_output,
-    recover_bag,
-)
 from t3mpc_ros.cli.command import ArgumentParser, RemovedOption, run_command
-from t3mpc_ros.cli.run_options import add_topic_options, report_options
+from t3mpc_ros.cli.run_options import add_json, add_topic_options, print_result, report_options
 from t3mpc_ros.cli.train import add_bag_options, run_bags
-from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 
+# Libraries for bags take long to import: the help and the completion do without.
 if TYPE_CHECKING:
+    from t3mpc_ros.bag.metadata import TopicInformation
+    from t3mpc_ros.bag.qos import QosProfile
+    from t3mpc_ros.bag.reader import BagReader
+    from t3mpc_ros.bag.recovery import Damage, FileResult, RecoveryResult
     from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances
 
 
@@ -82,21 +72,23 @@ def add_info_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParse
         description='Prints the contents of a bag. Exit code 0, or 1 when nothing can be read.',
     )
     parser.add_argument('bag', type=Path, help='an MCAP file, or the folder of a bag')
-    parser.add_argument('--json', action='store_true', help='everything, as JSON')
+    # Without FILE, as when this was a flag: the standard output.
+    add_json(parser, 'write everything', nargs='?', const=Path('-'))
     parser.set_defaults(run=_run_info)
 
 
 def _run_info(options: argparse.Namespace) -> int:
+    from t3mpc_ros.bag.reader import open_bag
+
     with open_bag(options.bag) as bag:
-        if options.json:
-            print(json.dumps(_info(bag), indent=1, ensure_ascii=False))
-        else:
-            print(_info_text(bag))
+        print_result(options, lambda: _info_text(bag), lambda: _info(bag))
     return 0
 
 
-def _info(bag: BagReader) -> dict[str, Any]:
+def _info(bag: 'BagReader') -> dict[str, Any]:
     """Return the contents of a bag as JSON data."""
+    from t3mpc_ros.bag.mcap_file import McapFile
+
     return {
         'path': str(bag.folder),
         'storage': bag.storage,
@@ -125,7 +117,9 @@ def _info(bag: BagReader) -> dict[str, Any]:
     }
 
 
-def _info_text(bag: BagReader) -> str:
+def _info_text(bag: 'BagReader') -> str:
+    from t3mpc_ros.bag.recording.message_losses import message_loss_notes
+
     info = _info(bag)
     size = size_text(sum(info['files'].values()))
     rows = [
@@ -169,12 +163,12 @@ def _size(path: Path) -> int:
     return sum(file.stat().st_size for file in files)
 
 
-def _rate(bag: BagReader, topic: TopicInformation) -> float:
+def _rate(bag: 'BagReader', topic: 'TopicInformation') -> float:
     """Return the mean rate of a topic in Hz; 0 for a bag without duration."""
     return topic.message_count / bag.duration if bag.duration > 0.0 else 0.0
 
 
-def _qos_text(profile: QosProfile) -> str:
+def _qos_text(profile: 'QosProfile') -> str:
     """Return reliability, durability, history and depth of a profile."""
     policies = ', '.join([profile.reliability, profile.durability, profile.history])
     return f'{policies} {profile.depth}'
@@ -202,6 +196,8 @@ _CALIBRATED = ('calibration.', 'odometry.gyro_scale', 'wheel_radius', 'wheel_sep
 
 
 def _date(time_ns: int) -> str:
+    from t3mpc_ros.geometry.types import NANOSECONDS
+
     return f'{datetime.fromtimestamp(time_ns // NANOSECONDS, UTC):%Y-%m-%d %H:%M:%S} UTC'
 
 
@@ -233,6 +229,8 @@ def add_recover_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
 
 
 def _run_recover(options: argparse.Namespace) -> int:
+    from t3mpc_ros.bag.recovery import RecoveryOutputError, default_output, recover_bag
+
     output = options.output or default_output(options.bag)
     progress = _RecoveryProgress()
     try:
@@ -246,7 +244,7 @@ def _run_recover(options: argparse.Namespace) -> int:
     return 0 if result.clean else EXIT_LOSS
 
 
-def _recovery_text(result: RecoveryResult) -> str:
+def _recovery_text(result: 'RecoveryResult') -> str:
     least = '' if result.exact else '>= '
     rows = [('topic', 'type', 'kept', 'unchecked', 'lost')]
     for topic in result.topics.values():
@@ -260,7 +258,7 @@ def _recovery_text(result: RecoveryResult) -> str:
     return '\n\n'.join(parts)
 
 
-def _file(file: FileResult) -> str:
+def _file(file: 'FileResult') -> str:
     if file.copied:
         return f'{file.name}: sound, copied'
     lines = [f'{file.name}: written anew']
@@ -271,7 +269,7 @@ def _file(file: FileResult) -> str:
     return '\n'.join(lines)
 
 
-def _damage(damage: Damage) -> str:
+def _damage(damage: 'Damage') -> str:
     where = f'bytes {damage.start} to {damage.end}: ' if damage.size else ''
     text = where + damage.reason
     if damage.harmless:
@@ -279,11 +277,13 @@ def _damage(damage: Damage) -> str:
     if damage.messages:
         text += f'; {damage.messages} messages lost'
     if damage.span_ns:
+        from t3mpc_ros.geometry.types import NANOSECONDS
+
         text += f'; within {(damage.span_ns[1] - damage.span_ns[0]) / NANOSECONDS:.3f} s'
     return text
 
 
-def _verdict(result: RecoveryResult, least: str) -> str:
+def _verdict(result: 'RecoveryResult', least: str) -> str:
     kept = f'{result.kept} messages are kept in {result.output}'
     if result.clean:
         return f'{kept}; nothing is lost'

@@ -70,7 +70,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         'robot is miscalibrated',
     )
     run_options.add_workers(parser)
-    run_options.add_outputs(parser, json='write every number to this file')
+    run_options.add_outputs(parser, 'write every number')
     parser.add_argument(
         '--csv', type=Path, help='write a row for each run, with commit and machine'
     )
@@ -90,12 +90,13 @@ def run(options: argparse.Namespace) -> int:
     with run_options.executor_of(options) as executor:
         results = run_plan(plan, executor, print_report)
     times = step_times(plan, time.perf_counter_ns)
-    print(comparison_page.markdown(plan, results, times))
-    run_options.write_outputs(
+    run_options.print_result(
         options,
+        lambda: comparison_page.markdown(plan, results, times),
         lambda: comparison_page.record(plan, results, times),
-        lambda: comparison_page.page(plan, results, times),
     )
+    if options.html:
+        options.html.write_text(comparison_page.page(plan, results, times), encoding='utf-8')
     if options.csv:
         write_csv(options.csv, columns_of(Comparison(plan, results).rows()))
     return 0

@@ -22,20 +22,22 @@ from pathlib import Path
 import sys
 
 from t3mpc_ros.cli.command import ArgumentParser
-from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters, StopTimeMonitor
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultError, parse_fault
-from t3mpc_ros.emulator.firmware_library import FirmwareLibraryError
-from t3mpc_ros.emulator.pty_port import PtyPort, PtyPortError, serve
 from t3mpc_ros.parameters.command_line import bounded_float, parse_assignments
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, read_key
-from t3mpc_ros.simulation.world import WorldError
 from t3mpc_ros.stop_signal import StopSignal
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the emulator until a stop signal; return the exit code."""
     options = program_parser().parse_args(arguments)
+    # They import the compiler, which the help does without.
+    from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters, StopTimeMonitor
+    from t3mpc_ros.emulator.firmware_library import FirmwareLibraryError
+    from t3mpc_ros.emulator.pty_port import PtyPort, PtyPortError, serve
+    from t3mpc_ros.simulation.world import WorldError
+
     try:
         if options.robot_link and options.robot_link.absolute() == options.link.absolute():
             raise PtyPortError(f'--link and --robot-link must be two paths: got {options.link}')

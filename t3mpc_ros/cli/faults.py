@@ -21,7 +21,7 @@ from t3mpc_ros.cli.run_options import (
     add_workers,
     executor_of,
     prepare_outputs,
-    write_outputs,
+    print_result,
 )
 
 
@@ -61,8 +61,9 @@ def run(options: argparse.Namespace) -> int:
     prepare_outputs(options)
     with executor_of(options) as executor:
         rows = study_faults(fault_runs, executor, print_report)
-    print(fault_page.console_text(rows))
+    print_result(options, lambda: fault_page.console_text(rows), lambda: list(rows))
     if options.output:
         fault_page.update_page(options.output, rows)
-    write_outputs(options, lambda: list(rows), lambda: fault_page.page(rows))
+    if options.html:
+        options.html.write_text(fault_page.page(rows), encoding='utf-8')
     return 1 if any(row['verdict'] == 'unbounded' for row in rows) else 0

@@ -25,8 +25,9 @@ import webbrowser
 
 from t3mpc_ros.cli import compare, faults, graph, paper, patrol, sweep, train, tune, view
 from t3mpc_ros.cli.command import ArgumentParser, reject_removed, run_command
+from t3mpc_ros.cli.run_options import add_json, add_seeds, prepare_outputs, print_result
 from t3mpc_ros.missing_library import remedy
-from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
+from t3mpc_ros.parameters.command_line import bounded_float
 
 if TYPE_CHECKING:
     from t3mpc_ros.evaluation.bag_report.verdict import Verdict
@@ -124,14 +125,16 @@ def _new_run(folder: Path) -> Path:
 def _estimation(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.open_loop_estimation import compare, records
     from t3mpc_ros.evaluation.paper.results import estimation
-    from t3mpc_ros.evaluation.reporting import strict_json
 
+    prepare_outputs(options)
     results = compare(
         seeds=options.seeds, duration=options.duration, normalised_gain=options.gain, progress=True
     )
-    print('\n\n'.join(table.markdown() for table in estimation(results)))
-    if options.json:
-        options.json.write_text(strict_json(records(results)), encoding='utf-8')
+    print_result(
+        options,
+        lambda: '\n\n'.join(table.markdown() for table in estimation(results)),
+        lambda: records(results),
+    )
     return 0
 
 
@@ -139,9 +142,17 @@ def _exponents(options: argparse.Namespace) -> int:
     from t3mpc_ros.chaos.system import hyperchaotic_system
     from t3mpc_ros.evaluation.lyapunov_exponents import lyapunov_exponents
 
+    prepare_outputs(options)
     values = lyapunov_exponents(hyperchaotic_system(orders=(1.0,) * 4), duration=options.duration)
-    print('Lyapunov exponents of (85) at q = 1: ' + ', '.join(f'{v:.3f}' for v in values))
-    print(f'their sum: {sum(values):.3f} (trace of the Jacobian: -38)')
+    text = ', '.join(f'{value:.3f}' for value in values)
+    print_result(
+        options,
+        lambda: (
+            f'Lyapunov exponents of (85) at q = 1: {text}\n'
+            f'their sum: {sum(values):.3f} (trace of the Jacobian: -38)'
+        ),
+        lambda: {'exponents': [*values], 'sum': sum(values), 'duration': options.duration},
+    )
     return 0
 
 
@@ -270,9 +281,7 @@ def _parser(
     estimation = commands.add_parser(
         'estimation', help='the kinds of fuzzy systems as estimators, without a controller (86)'
     )
-    estimation.add_argument(
-        '--seeds', type=bounded_int(1, 10_000), default=5, help='runs each (default 5)'
-    )
+    add_seeds(estimation, '1-5', 'the runs', counted=True)
     estimation.add_argument('--duration', type=SECONDS, default=60.0, help='seconds (default 60)')
     estimation.add_argument(
         '--gain',
@@ -280,13 +289,14 @@ def _parser(
         default=40.0,
         help='normalised gain of all kinds, 1/s² (default 40)',
     )
-    estimation.add_argument('--json', type=Path, help='also write the numbers to this file')
+    add_json(estimation)
     estimation.set_defaults(run=_estimation)
 
     exponents = commands.add_parser('exponents', help='Lyapunov exponents of the generator')
     exponents.add_argument(
         '--duration', type=SECONDS, default=200.0, help='system seconds (default 200)'
     )
+    add_json(exponents)
     exponents.set_defaults(run=_exponents)
 
     for module in (paper, compare, sweep, patrol, tune, train, faults, view, graph):

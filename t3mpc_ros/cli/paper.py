@@ -17,8 +17,14 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from t3mpc_ros.cli.run_options import add_workers, executor_of
-from t3mpc_ros.parameters.command_line import bounded_int
+from t3mpc_ros.cli.run_options import (
+    add_json,
+    add_seeds,
+    add_workers,
+    executor_of,
+    prepare_outputs,
+    print_result,
+)
 
 
 def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -29,19 +35,20 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.add_argument(
         '--quick', action='store_true', help='few seeds and short runs: shows that all works'
     )
-    parser.add_argument(
-        '--seeds', type=bounded_int(1, 10_000), help='held-out seeds (default: all, quick: 3)'
-    )
-    parser.add_argument(
-        '--estimation-seeds',
-        type=bounded_int(1, 10_000),
-        help='of the comparison without a controller (86)',
+    add_seeds(parser, '', 'the runs', counted=True, text='the 20 held-out ones, quick: 3')
+    add_seeds(
+        parser,
+        '',
+        'the comparison without a controller (86)',
+        name='--estimation-seeds',
+        counted=True,
+        text='20, quick: 2',
     )
     add_workers(parser)
     parser.add_argument(
         '--output', type=Path, help='folder (default runs/paper, or runs/paper-quick)'
     )
-    parser.add_argument('--json', type=Path, help='also write the results to this file')
+    add_json(parser, 'also write the results')
     parser.add_argument(
         '--fresh', action='store_true', help='discard the runs that the folder holds'
     )
@@ -54,6 +61,7 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.methods import NMPC, require_libraries
     from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, reproduce
 
+    prepare_outputs(options)
     require_libraries([NMPC])
     output = options.output or Path('runs') / ('paper-quick' if options.quick else 'paper')
     chosen = PaperOptions(
@@ -61,9 +69,9 @@ def run(options: argparse.Namespace) -> int:
         quick=options.quick,
         seeds=options.seeds,
         estimation_seeds=options.estimation_seeds,
-        json=options.json,
         fresh=options.fresh,
     )
     with executor_of(options) as executor:
-        print(reproduce(replace(chosen, workers=executor), print_report))
+        text, numbers = reproduce(replace(chosen, workers=executor), print_report)
+    print_result(options, lambda: text, lambda: numbers)
     return 0

@@ -28,7 +28,6 @@ from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.parameters.yaml_files import file_errors, parameter_file, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.radio_robot import RadioRobotParameters
 from t3mpc_ros.radio.tool.calibration_wizard import (
     STEPS,
     USB_STEPS,
@@ -105,6 +104,8 @@ def _rounded(value: float) -> float:
 
 def read_parameter_file(path: Path) -> tuple[Calibration, dict[str, object]]:
     """Return the calibration and the link parameters of a file of :func:`calibration_file`."""
+    from t3mpc_ros.radio.radio_robot import RadioRobotParameters  # with the compiler
+
     with file_errors(path, ParameterError):
         content: Any = read_yaml(path)
     try:

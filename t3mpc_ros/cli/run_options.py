@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 ROBOTS = ('twin', 'servo', 'torque')
 FULL, NOMINAL = 'full', 'nominal'
+STANDARD_OUTPUT = Path('-')
 
 
 def add_setting(parser: argparse.ArgumentParser) -> None:
@@ -60,14 +61,26 @@ def add_setting(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_seeds(parser: argparse.ArgumentParser, default: str, of: str) -> None:
-    """Add the seeds ``A-B``; the help says what they are the seeds ``of``."""
+def add_seeds(
+    parser: argparse.ArgumentParser,
+    default: str,
+    of: str,
+    *,
+    name: str = '--seeds',
+    counted: bool = False,
+    text: str = '',
+) -> None:
+    """Add the seeds ``A-B``; the help says what they are the seeds ``of``.
+
+    ``counted``: their number was asked for once, so that one number alone is an error; ``text``
+    says in the help which ones are the default.
+    """
     parser.add_argument(
-        '--seeds',
-        type=seed_range,
-        default=seed_range(default),
+        name,
+        type=uncounted_seeds if counted else seed_range,
+        default=None if text else seed_range(default),
         metavar='A-B',
-        help=f'seeds of {of} (default {default})',
+        help=f'seeds of {of} (default {text or default})',
     )
 
 
@@ -99,31 +112,39 @@ def setting_of(options: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def add_outputs(
-    parser: argparse.ArgumentParser, *, json: str = 'also write the numbers to this file'
+def add_json(
+    parser: argparse.ArgumentParser, text: str = 'also write the numbers', **how: Any
 ) -> None:
+    """Add ``--json FILE|-``, see :func:`print_result`; the help says what is written."""
+    text += ' to FILE as JSON, or with - to the standard output in place of the text'
+    parser.add_argument('--json', type=Path, metavar='FILE|-', help=text, **how)
+
+
+def print_result(
+    options: argparse.Namespace, text: Callable[[], str], record: Callable[[], object]
+) -> None:
+    """Print a result as text, and write it to the file of ``--json``; ``-``: print only JSON."""
+    from t3mpc_ros.evaluation.reporting import strict_json
+
+    if options.json == STANDARD_OUTPUT:
+        print(strict_json(record()), end='')
+        return
+    print(text())
+    if options.json:
+        options.json.write_text(strict_json(record()), encoding='utf-8')
+
+
+def add_outputs(parser: argparse.ArgumentParser, json: str = 'also write the numbers') -> None:
     """Add the files for the numbers and for the page of a study."""
-    parser.add_argument('--json', type=Path, help=json)
+    add_json(parser, json)
     parser.add_argument('--html', type=Path, help='write one page to this file')
 
 
 def prepare_outputs(options: argparse.Namespace, *further: Path | None) -> None:
     """Make the folders of the files: one that cannot be made is an error before the runs."""
-    for path in (options.json, options.html, *further):
+    for path in (options.json, getattr(options, 'html', None), *further):
         if path:
             path.parent.mkdir(parents=True, exist_ok=True)
-
-
-def write_outputs(
-    options: argparse.Namespace, record: Callable[[], object], page: Callable[[], str]
-) -> None:
-    """Write the files of :func:`add_outputs` that are wanted."""
-    from t3mpc_ros.evaluation.reporting import strict_json
-
-    if options.json:
-        options.json.write_text(strict_json(record()), encoding='utf-8')
-    if options.html:
-        options.html.write_text(page(), encoding='utf-8')
 
 
 def add_topic_options(parser: argparse._ActionsContainer) -> None:
@@ -177,3 +198,13 @@ def seed_range(text: str) -> tuple[int, ...]:
             f'must be A-B with 0 <= A <= B and at most 10000 seeds: got {text}'
         )
     return tuple(range(low, high + 1))
+
+
+def uncounted_seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds of ``A-B``, where a number alone was their number in earlier versions."""
+    if text.isdecimal() and int(text):
+        raise argparse.ArgumentTypeError(
+            f'must be A-B, as in 1-{text}, or {text}-{text} for one; a number alone was how many '
+            f'in earlier versions: got {text}'
+        )
+    return seed_range(text)

@@ -19,10 +19,13 @@ from pathlib import Path
 from t3mpc_ros.cli.run_options import (
     FULL,
     NOMINAL,
+    add_json,
     add_seeds,
     add_setting,
     add_workers,
     executor_of,
+    prepare_outputs,
+    print_result,
     setting_of,
 )
 from t3mpc_ros.parameters.command_line import parsed_value
@@ -63,6 +66,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         '--output', type=Path, default=OUTPUT, help=f'Parquet file (default {OUTPUT})'
     )
     add_workers(parser)
+    add_json(parser, 'also write the rows')
     parser.set_defaults(run=run)
 
 
@@ -70,6 +74,7 @@ def run(options: argparse.Namespace) -> int:
     """Run the sweep, print its table and return 0."""
     from t3mpc_ros.evaluation.api.parameter_sweep import sweep
 
+    prepare_outputs(options)
     with executor_of(options) as executor:
         found = sweep(
             options.controllers,
@@ -81,8 +86,11 @@ def run(options: argparse.Namespace) -> int:
             executor=executor,
             progress=True,
         )
-    print(found.table())
-    print(f'{len(found.rows)} runs: {options.output}')
+    print_result(
+        options,
+        lambda: f'{found.table()}\n{len(found.rows)} runs: {options.output}',
+        lambda: found.rows,
+    )
     return 0
 
 

@@ -16,11 +16,11 @@
 import argparse
 from pathlib import Path
 
-from t3mpc_ros.parameters.command_line import bounded_int
+from t3mpc_ros.cli.run_options import add_seeds
 
 DRIVES = {'servo': 'velocity', 'torque': 'torque'}
 OUTPUT = Path('model.npz')
-SEEDS = 5
+SEEDS = '101-105'
 FOLDS = 5
 
 
@@ -37,12 +37,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.add_argument(
         '--robot', choices=DRIVES, default='servo', help='of the training runs (default servo)'
     )
-    parser.add_argument(
-        '--seeds',
-        type=bounded_int(1, 20),
-        default=SEEDS,
-        help=f'runs with and without the model after the training (default {SEEDS})',
-    )
+    add_seeds(parser, SEEDS, 'the runs with and without the model afterwards', counted=True)
     add_bag_options(parser)
     parser.set_defaults(run=run)
 

@@ -70,6 +70,16 @@ STATE_DEVIATIONS = (10.6, 2.22, 0.937, 22.2)
 _PLANT_SEEDS = 10_000  # seeds of the plant start here: no reference has one of them by accident
 
 
+def held_out(seeds: Sequence[int]) -> tuple[int, ...]:
+    """Return seeds that nothing was tuned or trained on; ValueError for others."""
+    if not seeds or not {*seeds} <= {*HELD_OUT_SEEDS}:
+        raise ValueError(
+            f'seeds must be of {HELD_OUT_SEEDS[0]}-{HELD_OUT_SEEDS[-1]}, on which nothing was '
+            f'tuned or trained: got {", ".join(map(str, seeds)) or "none"}'
+        )
+    return tuple(seeds)
+
+
 @dataclass(frozen=True, slots=True)
 class SampledReference:
     """A reference sampled once a control period, and on beyond the end of the run.

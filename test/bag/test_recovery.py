@@ -36,6 +36,7 @@ from rosbags.typesys import Stores, get_typestore
 from support.bag_files import metadata_of, topics_of
 from support.long_tests import few_of
 
+from t3mpc_ros.bag import recovery
 from t3mpc_ros.bag.mcap_file import MAGIC, read_mcap_file
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
@@ -52,7 +53,6 @@ from t3mpc_ros.bag.recovery import (
 )
 from t3mpc_ros.bag.schema import MessageDefinitions
 from t3mpc_ros.bag.writer import BagWriter
-from t3mpc_ros.cli import bag as bag_commands
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.bag import size_text
 
@@ -539,7 +539,7 @@ def test_recover_says_what_it_knows_of_the_loss(
         FileResult('run_1.mcap', 10, True, True, {'/a': TopicResult('/a', 'x/Y', 2)}),
     ]  # fmt: skip
     result = RecoveryResult(tmp_path / 'new', tuple(made))
-    monkeypatch.setattr(bag_commands, 'recover_bag', lambda *_: result)
+    monkeypatch.setattr(recovery, 'recover_bag', lambda *_: result)
     assert bag_main(['recover', str(tmp_path / 'x')]) == (0 if verdict == 'nothing is lost' else 3)
     printed = capsys.readouterr().out
     lines = [re.split(r'\s{2,}', line) for line in printed.splitlines()]

@@ -37,6 +37,7 @@ from t3mpc_ros.radio.tool.procedure import ProcedureError
 from t3mpc_ros.radio.tool.robot_settings import StoredSettings, settings_file
 
 RUN = 'radio.tool.procedure.run_script'
+EMULATOR, RECOVER = 'emulator.emulator.Emulator', 'bag.recovery.recover_bag'
 
 
 class Interruption:
@@ -74,7 +75,7 @@ def jogged(error=''):
 
 def recovered(ended, *damages):
     file = FileResult('x', 1, ended=ended, damages=list(damages))
-    return {'cli.bag.recover_bag': RecoveryResult(Path('new'), (file,))}
+    return {RECOVER: RecoveryResult(Path('new'), (file,))}
 
 
 def compared(same):
@@ -135,15 +136,15 @@ CASES = [
     ('robot jog left 1 --port p --yes', jogged('blocked'), 2, 'blocked'),
     ('robot doctor --port p --robot-port r --no-questions', checked(PASS, SKIPPED), 0, ''),
     ('robot doctor --port p --robot-port r --no-questions', checked(PASS, FAIL), 1, ''),
-    ('emulator --link l', {'cli.emulator.Emulator': FaultError('no such fault')}, 2, 'no such'),
+    ('emulator --link l', {EMULATOR: FaultError('no such fault')}, 2, 'no such'),
     ('emulator --link l --key none', {}, 2, 'none'),
     ('bag info none', {}, 1, 'none'),
     ('bag recover bag', recovered(True), 0, 'nothing is lost'),
     ('bag recover bag', recovered(True, DOUBLE), 0, 'nothing is lost with it'),
     ('bag recover bag', recovered(True, LOSS), 3, '2 messages lost'),
     ('bag recover bag', recovered(False), 3, ''),
-    ('bag recover bag', {'cli.bag.recover_bag': RecoveryOutputError('not empty')}, 2, 'not empty'),
-    ('bag recover bag', {'cli.bag.recover_bag': BagError('no message')}, 1, 'no message'),
+    ('bag recover bag', {RECOVER: RecoveryOutputError('not empty')}, 2, 'not empty'),
+    ('bag recover bag', {RECOVER: BagError('no message')}, 1, 'no message'),
     ('bag compare bag', compared(True), 0, ''),
     ('bag compare bag', compared(False), 3, ''),
     ('bag compare bag --abs -1', {}, 1, 'tolerance absolute must be from 0'),
@@ -182,6 +183,7 @@ CASES = [
     ('compare --robot servo --cases miscalibrated', {}, 1, 'case must be one of nominal, mass'),
     ('compare --robot servo --gyro', {}, 1, 'gyro is for the twin alone: got robot servo'),
     ('compare --gyro --reference x.csv', {}, 1, '--gyro is for the methods of the package'),
+    ('paper --seeds 1-3', {}, 1, 'seeds must be of 101-120'),
     ('patrol --paths nothing', {}, 1, 'path must be one of'),
     ('patrol --arena 1 1 2 2', {}, 1, 'arena must contain the start'),
     ('bag report bag --track 1', {}, 1, '--wheel-radius and --track must be given together'),
@@ -194,7 +196,8 @@ CASES = [
             'demo --loss 1': 'must be from 0 to below 1: got 1',
             'demo --robot mine': 'invalid choice',
             'estimation --gain x': "invalid number value: 'x'",
-            'paper --seeds 0': 'must be from 1 to 10000: got 0',
+            'paper --seeds 3': 'must be A-B, as in 1-3, or 3-3 for one',
+            'estimation --seeds 2-1': 'must be A-B with 0 <= A <= B',
             'tune --evaluations many': "invalid number value: 'many'",
             'compare --workers -1': 'must be from 1 to 10000: got -1',
             'compare --seeds 3-1': 'must be A-B with 0 <= A <= B',

@@ -48,7 +48,8 @@ UNSTATED = ('workers', 'steps')
 ELSEWHERE = {
     ('bag compare', 'abs'): [Tolerances().absolute, replay_comparison.ELSEWHERE],
     ('bag compare', 'rel'): [Tolerances().relative],
-    ('paper', 'seeds'): [len(chosen_extent(quick=True).seeds)],
+    ('paper', 'seeds'): [len(chosen_extent(quick=each).seeds) for each in (False, True)],
+    ('paper', 'estimation_seeds'): [20, 2],
     ('tune', 'evaluations'): [tune.EVALUATIONS, tune.TWIN_EVALUATIONS],
 }
 """Defaults that are numbers of the code behind a command, not of its parser."""

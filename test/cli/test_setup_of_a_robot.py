@@ -33,10 +33,9 @@ from support.missing_tools import AVR, needing
 from support.tool_bench import START_NS
 import yaml
 
-from t3mpc_ros.cli import emulator as emulator_cli
 from t3mpc_ros.cli import robot as cli
 from t3mpc_ros.cli import robot_calibrate
-from t3mpc_ros.emulator.emulator import Emulator
+from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.protocol.authentication import read_key
 from t3mpc_ros.radio.radio_robot import RadioRobotParameters
@@ -189,7 +188,7 @@ def walk(request, monkeypatch, capsys, tmp_path):
         if request.param == 'avr':
             emulator = stack.enter_context(on_avr(flat=ERRORS, erased=True)).emulator
         else:
-            parameters = emulator_cli.EmulatorParameters.from_dict(ERRORS)
+            parameters = EmulatorParameters.from_dict(ERRORS)
             emulator = Emulator(parameters, b'', 1, START_NS, erased=True)
         yield Walk(emulator, monkeypatch, capsys)
 

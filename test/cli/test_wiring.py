@@ -216,7 +216,7 @@ BAG = {
     'evaluation.bag_report.report_page.write_report': REPORT,
     'evaluation.bag_report.run_comparison.write_comparison': ('there', 'text'),
     'evaluation.bag_report.animation.animate_bag': Path('page.md'),
-    'cli.bag.recover_bag': lambda output, **_: RecoveryResult(output, ()),
+    'bag.recovery.recover_bag': lambda output, **_: RecoveryResult(output, ()),
 }
 VIEW = {
     'nodes.viewer.view_node': context(SimpleNamespace(spin=lambda stop: None, command=print)),
@@ -240,9 +240,9 @@ SEEN = {
 }
 BOARD = MagicMock()
 EMULATOR = {
-    'cli.emulator.Emulator': lambda **_: BOARD,
-    'cli.emulator.PtyPort': lambda **_: MagicMock(),
-    'cli.emulator.serve': None,
+    'emulator.emulator.Emulator': lambda **_: BOARD,
+    'emulator.pty_port.PtyPort': lambda **_: MagicMock(),
+    'emulator.pty_port.serve': None,
 }
 STORED = StoredSettings(frames.SETTINGS_GOOD, RobotSettings())
 
@@ -294,7 +294,7 @@ TABLE = {
     'estimation': (
         {'evaluation.open_loop_estimation.compare': ResultTable([])},
         {
-            '--seeds 7': {'compare.seeds': 7},
+            '--seeds 6-7': {'compare.seeds': (6, 7)},
             '--duration 9': {'compare.duration': 9.0},
             '--gain 3': {'compare.normalised_gain': 3.0},
             '--json new.json': {'files': 'new.json'},
@@ -302,20 +302,23 @@ TABLE = {
     ),
     'exponents': (
         {'evaluation.lyapunov_exponents.lyapunov_exponents': (2.0, 1.0, -1.5)},
-        {'--duration 9': {'lyapunov_exponents.duration': 9.0}},
+        {
+            '--duration 9': {'lyapunov_exponents.duration': 9.0},
+            '--json new.json': {'files': 'new.json'},
+        },
     ),
     'paper': (
-        {PAPER: '', 'evaluation.methods.require_libraries': None, **SHARED},
+        {PAPER: ('', {}), 'evaluation.methods.require_libraries': None, **SHARED},
         {
             '': {'reproduce.options.output': 'runs/paper', 'reproduce.options.seeds': None},
             '--quick': {
                 'reproduce.options.quick': True,
                 'reproduce.options.output': 'runs/paper-quick',
             },
-            '--seeds 4': {'reproduce.options.seeds': 4},
-            '--estimation-seeds 6': {'reproduce.options.estimation_seeds': 6},
+            '--seeds 104-105': {'reproduce.options.seeds': (104, 105)},
+            '--estimation-seeds 5-6': {'reproduce.options.estimation_seeds': (5, 6)},
             '--output new': {'reproduce.options.output': 'new'},
-            '--json new.json': {'reproduce.options.json': 'new.json'},
+            '--json new.json': {'files': 'new.json'},
             '--fresh': {'reproduce.options.fresh': True},
             **workers('reproduce.options.workers'),
         },
@@ -367,6 +370,7 @@ TABLE = {
             '--seeds 3-4': {'sweep.seeds': (3, 4)},
             '--cases disturbance': {'sweep.cases': ('disturbance',)},
             '--output new.parquet': {'sweep.output': 'new.parquet'},
+            '--json new.json': {'files': 'new.json'},
             **workers('sweep.executor'),
         },
     ),
@@ -444,7 +448,7 @@ TABLE = {
         TRAIN,
         {
             '--robot torque': {'fit_simulated_runs.drive': 'torque'},
-            '--seeds 2': {'assess.seeds': 2},
+            '--seeds 104-105': {'assess.seeds': (104, 105)},
             '--output new.npz': {'save_model.path': 'new.npz'},
         },
     ),

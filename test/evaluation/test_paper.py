@@ -138,9 +138,9 @@ def test_the_quick_study_is_part_of_the_full_one_and_shorter():
             assert (FULL, drive, 0.04, case, 101) in found
 
 
-@pytest.mark.parametrize('seeds', [0, 21])
+@pytest.mark.parametrize('seeds', [(9,), (120, 121)])
 def test_seeds_that_are_not_held_out_cannot_be_asked_for(seeds):
-    with pytest.raises(ValueError, match='seeds must be from 1 to 20'):
+    with pytest.raises(ValueError, match='seeds must be of 101-120'):
         chosen_extent(seeds=seeds)
 
 
@@ -403,7 +403,7 @@ def test_few_seeds_decide_only_what_their_interval_does(full, word):
 def test_one_seed_leaves_every_claim_inconclusive():
     """All situations with one seed: nothing is held, nothing is not held."""
     generator = np.random.default_rng(7)
-    runs = study_runs(chosen_extent(quick=True, seeds=1))
+    runs = study_runs(chosen_extent(quick=True, seeds=(101,)))
     table = ResultTable(
         [run.fields | dict(zip(NUMBERS, generator.uniform(0.01, 1.0, 4), strict=True))
          for run in runs]
@@ -497,7 +497,7 @@ def begun():
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory, begun):
     output = tmp_path_factory.mktemp('paper')
-    options = PaperOptions(output, quick=True, seeds=2, estimation_seeds=1, json=output / 'copy')
+    options = PaperOptions(output, quick=True, seeds=(101, 102), estimation_seeds=(1,))
     reproduce(options)
     return output
 
@@ -523,7 +523,11 @@ def test_the_json_has_what_is_promised(folder):
     assert {row['kind'] for row in content['estimation']} >= {'type1', 'type3'}
     assert all(claim['held'] in (True, False, None) for claim in content['claims'])
     assert content['parameters']['seeds'] == [101, 102]
-    assert (folder / 'copy').read_text() == (folder / 'results.json').read_text()
+    with (folder / 'runs.csv').open() as file:
+        runs = list(csv.DictReader(file))
+    assert len(runs) == len((folder / RUNS).read_text().splitlines())
+    assert {row['seed'] for row in runs} == {'101', '102'}
+    assert all(row['commit'] and row['machine'] and float(row['overall']) > 0.0 for row in runs)
 
 
 def test_the_csv_equals_the_json(folder):
@@ -606,7 +610,7 @@ def test_nothing_depends_on_the_order_of_the_runs_or_on_a_resume(
     (tmp_path / RUNS).write_text(''.join(lines[::-3]) + lines[1][:-9])
     begun.clear()
     with ThreadPoolExecutor(3) as executor:
-        options = PaperOptions(tmp_path, True, 2, 1, executor)
+        options = PaperOptions(tmp_path, True, (101, 102), (1,), executor)
         reproduce(options)
     assert len(begun) < len(lines)
     for name in ('results.json', 'results.csv', 'tables.md'):
@@ -619,5 +623,6 @@ def test_a_fresh_start_runs_everything_again(folder, begun, tmp_path, monkeypatc
     monkeypatch.setattr(open_loop_estimation, 'compare', lambda **_: ResultTable([]))
     (tmp_path / RUNS).write_text(text := (folder / RUNS).read_text())
     begun.clear()
-    reproduce(PaperOptions(tmp_path, quick=True, seeds=2, estimation_seeds=1, fresh=True))
+    options = {'quick': True, 'seeds': (101, 102), 'estimation_seeds': (1,), 'fresh': True}
+    reproduce(PaperOptions(tmp_path, **options))
     assert len(begun) >= len(text.splitlines())  # and those of the figures

@@ -33,6 +33,7 @@ from t3mpc_ros.evaluation.paper.study import (
 )
 from t3mpc_ros.evaluation.plotting import write_pictures
 from t3mpc_ros.evaluation.reporting import strict_json, write_columns
+from t3mpc_ros.parameters.provenance import machine, provenance
 from t3mpc_ros.version import VERSION
 
 RUNS = 'runs.jsonl'
@@ -45,22 +46,23 @@ class PaperOptions:
 
     output: Path
     quick: bool = False
-    seeds: int | None = None
+    seeds: tuple[int, ...] | None = None
     """Held-out seeds of each experiment; None for all, or three when quick."""
-    estimation_seeds: int | None = None
+    estimation_seeds: tuple[int, ...] | None = None
     """The same of the comparison (86)."""
     workers: int | Executor = 1
     """As for :class:`WorkerPool`."""
-    json: Path | None = None
-    """Path of a second copy of the results."""
     fresh: bool = False
     """Whether runs that are there already are thrown away."""
 
 
-def reproduce(options: PaperOptions, report: Report | None = None) -> str:
-    """Return a summary in a few lines, after writing everything into the output folder.
+def reproduce(
+    options: PaperOptions, report: Report | None = None
+) -> tuple[str, dict[str, object]]:
+    """Return a summary in a few lines and the numbers; write everything into the output folder.
 
-    ``results.json``, ``results.csv``, ``tables.md``, ``paper.html`` and ``figures/*.png``. None
+    ``results.json``, ``results.csv`` (means), ``runs.csv`` (a row for each run), ``tables.md``,
+    ``paper.html`` and ``figures/*.png``. None
     of them depends on how many processes worked, or on which runs were there already. ``report``
     receives a line for each step; with None there is no progress line either.
     """
@@ -71,10 +73,10 @@ def reproduce(options: PaperOptions, report: Report | None = None) -> str:
     write('  runs for the figures')
     showcase = simulate_figure_runs(extent, results, workers)
     write('  estimation without a controller (86)')
-    count = options.estimation_seeds or (2 if options.quick else 20)
+    seeds = options.estimation_seeds or tuple(range(1, 3 if options.quick else 21))
     variances = (0.0, 0.04) if options.quick else open_loop_estimation.VARIANCES
     estimated = open_loop_estimation.compare(
-        seeds=count, duration=extent.duration, variances=variances
+        seeds=seeds, duration=extent.duration, variances=variances
     )
     write('  figures and page')
     claims = (*all_claims(results.runs, estimated), *showcase.claims())
@@ -82,7 +84,7 @@ def reproduce(options: PaperOptions, report: Report | None = None) -> str:
     material = ExhibitData(results, showcase, claims, tables)
     compared = [row for row in results.means if EXACT_MODEL not in row['controller']]
     exact = [row for row in results.means if EXACT_MODEL in row['controller']]
-    content = {
+    content: dict[str, object] = {
         'version': VERSION,
         'parameters': {
             'quick': options.quick,
@@ -90,7 +92,7 @@ def reproduce(options: PaperOptions, report: Report | None = None) -> str:
             'duration': extent.duration,
             'noises': list(extent.noises),
             'cases': list(extent.cases),
-            'estimation_seeds': count,
+            'estimation_seeds': len(seeds),
             'estimation_noises': list(variances),
             'methods': {
                 drive: {name: asdict(each.parameters) for name, each in methods(drive).items()}
@@ -105,10 +107,10 @@ def reproduce(options: PaperOptions, report: Report | None = None) -> str:
         'estimation': open_loop_estimation.records(estimated),
         'claims': [claim.record() for claim in claims],
     }
-    for path in (output / 'results.json', options.json):
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(strict_json(content), encoding='utf-8')
+    output.mkdir(parents=True, exist_ok=True)
+    (output / 'results.json').write_text(strict_json(content), encoding='utf-8')
+    origin = provenance() | machine()
+    write_columns(output / 'runs.csv', csv_columns([row | origin for row in results.runs]))
     write_columns(output / 'results.csv', csv_columns([*compared, *exact]))
     (output / 'tables.md').write_text(markdown(tables, claims), encoding='utf-8')
     drawn = write_pictures(
@@ -117,7 +119,7 @@ def reproduce(options: PaperOptions, report: Report | None = None) -> str:
     title = "The paper's figures and tables, reproduced"
     html = page(title, _origin(extent, options), material, drawn)
     (output / 'paper.html').write_text(html, encoding='utf-8')
-    return f'claims: {counted(claims)}\n{output / "paper.html"}'
+    return f'claims: {counted(claims)}\n{output / "paper.html"}', content
 
 
 def run_study(extent: Extent, options: PaperOptions, report: Report | None) -> ResultTable:

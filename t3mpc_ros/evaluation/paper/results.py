@@ -120,7 +120,8 @@ def label(row: Row) -> str:
 
 def csv_columns(rows: Sequence[Row]) -> dict[str, list[object]]:
     """Return the columns of the CSV file, by the keys of the JSON; empty if not finite."""
-    return {name: [_csv_cell(row[name]) for row in rows] for name in rows[0]}
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: [_csv_cell(row.get(name)) for row in rows] for name in names}
 
 
 def _csv_cell(value: object) -> object:

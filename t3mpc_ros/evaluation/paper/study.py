@@ -13,7 +13,7 @@
 # limitations under the License.
 """The paper's study: its runs, and what is measured of each."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
 
@@ -27,7 +27,7 @@ from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import STAGES as METHOD_STAGES
 from t3mpc_ros.evaluation.methods import methods
 from t3mpc_ros.evaluation.record import Record
-from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, KINDS, PLANT_OF, Scenario
+from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, KINDS, PLANT_OF, Scenario, held_out
 from t3mpc_ros.evaluation.workers import Job
 
 DRIVES = ('torque', 'velocity')
@@ -90,16 +90,13 @@ class Extent:
             raise ValueError(f'duration must be at least 5 s, 3 do not count: got {self.duration}')
 
 
-def chosen_extent(*, quick: bool = False, seeds: int | None = None) -> Extent:
+def chosen_extent(*, quick: bool = False, seeds: Sequence[int] | None = None) -> Extent:
     """Return how much is run: everything, or with ``quick`` enough to see that all works."""
-    count = (3 if quick else len(HELD_OUT_SEEDS)) if seeds is None else seeds
-    if not 1 <= count <= len(HELD_OUT_SEEDS):
-        raise ValueError(f'seeds must be from 1 to {len(HELD_OUT_SEEDS)}: got {count}')
-    held_out = HELD_OUT_SEEDS[:count]
+    chosen = held_out(seeds or (HELD_OUT_SEEDS[:3] if quick else HELD_OUT_SEEDS))
     if not quick:
-        return Extent(held_out)
+        return Extent(chosen)
     cases = (NOMINAL, 'mass +30 %', 'friction x3', 'disturbance', DEAD_TIME)
-    return Extent(held_out, 26.0, cases, (0.0, PAPER_NOISE), (PAPER_NOISE,), ())
+    return Extent(chosen, 26.0, cases, (0.0, PAPER_NOISE), (PAPER_NOISE,), ())
 
 
 def study_runs(extent: Extent) -> list[Run]:

@@ -13,7 +13,7 @@
 # limitations under the License.
 """Model fitted to simulated runs, assessed on held-out seeds."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -28,12 +28,12 @@ from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedPar
 from t3mpc_ros.evaluation.record import RATE, Record
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import (
-    HELD_OUT_SEEDS,
     PLANT_OF,
     PRETRAINING_DURATION,
     PRETRAINING_NOISE,
     PRETRAINING_SEEDS,
     Scenario,
+    held_out,
 )
 from t3mpc_ros.evaluation.training.fit import periods, skills, stretches
 from t3mpc_ros.evaluation.training.recorded_runs import MIDDLE, NEXT_STEP, pair
@@ -65,8 +65,8 @@ def origin(drive: str) -> Mapping[str, object]:
     }
 
 
-def assess(drive: str, seeds: int, *, progress: bool = False) -> str:
-    """Return a report on the model: runs on the first held-out seeds with it and without."""
+def assess(drive: str, seeds: Sequence[int], *, progress: bool = False) -> str:
+    """Return a report on the model: runs on held-out seeds with it and without."""
     _, parameters = fit_simulated_runs(drive)
     specs = {
         name: MethodSpec(FULL, ProposedController, parameters, pretrained=name == WITH)
@@ -74,7 +74,7 @@ def assess(drive: str, seeds: int, *, progress: bool = False) -> str:
     }
     scenarios = [
         Scenario(PLANT_OF[drive], NOMINAL, seed, PRETRAINING_DURATION, PRETRAINING_NOISE)
-        for seed in HELD_OUT_SEEDS[:seeds]
+        for seed in held_out(seeds)
     ]
     table = run_experiment(
         [
@@ -92,7 +92,7 @@ def assess(drive: str, seeds: int, *, progress: bool = False) -> str:
         rows.append([name, *(f'{mean(each):.4f} ± {interval(each):.4f}' for each in numbers)])
     gains = [table.difference(phase, {'model': WITH}, {'model': WITHOUT}) for phase in phases]
     rows.append(['difference', *(f'{each.mean:+.4f} ± {each.half:.4f}' for each in gains if each)])
-    what = f'RMSE (rad/s), seeds {HELD_OUT_SEEDS[0]} to {HELD_OUT_SEEDS[seeds - 1]}, mean ± 95 %'
+    what = f'RMSE (rad/s), seeds {seeds[0]} to {seeds[-1]}, mean ± 95 %'
     return '\n\n'.join(
         [
             f'Trained on runs of {PRETRAINING_DURATION:g} s with seeds '
