@@ -1,0 +1,201 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Numbers of the pages are those of the files that commands have written, and of today's code."""
+
+import csv
+from functools import cache
+import random
+import re
+
+import pytest
+from support.checkout import ROOT
+
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
+from t3mpc_ros.evaluation.experiment import measured_run
+from t3mpc_ros.evaluation.methods import methods_for
+from t3mpc_ros.evaluation.scenario import Scenario
+
+RESULTS = (ROOT / 'docs' / 'results.md').read_text()
+README = (ROOT / 'README.md').read_text()
+FULL = 'full'
+YAW = '†'
+"""Mark of the cases whose number is that of the yaw rate."""
+
+
+@cache
+def _runs():
+    with (ROOT / 'docs' / 'results_runs.csv').open() as file:
+        return list(csv.DictReader(file))
+
+
+@cache
+def _values(robot, case, controller, metric):
+    """Return a metric of the runs of the file, in the order of their seeds."""
+    found = {
+        int(row['seed']): float(row[metric])
+        for row in _runs()
+        if (row['robot'], row['case'], row['controller']) == (robot, case, controller)
+    }
+    assert len(found) == 6, (robot, case, controller)
+    return [found[seed] for seed in sorted(found)]
+
+
+def _table(text, head):
+    """Return the rows of the table that begins with some columns, its marks left out."""
+    (rows,) = re.findall(rf'^\| {re.escape(head)}.*\n\|[-|]+\n((?:\|.*\n)+)', text, re.M)
+    lines = [line.strip('|').split('|') for line in rows.splitlines()]
+    return [[cell.strip(' *¹²') for cell in line] for line in lines]
+
+
+def _close(shown, value):
+    """Return whether a printed number is a value, rounded to its digits."""
+    digits = len(shown.partition('.')[2])
+    return abs(float(shown) - value) <= 0.5 * 10.0**-digits + 1e-9
+
+
+def test_the_table_of_the_stepper_robot_is_that_of_its_runs():
+    others = (
+        *('feed-forward', 'feed-forward + shaper', 'feed-forward + shaper + dead time'),
+        'LMS body correction',
+    )
+    rows = _table(RESULTS, 'case | **full** | feed-forward | + shaper | + dead time')
+    assert len(rows) == 23
+    for name, *cells, ratio in rows:
+        case = name.strip(f' {YAW}')
+        metric = 'yaw_rate_settled' if YAW in name else 'settled'
+        means = []
+        for controller, cell in zip((FULL, *others), cells, strict=True):
+            values = _values('twin', case, controller, metric)
+            shown, half = cell.split(' ± ')
+            assert _close(shown, mean(values)), (name, controller)
+            assert _close(half, interval(values)), (name, controller)
+            means.append(mean(values))
+        assert _close(ratio, means[0] / min(means[1:])), name
+
+
+def test_the_table_with_equal_means_is_that_of_its_runs():
+    columns = [
+        *(('torque', 'nominal', metric) for metric in ('overall', 'settled', 'variation')),
+        *(('torque', case, 'overall') for case in ('friction x3', 'mass +30 %')),
+        *(('servo', 'nominal', metric) for metric in ('overall', 'settled')),
+        *(('servo', case, 'overall') for case in ('friction x3', 'unknown dead time')),
+    ]
+    rows = _table(RESULTS, 'method | torque drive | settled | variation')
+    assert len(rows) == 11
+    for name, *cells in rows:
+        for (robot, case, metric), cell in zip(columns, cells, strict=True):
+            if cell != '–':
+                assert _close(cell, mean(_values(robot, case, name, metric))), (name, case)
+
+
+def test_the_table_of_the_papers_plant_is_that_of_its_command():
+    tables = (ROOT / 'docs' / 'results_tables.md').read_text()
+    known = {}
+    for drive in ('velocity', 'torque'):
+        part = tables.partition(f'**RMSE (rad/s), {drive} drive, nominal robot**')[2]
+        rows = part.partition('\n\n**')[0].splitlines()
+        for cells in (line.strip('| ').split(' | ') for line in rows if line.startswith('|')):
+            known[cells[0].strip('*').replace(' (preview)', ''), drive] = cells[1:]
+    rows = _table(RESULTS, '| velocity drive, no noise')
+    assert len(rows) == 12
+    for name, *cells in rows:
+        plain = name.partition('**')[0]
+        for drive, shown in (('velocity', cells[:3]), ('torque', cells[3:])):
+            none, _, some, _, growth = known[plain, drive]
+            assert [none, some] == shown[:2], name
+            assert growth.split()[0] == f'{float(shown[2]):+.3f}', name
+
+
+def _mean(robot, case, controller, metric='overall'):
+    return mean(_values(robot, case, controller, metric))
+
+
+def _worst_and_best_correction():
+    """Return the errors of the yaw rate with the filter over those without, in wrong bodies."""
+    cases = 'radii and track', 'track +6 %', 'right radius +5 %'
+    return [
+        _mean('twin', case, FULL, 'yaw_rate_settled')
+        / _mean('twin', case, 'feed-forward + shaper + dead time', 'yaw_rate_settled')
+        for case in cases
+    ]
+
+
+def test_the_numbers_of_the_readme_are_those_of_the_runs():
+    computed, ramp = (
+        _mean('torque', 'nominal', 'computed torque + ramp'),
+        _mean('torque', 'nominal', FULL),
+    )
+    assert f'({computed:.3f} against {ramp:.3f}*)' in README
+    worse = _mean('torque', 'friction x3', 'computed torque + ramp') / _mean(
+        'torque', 'friction x3', FULL
+    )
+    assert f'has {worse:.1f} times our error with three times the friction' in README
+    settled = [
+        _mean('twin', 'nominal', name, 'settled')
+        for name in (FULL, 'feed-forward + shaper + dead time', 'feed-forward')
+    ]
+    text = ' '.join(README.split())
+    assert (
+        '({:.4f} and {:.4f} rad/s between switches, plain feed-forward {:.4f})'.format(*settled)
+        in text
+    )
+    shares = _worst_and_best_correction()
+    assert f'to {min(shares):.2f} to {max(shares):.2f} of the error without it' in text
+    rows = {row[0]: row[1:] for row in _table(RESULTS, '| velocity drive, no noise')}
+    full = next(cells for name, cells in rows.items() if name.startswith('full'))
+    assert f'RMSE {full[1].split()[0]} rad/s' in README
+    assert f'Torque drive: {full[4].split()[0]} rad/s' in README
+    assert f'CasADi NMPC {rows["CasADi NMPC"][4].split()[0]}' in README
+    assert f'linear MPC preview {rows["linear MPC preview"][4].split()[0]}' in README
+    assert f'without preview has {rows["computed torque"][1].split()[0]}' in README
+
+
+def test_the_sentences_of_the_results_are_those_of_the_runs():
+    text = ' '.join(RESULTS.split())
+    names = FULL, 'computed torque + ramp'
+    values = [_values('torque', 'nominal', name, 'overall') for name in names]
+    found = paired(values[1], values[0])
+    assert f'({found.mean:.4f} ± {found.half:.4f})'.replace('-', '−') in text
+    ratios = [
+        _mean(robot, case, names[1]) / _mean(robot, case, FULL)
+        for robot, case in (
+            ('torque', 'friction x3'), ('servo', 'friction x3'), ('torque', 'mass +30 %'),
+        )
+    ]  # fmt: skip
+    shown = 'it has {:.1f} times our error ({:.1f} times with the velocity drive), with 30 % more '
+    assert f'{shown}mass {{:.2f}} times'.format(*ratios) in text
+    shares = _worst_and_best_correction()
+    assert f'leaves {min(shares):.2f} to {max(shares):.2f} of the error' in text
+    drift = [
+        _mean('twin', 'right radius +5 %', name, 'drift') for name in ('LMS body correction', FULL)
+    ]
+    assert 'the yaw drifts by {:.3f} rad in 60 s, with full by {:.3f}'.format(*drift) in text
+
+
+@pytest.mark.long
+def test_runs_of_the_file_made_anew_have_its_digits():
+    """Eight of them, drawn; the file is as long as an hour of runs."""
+    chosen = random.Random(33).sample(_runs(), 8)
+    for row in chosen:
+        scenario = Scenario(
+            row['robot'],
+            row['case'],
+            int(row['seed']),
+            float(row['duration']),
+            float(row['noise']),
+        )
+        numbers = measured_run((scenario, methods_for(scenario.robot)[row['controller']]))
+        for name, value in numbers.items():
+            if row.get(name):
+                assert float(f'{value:.7g}') == pytest.approx(float(row[name]), rel=2e-6), row
