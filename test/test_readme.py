@@ -163,6 +163,8 @@ TOOLS = {
     '.venv/bin/python',
 }
 """Programs that are not parts of the package; of their arguments, files of the package exist."""
+OTHERS = 'scripts/check', 'scripts/docs', 'scripts/tag', 'make'
+"""Programs that are not parsed here; make has a test of its own."""
 PARSERS = {
     'bag': bag.program_parser,
     'robot': robot.program_parser,
@@ -252,7 +254,7 @@ def _check(command, capsys, complete=True):
             _check_node(name, arguments)
     elif words[0] == 't3mpc':
         _parse(words[1:], capsys, complete)
-    elif words[0] not in ('scripts/check', 'scripts/docs', 'scripts/tag', 'make'):  # make: a test of its own
+    elif words[0] not in OTHERS:
         assert words[0] in TOOLS, command
         assert all(
             (ROOT / word).exists()

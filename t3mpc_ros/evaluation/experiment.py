@@ -23,7 +23,6 @@ from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 import hashlib
-import inspect
 import os
 from pathlib import Path
 import pickle
@@ -32,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.evaluation.code_content import code_content
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.metrics import Numbers, measure
@@ -202,7 +202,8 @@ def print_report(line: str) -> None:
 def digest(*parts: Any) -> str:
     """Return a digest of version, sources of this package, and the content of ``parts``.
 
-    Functions and classes of a script count with their source, files with their content.
+    Functions and classes of a script count with their source and with what they use, files with
+    their content.
     """
     content = VERSION, source_digest(), [content_of(part) for part in parts]
     return hashlib.sha256(repr(content).encode()).hexdigest()[:16]
@@ -247,7 +248,9 @@ def content_of(value: Any) -> object:
         return [content_of(item) for item in value]
     if is_dataclass(value) and not isinstance(value, type):
         items = [content_of(getattr(value, item.name)) for item in fields(value)]
-        return _source(type(value)), items
+        used = getattr(value, 'resolve', None)  # of a file: what it uses of other files
+        code = [] if used is None else _code(used())
+        return _code(type(value)), items, code
     return _code(value)
 
 
@@ -268,18 +271,9 @@ def _file_digest(value: str | os.PathLike[str]) -> str:
 def _code(value: Any) -> object:
     """Return the source of a function or class, or of the class of an object and its state."""
     if hasattr(value, '__qualname__'):
-        return _source(value)
-    kind: Any = type(value)
+        return code_content(value, content_of)
+    code = code_content(type(value), content_of)
     try:
-        return *_source(kind), hashlib.sha256(pickle.dumps(value)).hexdigest()
+        return *code, hashlib.sha256(pickle.dumps(value)).hexdigest()
     except (pickle.PicklingError, AttributeError, TypeError):
-        return _source(kind)
-
-
-@cache  # reading takes milliseconds, and an experiment has thousands of runs
-def _source(code: Any) -> tuple[str, str]:
-    """Return name and source of a function or class."""
-    try:
-        return code.__qualname__, inspect.getsource(code)
-    except (OSError, TypeError):  # made in an interactive session: its name is all that is known
-        return code.__qualname__, ''
+        return code

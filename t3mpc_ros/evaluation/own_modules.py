@@ -19,6 +19,7 @@ folder. They get the text of the module with the job, and of another text at the
 """
 
 from concurrent.futures import Executor, Future
+from contextlib import suppress
 from importlib.abc import InspectLoader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_loader
@@ -43,21 +44,40 @@ class SourceText(NamedTuple):
 
 
 Sources = dict[str, SourceText]
+INSTALLED = {
+    *(Path(sysconfig.get_path(name)) for name in ('stdlib', 'purelib', 'platlib')),
+    *(Path(sys.base_prefix), Path(sys.prefix), PACKAGE_DIRECTORY),
+}
+"""Folders of Python, of libraries and of this package."""
+
+
+def is_own(name: str) -> bool:
+    """Return whether neither Python, a library nor this package installs a module."""
+    if name in ('__main__', '__mp_main__'):
+        return True
+    spec = getattr(sys.modules.get(name), '__spec__', None)
+    file = getattr(sys.modules.get(name), '__file__', None) or getattr(spec, 'origin', None)
+    if file is None or not file.endswith('.py'):
+        return False
+    return INSTALLED.isdisjoint(Path(file).resolve().parents)
+
+
+def own_text(module: ModuleType) -> str:
+    """Return the text of a module of one's own that has a file, else an empty one."""
+    file = getattr(module, '__file__', None)
+    if not file or module.__name__ in ('__main__', '__mp_main__'):
+        return ''
+    with suppress(OSError):
+        return Path(file).read_text(encoding='utf-8')
+    return ''
 
 
 def own_sources() -> Sources:
-    """Return the loaded modules that neither Python, a library nor this package installs."""
-    installed = {Path(sysconfig.get_path(name)) for name in ('stdlib', 'purelib', 'platlib')}
-    installed |= {Path(sys.base_prefix), Path(sys.prefix), PACKAGE_DIRECTORY}
+    """Return the loaded modules of one's own that have a file, by their names."""
     found: Sources = {}
     for name, module in list(sys.modules.items()):
-        file = getattr(module, '__file__', None)
-        if name in ('__main__', '__mp_main__') or not (file and file.endswith('.py')):
-            continue
-        path = Path(file).resolve()
-        if installed.isdisjoint(path.parents) and path.is_file():
-            package = hasattr(module, '__path__')
-            found[name] = SourceText(file, path.read_text(encoding='utf-8'), package)
+        if getattr(module, '__file__', None) and is_own(name) and (text := own_text(module)):
+            found[name] = SourceText(str(module.__file__), text, hasattr(module, '__path__'))
     for name in list(found):  # folders without __init__.py
         parts = name.split('.')[:-1]
         for count in range(1, len(parts) + 1):

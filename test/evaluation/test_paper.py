@@ -527,7 +527,7 @@ def test_the_json_has_what_is_promised(folder):
         runs = list(csv.DictReader(file))
     assert len(runs) == len((folder / RUNS).read_text().splitlines())
     assert {row['seed'] for row in runs} == {'101', '102'}
-    assert all(row['commit'] and row['machine'] and float(row['overall']) > 0.0 for row in runs)
+    assert all(row['commit'] and row['machine'] and float(row['rmse']) > 0.0 for row in runs)
 
 
 def test_the_csv_equals_the_json(folder):
