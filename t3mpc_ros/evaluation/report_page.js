@@ -142,6 +142,14 @@ async function start() {
   place('tools').hidden = charts.charts.length === 0;
   new ResizeObserver(() => drawPlanes(null)).observe(document.querySelector('main'));
   theme.addEventListener('change', () => drawPlanes(null));
+  // Paper is white, whatever the scheme of the screen.
+  for (const kind of ['beforeprint', 'afterprint']) {
+    addEventListener(kind, () => {
+      document.documentElement.classList.toggle('printed', kind === 'beforeprint');
+      charts.rebuild();
+      drawPlanes(null);
+    });
+  }
 }
 
 start();

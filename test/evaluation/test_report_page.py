@@ -14,6 +14,7 @@
 """The page of a report in a headless browser, as a person uses it."""
 
 import csv
+from functools import partial
 import math
 import re
 
@@ -180,3 +181,31 @@ def test_a_comparison_is_drawn(browser, tmp_path):
     }
     browser.show_as(360, 800)
     assert browser.errors() == []
+
+
+def test_a_report_is_printed_on_a4(report, browser):
+    """Charts were cut off at the edge, and those of a dark screen pale."""
+    opened(browser, report)
+    browser.show_as(1440, 1000, 'dark')
+    ink = "return [colour('ink'), charts.charts[0].uplot.axes[0].stroke()]"
+    dark = browser.run(ink)
+    browser.run("dispatchEvent(new Event('beforeprint'))")
+    light = browser.run(ink)
+    assert light[0] == light[1] != dark[0]
+    features = [{'name': 'prefers-color-scheme', 'value': 'dark'}]
+    set_media = partial(browser.driver.execute_cdp_cmd, 'Emulation.setEmulatedMedia')
+    try:
+        set_media({'media': 'print', 'features': features})
+        within = round((210 - 2 * 14) / 25.4 * 96)
+        metrics = {'width': within, 'height': 1000, 'deviceScaleFactor': 1, 'mobile': False}
+        browser.driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', metrics)
+        wide = browser.run(
+            'return Array.from(document.querySelectorAll("main *")).filter((each) =>'
+            ' each.getBoundingClientRect().right > innerWidth + 1).map((each) => each.tagName)'
+        )
+        assert wide == []
+        assert browser.run('return document.documentElement.scrollWidth') <= within
+    finally:
+        set_media({'media': '', 'features': features})
+    browser.run("dispatchEvent(new Event('afterprint'))")
+    assert browser.run(ink) == dark
