@@ -137,11 +137,15 @@ def chaos(
         orders = numbers('alpha', alpha, '() or (4,)')
         if orders.shape not in ((), (1,), (4,)):
             raise ScriptError(f'alpha must be one order or four: got {orders.tolist()}')
+        if not (np.all(orders > 0.0) and np.all(orders <= 1.0)):
+            raise ScriptError(f'alpha must be above 0 and at most 1: got {alpha!r}')
         chosen = hyperchaotic_system(orders=tuple(np.broadcast_to(orders, 4).tolist()))
         start = np.array(ReferenceParameters().initial)
     else:
         chosen, start = system, np.ones(system.size)
     initial = start if y0 is None else numbers('y0', y0, f'({chosen.size},)')
+    if initial.shape != (chosen.size,):
+        raise ScriptError(f'y0 must have the shape ({chosen.size},): got {initial.shape}')
     step = dt or _step_of(chosen, initial, end - begin, rtol)
     rows = every or max(1, round(ROW / step))
     states = _solve(chosen, initial, step, rows, end - begin)

@@ -156,11 +156,13 @@ def fuzzy(
     centres
         Centre of the first and of the last set.
     spread
-        Width of the sets over the distance of their centres.
+        Width σ of the sets over the distance of their centres; the grade at x of a set with
+        centre o is exp(-((x - o)/σ)²), so σ is √2 times a standard deviation.
     slices
         Slices of type-3 sets.
     input_fuzziness
-        Width of the Gaussian that stands for an uncertain input; 0: the input is a number.
+        Width of the Gaussian that stands for an uncertain input, √2 times its standard deviation;
+        0: the input is a number.
 
     Raises
     ------

@@ -173,7 +173,9 @@ WRONG = {
     ),
     'executor': (lambda: t3.compare('full', seeds=[1], executor='x'), 'executor must be None'),
     'missing bag': (lambda: t3.read_bag('no_bag'), 'there is no bag no_bag'),
-    'order of the derivatives': (lambda: t3.chaos(1.2), 'orders must be above 0 and at most 1'),
+    'order of the derivatives': (lambda: t3.chaos(1.2), 'alpha must be above 0 and at most 1'),
+    'orders of the derivatives': (lambda: t3.chaos([1, 1, 0, 1]), 'alpha must be above 0'),
+    'shape of the state': (lambda: t3.chaos(y0=[1, 2]), r'y0 must have the shape \(4,\)'),
     'fuzzy input': (
         lambda: t3.fuzzy('x').evaluate({'y': 1.0}),
         'inputs must be x: got y',
