@@ -14,11 +14,14 @@
 """Decorator for compiled functions, and the folder that holds the compiled code."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import update_wrapper
 import hashlib
 from importlib import import_module
 import os
 from pathlib import Path
+import re
+import shutil
 import tempfile
 from typing import Any, Generic, ParamSpec, Self, TypeVar, cast
 
@@ -79,6 +82,19 @@ def writable_directory(environment: Mapping[str, str], leaf: str) -> Path:
         'no writable folder for compiled code; set T3MPC_CACHE_DIR to one. Tried: '
         + ', '.join(tried)
     )
+
+
+def remove_compiled(environment: Mapping[str, str]) -> list[Path]:
+    """Remove what this package has compiled, of every version and in every folder; return them."""
+    removed = []
+    for base in _base_directories(environment):
+        for folder in sorted(base.glob('*')):
+            if folder.is_dir() and re.fullmatch('(firmware-)?[0-9a-f]{16}', folder.name):
+                shutil.rmtree(folder)
+                removed.append(folder)
+        with suppress(OSError):  # not there, or it has other files
+            base.rmdir()
+    return removed
 
 
 def source_fingerprint(sources: Path) -> str:

@@ -26,7 +26,13 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.control.command_shaper import row_at
-from t3mpc_ros.kernels import TypedKernel, cache_directory, kernel, source_fingerprint
+from t3mpc_ros.kernels import (
+    TypedKernel,
+    cache_directory,
+    kernel,
+    remove_compiled,
+    source_fingerprint,
+)
 
 
 def test_division_by_zero_gives_infinity_not_an_exception():
@@ -151,6 +157,22 @@ def test_error_without_a_writable_folder_names_all_candidates(tmp_path, monkeypa
     with pytest.raises(OSError, match='T3MPC_CACHE_DIR') as caught:
         cache_directory({'HOME': str(blocked)})
     assert str(blocked) in str(caught.value)
+
+
+def test_what_was_compiled_is_removed_and_nothing_else(tmp_path, monkeypatch):
+    """An uninstallation left the folders of every version."""
+    monkeypatch.setattr('tempfile.gettempdir', lambda: str(tmp_path / 'tmp'))
+    home, own = tmp_path / 'home' / '.cache' / 't3mpc_ros', tmp_path / 'own'
+    made = [home / ('0' * 16), home / f'firmware-{"f" * 16}', own / ('a' * 16)]
+    others = [own / 'mine', own / ('b' * 15)]
+    for folder in [*made, *others]:
+        folder.mkdir(parents=True)
+        (folder / 'file').write_text('')
+    environment = {'HOME': str(tmp_path / 'home'), 'T3MPC_CACHE_DIR': str(own)}
+    assert sorted(remove_compiled(environment)) == sorted(made)
+    assert not [folder for folder in [*made, home] if folder.exists()]
+    assert all((folder / 'file').exists() for folder in others)
+    assert remove_compiled(environment) == []
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from datetime import datetime
 from importlib import import_module
+import os
 from pathlib import Path
 import sys
 from typing import TYPE_CHECKING, Any
@@ -157,7 +158,13 @@ def _exponents(options: argparse.Namespace) -> int:
 
 
 def _compile(options: argparse.Namespace) -> int:
-    """Compile the kernels in two processes, each with about half of the work."""
+    """Compile the kernels in two processes, each with about half of the work; or remove them."""
+    if options.remove:
+        from t3mpc_ros.kernels import remove_compiled
+
+        for folder in remove_compiled(os.environ):
+            print(f'removed {folder}')
+        return 0
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
@@ -308,6 +315,11 @@ def _parser(
     completing.add_argument('shell', choices=('bash', 'zsh'))
     completing.set_defaults(run=_complete)
     compiling = commands.add_parser('compile', help='compile every kernel into the cache')
+    compiling.add_argument(
+        '--remove',
+        action='store_true',
+        help='instead: remove what was compiled, of every version, as before an uninstallation',
+    )
     compiling.set_defaults(run=_compile)
     return parser
 

@@ -15,13 +15,16 @@
 
 from dataclasses import asdict
 from inspect import signature
+import json
 import math
 import re
 import subprocess
+import sys
 
 import pytest
 from support.checkout import ROOT
 from support.parsers import commands, options
+from support.waiting import run
 
 from t3mpc_ros.cli import tune
 from t3mpc_ros.cli.demo import DemoOptions
@@ -86,6 +89,38 @@ def test_the_help_gives_defaults_and_units(command):
 
 
 COMMANDS = ('', 'bag', 'robot', *commands())
+
+
+HEAVY = ('numba', 'rosbags', 'matplotlib', 'rclpy', 'scipy', 'mcap')
+"""Libraries that take a part of a second to import."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('words', ['', 'bag', 'robot', 'robot calibrate', 'emulator', 'compare'])
+def test_the_help_imports_no_heavy_library(words):
+    """That of robot and emulator took two seconds, most of it for the compiler."""
+    code = (
+        'import contextlib, sys; from t3mpc_ros.cli.main import main\n'
+        f'with contextlib.suppress(SystemExit): main({[*words.split(), "--help"]})\n'
+        f'print([name for name in {HEAVY} if name in sys.modules])'
+    )
+    done = run([sys.executable, '-c', code])
+    assert done.stdout.splitlines()[-1] == '[]', done.stderr
+
+
+def test_json_means_the_same_in_every_command(tmp_path, capsys):
+    """It was a flag here and a file there; ``-`` is the standard output in place of the text."""
+    bag, file = str(ROOT / 'test' / 'golden' / 'stops.mcap'), tmp_path / 'new.json'
+    for command in (['exponents', '--duration', '1'], ['bag', 'info', bag]):
+        assert main(command) == 0
+        text = capsys.readouterr().out
+        assert main([*command, '--json', '-']) == 0
+        numbers = json.loads(capsys.readouterr().out)
+        assert main([*command, '--json', str(file)]) == 0
+        assert capsys.readouterr().out == text
+        assert json.loads(file.read_text()) == numbers
+    assert main(['bag', 'info', bag, '--json']) == 0  # as before
+    assert json.loads(capsys.readouterr().out) == numbers
 
 
 @pytest.mark.parametrize('words', COMMANDS)
