@@ -355,6 +355,15 @@ def finite(value: object) -> object:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def format_number(value: float) -> str:
+    """Return three significant digits, a count in full, or a dash for an unknown value."""
+    if isinstance(value, int):
+        return str(value)
+    if not math.isfinite(value):
+        return '–'
+    return f'{value:.0f}' if abs(value) >= 99.95 else f'{value:#.3g}'
+
+
 def format_interval(mean: float, ci95: float, sign: str = '', digits: int = 3) -> str:
     """Return a mean ± half its 95 % interval; a single seed has no interval."""
     if not math.isfinite(mean):

@@ -27,7 +27,6 @@ from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     ErrorStatistics,
     errors_of,
-    format_number,
     format_pair,
     path_distance,
 )
@@ -35,6 +34,7 @@ from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
 from t3mpc_ros.evaluation.record import ON_PATH
+from t3mpc_ros.evaluation.reporting import format_number
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
 

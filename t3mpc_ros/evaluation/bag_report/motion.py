@@ -23,8 +23,8 @@ from t3mpc_ros.evaluation.bag_report.incidents import (
     still_rows,
 )
 from t3mpc_ros.evaluation.bag_report.run_data import Run
-from t3mpc_ros.evaluation.bag_report.tracking_errors import format_number
 from t3mpc_ros.evaluation.record import spans_of
+from t3mpc_ros.evaluation.reporting import format_number
 from t3mpc_ros.evaluation.topic_roles import COMMAND
 
 

@@ -36,13 +36,13 @@ from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
 from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     driven,
-    format_number,
     path_distance,
     settled,
     tracking_error,
 )
 from t3mpc_ros.evaluation.charts import Chart, Curve, Line, LineStyle, Plane, thinned
 from t3mpc_ros.evaluation.drive_response import ResponseFit, busiest, predicted
+from t3mpc_ros.evaluation.reporting import format_number
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import world_outline

@@ -39,7 +39,6 @@ from t3mpc_ros.evaluation.bag_report.report_charts import (
 from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     errors_of,
-    format_number,
 )
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
@@ -57,6 +56,7 @@ from t3mpc_ros.evaluation.reporting import (
     Table,
     Tiles,
     VerdictBox,
+    format_number,
     html_page,
 )
 from t3mpc_ros.evaluation.topic_roles import (

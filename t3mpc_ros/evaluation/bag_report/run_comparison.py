@@ -36,7 +36,6 @@ from t3mpc_ros.evaluation.bag_report.report_page import verdict_box
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     driven,
-    format_number,
     path_distance,
     settled,
     tracking_error,
@@ -53,6 +52,7 @@ from t3mpc_ros.evaluation.reporting import (
     Paragraph,
     Table,
     VerdictBox,
+    format_number,
     html_page,
 )
 from t3mpc_ros.evaluation.topic_roles import (

@@ -25,6 +25,7 @@ from t3mpc_ros.evaluation.bag_report.incidents import BRAKING, Span, driving, fi
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.counted_time import ROBOT_WINDOW, counted_from, counted_rows
+from t3mpc_ros.evaluation.reporting import format_number
 from t3mpc_ros.evaluation.topic_roles import REFERENCE
 from t3mpc_ros.geometry.types import Array
 
@@ -167,15 +168,6 @@ def settled_rmse(
     rows &= apart_from(error.time, spared)
     right, left = (statistics(error[each.name][rows]).rmse for each in run.channels)
     return right, left
-
-
-def format_number(value: float) -> str:
-    """Return three significant digits, a count in full, or a dash for an unknown value."""
-    if isinstance(value, int):
-        return str(value)
-    if not math.isfinite(value):
-        return '–'
-    return f'{value:.0f}' if abs(value) >= 99.95 else f'{value:#.3g}'
 
 
 def format_pair(values: Sequence[float], units: Sequence[str]) -> str:

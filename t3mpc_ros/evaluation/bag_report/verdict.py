@@ -30,7 +30,6 @@ from t3mpc_ros.evaluation.bag_report.incidents import Incidents, driving
 from t3mpc_ros.evaluation.bag_report.known_results import MAX_RATIO, known_result
 from t3mpc_ros.evaluation.bag_report.run_data import Run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
-    format_number,
     format_pair,
     path_distance,
     settled_rmse,
@@ -38,6 +37,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.counted_time import counted_from
 from t3mpc_ros.evaluation.record import ON_PATH
+from t3mpc_ros.evaluation.reporting import format_number
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array
 

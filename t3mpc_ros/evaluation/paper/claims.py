@@ -28,7 +28,6 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from t3mpc_ros.evaluation.bag_report.tracking_errors import format_number
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import Difference, mean, paired
 from t3mpc_ros.evaluation.experiment import ResultTable
@@ -42,7 +41,7 @@ from t3mpc_ros.evaluation.paper.study import (
     STAGES,
     WITHOUT,
 )
-from t3mpc_ros.evaluation.reporting import Table
+from t3mpc_ros.evaluation.reporting import Table, format_number
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS
 from t3mpc_ros.geometry.types import Array
 

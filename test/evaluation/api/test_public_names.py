@@ -13,11 +13,13 @@
 # limitations under the License.
 """The scripting interface: its names, and what an import costs; docs/api.md has the signatures."""
 
+import itertools
 import json
 import subprocess
 import sys
 
 import t3mpc_ros as t3
+from t3mpc_ros.missing_library import EXTRAS, REQUIREMENTS
 
 HEAVY = ('numba', 'numpy', 'matplotlib', 'rclpy', 'mcap', 'rosbags', 'pyarrow', 'distributed')
 
@@ -34,6 +36,21 @@ def test_the_import_loads_no_library():
     )
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == []
+
+
+STUDIES = ('paper.reproduce', 'tuning.tune_methods', 'comparison_page', 'patrol.patrol_comparison')
+
+
+def test_the_extra_of_comparisons_is_enough_for_them():
+    """``t3mpc paper`` needed the libraries for bags, which its extra does not install."""
+    there = {*EXTRAS['compare']} | {*REQUIREMENTS} - {*itertools.chain(*EXTRAS.values())}
+    others = {*REQUIREMENTS} - there - {'PIL'}  # matplotlib needs that one
+    code = f'import sys; sys.modules.update(dict.fromkeys({others}))\n'
+    code += '\n'.join(f'import t3mpc_ros.evaluation.{name}' for name in STUDIES)
+    done = subprocess.run(
+        [sys.executable, '-c', code], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_generator_and_fuzzy_system_are_functions_in_any_order():
