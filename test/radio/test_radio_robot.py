@@ -120,6 +120,14 @@ def test_limits_above_those_of_the_board_are_rejected(name, value):
         RadioRobotParameters.from_dict({name: value})
 
 
+def test_a_cycle_longer_than_a_command_lasts_is_rejected():
+    """One command a second was allowed, and every one had expired before the next."""
+    slow = {'link.cycle_rate': 1.0, 'max_stopping_time': 2.0}
+    with pytest.raises(ParameterError, match='cycle_rate must be at least 5 Hz.*: got 1$'):
+        RadioRobotParameters.from_dict(slow)
+    RadioRobotParameters.from_dict(slow | {'link.cycle_rate': 5.0})
+
+
 @pytest.mark.parametrize(
     'changes',
     [

@@ -125,7 +125,7 @@ class LinkParameters(Parameters):
     robot: RobotParameters = group(RobotParameters)
 
     def check_consistency(self) -> None:
-        """Raise ParameterError for an invalid address, or a TTL that the robot would shorten."""
+        """Raise ParameterError for an invalid address, or a TTL that does not fit robot or rate."""
         try:
             size = len(bytes.fromhex(self.address))
         except ValueError:
@@ -135,6 +135,11 @@ class LinkParameters(Parameters):
         if self.ttl > self.robot.ttl_max:
             raise ParameterError(
                 f'ttl must be at most robot.ttl_max ({self.robot.ttl_max:g} s): got {self.ttl:g}'
+            )
+        if self.cycle_rate * self.ttl < 1.0:
+            raise ParameterError(
+                f'cycle_rate must be at least {1.0 / self.ttl:.4g} Hz, one command within ttl '
+                f'({self.ttl:g} s), or the robot stops between two: got {self.cycle_rate:g}'
             )
 
     @property
