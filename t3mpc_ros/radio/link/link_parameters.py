@@ -125,7 +125,7 @@ class LinkParameters(Parameters):
     robot: RobotParameters = group(RobotParameters)
 
     def check_consistency(self) -> None:
-        """Raise ParameterError for an invalid address, or a TTL that does not fit robot or rate."""
+        """Raise ParameterError for an invalid address or a TTL unfit for robot or rate."""
         try:
             size = len(bytes.fromhex(self.address))
         except ValueError:
