@@ -15,6 +15,7 @@
 
 import os
 from pathlib import Path
+import runpy
 import signal
 import subprocess
 import sys
@@ -131,6 +132,12 @@ def test_ctrl_c_while_python_starts_is_quiet(name, delay, tmp_path):
     assert errors.count('\n') <= 1
     # The shell, which is there for the first milliseconds, is ended by the signal.
     assert done.returncode in (-signal.SIGINT, 0, 1, 130)
+
+
+def test_a_process_of_a_pool_may_import_the_executable():
+    """Each ran the program anew: ``t3mpc compare`` under ``scripts/run`` ended with an error."""
+    executable = Path(__file__).resolve().parent.parent / 'resource' / 'executable'
+    assert 'main' in runpy.run_path(str(executable), run_name='__mp_main__')
 
 
 @pytest.mark.slow
