@@ -21,6 +21,7 @@ import re
 import pytest
 from support.checkout import ROOT
 
+import t3mpc_ros as t3
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
 from t3mpc_ros.evaluation.experiment import measured_run
 from t3mpc_ros.evaluation.methods import methods_for
@@ -199,3 +200,21 @@ def test_runs_of_the_file_made_anew_have_its_digits():
         for name, value in numbers.items():
             if row.get(name):
                 assert float(f'{value:.7g}') == pytest.approx(float(row[name]), rel=2e-6), row
+
+
+@pytest.mark.long
+def test_the_result_of_the_tutorial_is_that_of_its_controller(tmp_path, monkeypatch):
+    """It was older than the code, whose runs are equal to the last bit."""
+    page = (ROOT / 'docs' / 'tutorial.md').read_text()
+    (code,) = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+    (tmp_path / 'tutorial_controller.py').write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    from tutorial_controller import Pi
+
+    table = t3.compare([FULL, Pi], seeds=range(1, 6), executor=2)
+    full, own = (table.values(name, 'settled') for name in (FULL, 'Pi'))
+    found = table.difference('Pi', 'settled')
+    shown = [f'{mean(each):.4f} ± {interval(each):.4f}' for each in (full, own)]
+    text = ' '.join(page.split())
+    assert f'{shown[0]} rad/s (`full`) and {shown[1]} rad/s (`Pi`)' in text
+    assert f'a difference of {found.mean:+.4f} ± {found.half:.4f}: *worse*' in text
