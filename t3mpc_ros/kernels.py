@@ -85,9 +85,13 @@ def writable_directory(environment: Mapping[str, str], leaf: str) -> Path:
 
 
 def remove_compiled(environment: Mapping[str, str]) -> list[Path]:
-    """Remove what this package has compiled, of every version and in every folder; return them."""
+    """Remove what this package has compiled, of every version; return the folders.
+
+    Where ``T3MPC_CACHE_DIR`` is set, only what is there: other installations use the others.
+    """
     removed = []
-    for base in _base_directories(environment):
+    bases = list(_base_directories(environment))
+    for base in bases[:1] if environment.get('T3MPC_CACHE_DIR') else bases:
         for folder in sorted(base.glob('*')):
             if folder.is_dir() and re.fullmatch('(firmware-)?[0-9a-f]{16}', folder.name):
                 shutil.rmtree(folder)

@@ -318,7 +318,8 @@ def _parser(
     compiling.add_argument(
         '--remove',
         action='store_true',
-        help='instead: remove what was compiled, of every version, as before an uninstallation',
+        help='instead: remove what every version has compiled, from T3MPC_CACHE_DIR if it is set, '
+        "else from the user's cache, which other installations share",
     )
     compiling.set_defaults(run=_compile)
     return parser
