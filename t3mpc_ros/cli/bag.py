@@ -27,8 +27,7 @@ from t3mpc_ros.cli.run_options import add_json, add_topic_options, print_result,
 from t3mpc_ros.cli.train import add_bag_options, run_bags
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 
-# Libraries for bags take long to import: the help and the completion do without.
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # help and completion do without the libraries for bags, which load slowly
     from t3mpc_ros.bag.metadata import TopicInformation
     from t3mpc_ros.bag.qos import QosProfile
     from t3mpc_ros.bag.reader import BagReader
