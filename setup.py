@@ -30,7 +30,10 @@ from setuptools.command.sdist import sdist
 try:
     from setuptools.command.bdist_wheel import bdist_wheel
 except ImportError:  # before 70.1, as on Ubuntu 24.04
-    bdist_wheel = None
+    try:
+        from wheel.bdist_wheel import bdist_wheel
+    except ImportError:
+        bdist_wheel = None
 
 NAME = 't3mpc_ros'
 
