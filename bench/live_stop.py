@@ -44,13 +44,13 @@ const stopped = () => /^(E-STOP|STOP NOT CONFIRMED)/.test(headline.textContent);
 for (const kind of ['click', 'keydown']) {
   addEventListener(kind, (event) => {
     if (kind === 'keydown' ? event.code !== 'Space' : event.target.id !== 'e-stop') return;
-    window.pressed = performance.now();
+    window.begun = performance.now();
     window.shown = null;
   }, { capture: true });
 }
 new MutationObserver(() => {
   if (!stopped() || window.shown) return;
-  window.shown = [performance.now() - pressed, headline.textContent];
+  window.shown = [performance.now() - window.begun, headline.textContent];
 }).observe(headline, { childList: true, characterData: true, subtree: true });
 """
 

@@ -121,6 +121,7 @@ def report_pictures(browser: Browser, runs: Path, output: Path) -> None:
         browser.show_as(width, SIZES[width], scheme)
         if part == 'switch':
             browser.select('.timeline .switch button').click()
+            browser.run('scrollTo(0, 0)')
         elif part:
             browser.run(
                 'Array.from(document.querySelectorAll("h2")).find((each) =>'

@@ -192,6 +192,7 @@ def test_a_report_is_printed_on_a4(report, browser):
     browser.run("dispatchEvent(new Event('beforeprint'))")
     light = browser.run(ink)
     assert light[0] == light[1] != dark[0]
+    browser.run('charts.resize = () => {}')  # paper is no window that has changed its size
     features = [{'name': 'prefers-color-scheme', 'value': 'dark'}]
     set_media = partial(browser.driver.execute_cdp_cmd, 'Emulation.setEmulatedMedia')
     try:

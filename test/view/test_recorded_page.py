@@ -476,3 +476,10 @@ def test_a_robot_that_says_that_it_stands_is_believed(browser, show):
     answers.append('latched')
     browser.wait(lambda: browser.text('answer') == 'latched', 'no answer')
     assert browser.run('return pressed') is None
+    # What it said before the press is no confirmation: someone else may have released it since.
+    answers.clear()
+    browser.run("const f = fetch; fetch = (url, options) => (url.startsWith('events')"
+                ' ? new Promise(() => {}) : f(url, options))')  # fmt: skip
+    browser.find('e-stop').click()
+    browser.wait(lambda: browser.text('headline').startswith('STOP NOT CONFIRMED'), 'believed')
+    answers.append('latched')

@@ -148,15 +148,15 @@ def error(run: Run, metrics: ReportMetrics) -> Shown:
         seen.append(f'{title.capitalize()}: {text}.')
     if run.channels[0].unit == run.channels[1].unit:
         names = [each.name for each in run.channels]
-        extent = _extent_of(series, calm, names)
+        extent = extent_of(series, calm, names)
         yield Chart('Error', run.channels[0].unit, lines, ' '.join(seen), extent)
         return
     for each, channel, text in zip(lines, run.channels, seen, strict=True):
-        extent = _extent_of(series, calm, [channel.name])
+        extent = extent_of(series, calm, [channel.name])
         yield Chart(f'Error, {channel.title}', channel.unit, [each], text, extent)
 
 
-def _extent_of(
+def extent_of(
     series: Series, rows: NDArray[np.bool_], names: Sequence[str]
 ) -> tuple[float, float] | None:
     """Return the least and the largest value of some rows, a little wider; None without one."""

@@ -31,7 +31,13 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     ReportMetrics,
     compute_metrics,
 )
-from t3mpc_ros.evaluation.bag_report.report_charts import TERM_COLOURS, TERM_DASHES, is_long, line
+from t3mpc_ros.evaluation.bag_report.report_charts import (
+    TERM_COLOURS,
+    TERM_DASHES,
+    extent_of,
+    is_long,
+    line,
+)
 from t3mpc_ros.evaluation.bag_report.report_page import verdict_box
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
@@ -73,6 +79,8 @@ MIN_SHIFT, MAX_SHIFT = 0.01, 2.0
 """Resolution, and largest difference, of the places of the first commands in one reference, s."""
 MAX_SAMPLES = 2000
 """Samples of a reference that are compared."""
+GROUP = 3
+"""Blocks of a group of charts: heading, charts, and what their time is."""
 MAX_RUNS = len(TERM_COLOURS)
 """Runs that a page compares."""
 DISTANCE = Channel('distance', 'distance from the path', 'distance', 'm')
@@ -222,7 +230,9 @@ def write_comparison(
         if each.run.oddities:
             title = f'Unusual in {each.label}'
             blocks.append(Items([[text] for text in each.run.oddities], title=title))
-    blocks += [_metrics_table(runs), Contents(), *_charts(runs), *_parameters(runs)]
+    charts = list(_charts(runs))
+    blocks += [Contents(), *charts[:GROUP], Heading('Numbers'), _metrics_table(runs)]
+    blocks += [*charts[GROUP:], *_parameters(runs)]
     output.mkdir(parents=True, exist_ok=True)
     title = f'Comparison of {len(runs)} runs'
     path.write_text(html_page(title, blocks), encoding='utf-8')
@@ -328,8 +338,10 @@ def _charts(runs: Sequence[ComparedRun]) -> Iterator[Block]:
             elif is_long(reference):
                 label, shown = f'reference of {first.label}', _shifted(first, reference)
                 lines.append(line(label, 'reference', shown, channel.name, dash=(6, 4)))
+            extent = _settled_extent(runs, channel.name) if title == 'Error' else None
             if lines:
-                charts.append(Chart(f'{title}, {channel.title}', channel.unit, lines, seen))
+                name = f'{title}, {channel.title}'
+                charts.append(Chart(name, channel.unit, lines, seen, extent))
         if charts:
             yield from (Heading(heading), Group(charts, 'div', 'charts'), _TIME)
     curves = [
@@ -340,6 +352,18 @@ def _charts(runs: Sequence[ComparedRun]) -> Iterator[Block]:
     if curves:
         ends = ', '.join(f'{c.label} at {c.x[-1]:.2f}, {c.y[-1]:.2f} m' for c in curves)
         yield from (Heading('Paths'), Plane('Floor', 'm', curves, f'Ends: {ends}.'))
+
+
+def _settled_extent(runs: Sequence[ComparedRun], name: str) -> tuple[float, float] | None:
+    """Return the least and the largest settled error of all runs; None without one."""
+    found = []
+    for each in runs:
+        error = tracking_error(each.run, each.run.measured)
+        if error is not None:
+            rows = driven(error.time, each.run) & settled(error.time, each.run)
+            found.append(extent_of(error, rows, [name]))
+    known = [each for each in found if each is not None]
+    return (min(low for low, _ in known), max(high for _, high in known)) if known else None
 
 
 _TIME = Paragraph(
