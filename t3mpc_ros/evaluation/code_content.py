@@ -61,6 +61,7 @@ def _used(code: Any) -> Iterator[tuple[str, Any]]:
     """Yield what a class inherits, and what its functions, or a function, read from outside."""
     if isinstance(code, type):
         yield from ((base.__qualname__, base) for base in code.__mro__[1:])
+        yield from ((name, value) for name, value in vars(code).items() if name[:2] != '__')
     for function in _functions(code):
         names = {name for part in _parts(function.__code__) for name in part.co_names}
         known = function.__globals__

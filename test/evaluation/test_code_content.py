@@ -31,6 +31,8 @@ from used_helper import gain
 OFFSET = {offset}
 TABLE = np.array([{table}])
 UNUSED = {unused}
+FACTOR = {factor}
+SHARE = {share}
 
 
 class Base:
@@ -39,14 +41,16 @@ class Base:
 
 
 class Law(Base):
-    def step(self, o, *, factor={factor}):
+    share = SHARE
+
+    def step(self, o, *, factor=FACTOR):
         def inner():
             return gain() + used_helper.GAIN
-        return inner() + OFFSET + TABLE[0] + self.slope() * factor
+        return inner() + OFFSET + TABLE[0] + self.slope() * factor * self.share
 """
 VALUES = {
     'gain': '1.0', 'value': '2.0', 'offset': '3.0', 'table': '4.0', 'slope': '5.0',
-    'factor': '6.0', 'unused': '7.0',
+    'factor': '6.0', 'unused': '7.0', 'share': '8.0',
 }  # fmt: skip
 
 
