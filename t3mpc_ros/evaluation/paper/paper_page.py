@@ -33,6 +33,7 @@ from t3mpc_ros.evaluation.reporting import (
     Paragraph,
     Picture,
     Table,
+    VerdictBox,
     html_page,
 )
 
@@ -254,6 +255,7 @@ def page(title: str, origin: str, material: ExhibitData, pictures: Mapping[str, 
         title,
         [
             Paragraph(origin, 'quiet'),
+            VerdictBox(f'Claims: {counted(material.claims)}.', [], 'apart'),
             headline,
             Contents(),
             Heading('Claims'),
