@@ -47,6 +47,14 @@ def test_a_notebook_is_stored_without_outputs(path):
         assert cell.get('execution_count') is None
 
 
+def test_every_page_has_a_place_in_the_navigation():
+    """Without one the build of the site, which only a long test does, ends."""
+    placed = re.findall(r'^ +- .*: (\w+\.md)$', (ROOT / 'mkdocs.yml').read_text(), re.MULTILINE)
+    pages = {path.name for path in (ROOT / 'docs').glob('*.md')}
+    assert pages <= {*placed, 'index.md'}
+    assert len(placed) == len({*placed})
+
+
 @pytest.mark.long
 @pytest.mark.parametrize('path', NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_shows_little_text_and_its_figures(path, tmp_path):
