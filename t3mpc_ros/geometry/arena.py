@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Arena: the convex polygon in which a path lies, its map from the unit square, obstacles."""
+"""Arena: the convex polygon in which a path lies, its map from the unit square; obstacles."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -33,6 +33,19 @@ class Obstacles(NamedTuple):
     """Walls: ax, ay, bx, by, m, shape (n, 4)."""
     circles: Array = np.empty((0, 3))
     """Pillars: x, y, radius, m, shape (m, 3)."""
+
+
+class OccupancyGrid(NamedTuple):
+    """State of the floor in cells, as of ``nav_msgs/OccupancyGrid``."""
+
+    cells: NDArray[np.int8]
+    """0 (free) to 100 (occupied) percent, -1 unknown, shape (rows, columns), row by y."""
+    resolution: float
+    """Side of a cell, m."""
+    x: float
+    """Of the corner of the first cell, m."""
+    y: float
+    """Of the corner of the first cell, m."""
 
 
 class Arena:

@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.geometry.route_planning import OCCUPIED, nearest_distances
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters import yaml_files
@@ -40,9 +41,6 @@ MAX_WORK = 2e8
 """Largest number of nodes times obstacles of a world."""
 MAX_CELLS = 25_000_000
 """Largest number of cells of a grid."""
-OCCUPIED = 65
-"""Occupancy (percent) from which on a cell of a grid is an obstacle."""
-
 Mask = NDArray[np.bool_]
 
 
@@ -146,13 +144,8 @@ def map_of_grid(
     occupied = occupancy >= OCCUPIED
     if not occupied.any():
         raise MapError(f'the grid must have a cell of at least {OCCUPIED} percent')
-    squares = np.where(occupied, 0.0, math.inf)
-    longest = max(squares.shape)
-    distance_transform(
-        squares, np.empty(longest), np.empty(longest, dtype=np.int64), np.empty(longest + 1)
-    )
     # The surface of an occupied cell is half a cell from its centre.
-    distance = np.maximum(resolution * (np.sqrt(squares) - 0.5), 0.0)
+    distance = np.maximum(resolution * (nearest_distances(occupied) - 0.5), 0.0)
     x, y = origin[0] + 0.5 * resolution, origin[1] + 0.5 * resolution
     return LocalizationMap(DistanceField(distance, x, y, resolution), occupancy >= 0)
 
@@ -253,57 +246,6 @@ def spread(reached: Mask, free: Mask) -> bool:
                 if below or (column < columns - 1 and reached[row, column + 1]):
                     reached[row, column] = changed = True
     return changed
-
-
-@kernel
-def distance_transform(
-    squares: Array, line: Array, parabolas: NDArray[np.int64], bounds: Array
-) -> None:
-    """Replace 0 (obstacle) and inf by the squared distance, in cells, to the nearest obstacle.
-
-    Lower envelope of parabolas along each column and then along each row (Felzenszwalb and
-    Huttenlocher, Theory of Computing 8, 2012, doi 10.4086/toc.2012.v008a019).
-
-    line, parabolas : shape (n,), bounds : shape (n + 1,), with the longer side n; overwritten
-    """
-    rows, columns = squares.shape
-    for column in range(columns):
-        for row in range(rows):
-            line[row] = squares[row, column]
-        _envelope(squares[:, column], line, parabolas, bounds)
-    for row in range(rows):
-        for column in range(columns):
-            line[column] = squares[row, column]
-        _envelope(squares[row], line, parabolas, bounds)
-
-
-@kernel
-def _envelope(out: Array, line: Array, parabolas: NDArray[np.int64], bounds: Array) -> None:
-    """Write min over j of (i - j)² + line[j] into ``out[i]``."""
-    count, last = out.size, -1
-    for j in range(count):
-        if line[j] == math.inf:
-            continue
-        begin = -math.inf
-        while last >= 0:
-            k = parabolas[last]
-            begin = ((line[j] + j * j) - (line[k] + k * k)) / (2.0 * (j - k))
-            if begin > bounds[last]:
-                break
-            last -= 1
-        if last < 0:
-            begin = -math.inf
-        last += 1
-        parabolas[last], bounds[last] = j, begin
-    if last < 0:
-        return
-    bounds[last + 1] = math.inf
-    piece = 0
-    for i in range(count):
-        while bounds[piece + 1] < i:
-            piece += 1
-        away = i - parabolas[piece]
-        out[i] = away * away + line[parabolas[piece]]
 
 
 @kernel

@@ -20,7 +20,6 @@ import pytest
 
 from t3mpc_ros.localization.occupancy_map import (
     MapError,
-    distance_transform,
     load_grid,
     map_of_grid,
     map_of_world,
@@ -76,23 +75,6 @@ def test_a_robot_outside_all_walls_keeps_the_floor_there(tmp_path):
 def test_a_world_without_obstacles_is_no_map():
     with pytest.raises(MapError, match='plain must have walls'):
         map_of_world(load_world(''))
-
-
-def test_the_transform_is_the_distance_to_the_nearest_obstacle():
-    generator = np.random.default_rng(2)
-    for rows, columns in ((7, 12), (12, 7), (1, 9)):
-        occupied = generator.random((rows, columns)) < 0.15
-        occupied[0, 0] = True
-        squares = np.where(occupied, 0.0, math.inf)
-        longest = max(rows, columns)
-        distance_transform(
-            squares, np.empty(longest), np.empty(longest, dtype=np.int64), np.empty(longest + 1)
-        )
-        at = np.argwhere(occupied)
-        for row in range(rows):
-            for column in range(columns):
-                nearest = ((at - [row, column]) ** 2).sum(axis=1).min()
-                assert squares[row, column] == nearest
 
 
 def walled_grid():
