@@ -22,6 +22,7 @@ from typing import Protocol
 
 import numpy as np
 
+from t3mpc_ros.chaos.planned_path import PlannedPath, PlanParameters
 from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.secret_random import SecretRandom
@@ -126,6 +127,7 @@ class PathReferenceParameters(ReferenceParameters):
     )
     path: SmoothingParameters = group(SmoothingParameters)
     portrait: PortraitParameters = group(PortraitParameters)
+    plan: PlanParameters = group(PlanParameters)
     reseed: ReseedParameters = group(ReseedParameters)
     wait: WaitParameters = group(WaitParameters)
     motion: MotionLimits = group(MotionLimits)
@@ -138,6 +140,8 @@ class PathReferenceParameters(ReferenceParameters):
                 'path_file must name a file with source file, and only then: '
                 f'got source {self.source} with path_file {self.path_file!r}'
             )
+        if self.plan.enabled and self.source != 'portrait':
+            raise ParameterError(f'plan.enabled needs source portrait: got {self.source}')
 
 
 class PathClock:
@@ -251,10 +255,20 @@ class PortraitSource:
     ) -> None:
         self._reseed, self._next_seed = parameters.reseed, next_seed
         self._path = PortraitPath(parameters, parameters.portrait, parameters.motion.linear, seed)
-        self._timing = PathTiming(parameters.motion, geometry, 1.0 / parameters.rate, start)
         self._period = 1.0 / parameters.rate
-        self._times = SecretRandom(seed, 'reseed')
-        self._left = self._draw_time()
+        self._timing = PathTiming(parameters.motion, geometry, self._period, start)
+        self.planned: PlannedPath | None = None
+        """The path on the map; None: it does not know the map."""
+        if parameters.plan.enabled:
+            self.planned = PlannedPath(
+                parameters.plan,
+                self._timing,
+                self._period,
+                start,
+                self._path.advance,
+                self._path.arena,
+            )
+        self._draw(seed)
 
     def advance(self, rate: float = 1.0) -> tuple[Pose, BodyTwist]:
         """Return pose and twist of the next period, for a rate of :class:`PathClock`."""
@@ -262,6 +276,8 @@ class PortraitSource:
         self._left -= self._timing.rate * self._period
         if self._left <= 0.0:
             self.reseed(self._next_seed())
+        if self.planned is not None:
+            return self.planned.advance(rate)
         while self._timing.needs_points:
             self._timing.add_points(self._path.advance(1.0))
         return self._timing.advance(rate)
@@ -269,8 +285,14 @@ class PortraitSource:
     def reseed(self, seed: int) -> None:
         """Continue with another seed, from where the path planned so far ends."""
         self._path.reseed(seed)
+        self._draw(seed)
+
+    def _draw(self, seed: int) -> None:
+        """Draw from a seed what is not in the path itself."""
         self._times = SecretRandom(seed, 'reseed')
         self._left = self._draw_time()
+        if self.planned is not None:
+            self.planned.plan.use_random_numbers(SecretRandom(seed, 'revisits'))
 
     def _draw_time(self) -> float:
         """Return the time until the next seed, s."""

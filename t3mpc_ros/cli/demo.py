@@ -115,7 +115,13 @@ class DemoOptions:
         if self.patrol:
             given['controller'] |= {'pose.enabled': True, 'keep_out.enabled': True}
             # Without a seed it is a secret one from the operating system.
-            given['reference_generator'] |= {'source': 'portrait', 'seed': 0}
+            given['reference_generator'] |= {
+                'source': 'portrait',
+                'seed': 0,
+                'plan.enabled': True,
+                'motion.linear.x.max_velocity': 0.33,
+                'motion.wheel.max_velocity': 10.0,
+            }
             given['sim_robot']['world'] = 'room'
         if self.seed is not None:
             given['reference_generator']['seed'] = self.seed

@@ -41,6 +41,12 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         'the simulated robot among unknown boxes with keep-out, which takes about as long as it '
         'drives',
     )
+    parser.add_argument(
+        '--planned',
+        action='store_true',
+        help='as --robot twin, and the path goes around what the robot has seen; the robot rests '
+        'and looks before floor that it has not',
+    )
     add_seeds(parser, DEFAULT_SEEDS, 'path, robot and room')
     parser.add_argument(
         '--minutes',
@@ -182,7 +188,8 @@ def _patrols(options: argparse.Namespace) -> _Study:
         paths=find_names('path', options.paths, PATHS) or PATHS,
         seeds=options.seeds,
         duration=60.0 * options.minutes,
-        robot=options.robot,
+        robot='twin' if options.planned else options.robot,
+        planned=options.planned,
         arena=tuple(options.arena),
     )
     return patrol_page, plan, compare_patrols

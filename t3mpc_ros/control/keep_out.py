@@ -50,7 +50,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.range_monitor import RangeMonitor
-from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.types import STANDSTILL, Array, BodyTwist, Pose, has_moved, wrap_angle
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
@@ -67,6 +67,10 @@ STANDING_ROOM = 0.12
 """Radius of the floor that is free because the robot stands there, m."""
 MEMORY = 60.0
 """Default time after which floor that was seen to be free counts as unseen, s."""
+MARGIN = 25
+"""Cells of unknown floor around what is published."""
+ENDING = 5.0
+"""Rest of that time with which floor is published as unseen, s."""
 CLEARINGS = 4
 """Rays that must pass over an occupied cell to clear it."""
 DIRECTIONS = 48
@@ -196,6 +200,25 @@ class FreeSpaceMap:
         for x, y, radius in self._circles.tolist():
             angles = np.linspace(0.0, math.tau, math.ceil(math.tau * radius / spacing) + 2)
             mark(np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)]))
+
+    def occupancy(self) -> OccupancyGrid:
+        """Return what is known of the floor, with some unknown floor around.
+
+        Floor whose memory ends soon counts as unseen, so that nobody plans to drive on it.
+        """
+        grid = self.grid
+        rows, columns = (
+            slice(max(int(seen[0]) - MARGIN, 0), int(seen[-1]) + MARGIN + 1)
+            if (seen := np.flatnonzero(grid.cells.any(axis=axis))).size
+            else slice(0, 1)
+            for axis in (1, 0)
+        )
+        cells, oldest = grid.cells[rows, columns], self.now - self.parameters.memory + ENDING
+        found = np.full(cells.shape, -1, dtype=np.int8)
+        found[(cells == FREE) & (grid.seen[rows, columns] >= oldest)] = 0
+        found[cells >= OCCUPIED] = 100
+        low, size = grid.low, grid.size
+        return OccupancyGrid(found, size, low + size * columns.start, low + size * rows.start)
 
     def mark_free(self, x: float, y: float, radius: float) -> None:
         """Mark the floor below a robot that stands there as free."""
@@ -552,7 +575,7 @@ class KeepOut:
         permitted = self._permitted(wanted, self.parameters.distance)
         if abs(permitted.linear) < TURNING_SPEED:
             # The point ahead is a means to steer; a round robot that stands may turn anywhere.
-            limit = self.parameters.scan_rate
+            limit = self.limits.angular
             turn = min(max(wanted.angular, -limit), limit)
             permitted = BodyTwist(permitted.linear, turn)
         change = abs(permitted.linear - wanted.linear) + TURN_WEIGHT * abs(

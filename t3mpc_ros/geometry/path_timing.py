@@ -257,6 +257,14 @@ class PathTiming:
     def _stop(self) -> int:
         return stopping_node(self._nodes, self._limits, self._place + 1, self._squares)
 
+    def begin_at(self, pose: Pose) -> None:
+        """Rest at a pose, and forget the path."""
+        self._pose, self._twist = pose, STANDSTILL
+        self._curve = _CurveBuilder(pose)
+        self._nodes, self._squares = np.empty((0, 3)), np.zeros(1)
+        self._dropped, self._place, self._elapsed, self.rate = 0, 0, 0.0, 1.0
+        self._ended = self._renew = False
+
     def cut(self) -> PathEnd:
         """Remove the rest of the path from where the robot can stop; return where that is.
 
@@ -268,9 +276,7 @@ class PathTiming:
         self._ended = False
         if self.standing:
             pose = self._pose or self._curve.first or ORIGIN
-            self._curve = _CurveBuilder(pose)
-            self._nodes, self._squares = np.empty((0, 3)), np.zeros(1)
-            self._dropped, self._place, self._elapsed, self.rate = 0, 0, 0.0, 1.0
+            self.begin_at(pose)
             return PathEnd(pose)
         if self._braking:
             pose = Pose(*self._nodes[-1].tolist())

@@ -22,7 +22,7 @@ from typing import Any
 import zlib
 
 from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
 from sensor_msgs.msg import Range
 from std_msgs.msg import Float64, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
@@ -53,6 +53,8 @@ from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
 INITIAL_INPUT_TIME_NS = 10 * NANOSECONDS
 """Time from the first input for which inputs are republished on ``~/initial_inputs/*``."""
+MAP_PERIOD = 0.25
+"""Time between two maps of the keep-out, s."""
 WATCHDOG_PERIOD, SHORTEST_WATCHDOG_PERIOD = 0.05, 0.01
 """Time between two checks of the odometry, s; one period of a controller that drives through gaps,
 but no less than the second."""
@@ -175,6 +177,9 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             if self.parameters.keep_out.enabled
             else []
         )
+        if self.parameters.keep_out.enabled:
+            self._map_publisher = self.create_publisher(OccupancyGrid, 'keep_out/map', qos.LATCHED)
+            self.create_steady_timer(MAP_PERIOD, self._publish_map)
         self.offer(SetBool, '~/enable', self._enable)
         self.offer(Trigger, '~/reset', self._reset)
         self.offer(Trigger, '~/save_model', self._save_model)
@@ -238,6 +243,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._take_references()
         self._take_ranges()
         measured = conversions.state_from_odometry(message)
+        if not self._steps:
+            self._odometry_frame = conversions.frame_from_serialized(message)
         ignored = self._controller.ignored_odometry
         command, status = self._controller.step(measured)
         if self._controller.ignored_odometry == ignored or self._last_odometry_ns is None:
@@ -256,6 +263,13 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         if self._scalar_publishers:
             self._publish_scalars(status)
         self._log_reason(status)
+
+    def _publish_map(self) -> None:
+        keep_out = self._controller.keep_out
+        if keep_out is not None and self._steps:
+            grid = keep_out.map.occupancy()
+            message = conversions.occupancy_message(grid, self.now_ns(), self._odometry_frame)
+            self._map_publisher.publish(message)
 
     def _adapt_command_type(self) -> None:
         """Publish the other type if it is the only one that a subscriber expects."""

@@ -13,6 +13,7 @@
 # limitations under the License.
 """ROS messages: conversion to the types of the package, classes by name, frames, and age."""
 
+from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 import importlib
@@ -30,12 +31,14 @@ from geometry_msgs.msg import (
     Twist,
     TwistStamped,
 )
+from nav_msgs.msg import OccupancyGrid as OccupancyGridMessage
 from nav_msgs.msg import Odometry, Path
 import numpy as np
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
+from t3mpc_ros.geometry.arena import OccupancyGrid
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import Parameters, parameter
 
@@ -118,6 +121,12 @@ def state_from_odometry(data: bytes) -> State:
         Pose(x, y, yaw_from_quaternion(*rotation)),
         BodyTwist(linear, angular),
     )
+
+
+def frame_from_serialized(data: bytes) -> str:
+    """Return the frame of a serialized message that begins with its header."""
+    (length,) = struct.unpack_from('<I' if data[1] & 1 else '>I', data, 12)
+    return data[16 : 15 + length].decode(errors='replace')
 
 
 def twist_from_serialized(data: bytes) -> BodyTwist:
@@ -240,6 +249,35 @@ def points_from_path(message: Path) -> Array:
     """Return the points of a path, m, shape (n, 2)."""
     places = [each.pose.position for each in message.poses]
     return np.array([(each.x, each.y) for each in places], dtype=np.float64).reshape(-1, 2)
+
+
+def occupancy_message(grid: OccupancyGrid, stamp_ns: int, frame: str) -> OccupancyGridMessage:
+    """Return a grid as a message."""
+    message = OccupancyGridMessage(header=header(stamp_ns, frame))
+    message.info.map_load_time = message.header.stamp
+    message.info.resolution = grid.resolution
+    message.info.height, message.info.width = grid.cells.shape
+    message.info.origin.position.x, message.info.origin.position.y = grid.x, grid.y
+    message.data = array('b', grid.cells.tobytes())
+    return message
+
+
+def grid_from_occupancy(message: OccupancyGridMessage) -> OccupancyGrid:
+    """Return the grid of a message; ValueError: its size is wrong, or it is turned."""
+    info, origin = message.info, message.info.origin
+    cells = np.array(message.data, dtype=np.int8)
+    if cells.size != info.width * info.height or not cells.size:
+        raise ValueError(
+            f'map must have width x height cells, {info.width} x {info.height}: got {cells.size}'
+        )
+    turn = origin.orientation
+    yaw = yaw_from_quaternion(turn.x, turn.y, turn.z, turn.w)
+    place = origin.position.x, origin.position.y
+    if not all(map(math.isfinite, (*place, yaw))) or abs(yaw) > 1e-6:
+        raise ValueError(f'origin of map must be finite, with a yaw of 0: got {(*place, yaw)}')
+    if not 1e-3 <= info.resolution <= 10.0:
+        raise ValueError(f'resolution of map must be from 0.001 to 10 m: got {info.resolution:g}')
+    return OccupancyGrid(cells.reshape(info.height, info.width), info.resolution, *place)
 
 
 def pose_from_transform(transform: Transform) -> Pose:

@@ -19,8 +19,9 @@ from dataclasses import dataclass
 import secrets
 from typing import Any, ClassVar
 
-from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import Odometry, Path
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
+import numpy as np
 from rclpy.time import Time
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -108,9 +109,12 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         self._source: PathSource | None = None
         """Source of the pose, once the robot has reported where it is."""
         # A patrol is to cover its room: a portrait that waited would leave out much of it.
-        on_the_way = parameters.source != 'portrait'
+        # A planned one waits: what stands in its way is on the map, and it goes around it.
+        on_the_way = parameters.source != 'portrait' or parameters.plan.enabled
         self._path_clock = PathClock(parameters.wait, on_the_way=on_the_way)
         self._rejected = 0
+        self._mapped = not parameters.plan.enabled
+        """Whether the path needs no map, or has one."""
         if parameters.source == 'signals':
             self._generator = ChaoticReference(parameters, parameters.geometry)
             self._generator.advance()  # compile here, not within a step
@@ -168,6 +172,12 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 qos.MatchingSubscription(self, Path, 'path', self._on_path, qos.LATCHED)
             self._path_stamps: deque[int] = deque(maxlen=8)
             self._transforms = self._make_transform_buffer()
+        elif parameters.plan.enabled:
+            self.create_matching_subscription(
+                OccupancyGrid, 'keep_out/map', self._on_map, qos.LATCHED
+            )
+            self.create_matching_subscription(PoseStamped, 'goal_pose', self._on_goal, qos.COMMAND)
+            self._transforms = self._make_transform_buffer()
         elif parameters.source == 'twist':
             kind = TwistStamped if parameters.enable_stamped_target_twist else Twist
             self.create_matching_subscription(kind, 'target_twist', self._on_twist, qos.COMMAND)
@@ -182,6 +192,8 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 self._source = self._make_source(state.pose)
                 self._pose = state.pose
             self._path_clock.observe(state.stamp_ns, state.pose)
+            if isinstance(self._source, PortraitSource) and self._source.planned is not None:
+                self._source.planned.observe(state.pose)
 
     def _make_transform_buffer(self) -> Any:
         """Return the transforms known to tf2, None without tf2_ros."""
@@ -225,6 +237,31 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 self._transforms.lookup_transform(own, frame, Time()).transform
             )
         raise PathError(f'its frame is {frame}, and no transform from it to {own} is known')
+
+    def _on_map(self, message: OccupancyGrid, info: dict[str, Any]) -> None:
+        try:
+            grid = conversions.grid_from_occupancy(message)
+        except ValueError as error:
+            self._rejected += 1
+            self.get_logger().warning(f'map is ignored: {error}')
+            return
+        if isinstance(self._source, PortraitSource) and self._source.planned is not None:
+            self._mapped = True
+            self._source.planned.set_map(grid)
+
+    def _on_goal(self, message: PoseStamped, info: dict[str, Any]) -> None:
+        place = message.pose.position
+        try:
+            points = np.array([[place.x, place.y]])
+            check_points(points)
+            points = points_from_frame(self._frame_pose(message.header.frame_id), points)
+            check_points(points)
+        except PathError as error:
+            self._rejected += 1
+            self.get_logger().warning(f'goal_pose is ignored: {error}')
+            return
+        if isinstance(self._source, PortraitSource) and self._source.planned is not None:
+            self._source.planned.go_to((float(points[0, 0]), float(points[0, 1])))
 
     def _on_twist(self, message: Twist | TwistStamped, info: dict[str, Any]) -> None:
         twist = message.twist if isinstance(message, TwistStamped) else message
@@ -315,6 +352,8 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 values['path_under_way'] = self._source.under_way
             if self._source is None:
                 return WARN, 'no odom yet: the path begins where the robot is', values
+            if not self._mapped:
+                return WARN, 'no keep_out/map yet: the controller publishes it', values
         if self._scheduler.skipped:
             return WARN, 'processor overloaded: samples were skipped', values
         if self._path_clock.rate == 0.0:

@@ -49,7 +49,7 @@ INTERFACES = {
     'reference_generator': NodeInterface(
         'reference_generator:ReferenceGeneratorNode',
         'Publishes the reference: chaotic signals, a chaotic path, or a given path or twist.',
-        subscribes=('odom', 'path', 'target_twist'),
+        subscribes=('odom', 'path', 'target_twist', 'keep_out/map', 'goal_pose'),
         publishes=('reference', 'reference/path', 'reference/signals', '/diagnostics'),
         services=('~/reseed', '~/pause'),
     ),
@@ -67,6 +67,7 @@ INTERFACES = {
             '~/journal',
             '~/parameters',
             '~/initial_inputs/*',
+            'keep_out/map',
             '/diagnostics',
         ),
         services=('~/enable', '~/reset', '~/save_model'),

@@ -378,6 +378,10 @@ TABLE = {
         PATROL | SHARED,
         {
             '--robot twin': {'compare_patrols.plan.robot': 'twin'},
+            '--planned': {
+                'compare_patrols.plan.planned': True,
+                'compare_patrols.plan.robot': 'twin',
+            },
             '--seeds 3-4': {'compare_patrols.plan.seeds': (3, 4)},
             '--minutes 2': {'compare_patrols.plan.duration': 120.0},
             '--arena -1 -2 3 4': {'compare_patrols.plan.arena': (-1.0, -2.0, 3.0, 4.0)},

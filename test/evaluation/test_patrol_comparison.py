@@ -180,11 +180,12 @@ def test_the_key_of_a_patrol_changes_with_its_plan(monkeypatch):
         'paths': ('random walk',), 'seeds': (2,), 'duration': 60.0,
         'arena': (-1.0, -1.0, 1.0, 1.0), 'robot': 'twin',
     }  # fmt: skip
-    assert changes.keys() == {each.name for each in fields(PatrolPlan)}
+    assert {*changes, 'planned'} == {each.name for each in fields(PatrolPlan)}
     for plan in (base, *(replace(base, **{name: value}) for name, value in changes.items())):
         compare_patrols(plan)
+    compare_patrols(replace(base, robot='twin', planned=True))
     compare_patrols(PatrolPlan(('boustrophedon',), (3, 1)))  # only the first has a track
-    assert len(found) == len({*found}) == 8
+    assert len(found) == len({*found}) == 9
 
 
 def test_a_wrong_plan_is_refused(capsys, tmp_path):
@@ -192,6 +193,8 @@ def test_a_wrong_plan_is_refused(capsys, tmp_path):
     assert 'did you mean Lorenz?' in capsys.readouterr().err
     with pytest.raises(ValueError, match=r'arena must contain the start'):
         PatrolPlan(arena=(0.5, -1.0, 2.0, 1.0))
+    with pytest.raises(ValueError, match='planned needs the robot twin'):
+        PatrolPlan(planned=True)
     with pytest.raises(ValueError, match='blocked must leave at least one cell free'):
         CoverageGrid((0.0, 0.0), (1.0, 1.0), 1, 1, np.ones((1, 1), dtype=bool))
 

@@ -16,17 +16,22 @@
 import numpy as np
 import pytest
 
+from t3mpc_ros.chaos.planned_path import PlanParameters
 from t3mpc_ros.chaos.portrait import PortraitParameters
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     PatrolScenario,
     contact_count,
+    path_error,
     portrait_points,
     room_with_boxes,
     run_patrol,
+    share_on_path,
     world_file,
 )
-from t3mpc_ros.evaluation.record import RATE
+from t3mpc_ros.evaluation.record import ON_PATH, RATE
+
+PLANNED = PlanParameters(enabled=True)
 
 
 def _run(seed, duration):
@@ -57,6 +62,29 @@ def test_a_patrol_by_the_particle_filter_knows_its_place():
     assert error[row] == pytest.approx(1.0, abs=0.1)
     turned = record['truth'][row, 2] - record['pose'][row, 2]
     assert abs(np.cos(turned)) < 0.1
+
+
+@pytest.mark.slow
+def test_a_planned_path_is_not_ahead_of_the_robot():
+    """Once the robot has looked around, it is where its reference is, and drives."""
+    scenario = PatrolScenario(seed=4, duration=20.0, world='room', plan=PLANNED)
+    record = run_patrol(portrait_points(4, PortraitParameters()), scenario)
+    late = record['time'] > 9.0
+    assert path_error(record)[late].max() < ON_PATH
+    assert np.ptp(record['truth'][late, :2], axis=0).max() > 0.3
+    assert contact_count(record) == 0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(('seed', 'boxes'), [(11, 3), (12, 5)])
+def test_a_planned_patrol_is_on_its_path(seed, boxes):
+    with world_file(room_with_boxes(seed, (4.0, 3.0), boxes)) as world:
+        scenario = PatrolScenario(seed=seed, duration=300.0, world=world, plan=PLANNED)
+        record = run_patrol(portrait_points(seed, PortraitParameters()), scenario)
+    assert share_on_path(record) > 0.95
+    assert contact_count(record) == 0
+    steps = np.hypot(*np.diff(record['truth'][:, :2], axis=0).T)
+    assert steps.sum() > 40.0
 
 
 def test_an_unknown_localization_is_rejected():

@@ -106,7 +106,7 @@ def patrol(name, k):
     return {
         'controller': name, 'seed': 1, 'coverage': 0.2 * k, 'evenness': 0.3 * k,
         'exponent': 0.01 * k, 'permutation_entropy': 0.4 * k, 'spectral_entropy': 0.15 * k,
-        'path_error': 0.002 * k, 'contacts': k - 1, 'avoiding': 0.05 * k,
+        'path_error': 0.002 * k, 'contacts': k - 1, 'avoiding': 0.05 * k, 'on_path': 0.4 * k,
         **{f'time_to_{100.0 * share:g}': 100.0 * k + j for j, share in enumerate(SHARES)},
         **{f'skill_{h:g}': 0.1 * k + 0.01 * j for j, h in enumerate(HORIZONS)},
         **{f'prediction_error_{h:g}': 3.0 * k + j for j, h in enumerate(HORIZONS)},
@@ -118,11 +118,12 @@ def test_tables_of_patrols():
     names = (OURS, 'random walk')
     table = ResultTable([patrol(name, k) for k, name in enumerate(names, 1)])
     study = PatrolStudy(PatrolPlan(names, (1,), robot='twin'), table)
-    heads = ('coverage, %', 'evenness', 'path error, mm', 'avoiding, %', 'patrols with contacts')
+    heads = 'coverage, %', 'evenness', 'path error, mm', 'avoiding, %', 'on the path, %'
+    heads += ('patrols with contacts',)
     rows = columns(coverage_table(study))
     for k, row in enumerate(rows, 1):
         cells = [float(row[head]) for head in heads]
-        assert cells == pytest.approx([20.0 * k, 0.3 * k, 2.0 * k, 5.0 * k, k - 1])
+        assert cells == pytest.approx([20.0 * k, 0.3 * k, 2.0 * k, 5.0 * k, 40.0 * k, k - 1])
         times = [float(row[f'{100.0 * share:g} %, s']) for share in SHARES]
         assert times == pytest.approx([100.0 * k + j for j in range(len(SHARES))])
     for k, row in enumerate(columns(surprise_table(study)), 1):

@@ -17,10 +17,11 @@ import math
 from unittest.mock import Mock
 
 from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
 import numpy as np
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Range
 from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import (
@@ -38,6 +39,7 @@ from t3mpc_ros.nodes import controller as controller_module
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.controller import ControllerNode
+from t3mpc_ros.nodes.conversions import grid_from_occupancy, time_from_ns
 
 pytestmark = pytest.mark.ros
 
@@ -57,6 +59,34 @@ def test_a_stale_reference_gives_a_zero_command_with_the_reason(harness):
         'stopped: reference is stale',
     )
     assert bench.last_command() == Twist()
+
+
+def test_the_map_of_the_keep_out_is_in_the_frame_of_odom(harness):
+    bench = ControllerHarness(harness, pose__enabled=True, keep_out__enabled=True)
+    maps = harness.subscribe(OccupancyGrid, 'keep_out/map', LATCHED)
+    ranges = harness.connected_publisher(Range, 'range/front_left')
+    place = odometry(0)
+    place.header.frame_id = 'one/odom'
+    place.pose.pose.position.x = 1.0
+
+    def seen():
+        bench.stamp_ns += 10_000_000
+        place.header.stamp = time_from_ns(bench.stamp_ns)
+        bench.odom_publisher.publish(place)
+        ranges.publish(Range(range=0.5))
+        return maps and 100 in maps[-1].data
+
+    harness.spin_until(seen)
+    grid = grid_from_occupancy(maps[-1])
+    assert maps[-1].header.frame_id == 'one/odom'
+    row, column = np.argwhere(grid.cells == 100)[0]
+    assert grid.x + (column + 0.5) * grid.resolution == pytest.approx(1.6, abs=grid.resolution)
+    assert grid.y + (row + 0.5) * grid.resolution == pytest.approx(0.05, abs=grid.resolution)
+    column, row = (
+        int((at - low) / grid.resolution) for at, low in ((1.3, grid.x), (0.05, grid.y))
+    )
+    assert grid.cells[row, column] == 0
+    assert grid.cells[0, 0] == -1
 
 
 @pytest.mark.parametrize('repeated', [False, True])

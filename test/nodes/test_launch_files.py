@@ -364,7 +364,7 @@ def test_patrol_drives_its_path(place, start, slow):
     words = [launch_file(file), *(f'{name}:={value}' for name, value in given.items())]
     with start('launch_files', *words) as launch:
         launch.wait_for('tracking')
-        time.sleep(15.0)
+        time.sleep(25.0)  # it looks around first
         assert not launch.ends(), launch.output()
         codes = end(launch)
     names = (*LOOP, 'recorder', *(['localizer'] if 'localizer' in place else []))

@@ -32,8 +32,8 @@ pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[2]
 
 CONDITIONAL = {
-    'publishes': ('/clock', '/tf'),
-    'subscribes': ('/range/*', '/path', '/target_twist'),
+    'publishes': ('/clock', '/tf', '/keep_out/map'),
+    'subscribes': ('/range/*', '/path', '/target_twist', '/keep_out/map', '/goal_pose'),
     'services': (),
 }
 """Topics that a node has only with some parameters or libraries."""

@@ -19,14 +19,16 @@ from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TransformStamped, Twist
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
 import numpy as np
 import pytest
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import LATCHED, diagnostic, odometry, on_grid, reason, speed, stamp, twist
 
+from t3mpc_ros.geometry.arena import OccupancyGrid as Cells
 from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.nodes.conversions import occupancy_message
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 
 pytestmark = pytest.mark.ros
@@ -290,6 +292,58 @@ def test_a_path_begins_where_the_robot_is(harness, tmp_path, source):
     if source == 'topic':
         assert last.x > 0.5
         assert last.y == pytest.approx(-0.2, abs=1e-6)
+
+
+def test_a_planned_path_waits_for_a_map_and_leads_to_a_goal(harness):
+    reference = harness.add(ReferenceGeneratorNode, source='portrait', plan__enabled=True)
+    received = harness.subscribe(Odometry, 'reference')
+    places = harness.connected_publisher(Odometry, 'odom')
+    maps = harness.connected_publisher(OccupancyGrid, 'keep_out/map', LATCHED)
+    free = occupancy_message(Cells(np.zeros((60, 60), np.int8), 0.05, -1.0, -1.7), 0, '')
+    wrong = OccupancyGrid(data=[0, 0])
+
+    def where():
+        places.publish(received[-1] if received else _odometry())
+
+    def waits():
+        where()
+        return len(received) > 20
+
+    harness.spin_until(waits)
+    assert max(map(speed, received)) == 0.0
+    assert reason(reference) == 'no keep_out/map yet: the controller publishes it'
+
+    def rejects():
+        where()
+        maps.publish(wrong)
+        return diagnostic(reference, 'rejected_inputs')
+
+    harness.spin_until(rejects)
+    count = diagnostic(reference, 'rejected_inputs')
+
+    def drives():
+        where()
+        maps.publish(free)
+        return speed(received[-1]) > 0.2
+
+    harness.spin_until(drives)
+    goals = harness.connected_publisher(PoseStamped, 'goal_pose')
+    goal = PoseStamped()
+    goal.pose.position.x, goal.pose.position.y = 1.2, 0.3
+    for frame in ('elsewhere', 'odom'):
+        goal.header.frame_id = frame
+        goals.publish(goal)
+    nearest = []
+
+    def arrives():
+        where()
+        maps.publish(free)
+        at = received[-1].pose.pose.position
+        nearest.append(np.hypot(at.x - 1.2, at.y - 0.3))
+        return nearest[-1] < 0.15
+
+    harness.spin_until(arrives)
+    assert diagnostic(reference, 'rejected_inputs') > count
 
 
 @pytest.mark.parametrize('source', ['portrait', 'twist'])

@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.chaos.planned_path import PlanParameters
 from t3mpc_ros.chaos.portrait import PortraitParameters
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, digest, run_experiment
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
@@ -42,6 +43,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     portrait_points,
     room_with_boxes,
     run_patrol,
+    share_on_path,
     world_file,
 )
 from t3mpc_ros.evaluation.record import Record
@@ -78,6 +80,8 @@ class PatrolPlan:
     duration: float = 600.0
     """s"""
     robot: str = 'exact'
+    planned: bool = False
+    """Whether the twin plans its path on the map of its keep-out."""
     arena: tuple[float, ...] = PortraitParameters().arena
     """left, bottom, right, top of the area of the paths, m; the walls of the twin's room are
     0.25 m outside."""
@@ -97,6 +101,8 @@ class PatrolPlan:
                 f'arena must be left, bottom, right, top: got {len(self.arena)} numbers'
             )
         Arena(self.arena)
+        if self.planned and self.robot != 'twin':
+            raise ValueError(f'planned needs the robot twin: got {self.robot}')
         left, bottom, right, top = self.arena
         if not (left < 0.0 < right and bottom < 0.0 < top):
             raise ValueError(f'arena must contain the start at (0, 0): got {self.arena}')
@@ -125,6 +131,8 @@ class PatrolTrack(NamedTuple):
     """Where range sensors have hit, m, shape (k, 2)."""
     contacts: int = 0
     """Periods in which the robot touched something."""
+    on_path: float = 1.0
+    """Share of the time from the third minute on within 50 mm of the reference."""
 
 
 class PatrolStudy(NamedTuple):
@@ -168,7 +176,8 @@ def measured_patrol(job: tuple[PatrolPlan, DrivenPath]) -> Row:
     """Return the row of a patrol, by a plan of one path and one seed.
 
     The numbers of :func:`.patrol_metrics.patrol_metrics`, and ``contacts``, periods in which the
-    robot touched something; ``avoiding``, share of the time in which it avoids an obstacle;
+    robot touched something; ``on_path``, see :func:`.share_on_path`; ``avoiding``, share of the
+    time in which it avoids an obstacle;
     ``curve``, coverage at :data:`CURVE` even times from 0 to the duration. What is drawn:
     ``track``, positions (m); ``dwell``, time in each cell (s), NaN in those that do not count;
     ``hits`` of the range sensors (m).
@@ -181,6 +190,7 @@ def measured_patrol(job: tuple[PatrolPlan, DrivenPath]) -> Row:
     row = {
         **patrol_metrics(track.time, x, y, track.grid, reference),
         'contacts': track.contacts,
+        'on_path': track.on_path,
         'avoiding': 1.0 - float(track.counted.mean()),
         'curve': coverage_at(found, track.grid, np.linspace(0.0, plan.duration, CURVE)).tolist(),
     }
@@ -199,7 +209,15 @@ def patrol_track(plan: PatrolPlan, name: str, seed: int) -> PatrolTrack:
     text = plan_world(plan, seed)
     walls = text.partition('boxes:')[0]
     with world_file(walls) as known, world_file(text) as path:
-        record = run_patrol(points, PatrolScenario(seed, plan.duration, known, path))
+        scenario = PatrolScenario(
+            seed,
+            plan.duration,
+            known,
+            path,
+            plan=PlanParameters(enabled=plan.planned),
+            arena=plan.arena,
+        )
+        record = run_patrol(points, scenario)
     return _twin_track(plan, record, parse_world(text, 'room'))
 
 
@@ -254,6 +272,7 @@ def _twin_track(plan: PatrolPlan, record: Record, world: World) -> PatrolTrack:
         world,
         range_hits(record['truth'][rows], record['ranges'][rows]),
         contact_count(record),
+        share_on_path(record),
     )
 
 

@@ -159,7 +159,7 @@ def coverage_table(study: PatrolStudy) -> Table:
     head = ['path', 'coverage, %', *(f'{share} %, s' for share in shares), 'evenness']
     twin = study.plan.robot == 'twin'
     if twin:
-        head += ['path error, mm', 'avoiding, %', 'patrols with contacts']
+        head += ['path error, mm', 'on the path, %', 'avoiding, %', 'patrols with contacts']
     lines = []
     for name in study.plan.paths:
         rows = study.table.where(controller=name)
@@ -168,6 +168,7 @@ def coverage_table(study: PatrolStudy) -> Table:
         line.append(_cell(rows, 'evenness'))
         if twin:
             line.append(_cell(rows, 'path_error', 1, 1e3))
+            line.append(_cell(rows, 'on_path', 1, 100.0))
             line.append(_cell(rows, 'avoiding', 1, 100.0))
             line.append(str(sum(row['contacts'] > 0 for row in rows)))
         lines.append(line)

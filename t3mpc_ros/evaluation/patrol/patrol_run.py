@@ -29,14 +29,18 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.chaos.planned_path import PlannedPath, PlanParameters
 from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
+from t3mpc_ros.chaos.pose_reference import PathClock, WaitParameters
 from t3mpc_ros.chaos.reference import ReferenceParameters
+from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.keep_out import Activity
 from t3mpc_ros.evaluation.loop import reports_of, run_loop
 from t3mpc_ros.evaluation.patrol.path_trackers import PathTracker
-from t3mpc_ros.evaluation.record import RATE, Record, stamp_of
+from t3mpc_ros.evaluation.record import ON_PATH, RATE, Record, stamp_of
 from t3mpc_ros.evaluation.scenario import KINDS, LEAD
+from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
 from t3mpc_ros.geometry.types import (
@@ -70,13 +74,19 @@ SETTLING = 2.0
 ACTIVITIES = tuple(Activity)
 """Meaning of the column ``activity``."""
 LIMITS = MotionLimits()
-"""Limits of every path."""
+"""Limits of every path that is not planned."""
+PLANNED_LIMITS = MotionLimits(linear=0.33, wheel_speed=10.0)
+"""Limits of a planned path, as the launch file sets them: it never has to catch up."""
+EARLY = 180.0
+"""Time before which the robot mainly explores, s."""
 COMMAND_LOSS = 0.1
 """Share of commands that are lost."""
 POSITION_NOISE, YAW_NOISE = 0.003, 0.005
 """Standard deviation of the given position in each coordinate (m), and of the given yaw (rad)."""
 CARRIED_DISTANCE = 1.0
 """Distance by which a robot is carried, within the walls, m."""
+MAP_PERIOD = round(0.25 * RATE)
+"""Periods between two maps of the keep-out."""
 GRIP = 0.25
 """Share of the grip that slippery patches of floor have."""
 
@@ -169,8 +179,17 @@ class PatrolScenario:
     """One of :data:`LOCALIZATIONS`."""
     range_loss: float = 0.0
     """Share of the range readings that are lost."""
+    plan: PlanParameters = PlanParameters()
+    """Whether and how the path is planned on the map of the keep-out."""
+    arena: tuple[float, ...] = PortraitParameters().arena
+    """Where places are revisited, m."""
     carried_at: float = math.inf
     """When the robot is carried by 1 m and turned by 90 degrees, s."""
+
+    @property
+    def limits(self) -> MotionLimits:
+        """Limits of the path."""
+        return PLANNED_LIMITS if self.plan.enabled else LIMITS
 
     def __post_init__(self) -> None:
         if self.localization not in LOCALIZATIONS:
@@ -190,6 +209,12 @@ def path_error(record: Record) -> Array:
     """Return the distance of the true position from that of the reference, m, shape (n,)."""
     error: Array = np.hypot(*(record['truth'] - record['reference_pose'])[:, :2].T)
     return error
+
+
+def share_on_path(record: Record) -> float:
+    """Return the share of the time from the third minute on within 50 mm of the reference."""
+    late = record['time'] >= min(EARLY, 0.5 * float(record['time'][-1]))
+    return float((path_error(record)[late] < ON_PATH).mean())
 
 
 def outside_avoidance(record: Record) -> NDArray[np.bool_]:
@@ -308,7 +333,19 @@ class PathDriver:
             load_world(scenario.known_world).obstacles,
         )
         self._controller.warm_up()
-        self._timing = PathTiming(LIMITS, geometry, 1.0 / RATE, ORIGIN)
+        self._timing = PathTiming(scenario.limits, geometry, 1.0 / RATE, ORIGIN)
+        self._plan: PlannedPath | None = None
+        if scenario.plan.enabled:
+            self._plan = PlannedPath(
+                scenario.plan,
+                self._timing,
+                1.0 / RATE,
+                ORIGIN,
+                lambda: next(points),
+                Arena(scenario.arena),
+            )
+            self._plan.plan.use_random_numbers(SecretRandom(scenario.seed, 'revisits'))
+        self._clock = PathClock(WaitParameters())
         self._generator = np.random.default_rng((scenario.seed, 7))
         self._losses = np.random.default_rng((scenario.seed, 19))
         self._range_loss = scenario.range_loss
@@ -342,15 +379,28 @@ class PathDriver:
             stamp = stamp_of(len(self._references))
             reference = (ORIGIN, BodyTwist(0.0, 0.0))
             if len(self._references) >= round(START * RATE):
-                reference = self._timing.advance_along(self._points)
+                reference = self._next_reference(stamp)
             self._references.append(reference)
             self._controller.add_reference(State(stamp, *reference))
         if changed:
             self._controller.enable(enabled)
 
+    def _next_reference(self, stamp_ns: int) -> tuple[Pose, BodyTwist]:
+        if self._plan is None:
+            return self._timing.advance_along(self._points)
+        keep_out = self._controller.keep_out
+        if keep_out is not None and self._k % MAP_PERIOD == 0:
+            self._plan.set_map(keep_out.map.occupancy())
+        reference = self._plan.advance(self._clock.rate)
+        self._clock.add_reference(stamp_ns, reference[0])
+        return reference
+
     def step(self, state: RobotState) -> RobotCommand:
         """Return the command that follows from a report of the robot."""
         self._pose = self._localised(state)
+        self._clock.observe(state.stamp_ns, self._pose)
+        if self._plan is not None and self._driving:
+            self._plan.observe(self._pose)
         if self.on_state is not None:
             self.on_state(state)
         for sensor, reading in enumerate(state.ranges):

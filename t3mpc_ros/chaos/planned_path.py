@@ -1,0 +1,594 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A path on a map: it goes around what is known, and stops and looks before what is not.
+
+The map is the one of the keep-out, which comes again and again. What of the path leads too near to
+an obstacle is replaced by a route around it (:mod:`t3mpc_ros.geometry.route_planning`), and what
+no route reaches is left out. The reference is told only as much of the path as leads over floor
+that has been seen: it comes to rest before the rest of it, turns to look, and goes on where the
+map then shows free floor; what it cannot see counts as an obstacle for a while. Now and then the
+path leads to a place that was not visited for long.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t3mpc_ros.chaos.secret_random import SecretRandom
+from t3mpc_ros.geometry.arena import Arena, OccupancyGrid
+from t3mpc_ros.geometry.path_timing import PathTiming
+from t3mpc_ros.geometry.route_planning import OCCUPIED, SPACING, RoutePlanner, resampled
+from t3mpc_ros.geometry.types import Array, BodyTwist, Pose, wrap_angle
+from t3mpc_ros.parameters.table import Parameters, parameter
+
+REPLAN = 0.02
+"""Distance by which a planned path may come nearer to obstacles on a newer map, m: readings have
+noise."""
+BACK = 30
+"""Points before and after an obstacle in which a detour leaves and joins the path."""
+HORIZON = 300
+"""Points that are planned ahead of the reference."""
+SEARCH = 2000
+"""Points of the path among which a detour ends."""
+SKIP_COST = 0.05
+"""Way that a detour may be longer for each length of the path that it then does not leave out."""
+TURN_COST = 0.4
+"""Way that is as bad as a right angle where a detour joins the path, m."""
+FEED = 150
+"""Points ahead of the reference that are driven without another look at the map."""
+PASSED = 4
+"""Points that the reference may have passed beyond the length that it drove: it cuts corners."""
+STOP = 5
+"""Points before floor that has not been seen at which the path stops."""
+WIDTHS = 0.2, 0.15, 0.1, 0.07, 0.04
+"""Standard deviations of the windows that smooth a detour, m: the widest that keeps its distance
+from obstacles."""
+CUT = 0.015
+"""Distance by which smoothing may bring a detour nearer to them, m."""
+MISS = 0.12
+"""Distance by which it may pass a place that the path is to visit, m."""
+RAMP = 50
+"""Points over which smoothing begins and ends."""
+LOOK_ANGLE, LOOK_RATE, LOOK_ACCELERATION = 0.55, 1.9, 5.8
+"""Angle to both sides of the path (rad) and yaw rate (rad/s) of a look; its change (rad/s²)."""
+LOOK_AHEAD = 40
+"""Point of the path towards which it looks."""
+SEEN = 30
+"""Points that must have become free for a look to end before its time."""
+REST = 0.3
+"""Time at rest before floor that has not been seen, before the reference looks around, s: the map
+comes twice a second."""
+UNSEEABLE_RADIUS, UNSEEABLE_TIME = 0.2, 60.0
+"""Floor around a place that a look did not show (m), and time for which it then is avoided (s)."""
+FAR_AWAY, PATIENCE = 0.3, 5.0
+"""Distance of the robot from its reference (m) and time (s) after which the path begins anew where
+the robot is."""
+CELL = 0.15
+"""Side of the cells whose last visit is remembered, m."""
+PLACES, APART = 3, 0.25
+"""Old places that are visited one after the other, and their least distance, m."""
+FRESH_COST = 3.0
+"""Cost of floor that was just visited, by the length of a way to old places over it."""
+OLD_SHARE = 0.9
+"""Age of the places that are revisited, as a share of the greatest age."""
+
+
+_NOWHERE = np.empty((0, 2))
+
+
+@dataclass(frozen=True)
+class PlanParameters(Parameters):
+    """How a path is planned on the map of the keep-out."""
+
+    enabled: bool = parameter(
+        False,
+        'source portrait: plan the path on the map that the controller publishes: around '
+        'obstacles, and with a stop to look before floor that has not been seen; needs '
+        'keep_out.enabled of the controller',
+    )
+    distance: float = parameter(
+        0.195,
+        'least distance of the path from obstacles: keep_out.distance of the controller and a '
+        'reserve for the noise of the readings',
+        'm',
+        (0.02, 2.0),
+    )
+    reserve: ClassVar[float] = 0.01
+    """Distance by which floor must have been seen beside the path less than that, m."""
+    revisit_distance: float = parameter(
+        4.0,
+        'mean length of path after which it leads to a place that was not visited for long; '
+        '0: never',
+        'm',
+        (0.0, 1e6),
+    )
+
+
+class PathPlan:
+    """Points along an endless path, around what the map shows.
+
+    given : returns the next points of the path, m, shape (k, 2)
+    """
+
+    def __init__(
+        self,
+        parameters: PlanParameters,
+        planner: RoutePlanner,
+        given: Callable[[], Array],
+        arena: Arena,
+        start: Pose,
+    ) -> None:
+        self._parameters, self._planner, self._given = parameters, planner, given
+        self._arena = arena
+        self.points: Array = np.array([[start.x, start.y]])
+        """m, shape (n, 2)"""
+        self._next: NDArray[np.int64] = np.zeros(1, dtype=np.int64)
+        """Of each point, the first point of the given path that comes after it."""
+        self._path, self._base = np.empty((0, 2)), 0
+        """Points of the given path from a number on."""
+        low, high = arena.corners.min(axis=0), arena.corners.max(axis=0)
+        self._low = low
+        self._visited = np.zeros(np.ceil((high - low) / CELL).astype(np.int64) + 1)
+        """Time of the last visit of each cell, s."""
+        self._left = math.inf
+        self.goal: tuple[float, float] | None = None
+        """Place to which no way has been found yet, m."""
+
+    def lead_to(self, goal: tuple[float, float], fixed: int) -> None:
+        """Lead to a place (m) after the first ``fixed`` points, and then on along the path."""
+        self.truncate(max(fixed, 1))
+        self.goal = goal
+
+    def use_random_numbers(self, random: SecretRandom) -> None:
+        """Draw where and when places are revisited from these numbers from now on."""
+        self._random = random
+        self._left = self._draw_length()
+
+    def _draw_length(self) -> float:
+        mean = self._parameters.revisit_distance
+        return self._random.exponential(mean) if mean > 0.0 else math.inf
+
+    def visit(self, points: Array, time: float) -> None:
+        """Remember that the robot was at places (m) at a time (s)."""
+        column, row = self._cells(points)
+        self._visited[column, row] = time
+
+    def _freshness(self, points: Array) -> Array:
+        """Return the cost of places (m): a way leads over floor that was not visited for long."""
+        last = self._visited[tuple(self._cells(points))]
+        found: Array = FRESH_COST * last / max(float(self._visited.max()), 1e-9)
+        return found
+
+    def _cells(self, points: Array) -> NDArray[np.int64]:
+        cells = np.floor((points - self._low) / CELL).astype(np.int64)
+        found: NDArray[np.int64] = np.clip(cells, 0, np.array(self._visited.shape) - 1).T
+        return found
+
+    def forget(self, count: int) -> None:
+        """Remove the first points."""
+        self.points, self._next = self.points[count:], self._next[count:]
+        used = int(self._next[0]) - self._base
+        self._path, self._base = self._path[used:], self._base + used
+
+    def truncate(self, count: int) -> None:
+        """Keep the first points only; what followed is planned anew."""
+        self.points, self._next = self.points[:count], self._next[:count]
+
+    def begin_at(self, pose: Pose) -> None:
+        """Plan from a place on."""
+        self.points, self._next = np.array([[pose.x, pose.y]]), self._next[:1]
+
+    def extend(self, fixed: int, time: float) -> None:
+        """Plan ahead; the first ``fixed`` points stay as they are."""
+        while len(self.points) < fixed + HORIZON:
+            path = self._ahead()
+            blocked = self._planner.wall_distance(path) < self._parameters.distance
+            gap = math.hypot(*(path[0] - self.points[-1]))
+            begin = (float(self.points[-1, 0]), float(self.points[-1, 1]))
+            if self.goal is not None and self._visit([self.goal], begin, path, blocked, fixed):
+                self.goal = None
+                continue
+            if self._left <= 0.0:
+                self._left = self._draw_length()
+                places = self._old_places(begin, time)
+                if places and self._visit(places, begin, path, blocked, fixed):
+                    continue
+            first = int(np.argmax(blocked)) if blocked.any() else len(blocked)
+            free = min(first - BACK, 2 * BACK)
+            if gap <= 3.0 * SPACING and free > 0:
+                self._append(path[:free], np.arange(1, free + 1))
+            elif not self._detour(begin, path, blocked, fixed):
+                self._next[-1] += SEARCH // 2  # next time to what follows
+                break
+
+    def _ahead(self) -> Array:
+        """Return the given path from the end of the plan on."""
+        used = int(self._next[-1]) - self._base
+        needed = used + SEARCH + 2 * BACK
+        while len(self._path) < needed:
+            self._path = np.vstack([self._path, self._given()])
+        return self._path[used:needed]
+
+    def _append(self, points: Array, following: NDArray[np.int64]) -> None:
+        """Append points, with the numbers of points of the given path passed up to each."""
+        self._next = np.concatenate([self._next, self._next[-1] + following])
+        self.points = np.vstack([self.points, points])
+        self._left -= SPACING * len(points)
+
+    def _joint(
+        self, path: Array, blocked: NDArray[np.bool_], first: int, begin: Array, heading: Array
+    ) -> int:
+        """Return where the way that was found joins the given path best; -1: nowhere.
+
+        first : point of the given path from which on it may
+        begin, heading : begin of that way, and direction of motion there, shape (2,)
+        """
+        clear = np.convolve(~blocked, np.ones(BACK), 'valid')[:SEARCH] > BACK - 0.5
+        times = self._planner.arrival(path)
+        clear &= np.isfinite(times[:SEARCH])
+        clear[:first] = False
+        where = np.flatnonzero(clear)
+        if not where.size:
+            return -1
+        # The way found runs along the path where its time grows as the length does.
+        along = np.clip((times[where + BACK] - times[where]) / (SPACING * BACK), -1.0, 1.0)
+        turns = 2.0 - along - alignments(path[where] - begin, heading)
+        costs = times[where] + SKIP_COST * SPACING * where + TURN_COST * turns
+        return int(where[int(np.argmin(costs))])
+
+    def _detour(
+        self,
+        begin: tuple[float, float],
+        path: Array,
+        blocked: NDArray[np.bool_],
+        fixed: int,
+    ) -> bool:
+        """Append a route to where the given path is free again; return whether there is one."""
+        self._planner.spread(begin)
+        first = int(np.argmax(blocked)) if blocked[: 3 * BACK].any() else 0
+        joint = self._joint(path, blocked, first, self.points[-1], self._heading())
+        if joint < 0:
+            return False
+        route = self._planner.route((float(path[joint, 0]), float(path[joint, 1])), begin)
+        if route is None:
+            return False
+        self._append_smoothly(route, path, joint, fixed)
+        return True
+
+    def _old_places(self, begin: tuple[float, float], time: float) -> list[tuple[float, float]]:
+        """Return places that were not visited for long and have a way, one after the other.
+
+        The first one is drawn, the others are the nearest to the one before.
+        """
+        self._planner.spread(begin)
+        places = self._planner.reached_places()
+        inside = self._arena.contains(places)
+        inside &= self._planner.wall_distance(places) >= self._parameters.distance
+        places = places[inside]
+        if not len(places):
+            return []
+        age = time - self._visited[tuple(self._cells(places))]
+        places = places[age >= OLD_SHARE * age.max()]
+        chosen = [places[self._random.below(len(places))]]
+        for _ in range(1, PLACES):
+            places = places[np.hypot(*(places - chosen[-1]).T) > APART]
+            if not len(places):
+                break
+            chosen.append(places[int(np.argmin(np.hypot(*(places - chosen[-1]).T)))])
+        return [(float(x), float(y)) for x, y in chosen]
+
+    def _visit(
+        self,
+        places: list[tuple[float, float]],
+        begin: tuple[float, float],
+        path: Array,
+        blocked: NDArray[np.bool_],
+        fixed: int,
+    ) -> bool:
+        """Append a way to places, and on to the given path; return whether there is one."""
+        parts: list[Array] = []
+        for place in places:
+            self._planner.spread(begin, self._freshness)
+            part = self._planner.route(place, begin)
+            if part is None:
+                break
+            parts.append(part)
+            begin = place
+        if not parts:
+            return False
+        self._planner.spread(begin, self._freshness)
+        heading = parts[-1][-1] - parts[-1][max(len(parts[-1]) - BACK, 0)]
+        joint = self._joint(path, blocked, 0, parts[-1][-1], heading)
+        if joint < 0:
+            return False
+        back = self._planner.route((float(path[joint, 0]), float(path[joint, 1])), begin)
+        if back is None:
+            return False
+        visited = np.array(places[: len(parts)])
+        self._append_smoothly(np.vstack([*parts, back]), path, joint, fixed, visited)
+        return True
+
+    def _heading(self) -> Array:
+        heading: Array = self.points[-1] - self.points[max(len(self.points) - BACK, 0)]
+        return heading
+
+    def _append_smoothly(
+        self,
+        route: Array,
+        path: Array,
+        joint: int,
+        fixed: int,
+        places: Array = _NOWHERE,
+    ) -> None:
+        """Append a route to a point of the given path and the next ones, its corners rounded.
+
+        places : on the route, that it must not miss, m, shape (n, 2)
+        """
+        before = min(RAMP, len(self.points) - max(fixed, 1))
+        after = path[joint + 1 : joint + 1 + RAMP]
+        kept = len(self.points) - before - 1
+        self._append(route, np.zeros(len(route), dtype=np.int64))
+        self._append(after, joint + 1 + np.arange(1, RAMP + 1))
+        # Smoothing moves points towards each other where the path turns back.
+        points, numbers = self._smoothed(self.points[kept:], places), self._next[kept:]
+        lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        points = resampled(points)
+        even = np.interp(np.linspace(0.0, lengths[-1], len(points)), lengths, numbers)
+        self.points = np.vstack([self.points[:kept], points])
+        self._next = np.concatenate([self._next[:kept], even.astype(np.int64)])
+
+    def _smoothed(self, points: Array, places: Array) -> Array:
+        """Return points with their corners rounded, as wide as the obstacles permit."""
+        planner = self._planner
+        least = np.minimum(planner.wall_distance(points), planner.distance) - CUT
+        along = np.arange(len(points))
+        share = np.clip(np.minimum(along, along[::-1]) / RAMP, 0.0, 1.0)[:, None]
+        share = share * share * (3.0 - 2.0 * share)
+        for width in WIDTHS:
+            reach = math.ceil(3.0 * width / SPACING)
+            window = np.exp(-0.5 * (np.arange(-reach, reach + 1) * SPACING / width) ** 2)
+            padded = np.pad(points, ((reach, reach), (0, 0)), mode='edge')
+            smooth = np.column_stack(
+                [np.convolve(axis, window / window.sum(), 'valid') for axis in padded.T]
+            )
+            rounded: Array = (1.0 - share) * points + share * smooth
+            missed = max((np.hypot(*(rounded - each).T).min() for each in places), default=0.0)
+            if missed <= MISS and (planner.wall_distance(rounded) >= least).all():
+                return rounded
+        return points
+
+
+def alignments(vectors: Array, direction: Array) -> Array:
+    """Return the cosines of the angles between vectors, shape (n, 2), and a direction."""
+    sizes = np.maximum(np.hypot(*vectors.T) * math.hypot(*direction), 1e-9)
+    found: Array = vectors @ direction / sizes
+    return found
+
+
+class _Look:
+    """Turns on the spot from one direction to the next."""
+
+    def __init__(self, pose: Pose, directions: list[float], period: float) -> None:
+        self.pose = pose
+        self.directions = deque(directions)
+        self._rate, self._period = 0.0, period
+
+    def advance(self, rate: float) -> tuple[Pose, BodyTwist]:
+        """Return pose and twist of the next period; rate : share of the speed, 0 to 1."""
+        gap = wrap_angle(self.directions[0] - self.pose.yaw)
+        change = LOOK_ACCELERATION * self._period
+        fastest = min(LOOK_RATE, math.sqrt(2.0 * LOOK_ACCELERATION * abs(gap)))
+        wanted = math.copysign(rate * min(fastest, abs(gap) / self._period), gap)
+        self._rate = min(max(wanted, self._rate - change), self._rate + change)
+        result = self.pose, BodyTwist(0.0, self._rate)
+        x, y, yaw = self.pose
+        self.pose = Pose(x, y, yaw + self._rate * self._period)
+        if abs(gap) < 0.02 and abs(self._rate) < 0.05:
+            self.directions.popleft()
+        return result
+
+    @property
+    def ended(self) -> bool:
+        """Whether it rests in the last direction."""
+        return not self.directions
+
+
+class _Unseeable(NamedTuple):
+    """Floor that a look did not show."""
+
+    x: float
+    y: float
+    until: float
+    """s"""
+
+
+class PlannedPath:
+    """Pose and twist period by period along a planned path; at rest without a map.
+
+    timing : at rest at the start
+    period : s
+    given : returns the next points of the path, m, shape (k, 2)
+    arena : where places are revisited
+    """
+
+    def __init__(
+        self,
+        parameters: PlanParameters,
+        timing: PathTiming,
+        period: float,
+        start: Pose,
+        given: Callable[[], Array],
+        arena: Arena,
+    ) -> None:
+        self._parameters, self._timing, self._period = parameters, timing, period
+        self._planner = RoutePlanner(parameters.distance)
+        self.plan = PathPlan(parameters, self._planner, given, arena, start)
+        """What is known of the path."""
+        self._pose = start
+        self._fed = 1
+        """Points of the plan that the reference has."""
+        self._time = 0.0
+        """s"""
+        self._rested = 0.0
+        """Time at rest before floor that has not been seen, s."""
+        self._driven = 0.0
+        """Length that the reference drove since the last map, m."""
+        self._near_time = 0.0
+        """When the robot was near the reference last, s."""
+        self._look: _Look | None = None
+        self._looked = False
+        """Whether it has looked around since it came to rest."""
+        self._unseeable: list[_Unseeable] = []
+        self._seen = 0
+        """Points of the plan that lead over floor that has been seen."""
+
+    def advance(self, rate: float = 1.0) -> tuple[Pose, BodyTwist]:
+        """Return pose and twist of the next period, for a rate of the path's time."""
+        self._time += self._period
+        if self._look is not None:
+            self._pose, twist = self._look.advance(rate)
+            if self._look.ended:
+                self._begin_at(self._look.pose)
+                self._feed()
+            return self._pose, twist
+        self._pose, twist = self._timing.advance(rate)
+        self._driven += abs(twist.linear) * self._period
+        resting = self._timing.standing and self._timing.arrived
+        self._rested = self._rested + self._period if resting else 0.0
+        if not resting:
+            self._looked = False
+        return self._pose, twist
+
+    def _begin_at(self, pose: Pose) -> None:
+        """Rest at a pose."""
+        self._pose, self._look, self._rested = pose, None, 0.0
+        self._timing.begin_at(pose)
+
+    def observe(self, pose: Pose) -> None:
+        """Begin anew where the robot is, when it has not come near the reference for long."""
+        if math.hypot(pose.x - self._pose.x, pose.y - self._pose.y) < FAR_AWAY:
+            self._near_time = self._time
+        elif self._time - self._near_time > PATIENCE:
+            self._near_time = self._time
+            self.plan.begin_at(pose)
+            self._fed = 1
+            self._begin_at(pose)
+
+    def set_map(self, grid: OccupancyGrid) -> None:
+        """Plan on another map from now on."""
+        self._planner.update(self._with_unseeable(grid))
+        self._go_on()
+        self._leave_unsafe()
+        self.plan.extend(self._fed, self._time)
+        self._feed()
+        if self._look is not None:
+            if self._seen >= self._fed + SEEN and len(self._look.directions) > 1:
+                last = self._look.directions[-1]
+                self._look.directions.clear()
+                self._look.directions.append(last)
+        elif self._rested > REST:
+            self._look_around()
+
+    def _with_unseeable(self, grid: OccupancyGrid) -> OccupancyGrid:
+        self._unseeable = [each for each in self._unseeable if each.until > self._time]
+        if not self._unseeable:
+            return grid
+        cells = grid.cells.copy()
+        rows, columns = cells.shape
+        x = grid.x + grid.resolution * (np.arange(columns) + 0.5)
+        y = grid.y + grid.resolution * (np.arange(rows) + 0.5)
+        for each in self._unseeable:
+            near = (x[None, :] - each.x) ** 2 + (y[:, None] - each.y) ** 2
+            cells[(near < UNSEEABLE_RADIUS**2) & (cells < 0)] = OCCUPIED
+        return grid._replace(cells=cells)
+
+    def _go_on(self) -> None:
+        """Remove the points that the reference has passed."""
+        # Not farther than it drove: where the path crosses itself, another place is as near.
+        most = min(self._fed, math.ceil(self._driven / SPACING) + PASSED)
+        self._driven = 0.0
+        away = self.plan.points[:most] - np.array(self._pose[:2])
+        place = int(np.argmin(np.hypot(*away.T)))
+        self.plan.visit(self.plan.points[: place + 1], self._time)
+        self.plan.forget(place)
+        self._fed -= place
+
+    def _leave_unsafe(self) -> None:
+        """Leave the path where it leads too near to an obstacle, or over floor not seen."""
+        least = self._parameters.distance - REPLAN
+        walls = self._planner.wall_distance(self.plan.points) < least
+        unseen = self._planner.unsafe_distance(self.plan.points[: self._fed]) < least - REPLAN
+        fed = self._fed
+        if self._look is None and (walls[1:fed].any() or unseen[1:].any()):
+            self._cut()
+            fed = self._fed
+        if walls[fed:].any():
+            first = fed + int(np.argmax(walls[fed:]))
+            self.plan.truncate(max(fed, first - BACK))
+        elif walls[1:fed].any():
+            self.plan.truncate(fed)
+
+    def _cut(self) -> None:
+        """Leave the path where the reference can stop."""
+        end = self._timing.cut()
+        away = np.hypot(*(self.plan.points[: self._fed] - np.array(end.pose[:2])).T)
+        self._fed = int(np.argmin(away)) + 1
+
+    def go_to(self, goal: tuple[float, float]) -> None:
+        """Lead to a place (m) now, and then on along the path."""
+        if self._look is None:
+            self._cut()
+        self.plan.lead_to(goal, self._fed)
+
+    def _feed(self) -> None:
+        """Let the reference have what of the path leads over seen floor."""
+        points = self.plan.points[self._fed :]
+        seen = self._planner.unsafe_distance(points) >= (
+            self._parameters.distance - self._parameters.reserve
+        )
+        free = len(points) if seen.all() else int(np.argmin(seen))
+        self._seen = self._fed + free
+        if free < len(points):
+            free -= STOP
+        if self._look is not None:
+            return
+        count = min(free, FEED - self._fed)
+        if count > 0:
+            self._timing.add_points(points[:count])
+            self._fed += count
+
+    def _look_around(self) -> None:
+        """Turn to both sides of the path; where that has been of no use, avoid what is unseen."""
+        points = self.plan.points
+        if self._fed >= len(points):
+            return
+        ahead = points[min(self._fed + LOOK_AHEAD, len(points) - 1)]
+        x, y, yaw = self._pose
+        if self._looked:
+            place_x, place_y = points[min(self._seen, len(points) - 1)].tolist()
+            self._unseeable.append(_Unseeable(place_x, place_y, self._time + UNSEEABLE_TIME))
+            self.plan.truncate(self._fed)
+            self._looked = False
+            self._rested = 0.0
+            return
+        middle = math.atan2(ahead[1] - y, ahead[0] - x)
+        side = math.copysign(LOOK_ANGLE, wrap_angle(yaw - middle))
+        directions = [middle + side, middle - side, middle]
+        self._look = _Look(self._pose, directions, self._period)
+        self._looked = True

@@ -1,0 +1,304 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""A path on a map: around obstacles, not over unseen floor, and on to places that are old."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.chaos.planned_path import FAR_AWAY, PATIENCE, PlannedPath, PlanParameters
+from t3mpc_ros.chaos.pose_reference import PathReferenceParameters
+from t3mpc_ros.chaos.secret_random import SecretRandom
+from t3mpc_ros.geometry.arena import Arena, OccupancyGrid
+from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
+from t3mpc_ros.geometry.route_planning import nearest_distances
+from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, Pose
+from t3mpc_ros.parameters.table import ParameterError
+
+PERIOD = 0.05
+MAP_PERIOD = 5
+"""Periods between two maps."""
+LIMITS = MotionLimits()
+GEOMETRY = WheelGeometry()
+SIZE = 0.04
+"""Side of a cell of the room, m."""
+ROOM = (4.0, 3.0)
+ARENA = (-1.7, -1.2, 1.7, 1.2)
+KEEP_OUT = 0.165
+"""Distance of the keep-out, with which a planned path does not interfere, m."""
+
+
+class Room:
+    """A room of which the robot sees the floor around it, or in a sector ahead."""
+
+    def __init__(self, reach=0.7, half_angle=math.pi):
+        rows, columns = round(ROOM[1] / SIZE), round(ROOM[0] / SIZE)
+        self.occupied = np.zeros((rows, columns), dtype=np.bool_)
+        self.occupied[[0, -1]] = self.occupied[:, [0, -1]] = True
+        self.hidden = np.zeros_like(self.occupied)
+        self.seen = np.zeros_like(self.occupied)
+        self.reach, self.half_angle = reach, half_angle
+        row, column = np.indices((rows, columns))
+        self.x, self.y = SIZE * (column + 0.5) - 2.0, SIZE * (row + 0.5) - 1.5
+        self.see(ORIGIN, around=0.35)
+
+    def near(self, x, y, radius):
+        return np.hypot(self.x - x, self.y - y) < radius
+
+    def see(self, pose, around=0.2):
+        away_x, away_y = self.x - pose.x, self.y - pose.y
+        turn = np.arctan2(away_y, away_x) - pose.yaw
+        turn = np.abs(np.remainder(turn + math.pi, math.tau) - math.pi)
+        distance = np.hypot(away_x, away_y)
+        visible = (distance < self.reach) & (turn < self.half_angle) | (distance < around)
+        self.seen |= visible & ~self.hidden
+
+    def grid(self):
+        cells = np.where(self.seen, np.where(self.occupied, 100, 0), -1).astype(np.int8)
+        return OccupancyGrid(cells, SIZE, -2.0, -1.5)
+
+    def distances(self, marked, poses):
+        """Return the distance of poses from the centre of the nearest marked cell, m."""
+        field = SIZE * nearest_distances(marked)
+        column = ((poses[:, 0] + 2.0) / SIZE).astype(int)
+        row = ((poses[:, 1] + 1.5) / SIZE).astype(int)
+        return field[row, column]
+
+
+def curve():
+    """Return what returns the next points of an endless curve through the room, 1 cm apart."""
+    angle = [0.0]
+
+    def following():
+        found = []
+        for _ in range(100):
+            speed = math.hypot(1.6 * math.cos(angle[0]), 1.1 * 1.618 * math.cos(1.618 * angle[0]))
+            angle[0] += 0.01 / max(speed, 0.2)
+            found.append((1.6 * math.sin(angle[0]), 1.1 * math.sin(1.618 * angle[0])))
+        return np.array(found)
+
+    return following
+
+
+def planned(given=None, seed=1, start=ORIGIN, **values):
+    timing = PathTiming(LIMITS, GEOMETRY, PERIOD, start)
+    parameters = PlanParameters(enabled=True, **values)
+    path = PlannedPath(parameters, timing, PERIOD, start, given or curve(), Arena(ARENA))
+    path.plan.use_random_numbers(SecretRandom(seed, 'revisits'))
+    return path
+
+
+def drive(path, room, seconds, follow=True):
+    """Return poses and twists, shape (n, 5), of a robot that is where its reference is."""
+    rows = []
+    pose = ORIGIN
+    for k in range(round(seconds / PERIOD)):
+        if k % MAP_PERIOD == 0:
+            room.see(pose)
+            path.set_map(room.grid())
+        pose, twist = path.advance()
+        if follow:
+            path.observe(pose)
+        rows.append((*pose, *twist))
+    return np.array(rows)
+
+
+def check_limits(rows):
+    linear, angular = rows[:, 3], rows[:, 4]
+    assert np.abs(linear).max() <= LIMITS.linear
+    assert np.abs(angular).max() <= LIMITS.angular
+    assert np.abs(np.diff(linear)).max() <= LIMITS.linear_acceleration * PERIOD * (1 + 1e-9)
+    assert np.abs(np.diff(angular)).max() <= LIMITS.angular_acceleration * PERIOD * (1 + 1e-9)
+    moves = np.hypot(*np.diff(rows[:, :2], axis=0).T)
+    assert (moves <= LIMITS.linear * PERIOD + 1e-6).all()
+
+
+def length(rows):
+    return float(np.hypot(*np.diff(rows[:, :2], axis=0).T).sum())
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_it_keeps_its_distance_from_whatever_it_has_seen(seed):
+    room = Room()
+    generator = np.random.default_rng(seed)
+    for x, y in generator.uniform([-1.6, -1.1], [1.6, 1.1], (5, 2)):
+        if math.hypot(x, y) > 0.6:
+            room.occupied |= room.near(x, y, float(generator.uniform(0.05, 0.25)))
+    rows = drive(planned(seed=seed), room, 60.0)
+    check_limits(rows)
+    assert room.distances(room.occupied, rows).min() > KEEP_OUT
+    assert room.distances(~room.seen, rows).min() > KEEP_OUT - SIZE
+    assert length(rows) > 7.0
+
+
+def test_before_unseen_floor_it_rests_and_looks_to_both_sides():
+    room = Room(half_angle=0.15)
+    unseen = []
+    path = planned()
+    rows = []
+    pose = ORIGIN
+    for k in range(round(60.0 / PERIOD)):
+        if k % MAP_PERIOD == 0:
+            room.see(pose)
+            path.set_map(room.grid())
+            unseen.append(room.distances(~room.seen, np.array([pose]))[0])
+        pose, twist = path.advance()
+        rows.append((*pose, *twist))
+    rows = np.array(rows)
+    check_limits(rows)
+    assert min(unseen) > KEEP_OUT - SIZE
+    turns = rows[:, 3] == 0.0
+    looks = turns & (np.abs(rows[:, 4]) > 1.0)
+    assert (rows[looks, 4] > 0.0).any()
+    assert (rows[looks, 4] < 0.0).any()
+    assert length(rows) > 1.2
+
+
+def test_what_a_look_does_not_show_is_driven_around():
+    room = Room()
+    room.hidden = room.near(0.9, 0.7, 0.25) | room.near(-0.6, 0.3, 0.2)
+    rows = drive(planned(), room, 60.0)
+    assert room.distances(room.hidden, rows).min() > KEEP_OUT - 1.5 * SIZE
+    assert length(rows) > 6.0
+
+
+def test_what_is_placed_ahead_of_it_is_not_touched():
+    room = Room()
+    room.seen[:] = True
+    generator = np.random.default_rng(4)
+    path, pose, rows = planned(), ORIGIN, []
+    for k in range(round(60.0 / PERIOD)):
+        if k % 100 == 99:
+            angle = pose.yaw + generator.uniform(-0.5, 0.5)
+            room.occupied[1:-1, 1:-1] = False
+            room.occupied |= room.near(
+                pose.x + 0.45 * math.cos(angle), pose.y + 0.45 * math.sin(angle), 0.1
+            )
+        if k % MAP_PERIOD == 0:
+            path.set_map(room.grid())
+        pose, twist = path.advance()
+        rows.append((*pose, *twist, room.distances(room.occupied, np.array([pose]))[0]))
+    rows = np.array(rows)
+    check_limits(rows)
+    assert rows[:, 5].min() > 0.12
+    assert length(rows) > 4.0  # something is in its way every 5 s
+
+
+def test_old_places_are_visited_again():
+    """The given path is a small circle: what else is entered is due to the visits."""
+
+    def circle():
+        angle = 0.3
+        while True:
+            angles = angle + np.arange(100) * 0.01 / 0.3
+            yield 0.3 * np.column_stack([np.sin(angles), 1.0 - np.cos(angles)])
+            angle += 1.0 / 0.3
+
+    shares = []
+    for distance in (0.0, 3.0):
+        room = Room()
+        room.seen[:] = True
+        rows = drive(planned(circle().__next__, revisit_distance=distance), room, 120.0)
+        cells = np.floor(rows[:, :2] / 0.3).astype(int)
+        shares.append(len({*map(tuple, cells.tolist())}) / (3.4 * 2.4 / 0.09))
+    assert shares[0] < 0.12
+    assert shares[1] > 2.0 * shares[0]
+
+
+def test_it_leads_to_a_goal_and_waits_for_a_way_to_one_without():
+    room = Room()
+    room.seen[:] = True
+    room.occupied |= room.near(0.5, 0.4, 0.2)
+    ring = room.near(-1.0, -0.6, 0.5) & ~room.near(-1.0, -0.6, 0.38)
+    room.occupied |= ring
+    path = planned(revisit_distance=0.0)
+    drive(path, room, 5.0)
+    for goal in ((1.3, 0.9), (-1.2, 0.9)):
+        path.go_to(goal)
+        rows = drive(path, room, 20.0)
+        check_limits(rows)
+        assert path.plan.goal is None
+        assert np.hypot(*(rows[:, :2] - goal).T).min() < 0.15
+    path.go_to((-1.0, -0.6))
+    drive(path, room, 10.0)
+    assert path.plan.goal is not None
+    room.occupied &= ~ring
+    rows = drive(path, room, 40.0)
+    assert np.hypot(*(rows[:, :2] - (-1.0, -0.6)).T).min() < 0.15
+
+
+def test_equal_seeds_give_equal_paths_and_others_do_not():
+    def positions(seed):
+        room = Room()
+        room.seen[:] = True
+        return drive(planned(seed=seed, revisit_distance=2.0), room, 30.0)
+
+    first = positions(1)
+    assert np.array_equal(first, positions(1))
+    assert not np.array_equal(first, positions(2))
+
+
+def test_without_a_map_it_rests():
+    path = planned()
+    for _ in range(20):
+        assert path.advance() == (ORIGIN, STANDSTILL)
+
+
+def test_a_robot_that_is_walled_in_rests_until_it_is_free():
+    room = Room()
+    ring = room.near(0.0, 0.0, 0.45) & ~room.near(0.0, 0.0, 0.3)
+    room.occupied |= ring
+    path = planned()
+    assert length(drive(path, room, 10.0)) < 0.5
+    room.occupied &= ~ring
+    assert length(drive(path, room, 30.0)) > 3.0
+
+
+def test_it_begins_anew_at_a_robot_that_does_not_come():
+    room = Room()
+    room.seen[:] = True
+    path = planned()
+    drive(path, room, 5.0)
+    place = Pose(-0.9, -0.6, 2.0)
+    rows = []
+    for k in range(round((PATIENCE + 2.0) / PERIOD)):
+        if k % MAP_PERIOD == 0:
+            path.set_map(room.grid())
+        path.observe(place)
+        rows.append(path.advance(0.0)[0])
+    away = np.array([math.dist(each[:2], place[:2]) for each in rows])
+    assert (away[: round(PATIENCE / PERIOD) - 1] > FAR_AWAY).all()
+    assert rows[-1] == pytest.approx(place)
+    assert length(drive(path, room, 20.0)) > 2.0
+
+
+def test_a_pause_stops_it_within_the_limits_at_any_moment():
+    room = Room(half_angle=0.15)
+    path, pose, rows = planned(), ORIGIN, []
+    for k in range(round(40.0 / PERIOD)):
+        if k % MAP_PERIOD == 0:
+            room.see(pose)
+            path.set_map(room.grid())
+        pose, twist = path.advance(0.0 if k % 60 > 40 else 1.0)
+        rows.append((*pose, *twist))
+        if k % 60 == 59:
+            assert twist == STANDSTILL
+    check_limits(np.array(rows))
+
+
+def test_only_portraits_are_planned():
+    with pytest.raises(ParameterError, match='plan.enabled needs source portrait'):
+        PathReferenceParameters.from_dict({'source': 'topic', 'plan.enabled': True})
