@@ -16,6 +16,11 @@
 ``gymnasium.make('t3mpc_ros.gym:t3mpc_ros/Tracking-v0')`` imports it by itself.
 """
 
-from gymnasium import register
+from t3mpc_ros.missing_library import remedy
+
+try:
+    from gymnasium import register
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(remedy(error) or str(error), name=error.name) from error
 
 register('t3mpc_ros/Tracking-v0', 't3mpc_ros.evaluation.api.tracking_env:TrackingEnv')

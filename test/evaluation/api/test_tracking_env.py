@@ -13,6 +13,8 @@
 # limitations under the License.
 """The environment of Gymnasium is the loop of every other run, with a policy as its controller."""
 
+import importlib
+import sys
 import warnings
 
 import numpy as np
@@ -157,3 +159,10 @@ def test_wrong_use_is_an_error_when_it_is_made():
         TrackingEnv('no robot')
     with pytest.raises(t3.ScriptError, match='a policy needs preview'):
         t3.simulate(lambda observation: np.zeros(2) * vector_of(observation)[0], **SHORT)
+
+
+def test_a_missing_gymnasium_is_named_with_its_extra(monkeypatch):
+    monkeypatch.delitem(sys.modules, 't3mpc_ros.gym', raising=False)
+    monkeypatch.setitem(sys.modules, 'gymnasium', None)
+    with pytest.raises(ModuleNotFoundError, match=r'pip install .*with its extra \[gym\]'):
+        importlib.import_module('t3mpc_ros.gym')
