@@ -282,15 +282,16 @@ class BodyCorrection:
         bias, estimate = self.gyro_bias, self._state.estimate
         if abs(bias) > WARNED_BIAS:
             return (
-                f'the yaw of odom turns by {bias:.3f} rad/s more than the wheels: bias of the '
-                'gyro; it is not followed; let the robot stand for two seconds'
+                f'the yaw of odom turns by {_compared(bias, ".3f", "rad/s")} the wheels: bias '
+                'of the gyro; it is not followed; let the robot stand for two seconds'
             )
         share = estimate[TURNING] + estimate[GYRO_SCALE]
         deviations = np.sqrt(np.diag(self._state.covariance))
         deviation = deviations[TURNING]
-        if abs(estimate[GYRO_SCALE]) > WARNED_SCALE and deviation > WARNED_DEVIATION:
+        scale = min(abs(estimate[GYRO_SCALE]), abs(share))  # both: else the yaw of odom fits
+        if scale > WARNED_SCALE and deviation > WARNED_DEVIATION:
             return (
-                f'the yaw of odom turns by {100.0 * share:.1f} % more than the wheels: scale of '
+                f'the yaw of odom turns by {_compared(100.0 * share)} the wheels: scale of '
                 'the gyro, or wheel separation; calibrate the robot, or lower '
                 'body.gyro_scale_tolerance if the gyro is right'
             )
@@ -298,7 +299,7 @@ class BodyCorrection:
         if (np.abs(estimate[:GYRO_SCALE]) > least[:GYRO_SCALE]).any():
             turning, asymmetry = 100.0 * estimate[TURNING], 100.0 * estimate[ASYMMETRY]
             return (
-                f'the robot turns by {turning:.1f} % more than the wheels, and by {asymmetry:.1f} '
+                f'the robot turns by {_compared(turning)} the wheels, and by {asymmetry:.1f} '
                 '% of their mean speed: wheel separation or radii are not those that are set, or '
                 'the gyro is not calibrated; corrected as far as the wheels allow'
             )
@@ -525,3 +526,8 @@ def update_authority(memory: BodyMemory) -> None:
     elif memory.error_power > 0.0:
         skill = 1.0 - (memory.residual_power + DEAD_ZONE**2) / memory.error_power
         memory.authority = min(max((skill - NO_SKILL) / (FULL_SKILL - NO_SKILL), 0.0), 1.0)
+
+
+def _compared(value: float, digits: str = '.1f', unit: str = '%') -> str:
+    """Return by how much more or less something is than another thing."""
+    return f'{abs(value):{digits}} {unit} {"less" if value < 0.0 else "more"} than'

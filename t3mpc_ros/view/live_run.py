@@ -40,6 +40,12 @@ PAUSED = NodeReport('paused')
 """Report of a reference generator that was paused."""
 
 
+NOT_HEARD = (
+    'what is shown is old, and the robot may not hear a stop: use its switch, then see whether '
+    'sim_robot or radio_bridge runs and is reached'
+)
+
+
 class Banner(NamedTuple):
     """One line in large letters, and the reason for it."""
 
@@ -66,7 +72,8 @@ def banner(reports: Mapping[str, NodeReport], odometry_age: float | None) -> Ban
     if odometry_age is None:
         return Banner('lost', 'Waiting for a robot', detail or 'no odometry on the graph yet')
     if odometry_age > LOST:
-        return Banner('lost', 'Connection lost', f'no odometry for {odometry_age:.0f} s')
+        silence = f'no odometry for {odometry_age:.0f} s'
+        return Banner('lost', 'Connection lost', f'{silence}: {detail or NOT_HEARD}')
     if any(each.text.startswith(ESTOP) for each in stops.values()):
         return Banner('stopped', 'E-STOP', detail)
     if reports.get('reference_generator') == PAUSED:
