@@ -51,7 +51,7 @@ class RobotNode(BaseNode[P]):
         """Create the topics and services of a robot."""
         self._robot = robot
         self._lock = threading.Lock()
-        """Guards the robot, which several threads may use."""
+        """Guards the robot, which the thread of radio_bridge uses, too."""
         self._received = self._rejected = 0
         self._command_problem = ''
         """Why the last command was rejected; empty if it was accepted."""
