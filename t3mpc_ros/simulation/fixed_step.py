@@ -91,7 +91,7 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
         return self._limiter.accept(command, self._run_to(now_ns))
 
     def advance(self, now_ns: int) -> RobotState:
-        """Integrate up to ``now_ns``, and return the state at the last instant of the time grid."""
+        """Integrate up to ``now_ns``; return the state at the last instant of the time grid."""
         self._run_to(now_ns, whole_periods=True)
         reports = self._reports
         while len(reports) > 1 and reports[1].stamp_ns <= now_ns:
