@@ -319,7 +319,8 @@ def page(plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | Non
     """Return the page as self-contained HTML."""
     blocks: list[Block] = [verdict_box(plan, results)]
     figures: Mapping[str, Callable[[ComparisonPlan, ResultTable, str], Any]] = {
-        f'Difference from {plan.against}, with 95 % interval': _draw_differences,
+        f'Difference from {plan.against}, left is better; 95 % intervals are of each by itself, '
+        'verdicts are stricter because there are many': _draw_differences,
         'Error against variation of the command; joined: no method is better in both': draw_pareto,
         'Every seed, and the mean': draw_seeds,
     }

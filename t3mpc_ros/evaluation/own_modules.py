@@ -188,4 +188,5 @@ def _is_loaded(name: str, source: SourceText) -> bool:
     try:
         return loader is None or loader.get_source(name) == source.text
     except (AttributeError, ImportError, KeyError):
-        return not source.text  # a folder without __init__.py
+        # A folder without __init__.py, or a loader that keeps no text, as that of pytest.
+        return own_text(sys.modules[name]) == source.text

@@ -138,6 +138,7 @@ class ViewNode(Node):
             name: self.create_client(kind, service) for name, (kind, service) in SERVICES.items()
         }
         self._path_publisher = self.create_publisher(Path, 'path', PATH)
+        self._goal_publisher = self.create_publisher(PoseStamped, 'goal_pose', PATH)
         self._polled: dict[str, Subscription] = {}
         self._subscribe_all()
         sink.set('terms', list(TERM_NAMES))
@@ -424,7 +425,10 @@ class ViewNode(Node):
             reply.set_exception(CommandFailedError(str(error)))
 
     def _publish_path(self, points: Any) -> str:
-        """Publish points (m, in the frame of the odometry) for a reference of source ``topic``."""
+        """Publish points (m, in the frame of the odometry) for a reference that drives there.
+
+        A patrol that plans takes one point, its goal; a reference of source ``topic`` any path.
+        """
         try:
             places = np.array(points, dtype=np.float64)
             check_points(places)
@@ -432,9 +436,11 @@ class ViewNode(Node):
                 raise PathError('points must not be empty')
         except (PathError, TypeError, ValueError) as error:
             raise CommandFailedError(f'path needs points, [[x, y], …] in m: {error}') from None
-        if not self._path_publisher.get_subscription_count():
+        planned = len(places) == 1 and self._goal_publisher.get_subscription_count()
+        if not planned and not self._path_publisher.get_subscription_count():
             raise CommandFailedError(
-                'no node follows a path: start reference_generator with source topic'
+                'no node follows a path: start reference_generator with source topic; a patrol '
+                'with plan.enabled drives to a goal'
             )
         message = Path()
         message.header.stamp = self.get_clock().now().to_msg()
@@ -444,7 +450,10 @@ class ViewNode(Node):
             PoseStamped(header=message.header, pose=Pose(position=Point(x=float(x), y=float(y))))
             for x, y in places
         ]
-        self._path_publisher.publish(message)
+        if planned:
+            self._goal_publisher.publish(message.poses[0])
+        else:
+            self._path_publisher.publish(message)
         text = f'path of {len(places)} points' if len(places) > 1 else 'goal'
         x, y = places[-1]
         text = f'{text} to x {x:.2f} m, y {y:.2f} m'

@@ -69,6 +69,13 @@ def test_a_worker_gets_the_modules_of_each_job(finder):
     assert run_carried(source_digest(), sources(15), law) == 30
 
 
+def test_a_module_whose_loader_keeps_no_text_stays(finder):
+    """That of a test is one: it was run again, and its functions could no longer be pickled."""
+    here = sys.modules[__name__]
+    finder.provide(own_sources())
+    assert sys.modules[__name__] is here
+
+
 def test_a_module_that_the_worker_has_already_stays(finder, tmp_path, monkeypatch):
     """Of a worker that is a thread of the program: reloading finds its file, as before."""
     (tmp_path / 'carried_helper.py').write_text('def gain():\n    return 7\n')

@@ -17,6 +17,7 @@ from functools import partial
 import math
 import time
 
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
 import pytest
 from rclpy.serialization import serialize_message
@@ -217,6 +218,19 @@ def test_a_drawn_path_reaches_the_reference_and_no_later_one(viewer, harness):
     viewer.spin_until(lambda: len(paths) > 2)
     assert [len(each.poses) for each in paths] == [2, 1, 1]
     assert paths[-1].poses[0].pose.position.x == 3.0
+
+
+def test_a_goal_reaches_a_patrol_that_plans(viewer, harness):
+    goals = []
+    harness.probe.create_subscription(PoseStamped, 'goal_pose', goals.append, 10)
+    viewer.spin_until(lambda: viewer.node._goal_publisher.get_subscription_count())
+    assert viewer.command('path', points=[[1.0, 2.0]]) == 'goal to x 1.00 m, y 2.00 m'
+    viewer.spin_until(lambda: goals)
+    (goal,) = goals
+    assert (goal.pose.position.x, goal.pose.position.y) == (1.0, 2.0)
+    assert goal.header.frame_id == 'odom'
+    with pytest.raises(CommandFailedError, match='a patrol with plan.enabled drives to a goal'):
+        viewer.command('path', points=[[0.0, 0.5], [1.0, 2.0]])
 
 
 def setting(name, value):

@@ -77,6 +77,8 @@ function keptStop(time) {
 async function emergencyStop() {
   if (readOnly || pressed !== null) return;
   const begun = pressed = steady();
+  place('answer').className = ''; // the last one may be of a stop before
+  place('answer').textContent = 'e_stop …';
   const time = asked();
   const late = setTimeout(() => unconfirmed(begun, 'no answer yet'), CONFIRM);
   keptStop(Date.now());

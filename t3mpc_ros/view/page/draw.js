@@ -1,6 +1,7 @@
 // Copyright 2026 The t3mpc_ros developers
 // SPDX-License-Identifier: Apache-2.0
-// A path, or a goal, that a person draws on the floor for a reference of source topic.
+// A path, or a goal, that a person draws on the floor for a reference of source topic; a patrol that
+// plans takes goals.
 'use strict';
 
 const SPACING = 0.02; // m between two points of a line
@@ -12,7 +13,9 @@ let drawingLine = false; // whether a line is being drawn
 
 function showDrawing() {
   const rows = facts['parameters/reference_generator'] || [];
-  place('draw').hidden = readOnly || !rows.some(({ name, value }) => name === 'source' && value === 'topic');
+  const is = (wanted, given) => rows.some(({ name, value }) => name === wanted && value === given);
+  const takes = is('source', 'topic') || (is('source', 'portrait') && is('plan.enabled', true));
+  place('draw').hidden = readOnly || !takes;
 }
 
 function setDrawing(on) {
