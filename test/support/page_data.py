@@ -62,28 +62,24 @@ def legends(browser, at):
     }
 
 
-def check_legends(browser, run, seed, origin=0.0, span=None, delay=0.03):
-    """Compare the legends at 50 instants with the messages of the same run.
+DELAY = 0.03
+"""With which a command, which has no stamp, may have been received, s."""
 
-    ``origin`` is the time of the page at which the recording begins, s; ``span`` is the part of
-    the recording, s, in which the instants are; ``delay`` is that with which a command, which has
-    no stamp, may have been received, s.
-    """
+
+def check_legends(browser, run, seed):
+    """Compare the legends at 50 instants with the messages of the same run."""
     odom, reference, command = (run.motions[each] for each in ('odom', 'reference', 'cmd_vel'))
-    begin, end = span or (
-        max(odom.time[0], reference.time[0]),
-        min(odom.time[-1], reference.time[-1]),
-    )
+    begin = max(odom.time[0], reference.time[0])
+    end = min(odom.time[-1], reference.time[-1])
     instants = np.random.default_rng(seed).uniform(begin + 0.1, end - 0.1, 50)
     period = float(np.median(np.diff(odom.time)))
     # The lines of the page are those of every second sample, fewer where it was too slow.
-    drawn = np.array(browser.run('return streams.reference.time')) - origin
-    measured = np.array(browser.run('return streams.odometry.time')) - origin
-    moved = np.array(browser.run('return (streams.truth ?? streams.odometry).time')) - origin
+    drawn = np.array(browser.run('return streams.reference.time'))
+    measured = np.array(browser.run('return streams.odometry.time'))
+    moved = np.array(browser.run('return (streams.truth ?? streams.odometry).time'))
     lost = 0
     for at in instants.tolist():
-        instant, shown = legends(browser, at + origin)
-        instant -= origin
+        instant, shown = legends(browser, at)
         assert abs(instant - at) < np.min(np.abs(measured - at)) + 5e-3, 'not the nearest one'
         row = int(np.argmin(np.abs(odom.time - instant)))
         if abs(odom.time[row] - instant) > 2e-5:
@@ -109,9 +105,9 @@ def check_legends(browser, run, seed, origin=0.0, span=None, delay=0.03):
                 np.interp(instant, moved, np.interp(moved, motion.time, motion[wheel])) - wanted
             )
             assert shown['Error'][wheel] == pytest.approx(error, abs=1.6e-3 + 0.02 * slope)
-            sent = command[wheel][np.abs(command.time - instant) < delay]
+            sent = command[wheel][np.abs(command.time - instant) < DELAY]
             if lines['command'] is None or not sent.size:  # no processor for the controller
-                assert np.max(np.diff(command.time[np.abs(command.time - instant) < 5.0])) > delay
+                assert np.max(np.diff(command.time[np.abs(command.time - instant) < 5.0])) > DELAY
                 continue
             assert sent.min() - 1e-3 <= lines['command'] <= sent.max() + 1e-3
     assert lost < 10, 'too few instants were compared'
