@@ -28,6 +28,8 @@ from t3mpc_ros.geometry.route_planning import nearest_distances
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, Pose
 from t3mpc_ros.parameters.table import ParameterError
 
+pytestmark = pytest.mark.compiled  # without the compiler a drive takes half a minute
+
 PERIOD = 0.05
 MAP_PERIOD = 5
 """Periods between two maps."""
