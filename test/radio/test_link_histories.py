@@ -292,6 +292,7 @@ class History(RuleBasedStateMachine):
         bench.run(20.0, lambda: bench.link.state is LinkState.RUN)
         bench.run(0.5)
         bench.link.release_estop(bench.now_ns)
+        bench.run(1.0, lambda: not bench.robot.estop)  # up to 0.62 s after some histories
         bench.run(0.5)
         assert not bench.robot.estop
         bench.drive(2.0, 3.0)
