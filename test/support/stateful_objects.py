@@ -974,6 +974,10 @@ NEVER_RESET = {
         ('InputMonitor', 'Gaps', 'ResponseGain', 'GivenPathSource', 'SmoothedPath', 'PauseRamp'),
         'made anew for each run or path',
     ),
+    **dict.fromkeys(
+        ('RoutePlanner', 'PathPlan', 'PlannedPath', '_Look'),
+        'of one patrol: another seed is for what is planned next, the map and the plan are kept',
+    ),
     **dict.fromkeys(('NoisyPlant', 'PlantRobot'), 'one run, no reset'),
     'FixedStepRobot': 'base of PaperRobot and DigitalTwin',
     'StateArray': 'constant',
