@@ -19,16 +19,16 @@ It prints the table of docs/radio.md, or writes it there with ``--page``; words 
 fault begins at every phase of the cycle of the link, in virtual time on emulated boards.
 """
 
-import argparse
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 import math
-from pathlib import Path
 import re
 from typing import NamedTuple
 
 from support.emulator_bench import MS, RobotBench, cable_bench
 
+from bench.page_table import PageTable
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes.robot_topics import state_warnings
 from t3mpc_ros.radio.link.port_actions import LinkState
@@ -36,10 +36,6 @@ from t3mpc_ros.radio.link.statistics import DiagnosticLevel
 
 PHASES = 20
 """Trials of each fault."""
-HEAD = (
-    '| fault | microsteps missed | pose, mm | restarts counted | true ones | named for longest |',
-    '|---' * 6 + '|',
-)
 CYCLE = 0.02
 """Cycle of the link, s."""
 SAMPLE_NS = 50 * MS
@@ -57,8 +53,6 @@ HOPS = {
     'host': r'was not executed',
 }
 """What names a hop in the diagnostics; a silent line and a silent board look alike."""
-BEGIN, END = '<!-- faults -->\n', '<!-- end of faults -->\n'
-"""Marks of the table in the page."""
 
 
 class Trial(NamedTuple):
@@ -273,25 +267,23 @@ def format_row(fault: Fault, trials: list[Trial]) -> str:
     return f'| {fault.name} | {steps} | {1e3 * error:.2f} | {counted} | {happened} | {hop} |'
 
 
-def main() -> None:
-    """Print the table, or write it to the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--phases', type=int, default=PHASES)
-    parser.add_argument('--page', type=Path)
-    parser.add_argument('words', nargs='*')
-    options = parser.parse_args()
-    rows = []
-    for fault in faults():
-        if all(word in fault.name for word in options.words):
-            trials = [measure(fault, phase / options.phases) for phase in range(options.phases)]
-            rows.append(format_row(fault, trials))
-            print(rows[-1], flush=True)
-    if options.page is not None:
-        before, _, rest = options.page.read_text().partition(BEGIN)
-        after = rest.partition(END)[2]
-        table = ''.join(f'{line}\n' for line in (*HEAD, *rows))
-        options.page.write_text(f'{before}{BEGIN}{table}{END}{after}')
+def _measured_row(fault: Fault, phases: int) -> str:
+    return format_row(fault, [measure(fault, phase / phases) for phase in range(phases)])
 
+
+TABLE = PageTable(
+    'faults',
+    (
+        'fault',
+        'microsteps missed',
+        'pose, mm',
+        'restarts counted',
+        'true ones',
+        'named for longest',
+    ),
+    ('phases', PHASES),
+    [(fault.name, partial(_measured_row, fault)) for fault in faults()],
+)
 
 if __name__ == '__main__':
-    main()
+    TABLE.main(__doc__)

@@ -22,7 +22,6 @@ lag and dead time of the drive, and what happens to messages. The robots share n
 simulation of the package.
 """
 
-import argparse
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -37,6 +36,7 @@ import numpy as np
 from support.velocity_robot import VelocityRobot
 import yaml
 
+from bench.page_table import PageTable
 from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.evaluation.confidence_intervals import Difference, mean, paired
@@ -44,8 +44,6 @@ from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist,
 from t3mpc_ros.nodes.controller import GAP_PERIODS, SHORTEST_WATCHDOG_PERIOD, WATCHDOG_PERIOD
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
-BEGIN, END = '<!-- robots -->\n', '<!-- end of robots -->\n'
-"""Marks of the table in the page."""
 MS = 1_000_000
 SEEDS = 6
 DURATION, START = 60.0, 10.0
@@ -347,12 +345,6 @@ def measure(toy: Toy, seeds: int) -> Row:
     return Row(*runs)
 
 
-HEAD = (
-    '| robot | ours, % | ten lines, % | difference, 95 % | away from jumps: ours, ten lines, % |',
-    '|---' * 5 + '|',
-)
-
-
 def format_row(toy: Toy, row: Row) -> str:
     """Return a row of the table."""
     whole = [mean([each.whole for each in some]) for some in row]
@@ -365,24 +357,22 @@ def format_row(toy: Toy, row: Row) -> str:
     )
 
 
-def main() -> None:
-    """Print the table, or write it to the page."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--seeds', type=int, default=SEEDS)
-    parser.add_argument('--page', type=Path)
-    parser.add_argument('words', nargs='*')
-    options = parser.parse_args()
-    rows = []
-    for toy in TOYS:
-        if all(word in toy.name for word in options.words):
-            rows.append(format_row(toy, measure(toy, options.seeds)))
-            print(rows[-1], flush=True)
-    if options.page is not None:
-        before, _, rest = options.page.read_text().partition(BEGIN)
-        after = rest.partition(END)[2]
-        table = ''.join(f'{line}\n' for line in (*HEAD, *rows))
-        options.page.write_text(f'{before}{BEGIN}{table}{END}{after}')
+def _measured_row(toy: Toy, seeds: int) -> str:
+    return format_row(toy, measure(toy, seeds))
 
+
+TABLE = PageTable(
+    'robots',
+    (
+        'robot',
+        'ours, %',
+        'ten lines, %',
+        'difference, 95 %',
+        'away from jumps: ours, ten lines, %',
+    ),
+    ('seeds', SEEDS),
+    [(toy.name, partial(_measured_row, toy)) for toy in TOYS],
+)
 
 if __name__ == '__main__':
-    main()
+    TABLE.main(__doc__)

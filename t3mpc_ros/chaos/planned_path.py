@@ -15,7 +15,7 @@
 
 The map is the one of the keep-out, which comes again and again. What of the path leads too near to
 an obstacle is replaced by a route around it (:mod:`t3mpc_ros.geometry.route_planning`), and what
-no route reaches is left out. The reference is told only as much of the path as leads over floor
+no route reaches is left out. The reference gets only as much of the path as leads over floor
 that has been seen: it comes to rest before the rest of it, turns to look, and goes on where the
 map then shows free floor; what it cannot see counts as an obstacle for a while. Now and then the
 path leads to a place that was not visited for long.
@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.geometry.arena import Arena, OccupancyGrid
-from t3mpc_ros.geometry.path_timing import PathTiming
-from t3mpc_ros.geometry.route_planning import OCCUPIED, SPACING, RoutePlanner, resampled
+from t3mpc_ros.geometry.path_timing import PathTiming, resample
+from t3mpc_ros.geometry.route_planning import OCCUPIED, SPACING, RoutePlanner
 from t3mpc_ros.geometry.types import Array, BodyTwist, Pose, wrap_angle
 from t3mpc_ros.parameters.table import Parameters, parameter
 
@@ -72,8 +72,8 @@ LOOK_AHEAD = 40
 SEEN = 30
 """Points that must have become free for a look to end before its time."""
 REST = 0.3
-"""Time at rest before floor that has not been seen, before the reference looks around, s: the map
-comes twice a second."""
+"""Time at rest before floor that has not been seen, before the reference looks around, s: within
+which the map comes again."""
 UNSEEABLE_RADIUS, UNSEEABLE_TIME = 0.2, 60.0
 """Floor around a place that a look did not show (m), and time for which it then is avoided (s)."""
 FAR_AWAY, PATIENCE = 0.3, 5.0
@@ -164,7 +164,7 @@ class PathPlan:
         mean = self._parameters.revisit_distance
         return self._random.exponential(mean) if mean > 0.0 else math.inf
 
-    def visit(self, points: Array, time: float) -> None:
+    def remember(self, points: Array, time: float) -> None:
         """Remember that the robot was at places (m) at a time (s)."""
         column, row = self._cells(points)
         self._visited[column, row] = time
@@ -201,13 +201,13 @@ class PathPlan:
             blocked = self._planner.wall_distance(path) < self._parameters.distance
             gap = math.hypot(*(path[0] - self.points[-1]))
             begin = (float(self.points[-1, 0]), float(self.points[-1, 1]))
-            if self.goal is not None and self._visit([self.goal], begin, path, blocked, fixed):
+            if self.goal is not None and self._lead_over([self.goal], begin, path, blocked, fixed):
                 self.goal = None
                 continue
             if self._left <= 0.0:
                 self._left = self._draw_length()
                 places = self._old_places(begin, time)
-                if places and self._visit(places, begin, path, blocked, fixed):
+                if places and self._lead_over(places, begin, path, blocked, fixed):
                     continue
             first = int(np.argmax(blocked)) if blocked.any() else len(blocked)
             free = min(first - BACK, 2 * BACK)
@@ -232,12 +232,12 @@ class PathPlan:
         self._left -= SPACING * len(points)
 
     def _joint(
-        self, path: Array, blocked: NDArray[np.bool_], first: int, begin: Array, heading: Array
+        self, path: Array, blocked: NDArray[np.bool_], first: int, begin: Array, direction: Array
     ) -> int:
         """Return where the way that was found joins the given path best; -1: nowhere.
 
         first : point of the given path from which on it may
-        begin, heading : begin of that way, and direction of motion there, shape (2,)
+        begin, direction : begin of that way, and direction of motion there, shape (2,)
         """
         clear = np.convolve(~blocked, np.ones(BACK), 'valid')[:SEARCH] > BACK - 0.5
         times = self._planner.arrival(path)
@@ -248,7 +248,7 @@ class PathPlan:
             return -1
         # The way found runs along the path where its time grows as the length does.
         along = np.clip((times[where + BACK] - times[where]) / (SPACING * BACK), -1.0, 1.0)
-        turns = 2.0 - along - alignments(path[where] - begin, heading)
+        turns = 2.0 - along - alignments(path[where] - begin, direction)
         costs = times[where] + SKIP_COST * SPACING * where + TURN_COST * turns
         return int(where[int(np.argmin(costs))])
 
@@ -262,7 +262,7 @@ class PathPlan:
         """Append a route to where the given path is free again; return whether there is one."""
         self._planner.spread(begin)
         first = int(np.argmax(blocked)) if blocked[: 3 * BACK].any() else 0
-        joint = self._joint(path, blocked, first, self.points[-1], self._heading())
+        joint = self._joint(path, blocked, first, self.points[-1], self._direction())
         if joint < 0:
             return False
         route = self._planner.route((float(path[joint, 0]), float(path[joint, 1])), begin)
@@ -293,7 +293,7 @@ class PathPlan:
             chosen.append(places[int(np.argmin(np.hypot(*(places - chosen[-1]).T)))])
         return [(float(x), float(y)) for x, y in chosen]
 
-    def _visit(
+    def _lead_over(
         self,
         places: list[tuple[float, float]],
         begin: tuple[float, float],
@@ -313,8 +313,8 @@ class PathPlan:
         if not parts:
             return False
         self._planner.spread(begin, self._freshness)
-        heading = parts[-1][-1] - parts[-1][max(len(parts[-1]) - BACK, 0)]
-        joint = self._joint(path, blocked, 0, parts[-1][-1], heading)
+        direction = parts[-1][-1] - parts[-1][max(len(parts[-1]) - BACK, 0)]
+        joint = self._joint(path, blocked, 0, parts[-1][-1], direction)
         if joint < 0:
             return False
         back = self._planner.route((float(path[joint, 0]), float(path[joint, 1])), begin)
@@ -324,9 +324,9 @@ class PathPlan:
         self._append_smoothly(np.vstack([*parts, back]), path, joint, fixed, visited)
         return True
 
-    def _heading(self) -> Array:
-        heading: Array = self.points[-1] - self.points[max(len(self.points) - BACK, 0)]
-        return heading
+    def _direction(self) -> Array:
+        direction: Array = self.points[-1] - self.points[max(len(self.points) - BACK, 0)]
+        return direction
 
     def _append_smoothly(
         self,
@@ -348,7 +348,7 @@ class PathPlan:
         # Smoothing moves points towards each other where the path turns back.
         points, numbers = self._smoothed(self.points[kept:], places), self._next[kept:]
         lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-        points = resampled(points)
+        points = resample(points, SPACING, round)
         even = np.interp(np.linspace(0.0, lengths[-1], len(points)), lengths, numbers)
         self.points = np.vstack([self.points[:kept], points])
         self._next = np.concatenate([self._next[:kept], even.astype(np.int64)])
@@ -525,7 +525,7 @@ class PlannedPath:
         self._driven = 0.0
         away = self.plan.points[:most] - np.array(self._pose[:2])
         place = int(np.argmin(np.hypot(*away.T)))
-        self.plan.visit(self.plan.points[: place + 1], self._time)
+        self.plan.remember(self.plan.points[: place + 1], self._time)
         self.plan.forget(place)
         self._fed -= place
 

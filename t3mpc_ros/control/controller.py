@@ -539,10 +539,7 @@ class Controller:
             self._follow_pose(odometry, begin, end, dt)
         if restart:
             self._begin_plan(stamp, plan_ns)
-        if self._jumps or self._announced:
-            self._announce_jumps(stamp, plan_ns)
-        acceleration = self._acceleration(plan_ns, odometry.pose.yaw, begin, end, dt)
-        applied = actuation.send_acceleration(acceleration, dt).copy()
+        applied = self._send(stamp, plan_ns, odometry.pose.yaw, dt)
         short = self.parameters.composition == 'paper' and self._reach.update(
             actuation.speeds.tolist(),
             actuation.command.tolist(),
@@ -550,7 +547,6 @@ class Controller:
             dt,
         )
         self.law.set_applied(applied, saturated=actuation.limited or short)
-        self._response.add_command(*actuation.command.tolist())
         self._take_snapshot()
         self.status = self._make_status(stamp, reason, actuation.speeds - reference, applied)
         return actuation.twist, self.status
@@ -590,21 +586,27 @@ class Controller:
         wheels = WheelSpeeds(*actuation.speeds.tolist())
         twist = twist_from_wheels(wheels, self.parameters.geometry)
         plan_ns, reason = self._sample_plan(State(stamp_ns, self._place, twist))
-        _, reference, begin, end = self._sampled
+        reference = self._sampled.reference
         if not reason.moves:
             self._stop()
             self.status = self._make_status(stamp_ns, reason, actuation.speeds - reference)
             return STANDSTILL, self.status
-        if self._jumps or self._announced:
-            self._announce_jumps(stamp_ns, plan_ns)
         self.law.saturated = True  # the error is assumed: nothing is learnt from it
-        acceleration = self._acceleration(plan_ns, self._place.yaw, begin, end, dt)
-        applied = actuation.send_acceleration(acceleration, dt).copy()
+        applied = self._send(stamp_ns, plan_ns, self._place.yaw, dt)
         self.law.set_applied(applied, saturated=True)
-        self._response.add_command(*actuation.command.tolist())
         error = actuation.speeds - reference
         self.status = self._make_status(stamp_ns, reason, error, applied)
         return actuation.twist, self.status
+
+    def _send(self, stamp_ns: int, plan_ns: int, yaw: float, elapsed: float) -> Array:
+        """Send the command for the sampled plan; return the accelerations (rad/s²) that act."""
+        if self._jumps or self._announced:
+            self._announce_jumps(stamp_ns, plan_ns)
+        _, _, begin, end = self._sampled
+        acceleration = self._acceleration(plan_ns, yaw, begin, end, elapsed)
+        applied = self.actuation.send_acceleration(acceleration, elapsed).copy()
+        self._response.add_command(*self.actuation.command.tolist())
+        return applied
 
     def _check_keep_out(self, odometry: State, reason: Reason, begin: Array) -> Reason:
         """Return the reason after contact and range sensors were considered.

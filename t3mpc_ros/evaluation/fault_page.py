@@ -39,6 +39,7 @@ from t3mpc_ros.evaluation.reporting import (
     Table,
     VerdictBox,
     html_page,
+    replace_section,
 )
 from t3mpc_ros.evaluation.result_file import Row
 
@@ -134,8 +135,8 @@ def console_text(rows: Sequence[Row]) -> str:
 
 
 def page_section(rows: Sequence[Row]) -> str:
-    """Return the section of the page from mark to mark."""
-    return f"""{BEGIN_MARK}
+    """Return the section of the page between the marks."""
+    return f"""
 
 The controller drives the twin. Each fault begins at {BEGIN:g} s and lasts 5 s; `brown_out`
 restarts the board, which takes 0.5 s. A run lasts {DURATION:g} s, one into a wall 25 s, of which
@@ -150,20 +151,12 @@ Ground truth shows full steps lost by the right and the left motor at most, and 
 faster (root mean square) the wheels turn than they roll.
 
 {markdown_tables(rows)}
-{END_MARK}
 """
 
 
 def update_page(page: Path, rows: Sequence[Row]) -> None:
-    """Replace the section between the marks of a page, which has both once and in this order."""
-    text = page.read_text(encoding='utf-8')
-    head, begun, rest = text.partition(BEGIN_MARK)
-    _, ended, tail = rest.partition(END_MARK)
-    if not begun or not ended or BEGIN_MARK in rest or END_MARK in tail:
-        raise ValueError(
-            f'{page} must hold the lines {BEGIN_MARK} and {END_MARK} once, in this order'
-        )
-    page.write_text(head + page_section(rows).rstrip('\n') + tail, encoding='utf-8')
+    """Replace the section between the marks of a page."""
+    replace_section(page, BEGIN_MARK, END_MARK, page_section(rows))
 
 
 def _short(reason: str) -> str:

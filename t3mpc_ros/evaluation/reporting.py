@@ -328,6 +328,15 @@ def progress_bar(
     return bar
 
 
+def replace_section(page: Path, begin: str, end: str, section: str) -> None:
+    """Replace the text between two marks of a page, which has both once and in this order."""
+    head, begun, rest = page.read_text(encoding='utf-8').partition(begin)
+    _, ended, tail = rest.partition(end)
+    if not begun or not ended or begin in rest or end in tail:
+        raise ValueError(f'{page} must hold the lines {begin} and {end} once, in this order')
+    page.write_text(head + begin + section + end + tail, encoding='utf-8')
+
+
 def write_columns(
     path: Path, columns: Mapping[str, Sequence[object] | NDArray[np.generic]]
 ) -> None:

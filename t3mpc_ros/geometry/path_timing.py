@@ -33,7 +33,7 @@ the rates possible in the next period are an interval that contains the present 
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 import math
 from typing import NamedTuple
@@ -759,11 +759,14 @@ def polyline_length(points: Array) -> float:
     return float(np.hypot(*np.diff(points, axis=0).T).sum())
 
 
-def resample(points: Array, spacing: float) -> Array:
-    """Return points at even distances (m) along a polyline, shape (n, 2), its end included."""
+def resample(points: Array, spacing: float, rounding: Callable[[float], int] = math.ceil) -> Array:
+    """Return evenly spaced points along a polyline, shape (n, 2), with both ends.
+
+    Their distance is ``spacing`` (m) at most, or about that with ``rounding`` :func:`round`.
+    """
     lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    count = max(2, math.ceil(lengths[-1] / spacing) + 1)
-    along = np.linspace(0.0, lengths[-1], count)
+    count = max(1, rounding(float(lengths[-1]) / spacing))
+    along = np.linspace(0.0, lengths[-1], count + 1)
     return np.column_stack([np.interp(along, lengths, column) for column in points.T])
 
 

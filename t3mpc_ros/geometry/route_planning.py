@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.arena import OccupancyGrid
+from t3mpc_ros.geometry.path_timing import resample
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 
@@ -156,15 +157,7 @@ class RoutePlanner:
         if count < 0:
             return None
         found = self._origin + self._scale * places[:count]
-        return resampled(np.vstack([begin, found[::-1], goal]))[1:]
-
-
-def resampled(points: Array, spacing: float = SPACING) -> Array:
-    """Return evenly spaced points along a polyline, shape (n, 2), with both ends."""
-    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    count = max(1, round(float(lengths[-1]) / spacing))
-    along = np.linspace(0.0, lengths[-1], count + 1)
-    return np.column_stack([np.interp(along, lengths, axis) for axis in points.T])
+        return resample(np.vstack([begin, found[::-1], goal]), SPACING, round)[1:]
 
 
 def nearest_distances(marked: NDArray[np.bool_]) -> Array:

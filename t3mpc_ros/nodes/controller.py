@@ -266,7 +266,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
 
     def _publish_map(self) -> None:
         keep_out = self._controller.keep_out
-        if keep_out is not None and self._steps:
+        if keep_out is not None and self._steps and self._map_publisher.get_subscription_count():
             grid = keep_out.map.occupancy()
             message = conversions.occupancy_message(grid, self.now_ns(), self._odometry_frame)
             self._map_publisher.publish(message)

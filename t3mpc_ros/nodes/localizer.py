@@ -190,22 +190,10 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
     def _on_map(self, message: OccupancyGrid, info: dict[str, Any]) -> None:
         """Begin on another map: from the last pose, where it was known."""
         before = self._localizer
-        place = message.info.origin
-        orientation = place.orientation
-        yaw = conversions.yaw_from_quaternion(
-            orientation.x, orientation.y, orientation.z, orientation.w
-        )
-        cells = np.array(message.data, dtype=np.int8)
         try:
-            if cells.size != message.info.width * message.info.height:
-                raise MapError(
-                    f'map must have width x height cells, {message.info.width} x '
-                    f'{message.info.height}: got {cells.size}'
-                )
-            grid = cells.reshape(message.info.height, message.info.width)
-            origin = place.position.x, place.position.y, yaw
-            self._use_map(map_of_grid(grid, message.info.resolution, origin))
-        except MapError as error:
+            grid = conversions.grid_from_occupancy(message)
+            self._use_map(map_of_grid(grid.cells, grid.resolution, (grid.x, grid.y, 0.0)))
+        except ValueError as error:  # a MapError among them
             self._rejected += 1
             self._map_problem = '' if before else f'map is rejected: {error}'
             self.get_logger().warning(f'map is rejected: {error}')

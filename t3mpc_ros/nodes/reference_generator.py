@@ -26,6 +26,7 @@ from rclpy.time import Time
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from t3mpc_ros.chaos.planned_path import PlannedPath
 from t3mpc_ros.chaos.pose_reference import (
     GivenPathSource,
     PathClock,
@@ -41,7 +42,15 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, points_fr
 from t3mpc_ros.geometry.path_file import load_path
 from t3mpc_ros.geometry.path_timing import PathError, check_points
 from t3mpc_ros.geometry.timing import SampleScheduler
-from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, Pose, State
+from t3mpc_ros.geometry.types import (
+    NANOSECONDS,
+    ORIGIN,
+    STANDSTILL,
+    Array,
+    BodyTwist,
+    Pose,
+    State,
+)
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import ACK_TIMEOUT, NO_CLOCK, OK, WARN, BaseNode
 from t3mpc_ros.nodes.conversions import FrameParameters
@@ -182,6 +191,11 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             kind = TwistStamped if parameters.enable_stamped_target_twist else Twist
             self.create_matching_subscription(kind, 'target_twist', self._on_twist, qos.COMMAND)
 
+    @property
+    def _planned(self) -> PlannedPath | None:
+        """Plan of a patrol, once the robot has reported where it is."""
+        return self._source.planned if isinstance(self._source, PortraitSource) else None
+
     def _take_odometry(self) -> None:
         """Make the source where the robot is, once it has reported that; then wait for it."""
         for message in self._odometry.take_waiting()[-1:]:
@@ -192,8 +206,8 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 self._source = self._make_source(state.pose)
                 self._pose = state.pose
             self._path_clock.observe(state.stamp_ns, state.pose)
-            if isinstance(self._source, PortraitSource) and self._source.planned is not None:
-                self._source.planned.observe(state.pose)
+            if self._planned is not None:
+                self._planned.observe(state.pose)
 
     def _make_transform_buffer(self) -> Any:
         """Return the transforms known to tf2, None without tf2_ros."""
@@ -211,14 +225,11 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             return  # both subscriptions receive it
         self._path_stamps.append(stamp)
         try:
-            points = conversions.points_from_path(message)
-            check_points(points)
-            if len(points):
-                points = points_from_frame(self._frame_pose(message.header.frame_id), points)
-                check_points(points)
+            points = self._own_points(
+                message.header.frame_id, conversions.points_from_path(message)
+            )
         except PathError as error:
-            self._rejected += 1
-            self.get_logger().warning(f'path is ignored: {error}')
+            self._reject('path', error)
             return
         if not isinstance(self._source, GivenPathSource):
             self._points = points  # the robot has not reported where it is
@@ -226,6 +237,18 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             self._source.append(points)
         else:
             self._source.replace(points)
+
+    def _reject(self, topic: str, error: ValueError) -> None:
+        self._rejected += 1
+        self.get_logger().warning(f'{topic} is ignored: {error}')
+
+    def _own_points(self, frame: str, points: Array) -> Array:
+        """Return points of a frame, shape (n, 2), in that of the reference, or raise PathError."""
+        check_points(points)
+        if len(points):
+            points = points_from_frame(self._frame_pose(frame), points)
+            check_points(points)
+        return points
 
     def _frame_pose(self, frame: str) -> Pose:
         """Return the pose of a frame in that of the reference, or raise PathError."""
@@ -242,26 +265,22 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         try:
             grid = conversions.grid_from_occupancy(message)
         except ValueError as error:
-            self._rejected += 1
-            self.get_logger().warning(f'map is ignored: {error}')
+            self._reject('keep_out/map', error)
             return
-        if isinstance(self._source, PortraitSource) and self._source.planned is not None:
+        if self._planned is not None:
             self._mapped = True
-            self._source.planned.set_map(grid)
+            self._planned.set_map(grid)
 
     def _on_goal(self, message: PoseStamped, info: dict[str, Any]) -> None:
-        place = message.pose.position
+        place = np.array([[message.pose.position.x, message.pose.position.y]])
         try:
-            points = np.array([[place.x, place.y]])
-            check_points(points)
-            points = points_from_frame(self._frame_pose(message.header.frame_id), points)
-            check_points(points)
+            x, y = self._own_points(message.header.frame_id, place)[0].tolist()
+            if self._planned is None:
+                raise PathError('no odom yet: send it again when the robot has reported its pose')
         except PathError as error:
-            self._rejected += 1
-            self.get_logger().warning(f'goal_pose is ignored: {error}')
+            self._reject('goal_pose', error)
             return
-        if isinstance(self._source, PortraitSource) and self._source.planned is not None:
-            self._source.planned.go_to((float(points[0, 0]), float(points[0, 1])))
+        self._planned.go_to((x, y))
 
     def _on_twist(self, message: Twist | TwistStamped, info: dict[str, Any]) -> None:
         twist = message.twist if isinstance(message, TwistStamped) else message

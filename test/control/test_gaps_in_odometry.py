@@ -237,7 +237,7 @@ def test_the_page_has_what_is_measured_and_none_is_worse():
         rows.append(other_robots.format_row(toy, row))
         if not toy.old:  # no controller can tell it from a robot that responds late
             assert row.difference.mean <= row.difference.half, toy.name
-    table = '\n'.join((*other_robots.HEAD, *rows))
+    table = '\n'.join((*other_robots.TABLE.head, *rows))
     assert table in PAGE.read_text(), 'run bench/other_robots.py --page docs/your_robot.md'
 
 

@@ -58,7 +58,7 @@ def test_the_table_of_the_page_is_what_is_measured():
         trials = [link_faults.measure(fault, phase) for phase in phases]
         expect_right(fault, trials)
         rows.append(link_faults.format_row(fault, trials))
-    table = '\n'.join((*link_faults.HEAD, *rows))
+    table = '\n'.join((*link_faults.TABLE.head, *rows))
     assert table in PAGE.read_text(), 'run bench/link_faults.py --page docs/radio.md'
 
 

@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.geometry.arena import OccupancyGrid
+from t3mpc_ros.geometry.path_timing import resample
 from t3mpc_ros.geometry.route_planning import (
     NEAR_COST,
     UNSEEN_COST,
     RoutePlanner,
     nearest_distances,
-    resampled,
 )
 
 DISTANCE = 0.2
@@ -178,7 +178,7 @@ def test_without_a_map_nothing_is_safe_and_nothing_is_known():
 
 
 def test_points_of_a_polyline_are_spaced_evenly():
-    points = resampled(np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.4]]), 0.05)
+    points = resample(np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.4]]), 0.05, round)
     assert len(points) == 15
     assert points[-1] == pytest.approx([0.3, 0.4])
     assert length(points) == pytest.approx(0.7)

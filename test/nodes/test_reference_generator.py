@@ -13,6 +13,7 @@
 # limitations under the License.
 """Grid, latched topics, pause and seeds of the reference generator node."""
 
+import math
 import secrets
 import sys
 from types import SimpleNamespace
@@ -292,6 +293,19 @@ def test_a_path_begins_where_the_robot_is(harness, tmp_path, source):
     if source == 'topic':
         assert last.x > 0.5
         assert last.y == pytest.approx(-0.2, abs=1e-6)
+
+
+def test_a_goal_before_the_robot_has_reported_its_pose_is_rejected(harness, logged):
+    """It was forgotten without a word."""
+    reference = harness.add(ReferenceGeneratorNode, source='portrait', plan__enabled=True)
+    goals = harness.connected_publisher(PoseStamped, 'goal_pose')
+    for x in (1.0, math.nan):
+        goal = PoseStamped()
+        goal.header.frame_id, goal.pose.position.x = 'odom', x
+        goals.publish(goal)
+    harness.spin_until(lambda: reference._rejected == 2)
+    assert logged('goal_pose is ignored: no odom yet')
+    assert logged('finite')
 
 
 def test_a_planned_path_waits_for_a_map_and_leads_to_a_goal(harness):
