@@ -295,7 +295,7 @@ def test_a_path_begins_where_the_robot_is(harness, tmp_path, source):
         assert last.y == pytest.approx(-0.2, abs=1e-6)
 
 
-def test_a_goal_before_the_robot_has_reported_its_pose_is_rejected(harness, logged):
+def test_a_goal_before_the_first_odometry_is_rejected(harness, logged):
     """It was forgotten without a word."""
     reference = harness.add(ReferenceGeneratorNode, source='portrait', plan__enabled=True)
     goals = harness.connected_publisher(PoseStamped, 'goal_pose')
