@@ -224,6 +224,7 @@ def add_recover_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
     parser.add_argument(
         '--output', type=Path, help='new or empty folder (default: FILE_recovered beside FILE)'
     )
+    add_json(parser, 'write what was kept and lost')
     parser.set_defaults(run=_run_recover)
 
 
@@ -239,8 +240,26 @@ def _run_recover(options: argparse.Namespace) -> int:
         return EXIT_USAGE
     finally:
         progress.close()
-    print(_recovery_text(result))
+    print_result(options, lambda: _recovery_text(result), lambda: _recovered(result))
     return 0 if result.clean else EXIT_LOSS
+
+
+def _recovered(result: 'RecoveryResult') -> dict[str, Any]:
+    """Return what was kept and lost as JSON data; counts that are not exact are lower bounds."""
+    return {
+        'output': str(result.output),
+        'clean': result.clean,
+        'exact': result.exact,
+        'kept': result.kept,
+        'lost': result.lost,
+        'lost_seconds': result.lost_seconds,
+        'lost_bytes': result.lost_bytes,
+        'topics': {
+            topic.name: {'kept': topic.kept, 'unchecked': topic.unchecked, 'lost': topic.lost}
+            for topic in result.topics.values()
+        },
+        'files': {file.name: _file(file) for file in result.files},
+    }
 
 
 def _recovery_text(result: 'RecoveryResult') -> str:
@@ -337,6 +356,7 @@ def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
         metavar='TOPIC',
         help='what the robot was to follow: odometry or a twist',
     )
+    add_json(parser, 'write verdict and numbers')
     parser.set_defaults(run=run_report)
 
 
@@ -350,12 +370,13 @@ def run_report(options: argparse.Namespace) -> int:
     if len(options.bags) > 1:
         from t3mpc_ros.evaluation.bag_report.run_comparison import write_comparison
 
-        path, text = write_comparison(options.bags, output, wanted)
-        print(f'{text}\n{path}')
+        path, text, record = write_comparison(options.bags, output, wanted)
+        print_result(options, lambda: f'{text}\n{path}', lambda: record)
         return 0
     figures = write_report(options.bags[0], output, wanted)
-    print(figures.verdict.text())
-    print(figures.summary())
+    print_result(
+        options, lambda: f'{figures.verdict.text()}\n{figures.summary()}', figures.to_dict
+    )
     return 0
 
 
@@ -413,6 +434,7 @@ def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
     )
     parser.add_argument('--method', action=RemovedOption, nargs='?', help=argparse.SUPPRESS)
     add_input_options(parser)
+    add_json(parser, 'write speed and comparison')
     parser.set_defaults(run=run_replay)
 
 
@@ -456,18 +478,28 @@ def run_replay(options: argparse.Namespace) -> int:
     reading, starting, running = read - begin, ready - read, end - ready
     span = again.steps / again.parameters.rate
     whole, alone = span / (reading + running), span / running
-    print(
+    outcome = compare(inputs, again)
+    text = (
         f'{again.steps} steps, {span:.1f} s of control, in {reading + running:.2f} s: '
         f'{whole:.0f} x real time, {alone:.0f} x without reading; '
-        f'{starting:.2f} s to compile and to warm up are not counted'
+        f'{starting:.2f} s to compile and to warm up are not counted\n{outcome.table()}'
     )
-    print(compare(inputs, again).table())
     if changes or options.model:
-        print(OPEN_LOOP)
+        text += f'\n{OPEN_LOOP}'
+    record: dict[str, Any] = {
+        'steps': again.steps,
+        'seconds': span,
+        'reading': round(reading, 3),
+        'running': round(running, 3),
+        'output': None,
+        **outcome.to_dict(),
+    }
     if options.output:
         from t3mpc_ros.evaluation.process_replay.replay_bag import write_replay
 
-        print(f'written to {write_replay(inputs, again, options.output)}')
+        record['output'] = str(write_replay(inputs, again, options.output))
+        text += f'\nwritten to {record["output"]}'
+    print_result(options, lambda: text, lambda: record)
     return 0
 
 
@@ -509,6 +541,7 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
     )
     parser.add_argument('--update-golden', action=RemovedOption, nargs='?', help=argparse.SUPPRESS)
     add_input_options(parser)
+    add_json(parser, 'write the comparison')
     parser.set_defaults(run=run_compare)
 
 
@@ -535,9 +568,8 @@ def run_compare(options: argparse.Namespace) -> int:
         outcome = compare_bags(inputs, other, tolerances)
     else:
         outcome = compare(inputs, replay_controller(inputs, changes), tolerances)
-    print(outcome.table())
-    if changes or model:
-        print(OPEN_LOOP)
+    text = outcome.table() + (f'\n{OPEN_LOOP}' if changes or model else '')
+    print_result(options, lambda: text, outcome.to_dict)
     if options.picture:
         write_divergence_figure(outcome, options.picture)
         print(f'drawn to {options.picture}', file=sys.stderr)

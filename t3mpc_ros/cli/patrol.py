@@ -19,7 +19,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from t3mpc_ros.cli.run_options import add_seeds, add_workers, executor_of
+from t3mpc_ros.cli.run_options import add_json, add_seeds, add_workers, executor_of, print_result
 from t3mpc_ros.parameters.command_line import bounded_float
 
 DEFAULT_SEEDS = '101-105'
@@ -88,6 +88,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         'and by the particle filter, also with more noise and after it was carried; a table',
     )
     add_workers(parser)
+    add_json(parser, 'also write every run')
     parser.add_argument(
         '--output', type=Path, default=OUTPUT, help=f'folder of the page (default {OUTPUT})'
     )
@@ -114,9 +115,10 @@ def run(options: argparse.Namespace) -> int:
     runs = options.output / f'{name}{RUNS}'
     with executor_of(options) as executor:
         study = compare(plan, runs, executor, print_report)
-    print(page.markdown(study))
+    record = page.record(study)
+    print_result(options, lambda: page.markdown(study), lambda: record)
     drawn = write_pictures({each.stem: each.draw for each in page.PICTURES}, study, figures)
-    numbers = strict_json(page.record(study))
+    numbers = strict_json(record)
     (options.output / f'{name}.json').write_text(numbers, encoding='utf-8')
     written = options.output / f'{name}.html'
     written.write_text(page.page(study, drawn), encoding='utf-8')
@@ -131,7 +133,8 @@ def _tune_tracking(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.patrol.path_tracking import tune_trackers
 
     with executor_of(options) as executor:
-        print(tracking_page.tuning_markdown(tune_trackers(executor, print_report)))
+        found = tune_trackers(executor, print_report)
+    print_result(options, lambda: tracking_page.tuning_markdown(found), lambda: found)
     return 0
 
 
@@ -142,7 +145,7 @@ def _safety(options: argparse.Namespace) -> int:
     seconds = 60.0 * options.minutes
     with executor_of(options) as executor:
         measured = compare_safety(options.seeds, seconds, executor, print_report)
-    print(safety_table(measured).markdown())
+    print_result(options, safety_table(measured).markdown, lambda: measured.rows)
     return 0
 
 
@@ -157,7 +160,8 @@ def _compare_localizations(options: argparse.Namespace) -> int:
     plan = LocalizationPlan(seeds=options.seeds, duration=60.0 * options.minutes)
     runs = options.output / f'localization{RUNS}'
     with executor_of(options) as executor:
-        print(markdown(plan, compare_localizations(plan, runs, executor, print_report)))
+        measured = compare_localizations(plan, runs, executor, print_report)
+    print_result(options, lambda: markdown(plan, measured), lambda: measured.rows)
     return 0
 
 

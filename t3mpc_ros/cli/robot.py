@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 
 from t3mpc_ros.cli import robot_calibrate
 from t3mpc_ros.cli.command import ArgumentParser, ask_line, check_two_ports
+from t3mpc_ros.cli.run_options import STANDARD_OUTPUT, add_json, print_result
 from t3mpc_ros.parameters.command_line import (
     bounded_float,
     bounded_int,
@@ -93,7 +94,9 @@ def _create_key(options: argparse.Namespace, stop: StopSignal) -> int:
 
 
 def _check_key(options: argparse.Namespace, stop: StopSignal) -> int:
-    print(f'{options.file}: a key, check value {key_check(read_key(options.file)):08x}')
+    check = f'{key_check(read_key(options.file)):08x}'
+    text = f'{options.file}: a key, check value {check}'
+    print_result(options, lambda: text, lambda: {'check': check})
     return EXIT_OK
 
 
@@ -112,12 +115,13 @@ def _erase_key(options: argparse.Namespace, stop: StopSignal) -> int:
 
 def _show_key_state(options: argparse.Namespace, stop: StopSignal) -> int:
     key_state = _run_at_board(key_provisioning.read_key_state(), options, stop)
-    print(key_provisioning.format_key_state(key_state))
-    if options.key is None:
-        return EXIT_OK
-    same = key_provisioning.holds_key(key_state, read_key(options.key))
-    print('equal to the file' if same else 'different from the file')
-    return EXIT_OK if same else EXIT_POOR
+    text, same = key_provisioning.format_key_state(key_state), None
+    if options.key is not None:
+        same = key_provisioning.holds_key(key_state, read_key(options.key))
+        text += '\nequal to the file' if same else '\ndifferent from the file'
+    record = {**key_state._asdict(), 'equal_to_the_file': same}
+    print_result(options, lambda: text, lambda: record)
+    return EXIT_POOR if same is False else EXIT_OK
 
 
 # -- the link -------------------------------------------------------------------------------------
@@ -178,7 +182,8 @@ def _store_settings(
 
 
 def _show_log(options: argparse.Namespace, stop: StopSignal) -> int:
-    print(robot_log.format_log(_run_at_board(robot_log.read_log(), options, stop)))
+    entries = _run_at_board(robot_log.read_log(), options, stop)
+    print_result(options, lambda: robot_log.format_log(entries), lambda: entries)
     return EXIT_OK
 
 
@@ -193,7 +198,9 @@ def _ping(options: argparse.Namespace, stop: StopSignal) -> int:
     parameters = _link_parameters(options)
     result = _run_at_dongle(link_test.run_link_test(parameters, options.count), options, stop)
     rows = link_test.evaluate(result, parameters)
-    print(link_test.format_report(rows))
+    print_result(
+        options, lambda: link_test.format_report(rows), lambda: {'rows': rows, 'result': result}
+    )
     return EXIT_OK if link_test.is_usable(rows) else EXIT_POOR
 
 
@@ -206,7 +213,8 @@ def _scan(options: argparse.Namespace, stop: StopSignal) -> int:
         if interactive:
             print(f'\r{done} of {total} channels', end='', file=sys.stderr, flush=True)
         if result:
-            print(f'\r{result}' if interactive else result, flush=True)
+            file = sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout
+            print(f'\r{result}' if interactive else result, file=file, flush=True)
 
     results = _run_at_dongle(
         channel_scan.scan_channels(parameters, rates, progress), options, stop
@@ -214,14 +222,16 @@ def _scan(options: argparse.Namespace, stop: StopSignal) -> int:
     if interactive:
         print('\r' + 24 * ' ' + '\r', end='', file=sys.stderr)
     good, advice = channel_scan.recommend(results, parameters)
-    print(advice)
+    print_result(options, lambda: advice, lambda: {'advice': advice, 'channels': results})
     return EXIT_OK if good else EXIT_POOR
 
 
 def _show_parameters(options: argparse.Namespace, stop: StopSignal) -> int:
     parameters = _link_parameters(options)
     script = robot_info.read_robot_info(parameters, _key_option(options), os.urandom)
-    print(robot_info.format_robot_info(_run_at_dongle(script, options, stop), parameters))
+    robot = _run_at_dongle(script, options, stop)
+    text = robot_info.format_robot_info(robot, parameters)
+    print_result(options, lambda: text, lambda: robot)
     return EXIT_OK
 
 
@@ -396,12 +406,16 @@ def program_parser() -> argparse.ArgumentParser:
             add('--key', type=Path, help='file with the key of the robot')
         return command
 
-    add = link_command('ping', _ping, 'test the link to dongle and robot', False).add_argument
+    ping = link_command('ping', _ping, 'test the link to dongle and robot', False)
+    add_json(ping)
+    add = ping.add_argument
     text = 'number of requests to each (default 200)'
     add('--count', type=bounded_int(1, 100_000), default=200, help=text)
 
     text = 'list the channels on which the robot answers'
-    add = link_command('scan', _scan, text, False).add_argument
+    scan = link_command('scan', _scan, text, False)
+    add_json(scan, 'also write the channels')
+    add = scan.add_argument
     add('--all-rates', action='store_true', help='at 250k, 1M and 2M')
 
     text = 'turn one wheel, with both wheels in the air'
@@ -412,7 +426,7 @@ def program_parser() -> argparse.ArgumentParser:
     add('--speed', type=bounded_float(0.2, 10.0), default=2.0, help=text)
     add('--yes', action='store_true', help='do not ask whether the wheels are in the air')
 
-    link_command('parameters', _show_parameters, 'list the board parameters', True)
+    add_json(link_command('parameters', _show_parameters, 'list the board parameters', True))
 
     text = 'measure wheels, track, gyro, distance sensors and battery, step by step'
     robot_calibrate.add_arguments(link_command('calibrate', _calibrate, text, True))
@@ -469,6 +483,7 @@ def _add_settings_commands(
     command = commands.add_parser('log', help='print resets and faults that the robot has logged')
     command.set_defaults(run=_show_log)
     command.add_argument('--port', required=True, help='USB port of the robot board')
+    add_json(command, 'also write the entries')
 
 
 def _add_key_commands(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -491,6 +506,8 @@ def _add_key_commands(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
             action.add_argument('--port', required=True, help='USB port of the robot board')
         if name == 'state':
             action.add_argument('--key', type=Path, help='key file to compare with')
+        if name in ('check', 'state'):
+            add_json(action, 'also write the state')
 
 
 if __name__ == '__main__':

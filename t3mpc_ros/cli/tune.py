@@ -19,9 +19,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from t3mpc_ros.cli.run_options import (
+    add_json,
     add_topic_options,
     add_workers,
     executor_of,
+    print_result,
     report_options,
 )
 from t3mpc_ros.parameters.command_line import bounded_int
@@ -72,6 +74,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.add_argument(
         '--resume', action='store_true', help='go on where the last tuning was interrupted'
     )
+    add_json(parser, 'also write the parameters')
     add_topic_options(parser.add_argument_group('with a bag'))
     parser.set_defaults(run=run)
 
@@ -93,7 +96,7 @@ def run(options: argparse.Namespace) -> int:
     require_libraries(method.name for method in methods)
     with executor_of(options) as executor:
         store = _tuned(options, methods, executor)
-    print(store.table())
+    print_result(options, store.table, store.to_dict)
     return 0
 
 
@@ -133,7 +136,11 @@ def _tuned(
 def _identify(options: argparse.Namespace) -> int:
     """Print the parameter file for the robot in the bag ``options.robot`` and return 0."""
     from t3mpc_ros.evaluation.topic_roles import bag_display_name
-    from t3mpc_ros.evaluation.tuning.drive_identification import drive_file, identify_bag
+    from t3mpc_ros.evaluation.tuning.drive_identification import (
+        drive_file,
+        drive_record,
+        identify_bag,
+    )
 
     bag = Path(options.robot)
     if not bag.exists():
@@ -144,7 +151,7 @@ def _identify(options: argparse.Namespace) -> int:
         raise ValueError('methods, --evaluations and --resume are for simulated robots: got a bag')
     found = identify_bag(bag, report_options(options))
     text = drive_file(*found, bag_display_name(bag))
-    print(text, end='')
+    print_result(options, lambda: text.rstrip('\n'), lambda: drive_record(*found))
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         options.output.write_text(text, encoding='utf-8')

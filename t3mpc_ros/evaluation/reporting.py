@@ -356,7 +356,14 @@ def strict_json(content: object) -> str:
 
 
 def finite(value: object) -> object:
-    """Return plain data with None in place of numbers that are not finite."""
+    """Return plain data with None in place of numbers that are not finite.
+
+    A tuple with names becomes a mapping, bytes become hexadecimal digits.
+    """
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, tuple) and hasattr(value, '_asdict'):
+        value = value._asdict()
     if isinstance(value, Mapping):
         return {name: finite(item) for name, item in value.items()}
     if isinstance(value, list | tuple):

@@ -163,7 +163,7 @@ def map_jobs(
 
 def _job_error(job: tuple[Any, Any], error: BaseException) -> JobError:
     scenario, method = job
-    return JobError(f'{method.name} on {scenario} failed: {error!r}')
+    return JobError(f'{getattr(method, "name", method)} on {scenario} failed: {error!r}')
 
 
 def _start_worker(parent: int) -> None:

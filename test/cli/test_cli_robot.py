@@ -14,6 +14,7 @@
 """``t3mpc robot`` as a command: exit codes, messages, and one run over pseudo terminals."""
 
 import itertools
+import json
 import os
 import signal
 import subprocess
@@ -87,6 +88,18 @@ def test_bench_session_from_key_to_jog(ports, tmp_path, capsys, monkeypatch):
     assert (code, 'channel 82 at 1M' in output) == (0, True)
     code, output = run('jog', 'left', '0.2', '--port', dongle, '--key', key, '--yes')
     assert (code, 'target 640' in output) == (0, True)
+
+    for command, name in (
+        (['ping', '--count', '20', '--port', dongle], 'rows'),
+        (['scan', '--port', dongle], 'channels'),
+        (['parameters', '--port', dongle, '--key', key], 'values'),
+        (['key', 'state', '--port', robot, '--key', key], 'equal_to_the_file'),
+        (['key', 'check', key], 'check'),
+    ):
+        assert cli.main([*command, '--json', '-']) in (0, 1)  # 1: a slow machine
+        assert json.loads(capsys.readouterr().out)[name], command
+    assert cli.main(['log', '--port', robot, '--json', '-']) == 0
+    assert isinstance(json.loads(capsys.readouterr().out), list)
 
     # Ctrl-C during a jog: the robot stops, then the command ends.
     moves, move = itertools.count(), Jog._move

@@ -80,7 +80,7 @@ def recovered(ended, *damages):
 
 def compared(same):
     module = 'evaluation.process_replay.'
-    outcome = SimpleNamespace(table=lambda: '', same=same)
+    outcome = SimpleNamespace(table=lambda: '', same=same, to_dict=dict)
     return {
         f'{module}controller_inputs.load_inputs': None,
         f'{module}controller_replay.replay_controller': None,

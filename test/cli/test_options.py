@@ -15,6 +15,7 @@
 
 from dataclasses import asdict
 from inspect import signature
+import itertools
 import json
 import math
 import re
@@ -108,19 +109,51 @@ def test_the_help_imports_no_heavy_library(words):
     assert done.stdout.splitlines()[-1] == '[]', done.stderr
 
 
-def test_json_means_the_same_in_every_command(tmp_path, capsys):
+BAG = str(ROOT / 'test' / 'golden' / 'stops.mcap')
+JSON = {
+    'exponents --duration 1': 'exponents',
+    f'bag info {BAG}': 'topics',
+    f'bag report {BAG} --output OUT': 'verdict',
+    f'bag report {BAG} {BAG} --output OUT': 'verdicts',
+    f'bag replay {BAG}': 'fields',
+    f'bag compare {BAG}': 'same',
+    f'bag recover {BAG} --output NEW': 'topics',
+    'patrol --seeds 101-101 --minutes 0.2 --paths logistic --workers 1 --output OUT': 'paths',
+}
+"""Commands with ``--json``, and a name in what they write; ``robot``: test_cli_robot.py."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('command', JSON, ids=lambda text: ' '.join(text.split()[:2]))
+def test_json_means_the_same_in_every_command(command, tmp_path, capsys):
     """It was a flag here and a file there; ``-`` is the standard output in place of the text."""
-    bag, file = str(ROOT / 'test' / 'golden' / 'stops.mcap'), tmp_path / 'new.json'
-    for command in (['exponents', '--duration', '1'], ['bag', 'info', bag]):
-        assert main(command) == 0
+    file, count = tmp_path / 'new.json', itertools.count()
+
+    def words():
+        folders = {'OUT': tmp_path / 'out', 'NEW': tmp_path / f'new_{next(count)}'}
+        return [str(folders.get(word, word)) for word in command.split()]
+
+    assert main([*words(), '--json', '-']) == 0
+    numbers = json.loads(capsys.readouterr().out)
+    found = numbers[0] if isinstance(numbers, list) else numbers
+    assert JSON[command] in found
+    assert main([*words(), '--json', str(file)]) == 0
+    assert capsys.readouterr().out.strip()
+    written = json.loads(file.read_text())
+    for each in (numbers, written):  # what differs from run to run
+        if isinstance(each, dict):
+            [each.pop(name, None) for name in ('reading', 'running', 'output')]
+    assert written == numbers
+
+
+def test_the_text_is_the_same_beside_a_file_of_json(tmp_path, capsys):
+    for words in (['exponents', '--duration', '1'], ['bag', 'info', BAG]):
+        assert main(words) == 0
         text = capsys.readouterr().out
-        assert main([*command, '--json', '-']) == 0
-        numbers = json.loads(capsys.readouterr().out)
-        assert main([*command, '--json', str(file)]) == 0
+        assert main([*words, '--json', str(tmp_path / 'new.json')]) == 0
         assert capsys.readouterr().out == text
-        assert json.loads(file.read_text()) == numbers
-    assert main(['bag', 'info', bag, '--json']) == 0  # as before
-    assert json.loads(capsys.readouterr().out) == numbers
+    assert main(['bag', 'info', BAG, '--json']) == 0  # as before
+    assert json.loads(capsys.readouterr().out) == json.loads((tmp_path / 'new.json').read_text())
 
 
 @pytest.mark.parametrize('words', COMMANDS)

@@ -143,6 +143,7 @@ def topics(path):
     }
 
 
+JSON = {'--json new.json': {'files': 'new.json'}}
 PAPER = 'evaluation.paper.reproduce.reproduce'
 COMPARE = {
     'evaluation.comparison.run_plan': {},
@@ -165,18 +166,19 @@ PATROL = {
         table=SimpleNamespace(keys=())
     ),
     'evaluation.patrol.path_tracking.tune_trackers': {},
-    'evaluation.patrol.patrol_safety.compare_safety': {},
+    'evaluation.patrol.patrol_safety.compare_safety': SimpleNamespace(rows=[]),
     'evaluation.patrol.patrol_safety.safety_table': SimpleNamespace(markdown=str),
     'evaluation.patrol.tracking_page.tuning_markdown': '',
-    'evaluation.patrol.localization_study.compare_localizations': {},
+    'evaluation.patrol.localization_study.compare_localizations': SimpleNamespace(rows=[]),
     'evaluation.patrol.localization_study.markdown': '',
 }
 TUNE = {
     'evaluation.methods.require_libraries': None,
-    'evaluation.tuning.tune_methods.tune_methods': SimpleNamespace(table=text),
-    'evaluation.tuning.closed_loop_tuning.tune_twin': SimpleNamespace(table=text),
+    'evaluation.tuning.tune_methods.tune_methods': SimpleNamespace(table=text, to_dict=dict),
+    'evaluation.tuning.closed_loop_tuning.tune_twin': SimpleNamespace(table=text, to_dict=dict),
     'evaluation.tuning.drive_identification.identify_bag': ('drive', 'paper'),
     'evaluation.tuning.drive_identification.drive_file': 'a: 1\n',
+    'evaluation.tuning.drive_identification.drive_record': {},
 }
 MODEL = SimpleNamespace(
     text='', learnt={}, parameters=SimpleNamespace(to_dict=dict), origin={}, to_dict=dict
@@ -200,7 +202,7 @@ FAULTS = {
     'evaluation.fault_page.page': '',
 }
 REPLAYED = SimpleNamespace(steps=100, parameters=SimpleNamespace(rate=100.0))
-OUTCOME = SimpleNamespace(table=text, same=True)
+OUTCOME = SimpleNamespace(table=text, same=True, to_dict=dict)
 REPLAY = {
     'bag.run.model_file.load_model': {'w': np.ones(1)},
     'evaluation.process_replay.controller_inputs.load_inputs': 'inputs',
@@ -211,10 +213,10 @@ REPLAY = {
     'evaluation.process_replay.replay_bag.write_replay': 'there',
     'evaluation.process_replay.replay_comparison.write_divergence_figure': None,
 }
-REPORT = SimpleNamespace(verdict=SimpleNamespace(text=text), summary=text)
+REPORT = SimpleNamespace(verdict=SimpleNamespace(text=text), summary=text, to_dict=dict)
 BAG = {
     'evaluation.bag_report.report_page.write_report': REPORT,
-    'evaluation.bag_report.run_comparison.write_comparison': ('there', 'text'),
+    'evaluation.bag_report.run_comparison.write_comparison': ('there', 'text', {}),
     'evaluation.bag_report.animation.animate_bag': Path('page.md'),
     'bag.recovery.recover_bag': lambda output, **_: RecoveryResult(output, ()),
 }
@@ -386,6 +388,7 @@ TABLE = {
             '--minutes 2': {'compare_patrols.plan.duration': 120.0},
             '--arena -1 -2 3 4': {'compare_patrols.plan.arena': (-1.0, -2.0, 3.0, 4.0)},
             '--paths Lorenz': {'compare_patrols.plan.paths': ('Lorenz',)},
+            '--json new.json': {'files': 'new.json'},
             '--output new': {'compare_patrols.store': 'new/patrol.runs.jsonl'},
             **workers('compare_patrols.workers'),
         },
@@ -428,6 +431,7 @@ TABLE = {
             'DMC': {'tune_methods.methods.0.name': 'DMC'},
             '--robot servo': {'tune_methods.drives': ('velocity',)},
             '--evaluations 7': {'tune_methods.budget.evaluations': 7},
+            '--json new.json': {'files': 'new.json'},
             '--output new.json': {'tune_methods.path': 'new.json'},
             '--resume': {'tune_methods.resume': True},
             **workers('tune_methods.workers'),
@@ -513,10 +517,14 @@ TABLE = {
         },
     ),
     'stop': (SEEN, {}),
-    'bag recover bag': (BAG, {'--output new': {'recover_bag.output': 'new'}}),
+    'bag recover bag': (
+        BAG,
+        {'--output new': {'recover_bag.output': 'new'}, '--json new.json': {'files': 'new.json'}},
+    ),
     'bag report bag': (
         BAG,
         {
+            **JSON,
             'page.md': {'write_comparison.folders.1': 'page.md'},
             '--output new': {'write_report.output': 'new'},
             '--reference r': {'write_report.wanted.reference': 'r'},
@@ -538,6 +546,7 @@ TABLE = {
     'bag replay bag': (
         REPLAY,
         {
+            **JSON,
             '--namespace r1': {'load_inputs.namespace': 'r1'},
             '--model key': {'load_inputs.model.w': (1.0,), 'load_model.path': 'key'},
             '--set law.gain=3': {
@@ -550,6 +559,7 @@ TABLE = {
     'bag compare bag': (
         REPLAY,
         {
+            **JSON,
             'page.md': {'load_inputs.bag': 'page.md', 'compare_bags.one': 'inputs'},
             '': {'compare.tolerances.absolute': 1e-9, 'compare.tolerances.relative': 1e-9},
             '--abs 0.1': {'compare.tolerances.absolute': 0.1},
@@ -604,14 +614,15 @@ TABLE = {
             '--save new.yaml': {'files': 'new.yaml'},
         },
     ),
-    'robot log --port p': (ROBOT, {'--port q': {'run_script.path': 'q'}}),
+    'robot log --port p': (ROBOT, {'--port q': {'run_script.path': 'q'}} | JSON),
     'robot key create new': (ROBOT, {}),
-    'robot key check key': (ROBOT, {}),
+    'robot key check key': (ROBOT, JSON),
     'robot key write key --port p': (ROBOT, {'--port q': {'run_script.path': 'q'}}),
     'robot key erase --port p': (ROBOT, {'--port q': {'run_script.path': 'q'}}),
     'robot key state --port p': (
         ROBOT,
-        {'--port q': {'run_script.path': 'q'}, '--key key': {'text': '\nequal to the file\n'}},
+        {'--port q': {'run_script.path': 'q'}, '--key key': {'text': '\nequal to the file\n'}}
+        | JSON,
     ),
     'robot ping --port p': (
         ROBOT,
@@ -619,6 +630,7 @@ TABLE = {
             '--port q': {'run_script.path': 'q'},
             '--count 9': {'run_link_test.count': 9},
             **link('run_link_test', key=False),
+            **JSON,
         },
     ),
     'robot scan --port p': (
@@ -627,6 +639,7 @@ TABLE = {
             '--port q': {'run_script.path': 'q'},
             '--all-rates': {'scan_channels.rates': ('250k', '1M', '2M')},
             **link('scan_channels', key=False),
+            **JSON,
         },
     ),
     'robot parameters --port p': (
@@ -634,6 +647,7 @@ TABLE = {
         {
             '--port q': {'run_script.path': 'q'},
             **link('read_robot_info'),
+            **JSON,
         },
     ),
     'robot jog --port p --yes left 1': (

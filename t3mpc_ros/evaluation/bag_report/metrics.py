@@ -200,6 +200,22 @@ class ReportMetrics:
         ]
         return found
 
+    def to_dict(self) -> dict[str, object]:
+        """Return verdict and main numbers as plain data, unrounded; those of channels by name."""
+        rows = [*PATH_NUMBERS, *RUN_NUMBERS]
+        found: dict[str, object] = {
+            f'{title} ({unit})' if unit else title: value(self) for title, unit, value in rows
+        }
+        for title, unit, number in CHANNEL_NUMBERS:
+            for each in self.channels:
+                key = f'{title}, {each.name} ({unit.format(each.unit)})'
+                found[key] = number(self, each.name)
+        for name, link in self.links.items():
+            for title, unit, of_link in LINK_NUMBERS:
+                found[f'{title}, {name} ({unit})'] = of_link(link)
+        verdict = {'kind': self.verdict.kind, 'text': self.verdict.text()}
+        return {'report': str(self.report), 'verdict': verdict, 'numbers': found}
+
     def summary(self) -> str:
         """Return the main numbers in one line."""
         numbers = '; '.join(f'{title} {number}' for number, title in self.numbers())

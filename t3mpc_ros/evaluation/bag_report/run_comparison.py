@@ -88,6 +88,16 @@ DISTANCE = Channel('distance', 'distance from the path', 'distance', 'm')
 BETTER, WORSE, INCONCLUSIVE = 'smaller error', 'larger error', 'inconclusive'
 
 
+class WrittenComparison(NamedTuple):
+    """A comparison that has been written."""
+
+    path: Path
+    text: str
+    """Verdicts on the runs, and of each against the first, a line each."""
+    record: Mapping[str, object]
+    """The same with the main numbers, as plain data."""
+
+
 @dataclass(frozen=True)
 class ComparedRun:
     """A run of a comparison, with its metrics."""
@@ -216,8 +226,8 @@ def why_not_comparable(first: ComparedRun, other: ComparedRun) -> str:
 
 def write_comparison(
     folders: Sequence[Path], output: Path, wanted: ReportOptions | None = None
-) -> tuple[Path, str]:
-    """Compare each bag with the first in ``comparison.html``; return its path and the verdicts."""
+) -> WrittenComparison:
+    """Compare each bag with the first in ``comparison.html``."""
     if not 2 <= len(folders) <= MAX_RUNS:
         raise ReportError(f'a comparison must have 2 to {MAX_RUNS} bags: got {len(folders)}')
     path = output / PAGE
@@ -238,7 +248,15 @@ def write_comparison(
     path.write_text(html_page(title, blocks), encoding='utf-8')
     lines = [f'{each.label}: {each.metrics.verdict.text()}' for each in runs]
     lines += [f'{each.subject}: {each.headline}: {"; ".join(each.reasons)}' for each in verdicts]
-    return path, '\n'.join(lines)
+    record = {
+        'report': str(path),
+        'runs': {each.label: each.metrics.to_dict() for each in runs},
+        'verdicts': [
+            {'runs': each.subject, 'verdict': each.headline, 'reasons': list(each.reasons)}
+            for each in verdicts
+        ],
+    }
+    return WrittenComparison(path, '\n'.join(lines), record)
 
 
 def _load(number: int, folder: Path, path: Path, wanted: ReportOptions | None) -> ComparedRun:

@@ -124,6 +124,11 @@ class Comparison:
             self.recorded[name], self.computed[name], *self.tolerances.of(name)
         )
 
+    def to_dict(self) -> dict[str, object]:
+        """Return the comparison of each field as plain data."""
+        fields = {row.field: {**vars(row)} for row in self.rows}
+        return {'same': self.same, 'remarks': list(self.remarks), 'fields': fields}
+
     def table(self) -> str:
         """Return the comparison as text, remarks first."""
         lines = [f'note: {remark}' for remark in self.remarks]

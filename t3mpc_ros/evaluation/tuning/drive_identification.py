@@ -19,7 +19,7 @@ over the period before, whichever fits better.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 import math
 from pathlib import Path
 
@@ -237,6 +237,14 @@ def fitting_parameters(
         }
     )
     return parameters.resolved()
+
+
+def drive_record(drive: IdentifiedDrive, composition: str) -> dict[str, object]:
+    """Return the drive, with standard deviations, and the parameters that fit it as plain data."""
+    return {
+        'drive': asdict(drive),
+        'parameters': fitting_parameters(drive, composition).to_dict(),
+    }
 
 
 def drive_file(drive: IdentifiedDrive, composition: str, source: str) -> str:

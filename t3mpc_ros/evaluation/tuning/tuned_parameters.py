@@ -138,15 +138,18 @@ class TunedParameters(dict[tuple[str, str], TunedEntry]):
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise StoreError(f'{path} holds no tuned parameters: {error}') from error
 
-    def save(self, path: Path) -> None:
-        """Write the file, whole or not at all."""
+    def to_dict(self) -> dict[str, object]:
+        """Return the content of the file as plain data."""
         methods: dict[str, dict[str, object]] = {}
         for (method, drive), entry in sorted(self.items()):
             methods.setdefault(method, {})[drive] = asdict(
                 replace(entry, values=dict(entry.values))
             )
-        content = {'format': _FORMAT, 'methods': methods}
-        text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
+        return {'format': _FORMAT, 'methods': methods}
+
+    def save(self, path: Path) -> None:
+        """Write the file, whole or not at all."""
+        text = json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
         write_atomically(path, text + '\n')
 
     def entry(self, method: str, drive: str) -> TunedEntry:
