@@ -13,9 +13,10 @@
 # limitations under the License.
 """Measures how fast the robot stops: real bridge processes, and emulated boards on a pty.
 
-    PYTHONPATH=.:test .venv/bin/python bench/stopping_times.py [--trials 20] [KIND ...]
+    PYTHONPATH=.:test .venv/bin/python bench/stopping_times.py [--trials 20] [--file F] [KIND ...]
 
-It prints the table of docs/safety.md; ``test/nodes/test_stopping_times.py`` is its short form.
+It prints the table of docs/safety.md and writes its trials to a file, as
+docs/measured/stopping_times.csv; ``test/nodes/test_stopping_times.py`` is its short form.
 Times are those of the emulator, which knows when the motors pulse. It is in this process and may
 be interrupted on a busy machine: a trial in which its time has lagged is repeated.
 """
@@ -23,6 +24,7 @@ be interrupted on a busy machine: a trial in which its time has lagged is repeat
 import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+import csv
 from functools import partial
 import math
 import os
@@ -517,8 +519,10 @@ def main():
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--trials', type=int, default=20)
+    parser.add_argument('--file', type=Path)
     parser.add_argument('kinds', nargs='*', default=['all'])
     options = parser.parse_args()
+    written = [('fault', *Trial._fields)]
     with (
         tempfile.TemporaryDirectory() as name,
         PrivateGraph() as graph,
@@ -528,6 +532,14 @@ def main():
         print('|---' * 7 + '|')
         for row in rows(*made, Path(name), options.trials, kinds=options.kinds):
             print(format_row(*row), flush=True)
+            written += [(row[0], *map(_rounded, trial)) for trial in row[1]]
+    if options.file is not None:
+        with options.file.open('w', newline='', encoding='utf-8') as file:
+            csv.writer(file, lineterminator='\n').writerows(written)
+
+
+def _rounded(value):
+    return value if value is None else round(value, 5)
 
 
 if __name__ == '__main__':

@@ -19,6 +19,7 @@ import random
 import re
 
 import pytest
+from support import quantities
 from support.checkout import ROOT
 
 import t3mpc_ros as t3
@@ -218,3 +219,48 @@ def test_the_result_of_the_tutorial_is_that_of_its_controller(tmp_path, monkeypa
     text = ' '.join(page.split())
     assert f'{shown[0]} rad/s (`full`) and {shown[1]} rad/s (`Pi`)' in text
     assert f'a difference of {found.mean:+.4f} ± {found.half:.4f}: *worse*' in text
+
+
+SOURCES = re.compile(r'(?:bench|test|docs)/[\w/]+(?:\.\w+)?|t3mpc \w+(?: \w+)?')
+"""A program, a test or a command that a section of ``docs/numbers.yaml`` names."""
+UNNAMED = 'test/', 'docs/'
+"""Sources that a page need not name: tests assert, they do not measure."""
+
+
+@pytest.mark.parametrize('page', quantities.pages(), ids=lambda page: page.name)
+def test_every_quantity_of_a_page_has_a_source(page):
+    """Most numbers of the pages were written by hand, and stayed when a constant changed."""
+    without = {(one.section, one.text) for one, source in quantities.sources(page) if not source}
+    assert not without, (
+        'not the value of a parameter that the paragraph names; give docs/numbers.yaml an '
+        f'expression, or what the section is from: {sorted(without)}'
+    )
+
+
+@pytest.mark.parametrize('page', quantities.ledger())
+def test_the_sources_of_quantities_are_there(page):
+    text = ((quantities.DOCS if page != 'README.md' else ROOT) / page).read_text()
+    known = {(one.section, one.text): one for one in quantities.quantities(text)}
+    sections = {section for section, _ in known}
+    for section, entries in quantities.ledger()[page].items():
+        assert section in sections, (page, section)
+        for name, value in entries.items():
+            if name != 'from':
+                assert (section, name) in known, f'{page}, {section}: {name} is not on the page'
+                shown = known[section, name]
+                assert shown.shows(quantities.evaluated(value)), (page, section, name, value)
+                continue
+            for source in SOURCES.findall(value):
+                assert source.startswith('t3mpc') or (ROOT / source).exists(), source
+                assert source.startswith(UNNAMED) or source in text, f'{page} names no {source}'
+
+
+def test_defaults_beside_the_names_of_parameters_are_theirs():
+    """`name` (2 s) and 2 s (`name`), on every page."""
+    checked = 0
+    for page in quantities.pages():
+        for name, shown in quantities.stated_defaults(page.read_text()):
+            if values := quantities.values_of(name):
+                assert any(map(shown.shows, values)), (page.name, name, shown.text, values)
+                checked += 1
+    assert checked > 10
