@@ -138,6 +138,22 @@ def twist_from_serialized(data: bytes) -> BodyTwist:
     return BodyTwist(linear, angular)
 
 
+def float_from_serialized(data: bytes) -> float:
+    """Return the number in a serialized Float64; struct.error if it is truncated."""
+    (value,) = struct.unpack_from('<d' if data[1] & 1 else '>d', data, 4)
+    return float(value)
+
+
+def range_from_serialized(data: bytes) -> tuple[float, float]:
+    """Return ``range`` and ``max_range`` of a serialized Range; struct.error if truncated."""
+    order = '<' if data[1] & 1 else '>'
+    (length,) = struct.unpack_from(f'{order}I', data, 12)
+    end = 16 + length
+    # After the byte of the kind of radiation: field of view, least and largest range, range.
+    largest, distance = struct.unpack_from(f'{order}8x2f', data, end + 4 - end % 4)
+    return distance, largest
+
+
 def _layout(data: bytes | bytearray) -> tuple[str, int]:
     """Return the byte order of a serialized odometry message and the offset of its pose."""
     order = '<' if data[1] & 1 else '>'

@@ -15,7 +15,8 @@
 
 Its subscriptions are polled, not executed: every twentieth of a second it takes the messages that
 wait, so that two hundred messages a second cost about as much as twenty. Streams are requested
-best effort, which every publisher offers.
+best effort, which every publisher offers, and decoded from the serialized messages. The executor,
+which builds its wait set anew each time, runs only while an answer to a request may come.
 """
 
 from collections import deque
@@ -130,6 +131,8 @@ class ViewNode(Node):
         """Time of publication, ns, and text of each switch whose reference has not come yet."""
         self._remote = ParameterWatch(self, self._is_shown, self._on_parameters)
         self._rows: dict[str, dict[str, Mapping[str, Any]]] = {}
+        self._replies_until = -math.inf
+        """Steady time until which the answer of a command may come, s."""
         self._signals: tuple[int, ...] = ()
         self._faults = 'none'
         self._ranges = [math.nan] * len(RANGE_SENSORS)
@@ -151,16 +154,21 @@ class ViewNode(Node):
         """Collect and execute until ``stop`` returns True."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
-        next_poll = next_look = time.monotonic()
+        now = next_poll = next_look = time.monotonic()
         try:
             while not stop():
-                executor.spin_once(max(0.0, next_poll - time.monotonic()))
+                wait = max(0.0, next_poll - now)
+                if now < self._replies_until or len(self._rows) < len(self._remote.nodes):
+                    executor.spin_once(wait)
+                else:
+                    self._start_waiting(wait)
                 if (now := time.monotonic()) < next_poll:
                     continue
                 next_poll = max(next_poll + PERIOD, now)
                 if now >= next_look:
                     next_look = now + GRAPH_PERIOD
                     self.look_at_graph()
+                    executor.spin_once(0.0)
                 self.poll()
                 self._sink.tick(now)
         finally:
@@ -175,7 +183,12 @@ class ViewNode(Node):
         self._report_switches()
         self._add_collected('ranges', self._ranges)
         self._add_collected('terms', self._terms)
+        self._start_waiting(0.0)
+
+    def _start_waiting(self, seconds: float) -> None:
+        """Start the commands that wait, the first as soon as it comes within ``seconds``."""
         with suppress(Empty):
+            self._pending.get(timeout=seconds)()
             while True:
                 self._pending.get_nowait()()
 
@@ -195,11 +208,13 @@ class ViewNode(Node):
         ):
             self._subscribe(Odometry, topic, partial(self._on_state, stream), raw=True)
         for number, name in enumerate(RANGE_SENSORS):
-            self._subscribe(Range, f'range/{name}', partial(self._on_range, number), depth=1)
+            take = partial(self._on_range, number)
+            self._subscribe(Range, f'range/{name}', take, depth=1, raw=True)
         for row, term in enumerate(TERM_NAMES):
             for column, wheel in enumerate(WHEELS):
                 take = partial(self._on_term, len(WHEELS) * row + column)
-                self._subscribe(Float64, f'controller/terms/{term}/{wheel}', take, depth=1)
+                topic = f'controller/terms/{term}/{wheel}'
+                self._subscribe(Float64, topic, take, depth=1, raw=True)
         self._subscribe(Int32MultiArray, 'reference/signals', self._on_signals, latched=True)
         self._subscribe(DiagnosticArray, '/diagnostics', self._on_diagnostics)
         self._subscribe(Log, '/rosout', self._on_log)
@@ -268,15 +283,18 @@ class ViewNode(Node):
         wheels = wheels_from_twist(twist, self._geometry)
         self._sink.add('command', self._time(sent_ns), wheels)
 
-    def _on_range(self, number: int, message: Range, sent_ns: int) -> None:
+    def _on_range(self, number: int, data: bytes, sent_ns: int) -> None:
         del sent_ns
-        beyond = message.range > message.max_range  # infinite, or max_range as REP 117 allows
-        self._ranges[number] = message.max_range if beyond else max(message.range, 0.0)
-        self._sink.set('reach', round(message.max_range, 3))
+        with suppress(struct.error):
+            distance, reach = conversions.range_from_serialized(data)
+            # Beyond is infinite, or the reach, as REP 117 allows.
+            self._ranges[number] = reach if distance > reach else max(distance, 0.0)
+            self._sink.set('reach', round(reach, 3))
 
-    def _on_term(self, number: int, message: Float64, sent_ns: int) -> None:
+    def _on_term(self, number: int, data: bytes, sent_ns: int) -> None:
         del sent_ns
-        self._terms[number] = message.data
+        with suppress(struct.error):
+            self._terms[number] = conversions.float_from_serialized(data)
 
     def _on_signals(self, message: Int32MultiArray, sent_ns: int) -> None:
         signals = tuple(message.data)
@@ -409,6 +427,7 @@ class ViewNode(Node):
         if not reply.set_running_or_notify_cancel():
             return
         try:
+            self._replies_until = time.monotonic() + REPLY_TIMEOUT
             late = self._sink.refusal(name, arguments.get('on'), asked, time.monotonic())
             if late:
                 raise CommandFailedError(late)

@@ -96,6 +96,11 @@ class LiveData:
             self._number += 1
             self._events.append((self._number, {'time': time, 'kind': kind, 'text': text}))
 
+    def newest(self) -> Cursor:
+        """Return the cursor of a reader who has read everything."""
+        with self._lock:
+            return Cursor(self._number, self._fact_number)
+
     def read(self, cursor: Cursor) -> tuple[dict[str, Json], Cursor]:
         """Return what has changed since the cursor, as JSON values, and the new cursor.
 

@@ -102,6 +102,8 @@ class PageServer:
         self.report: Path | None = None
         """Newest report of a recording, served as ``/report``."""
         self.token = secrets.token_urlsafe(24)
+        self._texts: tuple[Cursor, dict[Cursor, str]] = Cursor(), {}
+        """Newest change, and what was sent since then, by the cursor of the page."""
         try:
             self._server = _Server((ADDRESS, port), self)
         except OSError as error:
@@ -111,6 +113,21 @@ class PageServer:
             ) from None  # fmt: skip
         self.port: int = self._server.server_address[1]
         self._thread = Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
+
+    def news(self, cursor: Cursor) -> str:
+        """Return what has changed since the cursor in JSON, without the final bracket.
+
+        Pages that ask between the same two changes get one text: most of the cost is its encoding.
+        """
+        newest, texts = self._texts
+        if newest != (present := self.data.newest()):
+            newest, texts = self._texts = present, {}
+        if (text := texts.get(cursor)) is None:
+            changes, end = self.data.read(cursor)
+            changes['id'] = f'{self.token[:8]}-{end.change}-{end.fact}'
+            text = json.dumps(changes, separators=(',', ':'), allow_nan=False)[:-1]
+            texts[cursor] = text
+        return text
 
     @property
     def url(self) -> str:
@@ -191,10 +208,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _events(self, query: str) -> None:
         """Send what is new since the last request of this page, and the time of this clock."""
         page = self.server.page
-        changes, cursor = page.data.read(self._cursor(query))
-        place = f'{page.token[:8]}-{cursor.change}-{cursor.fact}'
-        reply = {**changes, 'id': place, 'now': page.clock()}
-        self._send(json.dumps(reply, separators=(',', ':'), allow_nan=False), 'application/json')
+        self._send(f'{page.news(self._cursor(query))},"now":{page.clock()}}}', 'application/json')
 
     def _cursor(self, query: str) -> Cursor:
         """Return how far the page has read; a page of an earlier start has read nothing."""

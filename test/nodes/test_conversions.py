@@ -23,6 +23,7 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Range
+from std_msgs.msg import Float64
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State, WheelSpeeds, wrap_angle
@@ -111,6 +112,28 @@ def test_big_endian_odometry_is_read():
     )
     state = conversions.state_from_odometry(header + numbers)
     assert state == State(7 * NANOSECONDS + 8, Pose(1.0, 2.0, 0.0), BodyTwist(4.0, 5.0))
+
+
+@pytest.mark.parametrize('frame', range(9))
+def test_ranges_are_read_whatever_their_frame(frame):
+    """A text of any length precedes the numbers, which lie at multiples of four."""
+    message = Range(radiation_type=1, field_of_view=0.1, min_range=0.2, max_range=1.5)
+    message.header.frame_id = 'a' * frame
+    for distance in (0.25, math.inf, -math.inf):
+        message.range = distance
+        data = serialize_message(message)
+        assert conversions.range_from_serialized(data) == (distance, 1.5)
+        with pytest.raises(struct.error):
+            conversions.range_from_serialized(data[:-9])
+
+
+def test_numbers_are_read():
+    data = serialize_message(Float64(data=-0.1))
+    assert conversions.float_from_serialized(data) == -0.1
+    swapped = bytes(4) + data[:3:-1]
+    assert conversions.float_from_serialized(swapped) == -0.1
+    with pytest.raises(struct.error):
+        conversions.float_from_serialized(data[:-1])
 
 
 def test_yaw_survives_the_conversion_to_a_quaternion():

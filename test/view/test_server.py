@@ -162,6 +162,29 @@ def test_events_go_on_where_a_page_has_stopped(page, token):
         assert page.events(other)[1]['streams']['a']['values'] == [[1.0, 2.0]]
 
 
+def test_pages_that_share_answers_get_every_change_once(page):
+    """A text is encoded once for all pages that have read as far, until anything changes."""
+    data, pages = page.server.data, [{'last': '', 'events': [], 'facts': []} for _ in range(3)]
+
+    def ask(reader):
+        reader['last'], news = page.events(reader['last'])
+        reader['events'] += [event['text'] for event in news.get('events', ())]
+        reader['facts'] += [news['facts']['n']] if 'facts' in news else []
+
+    for k in range(12):
+        if k % 2:
+            data.set('n', k)
+        else:
+            data.report(float(k), 'note', str(k))
+        for i, reader in enumerate(pages):
+            if k % (i + 1) == 0:
+                ask(reader)
+    for reader in pages:
+        ask(reader)
+        assert reader['events'] == [str(k) for k in range(0, 12, 2)]
+        assert reader['facts'][-1] == 11
+
+
 def test_an_answer_without_news_comes_at_once_with_the_time(page):
     """No request waits: of the six connections of a browser one must be free for a stop."""
     before = time.monotonic()
