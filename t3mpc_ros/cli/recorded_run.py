@@ -37,7 +37,8 @@ def recorded_run(bag: Path, namespace: str | None = None) -> LiveData:
     data = LiveData(math.inf, STEP)
     with open_bag(bag) as recording:
         run = load_run(recording, ReportOptions(namespace))
-        verdict = compute_metrics(run, Path(), recording.message_count).verdict
+        metrics = compute_metrics(run, Path(), recording.message_count)
+        verdict, incidents = metrics.verdict, metrics.incidents
         data.set('origin', recording.start_ns / NANOSECONDS)
     if 'odom' not in run.motions:
         raise ValueError(f'{bag} has no odometry to show; t3mpc bag info lists its topics')
@@ -74,10 +75,11 @@ def recorded_run(bag: Path, namespace: str | None = None) -> LiveData:
         _add_columns(data, 'terms', first.time, columns)
     else:
         absent.append('terms')
-    for time_of_switch in run.switches.tolist():
-        data.report(time_of_switch, 'switch', 'switch of the reference')
-    for when, _, node, text in run.complaints:
-        data.report(when, 'note', f'{node}: {text}')
+    events = [(time, 'switch', 'switch of the reference') for time in run.switches.tolist()]
+    events += [(when, 'note', f'{node}: {text}') for when, _, node, text in run.complaints]
+    events += [(stop.end, 'resume', 'the robot moves again') for stop in incidents.stops]
+    for event in sorted(events + incidents.events()):
+        data.report(*event)
     data.set('absent', absent)
     data.set('channels', [[each.title.capitalize(), each.unit] for each in run.channels])
     data.set('follows_path', run.follows_path)

@@ -95,8 +95,8 @@ class Plane:
 class Timeline:
     """Events in order: time (s), kind, text.
 
-    The kinds ``switch``, ``stop``, ``stall``, ``gap`` and ``jump`` are marked in the charts of the
-    page; ``note`` is not.
+    The kinds ``switch``, ``stop``, ``stall``, ``gap``, ``jump`` and ``slip`` are marked in the
+    charts of the page; ``note`` is not.
     """
 
     show: ClassVar[str] = 'timeline'

@@ -124,14 +124,16 @@ def judged_metrics(case: str) -> tuple[Metric, ...]:
 
 
 def summary_table(
-    plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | None = None
+    plan: ComparisonPlan,
+    results: ResultTable,
+    judged: Mapping[tuple[str, str], str],
+    step_times: StepTimes | None = None,
 ) -> Table:
-    """Return the first judged metric of every method and case, with its verdict.
+    """Return the first judged metric of every method and case, with its verdict in ``judged``.
 
     Beside it the variation of the command in the first case, and the time of a step, µs.
     """
     firsts = {case: judged_metrics(case)[0] for case in plan.cases}
-    judged = _first_verdicts(plan, results)
     rows = []
     for method in plan.methods:
         cells = [method]
@@ -153,7 +155,7 @@ def summary_table(
     return Table(title, head, rows, (FULL,), wrap=True)
 
 
-def _first_verdicts(plan: ComparisonPlan, results: ResultTable) -> dict[tuple[str, str], str]:
+def first_verdicts(plan: ComparisonPlan, results: ResultTable) -> dict[tuple[str, str], str]:
     """Return the verdict on the first judged metric of every method and case."""
     return verdicts(
         {
@@ -165,7 +167,9 @@ def _first_verdicts(plan: ComparisonPlan, results: ResultTable) -> dict[tuple[st
     )
 
 
-def verdict_box(plan: ComparisonPlan, results: ResultTable) -> VerdictBox:
+def verdict_box(
+    plan: ComparisonPlan, results: ResultTable, judged: Mapping[tuple[str, str], str]
+) -> VerdictBox:
     """Return in one sentence how the first method does beside the one it is compared with."""
     case = plan.cases[0]
     own = next((each for each in plan.methods if each != plan.against), plan.against)
@@ -176,7 +180,6 @@ def verdict_box(plan: ComparisonPlan, results: ResultTable) -> VerdictBox:
         f'{name} {format_interval(mean(each), interval(each), "", metric.digits)}'
         for name, each in zip(named, numbers, strict=True)
     )
-    judged = _first_verdicts(plan, results)
     verdict = judged.get((own, case), '')
     counts = [
         f'{other}: {judged[own, other]}.' for other in plan.cases[1:] if (own, other) in judged
@@ -308,7 +311,7 @@ def markdown(
 ) -> str:
     """Return all tables in Markdown."""
     tables = [
-        summary_table(plan, results, step_times),
+        summary_table(plan, results, first_verdicts(plan, results), step_times),
         *(case_table(plan, results, case) for case in plan.cases),
         knowledge_table(plan),
     ]
@@ -317,7 +320,8 @@ def markdown(
 
 def page(plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | None = None) -> str:
     """Return the page as self-contained HTML."""
-    blocks: list[Block] = [verdict_box(plan, results)]
+    judged = first_verdicts(plan, results)
+    blocks: list[Block] = [verdict_box(plan, results, judged)]
     figures: Mapping[str, Callable[[ComparisonPlan, ResultTable, str], Any]] = {
         f'Difference from {plan.against}, left is better; 95 % intervals are of each by itself, '
         'verdicts are stricter because there are many': _draw_differences,
@@ -330,7 +334,7 @@ def page(plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | Non
             if figure := drawing(partial(draw, plan, results), case):
                 blocks.append(Picture(f'{caption}: {case}', file_of(figure, 'svg'), caption))
             if draw is _draw_differences and case == plan.cases[0]:
-                summary = summary_table(plan, results, step_times)
+                summary = summary_table(plan, results, judged, step_times)
                 blocks += [Contents(), Paragraph(description(plan)), summary]
         blocks.append(case_table(plan, results, case))
     blocks += [Heading('What the methods know'), knowledge_table(plan)]

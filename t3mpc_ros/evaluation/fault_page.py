@@ -196,16 +196,24 @@ def _verdict(rows: Sequence[Row]) -> VerdictBox:
     if names := sorted({row['name'] for row in rows if hidden(row)}):
         reasons.append(f'Not detected by robot or controller: {", ".join(names)}.')
     if count['unbounded']:
-        return VerdictBox('Not every fault stays bounded', reasons, 'bad')
+        beyond = '; '.join(map(_run_name, [row for row in rows if row['verdict'] == 'unbounded']))
+        return VerdictBox(f'Not every fault stays bounded: {beyond}', reasons, 'bad')
     lost = [row for row in rows if ODOMETRY_WRONG in row['undetected']]
     if not lost:
         return VerdictBox('Every fault stays bounded', reasons, 'good')
     worst = max(lost, key=lambda row: row['odometry_after'][0])
     headline = (
-        f'Every fault stays within the limits, but the odometry is wrong after {len(lost)} of '
-        f'{len(rows)}, by up to {_place(*worst["odometry_after"])} ({worst["name"]})'
+        f'Every fault stays within the limits, but the odometry is wrong at the end of '
+        f'{len(lost)} of {len(rows)} runs, by up to {_place(*worst["odometry_after"])} '
+        f'({_run_name(worst)})'
     )
     return VerdictBox(headline, reasons, 'open')
+
+
+def _run_name(row: Row) -> str:
+    """Return fault and course of a run, as its table names them."""
+    title = TITLES[row['course']]
+    return f'{row["name"]}, {title[0].lower()}{title[1:]}'
 
 
 def _draw_errors(rows: Sequence[Row]) -> Any:

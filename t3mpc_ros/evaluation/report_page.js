@@ -5,7 +5,7 @@
 
 const TICK = 1e-5; // s
 const NEAR = 3; // s shown before and after an event
-const EVENTS = { switch: 'switch', stop: 'stopped', stall: 'c4', gap: 'soft', jump: 'c5' }; // marks
+const EVENTS = { switch: 'switch', stop: 'stopped', stall: 'c4', gap: 'soft', jump: 'c5', slip: 'slip' }; // marks
 
 const place = (id) => document.getElementById(id);
 const data = JSON.parse(place('data').textContent);
@@ -84,6 +84,10 @@ function addPlane(id, { unit, curves, summary, title, world, marks }) {
   const legend = element('ul', { className: 'legend' });
   for (const { label, colour: name, dash } of curves) {
     legend.append(element('li', {}, sample(name, dash), label));
+  }
+  for (const name of new Set(marks.map((mark) => mark.at(-1)))) {
+    const [kind] = Object.entries(EVENTS).find((each) => each[1] === name);
+    legend.append(element('li', {}, dot(name), kind));
   }
   place(id).querySelector('h3').after(canvas, legend);
   const lines = curves.map(({ colour: name, dash, time, x, y }) => ({ colour: name, dash,

@@ -158,9 +158,9 @@ class RobotNode(BaseNode[P]):
     def _e_stop(self, on: bool) -> tuple[str, str]:
         with self._lock:
             if not on:
-                return self._robot.release_estop(self.robot_ns()), 'released'
+                return self._robot.release_estop(self.robot_ns()), 'emergency stop released'
             self._robot.latch_estop('requested by service e_stop', self.robot_ns())
-        return '', 'latched'
+        return '', 'emergency stop latched'
 
     def _log_reason(self, reason: str) -> None:
         if reason != self._logged_reason:

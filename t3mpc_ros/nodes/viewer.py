@@ -134,7 +134,7 @@ class ViewNode(Node):
         self._replies_until = -math.inf
         """Steady time until which the answer of a command may come, s."""
         self._signals: tuple[int, ...] = ()
-        self._faults = 'none'
+        self._faults, self._slips = 'none', False
         self._ranges = [math.nan] * len(RANGE_SENSORS)
         self._terms = [math.nan] * (len(WHEELS) * len(TERM_NAMES))
         self._command_clients = {
@@ -333,12 +333,19 @@ class ViewNode(Node):
             self._sink.node_report(name, status.message, condition)
             if name in ROBOTS:
                 self._on_faults(values.get('faults', 'none'), self._time(sent_ns))
+                self._on_slip(values.get('slipping') == 'True', self._time(sent_ns))
 
     def _on_faults(self, faults: str, seconds: float) -> None:
         if faults != self._faults:
             text = 'faults end' if faults == 'none' else f'fault: {faults}'
             self._sink.report(seconds, 'fault', text)
         self._faults = faults
+
+    def _on_slip(self, slips: bool, seconds: float) -> None:
+        if slips and not self._slips:
+            text = 'a wheel slips, is blocked, or has lost steps'
+            self._sink.report(seconds, 'slip', text)
+        self._slips = slips
 
     def _on_log(self, message: Log, sent_ns: int) -> None:
         prefix = self.get_namespace().strip('/').replace('/', '.')

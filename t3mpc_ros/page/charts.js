@@ -17,14 +17,20 @@ function element(name, properties = {}, ...children) {
 
 // A short piece of line as it is drawn in a chart: lines differ by their dashes, too.
 function sample(name, dash = []) {
+  return shape('line', { x1: 0, y1: 5, x2: 24, y2: 5, stroke: `var(--${name})`, 'stroke-width': 3,
+    'stroke-dasharray': dash.join(' ') });
+}
+
+// A point as on the floor.
+const dot = (name) => shape('circle', { cx: 12, cy: 5, r: 4.5, fill: `var(--${name})` });
+
+function shape(kind, look) {
   const picture = document.createElementNS('http://www.w3.org/2000/svg', 'svg');
   picture.setAttribute('viewBox', '0 0 24 10');
   picture.setAttribute('aria-hidden', 'true');
-  const line = document.createElementNS('http://www.w3.org/2000/svg', 'line');
-  const look = { x1: 0, y1: 5, x2: 24, y2: 5, stroke: `var(--${name})`, 'stroke-width': 3,
-    'stroke-dasharray': dash.join(' ') };
-  for (const [key, value] of Object.entries(look)) line.setAttribute(key, value);
-  picture.append(line);
+  const drawn = document.createElementNS('http://www.w3.org/2000/svg', kind);
+  for (const [key, value] of Object.entries(look)) drawn.setAttribute(key, value);
+  picture.append(drawn);
   return picture;
 }
 

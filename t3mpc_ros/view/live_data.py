@@ -89,8 +89,8 @@ class LiveData:
     def report(self, time: float, kind: str, text: str) -> None:
         """Add an event in one line.
 
-        Its kind is ``switch``, ``fault``, ``stop``, ``resume`` (the end of a stop), ``parameter``,
-        ``command`` or ``note``.
+        Its kind is ``switch``, ``fault``, ``slip``, ``stop``, ``resume`` (the end of a stop),
+        ``parameter``, ``command`` or ``note``; of a recording also ``stall``, ``gap`` or ``jump``.
         """
         with self._lock:
             self._number += 1

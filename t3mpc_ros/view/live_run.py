@@ -40,9 +40,9 @@ PAUSED = NodeReport('paused')
 """Report of a reference generator that was paused."""
 
 
-NOT_HEARD = (
-    'what is shown is old, and the robot may not hear a stop: use its switch, then see whether '
-    'sim_robot or radio_bridge runs and is reached'
+LOST_REMEDY = (
+    'what is shown is old, and a stop may not reach the robot: use the switch on the robot, then '
+    'check that sim_robot or radio_bridge runs and is connected'
 )
 
 
@@ -73,7 +73,7 @@ def banner(reports: Mapping[str, NodeReport], odometry_age: float | None) -> Ban
         return Banner('lost', 'Waiting for a robot', detail or 'no odometry on the graph yet')
     if odometry_age > LOST:
         silence = f'no odometry for {odometry_age:.0f} s'
-        return Banner('lost', 'Connection lost', f'{silence}: {detail or NOT_HEARD}')
+        return Banner('lost', 'Connection lost', f'{silence}: {detail or LOST_REMEDY}')
     if any(each.text.startswith(ESTOP) for each in stops.values()):
         return Banner('stopped', 'E-STOP', detail)
     if reports.get('reference_generator') == PAUSED:

@@ -43,6 +43,7 @@ from t3mpc_ros.evaluation.comparison_page import (
     INCONCLUSIVE,
     WORSE,
     case_table,
+    first_verdicts,
     front,
     record,
     summary_table,
@@ -496,7 +497,7 @@ def test_a_table_says_how_many_seeds_and_what_each_method_knows():
     ticks = iter(range(0, 10**9, 5000))
     times = step_times(plan, lambda: next(ticks))
     assert set(times.values()) == {5.0}
-    table = summary_table(plan, results, times)
+    table = summary_table(plan, results, first_verdicts(plan, results), times)
     assert table.head[-1] == 'step, µs'
     assert all(each[-1] == '5' for each in table.rows)
     written = record(plan, results, times)

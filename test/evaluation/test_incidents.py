@@ -23,6 +23,7 @@ from t3mpc_ros.evaluation.bag_report.incidents import (
     STALL_PERIODS,
     find_blocked_wheels,
     find_incidents,
+    find_slips,
     find_stalls,
     find_stops,
 )
@@ -178,6 +179,20 @@ def test_a_blocked_wheel_is_named(wheel):
     both = standing(wanted, [(12.0, 15.0)])
     assert find_blocked_wheels(run_of(wanted, both)) == (), 'that is a stop'
     assert find_blocked_wheels(run_of(wanted, wanted)) == ()
+
+
+def test_a_slip_lasts_until_its_node_says_otherwise():
+    speeds = wheels(np.random.default_rng(5))
+    changes = (
+        (4.0, 'warning', 'robot', 'a wheel slips, is blocked, or has lost steps'),
+        (5.0, 'warning', 'robot', 'the battery is low; a wheel slips, is blocked'),
+        (5.5, 'ok', 'controller', ''),
+        (6.0, 'ok', 'robot', ''),
+        (8.0, 'warning', 'robot', 'a wheel slips'),
+    )
+    run = replace(run_of(speeds, speeds), changes=changes)
+    end = max(series.time[-1] for series in run.motions.values())
+    assert find_slips(run) == ((4.0, 6.0), (8.0, end))
 
 
 def test_nothing_happens_in_a_run_without_an_incident():

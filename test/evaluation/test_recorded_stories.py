@@ -65,6 +65,18 @@ def test_the_first_sentence_tells_the_story_everywhere(name, tmp_path, capsys):
 
 
 @pytest.mark.slow
+def test_the_page_of_a_bag_marks_stops_and_slips(tmp_path):
+    """It marked switches only: a robot that stood drove on in its charts."""
+    events = read_all(recorded_run(STORIES['slip stop'].write(tmp_path / 'bag')))[0]['events']
+    times = [event['time'] for event in events]
+    assert times == sorted(times)
+    found = {event['kind']: event['time'] for event in events}
+    assert found['stop'] == pytest.approx(9.0, abs=0.2)
+    assert found['slip'] == pytest.approx(9.5, abs=0.01)  # as its diagnostics say
+    assert found['resume'] == pytest.approx(12.0, abs=0.2)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize('late', [False, True])
 def test_what_a_recorder_misses_at_its_start_is_usual(late, tmp_path):
     """A normal demo had 870 unusual messages, so nobody read what is unusual in a bag.

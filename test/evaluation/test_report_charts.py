@@ -163,7 +163,8 @@ def test_every_chart_is_known():
 
 
 def test_planes_have_the_axes_of_their_titles():
-    metrics = replace(METRICS, incidents=Incidents((Stop(3.0, 4.0, Cause('')),)))
+    incidents = Incidents((Stop(3.0, 4.0, Cause('')),), slips=((5.0, 5.5), (6.0, 6.5)))
+    metrics = replace(METRICS, incidents=incidents)
     planes = {
         each.title: each
         for section in SECTIONS
@@ -179,9 +180,15 @@ def test_planes_have_the_axes_of_their_titles():
     assert np.isin(motion(TRUTH, 'x'), truth.x).all()
     assert np.isin(motion(TRUTH, 'y'), truth.y).all()
     places = {colour: (t, x, y) for t, x, y, colour in floor.marks}
-    assert places['reference'][0] == pytest.approx(8.0, abs=0.02)
+    assert places['switch'][0] == pytest.approx(8.0, abs=0.02)
     assert places['stopped'][0] == pytest.approx(3.0, abs=0.02)
-    assert floor.summary.endswith('Grey points: switches of the reference. Red points: stops.')
+    assert floor.summary.endswith('A wheel slips for 1.0 s. Points: switches and stops.')
+    slip = floor.curves[-1]
+    assert slip.label == 'a wheel slips'
+    slipping = np.isfinite(slip.x)
+    expected = [(5.0 <= t <= 5.5) or (6.0 <= t <= 6.5) for t in slip.time]
+    assert slipping.tolist() == expected
+    assert slip.x[slipping].tolist() == truth.x[slipping].tolist()
 
 
 def test_sentences_give_the_numbers_of_their_charts():

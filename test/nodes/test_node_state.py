@@ -220,10 +220,10 @@ def test_an_emergency_stop_lasts_until_its_release(name, start):
     node = start(name)
     assert call(node, 'e_stop', data=False).message == 'no emergency stop is latched'
     for _ in range(2):
-        assert call(node, 'e_stop', data=True).message == 'latched'
+        assert call(node, 'e_stop', data=True).message == 'emergency stop latched'
         assert node._apply_command(BodyTwist(0.1, 0.0), node.robot_ns()).startswith('emerg')
     answer = call(node, 'e_stop', data=False)
-    assert (answer.success, answer.message) == (True, 'released')
+    assert (answer.success, answer.message) == (True, 'emergency stop released')
     assert node._apply_command(BodyTwist(0.1, 0.0), node.robot_ns()) == ''
     assert not call(node, 'e_stop', data=False).success
 

@@ -158,28 +158,35 @@ def odometry(stamp_ns):
 
 
 def test_the_e_stop_latches_and_is_shown(viewer, robot):
-    assert viewer.command('e_stop', on=True) == 'latched'
+    assert viewer.command('e_stop', on=True) == 'emergency stop latched'
     viewer.spin_until(lambda: viewer.facts()['banner']['headline'] == 'E-STOP')
     assert 'emergency stop' in viewer.facts()['banner']['detail']
-    assert viewer.command('e_stop', on=False) == 'released'
+    assert viewer.command('e_stop', on=False) == 'emergency stop released'
     viewer.spin_until(lambda: viewer.facts()['banner']['headline'] != 'E-STOP')
     texts = [event['text'] for event in viewer.changes()['events']]
-    assert {'e_stop on: latched', 'e_stop off: released'} <= set(texts)
+    done = {'e_stop on: emergency stop latched', 'e_stop off: emergency stop released'}
+    assert done <= set(texts)
 
 
 def test_a_robot_that_stands_latched_is_shown_as_stopped(viewer, robot, harness):
     """A blocked wheel was shown as *Driving, with a warning*, its reason hidden by another one."""
-    robot.produce_diagnostics = lambda: (
-        WARN,
-        'a wheel slips; processor overloaded: samples were skipped',
-        {'standstill': 'a wheel slips'},
-    )
+    text = 'a wheel slips; processor overloaded: samples were skipped'
+    produced = []
+
+    def produce():
+        produced.append(text)
+        return WARN, text, {'standstill': 'a wheel slips', 'slipping': True}
+
+    robot.produce_diagnostics = produce
 
     def shown():
         banner = viewer.facts()['banner']
         return banner['headline'] == 'Stopped' and 'sim_robot: a wheel slips' in banner['detail']
 
     viewer.spin_until(shown)
+    viewer.spin_until(lambda: len(produced) > 2)
+    slips = [each for each in viewer.changes()['events'] if each['kind'] == 'slip']
+    assert len(slips) == 1, 'reported again with each diagnostics'
 
 
 def test_a_parameter_is_set_and_its_change_is_shown(viewer, robot, harness):

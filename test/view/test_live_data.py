@@ -21,7 +21,7 @@ import pytest
 from support.page_data import read_all
 
 from t3mpc_ros.view.live_data import MAX_CHANGES, MAX_EVENTS, SPAN, Cursor, LiveData
-from t3mpc_ros.view.live_run import LOST, MAX_AGE, NOT_HEARD, LiveRun, NodeReport, banner
+from t3mpc_ros.view.live_run import LOST, LOST_REMEDY, MAX_AGE, LiveRun, NodeReport, banner
 
 
 def test_readers_of_any_pace_get_every_sample_once_and_in_order():
@@ -147,7 +147,7 @@ ESTOP = NodeReport('emergency stop: requested by service e_stop', 'stopped')
             0.1,
             ('stopped', 'E-STOP', f'sim_robot: {ESTOP.text}'),
         ),
-        (TRACKING, LOST + 1.6, ('lost', 'Connection lost', f'no odometry for 3 s: {NOT_HEARD}')),
+        (TRACKING, LOST + 1.6, ('lost', 'Connection lost', f'no odometry for 3 s: {LOST_REMEDY}')),
         (
             {**TRACKING, 'sim_robot': NodeReport('the battery is low', 'warning')},
             0.1,

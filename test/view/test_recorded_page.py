@@ -318,8 +318,42 @@ def test_the_banner_of_a_phone_leaves_room_for_the_rest(browser, show):
     browser.wait(lambda: browser.text('headline') == 'Stopped', 'no news')
     cut = browser.run(shown, 'detail')
     assert cut > 10
+    assert browser.text('more') == 'more'
     browser.find('state').click()
     assert browser.run(shown, 'detail') <= 1
+    browser.find('more').click()
+    assert browser.run(shown, 'detail') == cut
+    # So is a long verdict of a recording; what is whole offers no more.
+    long = (
+        'The robot stood for 17.7 s from 48.0 s on; while it drove settled RMSE 0.012 rad/s. ' * 3
+    )
+    for headline, offered in ((long, True), ('E-STOP', False)):
+        data.set('banner', {'kind': 'warning', 'headline': headline, 'detail': 'once'})
+        browser.wait(lambda words=headline: browser.text('headline')[:9] == words[:9], 'no news')
+        assert browser.find('more').is_displayed() == offered
+        assert browser.run('return place("banner").getBoundingClientRect().height') <= 96
+        if offered:
+            browser.find('more').click()
+            assert browser.run(shown, 'headline') <= 1
+            browser.find('more').click()
+
+
+def test_events_are_marked_where_the_robot_was(browser, show):
+    """The floor did not show where a wheel had slipped."""
+    data = LiveRun()
+    data.set('terms', [])
+    for k in range(300):
+        data.add('odometry', 0.02 * k, [1.0, 1.0, 0.01 * k, 0.02 * k, 0.0])
+    for time_of_event, kind in ((1.0, 'slip'), (2.0, 'parameter'), (4.0, 'stop')):
+        data.report(time_of_event, kind, kind)
+    show(data)
+    browser.run('floor.draw = (scene) => { window.scene = scene; }; moved = true')
+    browser.wait(lambda: browser.run('return Boolean(window.scene)'), 'not drawn')
+    marks = browser.run('return scene.marks')
+    assert [name for *_, name in marks] == ['slip', 'stopped']
+    assert [at for *at, _ in marks] == [pytest.approx([0.5, 1.0]), pytest.approx([2.0, 4.0])]
+    legend = browser.text('floor-legend').split('\n')
+    assert legend[1:] == ['stop', 'slip']
 
 
 def test_a_changed_parameter_is_compared_before_and_after(browser, show):
@@ -460,26 +494,26 @@ def test_a_stop_is_confirmed_however_slow_the_program_is(browser, show):
 
 
 def test_a_robot_that_says_that_it_stands_is_believed(browser, show):
-    data, answers = LiveData(), []
+    data, replies = LiveData(), []
     data.set('banner', {'kind': 'good', 'headline': 'Tracking the reference', 'detail': ''})
 
     def command(name, arguments, asked):
-        while not answers:
+        while not replies:
             time.sleep(0.02)
-        return answers[0]
+        return replies[0]
 
     show(data, command)
     browser.find('e-stop').click()
     browser.wait(lambda: browser.text('headline').startswith('STOP NOT CONFIRMED'), 'no warning')
     data.set('banner', {'kind': 'stopped', 'headline': 'E-STOP', 'detail': 'sim_robot: latched'})
     browser.wait(lambda: browser.text('headline') == 'E-STOP', 'not believed')
-    answers.append('latched')
+    replies.append('latched')
     browser.wait(lambda: browser.text('answer') == 'latched', 'no answer')
     assert browser.run('return pressed') is None
     # What it said before the press is no confirmation: someone else may have released it since.
-    answers.clear()
+    replies.clear()
     browser.run("const f = fetch; fetch = (url, options) => (url.startsWith('events')"
                 ' ? new Promise(() => {}) : f(url, options))')  # fmt: skip
     browser.find('e-stop').click()
     browser.wait(lambda: browser.text('headline').startswith('STOP NOT CONFIRMED'), 'believed')
-    answers.append('latched')
+    replies.append('latched')

@@ -68,6 +68,8 @@ class Pattern(NamedTuple):
     """Whether it stops the robot; else it is a condition under which it drives on."""
 
 
+SLIP = 'a wheel slips'
+"""Part of the reports of a robot whose gyro and steps disagree."""
 _CHARGE = 'Charge the battery.'
 OVERLOADED = 'The machine was overloaded'
 END_PROGRAMS = 'End other programs, or use a faster machine, and repeat the run.'
@@ -119,7 +121,7 @@ PATTERNS = (
         stops=False,
     ),
     Pattern(
-        'a wheel slips', 'A wheel slipped', 'See the floor, the tyres and the load.',
+        SLIP, 'A wheel slipped', 'See the floor, the tyres and the load.',
         stops=False,
     ),
     Pattern('processor overloaded', OVERLOADED, END_PROGRAMS, stops=False),

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.causes import Cause, cause_between
+from t3mpc_ros.evaluation.bag_report.causes import SLIP, Cause, cause_between
 from t3mpc_ros.evaluation.bag_report.continuity import (
     MIN_GAP,
     POSE_JUMP,
@@ -100,6 +100,8 @@ class Incidents:
     """Start and end of each time in which one wheel stood although it was commanded to turn, while
     the other one turned, and which."""
     jumps: tuple[Jump, ...] = ()
+    slips: tuple[Span, ...] = ()
+    """Times in which the robot reported that a wheel slips."""
 
     @property
     def stopped(self) -> float:
@@ -127,6 +129,14 @@ class Incidents:
             (jump.time, 'jump', f'of the position of {jump.name}, by {jump.distance:.4g} m')
             for jump in self.jumps
         ]
+        found += [
+            (
+                start,
+                'slip',
+                f'for {end - start:.1f} s a wheel slips, is blocked, or has lost steps',
+            )
+            for start, end in self.slips
+        ]
         return sorted(found)
 
 
@@ -146,6 +156,7 @@ def find_incidents(run: Run) -> Incidents:
         ),
         find_blocked_wheels(run),
         find_jumps(run),
+        find_slips(run),
     )
 
 
@@ -197,6 +208,20 @@ def still_rows(linear: Array, angular: Array, factor: float = 1.0) -> NDArray[np
         & (np.abs(angular) < factor * STILL['angular'])
     )
     return still
+
+
+def find_slips(run: Run) -> tuple[Span, ...]:
+    """Return start and end of each time in which diagnostics say that a wheel slips, s."""
+    begun: dict[str, float] = {}
+    found = []
+    for time, _, node, text in run.changes:
+        if SLIP in text:
+            begun.setdefault(node, time)
+        elif node in begun:
+            found.append((begun.pop(node), time))
+    end = max((float(each.time[-1]) for each in run.motions.values()), default=0.0)
+    found += [(start, max(start, end)) for start in begun.values()]
+    return tuple(sorted(found))
 
 
 def standstills(motion: Series) -> list[Span]:

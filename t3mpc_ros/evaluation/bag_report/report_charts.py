@@ -317,10 +317,13 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
             first = min(int(np.searchsorted(base.time, reference.time[0])), len(base) - 1)
             x, y = path_of(reference, (base['x'][first], base['y'][first], base['yaw'][first]))
         curves.insert(0, _curve(REFERENCE, reference, x, y))
-    for times, colour in (
-        (run.switches, 'reference'),
-        (np.array([stop.start for stop in metrics.incidents.stops]), 'stopped'),
-    ):
+    if slips := metrics.incidents.slips:
+        among = [(start <= measured.time) & (measured.time <= end) for start, end in slips]
+        slipping = np.any(among, axis=0)
+        x, y = (np.where(slipping, each, np.nan) for each in (measured.x, measured.y))
+        curves.append(Curve('a wheel slips', 'slip', measured.time, x, y))
+    stops = [start for start, kind, _ in metrics.incidents.events() if kind == 'stop']
+    for times, colour in ((run.switches, 'switch'), (np.array(stops), 'stopped')):
         rows = np.searchsorted(measured.time, times[:200])
         rows = rows[rows < measured.time.size]
         columns = np.stack([measured.time, measured.x, measured.y], axis=1)[rows]
@@ -330,10 +333,12 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
         f'The robot moved in x {_extent(x, "m")} and in y {_extent(y, "m")}, and ended '
         f'{format_number(float(np.hypot(x[-1] - x[0], y[-1] - y[0])))} m from its start.'
     )
-    if run.switches.size:
-        seen += ' Grey points: switches of the reference.'
-    if metrics.incidents.stops:
-        seen += ' Red points: stops.'
+    if slips:
+        seen += f' A wheel slips for {sum(end - start for start, end in slips):.1f} s.'
+    if named := [
+        name for name, times in (('switches', run.switches), ('stops', stops)) if len(times)
+    ]:
+        seen += f' Points: {" and ".join(named)}.'
     yield Plane('Floor', 'm', curves, seen, world_outline(run.world), marks)
 
 

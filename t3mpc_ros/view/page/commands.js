@@ -18,16 +18,27 @@ function showBanner() {
     : { kind: 'lost', headline: 'This page has lost its program',
       detail: 'It connects again by itself as soon as t3mpc view runs.' };
   // What the robot says itself counts, if it was asked after the press.
-  if (stopping && !(shown.headline === 'E-STOP' && heard > pressed)) {
+  if (stopping && !(shown.headline === 'E-STOP' && replied > pressed)) {
     shown = { kind: 'unconfirmed', headline: 'STOP NOT CONFIRMED: use the switch on the robot',
       detail: `${stopping}; asking again` };
   }
-  place('banner').className = shown.kind + (place('banner').matches('.expanded') ? ' expanded' : '');
+  place('banner').className = shown.kind + (isExpanded() ? ' expanded' : '');
   place('headline').textContent = shown.headline;
   place('detail').textContent = place('detail').title = shown.detail;
   document.title = `${shown.headline} – t3mpc_ros`;
   place('release').hidden = readOnly || shown.headline !== 'E-STOP';
   place('e-stop').disabled = readOnly;
+  showMore();
+}
+
+const isExpanded = () => place('banner').classList.contains('expanded');
+
+// Offer what of the reason does not fit, as on a phone.
+function showMore() {
+  const isCut = (part) => part.scrollHeight > part.clientHeight + 1;
+  place('more').hidden = !isExpanded() && ![place('headline'), place('detail')].some(isCut);
+  place('more').textContent = isExpanded() ? 'less' : 'more';
+  place('more').setAttribute('aria-expanded', String(isExpanded()));
 }
 
 // -- commands ------------------------------------------------------------------------------------
@@ -143,7 +154,8 @@ function showRecorder() {
 }
 
 place('record').onclick = () => command('record', { on: facts.recorder.state === 'idle' }, 90000);
-place('state').onclick = () => place('banner').classList.toggle('expanded'); // the whole reason, on a phone
+place('state').onclick = () => { place('banner').classList.toggle('expanded'); showMore(); };
+window.addEventListener('resize', showMore);
 place('e-stop').onclick = emergencyStop;
 place('release').onclick = () => command('e_stop', { on: false });
 

@@ -3,7 +3,8 @@
 // The timeline: events, marked in the charts, each of which leads to its instant.
 'use strict';
 
-const MARKS = { switch: 'switch', stop: 'stopped', fault: 'fault', parameter: 'accent' }; // their colours
+const MARKS = { switch: 'switch', stop: 'stopped', fault: 'fault', slip: 'slip', stall: 'c4', gap: 'soft', jump: 'c5',
+  parameter: 'accent' }; // their colours
 
 function addEvent(event) {
   events.push(event);

@@ -282,6 +282,7 @@ function path(name, look, frame, [from, to]) {
   return result;
 }
 
+const ON_FLOOR = ['switch', 'stop', 'fault', 'slip']; // events that are marked where the robot was
 const PATHS = [
   ['reference', 'reference', { colour: 'reference', dash: [6, 4] }],
   ['preview', 'preview', { colour: 'preview', dash: [2, 3] }],
@@ -314,7 +315,9 @@ function drawFloor() {
     path(parts[name][0], look, name === 'truth' ? null : base, parts[name][1]));
   const robot = truth || (odometry && base && compose(base, odometry));
   if (drawnPath) paths.push(drawnPath);
-  floor.draw({ still: isDrawing(), world: facts.world, paths, robot, mounts: facts.mounts, reach: facts.reach,
+  const marks = events.filter(({ kind, time }) => ON_FLOOR.includes(kind) && all[0] <= time && time <= all[1])
+    .map(({ kind, time }) => [placeAt(time), MARKS[kind]]).filter(([at]) => at).map(([at, name]) => [...at, name]);
+  floor.draw({ still: isDrawing(), world: facts.world, paths, marks, robot, mounts: facts.mounts, reach: facts.reach,
     ranges: sampleOf('ranges', 0, 8), track: facts.robot?.wheel_separation,
     wheel: facts.robot?.wheel_radius });
   if (!robot) return;
@@ -327,10 +330,22 @@ function drawFloor() {
     + `yaw ${number(degrees, 0)}°, ${motion}`;
 }
 
+// Where the robot was at an instant, by what is shown as its place.
+function placeAt(time) {
+  const name = streams.truth ? 'truth' : 'odometry';
+  const { time: times, values } = streams[name] || { time: [] };
+  const row = rowAt(times, time);
+  const pose = values?.slice(2, 5).map((column) => column[row] ?? null);
+  if (row < 0 || !pose || pose.includes(null) || (name === 'odometry' && !base)) return null;
+  return (name === 'truth' ? pose : compose(base, pose)).slice(0, 2);
+}
+
 function showFloorLegend() {
   const shown = PATHS.filter(([name]) => streams[name === 'preview' ? 'reference' : name]);
   place('floor-legend').replaceChildren(...shown.map(([, label, { colour: name, dash }]) =>
     element('li', {}, sample(name, dash), label)),
+  ...ON_FLOOR.filter((each) => events.some(({ kind }) => kind === each)).map((kind) =>
+    element('li', {}, dot(MARKS[kind]), kind)),
   ...(streams.ranges ? [element('li', {}, sample('ray'), 'range'),
     element('li', {}, sample('ray', [2, 4]), 'nothing within range')] : []));
 }

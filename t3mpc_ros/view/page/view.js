@@ -16,7 +16,7 @@ const facts = {};
 const events = [];
 let lastId = '';
 let clock = null; // s to add to the time of the page for the clock of the program
-let heard = -Infinity; // s, when the newest request was sent that the program has answered
+let replied = -Infinity; // s, when the newest request was sent that has a reply
 let connected = false;
 let changed = true; // whether the charts must be drawn
 let moved = true; // whether the floor must be drawn
@@ -42,7 +42,7 @@ async function poll() {
       if (lastId && start(id) !== start(lastId)) location.reload(); // another start of the program
       lastId = id;
       clock = Math.max(now - steady(), (clock ?? -Infinity) - 1e-4); // the fastest answer
-      heard = sent;
+      replied = sent;
       setConnected(true);
       take(news);
       if (stopping) showBanner();
