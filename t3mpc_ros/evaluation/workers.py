@@ -19,6 +19,7 @@ work by ``if __name__ == '__main__':``.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import suppress
 import multiprocessing
 from multiprocessing.context import SpawnContext, SpawnProcess
 import os
@@ -36,10 +37,8 @@ from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.parent_process import end_with_parent
 
-LOST_PROCESS = (
-    'a worker process ended before its work was done; a script that uses several processes must '
-    "begin its work with: if __name__ == '__main__':"
-)
+GUARD = "a script that uses several processes must begin its work with: if __name__ == '__main__':"
+LOST_PROCESS = f'a worker process ended before its work was done; {GUARD}'
 T = TypeVar('T')
 
 
@@ -98,6 +97,7 @@ class WorkerPool:
         if isinstance(self._workers, Executor):
             self._pool = self._workers
         elif self._workers > 1:
+            _check_guarded()
             self._pool = ProcessPoolExecutor(
                 self._workers, self._context, _start_worker, (os.getpid(),)
             )
@@ -159,6 +159,21 @@ def map_jobs(
             found[index] = result
             bar.update()
     return [found[index] for index in range(len(jobs))]
+
+
+def _check_guarded() -> None:
+    """Raise ValueError if the script that is run begins its work without a guard.
+
+    Each worker would import it, do again what comes before, and end where the processes start.
+    """
+    main = sys.modules['__main__']
+    file, frame = getattr(main, '__file__', None), sys._getframe()
+    while frame.f_back is not None:
+        frame = frame.f_back
+        if file and frame.f_code.co_name == '<module>' and frame.f_code.co_filename == file:
+            with suppress(OSError, UnicodeError), open(file, encoding='utf-8') as script:
+                if '__name__' not in script.read():
+                    raise ValueError(GUARD)
 
 
 def _job_error(job: tuple[Any, Any], error: BaseException) -> JobError:

@@ -218,13 +218,19 @@ def test_faults_of_ones_own_are_checked_when_they_are_made(kind, given, text):
 
 
 @pytest.mark.slow
-def test_a_script_without_a_guard_gets_a_sentence(tmp_path):
-    """Worker processes run the script again: without its guard they would start workers."""
+@pytest.mark.parametrize('line', ['', 'name = __name__\n'])
+def test_a_script_without_a_guard_gets_a_sentence(tmp_path, line):
+    """Worker processes run the script again: without its guard they would start workers.
+
+    What comes before, a training of minutes, ran in each of them first; it is refused before.
+    """
     script = tmp_path / 'script.py'
     script.write_text(
-        'import t3mpc_ros as t3\n'
+        f'{line}import t3mpc_ros as t3\n'
+        "print('begun', flush=True)\n"
         "print(t3.compare('ADRC', seeds=[1, 2], plant='servo', duration=4.0, executor=2))\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True)
     assert done.returncode == 1
     assert "begin its work with: if __name__ == '__main__':" in done.stderr.splitlines()[-1]
+    assert line or done.stdout.split() == ['begun']
