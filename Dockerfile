@@ -8,6 +8,8 @@ FROM ros:jazzy-ros-base
 SHELL ["/bin/bash", "-c"]
 WORKDIR /workspace
 COPY . src/t3mpc_ros
+# A ROS distribution has one version of each package at a time.
+# hadolint ignore=DL3008
 RUN apt-get update && apt-get install -y --no-install-recommends python3-venv \
     && rosdep update --rosdistro jazzy \
     && rosdep install --from-paths src --ignore-src -y \

@@ -264,3 +264,28 @@ def test_defaults_beside_the_names_of_parameters_are_theirs():
                 assert any(map(shown.shows, values)), (page.name, name, shown.text, values)
                 checked += 1
     assert checked > 10
+
+
+def test_stopping_times_of_the_page_are_those_of_the_trials():
+    page = (ROOT / 'docs' / 'safety.md').read_text()
+    trials = _measured('stopping_times.csv')
+    rows = _table(page, 'fault | rest, s | way, m | after, m')
+    assert {row[0] for row in rows} == {trial['fault'] for trial in trials}
+    for name, *cells in rows:
+        some = [trial for trial in trials if trial['fault'] == name]
+        assert len(some) == 20, name
+        for field, cell in zip(('rest', 'way', 'after'), cells, strict=True):
+            values = [float(trial[field]) for trial in some if trial[field]]
+            if cell.strip().isalpha() or ' ' in cell.strip() or cell.strip() == '-':
+                continue
+            assert _close(cell.strip(), max(values)), (name, field)
+    rests = [float(trial['rest']) for trial in trials if trial['rest']]
+    assert max(rests) <= 0.45
+    assert 'No stop takes longer than 0.45 s' in page
+    assert max(float(trial['after']) for trial in trials) <= 2e-4
+
+
+def _measured(name):
+    """Return the rows of a file that a program of ``bench`` has written."""
+    with (ROOT / 'docs' / 'measured' / name).open() as file:
+        return list(csv.DictReader(file))

@@ -18,6 +18,7 @@ from contextlib import suppress
 from copy import copy
 import difflib
 from itertools import islice
+import platform
 import sys
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -93,8 +94,8 @@ class BaseNode(Node, Generic[P]):
         """``siblings`` are the parameter names of the other nodes of the process."""
         super().__init__(name, **options)
         self._siblings = siblings
-        self.hardware_id = 'none'
-        """Device that the diagnostics are about."""
+        self.hardware_id = platform.node() or 'none'
+        """Device that the diagnostics are about: this computer, unless the node drives another."""
         self.exit_code = 0
         """Exit code of the process; a value other than 0 ends the process."""
         self.start_warnings: list[str] = []
