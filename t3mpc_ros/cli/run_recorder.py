@@ -21,7 +21,7 @@ import subprocess
 import time
 
 from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup, executable
-from t3mpc_ros.view.live_data import LiveData
+from t3mpc_ros.view.live_data import Json, LiveData
 
 NAME = 'recorder'
 """The executable, the fact and the command of the page."""
@@ -31,14 +31,17 @@ END_TIMEOUT = 20.0
 """Longest time in which the recorder completes the bag, s."""
 REPORT_TIMEOUT = 900.0
 """Longest time in which a report is drawn, s."""
+WATCH_PERIOD = 0.2
+"""Time between two looks at the recorder, s."""
 
 
 class RunRecorder:
     """Records the graph into a folder of its own for each recording; then draws the report.
 
     The fact ``recorder`` of ``data`` says what it does: ``state`` is ``idle``, ``starting``,
-    ``recording``, ``ending`` or ``drawing``; ``text`` is for the person, ``folder`` holds bag and
-    report. ``report_ready`` gets the file of a report that is complete.
+    ``recording``, ``ending`` or ``drawing``; ``text`` is for the person, and names a problem if
+    ``failed``; ``report`` is the folder of a report. ``report_ready`` gets the file of a report
+    that is complete.
     """
 
     def __init__(
@@ -53,6 +56,8 @@ class RunRecorder:
         self._folder = Path()
         self._processes: ProcessGroup | None = None
         self._drawing: subprocess.Popen[bytes] | None = None
+        self._problem = ''
+        """Why the recording has ended by itself."""
         self._show('idle', '')
 
     def switch(self, on: object) -> str:
@@ -86,10 +91,32 @@ class RunRecorder:
             processes.wait_ready(NAME, START_TIMEOUT)
         except (OSError, ProcessError) as error:
             self._stop_processes()
-            self._show('idle', f'not recorded: {error}')
-            raise RuntimeError(str(error)) from None
+            reason = _reason(error)
+            self._show('idle', f'not recorded: {reason}', failed=True)
+            raise RuntimeError(reason) from None
+        self._problem = ''
         self._show('recording', f'recording into {bag}')
+        self._worker.submit(self._watch)
         return f'recording into {bag}'
+
+    def _watch(self) -> None:
+        """Draw the report of a recording that ends by itself, as with a full disk."""
+        if self._state != 'recording' or self._processes is None:
+            return
+        if not (bag := self._folder / 'bag').is_dir():
+            self._stop_processes()
+            self._show('idle', f'nothing is recorded: {bag} was removed', failed=True)
+            return
+        try:
+            self._processes.check()
+        except ProcessError as error:
+            self._problem = _reason(error)
+            self._processes = None
+            self._show('drawing', f'{self._problem}; the report is being drawn', failed=True)
+            self._worker.submit(self._draw, self._folder)
+        else:
+            time.sleep(WATCH_PERIOD)
+            self._worker.submit(self._watch)
 
     def _end(self) -> str:
         if self._state != 'recording' or self._processes is None:
@@ -98,7 +125,7 @@ class RunRecorder:
         try:
             self._processes.stop(NAME, seconds=END_TIMEOUT)
         except ProcessError as error:
-            self._show('idle', f'the bag may be unfinished: {error}')
+            self._show('idle', f'the bag may be unfinished: {error}', failed=True)
             raise RuntimeError(str(error)) from None
         finally:
             self._processes = None
@@ -120,6 +147,8 @@ class RunRecorder:
                     start_new_session=True,  # Ctrl-C in a terminal reaches this process only
                 )
                 code = drawing.wait(REPORT_TIMEOUT)
+        except OSError as error:
+            text = str(error)
         except subprocess.TimeoutExpired as error:
             drawing.kill()
             text = str(error)
@@ -128,17 +157,31 @@ class RunRecorder:
                 lines = (folder / 'log' / 'report.log').read_text(errors='replace').splitlines()
                 text = lines[-1] if lines else f'exit code {code}'
         if text:
-            self._show('idle', f'no report of {folder / "bag"}: {text}')
+            why = '; '.join(filter(None, (text, self._problem)))
+            self._show('idle', f'no report of {folder / "bag"}: {why}', failed=True)
             return
         self._report_ready(folder / 'report.html')
-        self._show('idle', f'report of {folder / "bag"}', report=folder.name)
+        early = f', which ends early: {self._problem}' if self._problem else ''
+        text = f'report of {folder / "bag"}{early}'
+        self._show('idle', text, report=folder.name, failed=bool(early))
 
     def _stop_processes(self) -> None:
         if self._processes is not None:
             self._processes.end_all(seconds=END_TIMEOUT)
         self._processes = None
 
-    def _show(self, state: str, text: str, report: str = '') -> None:
+    def _show(self, state: str, text: str, report: str = '', failed: bool = False) -> None:
         self._state, self._text = state, text
-        shown = {'state': state, 'text': text, 'report': report}
+        shown: dict[str, Json] = {'state': state, 'text': text, 'report': report, 'failed': failed}
         self._data.set(NAME, shown)
+
+
+def _reason(error: Exception) -> str:
+    """Return the last error that the recorder has printed, in one sentence, else how it ended."""
+    first, *lines = str(error).splitlines()
+    for line in reversed(lines):
+        if '[ERROR]' in line or line.strip().startswith(f'{NAME}: '):
+            return (
+                line.rpartition(f'{NAME}]: ')[2].strip().removeprefix(f'{NAME}: ').split('. ')[0]
+            )
+    return first.removesuffix(':')

@@ -144,6 +144,7 @@ class ViewNode(Node):
         self._goal_publisher = self.create_publisher(PoseStamped, 'goal_pose', PATH)
         self._polled: dict[str, Subscription] = {}
         self._subscribe_all()
+        sink.set('namespace', self.get_namespace().strip('/'))
         sink.set('terms', list(TERM_NAMES))
         sink.set('sensors', list(RANGE_SENSORS))
         sink.set('mounts', sensor_mounts(RangeSensorParameters()).tolist())
@@ -360,12 +361,21 @@ class ViewNode(Node):
     # -- nodes and parameters ---------------------------------------------------------------------
 
     def look_at_graph(self) -> None:
-        """Find nodes that have come or gone, and the type of ``cmd_vel``."""
+        """Find nodes that have come or gone, other robots, and the type of ``cmd_vel``."""
         for remote in self._remote.update():
             self._rows.pop(remote.node_name, None)
             self._sink.set(f'parameters/{remote.node_name}', None)
             self._sink.node_gone(remote.node_name)
         self._sink.set('nodes', sorted(each.node_name for each in self._remote.nodes.values()))
+        self._sink.other_robots(
+            sorted(
+                {
+                    namespace
+                    for name, namespace in self.get_node_names_and_namespaces()
+                    if name in ROBOTS and namespace != self.get_namespace()
+                }
+            )
+        )
         self._subscribe_command()
 
     def _is_shown(self, name: str, namespace: str) -> bool:
@@ -483,6 +493,8 @@ class ViewNode(Node):
         text = f'path of {len(places)} points' if len(places) > 1 else 'goal'
         x, y = places[-1]
         text = f'{text} to x {x:.2f} m, y {y:.2f} m'
+        if self._sink.is_latched():
+            text += ': the robot drives there as soon as the emergency stop is released'
         self._sink.report(self._newest, 'command', text)
         return text
 
@@ -529,7 +541,7 @@ def view_node(sink: Any, namespace: str = '') -> AbstractContextManager[ViewNode
 
     def make() -> ViewNode:
         try:
-            return ViewNode(sink, namespace)
+            return ViewNode(sink, namespace.rstrip('/'))
         except InvalidNamespaceException:
             raise ValueError(
                 f'namespace must be letters, digits, _ and / only: got {namespace!r}'

@@ -58,19 +58,24 @@ class Banner(NamedTuple):
         return self.headline, self.detail.partition('; ')[0]
 
 
-def banner(reports: Mapping[str, NodeReport], odometry_age: float | None) -> Banner:
+def banner(
+    reports: Mapping[str, NodeReport], odometry_age: float | None, others: Sequence[str] = ()
+) -> Banner:
     """Return what a person has to know first.
 
     ``reports`` are the newest ones of the nodes; ``odometry_age`` is the time since the last
-    odometry, s, None before the first one. The reason of the robot stands before those of the
-    other nodes: theirs often follow from it.
+    odometry, s, None before the first one; ``others`` are namespaces of other robots. The reason
+    of the robot stands before those of the other nodes: theirs often follow from it.
     """
     order = sorted(reports, key=lambda name: name not in ROBOTS)
     worse = {name: reports[name] for name in order if reports[name].condition != 'normal'}
     stops = {name: each for name, each in worse.items() if each.condition == 'stopped'}
     detail = '; '.join(f'{name}: {each.text}' for name, each in (stops or worse).items())
     if odometry_age is None:
-        return Banner('lost', 'Waiting for a robot', detail or 'no odometry on the graph yet')
+        reason = detail or 'no odometry on the graph yet'
+        if others:
+            reason += f'; robots of other namespaces: {", ".join(others)} (t3mpc view --namespace)'
+        return Banner('lost', 'Waiting for a robot', reason)
     if odometry_age > LOST:
         silence = f'no odometry for {odometry_age:.0f} s'
         return Banner('lost', 'Connection lost', f'{silence}: {detail or LOST_REMEDY}')
@@ -113,6 +118,7 @@ class LiveRun(LiveData):
         self._time = 0.0
         self._banner: Banner | None = None
         self._newest_stop = -math.inf
+        self._others: Sequence[str] = ()
 
     def add(self, stream: str, time: float, values: Sequence[float]) -> None:
         """Add a sample."""
@@ -128,12 +134,22 @@ class LiveRun(LiveData):
         """Discard the report of a node that has left the graph."""
         self._reports.pop(name, None)
 
+    def other_robots(self, namespaces: Sequence[str]) -> None:
+        """Replace the namespaces of other robots."""
+        self._others = namespaces
+
+    def is_latched(self) -> bool:
+        """Return whether the robot stands by its emergency stop."""
+        return any(
+            self._reports[name].text.startswith(ESTOP) for name in {*ROBOTS} & {*self._reports}
+        )
+
     def tick(self, now: float) -> None:
         """Update the banner at steady time ``now`` (s); call it several times a second."""
         if self._odometry_pending:
             self._odometry_pending, self._last_odometry = False, now
         age = None if self._last_odometry is None else now - self._last_odometry
-        shown = banner(self._reports, age)
+        shown = banner(self._reports, age, self._others)
         if shown == self._banner:
             return
         previous, self._banner = self._banner, shown

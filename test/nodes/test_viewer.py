@@ -306,6 +306,19 @@ def test_robots_of_other_namespaces_are_left_alone(robot, harness):
     viewer.spin_until(lambda: viewer.facts()['banner']['headline'] == 'E-STOP')
     assert other._state.status.estop
     assert not robot._state.status.estop
+    # A goal that is given meanwhile: the robot would start at the release, without a word.
+    harness.probe.create_subscription(Path, '/east/path', lambda path: None, qos.LATCHED)
+    viewer.spin_until(lambda: viewer.node._path_publisher.get_subscription_count())
+    text = viewer.command('path', points=[[1.0, 2.0]])
+    assert text.endswith('the robot drives there as soon as the emergency stop is released')
+
+
+def test_a_page_without_a_robot_names_those_of_other_namespaces(harness):
+    """It said that no odometry was on the graph."""
+    harness.add(SimRobotNode, namespace='east')
+    viewer = Viewer(harness)
+    viewer.spin_until(lambda: '/east' in viewer.facts().get('banner', {}).get('detail', ''))
+    assert viewer.facts()['banner']['headline'] == 'Waiting for a robot'
 
 
 def test_parameters_of_other_packages_have_rows_too(harness):

@@ -128,6 +128,12 @@ TRACKING = {'controller': NodeReport('tracking'), 'sim_robot': NodeReport('follo
 ESTOP = NodeReport('emergency stop: requested by service e_stop', 'stopped')
 
 
+def test_a_page_without_a_robot_names_others():
+    words = 'robots of other namespaces: /east, /west (t3mpc view --namespace)'
+    assert banner({}, None, ['/east', '/west']).detail == f'no odometry on the graph yet; {words}'
+    assert words not in banner({}, 0.1, ['/east', '/west']).detail
+
+
 @pytest.mark.parametrize(
     ('reports', 'age', 'expected'),
     [

@@ -298,8 +298,11 @@ def test_the_banner_of_a_phone_leaves_room_for_the_rest(browser, show):
     """With a reason of several lines it took 368 px."""
     data = LiveData()
     data.set('banner', {'kind': 'good', 'headline': 'Tracking the reference', 'detail': ''})
+    data.set('namespace', 'east')
     show(data, lambda *_: 'done')
     browser.show_as(360, 800)
+    assert browser.text('namespace') == 'east'  # which robot it stops
+    assert 'east' in browser.driver.title
     for headline, detail in BANNERS:
         words = {'kind': 'stopped', 'headline': headline, 'detail': detail}
         data.set('banner', words)

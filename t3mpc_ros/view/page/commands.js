@@ -25,7 +25,9 @@ function showBanner() {
   place('banner').className = shown.kind + (isExpanded() ? ' expanded' : '');
   place('headline').textContent = shown.headline;
   place('detail').textContent = place('detail').title = shown.detail;
-  document.title = `${shown.headline} – t3mpc_ros`;
+  const robot = facts.namespace ?? ''; // of several robots, the one that this page shows and stops
+  place('namespace').textContent = robot;
+  document.title = [shown.headline, robot, 't3mpc_ros'].filter(Boolean).join(' – ');
   place('release').hidden = readOnly || shown.headline !== 'E-STOP';
   place('e-stop').disabled = readOnly;
   showMore();
@@ -143,17 +145,23 @@ function showButtons() {
 
 // What the recorder does: it begins a bag, and ends it with a report.
 function showRecorder() {
-  const { state, text, report } = facts.recorder;
+  const { state, text, report, failed } = facts.recorder;
   const begins = state === 'idle';
   place('record-box').hidden = false;
   place('record').textContent = begins ? 'Record' : 'End recording, draw report';
   place('record').disabled = readOnly || !(begins || state === 'recording');
   place('record').className = state === 'recording' ? 'recording' : '';
   place('record-text').textContent = text;
+  place('record-text').className = failed ? 'numbers failed' : 'numbers';
   place('report').hidden = !report;
 }
 
-place('record').onclick = () => command('record', { on: facts.recorder.state === 'idle' }, 90000);
+place('record').onclick = async () => {
+  place('record').disabled = true; // a second press would be another command
+  const done = await command('record', { on: facts.recorder.state === 'idle' }, 90000);
+  if (done) place('answer').textContent = ''; // it stands beside the button
+  showRecorder();
+};
 place('state').onclick = () => { place('banner').classList.toggle('expanded'); showMore(); };
 window.addEventListener('resize', showMore);
 place('e-stop').onclick = emergencyStop;

@@ -57,7 +57,7 @@ async function poll() {
 function take(news) {
   for (const [name, value] of Object.entries(news.facts || {})) {
     facts[name] = value;
-    if (name === 'banner') showBanner();
+    if (name === 'banner' || name === 'namespace') showBanner();
     if (name === 'nodes') showButtons();
     if (name === 'recording') showRecording();
     if (name === 'recorder') showRecorder();
@@ -97,7 +97,7 @@ function setConnected(now) {
 }
 
 // Time of the run, and its end, as far as they are kept.
-const begin = () => streams.odometry?.time[0];
+const begin = () => streams.odometry && Math.max(streams.odometry.time[0], newest() - (facts.span ?? Infinity));
 const newest = () => streams.odometry?.time.at(-1);
 
 // A time of the run in words: of the clock, or in a recording since its begin, as in its report.

@@ -1,0 +1,118 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Recordings of the live page: they end by themselves, or their folder goes; the page says so."""
+
+import shutil
+
+import pytest
+from support.page_data import read_all
+from support.waiting import wait_until
+
+from t3mpc_ros.cli.run_recorder import RunRecorder
+from t3mpc_ros.view.live_data import LiveData
+
+pytestmark = pytest.mark.slow
+
+RECORDER = """#!/bin/sh
+bag=$(echo "$*" | sed 's/.*storage.uri:="\\([^"]*\\)".*/\\1/')
+mkdir -p "$bag"
+trap 'exit 0' INT
+echo '[INFO] [1.0] [recorder]: recorder ready'
+while [ ! -e "$bag/../../full" ]; do sleep 0.05; done
+echo '[ERROR] [2.0] [recorder]: recording has stopped: the disk is full. Free disk space'
+exit 1
+"""
+REPORT = """#!/bin/sh
+echo drawn > "$5/report.html"
+"""
+
+
+class Recording:
+    """A recorder of the page with programs that take its place, and what the page shows."""
+
+    def __init__(self, runs):
+        self.runs, self.data, self.reports = runs, LiveData(), []
+        self.recorder = RunRecorder(runs, '', self.data, self.reports.append)
+
+    def shown(self):
+        return read_all(self.data)[0]['facts']['recorder']
+
+    def wait_idle(self):
+        wait_until(lambda: self.shown()['state'] == 'idle', lambda: f'busy: {self.shown()}')
+        return self.shown()
+
+    def folder(self):
+        (found,) = self.runs.glob('view_*')
+        return found
+
+
+@pytest.fixture
+def recording(tmp_path, monkeypatch):
+    for name, text in (('recorder', RECORDER), ('t3mpc', REPORT)):
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    for module in ('process_group', 'run_recorder'):
+        monkeypatch.setattr(f't3mpc_ros.cli.{module}.executable', lambda name: tmp_path / name)
+    made = Recording(tmp_path / 'runs')
+    yield made
+    made.recorder.close()
+
+
+def test_a_recording_ends_in_its_report(recording):
+    assert recording.recorder.switch(True).startswith('recording into')
+    with pytest.raises(RuntimeError, match='nothing new is recorded: recording into'):
+        recording.recorder.switch(True)
+    recording.recorder.switch(False)
+    shown = recording.wait_idle()
+    assert not shown['failed']
+    assert shown['text'] == f'report of {recording.folder() / "bag"}'
+    assert [file.read_text() for file in recording.reports] == ['drawn\n']
+    with pytest.raises(RuntimeError, match='nothing is being recorded'):
+        recording.recorder.switch(False)
+
+
+def test_a_full_disk_ends_the_recording(recording):
+    """The page said *recording* until somebody ended it, and then nothing of the rest."""
+    recording.recorder.switch(True)
+    (recording.runs / 'full').touch()
+    shown = recording.wait_idle()
+    assert shown['failed']
+    end = 'which ends early: recording has stopped: the disk is full'
+    assert shown['text'] == f'report of {recording.folder() / "bag"}, {end}'
+    assert len(recording.reports) == 1
+
+
+def test_a_folder_that_is_removed_ends_the_recording(recording):
+    """The page said *recording* into a folder that was no longer there."""
+    recording.recorder.switch(True)
+    shutil.rmtree(recording.folder())
+    shown = recording.wait_idle()
+    assert shown['failed']
+    assert shown['text'].endswith('bag was removed')
+
+
+def test_a_report_without_a_folder_is_given_up(recording, monkeypatch):
+    """The page said *the report is being drawn* for ever, and nothing could be recorded."""
+    recording.recorder.switch(True)
+    draw = recording.recorder._draw
+
+    def removed(folder):
+        shutil.rmtree(folder)
+        draw(folder)
+
+    monkeypatch.setattr(recording.recorder, '_draw', removed)
+    recording.recorder.switch(False)
+    shown = recording.wait_idle()
+    assert shown['failed']
+    assert shown['text'].startswith('no report of')
