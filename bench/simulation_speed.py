@@ -10,6 +10,7 @@
 # distributed under the License is distributed on an "AS IS" BASIS,
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
+# limitations under the License.
 """Measures how much faster than real time the simulated robots are, without ROS.
 
     PYTHONPATH=. .venv/bin/python bench/simulation_speed.py
