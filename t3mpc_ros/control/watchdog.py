@@ -87,6 +87,48 @@ class Reason(enum.Enum):
         """Whether a non-zero command may be sent."""
 
 
+class StopHistory:
+    """Stops since the robot first followed a reference, also those between two reports."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self.last: Reason | None = None
+        """Reason of the newest stop; None before the first motion, and without a stop."""
+        self._moving: bool | None = None
+        self._begin_ns = self._end_ns = 0
+        self._reported = 0
+
+    def update(self, reason: Reason, now_ns: int) -> None:
+        """Count a stop when it begins, and take its reason, the newest while it lasts."""
+        if reason.moves:
+            if self._moving is False:
+                self._end_ns = now_ns
+            self._moving = True
+        elif self._moving is not None:
+            if self._moving:
+                self.number += 1
+                self._begin_ns = now_ns
+            self._moving, self.last = False, reason
+
+    def duration(self, now_ns: int) -> float:
+        """Return the duration of the newest stop, s."""
+        return ((self._end_ns if self._moving else now_ns) - self._begin_ns) / NANOSECONDS
+
+    def age(self, now_ns: int) -> float:
+        """Return the time since the newest stop ended, s; 0 while it lasts."""
+        return (now_ns - self._end_ns) / NANOSECONDS if self._moving else 0.0
+
+    def unreported(self, now_ns: int) -> str:
+        """Return the newest stop if it has begun and ended since the last call."""
+        known, self._reported = self._reported, self.number
+        if self.last is None or not self._moving or self.number == known:
+            return ''
+        return (
+            f'stopped for {self.duration(now_ns):.2g} s, {self.age(now_ns):.1f} s ago: '
+            f'{self.last.value}'
+        )
+
+
 class InputWatchdog:
     """Decides at each step whether odometry and reference are recent and plausible.
 

@@ -241,10 +241,11 @@ class BaseNode(Node, Generic[P]):
         own = [spec.name for spec in self.parameter_class.specs()]
         node = self.get_name()
         if not shared:
-            owners = ' and '.join(_owners(name))
+            owners = _owners(name)
+            verb = 'has' if len(owners) == 1 else 'have'
             raise ParameterError(
                 f'{node} has no parameter {name}'
-                + (f' ({owners} has)' if owners else '')
+                + (f' ({", ".join(owners)} {verb})' if owners else '')
                 + f'{nearest_hint(name, own)} (`ros2 param list /{node}` lists them)'
             )
         near = difflib.get_close_matches(name, own, n=1, cutoff=TYPO_SIMILARITY)

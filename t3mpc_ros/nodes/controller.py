@@ -36,7 +36,7 @@ from t3mpc_ros.control.controller import (
     StepperControllerParameters,
 )
 from t3mpc_ros.control.odometry_plausibility import NAMES, InputMonitor
-from t3mpc_ros.control.watchdog import TRIALS, Reason
+from t3mpc_ros.control.watchdog import TRIALS, Reason, StopHistory
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes import conversions, qos
@@ -150,6 +150,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._reported_ignored = 0
         self._odometry_problem = ''
         self._logged_reason = self._controller.status.reason
+        self._stops = StopHistory()
         self._command_type = TwistStamped if self.parameters.enable_stamped_cmd_vel else Twist
         self._command_publisher = self.create_publisher(self._command_type, 'cmd_vel', qos.COMMAND)
         self._scalar_publishers = {
@@ -322,6 +323,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         return conversions.twist_from_body(command)
 
     def _log_reason(self, status: Status) -> None:
+        self._stops.update(status.reason, self.steady_ns())
         if status.reason is not self._logged_reason:
             self._logged_reason = status.reason
             self.get_logger().info(status.reason.value)
@@ -375,6 +377,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             'odometry_has_twist': not self._controller.odometry_twist.missing,
             'odometry_ignored': self._controller.ignored_odometry,
             'pauses': self._controller.drive_monitor.pauses,
+            **self._stop_values(),
             'references_rejected': self._rejected_references,
             'odometry_rejected': self._rejected_odometry,
             **self._input_values(),
@@ -406,6 +409,18 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         if self._rejected_references:
             return WARN, 'reference messages with non-finite values were ignored', values
         return OK, status.reason.value, values
+
+    def _stop_values(self) -> dict[str, object]:
+        """Return the number of stops since the first motion, and the newest one."""
+        stops, now_ns = self._stops, self.steady_ns()
+        if stops.last is None:
+            return {'stops': 0}
+        return {
+            'stops': stops.number,
+            'last_stop': stops.last.value,
+            'last_stop_duration_s': stops.duration(now_ns),
+            'last_stop_age_s': stops.age(now_ns),
+        }
 
     def _input_values(self) -> dict[str, object]:
         """Return the gaps and jumps of the odometry, and the gains of the response."""
@@ -442,6 +457,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
                 'overtaken by later ones; one publisher only, with increasing stamps'
             )
         self._reported_ignored = ignored
+        if stopped := self._stops.unreported(self.steady_ns()):
+            found.insert(0, stopped)
         return found + self._controller.problems()
 
     def on_shutdown(self) -> None:

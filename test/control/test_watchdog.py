@@ -36,10 +36,11 @@ from t3mpc_ros.control.watchdog import (
     OdometryTwist,
     Reason,
     ResponseMonitor,
+    StopHistory,
     WatchdogParameters,
 )
 from t3mpc_ros.geometry.kinematics import advance_pose, wheels_from_twist
-from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, Pose, State
+from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, Pose, State
 
 MS = 1_000_000
 
@@ -605,3 +606,22 @@ def test_free_motion_is_no_contact(turn, late):
         return poses[max(k - round(100 * late), 0)], twists[k], twists[k]
 
     assert set(_feel(drive, 40.0)[1]) == {Reason.TRACKING}
+
+
+def test_a_stop_between_two_reports_is_in_the_next_one():
+    """A stop of 0.1 s fell between two reports of 1 Hz, which said that all was well."""
+    second, stops = NANOSECONDS, StopHistory()
+    stops.update(Reason.NO_ODOMETRY, 0)
+    stops.update(Reason.TRACKING, second)
+    assert (stops.number, stops.unreported(second)) == (0, '')
+    stops.update(Reason.NO_ODOMETRY, 2 * second)
+    stops.update(Reason.ODOMETRY_RESTARTED, 2 * second + second // 20)
+    stops.update(Reason.TRACKING, 2 * second + second // 10)
+    text = stops.unreported(2 * second + second // 2)
+    assert text == 'stopped for 0.1 s, 0.4 s ago: odometry has restarted'
+    assert stops.unreported(4 * second) == ''
+    stops.update(Reason.NO_ODOMETRY, 5 * second)
+    assert (stops.number, stops.age(6 * second), stops.duration(6 * second)) == (2, 0.0, 1.0)
+    assert stops.unreported(6 * second) == ''  # the report says so itself
+    stops.update(Reason.TRACKING, 7 * second)
+    assert stops.unreported(8 * second) == ''

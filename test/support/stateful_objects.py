@@ -963,6 +963,7 @@ FRESH = {
 }
 
 NEVER_RESET = {
+    'StopHistory': 'counts since the start of the node',
     # The state is in the memory of the C core: see test_core_fresh_state.py.
     **dict.fromkeys(('Board', 'Motion', 'RobotBoard', 'Dongle', 'Emulator'), 'C core'),
     **dict.fromkeys(('c_short_Array_7', 'c_ushort_Array_9'), 'C core'),
