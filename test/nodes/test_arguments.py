@@ -108,7 +108,7 @@ def test_names_for_other_nodes_in_a_shared_file_are_ignored(execute, tmp_path):
 INVALID = [
     ('player', '--ros-args -p rate:=2.0', 'no parameter rate', 'did you mean play.rate?'),
     ('player', '--ros-args -p rate:=fast', 'no parameter rate', 'did you mean play.rate?'),
-    ('controller', '--ros-args -p seed:=1.5', 'no parameter seed', '(reference_generator and'),
+    ('controller', '--ros-args -p seed:=1.5', 'no parameter seed', '(reference_generator, '),
     ('recorder', '--ros-args -p rate:=5', 'no parameter rate', 'controller', 'sim_robot'),
     ('controller', '--ros-args --params-file SECTION', 'no parameter seed'),
     ('composed', '--ros-args -p play.rate:=2.0', 'no parameter play.rate (player has)'),
