@@ -18,7 +18,8 @@ an obstacle is replaced by a route around it (:mod:`t3mpc_ros.geometry.route_pla
 no route reaches is left out. The reference gets only as much of the path as leads over floor
 that has been seen: it comes to rest before the rest of it, turns to look, and goes on where the
 map then shows free floor; what it cannot see counts as an obstacle for a while. Now and then the
-path leads to a place that was not visited for long.
+path leads to a place that was not visited for long. With a low battery it leads to the charging
+place, and on from there when the battery is charged.
 """
 
 from collections import deque
@@ -35,7 +36,7 @@ from t3mpc_ros.geometry.arena import Arena, OccupancyGrid
 from t3mpc_ros.geometry.path_timing import PathTiming, resample
 from t3mpc_ros.geometry.route_planning import OCCUPIED, SPACING, RoutePlanner
 from t3mpc_ros.geometry.types import Array, BodyTwist, Pose, wrap_angle
-from t3mpc_ros.parameters.table import Parameters, parameter
+from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
 REPLAN = 0.02
 """Distance by which a planned path may come nearer to obstacles on a newer map, m: readings have
@@ -61,8 +62,8 @@ WIDTHS = 0.2, 0.15, 0.1, 0.07, 0.04
 from obstacles."""
 CUT = 0.015
 """Distance by which smoothing may bring a detour nearer to them, m."""
-MISS = 0.12
-"""Distance by which it may pass a place that the path is to visit, m."""
+MISS, GOAL_MISS = 0.12, 0.03
+"""Distance by which it may pass an old place, and a goal, m."""
 RAMP = 50
 """Points over which smoothing begins and ends."""
 LOOK_ANGLE, LOOK_RATE, LOOK_ACCELERATION = 0.55, 1.9, 5.8
@@ -89,7 +90,41 @@ OLD_SHARE = 0.9
 """Age of the places that are revisited, as a share of the greatest age."""
 
 
+BATTERY_TIME = 5.0
+"""Time for which a voltage must last to count, s: it sags while the robot accelerates."""
+
 _NOWHERE = np.empty((0, 2))
+
+
+@dataclass(frozen=True)
+class ChargingParameters(Parameters):
+    """When and where the battery is charged."""
+
+    min_voltage: float = parameter(
+        0.0,
+        'voltage of battery_state below which the path leads to place; 0: never',
+        'V',
+        (0.0, 60.0),
+    )
+    full_voltage: float = parameter(
+        12.3, 'voltage of battery_state from which it leads on from there', 'V', (0.0, 60.0)
+    )
+    place: tuple[float, ...] = parameter(
+        (0.0, 0.0),
+        'where the battery is charged: x, y in the frame of the reference',
+        'm',
+        (-1000.0, 1000.0),
+    )
+
+    def check_consistency(self) -> None:
+        """Raise ParameterError if it would leave at once, or does not know where to."""
+        if self.full_voltage <= self.min_voltage:
+            raise ParameterError(
+                f'full_voltage must be more than min_voltage ({self.min_voltage:g} V): '
+                f'got {self.full_voltage:g}'
+            )
+        if len(self.place) != 2:
+            raise ParameterError(f'place must be two numbers, x and y: got {len(self.place)}')
 
 
 @dataclass(frozen=True)
@@ -118,6 +153,7 @@ class PlanParameters(Parameters):
         'm',
         (0.0, 1e6),
     )
+    charging: ChargingParameters = group(ChargingParameters)
 
 
 class PathPlan:
@@ -148,12 +184,21 @@ class PathPlan:
         """Time of the last visit of each cell, s."""
         self._left = math.inf
         self.goal: tuple[float, float] | None = None
-        """Place to which no way has been found yet, m."""
+        """Place that is to be visited, and was not yet, m."""
+        self._leads_there = False
+        """Whether a way to the goal is in the plan."""
 
     def lead_to(self, goal: tuple[float, float], fixed: int) -> None:
         """Lead to a place (m) after the first ``fixed`` points, and then on along the path."""
         self.truncate(max(fixed, 1))
-        self.goal = goal
+        self.goal, self._leads_there = goal, False
+
+    @property
+    def goal_point(self) -> int | None:
+        """The point that is nearest to the goal; None without a way there."""
+        if self.goal is None or not self._leads_there:
+            return None
+        return int(np.argmin(np.hypot(*(self.points - self.goal).T)))
 
     def use_random_numbers(self, random: SecretRandom) -> None:
         """Draw where and when places are revisited from these numbers from now on."""
@@ -181,17 +226,22 @@ class PathPlan:
         return found
 
     def forget(self, count: int) -> None:
-        """Remove the first points."""
+        """Remove the first points, which have been passed."""
+        if (point := self.goal_point) is not None and point <= count:
+            self.goal = None
         self.points, self._next = self.points[count:], self._next[count:]
         used = int(self._next[0]) - self._base
         self._path, self._base = self._path[used:], self._base + used
 
     def truncate(self, count: int) -> None:
         """Keep the first points only; what followed is planned anew."""
+        if (point := self.goal_point) is not None and point >= count:
+            self._leads_there = False
         self.points, self._next = self.points[:count], self._next[:count]
 
     def begin_at(self, pose: Pose) -> None:
         """Plan from a place on."""
+        self._leads_there = False
         self.points, self._next = np.array([[pose.x, pose.y]]), self._next[:1]
 
     def extend(self, fixed: int, time: float) -> None:
@@ -201,13 +251,15 @@ class PathPlan:
             blocked = self._planner.wall_distance(path) < self._parameters.distance
             gap = math.hypot(*(path[0] - self.points[-1]))
             begin = (float(self.points[-1, 0]), float(self.points[-1, 1]))
-            if self.goal is not None and self._lead_over([self.goal], begin, path, blocked, fixed):
-                self.goal = None
-                continue
+            if self.goal is not None and not self._leads_there:
+                goal = [self.goal]
+                self._leads_there = self._lead_over(goal, GOAL_MISS, begin, path, blocked, fixed)
+                if self._leads_there:
+                    continue
             if self._left <= 0.0:
                 self._left = self._draw_length()
                 places = self._old_places(begin, time)
-                if places and self._lead_over(places, begin, path, blocked, fixed):
+                if places and self._lead_over(places, MISS, begin, path, blocked, fixed):
                     continue
             first = int(np.argmax(blocked)) if blocked.any() else len(blocked)
             free = min(first - BACK, 2 * BACK)
@@ -296,12 +348,16 @@ class PathPlan:
     def _lead_over(
         self,
         places: list[tuple[float, float]],
+        miss: float,
         begin: tuple[float, float],
         path: Array,
         blocked: NDArray[np.bool_],
         fixed: int,
     ) -> bool:
-        """Append a way to places, and on to the given path; return whether there is one."""
+        """Append a way to places, and on to the given path; return whether there is one.
+
+        miss : distance by which it may pass them, m
+        """
         parts: list[Array] = []
         for place in places:
             self._planner.spread(begin, self._freshness)
@@ -321,7 +377,7 @@ class PathPlan:
         if back is None:
             return False
         visited = np.array(places[: len(parts)])
-        self._append_smoothly(np.vstack([*parts, back]), path, joint, fixed, visited)
+        self._append_smoothly(np.vstack([*parts, back]), path, joint, fixed, visited, miss)
         return True
 
     def _direction(self) -> Array:
@@ -335,10 +391,11 @@ class PathPlan:
         joint: int,
         fixed: int,
         places: Array = _NOWHERE,
+        miss: float = MISS,
     ) -> None:
         """Append a route to a point of the given path and the next ones, its corners rounded.
 
-        places : on the route, that it must not miss, m, shape (n, 2)
+        places, miss : on the route, shape (n, 2), and how far it may pass them, m
         """
         before = min(RAMP, len(self.points) - max(fixed, 1))
         after = path[joint + 1 : joint + 1 + RAMP]
@@ -346,14 +403,14 @@ class PathPlan:
         self._append(route, np.zeros(len(route), dtype=np.int64))
         self._append(after, joint + 1 + np.arange(1, RAMP + 1))
         # Smoothing moves points towards each other where the path turns back.
-        points, numbers = self._smoothed(self.points[kept:], places), self._next[kept:]
+        points, numbers = self._smoothed(self.points[kept:], places, miss), self._next[kept:]
         lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
         points = resample(points, SPACING, round)
         even = np.interp(np.linspace(0.0, lengths[-1], len(points)), lengths, numbers)
         self.points = np.vstack([self.points[:kept], points])
         self._next = np.concatenate([self._next[:kept], even.astype(np.int64)])
 
-    def _smoothed(self, points: Array, places: Array) -> Array:
+    def _smoothed(self, points: Array, places: Array, miss: float) -> Array:
         """Return points with their corners rounded, as wide as the obstacles permit."""
         planner = self._planner
         least = np.minimum(planner.wall_distance(points), planner.distance) - CUT
@@ -369,7 +426,7 @@ class PathPlan:
             )
             rounded: Array = (1.0 - share) * points + share * smooth
             missed = max((np.hypot(*(rounded - each).T).min() for each in places), default=0.0)
-            if missed <= MISS and (planner.wall_distance(rounded) >= least).all():
+            if missed <= miss and (planner.wall_distance(rounded) >= least).all():
                 return rounded
         return points
 
@@ -457,6 +514,10 @@ class PlannedPath:
         self._unseeable: list[_Unseeable] = []
         self._seen = 0
         """Points of the plan that lead over floor that has been seen."""
+        self.charging = False
+        """Whether the path leads to the charging place, or rests there."""
+        self._battery_time = math.inf
+        """Since when the voltage has called for a change, s."""
 
     def advance(self, rate: float = 1.0) -> tuple[Pose, BodyTwist]:
         """Return pose and twist of the next period, for a rate of the path's time."""
@@ -489,6 +550,34 @@ class PlannedPath:
             self.plan.begin_at(pose)
             self._fed = 1
             self._begin_at(pose)
+            if self.charging:
+                self.plan.goal = self._charging_place
+
+    def observe_battery(self, voltage: float) -> None:
+        """Lead to the charging place with a low battery, and on from there with a full one.
+
+        voltage : V, NaN if it is not measured; one that lasts for 5 s counts
+        """
+        parameters = self._parameters.charging
+        enough = voltage >= parameters.full_voltage
+        if not (enough if self.charging else voltage < parameters.min_voltage):
+            self._battery_time = math.inf
+            return
+        self._battery_time = min(self._battery_time, self._time)
+        if self._time - self._battery_time >= BATTERY_TIME:
+            self.charging, self._battery_time = not self.charging, math.inf
+            if self.charging:
+                self.go_to(self._charging_place)
+
+    @property
+    def _charging_place(self) -> tuple[float, float]:
+        x, y = self._parameters.charging.place
+        return x, y
+
+    @property
+    def at_charging_place(self) -> bool:
+        """Whether the path rests where the battery is charged."""
+        return self.charging and self.plan.goal is None
 
     def set_map(self, grid: OccupancyGrid) -> None:
         """Plan on another map from now on."""
@@ -496,13 +585,13 @@ class PlannedPath:
         self._go_on()
         self._leave_unsafe()
         self.plan.extend(self._fed, self._time)
-        self._feed()
+        goes_on = self._feed()
         if self._look is not None:
             if self._seen >= self._fed + SEEN and len(self._look.directions) > 1:
                 last = self._look.directions[-1]
                 self._look.directions.clear()
                 self._look.directions.append(last)
-        elif self._rested > REST:
+        elif self._rested > REST and not goes_on and not self.at_charging_place:
             self._look_around()
 
     def _with_unseeable(self, grid: OccupancyGrid) -> OccupancyGrid:
@@ -556,8 +645,11 @@ class PlannedPath:
             self._cut()
         self.plan.lead_to(goal, self._fed)
 
-    def _feed(self) -> None:
-        """Let the reference have what of the path leads over seen floor."""
+    def _feed(self) -> bool:
+        """Let the reference have what of the path leads over seen floor; return whether it has.
+
+        During a look it gets nothing: the look ends with a new begin.
+        """
         points = self.plan.points[self._fed :]
         seen = self._planner.unsafe_distance(points) >= (
             self._parameters.distance - self._parameters.reserve
@@ -566,12 +658,17 @@ class PlannedPath:
         self._seen = self._fed + free
         if free < len(points):
             free -= STOP
-        if self._look is not None:
-            return
+        if self._look is not None or self.at_charging_place:
+            return False
+        if self.charging and (point := self.plan.goal_point) is not None:
+            free = min(free, point + 1 - self._fed)
         count = min(free, FEED - self._fed)
         if count > 0:
             self._timing.add_points(points[:count])
             self._fed += count
+            if self.charging and self.plan.goal_point == self._fed - 1:
+                self._timing.drive_to_last_point()
+        return count > 0
 
     def _look_around(self) -> None:
         """Turn to both sides of the path; where that has been of no use, avoid what is unseen."""

@@ -364,6 +364,7 @@ class PathTiming:
         squares = self._squares[drop : self._place + 2]
         self._place -= drop
         if len(self._nodes) < 2:
+            self._squares = squares  # rest, from which a path that grows later is planned
             return
         count = min(len(self._nodes), self._place + WINDOW + 1)
         plan = np.zeros(count)

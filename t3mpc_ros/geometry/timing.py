@@ -38,6 +38,7 @@ class SampleScheduler:
         self._next = 0
         self.skipped = 0
         """Samples skipped since the start of the grid."""
+        self._reported = 0
 
     def due(self, now_ns: int) -> list[int]:
         """Return the stamps (ns) of all samples due at ``now_ns`` and not returned before.
@@ -54,6 +55,11 @@ class SampleScheduler:
         self.skipped += first - self._next
         self._next = max(self._next, last + 1)
         return [self._stamp(n) for n in range(first, last + 1)]
+
+    def newly_skipped(self) -> int:
+        """Return the number of samples skipped since the last call of this."""
+        before, self._reported = self._reported, self.skipped
+        return self.skipped - before
 
     def lateness(self, now_ns: int) -> float:
         """Return the time (s) since the newest returned sample was due."""

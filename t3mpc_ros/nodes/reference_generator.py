@@ -23,6 +23,7 @@ from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 import numpy as np
 from rclpy.time import Time
+from sensor_msgs.msg import BatteryState
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 
@@ -186,6 +187,10 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 OccupancyGrid, 'keep_out/map', self._on_map, qos.LATCHED
             )
             self.create_matching_subscription(PoseStamped, 'goal_pose', self._on_goal, qos.COMMAND)
+            if parameters.plan.charging.min_voltage > 0.0:
+                self.create_matching_subscription(
+                    BatteryState, 'battery_state', self._on_battery, qos.SCALARS
+                )
             self._transforms = self._make_transform_buffer()
         elif parameters.source == 'twist':
             kind = TwistStamped if parameters.enable_stamped_target_twist else Twist
@@ -277,10 +282,16 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             x, y = self._own_points(message.header.frame_id, place)[0].tolist()
             if self._planned is None:
                 raise PathError('no odom yet: send it again when the robot has reported its pose')
+            if self._planned.charging:
+                raise PathError('the battery is charged first: send it again after that')
         except PathError as error:
             self._reject('goal_pose', error)
             return
         self._planned.go_to((x, y))
+
+    def _on_battery(self, message: BatteryState, info: dict[str, Any]) -> None:
+        if self._planned is not None:
+            self._planned.observe_battery(message.voltage)
 
     def _on_twist(self, message: Twist | TwistStamped, info: dict[str, Any]) -> None:
         twist = message.twist if isinstance(message, TwistStamped) else message
@@ -355,7 +366,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         return '', 'reference paused' if on else 'reference resumed'
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
-        """Return the state of the reference; a warning if samples were skipped."""
+        """Return the state of the reference; a warning if samples were skipped since the last one."""
         values: dict[str, object] = {
             'lateness_s': self._scheduler.lateness(self.now_ns()),
             'skipped_samples': self._scheduler.skipped,
@@ -373,8 +384,11 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 return WARN, 'no odom yet: the path begins where the robot is', values
             if not self._mapped:
                 return WARN, 'no keep_out/map yet: the controller publishes it', values
-        if self._scheduler.skipped:
+        if self._scheduler.newly_skipped():
             return WARN, 'processor overloaded: samples were skipped', values
+        if self._planned is not None and self._planned.charging:
+            there = self._planned.at_charging_place
+            return OK, f'{"at" if there else "on the way to"} the charging place', values
         if self._path_clock.rate == 0.0:
             return OK, 'waiting for the robot', values
         return OK, 'paused' if self._paused else 'running', values

@@ -143,7 +143,6 @@ class SimRobotNode(RobotNode[SimRobotParameters]):
             raise ParameterError(f'initial_pose.x and initial_pose.y: {error}') from error
         robot.warm_up()  # compile here, not within a step
         self._scheduler = SampleScheduler(parameters.rate, slack=0.2 / parameters.rate)
-        self._reported_skipped = 0
         self._simulated_time = (
             SimulatedTime(parameters.rate, parameters.real_time_factor)
             if parameters.publish_clock
@@ -277,8 +276,7 @@ class SimRobotNode(RobotNode[SimRobotParameters]):
 
     def _overload(self) -> str:
         """Return how the processor is overloaded since the last report; '' if it is not."""
-        skipped, self._reported_skipped = self._reported_skipped, self._scheduler.skipped
-        if self._scheduler.skipped > skipped:
+        if self._scheduler.newly_skipped():
             return 'samples were skipped'
         time, factor = self._simulated_time, self._real_time_factor.value
         if (

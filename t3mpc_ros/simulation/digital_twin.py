@@ -461,7 +461,8 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             copper = 2.0 * motor.phase_current**2 * motor.resistance
             power = copper + max(0.0, done - self._field_work) / dt
         self._field_work = done
-        self._supply = self._battery.draw(power, dt, self._faults.supply_sag)
+        charger = self._world.charging_current(*self._drivetrain.pose[:2])
+        self._supply = self._battery.draw(power, dt, self._faults.supply_sag, charger)
         if self._battery.collapsed and not self._restarting:
             self._lose_power()
 

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""World: walls, boxes, pillars, moving discs and slippery patches from a YAML file; ray casting.
+"""World: obstacles, slippery patches and chargers from a YAML file; ray casting.
 
 A file with an error is rejected, never repaired; the error names the entry. The kernels read the
 arrays of a :class:`World`: ``segments`` (n, 4: ax, ay, bx, by), ``circles`` (m, 3: x, y, radius),
@@ -20,7 +20,7 @@ may be empty.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import math
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -45,6 +45,9 @@ MAX_SEGMENTS = 2000
 MAX_CIRCLES = 500
 MAX_PATCHES = 100
 MAX_MOVING = 100
+MAX_CHARGERS = 20
+MAX_CURRENT = 100.0
+"""A, of a charger."""
 MAX_SPEED = 5.0
 """m/s, of a disc that moves."""
 JOIN_TOLERANCE = 1e-4
@@ -105,6 +108,8 @@ class World:
     """Which of them the range sensors do not see."""
     moving: tuple[MovingDisc, ...] = ()
     """They are in :attr:`circles` of :meth:`at` only."""
+    chargers: Array = field(default_factory=lambda: np.zeros((0, 4)))
+    """Floor on which a battery is charged, shape (k, 4): x, y, radius (m), current (A)."""
 
     @property
     def obstacles(self) -> Obstacles:
@@ -132,6 +137,13 @@ class World:
             circles=np.vstack([self.circles, _rows(circles, 3)]),
             unseen=Obstacles(self.unseen.segments, unseen),
         )
+
+    def charging_current(self, x: float, y: float) -> float:
+        """Return the current (A) that charges a robot whose centre is at a place (m)."""
+        for at_x, at_y, radius, current in self.chargers.tolist():
+            if math.hypot(x - at_x, y - at_y) <= radius:
+                return float(current)
+        return 0.0
 
     def is_free(self, x: float, y: float, radius: float) -> bool:
         """Decide whether a disc at (x, y) touches no wall and is in no box or circle, all in m.
@@ -228,7 +240,7 @@ def parse_world(text: str, source: str) -> World:
 
 
 def _world(content: object, stem: str) -> World:
-    lists = ('walls', 'boxes', 'circles', 'patches', 'moving')
+    lists = ('walls', 'boxes', 'circles', 'patches', 'moving', 'chargers')
     read = yaml_files.check_entry(content, 'the world', (), ('name', *lists))
     name = read.get('name', stem)
     if not isinstance(name, str) or not name:
@@ -260,6 +272,13 @@ def _world(content: object, stem: str) -> World:
         (*_disc(where, each), yaml_files.check_number(each['grip'], f'{where}.grip', 0.0, 1.0))
         for where, each in _entries(read, 'patches', MAX_PATCHES, (*disc, 'grip'))
     ]
+    chargers = [
+        (
+            *_disc(where, each),
+            yaml_files.check_number(each['current'], f'{where}.current', 0.0, MAX_CURRENT, 'A'),
+        )
+        for where, each in _entries(read, 'chargers', MAX_CHARGERS, (*disc, 'current'))
+    ]
     return World(
         name,
         segments,
@@ -268,6 +287,7 @@ def _world(content: object, stem: str) -> World:
         _rows(boxes, 5),
         Obstacles(unseen, _rows(hidden, 3)),
         tuple(moving),
+        _rows(chargers, 4),
     )
 
 

@@ -97,20 +97,26 @@ def curve():
 
 def planned(given=None, seed=1, start=ORIGIN, **values):
     timing = PathTiming(LIMITS, GEOMETRY, PERIOD, start)
-    parameters = PlanParameters(enabled=True, **values)
+    given_values = {name.replace('__', '.'): value for name, value in values.items()}
+    parameters = PlanParameters.from_dict({'enabled': True, **given_values})
     path = PlannedPath(parameters, timing, PERIOD, start, given or curve(), Arena(ARENA))
     path.plan.use_random_numbers(SecretRandom(seed, 'revisits'))
     return path
 
 
-def drive(path, room, seconds, follow=True):
-    """Return poses and twists, shape (n, 5), of a robot that is where its reference is."""
+def drive(path, room, seconds, follow=True, voltage=None):
+    """Return poses and twists, shape (n, 5), of a robot that is where its reference is.
+
+    voltage : returns that of the battery at a pose
+    """
     rows = []
-    pose = ORIGIN
+    pose = path._pose
     for k in range(round(seconds / PERIOD)):
         if k % MAP_PERIOD == 0:
             room.see(pose)
             path.set_map(room.grid())
+        if voltage is not None and k % round(1.0 / PERIOD) == 0:
+            path.observe_battery(voltage(pose))
         pose, twist = path.advance()
         if follow:
             path.observe(pose)
@@ -240,6 +246,83 @@ def test_it_leads_to_a_goal_and_waits_for_a_way_to_one_without():
     room.occupied &= ~ring
     rows = drive(path, room, 40.0)
     assert np.hypot(*(rows[:, :2] - (-1.0, -0.6)).T).min() < 0.15
+
+
+def test_a_thing_in_the_way_does_not_make_it_forget_a_goal():
+    """What was planned behind it was cut off, and the goal with it."""
+    goal = (1.4, 0.0)
+    room = Room(reach=0.5)
+    room.seen[:] = True
+    path = planned(revisit_distance=0.0)
+    path.go_to(goal)
+    drive(path, room, 0.5)
+    assert path.plan.goal_point is not None
+    room.occupied |= room.near(0.7, 0.0, 0.15)
+    rows = drive(path, room, 15.0)
+    assert np.hypot(*(rows[:, :2] - goal).T).min() < 0.05
+    assert path.plan.goal is None
+
+
+CHARGER = (-1.2, 0.7)
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_with_a_low_battery_it_is_charged_and_goes_on(seed):
+    room = Room()
+    generator = np.random.default_rng(seed)
+    for x, y in generator.uniform([-1.6, -1.1], [1.6, 1.1], (5, 2)):
+        if min(math.hypot(x, y), math.hypot(x - CHARGER[0], y - CHARGER[1])) > 0.5:
+            room.occupied |= room.near(x, y, 0.1)
+    volts, charged = [11.0], []
+
+    def voltage(pose):
+        there = math.hypot(pose.x - CHARGER[0], pose.y - CHARGER[1]) < 0.06
+        volts.append(min(volts[-1] + (0.1 if there else -0.02), 12.6))
+        charged.append(path.charging)
+        return volts[-1]
+
+    path = planned(seed=seed, charging__place=CHARGER, charging__min_voltage=10.0)
+    rows = drive(path, room, 300.0, voltage=voltage)
+    check_limits(rows)
+    assert min(volts) > 9.0, 'it did not get there'
+    changes = np.flatnonzero(np.diff(np.array(charged, dtype=int)))
+    assert len(changes) >= 3, 'it did not go on'
+    assert room.distances(room.occupied, rows).min() > KEEP_OUT - SIZE
+
+
+def test_only_a_voltage_that_lasts_calls_for_the_charger():
+    room = Room()
+    room.seen[:] = True
+    path = planned(charging__place=CHARGER, charging__min_voltage=10.0)
+    sags = iter([9.0, 9.0, 9.0, 9.0, 9.0, 10.5] * 10 + [math.nan] * 60)
+    drive(path, room, 100.0, voltage=lambda pose: next(sags))
+    assert not path.charging
+    drive(path, room, 7.0, voltage=lambda pose: 9.0)
+    assert path.charging
+    assert not path.at_charging_place
+    drive(path, room, 20.0, voltage=lambda pose: 12.0)
+    assert path.at_charging_place
+    # Pushed away, it returns.
+    away = Pose(-0.4, 0.2, 0.0)
+    for _ in range(round((PATIENCE + 1.0) / PERIOD)):
+        path.advance()
+        path.observe(away)
+    rows = drive(path, room, 30.0, voltage=lambda pose: math.nan)
+    assert path.at_charging_place
+    assert np.hypot(*(rows[-1, :2] - CHARGER)) < 0.06
+    assert np.abs(rows[-1, 3:]).max() == 0.0
+
+
+@pytest.mark.parametrize(
+    'wrong, words',
+    [
+        ({'full_voltage': 9.5, 'min_voltage': 10.0}, 'full_voltage must be more than min_voltage'),
+        ({'place': (1.0,)}, 'place must be two numbers'),
+    ],
+)
+def test_a_charger_that_cannot_be_is_refused(wrong, words):
+    with pytest.raises(ParameterError, match=words):
+        PlanParameters.from_dict({f'charging.{name}': value for name, value in wrong.items()})
 
 
 def test_equal_seeds_give_equal_paths_and_others_do_not():

@@ -87,6 +87,32 @@ def test_a_planned_patrol_is_on_its_path(seed, boxes):
     assert steps.sum() > 40.0
 
 
+@pytest.mark.long
+def test_a_patrol_is_charged_and_goes_on(tmp_path):
+    """Once in three minutes with a battery of 50 mAh."""
+    world, place = tmp_path / 'yard.yaml', (-1.2, 0.7)
+    world.write_text(
+        'walls: [{points: [[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]], closed: true}]\n'
+        'boxes: [{center: [-0.5, 0.5], size: [0.3, 0.3]}]\n'
+        f'chargers: [{{center: {list(place)}, radius: 0.06, current: 3.0}}]\n'
+    )
+    charging = {'place': place, 'min_voltage': 10.4, 'full_voltage': 12.4}
+    values = {f'charging.{name}': value for name, value in charging.items()}
+    scenario = PatrolScenario(
+        seed=3,
+        duration=180.0,
+        world=str(world),
+        plan=PlanParameters.from_dict({'enabled': True, **values}),
+        robot={'battery.capacity': 0.05, 'battery.charge': 0.35},
+    )
+    record = run_patrol(portrait_points(3, PortraitParameters()), scenario)
+    assert contact_count(record) == 0
+    assert set(record.robot_reasons) == {''}, 'the battery was empty'
+    there = np.hypot(*(record['truth'][:, :2] - place).T) < 0.06
+    assert there.mean() > 0.1
+    assert not there[-round(20.0 * RATE) :].any()
+
+
 def test_an_unknown_localization_is_rejected():
     with pytest.raises(ValueError, match='localization must be one of given'):
         PatrolScenario(localization='gps')

@@ -207,6 +207,21 @@ def test_late_points_stop_the_robot_in_time():
     assert np.abs(np.diff(speeds)).max() <= limits.linear_acceleration * PERIOD
 
 
+def test_a_path_that_grows_after_a_rest_begins_at_rest():
+    """Where the rest came in the last part of a plan, it began at the speeds of long before."""
+    for length in np.arange(0.9, 1.3, 0.01):
+        timing = PathTiming(MotionLimits(), GEOMETRY, 0.05)
+        along = np.linspace(0.0, length, 100)
+        speeds = []
+        for begin in (0.0, length):
+            timing.add_points(np.column_stack([begin + along, np.zeros(100)])[int(begin > 0.0) :])
+            while not (speeds and timing.standing and timing.arrived):
+                speeds.append(timing.advance()[1].linear)
+            speeds += [timing.advance()[1].linear for _ in range(2)]
+        assert np.abs(np.diff(speeds)).max() <= MotionLimits().linear_acceleration * 0.05
+        assert sum(speeds) * 0.05 == pytest.approx(2.0 * length, abs=0.03)
+
+
 def test_start_pose_is_left_at_rest():
     """From another pose the robot turns towards the path, and drives to it."""
     start = Pose(-0.5, 0.2, 2.0)

@@ -51,6 +51,7 @@ def test_a_late_timer_catches_up_by_at_most_one_burst():
     due = scheduler.due(1000 * MS)
     assert due == [n * 10 * MS for n in range(91, 101)]
     assert scheduler.skipped == 90
+    assert [scheduler.newly_skipped() for _ in range(2)] == [90, 0]
 
 
 def test_a_clock_that_jumps_back_starts_a_new_grid():

@@ -23,6 +23,7 @@ from geometry_msgs.msg import PoseStamped, TransformStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 import numpy as np
 import pytest
+from sensor_msgs.msg import BatteryState
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import LATCHED, diagnostic, odometry, on_grid, reason, speed, stamp, twist
@@ -306,6 +307,41 @@ def test_a_goal_before_the_first_odometry_is_rejected(harness, logged):
     harness.spin_until(lambda: reference._rejected == 2)
     assert logged('goal_pose is ignored: no odom yet')
     assert logged('finite')
+
+
+def test_a_low_battery_leads_to_the_charging_place(harness, logged, monkeypatch):
+    monkeypatch.setattr('t3mpc_ros.chaos.planned_path.BATTERY_TIME', 0.0)
+    charging = {'plan__charging__min_voltage': 10.0, 'plan__charging__place': [0.9, -0.2]}
+    reference = harness.add(
+        ReferenceGeneratorNode, source='portrait', plan__enabled=True, **charging
+    )
+    received = harness.subscribe(Odometry, 'reference')
+    places = harness.connected_publisher(Odometry, 'odom')
+    maps = harness.connected_publisher(OccupancyGrid, 'keep_out/map', LATCHED)
+    batteries = harness.connected_publisher(BatteryState, 'battery_state')
+    goals = harness.connected_publisher(PoseStamped, 'goal_pose')
+    free = occupancy_message(Cells(np.zeros((60, 60), np.int8), 0.05, -1.0, -1.7), 0, '')
+    volts, known = 9.9, 0
+
+    def says(words):
+        nonlocal known
+        if not received:
+            places.publish(_odometry())
+        elif len(received) >= known + 10:  # no more than the node can take
+            known = len(received)
+            places.publish(received[-1])
+            maps.publish(free)
+            batteries.publish(BatteryState(voltage=volts))
+        return reason(reference) == words
+
+    harness.spin_until(lambda: says('on the way to the charging place'))
+    goals.publish(PoseStamped())
+    harness.spin_until(lambda: says('at the charging place') and speed(received[-1]) == 0.0)
+    at = received[-1].pose.pose.position
+    assert np.hypot(at.x - 0.9, at.y + 0.2) < 0.05
+    assert logged('goal_pose is ignored: the battery is charged first')
+    volts = 12.5
+    harness.spin_until(lambda: says('running') and speed(received[-1]) > 0.1)
 
 
 def test_a_planned_path_waits_for_a_map_and_leads_to_a_goal(harness):

@@ -145,6 +145,22 @@ def test_regenerated_power_does_not_charge():
     assert cell.draw(-20.0, 1.0) == battery(charge=0.5).draw(0.0, 1.0)
 
 
+@pytest.mark.parametrize('power', [0.0, 5.0])
+def test_a_charger_fills_the_battery_and_no_more(power):
+    cell, others = battery(charge=0.0), battery(charge=0.5)
+    readings = [cell.draw(power, 10.0, charger=2.0) for _ in range(1500)]
+    currents = np.array([reading.current for reading in readings])
+    charges = np.array([reading.charge for reading in readings])
+    assert currents[1] < 0.0
+    assert np.diff(charges)[1:] == pytest.approx(-10.0 * currents[2:] / FULL, abs=1e-12)
+    assert charges.max() <= 1.0
+    assert charges[-1] > 0.97
+    assert max(reading.voltage for reading in readings) <= 12.6
+    assert not cell.low
+    # The more it draws, the less is left.
+    assert others.draw(20.0, 1.0, charger=2.0).voltage < others.draw(0.0, 1.0, charger=2.0).voltage
+
+
 def test_voltage_is_defined_before_the_first_draw():
     assert battery().voltage == pytest.approx(3 * 4.2 - 0.15 * 0.3)
     assert battery().charge == 1.0

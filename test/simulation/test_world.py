@@ -27,6 +27,7 @@ from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
 from t3mpc_ros.simulation.world import (
     JOIN_TOLERANCE,
+    MAX_CHARGERS,
     MAX_CIRCLES,
     MAX_COORDINATE,
     MAX_MOVING,
@@ -76,7 +77,7 @@ def test_documentation_lists_bounds_worlds_and_error():
     assert f'| -{MAX_COORDINATE:g} to {MAX_COORDINATE:g} m |' in page
     assert f'| {MIN_SIZE:g} to {MAX_COORDINATE:g} m |' in page
     assert f'| {MAX_SEGMENTS} together |' in page
-    assert f'| {MAX_CIRCLES}, {MAX_PATCHES}, {MAX_MOVING} |' in page
+    assert f'| {MAX_CIRCLES}, {MAX_PATCHES}, {MAX_MOVING}, {MAX_CHARGERS} |' in page
     assert f'nearer than {1e3 * JOIN_TOLERANCE:g} mm' in page
     assert set(re.findall(r'^\| `(\w+)` \| a ', page, re.MULTILINE)) == set(bundled_worlds())
     wrong = EXAMPLE.replace('[0.4, 0.4]', '[-0.4, 0.4]')
@@ -262,9 +263,19 @@ BAD = {
     'walls:': 'walls must be a list: got None',
     'name: 7': 'name must be a text: got 7',
     'name: a\nwalls: []\nname: b': 'is not YAML: line 3: name is given twice in one entry',
-    '': 'the world must hold name, walls, boxes, circles, patches, moving by name: got None',
+    '': 'the world must hold name, walls, boxes, circles, patches, moving, chargers by name: got',
+    f'chargers: [{{{CIRCLE}, current: -1}}]': (
+        'chargers[0].current must be a number from 0 to 100 A: got -1'
+    ),
     'circles: &a [*a]': 'circles[0] must hold center, radius, unseen by name: got [',
 }
+
+
+def test_a_charger_charges_where_it_stands():
+    world = parse_world('chargers: [{center: [1, 2], radius: 0.1, current: 2}]', 'yard.yaml')
+    assert world.charging_current(1.05, 2.05) == 2.0
+    assert world.charging_current(1.1, 2.05) == 0.0
+    assert parse_world('walls: []', 'yard.yaml').charging_current(0.0, 0.0) == 0.0
 
 
 @pytest.mark.parametrize('text', BAD, ids=lambda text: text[:60])

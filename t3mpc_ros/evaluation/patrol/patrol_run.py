@@ -401,6 +401,8 @@ class PathDriver:
         self._clock.observe(state.stamp_ns, self._pose)
         if self._plan is not None and self._driving:
             self._plan.observe(self._pose)
+            if state.battery is not None and self._k % round(RATE) == 0:
+                self._plan.observe_battery(state.battery.voltage)
         if self.on_state is not None:
             self.on_state(state)
         for sensor, reading in enumerate(state.ranges):

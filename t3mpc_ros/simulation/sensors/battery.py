@@ -92,7 +92,9 @@ class SimulatedBattery:
         """Whether the voltage is, or within the hysteresis was, too low for drivers and board."""
         self.draw(0.0, 0.0)
 
-    def draw(self, power: float, dt: float, sag: float = 0.0) -> BatteryReading:
+    def draw(
+        self, power: float, dt: float, sag: float = 0.0, charger: float = 0.0
+    ) -> BatteryReading:
         r"""Return voltage, current and charge after ``dt`` seconds of ``power`` (W) to the motors.
 
         With E the open-circuit voltage less ``sag`` (V, a fault of the cells) and the voltage
@@ -103,6 +105,9 @@ class SimulatedBattery:
         More than E²/4R cannot be drawn: the voltage is then E/2, and the battery collapses. An
         empty battery is disconnected by its protection: no voltage, no current. Regenerated
         (negative) power is dissipated in the drivers.
+
+        A ``charger`` adds so many A to the cells, less when they reach the voltage of a full
+        battery; the reading's current is then negative.
         """
         if not (math.isfinite(power + sag) and 0.0 <= dt < math.inf):
             raise ValueError(
@@ -127,6 +132,14 @@ class SimulatedBattery:
                 # Empty within the step: the current is the mean over the step.
                 current = self.charge * full / dt
                 self.charge = 0.0
+        if charger > 0.0:
+            full_volts = parameters.cells * _VOLTAGES[-1]
+            open_circuit = open_circuit_voltage(self.charge, parameters.cells)
+            charger = min(charger, max(full_volts - open_circuit, 0.0) / parameters.resistance)
+            full = parameters.capacity * _SECONDS_PER_HOUR
+            self.charge = min(self.charge + charger * dt / full, 1.0)
+            current -= charger
+            volts = min(volts + charger * parameters.resistance, full_volts)
         self.voltage = volts
         back = parameters.hysteresis
         self.low = volts < parameters.low_voltage + (back if self.low else 0.0)
