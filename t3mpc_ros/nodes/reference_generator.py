@@ -366,7 +366,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         return '', 'reference paused' if on else 'reference resumed'
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
-        """Return the state of the reference; a warning if samples were skipped since the last one."""
+        """Return the state of the reference; a warning if samples were skipped since the last."""
         values: dict[str, object] = {
             'lateness_s': self._scheduler.lateness(self.now_ns()),
             'skipped_samples': self._scheduler.skipped,
