@@ -171,18 +171,23 @@ def cell(rows: Sequence[Mapping[str, object]]) -> str:
     return f'{text}; {1e3 * errors:.1f}, {1e3 * largest:.1f}'
 
 
+def row(name: str, methods: Sequence[str]) -> list[str]:
+    """Return the cells of a row of the table."""
+    shape, points = SAMPLINGS[name]
+    least = bound(shape)
+    given = time_path(points, LIMITS, GEOMETRY).time[-1]
+    pieces = SmoothedPath(points, TOLERANCE, LIMITS, GEOMETRY).pieces()
+    planned = time_path(np.vstack(list(pieces)), LIMITS, GEOMETRY).time[-1]
+    times = [f'{least:.1f} s', f'{given:.1f} s', f'{planned:.1f} s', f'{planned / least:.2f}']
+    return times + [cell(drives(method, points)) for method in methods]
+
+
 def main() -> None:
     """Print the table."""
     print('| path | bound | as given | smoothed | of the bound | ours |', *TRACKERS, sep=' | ')
     print('|---' * (6 + len(TRACKERS)) + '|')
-    for name, (shape, points) in SAMPLINGS.items():
-        least = bound(shape)
-        given = time_path(points, LIMITS, GEOMETRY).time[-1]
-        pieces = SmoothedPath(points, TOLERANCE, LIMITS, GEOMETRY).pieces()
-        planned = time_path(np.vstack(list(pieces)), LIMITS, GEOMETRY).time[-1]
-        cells = [f'{least:.1f} s', f'{given:.1f} s', f'{planned:.1f} s', f'{planned / least:.2f}']
-        cells += [cell(drives(method, points)) for method in ('ours', *TRACKERS)]
-        print(f'| {name} |', ' | '.join(cells), '|', flush=True)
+    for name in SAMPLINGS:
+        print(f'| {name} |', ' | '.join(row(name, ('ours', *TRACKERS))), '|', flush=True)
 
 
 if __name__ == '__main__':

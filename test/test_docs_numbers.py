@@ -22,10 +22,17 @@ import pytest
 from support import quantities
 from support.checkout import ROOT
 
+from bench import path_samplings
 import t3mpc_ros as t3
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired
 from t3mpc_ros.evaluation.experiment import measured_run
 from t3mpc_ros.evaluation.methods import methods_for
+from t3mpc_ros.evaluation.patrol.path_tracking import (
+    TRACKED_PATHS,
+    TrackingPlan,
+    compare_trackers,
+)
+from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
 from t3mpc_ros.evaluation.scenario import Scenario
 
 RESULTS = (ROOT / 'docs' / 'results.md').read_text()
@@ -289,3 +296,55 @@ def _measured(name):
     """Return the rows of a file that a program of ``bench`` has written."""
     with (ROOT / 'docs' / 'measured' / name).open() as file:
         return list(csv.DictReader(file))
+
+
+PATROL = (ROOT / 'docs' / 'patrol.md').read_text()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ('method', 'path'), [('**ours**', 'straight line'), ('pure pursuit', 'figure of eight')]
+)
+def test_drives_of_the_tracking_table_made_anew_have_its_digits(method, path):
+    """Two of its 40 cells; ``t3mpc patrol --tracking`` makes all of them, in half an hour."""
+    name, column = method.strip('*'), list(TRACKED_PATHS).index(path)
+    plan = TrackingPlan(paths=(path,), methods=(name,))
+    rows = compare_trackers(plan, None, 2, None).table.where(controller=name)
+    errors = [1e3 * row['cross_track'] for row in rows]
+    (table,) = _tables(PATROL, 'error rms, mm; verdict')
+    shown, _, half = next(row for row in table if row[0] == name)[1 + column].partition(' ± ')
+    assert _close(shown, mean(errors))
+    assert _close(half.partition(';')[0], interval(errors))
+
+
+@pytest.mark.long
+def test_a_patrol_of_the_table_made_anew_has_its_digits():
+    """The one row whose 20 seeds differ by less than its digits: one of them is enough."""
+    plan = PatrolPlan(paths=('boustrophedon',), seeds=(141,), duration=1080.0)
+    (row,) = compare_patrols(plan, None, 1, None).table.where(controller='boustrophedon')
+    (table,) = _tables(PATROL, 'path | coverage, % | 50 %, s | 90 %, s | evenness')
+    shown = next(cells for cells in table if cells[0] == 'boustrophedon')
+    print(row)
+    assert _close(shown[1].partition(' ±')[0], 100.0 * row['coverage'])
+
+
+@pytest.mark.long
+def test_a_path_of_the_samplings_made_anew_has_its_digits():
+    """One of twelve rows of ``bench/path_samplings.py``: the plans, and the drive of ours.
+
+    The bound needs toppra, which is not among the requirements.
+    """
+    name = 'line, 20 mm, noise 2 mm'
+    (table,) = _tables(PATROL, 'path | bound | as given | smoothed | of the bound')
+    shown = next(row[1:6] for row in table if row[0] == name)
+    made = path_samplings.row(name, ('ours',))
+    assert [made[i] for i in (1, 2, 4)] == [shown[i] for i in (1, 2, 4)]
+
+
+def _tables(text, head):
+    """Return the tables whose head begins with some columns, a list of cells a row."""
+    found = re.findall(rf'^\| {re.escape(head)}.*\n\|[-|]+\n((?:\|.*\n)+)', text, re.M)
+    return [
+        [[cell.strip(' *') for cell in line.strip('|').split('|')] for line in rows.splitlines()]
+        for rows in found
+    ]
