@@ -89,6 +89,7 @@ function addPlane(id, { unit, curves, summary, title, world, marks }) {
     const [kind] = Object.entries(EVENTS).find((each) => each[1] === name);
     legend.append(element('li', {}, dot(name), kind));
   }
+  if (world?.patches.length) legend.append(element('li', {}, dot('patch'), 'slippery floor'));
   place(id).querySelector('h3').after(canvas, legend);
   const lines = curves.map(({ colour: name, dash, time, x, y }) => ({ colour: name, dash,
     time: data.columns[time], x: data.columns[x], y: data.columns[y] }));

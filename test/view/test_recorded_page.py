@@ -347,6 +347,7 @@ def test_events_are_marked_where_the_robot_was(browser, show):
     data.set('terms', [])
     for k in range(300):
         data.add('odometry', 0.02 * k, [1.0, 1.0, 0.01 * k, 0.02 * k, 0.0])
+    data.set('world', {'segments': [], 'circles': [], 'patches': [[0.0, 0.0, 0.3, 0.5]]})
     for time_of_event, kind in ((1.0, 'slip'), (2.0, 'parameter'), (4.0, 'stop')):
         data.report(time_of_event, kind, kind)
     show(data)
@@ -356,7 +357,7 @@ def test_events_are_marked_where_the_robot_was(browser, show):
     assert [name for *_, name in marks] == ['slip', 'stopped']
     assert [at for *at, _ in marks] == [pytest.approx([0.5, 1.0]), pytest.approx([2.0, 4.0])]
     legend = browser.text('floor-legend').split('\n')
-    assert legend[1:] == ['stop', 'slip']
+    assert legend[1:] == ['stop', 'slip', 'slippery floor']
 
 
 def test_a_changed_parameter_is_compared_before_and_after(browser, show):

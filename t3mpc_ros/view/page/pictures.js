@@ -346,6 +346,7 @@ function showFloorLegend() {
     element('li', {}, sample(name, dash), label)),
   ...ON_FLOOR.filter((each) => events.some(({ kind }) => kind === each)).map((kind) =>
     element('li', {}, dot(MARKS[kind]), kind)),
+  ...(facts.world?.patches.length ? [element('li', {}, dot('patch'), 'slippery floor')] : []),
   ...(streams.ranges ? [element('li', {}, sample('ray'), 'range'),
     element('li', {}, sample('ray', [2, 4]), 'nothing within range')] : []));
 }
