@@ -74,6 +74,11 @@ def test_the_page_of_a_bag_marks_stops_and_slips(tmp_path):
     assert found['stop'] == pytest.approx(9.0, abs=0.2)
     assert found['slip'] == pytest.approx(9.5, abs=0.01)  # as its diagnostics say
     assert found['resume'] == pytest.approx(12.0, abs=0.2)
+    # A robot that stands to the end does not move again.
+    events = read_all(recorded_run(STORIES['e-stop'].write(tmp_path / 'stopped')))[0]['events']
+    kinds = {event['kind'] for event in events}
+    assert 'stop' in kinds
+    assert 'resume' not in kinds
 
 
 @pytest.mark.slow
