@@ -69,7 +69,7 @@ RUNS = {
         'faults', *FAULTS, '--workers', '1', '--html', 'faults.html',
     ),
     'paper/paper.html': (
-        'paper', '--quick', '--seeds', '1', '--workers', '1', '--output', 'paper',
+        'paper', '--quick', '--seeds', '1-1', '--workers', '1', '--output', 'paper',
     ),
 }  # fmt: skip
 """Commands by the page that each writes."""

@@ -35,6 +35,7 @@ from support.recorded_stories import STORIES, TWIN, Story
 
 from t3mpc_ros.cli.main import main as t3mpc
 from t3mpc_ros.cli.recorded_run import recorded_run
+from t3mpc_ros.evaluation.bag_report.causes import cause_of
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 
 LOSSES = {'losses': {'undiscovered': '25', 'undiscovered /imu/data_raw': '25'}}
@@ -79,6 +80,24 @@ def test_the_page_of_a_bag_marks_stops_and_slips(tmp_path):
     kinds = {event['kind'] for event in events}
     assert 'stop' in kinds
     assert 'resume' not in kinds
+
+
+@pytest.mark.parametrize(
+    ('text', 'name'),
+    [
+        (
+            'stopped: odom is too old: 0.347 s, it has waited or the clocks of the computers '
+            'differ; odom had 2 gaps in the last 10 s',
+            'Odometry too old',
+        ),
+        ('a new error: 1; another one', 'controller: a new error: 1'),
+    ],
+)
+def test_a_cause_is_one_sentence(text, name):
+    """All that a controller reported, ten lines of it, was the headline of a report."""
+    cause = cause_of((1.0, 'error', 'controller', text))
+    assert cause.name == name
+    assert cause.text == f'controller: {text}'
 
 
 @pytest.mark.slow

@@ -107,6 +107,13 @@ PATTERNS = (
         'See why the reference generator fell silent.',
     ),
     Pattern('no reference yet', 'No reference', 'Start a reference generator.'),
+    Pattern(
+        'odom is too old', 'Odometry too old',
+        'See the processor, the network and the clocks of the computers.',
+    ),
+    Pattern(
+        'odom is from the future', 'Odometry from the future', 'Set the clocks of the computers.',
+    ),
     Pattern('no odometry', 'No odometry', 'See why the robot fell silent.'),
     Pattern('odometry is not finite', 'Odometry is not finite', 'See the sensors of the robot.'),
     Pattern('state is diverging', 'The state diverged', 'See the wheels and the parameters.'),
@@ -146,7 +153,8 @@ def cause_of(event: DiagnosticEvent, *, stops: bool = True) -> Cause | None:
     if found is not None and found.stops == stops:
         return Cause(found.name, found.remedy, f'{node}: {text}', source)
     if found is None and stops and level == 'error' and source != MACHINE:
-        return Cause(f'{node}: {text}', '', f'{node}: {text}', source)
+        first = text.split('; ')[0]  # what follows is about something else
+        return Cause(f'{node}: {first}', '', f'{node}: {text}', source)
     return None
 
 

@@ -482,7 +482,8 @@ SECTIONS = (
     Section(
         'Speeds and their references (Fig. 11)',
         'Wheel speeds are computed from the body twists by (1). Dashed vertical lines: switches '
-        '(brown), stops (red), stalls of the machine (violet), gaps (grey), jumps (turquoise).',
+        '(brown), stops (red), stalls of the machine (violet), gaps (grey), jumps (turquoise), '
+        'slips (pink).',
         tracking,
     ),
     Section(
