@@ -188,6 +188,7 @@ def test_a_report_is_printed_on_a4(report, browser):
     opened(browser, report)
     browser.show_as(1440, 1000, 'dark')
     ink = "return [colour('ink'), charts.charts[0].uplot.axes[0].stroke()]"
+    browser.wait(lambda: len(set(browser.run(ink))) == 1, 'not drawn in the dark')
     dark = browser.run(ink)
     browser.run("dispatchEvent(new Event('beforeprint'))")
     light = browser.run(ink)
