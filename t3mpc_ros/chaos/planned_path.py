@@ -32,9 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.secret_random import SecretRandom
-from t3mpc_ros.geometry.arena import Arena, OccupancyGrid
+from t3mpc_ros.geometry.arena import OCCUPIED_PERCENT, Arena, OccupancyGrid
 from t3mpc_ros.geometry.path_timing import PathTiming, resample
-from t3mpc_ros.geometry.route_planning import OCCUPIED, SPACING, RoutePlanner
+from t3mpc_ros.geometry.route_planning import SPACING, RoutePlanner
 from t3mpc_ros.geometry.types import Array, BodyTwist, Pose, wrap_angle
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
@@ -604,7 +604,7 @@ class PlannedPath:
         y = grid.y + grid.resolution * (np.arange(rows) + 0.5)
         for each in self._unseeable:
             near = (x[None, :] - each.x) ** 2 + (y[:, None] - each.y) ** 2
-            cells[(near < UNSEEABLE_RADIUS**2) & (cells < 0)] = OCCUPIED
+            cells[(near < UNSEEABLE_RADIUS**2) & (cells < 0)] = OCCUPIED_PERCENT
         return grid._replace(cells=cells)
 
     def _go_on(self) -> None:

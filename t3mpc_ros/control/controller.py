@@ -55,7 +55,7 @@ from t3mpc_ros.control.watchdog import (
     WatchdogParameters,
 )
 from t3mpc_ros.geometry import kinematics
-from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.kinematics import (
     WheelGeometry,
     advance_pose,
@@ -280,17 +280,21 @@ class Controller:
 
     parameters : replaceable at run time, see :meth:`configure`
     obstacles : known walls and pillars in the frame of the odometry, for the keep-out
+    saved : a map in that frame, whose obstacles it knows at the start
     """
 
     def __init__(
-        self, parameters: ControllerParameters, obstacles: Obstacles | None = None
+        self,
+        parameters: ControllerParameters,
+        obstacles: Obstacles | None = None,
+        saved: OccupancyGrid | None = None,
     ) -> None:
         self.parameters = parameters
         self._pose_reference = PoseReference()
         self.pose_controller = PoseController(parameters.pose)
         """The pose loop."""
         self.keep_out = (
-            KeepOut(parameters.keep_out, _largest(parameters.limits), obstacles)
+            KeepOut(parameters.keep_out, _largest(parameters.limits), obstacles, saved)
             if parameters.keep_out.enabled
             else None
         )

@@ -50,7 +50,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.range_monitor import RangeMonitor
-from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
+from t3mpc_ros.geometry.arena import OCCUPIED_PERCENT, Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.types import STANDSTILL, Array, BodyTwist, Pose, has_moved, wrap_angle
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
@@ -153,6 +153,8 @@ class FreeSpaceMap:
         (s, 3)
     segments, circles : known obstacles: walls (ax, ay, bx, by), shape (n, 4), and pillars (x, y,
         radius), shape (m, 3), in the frame of the odometry, m
+    saved : a map in the frame of the odometry, of which the obstacles are used: floor that was
+        free is looked at again
     """
 
     def __init__(
@@ -161,8 +163,10 @@ class FreeSpaceMap:
         mounts: Array,
         segments: Array,
         circles: Array,
+        saved: OccupancyGrid | None = None,
     ) -> None:
         self.parameters = parameters
+        self._saved = np.empty((0, 2)) if saved is None else _occupied_places(saved)
         self._mounts = np.ascontiguousarray(mounts, dtype=np.float64)
         self._segments, self._circles = segments, circles
         count = 2 * math.ceil(parameters.half_size / parameters.resolution)
@@ -189,11 +193,12 @@ class FreeSpaceMap:
         count = len(self.grid.cells)
         spacing = 0.5 * size
 
-        def mark(points: Array) -> None:
+        def mark(points: Array, state: int = KNOWN) -> None:
             index = np.floor((points - low) / size).astype(np.int64)
             index = index[((index >= 0) & (index < count)).all(axis=1)]
-            self.grid.cells[index[:, 1], index[:, 0]] = KNOWN
+            self.grid.cells[index[:, 1], index[:, 0]] = state
 
+        mark(self._saved, OCCUPIED)
         for ax, ay, bx, by in self._segments.tolist():
             steps = max(2, math.ceil(math.hypot(bx - ax, by - ay) / spacing) + 1)
             mark(np.column_stack([np.linspace(ax, bx, steps), np.linspace(ay, by, steps)]))
@@ -274,6 +279,16 @@ class FreeSpaceMap:
             0.09 if near else (hit if reading < limit else -1.0),
             parameters.beam_half_width,
         )
+
+
+def _occupied_places(grid: OccupancyGrid) -> Array:
+    """Return points (m), shape (n, 2), of the occupied cells, close enough for our cells."""
+    rows, columns = np.nonzero(grid.cells >= OCCUPIED_PERCENT)
+    parts = max(1, math.ceil(grid.resolution / FreeSpaceMapParameters.resolution))
+    inside = (np.arange(parts) + 0.5) / parts
+    across, up = (each.ravel() for each in np.meshgrid(inside, inside))
+    x, y = np.add.outer(columns, across).ravel(), np.add.outer(rows, up).ravel()
+    return np.column_stack([grid.x + grid.resolution * x, grid.y + grid.resolution * y])
 
 
 @kernel
@@ -388,6 +403,12 @@ class KeepOutParameters(Parameters):
         'known walls and pillars: name of a bundled world, or path of a YAML file, in the frame '
         'of the odometry; empty: none',
     )
+    yaml_filename: str = parameter(
+        '',
+        'saved map whose obstacles are known at the start: YAML file of map_server, as ~/save_map '
+        'writes it, in the frame of the odometry; rays clear what is no longer there; empty: none',
+        source='nav2_map_server',
+    )
     mounts: tuple[float, ...] = parameter(
         (
             *(0.10, 0.05, 0.0, 0.10, -0.05, 0.0),
@@ -431,6 +452,7 @@ class KeepOut:
     """Reshapes twists by the map that it builds from the range readings.
 
     limits : largest |v| (m/s) and |omega| (rad/s)
+    obstacles, saved : what is known at the start, in the frame of the odometry
     """
 
     def __init__(
@@ -438,11 +460,12 @@ class KeepOut:
         parameters: KeepOutParameters,
         limits: BodyTwist,
         obstacles: Obstacles | None = None,
+        saved: OccupancyGrid | None = None,
     ) -> None:
         self.parameters = parameters
         known = Obstacles() if obstacles is None else obstacles
         mounts = np.array(parameters.mounts).reshape(-1, 3)
-        self.map = FreeSpaceMap(parameters.map, mounts, known.segments, known.circles)
+        self.map = FreeSpaceMap(parameters.map, mounts, *known, saved)
         """What is known of the floor."""
         self.ranges = RangeMonitor(mounts, parameters.range_timeout, parameters.map.range)
         """Which range sensors can be relied on."""

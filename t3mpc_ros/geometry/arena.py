@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError
 
+OCCUPIED_PERCENT = 65
+"""Occupancy from which on a cell is an obstacle."""
 _SLICES = 257
 """Vertical lines at which area and height of the arena are tabulated."""
 

@@ -25,13 +25,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.geometry.arena import OccupancyGrid
+from t3mpc_ros.geometry.arena import OCCUPIED_PERCENT, OccupancyGrid
 from t3mpc_ros.geometry.path_timing import resample
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 
-OCCUPIED = 65
-"""Occupancy (percent) from which on a cell is an obstacle."""
 SPACING = 0.01
 """Distance of the points of a route, m."""
 STRIDE = 2
@@ -66,7 +64,7 @@ class RoutePlanner:
 
     def update(self, grid: OccupancyGrid) -> None:
         """Use another grid from now on; beyond it, floor counts as unknown."""
-        occupied = grid.cells >= OCCUPIED
+        occupied = grid.cells >= OCCUPIED_PERCENT
         self._step = grid.resolution
         self._origin = np.array([grid.x, grid.y]) + 0.5 * grid.resolution
         self._walls = np.minimum(grid.resolution * nearest_distances(occupied), FAR)

@@ -21,16 +21,16 @@ falls linearly along the ray, and two samples before the last cell give the hit 
 
 import math
 import os
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.geometry.route_planning import OCCUPIED, nearest_distances
+from t3mpc_ros.geometry.arena import OCCUPIED_PERCENT
+from t3mpc_ros.geometry.map_file import MAX_CELLS, MapError, load_map
+from t3mpc_ros.geometry.route_planning import nearest_distances
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.parameters import yaml_files
 from t3mpc_ros.simulation.world import World, clearance
 
 MARGIN = 0.3
@@ -39,13 +39,7 @@ FINEST_STEP = 0.01
 """Distance of the nodes of the field of a world, m; more in a large one."""
 MAX_WORK = 2e8
 """Largest number of nodes times obstacles of a world."""
-MAX_CELLS = 25_000_000
-"""Largest number of cells of a grid."""
 Mask = NDArray[np.bool_]
-
-
-class MapError(ValueError):
-    """An invalid map; the text names the file or the entry, the bound and the value."""
 
 
 class DistanceField(NamedTuple):
@@ -141,9 +135,9 @@ def map_of_grid(
         raise MapError(f'resolution must be from 0.001 to 10 m: got {resolution:g}')
     if not all(map(math.isfinite, origin)) or abs(origin[2]) > 1e-6:
         raise MapError(f'origin must be finite, with a yaw of 0: got {origin}')
-    occupied = occupancy >= OCCUPIED
+    occupied = occupancy >= OCCUPIED_PERCENT
     if not occupied.any():
-        raise MapError(f'the grid must have a cell of at least {OCCUPIED} percent')
+        raise MapError(f'the grid must have a cell of at least {OCCUPIED_PERCENT} percent')
     # The surface of an occupied cell is half a cell from its centre.
     distance = np.maximum(resolution * (nearest_distances(occupied) - 0.5), 0.0)
     x, y = origin[0] + 0.5 * resolution, origin[1] + 0.5 * resolution
@@ -151,71 +145,12 @@ def map_of_grid(
 
 
 def load_grid(path: str | os.PathLike[str]) -> LocalizationMap:
-    """Return the map of a YAML file of map_server, with its image as PGM beside it.
-
-    MapError: a file cannot be read, an entry is invalid, or the image is no PGM of 8 bits.
-    """
-    file = Path(path)
-    names = 'image', 'resolution', 'origin', 'negate', 'occupied_thresh', 'free_thresh'
-    with yaml_files.file_errors(file, MapError):
-        read = yaml_files.check_entry(yaml_files.read_yaml(file), 'the map', names, ('mode',))
-        if read.get('mode', 'trinary') not in ('trinary', 'scale'):
-            raise yaml_files.EntryError(f'mode must be trinary or scale: got {read["mode"]}')
-        resolution = yaml_files.check_number(read['resolution'], 'resolution', 1e-3, 10.0, 'm')
-        x, y, yaw = (
-            yaml_files.check_number(number, f'origin[{index}]', -1e4, 1e4)
-            for index, number in enumerate(yaml_files.check_list(read['origin'], 'origin', 3, 3))
-        )
-        occupied = yaml_files.check_number(read['occupied_thresh'], 'occupied_thresh', 0.0, 1.0)
-        free = yaml_files.check_number(read['free_thresh'], 'free_thresh', 0.0, occupied)
-        negate = yaml_files.check_number(read['negate'], 'negate', 0, 1) != 0
-        if not isinstance(read['image'], str):
-            raise yaml_files.EntryError('image must be the name of a file')
-    image = file.parent / read['image']
-    share = _read_pgm(image)[::-1]
-    darkness = share if negate else 1.0 - share
-    cells = np.full(share.shape, -1, dtype=np.int8)
-    cells[darkness < free] = 0
-    cells[darkness > occupied] = 100
+    """Return the map of a YAML file of map_server, see :func:`.load_map`."""
+    grid = load_map(path)
     try:
-        return map_of_grid(cells, resolution, (x, y, yaw))
+        return map_of_grid(grid.cells, grid.resolution, (grid.x, grid.y, 0.0))
     except MapError as error:
-        raise MapError(f'{file}: {error}') from None
-
-
-def _read_pgm(path: Path) -> Array:
-    """Return the grey levels of a PGM, 0 to 1, shape (rows, columns), from the top."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise MapError(f'{path} cannot be read: {error.strerror}') from error
-    words: list[bytes] = []
-    begin = 0
-    while len(words) < 4 and begin < len(content):
-        end = content.find(b'\n', begin) % (len(content) + 1)
-        line = content[begin:end].partition(b'#')[0]
-        words += line.split()
-        begin = end + 1
-    kind, *numbers = [*words, b'', b'', b'', b''][:4]
-    if kind not in (b'P2', b'P5') or not all(number.isdigit() for number in numbers):
-        raise MapError(f'{path} must be a PGM (P2 or P5)')
-    width, height, largest = map(int, numbers)
-    if not (0 < largest < 256 and 4 <= width * height <= MAX_CELLS):
-        raise MapError(
-            f'{path} must have 4 to {MAX_CELLS} pixels of 8 bits: got {width} x {height} of '
-            f'{largest}'
-        )
-    try:
-        pixels = (
-            np.frombuffer(content[begin:], dtype=np.uint8)
-            if kind == b'P5'
-            else np.array(content[begin:].split(), dtype=np.int64)
-        )
-    except ValueError:
-        raise MapError(f'{path} must hold numbers after its header') from None
-    if pixels.size < width * height:
-        raise MapError(f'{path} must have {width * height} pixels: got {pixels.size}')
-    return pixels[: width * height].reshape(height, width) / largest
+        raise MapError(f'{path}: {error}') from None
 
 
 @kernel

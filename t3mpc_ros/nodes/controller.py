@@ -22,7 +22,8 @@ from typing import Any
 import zlib
 
 from geometry_msgs.msg import Twist, TwistStamped
-from nav_msgs.msg import OccupancyGrid, Odometry
+from nav_msgs.msg import OccupancyGrid as OccupancyGridMessage
+from nav_msgs.msg import Odometry
 from sensor_msgs.msg import Range
 from std_msgs.msg import Float64, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
@@ -37,7 +38,7 @@ from t3mpc_ros.control.controller import (
 )
 from t3mpc_ros.control.odometry_plausibility import NAMES, InputMonitor
 from t3mpc_ros.control.watchdog import TRIALS, Reason, StopHistory
-from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, STANDSTILL, BodyTwist
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import (
@@ -89,6 +90,10 @@ class ControllerNodeParameters(StepperControllerParameters):
         'with drive.kind velocity; empty = start without learnt weights',
     )
     model_output: str = parameter('controller_model.npz', 'file that ~/save_model writes')
+    map_output: str = parameter(
+        'keep_out_map.yaml',
+        'file that ~/save_map writes, for map_server; the image is beside it, as PGM',
+    )
 
 
 class InitialInputs:
@@ -129,7 +134,9 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
     def __init__(self, **options: Any) -> None:
         super().__init__('controller', **options)
         self.get_logger().info('initialising (the first start compiles the kernels, about 30 s)')
-        self._controller = Controller(self.parameters, _obstacles(self.parameters))
+        self._controller = Controller(
+            self.parameters, _obstacles(self.parameters), _saved_map(self.parameters)
+        )
         self._controller.warm_up()  # compile and pre-train here, not within a step
         self._journal = Journal()
         self._journal_publisher = self.create_publisher(Int64MultiArray, '~/journal', qos.JOURNAL)
@@ -179,8 +186,11 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             else []
         )
         if self.parameters.keep_out.enabled:
-            self._map_publisher = self.create_publisher(OccupancyGrid, 'keep_out/map', qos.LATCHED)
+            self._map_publisher = self.create_publisher(
+                OccupancyGridMessage, 'keep_out/map', qos.LATCHED
+            )
             self.create_steady_timer(MAP_PERIOD, self._publish_map)
+            self.offer(Trigger, '~/save_map', self._save_map)
         self.offer(SetBool, '~/enable', self._enable)
         self.offer(Trigger, '~/reset', self._reset)
         self.offer(Trigger, '~/save_model', self._save_model)
@@ -355,6 +365,17 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             return str(error), ''
         return '', f'saved {path.resolve()}'
 
+    def _save_map(self) -> tuple[str, str]:
+        from t3mpc_ros.geometry.map_file import MapError, save_map
+
+        assert self._controller.keep_out is not None
+        path = Path(self.parameters.map_output)
+        try:
+            save_map(path, self._controller.keep_out.map.occupancy())
+        except MapError as error:
+            return str(error), ''
+        return '', f'saved {path.resolve()}'
+
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the controller tracks the reference, or the reason of the stop."""
         status = self._controller.status
@@ -479,3 +500,15 @@ def _obstacles(parameters: ControllerNodeParameters) -> Obstacles:
         return load_world(parameters.keep_out.world).obstacles
     except WorldError as error:
         raise ParameterError(f'keep_out.world: {error}') from error
+
+
+def _saved_map(parameters: ControllerNodeParameters) -> OccupancyGrid | None:
+    """Return the map with which the keep-out begins, if there is one."""
+    if not parameters.keep_out.yaml_filename:
+        return None
+    from t3mpc_ros.geometry.map_file import MapError, load_map
+
+    try:
+        return load_map(parameters.keep_out.yaml_filename)
+    except MapError as error:
+        raise ParameterError(f'keep_out.yaml_filename: {error}') from error

@@ -33,7 +33,7 @@ from t3mpc_ros.control.keep_out import (
     nearest_permitted,
 )
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.kinematics import advance_pose
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State
 
@@ -288,3 +288,17 @@ def test_a_robot_does_not_back_off_into_what_it_sees():
     while robot.controller.keep_out.retreats or robot.reasons[-1] is Reason.PAUSED:
         robot.run(0.05)
         assert robot.pose.x - robot.wall > 0.12
+
+
+def test_it_begins_with_the_obstacles_of_a_saved_map():
+    cells = np.full((40, 40), -1, dtype=np.int8)
+    cells[18:22] = 0
+    cells[19, 30] = 100  # x 0.5 to 0.55 m, y -0.05 to 0 m
+    keep_out = KeepOut(PARAMETERS, LIMITS, None, OccupancyGrid(cells, 0.05, -1.0, -1.0))
+    for _ in range(2):
+        places = [(0.51, -0.04), (0.54, -0.01), (0.51, 0.03), (0.3, -0.03)]
+        assert [_state(keep_out, *place) for place in places] == 2 * [OCCUPIED] + 2 * [UNKNOWN]
+        for _ in range(2 * CLEARINGS):  # a ray of the right one of both front sensors
+            keep_out.map.add_reading(1, 0.75, Pose(0.0, 0.02, 0.0))
+        assert _state(keep_out, 0.51, -0.03) == FREE
+        keep_out.reset()

@@ -35,11 +35,13 @@ from support.ros_graph import (
 )
 
 from t3mpc_ros.bag.run.model_file import ModelError, load_model
+from t3mpc_ros.geometry.map_file import load_map
 from t3mpc_ros.nodes import controller as controller_module
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.conversions import grid_from_occupancy, time_from_ns
+from t3mpc_ros.parameters.table import ParameterError
 
 pytestmark = pytest.mark.ros
 
@@ -61,8 +63,10 @@ def test_a_stale_reference_gives_a_zero_command_with_the_reason(harness):
     assert bench.last_command() == Twist()
 
 
-def test_the_map_of_the_keep_out_is_in_the_frame_of_odom(harness):
-    bench = ControllerHarness(harness, pose__enabled=True, keep_out__enabled=True)
+def test_the_map_of_the_keep_out_is_in_the_frame_of_odom(harness, tmp_path):
+    file = str(tmp_path / 'room.yaml')
+    keep_out = {'pose__enabled': True, 'keep_out__enabled': True}
+    bench = ControllerHarness(harness, **keep_out, map_output=file)
     maps = harness.subscribe(OccupancyGrid, 'keep_out/map', LATCHED)
     ranges = harness.connected_publisher(Range, 'range/front_left')
     place = odometry(0)
@@ -87,6 +91,21 @@ def test_the_map_of_the_keep_out_is_in_the_frame_of_odom(harness):
     )
     assert grid.cells[row, column] == 0
     assert grid.cells[0, 0] == -1
+    response = harness.call(Trigger, 'controller/save_map')
+    assert response.success
+    assert file in response.message
+    assert (load_map(file).cells == 100).any()
+    # Another one begins with its obstacles, and looks at the floor again.
+    other = harness.add(
+        ControllerNode, namespace='other', **keep_out, keep_out__yaml_filename=file
+    )
+    known = other._controller.keep_out.map.occupancy()
+    assert (known.cells == 100).sum() == (load_map(file).cells == 100).sum()
+    assert not (known.cells == 0).any()
+    with pytest.raises(ParameterError, match=r'keep_out.yaml_filename: .*none.yaml'):
+        harness.add(
+            ControllerNode, namespace='none', **keep_out, keep_out__yaml_filename='none.yaml'
+        )
 
 
 @pytest.mark.parametrize('repeated', [False, True])

@@ -34,7 +34,7 @@ ROOT = Path(__file__).resolve().parents[2]
 CONDITIONAL = {
     'publishes': ('/clock', '/tf', '/keep_out/map'),
     'subscribes': ('/range/*', '/path', '/target_twist', '/keep_out/map', '/goal_pose'),
-    'services': (),
+    'services': ('/controller/save_map',),
 }
 """Topics that a node has only with some parameters or libraries."""
 FOR_PATHS = {'reference_generator': ('/odom',)}

@@ -32,7 +32,8 @@ from t3mpc_ros.evaluation.process_replay.controller_inputs import (
     inputs_of,
     motions,
 )
-from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
+from t3mpc_ros.geometry.map_file import MapError, load_map
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, Array, BodyTwist
 from t3mpc_ros.simulation.world import WorldError, load_world
 
@@ -135,7 +136,7 @@ def make_controllers(
     controllers = []
     for session in inputs.sessions:
         parameters = session.parameters[session.start].with_values(changes or {})
-        controller = Controller(parameters, _obstacles(parameters))
+        controller = Controller(parameters, _obstacles(parameters), _saved_map(parameters))
         controller.warm_up()
         if session.model is not None:
             controller.set_weights(session.model)
@@ -151,6 +152,16 @@ def _obstacles(parameters: ControllerParameters) -> Obstacles:
         return load_world(parameters.keep_out.world).obstacles
     except WorldError as error:
         raise ReplayError(f'keep_out.world: {error}') from error
+
+
+def _saved_map(parameters: ControllerParameters) -> OccupancyGrid | None:
+    """Return the map with which a keep-out begins; ReplayError if it is not here."""
+    if not (parameters.keep_out.enabled and parameters.keep_out.yaml_filename):
+        return None
+    try:
+        return load_map(parameters.keep_out.yaml_filename)
+    except MapError as error:
+        raise ReplayError(f'keep_out.yaml_filename: {error}') from error
 
 
 def recompute_scalars(
