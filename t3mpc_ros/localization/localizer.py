@@ -18,6 +18,7 @@ repeat their errors. Each reading counts once, along the beam on which it was ta
 of the odometry at that instant.
 """
 
+from collections import deque
 from dataclasses import dataclass
 import enum
 import math
@@ -35,6 +36,7 @@ from t3mpc_ros.geometry.types import (
     is_out_of_order,
     wrap_angle,
 )
+from t3mpc_ros.localization.change_detection import ChangeDetector, ChangeParameters
 from t3mpc_ros.localization.occupancy_map import LocalizationMap, map_of_grid
 from t3mpc_ros.localization.particle_filter import (
     KNOWN_SHARE,
@@ -56,6 +58,9 @@ DISORDER = 0.2
 controller."""
 SCAN = -1
 """Number of a scan among the sensors."""
+LONGEST_UPDATE = 60.0
+"""Longest time between two updates for which the yaw drifts, s: a robot at rest measures the bias
+of its gyro."""
 LARGEST_STEP = 1.0
 """Distance between two messages of the odometry from which on it has restarted, m."""
 SYSTEMATIC = 0.01, 0.01, 0.007
@@ -69,6 +74,9 @@ CORRECTION_SPEED, CORRECTION_RATE = 0.05, 0.2
 """Largest speed of that (m/s, rad/s)."""
 JUMP_DISTANCE, JUMP_ANGLE = 0.25, 0.5
 """Distance (m) and angle (rad) from which on the pose is taken at once."""
+STEADY_TIME, STEADY_DISTANCE, STEADY_ANGLE = 3.0, 0.08, 0.08
+"""Largest corrections of the odometry (m, rad) in a time (s) with which readings may contradict
+the map: the filter is not in doubt."""
 AGREEMENT_DECAY = 0.05
 """Decay of the share of readings that fit, per telling reading."""
 
@@ -123,6 +131,7 @@ class LocalizerParameters(ParticleFilterParameters):
         0.4, 'share of fitting readings below which the robot is lost', bounds=(0.0, 1.0)
     )
     ranges: RangeModelParameters = group(RangeModelParameters, inline=True)
+    changes: ChangeParameters = group(ChangeParameters)
 
 
 class Localization(enum.Enum):
@@ -167,12 +176,16 @@ class Localizer:
             parameters, known.field, known.free_places(parameters.robot_radius), self._model
         )
         """The particles."""
+        self.changes = ChangeDetector(parameters.changes, known.field, self._model)
+        """What contradicts the map."""
         self.result: LocalizedPose | None = None
         """Pose of the last update; None before the first."""
         self.agreement = 1.0 if parameters.set_initial_pose else parameters.lost_agreement
         """Share of the telling readings that fit to the map, of the last 20 or so."""
         self._searching = not parameters.set_initial_pose
         """Whether random particles are added until the readings fit for some time."""
+        self._frames: deque[tuple[int, Pose]] = deque()
+        """Stamps and origins of the odometry of the last :data:`STEADY_TIME`."""
         self.share = 0.0
         """Share of the weight in the heaviest cluster."""
         self._stamp_ns = 0
@@ -180,8 +193,9 @@ class Localizer:
         """Of the last message."""
         self._updated: Pose | None = None
         """Odometry at the last update."""
-        self._pending: dict[int, Beams] = {}
-        """Beams since the last update by sensor, in the frame of the odometry."""
+        self._updated_ns = 0
+        self._pending: dict[int, tuple[Pose, Beams]] = {}
+        """Beams since the last update by sensor, each with the odometry at its instant."""
         if parameters.set_initial_pose:
             initial = parameters.initial_pose
             variances = initial.covariance_x, initial.covariance_y, initial.covariance_yaw
@@ -237,8 +251,7 @@ class Localizer:
 
     def _add(self, sensor: int, beams: Beams) -> None:
         if self._odometry is not None:
-            origin = transformed(self._odometry, beams.origin)
-            self._pending[sensor] = beams._replace(origin=origin)
+            self._pending[sensor] = self._odometry, beams
 
     def add_odometry(self, stamp_ns: int, pose: Pose) -> bool:
         """Add a pose of the odometry; return whether there is a new :attr:`result`.
@@ -258,25 +271,49 @@ class Localizer:
         )
         if restarted:
             self._pending.clear()
-            self._updated = pose
+            self._updated, self._updated_ns = pose, stamp_ns
             return False
         if self._updated is None:
             return self._publish(pose)
         parameters = self.parameters
         if not has_moved(self._updated, pose, parameters.update_min_d, parameters.update_min_a):
             return False
-        self.filter.predict(self._updated, pose)
+        elapsed = min((stamp_ns - self._updated_ns) / NANOSECONDS, LONGEST_UPDATE)
+        self.filter.predict(self._updated, pose, elapsed)
         beams = self._beams(pose)
         # Averages of the likelihood get used to a wrong place; the share that fits does not.
         self.filter.correct(beams, 1.0 - self.agreement if self._searching else 0.0)
         found = self._publish(pose)
         self._compare(beams)
+        if self.parameters.changes.enabled:
+            self._detect(beams)
         return found
+
+    def _detect(self, beams: Beams) -> None:
+        """Look for changes of the surroundings where the place is known.
+
+        After a slip all readings contradict the map until the filter has corrected the pose.
+        """
+        assert self.result is not None
+        assert self._odometry is not None
+        stamp_ns, pose, _, frame = self.result
+        self._frames.append((stamp_ns, frame))
+        while not 0 <= stamp_ns - self._frames[0][0] <= STEADY_TIME * NANOSECONDS:
+            self._frames.popleft()
+        expected = pose_in(self._frames[0][1], self._odometry)
+        steady = not has_moved(expected, pose, STEADY_DISTANCE, STEADY_ANGLE)
+        if steady and self.state is Localization.LOCALIZED:
+            self.changes.add(*self.result[:3], beams)
+        else:
+            self.changes.forget()
 
     def _beams(self, pose: Pose) -> Beams:
         """Return the beams since the last update in the frame of the robot."""
         back = frame_between(ORIGIN, pose)
-        parts = [self._pending[sensor] for sensor in sorted(self._pending)]
+        parts = [
+            (transformed(there, beams.origin), *beams[1:])
+            for _, (there, beams) in sorted(self._pending.items())
+        ]
         self._pending.clear()
         if not parts:
             return no_beams()
@@ -284,8 +321,12 @@ class Localizer:
         return Beams(transformed(back, origin), reading, limits)
 
     def _publish(self, odometry: Pose) -> bool:
-        self._updated = odometry
         estimate = self.filter.estimate()
+        if self._updated is not None and self.result is not None:
+            expected = pose_in(self.result.odometry_frame, odometry)
+            if has_moved(expected, estimate.pose, JUMP_DISTANCE, JUMP_ANGLE):
+                self._searching = True  # until the readings have fitted there for some time
+        self._updated, self._updated_ns = odometry, self._stamp_ns
         self.share = estimate.share
         covariance = estimate.covariance + np.diag(np.square(SYSTEMATIC))
         if estimate.share < KNOWN_SHARE:

@@ -55,6 +55,9 @@ KNOWN_SHARE = 0.7
 SEARCH_SIGMA = 0.06
 """Least standard deviation of a reading while it is not known, m: particles are farther apart than
 the readings are exact, and the nearest to the robot would be dropped."""
+NEAR_DISTANCE, NEAR_ANGLE = 0.15, 0.15
+"""Standard deviations (m, rad) of half of the new particles from the last estimate: wheels slip
+more often than a robot is carried."""
 KEPT_SHARE = 0.5
 """Share of the heaviest cluster's weight with which the cluster of the last estimate is kept."""
 
@@ -82,6 +85,12 @@ class ParticleFilterParameters(Parameters):
         'm²/rad²',
         (0.0, 10.0),
         source=NAMES,
+    )
+    yaw_drift: float = parameter(
+        1e-4,
+        'variance of the yaw per time: bias of a gyro, for which turn and travel say nothing',
+        'rad²/s',
+        (0.0, 1.0),
     )
     min_particles: int = parameter(
         500, 'smallest number of particles', bounds=(10, 100_000), source=NAMES
@@ -205,8 +214,8 @@ class ParticleFilter:
         poses[:, 2] = generator.uniform(-math.pi, math.pi, count)
         return poses
 
-    def predict(self, begin: Pose, end: Pose) -> None:
-        """Move every particle as the odometry went, with noise."""
+    def predict(self, begin: Pose, end: Pose, elapsed: float = 0.0) -> None:
+        """Move every particle as the odometry went in a time (s), with noise."""
         parameters = self.parameters
         noise = self._generator.standard_normal((len(self.poses), 3))
         motion = odometry_motion(begin, end)
@@ -215,7 +224,11 @@ class ParticleFilter:
         deviations = (
             math.sqrt(parameters.alpha1 * turns[0] + parameters.alpha2 * travel**2),
             math.sqrt(parameters.alpha3 * travel**2 + parameters.alpha4 * sum(turns)),
-            math.sqrt(parameters.alpha1 * turns[1] + parameters.alpha2 * travel**2),
+            math.sqrt(
+                parameters.alpha1 * turns[1]
+                + parameters.alpha2 * travel**2
+                + parameters.yaw_drift * elapsed
+            ),
         )
         self._move(self.poses, noise, np.array([motion, deviations]))
         if self._last is not None:
@@ -281,8 +294,20 @@ class ParticleFilter:
         self.weights = np.full(len(self.poses), 1.0 / len(self.poses))
 
     def _likely(self, count: int, beams: Beams) -> Array:
-        """Return random poses drawn by the likelihood of readings, shape (count, 3)."""
-        poses = self._anywhere(CANDIDATES * count)
+        """Return random poses drawn by the likelihood of readings, shape (count, 3).
+
+        Half of them are near the last estimate, if there is one.
+        """
+        near = 0 if self._last is None else count // 2
+        parts = [self._drawn(self._anywhere(CANDIDATES * (count - near)), count - near, beams)]
+        if near:
+            drawn = self._generator.standard_normal((CANDIDATES * near, 3))
+            poses = np.array(self._last) + drawn * (NEAR_DISTANCE, NEAR_DISTANCE, NEAR_ANGLE)
+            parts.append(self._drawn(poses, near, beams))
+        return np.concatenate(parts)
+
+    def _drawn(self, poses: Array, count: int, beams: Beams) -> Array:
+        """Return some of poses, drawn by the likelihood of readings, shape (count, 3)."""
         logarithms = np.empty(len(poses))
         self._weigh(poses, logarithms, self._field, beams, self._search_model)
         cumulative = np.cumsum(np.exp(logarithms - logarithms.max()))

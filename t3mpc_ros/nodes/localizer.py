@@ -18,14 +18,17 @@ from dataclasses import dataclass
 import math
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import geometry_msgs.msg
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
 import numpy as np
 from sensor_msgs.msg import LaserScan, Range
 from std_srvs.srv import Empty
+from visualization_msgs.msg import Marker, MarkerArray
 
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, Pose, State
+from t3mpc_ros.localization.change_detection import Change, ChangeKind
 from t3mpc_ros.localization.localizer import (
     Localization,
     Localizer,
@@ -54,6 +57,16 @@ TRANSFORM_PERIOD = 0.1
 """Time between two transforms of a robot at rest, s."""
 CLOUD_PERIOD = 0.5
 """Time between two clouds of particles, s."""
+CHANGES_PERIOD = 0.5
+"""Least time between two messages of the changes, s."""
+MARKER_HEIGHT = 0.3
+"""m"""
+COLOURS = {
+    ChangeKind.NEW: (0.85, 0.33, 0.1),
+    ChangeKind.MISSING: (0.2, 0.45, 0.9),
+    ChangeKind.MOVING: (0.6, 0.2, 0.75),
+}
+"""Red, green and blue of markers, 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +146,7 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         self._map_problem = 'no map yet: set world or yaml_filename, or publish map'
         self._rejected = 0
         self._updates = 0
+        self._shown_changes: tuple[Change, ...] = ()
         self._odometry_ns = 0
         self._map_frame = parameters.frames.prefixed(parameters.global_frame_id, namespace)
         self._odometry_frame = parameters.frames.prefixed(parameters.odom_frame_id, namespace)
@@ -143,6 +157,8 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         self._serialized = conversions.SerializedOdometry(self._map_frame, base)
         self._correction = PoseCorrection()
         self._cloud = self.create_publisher(PoseArray, 'particlecloud', qos.SCALARS)
+        self._changes = self.create_publisher(DiagnosticArray, 'map_changes', qos.LATCHED)
+        self._markers = self.create_publisher(MarkerArray, 'map_changes/markers', qos.LATCHED)
         self._broadcaster = self._make_broadcaster() if parameters.tf_broadcast else None
         self._scan: qos.MatchingSubscription | None = None
         self._ranges: list[qos.MatchingSubscription] = []
@@ -172,6 +188,7 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         )
         self.create_steady_timer(TRANSFORM_PERIOD, self._publish_transform)
         self.create_steady_timer(CLOUD_PERIOD, self._publish_cloud)
+        self.create_steady_timer(CHANGES_PERIOD, self._publish_changes)
 
     def _make_broadcaster(self) -> Any:
         try:
@@ -325,6 +342,19 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
             message.poses.append(pose)
         self._cloud.publish(message)
 
+    def _publish_changes(self) -> None:
+        """Publish all changes if one of them is other than it was."""
+        changes = () if self._localizer is None else self._localizer.changes.changes
+        if changes == self._shown_changes:
+            return
+        self._shown_changes = changes
+        header = conversions.header(self._odometry_ns, self._map_frame)
+        self._changes.publish(
+            DiagnosticArray(header=header, status=[change_status(each) for each in changes])
+        )
+        markers = [change_marker(each, self._map_frame) for each in changes]
+        self._markers.publish(MarkerArray(markers=markers))
+
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the place is known; a warning if the robot is lost, or inputs lack."""
         values: dict[str, object] = {'updates': self._updates, 'rejected_inputs': self._rejected}
@@ -338,6 +368,8 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
             'share': localizer.share,
             'agreement': localizer.agreement,
         }
+        if changes := localizer.changes.changes:
+            values |= {'map_changes': len(changes), 'newest_map_change': changes[-1].text}
         if localizer.result is not None:
             x, y, yaw = np.sqrt(np.diag(localizer.result.covariance)).tolist()
             values |= {'x_std_m': x, 'y_std_m': y, 'yaw_std_rad': yaw}
@@ -349,3 +381,38 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
 def _stamp_ns(message: Range | LaserScan) -> int | None:
     """Return the stamp of a reading, None of one without."""
     return conversions.ns_from_time(message.header.stamp) or None
+
+
+def change_status(change: Change) -> DiagnosticStatus:
+    """Return a change with its numbers; a warning while it is there."""
+    values = {
+        'kind': change.kind.name.lower(),
+        'present': change.present,
+        'x_m': f'{change.x:.3f}',
+        'y_m': f'{change.y:.3f}',
+        'size_m': f'{change.size:.3f}',
+        'confidence': f'{change.confidence:.3f}',
+        'first_seen_s': f'{change.first_ns / NANOSECONDS:.3f}',
+        'found_s': f'{change.found_ns / NANOSECONDS:.3f}',
+        'last_seen_s': f'{change.last_ns / NANOSECONDS:.3f}',
+    }
+    return DiagnosticStatus(
+        level=WARN if change.present else OK,
+        name=f'change {change.number}',
+        message=change.text,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items()],
+    )
+
+
+def change_marker(change: Change, frame: str) -> Marker:
+    """Return a change as a cylinder at its place, stamped as first seen; pale: it is gone."""
+    marker = Marker(ns='map_changes', id=change.number, type=Marker.CYLINDER, text=change.text)
+    marker.header = conversions.header(change.first_ns, frame)
+    marker.pose.position.x, marker.pose.position.y = change.x, change.y
+    marker.pose.position.z = 0.5 * MARKER_HEIGHT
+    marker.pose.orientation.w = 1.0
+    marker.scale.x = marker.scale.y = change.size
+    marker.scale.z = MARKER_HEIGHT
+    marker.color.r, marker.color.g, marker.color.b = COLOURS[change.kind]
+    marker.color.a = change.confidence if change.present else 0.25
+    return marker

@@ -70,7 +70,7 @@ INTERFACES = {
             'keep_out/map',
             '/diagnostics',
         ),
-        services=('~/enable', '~/reset', '~/save_model'),
+        services=('~/enable', '~/reset', '~/save_model', '~/save_map'),
     ),
     'sim_robot': NodeInterface(
         'sim_robot:SimRobotNode',
@@ -115,6 +115,8 @@ INTERFACES = {
             'pose',
             'map_to_odom',
             'particlecloud',
+            'map_changes',
+            'map_changes/markers',
             '/tf',
             '/diagnostics',
         ),

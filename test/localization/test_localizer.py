@@ -415,3 +415,36 @@ def test_a_search_ends_when_readings_fit_for_some_time():
     assert lost
     assert known
     assert not early
+
+
+@pytest.mark.compiled
+def test_a_slip_is_no_reason_to_look_elsewhere():
+    """A turn that the odometry missed led to another place that looked alike, 1.4 m away."""
+    for seed in (1, 2, 3):
+        localizer, drive = make_localizer(seed=seed), Drive(seed=seed)
+        follow(localizer, drive, 10.0)
+        x, y, yaw = drive.odometry
+        drive.odometry = Pose(x, y, wrap_angle(yaw - 0.25))
+        away, turned = follow(localizer, drive, 15.0).T
+        assert away.max() < 0.25
+        assert away[-20:].max() < 0.06
+        assert turned[-20:].max() < 0.06
+
+
+def test_an_estimate_that_jumps_must_fit_for_some_time():
+    localizer, drive = make_localizer(), Drive()
+    follow(localizer, drive, 5.0)
+    assert localizer.state is Localization.LOCALIZED
+    localizer.filter.place(Pose(-0.9, 0.8, 1.0), 1e-4 * np.eye(3))  # as if readings fitted there
+    follow(localizer, drive, 0.6)
+    assert localizer.result.pose.x < -0.5
+    assert localizer.state is not Localization.LOCALIZED
+
+
+def test_the_yaw_drifts_with_time():
+    made = [make_localizer(yaw_drift=drift) for drift in (0.0, 1e-3)]
+    for localizer in made:
+        for k in range(40):
+            localizer.add_odometry(k * 10**9, Pose(0.06 * k, 0.0, 0.0))
+    narrow, wide = (localizer.filter.poses[:, 2].std() for localizer in made)
+    assert wide > math.sqrt(narrow**2 + 0.9 * 39e-3)

@@ -15,6 +15,7 @@
 
 import math
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import OccupancyGrid, Odometry
 import numpy as np
@@ -22,6 +23,7 @@ import pytest
 from sensor_msgs.msg import LaserScan, Range
 from std_srvs.srv import Empty
 from support.ros_graph import LATCHED, diagnostic, odometry, reason
+from visualization_msgs.msg import MarkerArray
 
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
 from t3mpc_ros.localization.localizer import Localization
@@ -54,9 +56,12 @@ class Robot:
         for name in RANGE_SENSORS:
             self.publishers[name] = harness.connected_publisher(Range, f'range/{name}')
 
-    def step(self, node, travel=0.03):
-        """Publish ranges, then the odometry after some more travel; wait until it is used."""
-        distance = 2.0 - (1.0 + AHEAD + self.travel) - (0.0 if self.scan else 0.1)
+    def step(self, node, travel=0.03, wall=2.0):
+        """Publish ranges, then the odometry after some more travel; wait until it is used.
+
+        wall : x of what the sensors see ahead, m
+        """
+        distance = wall - (1.0 + AHEAD + self.travel) - (0.0 if self.scan else 0.1)
         if self.scan:
             message = LaserScan(angle_min=-0.2, angle_increment=0.2, range_min=0.05, range_max=3.0)
             message.ranges = [distance / math.cos(0.2), distance, distance / math.cos(0.2)]
@@ -123,6 +128,32 @@ def test_a_pose_is_given_and_one_in_another_frame_is_ignored(harness):
     given.publish(message)
     harness.spin_until(lambda: abs(np.mean(node._localizer.filter.poses[:, 0]) + 0.5) < 0.01)
     assert diagnostic(node, 'rejected_inputs') == 3
+
+
+def test_a_thing_that_the_map_lacks_is_published(harness):
+    node = harness.add(LocalizerNode, world='room', **START)
+    changes = harness.subscribe(DiagnosticArray, 'map_changes', LATCHED)
+    markers = harness.subscribe(MarkerArray, 'map_changes/markers', LATCHED)
+    robot = Robot(harness)
+    for _ in range(14):
+        robot.step(node, wall=1.75)
+    harness.spin_until(lambda: changes and markers)
+    (status,) = changes[-1].status
+    values = {each.key: each.value for each in status.values}
+    assert changes[-1].header.frame_id == 'map'
+    assert (values['kind'], values['present']) == ('new', 'True')
+    assert float(values['x_m']) == pytest.approx(1.75, abs=0.15)  # as far as the start is off
+    assert float(values['y_m']) == pytest.approx(-0.2, abs=0.08)
+    first, found, last = (
+        float(values[f'{name}_s']) for name in ('first_seen', 'found', 'last_seen')
+    )
+    assert 1.0 <= first < found <= last <= robot.stamp_ns / NANOSECONDS
+    (marker,) = markers[-1].markers
+    assert (marker.id, marker.header.frame_id, marker.text) == (1, 'map', status.message)
+    assert marker.pose.position.x == pytest.approx(float(values['x_m']), abs=1e-3)
+    assert marker.scale.x == pytest.approx(float(values['size_m']), abs=1e-3)
+    assert diagnostic(node, 'map_changes') == 1
+    assert diagnostic(node, 'newest_map_change').startswith('new thing: ')
 
 
 def test_the_service_scatters_the_particles(harness):

@@ -167,6 +167,9 @@ class PatrolScenario:
     """World that the keep-out knows: a name or a file; empty: nothing."""
     world: str = ''
     """World in which the robot drives: a name or a file; empty: that which it knows."""
+    map: str = ''
+    """World that the localisation has as its map: a name or a file; empty: that in which the robot
+    drives."""
     keep_out: bool = True
     """Whether the keep-out is used."""
     robot: Mapping[str, object] = field(default_factory=dict)
@@ -235,6 +238,7 @@ def run_patrol(
     scenario: PatrolScenario,
     tracker: PathTracker | None = None,
     visitors: Visitors | None = None,
+    use_localizer: Callable[[Localizer], None] | None = None,
 ) -> Record:
     """Return the record of a robot that follows a path; equal arguments give equal runs.
 
@@ -251,6 +255,8 @@ def run_patrol(
         Law in place of the controller; the path is then only recorded as the reference.
     visitors
         What comes while the robot drives.
+    use_localizer
+        Called before the drive with the localisation, if there is one.
     """
     parameters = DigitalTwinParameters.from_dict(
         {
@@ -264,6 +270,8 @@ def run_patrol(
     carried_ns = stamp_of(round((START + min(scenario.carried_at, 1e6)) * RATE))
     robot = CarriedTwin(parameters, carried_ns)
     driver = PathDriver(points, scenario, parameters.geometry, tracker)
+    if use_localizer is not None and driver.localizer is not None:
+        use_localizer(driver.localizer)
     if visitors is not None:
         driver.on_state = lambda state: _visit(robot, visitors, state)
     rest = round(START * RATE)
@@ -350,12 +358,12 @@ class PathDriver:
         self._losses = np.random.default_rng((scenario.seed, 19))
         self._range_loss = scenario.range_loss
         self._localization = scenario.localization
-        self._localizer: Localizer | None = None
+        self.localizer: Localizer | None = None
         if scenario.localization == 'filter':
             sensors = RangeSensorParameters()
-            self._localizer = Localizer(
+            self.localizer = Localizer(
                 LocalizerParameters.from_dict({'set_initial_pose': True, 'seed': scenario.seed}),
-                map_of_world(load_world(scenario.world or scenario.known_world)),
+                map_of_world(load_world(scenario.map or scenario.world or scenario.known_world)),
                 sensor_mounts(sensors),
                 (sensors.minimum, sensors.maximum),
             )
@@ -412,8 +420,8 @@ class PathDriver:
             if due and not math.isnan(reading):  # as the nodes publish them
                 for received in self._faulty.received(sensor, reading, state.stamp_ns):
                     self._controller.add_range(sensor, *received)
-                    if self._localizer is not None:
-                        self._localizer.add_range(sensor, *received)
+                    if self.localizer is not None:
+                        self.localizer.add_range(sensor, *received)
         self._ranges = state.ranges
         if self._tracker is None:
             measured = State(state.stamp_ns, self._pose, state.odometry.twist)
@@ -427,12 +435,12 @@ class PathDriver:
         """Return the pose that the controller receives."""
         noise = self._generator.standard_normal(3).tolist()
         odometry = state.odometry
-        if self._localizer is not None:
+        if self.localizer is not None:
             # As in the node: the pose of this message is by the correction known so far.
             if odometry.stamp_ns == 0:
-                self._localizer.add_odometry(0, odometry.pose)
-            pose = self._correction.step(odometry.stamp_ns, odometry.pose, self._localizer)
-            self._localizer.add_odometry(odometry.stamp_ns, odometry.pose)
+                self.localizer.add_odometry(0, odometry.pose)
+            pose = self._correction.step(odometry.stamp_ns, odometry.pose, self.localizer)
+            self.localizer.add_odometry(odometry.stamp_ns, odometry.pose)
             return pose or ORIGIN
         if self._localization == 'odometry':
             return odometry.pose
@@ -460,8 +468,7 @@ class PathDriver:
             'command': self._twist,
             'activity': ACTIVITIES.index(activity),
             'avoiding': changed or self._controller.pose_controller.rejoining,
-            'localized': self._localizer is None
-            or self._localizer.state is Localization.LOCALIZED,
+            'localized': self.localizer is None or self.localizer.state is Localization.LOCALIZED,
         }
 
 
