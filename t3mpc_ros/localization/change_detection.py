@@ -43,8 +43,8 @@ TOO_NEAR = 0.07
 """Distance that stands for a reading that is too near, m: they are from 0.036 m on."""
 LARGEST = 1.5
 """Largest evidence of one reading: its error is in part that of the pose and repeats."""
-CELL_LIMIT = 4.0
-"""Largest evidence of a cell."""
+CELL_LIMIT = 6.0
+"""Largest evidence of a cell: an event has two or more."""
 PASSED = 0.7
 """Evidence of a ray that passes over a cell against a thing there."""
 UNSEEN_NEAR = 0.08

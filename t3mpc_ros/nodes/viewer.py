@@ -135,6 +135,7 @@ class ViewNode(Node):
         """Steady time until which the answer of a command may come, s."""
         self._signals: tuple[int, ...] = ()
         self._faults, self._slips = 'none', False
+        self._map_changes: dict[str, tuple[str, bool]] = {}
         self._ranges = [math.nan] * len(RANGE_SENSORS)
         self._terms = [math.nan] * (len(WHEELS) * len(TERM_NAMES))
         self._command_clients = {
@@ -218,6 +219,7 @@ class ViewNode(Node):
                 self._subscribe(Float64, topic, take, depth=1, raw=True)
         self._subscribe(Int32MultiArray, 'reference/signals', self._on_signals, latched=True)
         self._subscribe(DiagnosticArray, '/diagnostics', self._on_diagnostics)
+        self._subscribe(DiagnosticArray, 'map_changes', self._on_map_changes, latched=True)
         self._subscribe(Log, '/rosout', self._on_log)
         self._subscribe(ParameterEvent, '/parameter_events', self._on_parameter_event)
 
@@ -335,6 +337,21 @@ class ViewNode(Node):
             if name in ROBOTS:
                 self._on_faults(values.get('faults', 'none'), self._time(sent_ns))
                 self._on_slip(values.get('slipping') == 'True', self._time(sent_ns))
+
+    def _on_map_changes(self, message: DiagnosticArray, sent_ns: int) -> None:
+        shown = []
+        for status in message.status:
+            values = {each.key: each.value for each in status.values}
+            try:
+                place = [float(values[key]) for key in ('x_m', 'y_m', 'size_m')]
+            except (KeyError, ValueError):  # of another publisher
+                continue
+            kind, present = values.get('kind', ''), values.get('present') == 'True'
+            shown.append([*place, kind, present])
+            if self._map_changes.get(status.name) != (kind, present):
+                self._map_changes[status.name] = kind, present
+                self._sink.report(self._time(sent_ns), 'change', status.message)
+        self._sink.set('map_changes', shown)
 
     def _on_faults(self, faults: str, seconds: float) -> None:
         if faults != self._faults:

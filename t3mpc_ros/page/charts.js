@@ -294,7 +294,8 @@ class Floor {
   }
 
   // scene: {world, paths: [{x, y, colour, dash}], marks: [[x, y, colour]], robot: [x, y, yaw] or
-  // null, mounts: [[x, y, yaw]] of the range sensors, ranges, reach, track, wheel (radius) (m)};
+  // null, changes: [[x, y, size, kind, present]] of the map, mounts: [[x, y, yaw]] of the range
+  // sensors, ranges, reach, track, wheel (radius) (m)};
   // NaN interrupts a path; still: whether the view stays as it is
   draw(scene) {
     const canvas = this.canvas;
@@ -327,6 +328,13 @@ class Floor {
     for (const [x, y, name] of scene.marks || []) {
       context.fillStyle = colour(name);
       disc(context, ...at(x, y), 4.5 * ratio);
+    }
+    for (const [x, y, size, , present] of scene.changes || []) {
+      context.strokeStyle = colour(present ? 'fault' : 'line');
+      context.lineWidth = 2.5 * ratio;
+      context.beginPath();
+      context.arc(...at(x, y), Math.max(0.5 * size * scale, 6 * ratio), 0, 2 * Math.PI);
+      context.stroke();
     }
     if (scene.robot) this.robot(context, scene, at, scale, ratio);
   }

@@ -56,10 +56,11 @@ class Robot:
         for name in RANGE_SENSORS:
             self.publishers[name] = harness.connected_publisher(Range, f'range/{name}')
 
-    def step(self, node, travel=0.03, wall=2.0):
+    def step(self, node, travel=0.03, wall=2.0, period=0.1, side=math.inf):
         """Publish ranges, then the odometry after some more travel; wait until it is used.
 
-        wall : x of what the sensors see ahead, m
+        wall : x of what the sensors see ahead, m; period : since the last step, s; side : reading
+        of the sensors on the right, m
         """
         distance = wall - (1.0 + AHEAD + self.travel) - (0.0 if self.scan else 0.1)
         if self.scan:
@@ -69,9 +70,10 @@ class Robot:
         else:
             for name in RANGE_SENSORS:
                 ahead = name.startswith('front') and distance < 0.8
-                self.publishers[name].publish(Range(range=distance if ahead else math.inf))
+                other = side if name.startswith('right') else math.inf
+                self.publishers[name].publish(Range(range=distance if ahead else other))
         self.travel += travel
-        self.stamp_ns += NANOSECONDS // 10
+        self.stamp_ns += round(period * NANOSECONDS)
         message = odometry(self.stamp_ns)
         message.pose.pose.position.x = self.travel
         self.publishers['odom'].publish(message)
@@ -131,19 +133,19 @@ def test_a_pose_is_given_and_one_in_another_frame_is_ignored(harness):
 
 
 def test_a_thing_that_the_map_lacks_is_published(harness):
-    node = harness.add(LocalizerNode, world='room', **START)
+    node = harness.add(LocalizerNode, world='room', **{**START, 'initial_pose__y': -1.0})
     changes = harness.subscribe(DiagnosticArray, 'map_changes', LATCHED)
     markers = harness.subscribe(MarkerArray, 'map_changes/markers', LATCHED)
     robot = Robot(harness)
     for _ in range(14):
-        robot.step(node, wall=1.75)
+        robot.step(node, wall=1.75, period=0.3, side=0.41)
     harness.spin_until(lambda: changes and markers)
     (status,) = changes[-1].status
     values = {each.key: each.value for each in status.values}
     assert changes[-1].header.frame_id == 'map'
     assert (values['kind'], values['present']) == ('new', 'True')
     assert float(values['x_m']) == pytest.approx(1.75, abs=0.15)  # as far as the start is off
-    assert float(values['y_m']) == pytest.approx(-0.2, abs=0.08)
+    assert float(values['y_m']) == pytest.approx(-1.0, abs=0.08)
     first, found, last = (
         float(values[f'{name}_s']) for name in ('first_seen', 'found', 'last_seen')
     )

@@ -17,6 +17,7 @@ from functools import partial
 import math
 import time
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
 import pytest
@@ -133,6 +134,26 @@ def test_a_switch_has_the_time_of_the_reference_that_it_begins(viewer, harness):
     origin = viewer.facts()['origin']
     expected = [(stamp - origin * 1_000_000_000) / 1e9 for stamp in switches[1:]]
     assert found() == pytest.approx(expected, abs=1e-6)
+
+
+def test_what_contradicts_the_map_is_shown_once(viewer, harness):
+    publisher = harness.probe.create_publisher(DiagnosticArray, 'map_changes', qos.LATCHED)
+    numbers = {'x_m': '0.5', 'y_m': '-0.25', 'size_m': '0.3'}
+
+    def send(kind, present):
+        values = {'kind': kind, 'present': str(present), **numbers}
+        status = DiagnosticStatus(name='change 1', message=f'{kind} thing')
+        status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+        publisher.publish(DiagnosticArray(status=[status, DiagnosticStatus(name='other')]))
+        shown = [[0.5, -0.25, 0.3, kind, present]]
+        viewer.spin_until(lambda: viewer.facts().get('map_changes') == shown)
+
+    send('new', True)
+    numbers['size_m'] = '0.30'
+    send('new', True)
+    send('moving', False)
+    events = [each for each in viewer.changes()['events'] if each['kind'] == 'change']
+    assert [each['text'] for each in events] == ['new thing', 'moving thing']
 
 
 def test_a_command_without_stamp_has_the_time_of_its_sending(viewer):

@@ -328,6 +328,7 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
         rows = rows[rows < measured.time.size]
         columns = np.stack([measured.time, measured.x, measured.y], axis=1)[rows]
         marks += [(*mark, colour) for mark in columns[np.isfinite(columns).all(axis=1)].tolist()]
+    marks += [(each.found, each.x, each.y, 'fault') for each in run.map_changes]
     x, y = measured.x[np.isfinite(measured.x)], measured.y[np.isfinite(measured.y)]
     seen = (
         f'The robot moved in x {_extent(x, "m")} and in y {_extent(y, "m")}, and ended '
@@ -336,7 +337,13 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
     if slips:
         seen += f' A wheel slips for {sum(end - start for start, end in slips):.1f} s.'
     if named := [
-        name for name, times in (('switches', run.switches), ('stops', stops)) if len(times)
+        name
+        for name, found in (
+            ('switches', run.switches),
+            ('stops', stops),
+            ('what contradicts the map', run.map_changes),
+        )
+        if len(found)
     ]:
         seen += f' Points: {" and ".join(named)}.'
     yield Plane('Floor', 'm', curves, seen, world_outline(run.world), marks)

@@ -22,6 +22,7 @@ from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.bag.recording.message_losses import LOSS_CAUSES, LOSSES, UNDISCOVERED
 from t3mpc_ros.evaluation.bag_report.incidents import BRAKING, driving
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkMetrics
+from t3mpc_ros.evaluation.bag_report.map_changes import map_change_blocks
 from t3mpc_ros.evaluation.bag_report.metrics import (
     LINK_NUMBERS,
     UNMEASURED,
@@ -150,6 +151,7 @@ def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
         blocks += [Heading('Tracking error'), *_errors(run)]
     blocks += _response(run, figures)
     blocks += _sections(run, figures, [each for each in others if each not in soon])
+    blocks += map_change_blocks(run.map_changes)
     blocks += patrol_blocks(run)
     blocks += [Heading('Timing by topic'), *_timing(run), *_complaints(run)]
     blocks += [Heading('Contents of the bag'), *_contents(recording)]

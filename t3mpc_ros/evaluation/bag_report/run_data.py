@@ -31,6 +31,7 @@ from t3mpc_ros.evaluation.bag_report.link_history import (
     LinkHistory,
     read_diagnostics,
 )
+from t3mpc_ros.evaluation.bag_report.map_changes import RecordedChange, read_map_changes
 from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
@@ -177,6 +178,8 @@ class Run:
     follows_path: bool = False
     """Whether the controller follows the poses of the reference, not its speeds."""
 
+    map_changes: tuple[RecordedChange, ...] = ()
+    """What contradicts the map."""
     other_clock: bool = False
     """Whether the stamps are of another clock than the receive times, as with simulated time."""
     parameters: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
@@ -251,6 +254,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         remarks=tuple(notes),
         damage=tuple(damage),
         world=records.get('sim_robot', {}).get('world', ''),
+        map_changes=read_map_changes(recording, choice.namespaces[0], clock.local),
         other_clock=clock.other,
         parameters=records,
         follows_path=records.get('controller', {}).get('pose.enabled', '').lower() == 'true',

@@ -4,7 +4,7 @@
 'use strict';
 
 const MARKS = { switch: 'switch', stop: 'stopped', fault: 'fault', slip: 'slip', stall: 'c4', gap: 'soft', jump: 'c5',
-  parameter: 'accent' }; // their colours
+  parameter: 'accent', change: 'fault' }; // their colours
 
 function addEvent(event) {
   events.push(event);

@@ -317,7 +317,7 @@ function drawFloor() {
   if (drawnPath) paths.push(drawnPath);
   const marks = events.filter(({ kind, time }) => ON_FLOOR.includes(kind) && all[0] <= time && time <= all[1])
     .map(({ kind, time }) => [placeAt(time), MARKS[kind]]).filter(([at]) => at).map(([at, name]) => [...at, name]);
-  floor.draw({ still: isDrawing(), world: facts.world, paths, marks, robot, mounts: facts.mounts, reach: facts.reach,
+  floor.draw({ still: isDrawing(), world: facts.world, changes: facts.map_changes, paths, marks, robot, mounts: facts.mounts, reach: facts.reach,
     ranges: sampleOf('ranges', 0, 8), track: facts.robot?.wheel_separation,
     wheel: facts.robot?.wheel_radius });
   if (!robot) return;
