@@ -25,6 +25,7 @@ from t3mpc_ros.evaluation.patrol.patrol_safety import (
     People,
     PlacedThings,
     at_places,
+    compare_safety,
     contacts,
     measured_safety,
     safety_table,
@@ -109,3 +110,8 @@ def test_a_robot_whose_sensors_fail_rests_within_half_a_second():
     assert row['ended'] == 'too few range sensors work to drive on'
     table = safety_table(ResultTable([{'controller': 'sensors silent', 'seed': 11, **row}]))
     assert f'{row["rest"]:.2f}' in table.markdown()
+
+
+def test_a_run_that_ends_before_the_sensors_fail_is_refused():
+    with pytest.raises(ValueError, match=r'at least 40 s \(0\.67 min\).* got 6 s'):
+        compare_safety([1], 6.0)

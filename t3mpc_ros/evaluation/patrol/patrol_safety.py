@@ -139,9 +139,15 @@ class SafetyCase:
     """By seed, the faults of the range sensors."""
 
 
+FAULTS_BEGIN, FAULTS_END = 8.0, 38.0
+"""First and last instant at which sensors fail, s of the twin."""
+LEAST_DURATION = FAULTS_END + 2.0
+"""Length of a run in which the robot also comes to rest after that, s."""
+
+
 def cut_time(seed: int) -> float:
     """Return when the sensors of a seed fail, s of the twin."""
-    return float(np.random.default_rng((seed, 44)).uniform(8.0, 38.0))
+    return float(np.random.default_rng((seed, 44)).uniform(FAULTS_BEGIN, FAULTS_END))
 
 
 def _all_silent(seed: int) -> Sequence[SensorFault]:
@@ -294,7 +300,15 @@ def compare_safety(
     workers: int | Executor = 1,
     report: Report | None = None,
 ) -> ResultTable:
-    """Return one row a case and seed; arguments as of :func:`run_experiment`."""
+    """Return one row a case and seed; arguments as of :func:`run_experiment`.
+
+    ValueError: the runs end before the last sensors have failed.
+    """
+    if duration < LEAST_DURATION:
+        raise ValueError(
+            f'a run must last at least {LEAST_DURATION:g} s ({LEAST_DURATION / 60.0:.2g} min): '
+            f'sensors fail until {FAULTS_END:g} s: got {duration:g} s'
+        )
     runs = [
         Run(((case, duration), seed), {'controller': case, 'seed': seed})
         for case in CASES
