@@ -156,7 +156,7 @@ EXPECTED = {
     'wheel_blocked right': ('stops', f'{SLIP_STOP_REASON}; {Reason.PAUSED.value}', 'by itself'),
     'load_change 3 kg': ('bounded', '', ''),
     'slippery 0.05': ('stops', f'{SLIP_STOP_REASON}; {Reason.PAUSED.value}', 'by itself'),
-    'supply_sag 5 V': ('stops', BROWN_OUT_REASON, 'by itself'),
+    'supply_sag 5 V': ('stops', f'{BROWN_OUT_REASON}; {Reason.PAUSED.value}', 'by itself'),
     'brown_out': ('stops', BROWN_OUT_REASON, 'by itself'),
 }
 
