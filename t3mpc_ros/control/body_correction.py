@@ -17,13 +17,17 @@ The wheels of a stepper follow their command almost exactly; the body does not: 
 separation differ from the nominal ones, and tyres creep. With the yaw rate expressed as half of
 the difference of the wheel speeds, w = b omega / R, the body obeys
 
-.. math:: w_a - w_c = k_m m_c + k_w w_c + s w_a + c + \tau \dot w_c + \nu                    E20
+.. math:: w_a - w_c = k_m m_c + k(|m_c|, |w_c|) w_c + s w_a + c + \tau \dot w_c + \nu,       E20
 
-for mean m_c and half difference w_c of the wheel speeds commanded one dead time before. Two gains
-are properties of the robot: k_m of unequal radii, k_w of a wrong separation or mean radius. The
-others are not, and nothing is corrected by them: the scale error s of the gyro, its bias c, and
-the error tau of the assumed delay. The filter estimates all five from means over a quarter of a
-second, and starts from what is stated of each.
+          k(|m|, |w|) = k_w + \frac{k_1 |w| + k_2 |m|}{U} + \frac{k_3 |m| |w|}{U^2},
+
+for mean m_c and half difference w_c of the wheel speeds commanded one dead time before. The gains
+are properties of the robot: k_m of unequal radii, k_w of a wrong separation or mean radius, k_1 to
+k_3 of tyres that creep the more the faster and the tighter it turns. k is a map of Takagi and
+Sugeno with two triangular sets for each of |m| and |w|, in its linear parameters. The
+others are no gains, and nothing is corrected by them: the scale error s of the gyro, its bias c,
+and the error tau of the assumed delay. The filter estimates all eight from means over a quarter of
+a second, and starts from what is stated of each.
 
 To steps and gyro, k_w and s are one quantity. How an error is shared between them follows from
 the stated deviations, ``wheel_tolerance`` and ``gyro_scale_tolerance``: with a calibrated gyro it
@@ -32,10 +36,10 @@ that lasts is a jump of the bias first; what contradicts that later returns to t
 
 The reference of the law becomes
 
-.. math:: w_r - a (k_m m_r + k_w w_r) - a v_\psi, \quad v_\psi = \bar v \tanh(k e_\psi/\bar v)  E21
+.. math:: w_r - a (k_m m_r + k w_r) - a v_\psi, \quad v_\psi = \bar v \tanh(k e_\psi/\bar v)  E21
 
 with e_psi the integral of w_a - s w_a - c - w_r: the compensator (81)-(82) in the form of E14, for
-the yaw. The authority a in [0, 1] is the measured skill of both gains: the share of the variance
+the yaw. The authority a in [0, 1] is the measured skill of the gains: the share of the variance
 of what they explain, w_a - w_c without the terms of gyro and delay, that they predict *before*
 they learn from it. On a robot with nominal geometry there is nothing to predict: a is 0, and
 nothing is corrected.
@@ -61,7 +65,7 @@ BLOCK = 0.25
 """Time over which E20 is averaged, s."""
 SKILL_TIME = 5.0
 """Time constant of the measured skill, s."""
-DEAD_ZONE = 0.015
+DEAD_ZONE = 0.010
 """Error of a wheel that is not worth correcting, rad/s: noise of the gyro and of the rotors,
 averaged over a block."""
 FULL_SKILL, NO_SKILL = 0.6, 0.2
@@ -77,11 +81,15 @@ YAW_JUMP = 20.0
 STANDSTILL_SPEED = 0.05
 """Commanded speed (rad/s, mean square over a block) below which a block shows nothing."""
 
-ASYMMETRY, TURNING, GYRO_SCALE, BIAS, DELAY = range(5)
-"""k_m, k_w, s, c, tau: rows of the estimate."""
+ASYMMETRY, TURNING, CREEP, GYRO_SCALE, BIAS, DELAY = 0, 1, 2, 5, 6, 7
+"""k_m, k_w, k_1 of k_1 to k_3, s, c, tau: rows of the estimate."""
+ROWS = 8
+"""Number of rows; those before GYRO_SCALE are gains of the robot."""
+CREEP_SPEED = 5.0
+"""U, rad/s."""
 BIAS_DEVIATION, DELAY_DEVIATION = 0.01, 0.02
 """Standard deviations of c after a standstill (rad/s of a wheel) and of tau (s) at the start."""
-WALK = (0.0005, 0.0005, 0.0, 0.0003, 0.0005)
+WALK = (0.0005, 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.0003, 0.0005)
 """Random walk of each: standard deviation after a second, in its unit."""
 NOISE, SLOPE_NOISE = 0.006, 0.01
 """Standard deviation of the mean of a block, rad/s, and per slope of w_c, s."""
@@ -91,6 +99,8 @@ SLACK, LARGEST, JUMP = 1.5, 4.0, 6.0
 """Of a cumulative sum of innovations (in their standard deviations, at most LARGEST): what a block
 takes off, and the sum at which the bias has jumped; three blocks in a row at least. Page 1954, doi
 10.1093/biomet/41.1-2.100."""
+JUMP_SHARE = 0.5
+"""Variance by which a jump makes k_m and k_w uncertain again, over that of ``wheel_tolerance``."""
 WARNED_BIAS = 0.01
 """Bias that is reported, rad/s."""
 WARNED_SCALE, WARNED_DEVIATION = 0.01, 0.004
@@ -158,10 +168,6 @@ class BodyMemory(Structure):
     """Whether it is that of the last period; a gap belongs to no block."""
     rise: float
     """Sum of the changes of w_c."""
-    mean_sum: float
-    """Sum of m_c."""
-    commanded_sum: float
-    """Sum of w_c."""
     achieved_sum: float
     """Sum of w_a."""
     square_sum: float
@@ -181,8 +187,7 @@ class BodyMemory(Structure):
 
 DRIVE = (
     *('started', 'yaw_error', 'commands', 'above', 'below'),
-    *('block_time', 'mean_sum', 'commanded_sum', 'achieved_sum', 'square_sum', 'rise'),
-    *('linked', 'spoilt'),
+    *('block_time', 'achieved_sum', 'square_sum', 'rise', 'linked', 'spoilt'),
 )
 """Fields of the memory that belong to one drive."""
 SKILL = 'raw_power', 'error_power', 'residual_power', 'command_power', 'authority'
@@ -213,12 +218,14 @@ class BodyState(NamedTuple):
     """Array of one."""
     history: Array
     """Commands, newest first, rad/s, shape (n, 2)."""
+    sums: Array
+    """Sums over the present block of what the turn is per gain, shape (5,)."""
     estimate: Array
-    """k_m, k_w, s, c, tau, shape (5,)."""
+    """Gains, s, c, tau, shape (8,)."""
     covariance: Array
-    """Of the estimate, shape (5, 5)."""
+    """Of the estimate, shape (8, 8)."""
     work: Array
-    """Work space: row h of E20, and P h, shape (2, 5)."""
+    """Work space: row h of E20, and P h, shape (2, 8)."""
 
 
 class BodyCorrection:
@@ -239,7 +246,12 @@ class BodyCorrection:
         self._period = period
         self._memory = BodyMemory.new()
         self._state = BodyState(
-            self._memory, np.zeros((HISTORY, 2)), np.zeros(5), np.zeros((5, 5)), np.zeros((2, 5))
+            self._memory,
+            np.zeros((HISTORY, 2)),
+            np.zeros(GYRO_SCALE),
+            np.zeros(ROWS),
+            np.zeros((ROWS, ROWS)),
+            np.zeros((2, ROWS)),
         )
         self._correct_body = TypedKernel(correct_body)
         self.configure(parameters)
@@ -254,7 +266,7 @@ class BodyCorrection:
             parameters.yaw_gain,
             parameters.max_correction,
             parameters.max_yaw_correction,
-            parameters.wheel_tolerance**2,
+            JUMP_SHARE * parameters.wheel_tolerance**2,
         )
 
     @property
@@ -269,7 +281,7 @@ class BodyCorrection:
 
     @property
     def estimate(self) -> Array:
-        """Copy of k_m, k_w, s, c (rad/s of a wheel) and tau (s), shape (5,)."""
+        """Copy of k_m, k_w, creep gains, s, c (rad/s of a wheel) and tau (s), shape (8,)."""
         return self._state.estimate.copy()
 
     @property
@@ -296,18 +308,26 @@ class BodyCorrection:
                 'body.gyro_scale_tolerance if the gyro is right'
             )
         least = np.maximum(4.0 * deviations, self.parameters.wheel_tolerance)
-        if (np.abs(estimate[:GYRO_SCALE]) > least[:GYRO_SCALE]).any():
+        if (np.abs(estimate[:CREEP]) > least[:CREEP]).any():
             turning, asymmetry = 100.0 * estimate[TURNING], 100.0 * estimate[ASYMMETRY]
             return (
                 f'the robot turns by {_compared(turning)} the wheels, and by {asymmetry:.1f} '
                 '% of their mean speed: wheel separation or radii are not those that are set, or '
                 'the gyro is not calibrated; corrected as far as the wheels allow'
             )
+        if (np.abs(estimate[CREEP:GYRO_SCALE]) > least[CREEP:GYRO_SCALE]).any():
+            creep = 100.0 * float(np.sum(estimate[CREEP:GYRO_SCALE]))
+            return (
+                f'with wheels at {CREEP_SPEED:g} rad/s the robot turns by '
+                f'{_compared(creep)} its slow turns let expect: its tyres creep; corrected as far '
+                'as the wheels allow'
+            )
         return ''
 
     def restart(self) -> None:
         """Start a drive: clear yaw error and history; gains and skill are kept."""
         self._state.history[:] = 0.0
+        self._state.sums[:] = 0.0
         for name in DRIVE:
             setattr(self._memory[0], name, 0)
 
@@ -315,20 +335,30 @@ class BodyCorrection:
         """Discard the gains and their skill too."""
         for name in BodyMemory.__annotations__:
             setattr(self._memory[0], name, 0)
-        wheel, gyro = self.parameters.wheel_tolerance, self.parameters.gyro_scale_tolerance
-        deviations = np.array([wheel, wheel, gyro, BIAS_DEVIATION, DELAY_DEVIATION])
         self._state.estimate[:] = 0.0
-        self._state.covariance[:] = np.diag(deviations**2)
+        self._state.covariance[:] = self._prior()
         self.restart()
 
+    def _prior(self) -> Array:
+        """Return the covariance that follows from what is stated, shape (8, 8)."""
+        wheel, gyro = self.parameters.wheel_tolerance, self.parameters.gyro_scale_tolerance
+        deviations = [*(GYRO_SCALE * [wheel]), gyro, BIAS_DEVIATION, DELAY_DEVIATION]
+        return np.diag(np.square(deviations))
+
     def get_weights(self) -> Array:
-        """Return estimate (row 0) and covariance (the others), shape (6, 5)."""
+        """Return estimate (row 0) and covariance (the others), shape (9, 8)."""
         return np.vstack([self._state.estimate, self._state.covariance])
 
     def set_weights(self, weights: Array) -> None:
-        """Use what :meth:`get_weights` returned."""
-        if np.shape(weights) != (6, 5):
-            raise ValueError(f'the body correction has shape (6, 5): got {np.shape(weights)}')
+        """Use what :meth:`get_weights` returned, also before 0.3.0, which had no creep gains."""
+        if np.shape(weights) == (6, 5):
+            known = [ASYMMETRY, TURNING, GYRO_SCALE, BIAS, DELAY]
+            former, weights = weights, np.vstack([np.zeros(ROWS), self._prior()])
+            weights[0, known] = former[0]
+            weights[1:][np.ix_(known, known)] = former[1:]
+        if np.shape(weights) != (1 + ROWS, ROWS):
+            shape = np.shape(weights)
+            raise ValueError(f'the body correction has shape (9, 8): got {shape}')
         self._state.estimate[:] = weights[0]
         self._state.covariance[:] = weights[1:]
 
@@ -412,10 +442,14 @@ def correct_body(
     if memory.block_time >= BLOCK - 0.5 * period:
         if memory.square_sum > STANDSTILL_SPEED**2 * memory.block_time:
             learn_block(constants, state)
-        clear_block(memory)
+        clear_block(state)
     mean, half = 0.5 * (planned[0] + planned[1]), 0.5 * (planned[0] - planned[1])
     bound = constants.bound
-    correction = -min(max(gains[ASYMMETRY] * mean + gains[TURNING] * half, -bound), bound)
+    row, turn_error = state.work[0], 0.0
+    write_gain_row(mean, half, row)
+    for j in range(GYRO_SCALE):
+        turn_error += gains[j] * row[j]
+    correction = -min(max(turn_error, -bound), bound)
     bound = constants.yaw_bound
     if bound > 0.0:
         correction -= bound * math.tanh(constants.yaw_gain * memory.yaw_error / bound)
@@ -428,17 +462,19 @@ def add_to_block(
 ) -> None:
     """Add the turning ``achieved`` (rad/s) by the commands of a row of the history."""
     memory, history = state.memory[0], state.history
-    row = int(position)
-    part = position - row
-    right = (1.0 - part) * history[row, 0] + part * history[row + 1, 0]
-    left = (1.0 - part) * history[row, 1] + part * history[row + 1, 1]
+    newer = int(position)
+    part = position - newer
+    right = (1.0 - part) * history[newer, 0] + part * history[newer + 1, 0]
+    left = (1.0 - part) * history[newer, 1] + part * history[newer + 1, 1]
     commanded = 0.5 * (right - left)
     if memory.linked:
         memory.rise += commanded - memory.last
     memory.last, memory.linked = commanded, True
     memory.block_time += elapsed
-    memory.mean_sum += 0.5 * (right + left) * elapsed
-    memory.commanded_sum += commanded * elapsed
+    row = state.work[0]
+    write_gain_row(0.5 * (right + left), commanded, row)
+    for j in range(GYRO_SCALE):
+        state.sums[j] += row[j] * elapsed
     memory.achieved_sum += achieved * elapsed
     memory.square_sum += 0.5 * (right * right + left * left) * elapsed
     if not learn or abs(achieved - commanded) > OUTLIER + RELATIVE_OUTLIER * abs(commanded):
@@ -446,11 +482,20 @@ def add_to_block(
 
 
 @kernel
-def clear_block(memory: BodyMemory) -> None:
+def clear_block(state: BodyState) -> None:
     """Begin another block."""
-    memory.block_time = memory.mean_sum = memory.commanded_sum = 0.0
-    memory.achieved_sum = memory.square_sum = memory.rise = 0.0
+    memory = state.memory[0]
+    memory.block_time = memory.achieved_sum = memory.square_sum = memory.rise = 0.0
     memory.spoilt = False
+    state.sums[:] = 0.0
+
+
+@kernel
+def write_gain_row(mean: float, half: float, row: Array) -> None:
+    """Write what the turn is per gain, rad/s, for mean and half difference of wheel speeds."""
+    row[ASYMMETRY], row[TURNING] = mean, half
+    turn, drive = abs(half) / CREEP_SPEED, abs(mean) / CREEP_SPEED
+    row[CREEP], row[CREEP + 1], row[CREEP + 2] = turn * half, drive * half, turn * drive * half
 
 
 @kernel
@@ -462,14 +507,15 @@ def learn_block(constants: BodyConstants, state: BodyState) -> None:
     memory, covariance = state.memory[0], state.covariance
     row, gain = state.work[0], state.work[1]
     time = memory.block_time
-    row[ASYMMETRY], row[TURNING] = memory.mean_sum / time, memory.commanded_sum / time
+    for j in range(GYRO_SCALE):
+        row[j] = state.sums[j] / time
     row[GYRO_SCALE], row[BIAS] = memory.achieved_sum / time, 1.0
     row[DELAY] = memory.rise / time
     error = row[GYRO_SCALE] - row[TURNING]
     for j in (GYRO_SCALE, BIAS, DELAY):
         error -= row[j] * state.estimate[j]
     residual = error
-    for j in (ASYMMETRY, TURNING):
+    for j in range(GYRO_SCALE):
         residual -= row[j] * state.estimate[j]
     share = time / SKILL_TIME
     memory.raw_power += share * ((row[GYRO_SCALE] - row[TURNING]) ** 2 - memory.raw_power)
@@ -477,7 +523,7 @@ def learn_block(constants: BodyConstants, state: BodyState) -> None:
     if memory.spoilt:
         update_authority(memory)
         return
-    for j in range(5):
+    for j in range(ROWS):
         covariance[j, j] += WALK[j] * WALK[j] * time
     noise = NOISE * NOISE + (SLOPE_NOISE * row[DELAY]) ** 2
     variance = spread(row, covariance, gain) + noise
@@ -493,16 +539,16 @@ def learn_block(constants: BodyConstants, state: BodyState) -> None:
     if max(memory.above, memory.below) >= JUMP:
         memory.above = memory.below = 0.0
         covariance[BIAS, BIAS] += residual * residual
-        covariance[ASYMMETRY, ASYMMETRY] += constants.jump_variance
-        covariance[TURNING, TURNING] += constants.jump_variance
+        for j in (ASYMMETRY, TURNING):
+            covariance[j, j] += constants.jump_variance
         variance = spread(row, covariance, gain) + noise
     elif sudden:
         return
     limit = CLIP * math.sqrt(variance)
     innovation = min(max(residual, -limit), limit)
-    for j in range(5):
+    for j in range(ROWS):
         state.estimate[j] += gain[j] / variance * innovation
-        for i in range(5):
+        for i in range(ROWS):
             covariance[j, i] -= gain[j] * gain[i] / variance
 
 
@@ -510,9 +556,9 @@ def learn_block(constants: BodyConstants, state: BodyState) -> None:
 def spread(row: Array, covariance: Array, gain: Array) -> float:
     """Set ``gain`` to P h and return h' P h, for the row h of E20."""
     total = 0.0
-    for j in range(5):
+    for j in range(ROWS):
         gain[j] = 0.0
-        for i in range(5):
+        for i in range(ROWS):
             gain[j] += covariance[j, i] * row[i]
         total += gain[j] * row[j]
     return total

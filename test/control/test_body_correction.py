@@ -23,6 +23,7 @@ import pytest
 from t3mpc_ros.control.body_correction import (
     ASYMMETRY,
     BIAS,
+    CREEP,
     DELAY,
     GYRO_SCALE,
     TURNING,
@@ -120,6 +121,33 @@ def test_wrong_radii_and_separation_are_learnt():
     found = body.correction.estimate
     assert abs(found[ASYMMETRY] - 0.015 / 1.03) < 0.0015
     assert abs(found[TURNING] - (1.005 / 1.03 - 1.0)) < 0.0025
+
+
+def creeping(right, left):
+    """Soft tyres: the turn that is lost grows with yaw rate and lateral acceleration."""
+    mean, half = 0.5 * (right + left), 0.5 * (right - left)
+    return half / (1.0 + 0.01 * abs(half) + 0.003 * abs(mean * half))
+
+
+def test_creep_that_grows_with_speed_and_curvature_is_learnt():
+    """Two gains alone can only learn its mean."""
+    before = uncorrected(60.0, creeping) - uncorrected(60.0)
+    body = Body(creeping, noise=0.02)
+    after = body.run(60.0) - uncorrected(60.0)
+    assert body.correction.authority == 1.0
+    assert rms(after[3000:]) < 0.15 * rms(before[3000:])
+    assert re.search(r'tyres creep', body.correction.problem())
+    gains = body.correction.estimate[:GYRO_SCALE]
+    two = np.linalg.lstsq(
+        np.array(
+            [[0.5 * (right + left), 0.5 * (right - left)] for right, left in body.sent[3000:]]
+        ),
+        np.array([creeping(right, left) - exact(right, left) for right, left in body.sent[3000:]]),
+        rcond=None,
+    )
+    assert gains[CREEP] < -0.02
+    best = np.sqrt(two[1][0] / 3000.0)
+    assert rms(after[3000:]) < 0.7 * best
 
 
 @pytest.mark.slow
@@ -283,8 +311,20 @@ def test_a_rollback_restores_gains_and_authority():
 
 
 def test_weights_of_another_shape_are_rejected():
-    with pytest.raises(ValueError, match=r'\(6, 5\): got \(25,\)'):
+    with pytest.raises(ValueError, match=r'\(9, 8\): got \(25,\)'):
         Body(exact).correction.set_weights(np.zeros(25))
+
+
+def test_weights_without_creep_are_accepted():
+    """Model files of 0.2.0 have five rows."""
+    body = Body(miscalibrated, noise=0.01)
+    body.run(20.0)
+    known, weights = [0, 1, *range(GYRO_SCALE, 8)], body.correction.get_weights()
+    former = np.vstack([weights[0, known], weights[1:][np.ix_(known, known)]])
+    other = Body(exact).correction
+    other.set_weights(former)
+    np.testing.assert_array_equal(other.estimate[known], former[0])
+    np.testing.assert_array_equal(other.estimate[CREEP:GYRO_SCALE], 0.0)
 
 
 @pytest.mark.parametrize('case', ['disturbed', 'at rest'])
