@@ -45,6 +45,9 @@ TERM_NAMES = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
 FRICTION_WEIGHTS = 'friction.coefficients'
 """Name of the weights of the friction term."""
 
+INERTIA_WEIGHTS = 'inertia.coefficients'
+"""Name of the weights of the inertia term."""
+
 MAX_SMOOTHING = 100.0
 """Largest width epsilon of the compensator, rad/s."""
 
@@ -117,6 +120,31 @@ class FrictionTermParameters(Parameters):
 
 
 @dataclass(frozen=True)
+class InertiaTermParameters(Parameters):
+    """Adaptation of the inertia in the estimate g, E24.
+
+    A torque drive whose inertia is not the assumed one accelerates by another u: what is missing
+    is proportional to the acceleration that is asked for, which no function of the speeds (31) is.
+    g gets one more basis, as for the friction (E23):
+
+        g_i = ... + theta_i^T a,    a_j = r'_j/a_0,    d theta_i/dt = gamma_i a delta_i
+
+    with the r' of both wheels, because the inertia of the body couples them.
+    """
+
+    gamma: float = parameter(
+        0.0,
+        'adaptation gain of the inertia in g, as gamma of (77)-(78) for a basis of size one; for '
+        'a torque drive. 0: without this basis',
+        '1/s²',
+        (0.0, 1e4),
+        dynamic=True,
+    )
+    acceleration: ClassVar[float] = 50.0
+    """a_0, rad/s²."""
+
+
+@dataclass(frozen=True)
 class Nt3fsMpcParameters(Parameters):
     """The law and its parts, each of which can be disabled."""
 
@@ -145,6 +173,8 @@ class Nt3fsMpcParameters(Parameters):
         AdaptationParameters, fixed=('sigma_modification', 'dead_zone', 'step_limit')
     )
     friction: FrictionTermParameters = group(FrictionTermParameters)
+    # A velocity drive has its own controller of the inertia.
+    inertia: InertiaTermParameters = group(InertiaTermParameters, fixed=('gamma',))
     predictive: PredictiveParameters = group(PredictiveParameters)
 
     @property
@@ -189,34 +219,52 @@ def fitting_gain(parameters: Nt3fsMpcParameters, drive: str) -> tuple[float, flo
     return total - bound / smoothing, smoothing
 
 
-class FrictionTables(NamedTuple):
-    """Basis and coefficients, for kernels."""
+class LinearTerm(NamedTuple):
+    """Basis and coefficients of a term that is linear in its own parameters, for kernels."""
 
     basis: Array
-    """s of the last evaluation, shape (n,)."""
+    """Of the last evaluation, shape (n,)."""
     coefficients: Array
-    """phi, rad/s², shape (n, n): row i for the estimate of wheel i."""
+    """rad/s², shape (n, n): row i for the estimate of wheel i."""
 
     @classmethod
-    def of(cls, wheels: int) -> 'FrictionTables':
-        """Return tables of a friction that is not known."""
+    def of(cls, wheels: int) -> 'LinearTerm':
+        """Return a term of which nothing is known."""
         return cls(np.zeros(wheels), np.zeros((wheels, wheels)))
 
 
 @kernel
-def add_friction(reference: Array, width: float, tables: FrictionTables, outputs: Array) -> None:
+def add_friction(reference: Array, width: float, term: LinearTerm, outputs: Array) -> None:
     """Write the basis s of E23, and add the friction to the estimates g of (31).
 
     reference : shape (n,), r, rad/s
     width     : w, rad/s
     outputs   : shape (n,), g, rad/s², updated
     """
-    basis, coefficients = tables.basis, tables.coefficients
-    for j in range(basis.size):
-        basis[j] = math.tanh(reference[j] / width)
+    for j in range(term.basis.size):
+        term.basis[j] = math.tanh(reference[j] / width)
+    add_term(term, outputs)
+
+
+@kernel
+def add_inertia(rate: Array, acceleration: float, term: LinearTerm, outputs: Array) -> None:
+    """Write the basis a of E24, and add the wrong inertia to the estimates g of (31).
+
+    rate         : shape (n,), r', rad/s²
+    acceleration : a_0, rad/s²
+    outputs      : shape (n,), g, rad/s², updated
+    """
+    for j in range(term.basis.size):
+        term.basis[j] = rate[j] / acceleration
+    add_term(term, outputs)
+
+
+@kernel
+def add_term(term: LinearTerm, outputs: Array) -> None:
+    """Add a term at its basis to ``outputs``, rad/s², shape (n,)."""
     for i in range(outputs.size):
-        for j in range(basis.size):
-            outputs[i] += coefficients[i, j] * basis[j]
+        for j in range(term.basis.size):
+            outputs[i] += term.coefficients[i, j] * term.basis[j]
 
 
 # -- law (66)-(67) and compensator (81)-(82) --------------------------------------------------
@@ -396,7 +444,8 @@ class Nt3fsMpcController:
         self._parameters = parameters
         self._period = 1.0 / parameters.rate
         self.fuzzy = FuzzyEstimator(parameters.fuzzy, parameters.adaptation, outputs=2)
-        self._friction = FrictionTables.of(wheels=2)
+        self._friction = LinearTerm.of(wheels=2)
+        self._inertia = LinearTerm.of(wheels=2)
         self.predictive = PredictiveController(
             parameters.predictive, self._period, parameters.law.gain, outputs=2
         )
@@ -421,10 +470,12 @@ class Nt3fsMpcController:
         self.fuzzy.warm_up()
         self.predictive.warm_up()
         coefficients, friction = self.fuzzy.coefficients, self.friction.copy()
+        inertia = self.inertia.copy()
         self.step(np.zeros(2), np.zeros(2), np.zeros(2), self._period)
         self.set_applied(self.command, saturated=True)
         self.fuzzy.reset()
         self.fuzzy.coefficients, self.friction[:] = coefficients, friction
+        self.inertia[:] = inertia
         self.reset()
         self.terms[:] = 0.0
         self.command[:] = 0.0
@@ -439,13 +490,16 @@ class Nt3fsMpcController:
     def get_weights(self) -> dict[str, Array]:
         """Return all adapted arrays by name: coefficients of g, and predictor weights."""
         weights = self.predictive.get_weights()
-        return {
+        found = {
             'fuzzy.coefficients': self.fuzzy.coefficients,
             FRICTION_WEIGHTS: self.friction.copy(),
-        } | {f'predictive.{name}': value for name, value in weights.items()}
+        }
+        if self._gains.inertia.gamma > 0.0:
+            found[INERTIA_WEIGHTS] = self.inertia.copy()
+        return found | {f'predictive.{name}': value for name, value in weights.items()}
 
     def set_weights(self, weights: Mapping[str, Array]) -> None:
-        """Use weights as returned by :meth:`get_weights`; those of the friction may be missing.
+        """Use weights of :meth:`get_weights`; those of friction and inertia may be missing.
 
         Values that do not fit raise ValueError; the predictor is then unchanged.
         """
@@ -456,20 +510,24 @@ class Nt3fsMpcController:
         }
         if 'fuzzy.coefficients' not in weights:
             raise ValueError('fuzzy.coefficients are missing')
-        friction = np.asarray(weights.get(FRICTION_WEIGHTS, np.zeros((2, 2))), dtype=np.float64)
-        if friction.shape != self.friction.shape or not np.isfinite(friction).all():
-            raise ValueError(
-                f'{FRICTION_WEIGHTS} must be finite, of shape {self.friction.shape}: '
-                f'got shape {friction.shape}'
-            )
+        terms = {FRICTION_WEIGHTS: self.friction, INERTIA_WEIGHTS: self.inertia}
+        given = {}
+        for name, term in terms.items():
+            given[name] = np.asarray(weights.get(name, np.zeros((2, 2))), dtype=np.float64)
+            if given[name].shape != term.shape or not np.isfinite(given[name]).all():
+                raise ValueError(
+                    f'{name} must be finite, of shape {term.shape}: got shape {given[name].shape}'
+                )
         self.fuzzy.coefficients = weights['fuzzy.coefficients']
         self.predictive.set_weights(predictive)
-        self.friction[:] = friction
+        for name, term in terms.items():
+            term[:] = given[name]
 
     def reset_estimate(self) -> None:
         """Discard what is known of the estimate g."""
         self.fuzzy.reset()
         self.friction[:] = 0.0
+        self.inertia[:] = 0.0
 
     def reset(self) -> None:
         """Start a new run; the weights are kept."""
@@ -481,6 +539,11 @@ class Nt3fsMpcController:
     def friction(self) -> Array:
         """Coefficients of the Coulomb friction in g (E23), rad/s², shape (2, 2)."""
         return self._friction.coefficients
+
+    @property
+    def inertia(self) -> Array:
+        """Coefficients of the wrong inertia in g (E24), rad/s², shape (2, 2)."""
+        return self._inertia.coefficients
 
     @property
     def certificate(self) -> CertificateReading:
@@ -521,6 +584,7 @@ class Nt3fsMpcController:
             self.predictive.signals,
             self.fuzzy.tables,
             self._friction,
+            self._inertia,
             self._output,
         ):
             raise ValueError(f'speeds must be finite: got {speeds}')
@@ -546,6 +610,7 @@ class Nt3fsMpcController:
     def _law_gains(self) -> 'LawGains':
         parameters, law = self._parameters, self._parameters.law
         adaptation = parameters.adaptation
+        linear = self.fuzzy.gains._replace(radius=math.sqrt(2.0) * adaptation.radius)
         return LawGains(
             use_fuzzy=parameters.use_fuzzy,
             adapted=parameters.use_fuzzy and adaptation.enabled,
@@ -554,10 +619,10 @@ class Nt3fsMpcController:
             bound=parameters.compensated_bound if law.compensator else 0.0,
             smoothing=law.smoothing,
             fuzzy=self.fuzzy.gains,
-            friction=self.fuzzy.gains._replace(
-                gamma=parameters.friction.gamma, radius=math.sqrt(2.0) * adaptation.radius
-            ),
+            friction=linear._replace(gamma=parameters.friction.gamma),
             friction_width=parameters.friction.width,
+            inertia=linear._replace(gamma=parameters.inertia.gamma),
+            inertia_acceleration=parameters.inertia.acceleration,
         )
 
 
@@ -573,6 +638,8 @@ class LawGains(NamedTuple):
     fuzzy: AdaptationGains
     friction: AdaptationGains
     friction_width: float
+    inertia: AdaptationGains
+    inertia_acceleration: float
 
 
 class LawOutput(NamedTuple):
@@ -598,7 +665,8 @@ def step_law(
     gains: LawGains,
     predictive: Signals,
     fuzzy: FuzzyTables,
-    friction: FrictionTables,
+    friction: LinearTerm,
+    inertia: LinearTerm,
     output: LawOutput,
 ) -> bool:
     """Write terms and command of the law, and adapt the fuzzy systems.
@@ -609,7 +677,7 @@ def step_law(
     dt         : time since the last step, s
     saturated  : whether a limit changed the last command
     predictive : signals of the predictive term
-    fuzzy, friction : parts of the estimate g by (31) and E23, adapted
+    fuzzy, friction, inertia : parts of the estimate g by (31), E23 and E24, adapted
     output     : overwritten
     """
     fuzzy_estimate, adaptation_error = output.estimate, output.adaptation_error
@@ -619,6 +687,9 @@ def step_law(
     has_friction = gains.use_fuzzy and gains.friction.gamma > 0.0
     if has_friction:
         add_friction(reference, gains.friction_width, friction, fuzzy_estimate)
+    has_inertia = gains.use_fuzzy and gains.inertia.gamma > 0.0
+    if has_inertia:
+        add_inertia(reference_rate, gains.inertia_acceleration, inertia, fuzzy_estimate)
     law_terms(
         speeds,
         reference,
@@ -640,6 +711,8 @@ def step_law(
         adapt(fuzzy.coefficients, fuzzy.phi, adaptation_error, dt, gains.fuzzy)
         if has_friction:
             adapt(friction.coefficients, friction.basis, adaptation_error, dt, gains.friction)
+        if has_inertia:
+            adapt(inertia.coefficients, inertia.basis, adaptation_error, dt, gains.inertia)
     return True
 
 

@@ -20,18 +20,20 @@ from functools import lru_cache
 
 import numpy as np
 
-from t3mpc_ros.control.control_law import Nt3fsMpcParameters
+from t3mpc_ros.control.control_law import InertiaTermParameters, Nt3fsMpcParameters
 from t3mpc_ros.control.controller import SwitchingTracker
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
+    FRICTION,
     JUMP,
     BaselineController,
     NominalModel,
     Observation,
+    WheelLoads,
     future_jump,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
-from t3mpc_ros.parameters.table import Parameters, parameter
+from t3mpc_ros.parameters.table import Parameters, group, parameter
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,12 @@ class ProposedParameters(Nt3fsMpcParameters):
         1.0,
         'inertia by which accelerations become the torques of a torque drive, over the true one',
         bounds=(0.1, 10.0),
+    )
+    inertia: InertiaTermParameters = group(InertiaTermParameters)
+    nominal_loads: bool = parameter(
+        False,
+        'whether what friction and turning do to the nominal robot is cancelled, so that NT3FS '
+        'learns the rest',
     )
     random_predictor: bool = parameter(
         False,
@@ -76,6 +84,7 @@ class ProposedController(BaselineController):
             self._randomize_predictor(self._random)
         self.estimate_dead_time = table.estimate_dead_time
         self.inertia_error = table.inertia_error
+        self._loads = WheelLoads(nominal_model) if table.nominal_loads else None
         self._begun = False
         self._steps = 0
         """Control periods since the first observation."""
@@ -85,6 +94,11 @@ class ProposedController(BaselineController):
         self._slope: Array = np.zeros(2)
         self.terms = self._tracker.law.terms
         """The law's terms of the last step, rows as in ``TERM_NAMES``, rad/s², shape (5, 2)."""
+
+    @property
+    def knowledge(self) -> list[str]:
+        """What it knows, see :attr:`BaselineController.knowledge`."""
+        return [*super().knowledge, *([FRICTION] if self._loads else [])]
 
     def get_weights(self) -> dict[str, Array]:
         """Return fuzzy coefficients and predictor weights, as a model file keeps them."""
@@ -115,13 +129,18 @@ class ProposedController(BaselineController):
             self._announced = max(self._announced, last)
         self._expected = observation.next_reference.copy()
         self._slope = (observation.next_reference - observation.reference) / self._period
-        return self._tracker.step(
+        u = self._tracker.step(
             now_ns,
             observation.speeds,
             observation.reference,
             observation.next_reference,
             self._period,
         )
+        if self._loads is None:
+            return u
+        # Half-way between the measured speeds, which are noisy, and the followed ones.
+        error = self._tracker.law.predictive.signals.errors
+        return np.asarray(u - self._loads(observation.speeds - 0.5 * error))
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:
         """Take note of the u that the drive's limits let through."""

@@ -18,8 +18,8 @@ import pytest
 
 from t3mpc_ros.control.control_law import (
     FRICTION_WEIGHTS,
-    FrictionTables,
     FrictionTermParameters,
+    LinearTerm,
     Nt3fsMpcController,
     Nt3fsMpcParameters,
     add_friction,
@@ -51,7 +51,7 @@ def track(law, seconds, friction=FRICTION):
 
 def test_the_estimate_is_the_fuzzy_one_plus_the_friction_e23():
     rng = np.random.default_rng(1)
-    tables = FrictionTables(np.zeros(2), rng.normal(size=(2, 2)))
+    tables = LinearTerm(np.zeros(2), rng.normal(size=(2, 2)))
     reference, fuzzy = rng.normal(size=(2, 2))
     estimate = fuzzy.copy()
     add_friction(reference, 0.3, tables, estimate)
@@ -135,7 +135,7 @@ def test_a_model_from_before_the_term_has_no_friction():
 
 def test_at_the_width_friction_has_76_percent():
     assert np.tanh(1.0) == pytest.approx(0.76, abs=0.005)
-    tables = FrictionTables(np.zeros(1), np.ones((1, 1)))
+    tables = LinearTerm(np.zeros(1), np.ones((1, 1)))
     estimate, width = np.zeros(1), FrictionTermParameters().width
     add_friction(np.array([width]), width, tables, estimate)
     assert estimate[0] == pytest.approx(0.76, abs=0.005)

@@ -58,10 +58,12 @@ from t3mpc_ros.evaluation.methods import (
     FULL_WRONG,
     LMS,
     OFFSET_FREE,
+    PAPER_PARTS,
     RAMP,
     SHAPED,
     SHAPED_IN_TIME,
     default_methods,
+    methods,
     methods_for,
 )
 from t3mpc_ros.evaluation.metrics import OVERALL, SETTLED, measure
@@ -523,3 +525,16 @@ def test_counts_of_disordered_reports_are_whole_and_possible(name, least, values
             ValueError, match=rf'{name} must be a whole number of at least {least}'
         ):
             LinkFaults(**{name: value})
+
+
+def test_full_on_the_torque_drive_states_what_it_knows():
+    known = methods_for('torque')
+    full, paper = known[FULL], known[PAPER_PARTS]
+    assert next(iter(known)) == FULL
+    assert not full.parameters.predictive.enabled
+    assert paper.parameters == methods('torque')[FULL].parameters
+    model = Scenario('torque', 'nominal', 1).nominal_model()
+    assert 'nominal friction' in full(model).knowledge
+    assert 'nominal friction' not in paper(model).knowledge
+    assert {FULL, PAPER_PARTS} <= {*default_methods('torque')}
+    assert 'full with MPC' not in default_methods('torque')

@@ -554,7 +554,10 @@ LAST = (
     '.fuzzy.tables.phi',
 )
 """What the last step of the law has written."""
-ALPHA = '.fuzzy.tables.coefficients', '.fuzzy._coefficients', '._friction.coefficients'
+ALPHA = (
+    *('.fuzzy.tables.coefficients', '.fuzzy._coefficients'),
+    *('._friction.coefficients', '._inertia.coefficients'),
+)
 MACHINE = tuple(
     f'._{each}.{name}'
     for each in ('predictors[0].state', 'predictors[1].state', 'wheels[0]', 'wheels[1]')
