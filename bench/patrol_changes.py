@@ -204,6 +204,7 @@ def planted_row(
     named = [each for each in right if each.kind.name.lower() == planted.kind]
     best = (named or right or [None])[0]
     return {
+        **localization_errors(record),
         'sight': sight,
         'found': found - sight,
         'named': bool(named),
@@ -212,7 +213,6 @@ def planted_row(
         'size': size,
         'size_found': math.nan if best is None else best.size,
         'confidence': math.nan if best is None else best.confidence,
-        **localization_errors(record),
     }
 
 

@@ -87,8 +87,9 @@ class ParticleFilterParameters(Parameters):
         source=NAMES,
     )
     yaw_drift: float = parameter(
-        1e-4,
-        'variance of the yaw per time: bias of a gyro, for which turn and travel say nothing',
+        1e-5,
+        'variance of the yaw per time: bias of a gyro, for which turn and travel say nothing; from '
+        '3e-5 on the corrections of the pose look like contacts',
         'rad²/s',
         (0.0, 1.0),
     )
