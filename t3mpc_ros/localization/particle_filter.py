@@ -88,8 +88,8 @@ class ParticleFilterParameters(Parameters):
     )
     yaw_drift: float = parameter(
         1e-5,
-        'variance of the yaw per time: bias of a gyro, for which turn and travel say nothing; from '
-        '3e-5 on the corrections of the pose look like contacts',
+        'variance of the yaw per time: bias of a gyro, for which turn and travel say nothing; '
+        'from 3e-5 on the corrections of the pose look like contacts',
         'rad²/s',
         (0.0, 1.0),
     )
