@@ -227,7 +227,7 @@ def _check_launch(file, *arguments):
     assert nodes_of(path, given, share=ROOT)
 
 
-OTHER_PACKAGES = 'teleop_twist_joy', 'teleop_twist_keyboard', 'rmw_zenoh_cpp'
+OTHER_PACKAGES = 'nav2_map_server', 'teleop_twist_joy', 'teleop_twist_keyboard', 'rmw_zenoh_cpp'
 
 
 def _check(command, capsys, complete=True):

@@ -472,7 +472,8 @@ def test_errors_of_faults_are_named_and_judged_by_the_worst(caught):
     astray = fault_page.page([OUTCOME, other | lost])
     assert (
         '<div class="verdict open"><p class="headline">Every fault stays within the limits, but '
-        'the odometry is wrong after 1 of 2, by up to 1.03 m, 28.6° (brown_out)' in astray
+        'the odometry is wrong at the end of 1 of 2 runs, by up to 1.03 m, 28.6° (brown_out, '
+        in astray
     ), 'it was green: every fault stays bounded'
     worse = fault_page.page([OUTCOME, other | {'verdict': 'unbounded', 'undetected': ['tilt']}])
     assert 'Not every fault stays bounded' in worse

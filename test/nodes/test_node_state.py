@@ -341,12 +341,12 @@ def test_levels_of_the_simulated_robot(start):
         node._state = found
         assert diagnostic_level(node) == level, found
     node._state = robot_conditions(node._state)[0][0]
-    node._scheduler = Instead(node._scheduler, skipped=1)
+    node._scheduler.skipped += 1
     text = 'processor overloaded: samples were skipped'
     assert report(node) == (WARN, text)
     # One skipped sample is no warning for ever, and never hides why the robot stands.
     assert report(node) == (OK, 'following commands')
-    node._scheduler = Instead(node._scheduler, skipped=2)
+    node._scheduler.skipped += 1
     node._state = node._state._replace(reason=SLIP_STOP_REASON)
     assert report(node) == (WARN, f'{SLIP_STOP_REASON}; {text}')
     values = dict(node.produce_diagnostics()[2])
@@ -423,7 +423,7 @@ def test_levels_of_the_reference_generator(start):
     call(node, '~/pause', data=False)
     node._path_clock.rate = 0.0
     assert report(node) == (OK, 'waiting for the robot')
-    node._scheduler = Instead(node._scheduler, skipped=1)
+    node._scheduler.skipped += 1
     assert diagnostic_level(node) == WARN
     node.clock_started = lambda: False
     assert report(node) == (WARN, NO_CLOCK)
