@@ -168,6 +168,7 @@ def test_a_reading_counts_at_the_pose_of_the_last_odometry():
     assert np.array_equal(controller.keep_out.map.grid.cells, wanted.map.grid.cells)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(
     ('x', 'yaw', 'forgotten'), [(0.2, 0.0, False), (0.3, 0.0, True), (0.0, 0.6, True)]
 )

@@ -211,6 +211,7 @@ class KeptOut:
         return len(self.speeds)
 
 
+@pytest.mark.compiled
 def test_all_silent_brakes_stops_and_goes_on_by_itself():
     robot = KeptOut().run(0.5, sensors=())
     assert robot.reasons[-1] is Reason.TOO_FEW_RANGES  # none before the first reading

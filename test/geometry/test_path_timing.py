@@ -207,6 +207,7 @@ def test_late_points_stop_the_robot_in_time():
     assert np.abs(np.diff(speeds)).max() <= limits.linear_acceleration * PERIOD
 
 
+@pytest.mark.compiled
 def test_a_path_that_grows_after_a_rest_begins_at_rest():
     """Where the rest came in the last part of a plan, it began at the speeds of long before."""
     for length in np.arange(0.9, 1.3, 0.01):
