@@ -146,7 +146,7 @@ class Event:
     present: bool = True
 
 
-@dataclass
+@dataclass(eq=False)
 class Place:
     """Cells near each other with evidence of the same kind."""
 
@@ -237,7 +237,7 @@ class ChangeDetector:
             if place.event is None and stamp_ns - place.last_ns > limit_ns:
                 self._remove(place)
         changed = False
-        touched: dict[int, Place] = {}
+        touched: dict[Place, None] = {}
         for row in map(BeamEvidence._make, found.tolist()):
             changed |= self._pass(row)
             for missing, evidence, x, y in (
@@ -246,12 +246,13 @@ class ChangeDetector:
             ):
                 cell = math.floor(x / CELL), math.floor(y / CELL)
                 if evidence > 0.0:
-                    place = self._support(missing, cell, evidence, stamp_ns)
-                    touched[id(place)] = place
+                    touched[self._support(missing, cell, evidence, stamp_ns)] = None
                 elif evidence < 0.0:
                     changed |= self._oppose(missing, around(cell), -evidence)
-        for place in touched.values():
-            changed |= self._seen(place, stamp_ns, pose)
+        for place in touched:
+            # Not what another beam of the same readings has ended, or merged with its neighbour.
+            if place in self._places:
+                changed |= self._seen(place, stamp_ns, pose)
         return changed
 
     def _pass(self, row: 'BeamEvidence') -> bool:

@@ -165,3 +165,20 @@ def test_equal_readings_give_equal_events():
     first, second = (Patrol(seed=5).drive(changed, ROUND) for _ in range(2))
     assert first == second
     assert first
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize('seed', range(4))
+def test_no_readings_of_a_fan_of_beams_are_too_much(seed):
+    """One beam saw a thing over which another one passed: its place had no cell, and no middle."""
+    generator = np.random.default_rng(seed)
+    detector = ChangeDetector(ChangeParameters(), SEEN, MODEL)
+    origin = np.column_stack([np.zeros((60, 2)), np.linspace(-1.0, 1.0, 60)])
+    limits = np.tile([LEAST, MOST], (60, 1))
+    for k in range(100):
+        beams = Beams(origin, generator.uniform(0.05, 0.9, 60), limits)
+        stamp_ns = round(PERIOD * k * NANOSECONDS)
+        detector.add(stamp_ns, on_ellipse(PERIOD * k), np.diag(np.square(DEVIATIONS)), beams)
+    for each in detector.changes:
+        assert math.isfinite(each.x + each.y + each.size)
+        assert 0.0 < each.confidence <= 1.0
