@@ -130,22 +130,6 @@ class Change(NamedTuple):
         )
 
 
-@dataclass
-class Event:
-    """A change, as far as it is known."""
-
-    number: int
-    kind: ChangeKind
-    first_ns: int
-    found_ns: int
-    x: float = 0.0
-    y: float = 0.0
-    size: float = 0.0
-    confidence: float = 0.0
-    last_ns: int = 0
-    present: bool = True
-
-
 @dataclass(eq=False)
 class Place:
     """Cells near each other with evidence of the same kind."""
@@ -158,7 +142,8 @@ class Place:
     views: int = 0
     seen_from: Pose | None = None
     """Pose of the robot in the last view."""
-    event: Event | None = None
+    event: int | None = None
+    """Index of its event."""
 
     @property
     def evidence(self) -> float:
@@ -185,26 +170,12 @@ class ChangeDetector:
         self._places: list[Place] = []
         self._owners: dict[bool, dict[Cell, Place]] = {False: {}, True: {}}
         """Place of each cell, by whether something is missing there."""
-        self._events: list[Event] = []
+        self._changes: list[Change] = []
 
     @property
     def changes(self) -> tuple[Change, ...]:
         """The events, in the order in which they were found."""
-        return tuple(
-            Change(
-                each.number,
-                each.kind,
-                each.x,
-                each.y,
-                each.size,
-                each.confidence,
-                each.first_ns,
-                each.last_ns,
-                each.found_ns,
-                each.present,
-            )
-            for each in self._events
-        )
+        return tuple(self._changes)
 
     def forget(self) -> None:
         """Forget what is no event yet: the robot was not where it took itself to be."""
@@ -287,12 +258,11 @@ class ChangeDetector:
     def _end(self, place: Place) -> bool:
         """Remove a place without evidence; return whether it was an event."""
         self._places.remove(place)
-        event = place.event
-        if event is None:
+        if place.event is None:
             return False
-        event.present = False
-        if event.kind is ChangeKind.NEW:
-            event.kind = ChangeKind.MOVING
+        event = self._changes[place.event]
+        kind = ChangeKind.MOVING if event.kind is ChangeKind.NEW else event.kind
+        self._changes[place.event] = event._replace(kind=kind, present=False)
         return True
 
     def _remove(self, place: Place) -> None:
@@ -340,26 +310,32 @@ class ChangeDetector:
             place.views += 1
             place.seen_from = pose
         confidence = 1.0 / (1.0 + math.exp(self.parameters.prior - place.evidence))
-        event = place.event
         centres = CELL * (np.array(list(place.cells)) + 0.5)
         x, y = centres.mean(axis=0).tolist()
-        if event is None:
+        if place.event is None:
             if (
                 confidence < self.parameters.min_confidence
                 or place.views < self.parameters.min_views
                 or stamp_ns - place.first_ns < self.parameters.min_duration * NANOSECONDS
             ):
                 return False
-            event = place.event = self._event_at(place, x, y, stamp_ns)
-        event.x, event.y, event.last_ns, event.present = x, y, stamp_ns, True
-        event.confidence = max(confidence, event.confidence)
+            place.event = self._event_at(place, x, y, stamp_ns)
+        event = self._changes[place.event]
         apart = centres[:, None] - centres[None, :]
-        event.size = max(event.size, float(np.hypot(apart[..., 0], apart[..., 1]).max()) + CELL)
+        size = float(np.hypot(apart[..., 0], apart[..., 1]).max()) + CELL
+        self._changes[place.event] = event._replace(
+            x=x,
+            y=y,
+            size=max(size, event.size),
+            confidence=max(confidence, event.confidence),
+            last_ns=stamp_ns,
+            present=True,
+        )
         return True
 
-    def _event_at(self, place: Place, x: float, y: float, stamp_ns: int) -> Event:
-        """Return the event of a place: one that ended nearby, or a new one."""
-        for event in reversed(self._events):
+    def _event_at(self, place: Place, x: float, y: float, stamp_ns: int) -> int:
+        """Return the index of the event of a place: one that ended nearby, or a new one."""
+        for event in reversed(self._changes):
             away = math.hypot(event.x - x, event.y - y)
             if event.present or (event.kind is ChangeKind.MISSING) is not place.missing:
                 continue
@@ -370,11 +346,13 @@ class ChangeDetector:
                 and stamp_ns - event.last_ns <= AGAIN_TIME * NANOSECONDS
             )
             if again:
-                return event
+                return event.number - 1
         kind = ChangeKind.MISSING if place.missing else ChangeKind.NEW
-        event = Event(len(self._events) + 1, kind, place.first_ns, stamp_ns)
-        self._events.append(event)
-        return event
+        number, first_ns = len(self._changes) + 1, place.first_ns
+        self._changes.append(
+            Change(number, kind, x, y, 0.0, 0.0, first_ns, stamp_ns, stamp_ns, present=True)
+        )
+        return number - 1
 
 
 REACH_CELLS = round(ChangeParameters.reach / CELL)
