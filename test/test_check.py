@@ -217,7 +217,7 @@ def test_time():
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_pytest_notes_is_what_is_repeated(checkout, tmp_path, monkeypatch):
     """With the plugin and worker processes of the real tests, in all stages.
 

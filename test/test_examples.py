@@ -18,6 +18,7 @@ import math
 import numpy as np
 import pytest
 from support.checkout import ROOT, load_example
+from support.long_tests import few_of
 
 import t3mpc_ros as t3
 from t3mpc_ros.geometry.kinematics import WheelGeometry
@@ -25,6 +26,8 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry
 pytestmark = pytest.mark.slow
 
 EXAMPLES = sorted((ROOT / 'examples').glob('*.py'))
+NAMES = sorted((path.stem for path in EXAMPLES), key=lambda name: name != 'own_controller')
+"""That of the tutorial first."""
 BAG = ROOT / 'test' / 'golden' / 'stops.mcap'
 
 
@@ -107,7 +110,7 @@ CHECKS = {
 }
 
 
-@pytest.mark.parametrize('name', [path.stem for path in EXAMPLES])
+@pytest.mark.parametrize('name', few_of(NAMES, 4))
 def test_an_example_runs_and_shows_what_it_says(name, tmp_path):
     """Also where its folder is not there yet: those that a reader starts ended with an error."""
     CHECKS[name](load_example(name), tmp_path / 'made')

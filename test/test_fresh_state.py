@@ -45,6 +45,8 @@ CASES = [
     for kind, entry in FRESH.items()
     for name, operation in entry.operations.items()
 ]
+LONG = 'DigitalTwin', 'PaperRobot'
+"""Those with so many parameters that the effect of each takes seconds."""
 OF_PARAMETERS = [pytest.param(entry, id=_name(kind)) for kind, entry in CONFIGURED.items()]
 
 
@@ -80,8 +82,17 @@ def test_a_used_object_is_as_new(entry, operation):
     check_fresh(entry, operation)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('entry', OF_PARAMETERS)
+@pytest.mark.parametrize(
+    'entry',
+    [
+        pytest.param(
+            entry,
+            id=_name(kind),
+            marks=pytest.mark.long if _name(kind) in LONG else pytest.mark.slow,
+        )
+        for kind, entry in CONFIGURED.items()
+    ],
+)
 def test_replaced_parameters_are_those_of_a_new_object(entry):
     check_configured(entry)
 

@@ -50,7 +50,7 @@ LISTED = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_missing_is_listed_once_with_its_remedy(tmp_path):
     """By the process that writes the summary, and for several runs at the end of the last."""
     (tmp_path / 'test_users.py').write_text(USERS)

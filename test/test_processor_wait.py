@@ -189,6 +189,7 @@ def test_a_timeout_on_a_quiet_machine_is_a_failure(tmp_path):
 # -- the measure ----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_processes_that_share_a_processor_wait_for_it(busy):
     wait = ProcessorWait()
     end = time.monotonic() + 1.0

@@ -17,6 +17,7 @@ import math
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.chaos.planned_path import FAR_AWAY, PATIENCE, PlannedPath, PlanParameters
 from t3mpc_ros.chaos.pose_reference import PathReferenceParameters
@@ -205,6 +206,7 @@ def test_what_is_placed_ahead_of_it_is_not_touched():
     assert length(rows) > 4.0  # something is in its way every 5 s
 
 
+@pytest.mark.long
 def test_old_places_are_visited_again():
     """The given path is a small circle: what else is entered is due to the visits."""
 
@@ -266,7 +268,7 @@ def test_a_thing_in_the_way_does_not_make_it_forget_a_goal():
 CHARGER = (-1.2, 0.7)
 
 
-@pytest.mark.parametrize('seed', [1, 2, 3])
+@pytest.mark.parametrize('seed', few_of([3, 1, 2]))
 def test_with_a_low_battery_it_is_charged_and_goes_on(seed):
     room = Room()
     generator = np.random.default_rng(seed)

@@ -58,7 +58,7 @@ def ports(tmp_path):
     assert not robot.is_symlink()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bench_session_from_key_to_jog(ports, tmp_path, capsys, monkeypatch):
     """Over pseudo terminals, in the order of docs/robot.md."""
     dongle, robot = ports

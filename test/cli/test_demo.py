@@ -219,6 +219,7 @@ def test_a_wait_shows_progress(tmp_path, monkeypatch):
     assert re.fullmatch(r'controller, \d+ s: controller ready', shown[-1])
 
 
+@pytest.mark.long
 def test_the_demo_names_what_it_waits_for_and_its_own_domain(tmp_path):
     """Two demos at once; their nodes once met in the domain of the caller."""
     folders = [tmp_path / 'one', tmp_path / 'two']

@@ -193,7 +193,7 @@ def walk(request, monkeypatch, capsys, tmp_path):
         yield Walk(emulator, monkeypatch, capsys)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_documented_commands_lead_to_a_driving_robot(walk):
     unset = RobotBench(emulator=walk.bench.emulator)
     unset.drive(4.0, 4.0)

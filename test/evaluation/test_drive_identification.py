@@ -129,6 +129,7 @@ def test_a_known_drive_is_recovered(tmp_path, lag, dead_time, noise, seed):
     assert drive.duration == pytest.approx(40.0, abs=0.1)
 
 
+@pytest.mark.long
 def test_more_noise_gives_a_larger_deviation(tmp_path):
     found = []
     for noise in (0.002, 0.1):

@@ -527,6 +527,7 @@ def test_counts_of_disordered_reports_are_whole_and_possible(name, least, values
             LinkFaults(**{name: value})
 
 
+@pytest.mark.long
 def test_full_on_the_torque_drive_states_what_it_knows():
     known = methods_for('torque')
     full, paper = known[FULL], known[PAPER_PARTS]

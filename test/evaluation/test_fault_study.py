@@ -161,10 +161,10 @@ EXPECTED = {
 }
 
 
-SHORT = ('command_delay 0.1 s', 'gyro_bias_jump 0.35 rad/s')
+SHORT = ('gyro_bias_jump 0.35 rad/s', 'command_delay 0.1 s')
 
 
-@pytest.mark.parametrize('name', few_of(dict.fromkeys((*SHORT, *EXPECTED)), len(SHORT)))
+@pytest.mark.parametrize('name', few_of(dict.fromkeys((*SHORT, *EXPECTED)), 1))
 def test_the_loop_stays_bounded_or_stops_with_a_reason(name):
     """One strength of each fault, and the page says of it what comes out here."""
     (result,) = study_faults([fault_run('chaotic', name)])
@@ -180,12 +180,11 @@ def test_every_fault_is_among_those_expected():
     'course, name',
     few_of(
         [
-            ('straight', 'wheel_blocked both'),
             ('straight', 'collision, head-on'),
+            ('straight', 'wheel_blocked both'),
             ('straight', 'gyro_bias_jump 0.02 rad/s'),
             ('arc', 'collision, at a slant'),
-        ],
-        2,
+        ]
     ),
 )
 def test_undetected_faults_are_named(course, name):
@@ -284,6 +283,7 @@ def two(monkeypatch):
     monkeypatch.setattr(fault_study, 'FAULT_RUNS', made)
 
 
+@pytest.mark.long
 def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     page, numbers = tmp_path / 'page.md', tmp_path / 'numbers.json'
     page.write_text(f'before\n{BEGIN_MARK}\nold\n{END_MARK}\nafter\n')

@@ -554,7 +554,7 @@ def test_many_runs_are_the_same_in_one_process_and_in_two():
             Scenario(robot, 'load change', seed, 2.0),
             MethodSpec(f'P {gain}', Proportional, ProportionalParameters(gain=gain)),
         )
-        for robot in PLANTS
+        for robot in [*PLANTS][:2]
         for seed, gain in ((1, 4.0), (2, 9.0))
     ]
     alone = dict(WorkerPool(1).map(whole, jobs))

@@ -601,6 +601,7 @@ def test_the_markdown_holds_the_numbers_of_the_json(folder):
         assert len({line.count('|') for line in block}) == 1
 
 
+@pytest.mark.long
 def test_nothing_depends_on_the_order_of_the_runs_or_on_a_resume(
     folder, begun, tmp_path, monkeypatch
 ):
@@ -617,6 +618,7 @@ def test_nothing_depends_on_the_order_of_the_runs_or_on_a_resume(
         assert (tmp_path / name).read_text() == (folder / name).read_text(), name
 
 
+@pytest.mark.long
 def test_a_fresh_start_runs_everything_again(folder, begun, tmp_path, monkeypatch):
     monkeypatch.setattr(reproduction, 'write_pictures', lambda *_: {})
     monkeypatch.setattr(reproduction, 'page', lambda *_: '')

@@ -40,7 +40,7 @@ def _run(seed, duration):
         return run_patrol(portrait_points(seed, PortraitParameters()), scenario)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_patrol_with_a_seed_is_repeatable():
     """Every number is equal, bit for bit; another seed gives another path."""
     one, again, other = _run(5, 4.0), _run(5, 4.0), _run(6, 4.0)
@@ -64,7 +64,7 @@ def test_a_patrol_by_the_particle_filter_knows_its_place():
     assert abs(np.cos(turned)) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_planned_path_is_not_ahead_of_the_robot():
     """Once the robot has looked around, it is where its reference is, and drives."""
     scenario = PatrolScenario(seed=4, duration=20.0, world='room', plan=PLANNED)

@@ -135,6 +135,7 @@ def test_a_torque_drive_has_no_dead_time_to_find():
     np.testing.assert_array_equal(late, 0)
 
 
+@pytest.mark.long
 def test_the_node_finds_an_unknown_dead_time_alike():
     scenario = Scenario('servo', 'unknown dead time 60 ms', 2, 30.0)
     settled = slice(1500, None)
@@ -205,6 +206,7 @@ def test_leaving_out_a_part_costs_accuracy_on_the_same_seeds(part, robot):
     assert more.certain
 
 
+@pytest.mark.long
 def test_jumps_left_to_the_program_alone_cost_more_than_a_ramp():
     """Psi_free knows the jump beforehand, but v_p is bounded and K works against it."""
     more = paired(

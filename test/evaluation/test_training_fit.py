@@ -176,6 +176,7 @@ def test_jumps_that_the_law_knows_are_no_errors(tmp_path):
 # -- what is learnt -----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_model_is_fitted_to_all_and_evaluated_by_folds(run, sampled, trained):
     """Each block with the model of the other four, so never with its own data."""
     parameters = run.controller.parameters
@@ -269,6 +270,7 @@ def test_the_model_improves_the_first_seconds(trained, tmp_path):
     assert np.all(better.statuses[0].skill > 0.0)
 
 
+@pytest.mark.long
 def test_several_bags_train_together_and_each_is_a_fold(bag, replayed, tmp_path):
     other = TrainingRun(4, 14.0, **{'predictive.dither': 3.0}).tape.write(tmp_path / 'other')
     both = fit_bags([bag, other])

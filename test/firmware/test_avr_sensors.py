@@ -51,6 +51,7 @@ def run_recorded(bench, seconds):
     return np.array(times), np.unwrap(yaws)
 
 
+@pytest.mark.long
 def test_gyro_rate_and_delay(build):
     """Scale within the 3 % of the data sheet; delay of the filter and of both buses."""
     bench = build(flat={'twin.imu.gyro_offset': 0.0})

@@ -80,6 +80,7 @@ def read_info(boards: Boards) -> Any:
     return boards.request(frames.Poll(0, 0, 2), frames.Poll(0, 0, 2))
 
 
+@pytest.mark.long
 def test_an_erased_robot_moves_only_after_its_settings() -> None:
     """A new chip once followed whatever host came first on the default channel."""
     with contextmanager(booted)(1, True) as boards:

@@ -90,6 +90,7 @@ def signed(boards: Boards, signer: Signer, left: int, right: int) -> Any:
 # -- key ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_key_from_the_console_makes_a_keyed_link(boards: Boards) -> None:
     boards.start()
     assert request(boards, Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
@@ -127,6 +128,7 @@ def test_a_key_from_the_console_makes_a_keyed_link(boards: Boards) -> None:
     assert boards.call('usb_overruns') == 0
 
 
+@pytest.mark.long
 def test_a_flood_on_the_console_does_not_delay_replies(boards: Boards) -> None:
     """50 000 bytes per second, frames and noise, while the robot verifies tags and drives.
 

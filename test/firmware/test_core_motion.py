@@ -184,6 +184,7 @@ def test_drivers_switch_off_when_idle_and_on_before_a_step(robot):
     assert robot.call('unpowered_pulses') == 0
 
 
+@pytest.mark.long
 def test_clock_wrap_after_hours_at_rest_has_no_effect(robot):
     """2**32 us later an old time stamp equals now, for the idle time and the command age."""
     assert robot.set(core.IDLE_OFF, 1000) == (core.OK, 1000)

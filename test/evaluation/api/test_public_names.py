@@ -18,6 +18,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 import t3mpc_ros as t3
 from t3mpc_ros.missing_library import EXTRAS, REQUIREMENTS
 
@@ -41,6 +43,7 @@ def test_the_import_loads_no_library():
 STUDIES = ('paper.reproduce', 'tuning.tune_methods', 'comparison_page', 'patrol.patrol_comparison')
 
 
+@pytest.mark.long
 def test_the_extra_of_comparisons_is_enough_for_them():
     """``t3mpc paper`` needed the libraries for bags, which its extra does not install."""
     there = {*EXTRAS['compare']} | {*REQUIREMENTS} - {*itertools.chain(*EXTRAS.values())}

@@ -21,6 +21,7 @@ import traceback
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 import t3mpc_ros as t3
 
@@ -218,7 +219,7 @@ def test_faults_of_ones_own_are_checked_when_they_are_made(kind, given, text):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('line', ['', 'name = __name__\n'])
+@pytest.mark.parametrize('line', few_of(['', 'name = __name__\n']))
 def test_a_script_without_a_guard_gets_a_sentence(tmp_path, line):
     """Worker processes run the script again: without its guard they would start workers.
 
