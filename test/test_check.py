@@ -139,7 +139,7 @@ def check(checkout, plan, *arguments):
 @pytest.mark.parametrize(
     'arguments, stages, cases',
     [
-        ([], [*STAGES, 'pytest', 'pytest'], CASES + LATER),
+        pytest.param([], [*STAGES, 'pytest', 'pytest'], CASES + LATER, marks=pytest.mark.long),
         (['--quick'], STAGES, CASES[::4]),
         (['-k', 'some test'], STAGES, CASES[::4]),
         (['--long', '2/7'], ['pytest'], [case for case in CASES if {*case[0]} <= {'pytest 1'}]),

@@ -45,7 +45,7 @@ CASES = [
     for kind, entry in FRESH.items()
     for name, operation in entry.operations.items()
 ]
-LONG = 'DigitalTwin', 'PaperRobot'
+LONG = 'Controller', 'DigitalTwin', 'PaperRobot'
 """Those with so many parameters that the effect of each takes seconds."""
 OF_PARAMETERS = [pytest.param(entry, id=_name(kind)) for kind, entry in CONFIGURED.items()]
 

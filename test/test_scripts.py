@@ -113,8 +113,8 @@ class Checkout:
         self.notes = folder / 'notes'
         self.bin = folder / 'bin'
         self.python(self.bin, '3.12.3')
-        tools = 'bash cat chmod cp dirname env flock grep locale mkdir mktemp mv nproc readlink rm'
-        tools += ' sed setsid sha256sum sleep sort tail uname'
+        tools = 'bash cat chmod cp dirname env flock grep locale mkdir mktemp mv'
+        tools += ' nice nproc readlink rm sed setsid sha256sum sleep sort tail uname'
         for tool in tools.split():
             (self.bin / tool).symlink_to(shutil.which(tool))
         # The sleep between two looks at a command is shortened.
@@ -205,6 +205,7 @@ SOURCES = 'requirements.txt', 'setup.py', 'config/fastdds_loopback.xml', 'script
 
 
 @pytest.mark.parametrize(('names',), few_of([(SOURCES[:2],), (SOURCES[2:],)]))
+@pytest.mark.long
 def test_a_stale_environment_is_updated(names, checkout):
     checkout.run('t3mpc')
     checkout.done()
@@ -223,6 +224,7 @@ def test_compiled_files_beside_the_launch_file_are_ignored(checkout):
     assert checkout.run('t3mpc').returncode == 0
 
 
+@pytest.mark.long
 def test_a_moved_checkout_or_new_python_gets_a_new_environment(checkout, tmp_path):
     checkout.run('t3mpc')
     checkout.root = checkout.root.rename(tmp_path / 'moved')

@@ -38,6 +38,7 @@ def collect(*words):
     return [line for line in done.stdout.splitlines() if '.py::' in line]
 
 
+@pytest.mark.long
 def test_the_default_set_is_a_part_that_needs_no_selection():
     """``colcon test`` gives no selection; scripts/check selects by marker and runs everything."""
     # The import of all of them takes seconds; these begin with some letters.

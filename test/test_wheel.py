@@ -77,6 +77,7 @@ def installed(wheel, tmp_path_factory):
     return folder / 'env'
 
 
+@pytest.mark.long
 def test_a_build_that_was_interrupted_can_be_repeated(source, tmp_path):
     """Ctrl-C in a set-up left a folder behind, at which every later set-up ended."""
     left = f'build/bdist.{get_platform()}/wheel/t3mpc_ros-{VERSION}.data/data/lib/t3mpc_ros'
@@ -85,6 +86,7 @@ def test_a_build_that_was_interrupted_can_be_repeated(source, tmp_path):
     assert [*tmp_path.glob('*.whl')]
 
 
+@pytest.mark.long
 def test_the_distributions_hold_every_file_of_the_package(source, archive, wheel):
     wanted = {
         str(path.relative_to(source))
@@ -110,6 +112,7 @@ def test_the_distributions_hold_every_file_of_the_package(source, archive, wheel
 
 
 @pytest.mark.parametrize('kind', few_of(['sdist', 'wheel']))
+@pytest.mark.long
 def test_equal_sources_give_equal_distributions(kind, source, request, tmp_path):
     """At another time and place, with another umask, for another time zone and owner of files."""
     (tmp_path / 'Übung mit Blank').mkdir()

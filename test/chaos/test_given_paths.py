@@ -17,6 +17,7 @@ import math
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.chaos.pose_reference import (
     GivenPathSource,
@@ -96,7 +97,7 @@ def replaced_at_random(seed, count):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', few_of(range(4)))
 def test_whatever_replaces_a_path_no_limit_is_exceeded(seed):
     """Paths of every kind, at any moment: in turns, at corners, while braking, at rest, paused."""
     check_motion(replaced_at_random(seed, 60))

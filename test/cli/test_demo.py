@@ -274,7 +274,7 @@ RUNS = [
 ]
 
 
-@pytest.mark.parametrize('ends, rows, unfinished, code, words', few_of(RUNS, len(RUNS) - 3))
+@pytest.mark.parametrize('ends, rows, unfinished, code, words', few_of(RUNS, 6))
 def test_the_exit_code_says_what_became_of_the_run(
     ends, rows, unfinished, code, words, tmp_path, monkeypatch, capsys
 ):

@@ -465,7 +465,9 @@ print({name for name in after if after[name] != before[name]} or 'nothing')
 """
 
 
-@pytest.mark.parametrize('parameters', ['ControllerParameters', 'StepperControllerParameters'])
+@pytest.mark.parametrize(
+    'parameters', few_of(['StepperControllerParameters', 'ControllerParameters'])
+)
 @pytest.mark.slow
 def test_after_the_warm_up_no_step_compiles(parameters):
     """A separate process, because other tests compile in this one."""

@@ -327,7 +327,7 @@ def test_dead_time_of_a_servo_is_found_with_friction(dead_time, friction):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize('friction', few_of([4.0, 0.0, 1.0, 3.0], 2))
+@pytest.mark.parametrize('friction', few_of([4.0, 0.0, 1.0, 3.0]))
 @pytest.mark.parametrize('noise_variance', few_of([0.04, 0.0, 0.1]))
 @pytest.mark.slow
 def test_friction_is_not_taken_for_dead_time(friction, noise_variance):

@@ -43,7 +43,7 @@ def resets(bench):
     return quality.robot_resets, quality.dongle_resets
 
 
-@pytest.mark.parametrize('seconds, publishes', [(1.2, True), (2.0, False)])
+@pytest.mark.parametrize('seconds, publishes', few_of([(1.2, True), (2.0, False)]))
 def test_no_distance_is_lost_while_the_host_is_suspended(seconds, publishes):
     """The result that waited looked like a restart of robot and dongle: 1568 microsteps were lost.
 

@@ -166,6 +166,7 @@ def test_a_robot_of_another_make_is_identified(tmp_path, lag, dead_time):
         identify_bag(folder, ReportOptions())
 
 
+@pytest.mark.long
 def test_the_drive_file_has_the_gain_by_the_rule(tmp_path):
     tape = recorded(ramps(1, 2500), drive__lag=0.03, noise__variance=0.04)
     drive, _ = identified(tape, tmp_path / 'bag')
@@ -241,7 +242,9 @@ def without(lost):
         (short, r'at least 10 s without a gap: got 6\.0 s'),
         (torn('/odom'), r'at least 10 s without a gap: got [89]\.\d s'),
         (torn('/cmd_vel'), r'at least 10 s without a gap: got [89]\.\d s'),
-        (slow, r'deviation of the .* at most \d+\.\d ms: got \d+\.\d ms'),
+        pytest.param(
+            slow, r'deviation of the .* at most \d+\.\d ms: got \d+\.\d ms', marks=pytest.mark.long
+        ),
         (without('/odom'), 'cmd_vel and odom: no odom$'),
         (without('/cmd_vel'), 'cmd_vel and odom: no cmd_vel$'),
     ],

@@ -322,6 +322,7 @@ def test_a_method_knows_how_fast_both_wheels_may_change_at_once():
 # -- the reference ----------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_reference_deviation_is_three_rad_per_second():
     values = np.array(
         [

@@ -104,6 +104,7 @@ def situations(extent):
     return [tuple(run.fields[name] for name in names) for run in study_runs(extent)]
 
 
+@pytest.mark.long
 def test_full_study_holds_exactly_the_needed_runs():
     found = situations(chosen_extent())
     baselines = {name for name, method in METHODS.items() if method.baseline}

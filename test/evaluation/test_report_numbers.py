@@ -325,7 +325,7 @@ def table_after(page, heading):
 BAGS = ['demo', 'switches', 'slip stop', 'gap', 'good']
 
 
-@pytest.fixture(scope='module', params=few_of(BAGS, 4))
+@pytest.fixture(scope='module', params=few_of(BAGS, 2))
 def reported(request, tmp_path_factory):
     """Return the page of a report, and the messages of its bag."""
     folder = tmp_path_factory.mktemp('numbers')

@@ -183,6 +183,7 @@ def test_a_comparison_is_drawn(browser, tmp_path):
     assert browser.errors() == []
 
 
+@pytest.mark.long
 def test_a_report_is_printed_on_a4(report, browser):
     """Charts were cut off at the edge, and those of a dark screen pale."""
     opened(browser, report)

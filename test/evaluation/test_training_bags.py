@@ -136,6 +136,7 @@ def program(*arguments):
     return options.run(options)
 
 
+@pytest.mark.long
 def test_the_model_file_is_loaded_and_says_where_it_is_from(
     bags, model, tmp_path, monkeypatch, capsys
 ):

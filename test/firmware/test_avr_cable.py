@@ -52,6 +52,7 @@ def drive(bench):
 
 
 @pytest.mark.parametrize('way', few_of([CableBench, Bench]), ids=['cable', 'radio'])
+@pytest.mark.long
 def test_the_board_drives_over_the_cable_in_time(way):
     """A signed CMD, a POLL and their RESULT, 50 times a second, while the wheels turn."""
     with on_avr(way, key=KEY) as bench:

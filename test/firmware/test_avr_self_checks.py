@@ -43,6 +43,7 @@ def _drained(boards: Boards) -> int:
 
 
 @pytest.mark.parametrize('sizes', few_of([range(1500, 1560, 15), range(1500, 1560)]))
+@pytest.mark.long
 def test_a_saturated_line_does_not_reset_the_dongle(sizes: range) -> None:
     """It once read bytes until none waited: on a full line the watchdog ended that."""
     build()

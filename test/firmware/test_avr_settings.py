@@ -115,6 +115,7 @@ def test_an_erased_robot_moves_only_after_its_settings() -> None:
 @pytest.mark.parametrize(
     'cuts', few_of([[0.002, WRITING], [0.001, 0.002, 0.003, 0.005, 0.008, 0.012, WRITING]])
 )
+@pytest.mark.long
 def test_power_loss_during_a_write_leaves_no_mixture(cuts: list[float]) -> None:
     """Power fails at several times: the old settings or the new ones, in both places."""
     build()

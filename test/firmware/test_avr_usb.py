@@ -241,6 +241,7 @@ def test_telemetry_never_lags_at_any_rate(boards_at_rate: tuple[Boards, LinkPara
     assert boards.radio(ROBOT).ack_damaged == before <= 1
 
 
+@pytest.mark.long
 def test_signed_commands_are_answered_in_time_at_every_rate(
     boards_at_rate: tuple[Boards, LinkParameters],
 ) -> None:

@@ -387,6 +387,7 @@ def test_patrol_drives_its_path(place, start, slow):
 @pytest.mark.slow
 @pytest.mark.timed
 @pytest.mark.ros
+@pytest.mark.long
 def test_a_robot_of_another_make_follows_the_reference(start, tmp_path, capsys):
     """TurtleBot3 figures: 30 Hz best-effort odometry, stamped commands, own topic names."""
     words = [launch_file(FOLLOW), 'params_file:=turtlebot3.yaml', 'rate:=30']

@@ -42,6 +42,7 @@ SLOTS = 5
 """Recorders at a time."""
 
 
+@pytest.mark.long
 def test_two_thousand_messages_a_second_are_all_recorded(processes, tmp_path):
     """``bench/recorder_load.py`` runs this for a minute and prints the processor load."""
     found = run(tmp_path / 'bag', processes, seconds=2.0)

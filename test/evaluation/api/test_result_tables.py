@@ -114,6 +114,7 @@ def test_one_case_or_metric_is_chosen_by_its_name():
         comparison.to_latex('no such case')
 
 
+@pytest.mark.long
 def test_a_figure_shows_itself_and_is_written_in_three_forms(tmp_path):
     figure = made('run').plot()
     assert figure._repr_png_().startswith(b'\x89PNG')

@@ -25,6 +25,7 @@ import matplotlib.figure
 import numpy as np
 import pytest
 from support.equations import linear_decay_system
+from support.long_tests import few_of
 
 import t3mpc_ros as t3
 
@@ -324,7 +325,7 @@ WRITERS = {
 ENDS = {'to_csv': '.csv', 'to_parquet': '.parquet', 'to_html': '.html', 'plot': '.png'}
 
 
-@pytest.mark.parametrize('name', WRITERS)
+@pytest.mark.parametrize('name', few_of(WRITERS, 2))
 def test_a_file_that_exists_is_replaced(name, tmp_path):
     make, writers = WRITERS[name]
     result = make()
