@@ -222,14 +222,23 @@ class Gaps:
     def warning(self, tolerated: float) -> str:
         """Return the gaps of the last 10 s if many messages are missing, or for so long (s)."""
         longest = max((gap for _, gap, _ in self._recent), default=0.0)
-        share = sum(missing for *_, missing in self._recent) * self._period / RECENT
+        share = self._missing_share()
         if longest <= tolerated and share <= MANY_MISSING:
             return ''
+        clock = 'whether a clock was set, ' if longest > RECENT else ''
         return (
             f'odom had {len(self._recent)} gaps in the last {RECENT:g} s, the longest '
             f'{longest:.2g} s, the last {self.age:.1f} s ago: {share:.0%} of its messages '
-            'are missing; check the network, the processor of the robot, and the QoS'
+            f'are missing; check {clock}the network, the processor of the robot, and the QoS'
         )
+
+    def _missing_share(self) -> float:
+        """Return which share of the messages of the last 10 s is missing: a gap may be older."""
+        lost = 0.0
+        for end_ns, gap, missing in self._recent:
+            age = ((self._last_ns or end_ns) - end_ns) / NANOSECONDS
+            lost += missing * min(1.0, (RECENT - age) / gap)
+        return lost * self._period / RECENT
 
 
 class InputMonitor:

@@ -35,9 +35,6 @@ from t3mpc_ros.robot.sensor_conversions import (
 )
 from t3mpc_ros.simulation.digital_twin import TwinDiagnostics
 
-BATTERY_RATE = 1.0
-"""Rate of ``battery_state``, Hz."""
-
 
 @dataclass(frozen=True)
 class RobotTopicParameters(FrameParameters):

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from support.long_tests import few_of
 
-from t3mpc_ros.control.odometry_plausibility import InputMonitor
+from t3mpc_ros.control.odometry_plausibility import Gaps, InputMonitor
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
 
@@ -202,6 +202,19 @@ def test_gaps_are_counted_with_the_longest_and_the_last():
     assert drive.run(11.0) == []
     assert gaps.number == 1
     assert drive.monitor.jumps == 0
+
+
+@pytest.mark.parametrize('silence', [9.0, 3600.0, 86400.0])
+def test_no_more_than_all_messages_of_a_time_are_missing(silence):
+    """After a clock had been set by an hour, 35995 % were missing."""
+    gaps = Gaps(100.0)
+    stamps = [10_000_000 * k for k in range(1000)]
+    begin = stamps[-1] + round(silence * 1e9)
+    for stamp in [*stamps, *(begin + 10_000_000 * k for k in range(400))]:
+        gaps.update(stamp)
+    share = float(re.search(r'([\d.]+)%', gaps.warning(0.1)).group(1))
+    assert share == pytest.approx(10.0 * min(silence, 6.0), abs=1.0)
+    assert ('a clock was set' in gaps.warning(0.1)) == (silence > 10.0)
 
 
 def test_a_single_lost_message_is_counted_only():
