@@ -215,9 +215,7 @@ class Gaps:
     @property
     def age(self) -> float:
         """Time since the end of the last gap, s; infinite without a recent one."""
-        if not self._recent or self._last_ns is None:
-            return math.inf
-        return (self._last_ns - self._recent[-1][0]) / NANOSECONDS
+        return self._since(self._recent[-1][0]) if self._recent else math.inf
 
     def warning(self, tolerated: float) -> str:
         """Return the gaps of the last 10 s if many messages are missing, or for so long (s)."""
@@ -236,9 +234,11 @@ class Gaps:
         """Return which share of the messages of the last 10 s is missing: a gap may be older."""
         lost = 0.0
         for end_ns, gap, missing in self._recent:
-            age = ((self._last_ns or end_ns) - end_ns) / NANOSECONDS
-            lost += missing * min(1.0, (RECENT - age) / gap)
+            lost += missing * min(1.0, (RECENT - self._since(end_ns)) / gap)
         return lost * self._period / RECENT
+
+    def _since(self, stamp_ns: int) -> float:
+        return ((self._last_ns or stamp_ns) - stamp_ns) / NANOSECONDS
 
 
 class InputMonitor:
