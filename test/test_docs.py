@@ -138,7 +138,7 @@ def _imported(path):
     return {file for file in found if (ROOT / file).exists()}
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_package_calls_its_functions_on_the_page():
     """What only tests call stands in test/support/equations.py."""
     for path, name in FUNCTIONS:

@@ -22,7 +22,14 @@ the map.
 from dataclasses import replace
 
 import pytest
-from support.fresh_state import check_configured, check_fresh, check_round_trip, classes_of, leaves
+from support.fresh_state import (
+    check_all_at_once,
+    check_configured,
+    check_fresh,
+    check_round_trip,
+    classes_of,
+    leaves,
+)
 from support.stateful_objects import CONFIGURED, FRESH, NEVER_RESET
 
 from t3mpc_ros.mpc.predictive_controller import PredictiveParameters
@@ -48,6 +55,10 @@ CASES = [
 LONG = 'Controller', 'DigitalTwin', 'PaperRobot'
 """Those with so many parameters that the effect of each takes seconds."""
 OF_PARAMETERS = [pytest.param(entry, id=_name(kind)) for kind, entry in CONFIGURED.items()]
+ONE_BY_ONE = [
+    pytest.param(*case.values, id=case.id, marks=pytest.mark.long if case.id in LONG else ())
+    for case in OF_PARAMETERS
+]
 
 
 @pytest.fixture(autouse=True)
@@ -82,17 +93,12 @@ def test_a_used_object_is_as_new(entry, operation):
     check_fresh(entry, operation)
 
 
-@pytest.mark.parametrize(
-    'entry',
-    [
-        pytest.param(
-            entry,
-            id=_name(kind),
-            marks=pytest.mark.long if _name(kind) in LONG else pytest.mark.slow,
-        )
-        for kind, entry in CONFIGURED.items()
-    ],
-)
+@pytest.mark.parametrize('entry', OF_PARAMETERS)
+def test_all_parameters_are_replaced_at_once(entry):
+    check_all_at_once(entry)
+
+
+@pytest.mark.parametrize('entry', ONE_BY_ONE)
 def test_replaced_parameters_are_those_of_a_new_object(entry):
     check_configured(entry)
 

@@ -111,7 +111,7 @@ def test_fingerprint_depends_on_kernels_and_compiler_only(tmp_path, monkeypatch)
     assert len(seen) == 5
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_equal_sources_share_compiled_code_wherever_they_are(tmp_path):
     """The compiler's cache is by path: each clone and each workspace compiled everything again."""
     package = Path(__file__).resolve().parent.parent / 't3mpc_ros'

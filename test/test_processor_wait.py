@@ -23,7 +23,6 @@ import time
 
 import pytest
 from support import processor_wait, waiting
-from support.long_tests import few_of
 from support.processor_wait import ProcessorWait, descendants
 from support.signals import attended
 
@@ -141,7 +140,7 @@ def run_pytest(folder, text, *words, shares=''):
     return done, {name.rpartition('::')[2]: outcome for outcome, name in found}
 
 
-@pytest.mark.parametrize('workers', few_of([1, 0]))
+@pytest.mark.parametrize('workers', [1, 0])
 @pytest.mark.long
 def test_only_a_timeout_of_a_wait_is_inconclusive(workers, tmp_path):
     """With worker processes nothing was listed at the end: the failure was a mere skip."""
@@ -172,7 +171,6 @@ def test_only_a_timeout_of_a_wait_is_inconclusive(workers, tmp_path):
     assert 'processor wait of 8 tests with nodes: median 90%, above the limit of 30%: 8' in listed
 
 
-@pytest.mark.long
 def test_inconclusive_tests_alone_have_an_exit_code_of_their_own(tmp_path):
     text = CERTAIN.format(busy=0.0) + WAITS
     done, outcomes = run_pytest(tmp_path, text, '-k', 'test_wait or test_sound')

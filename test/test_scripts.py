@@ -205,7 +205,6 @@ SOURCES = 'requirements.txt', 'setup.py', 'config/fastdds_loopback.xml', 'script
 
 
 @pytest.mark.parametrize(('names',), few_of([(SOURCES[:2],), (SOURCES[2:],)]))
-@pytest.mark.long
 def test_a_stale_environment_is_updated(names, checkout):
     checkout.run('t3mpc')
     checkout.done()

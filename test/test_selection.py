@@ -60,7 +60,6 @@ def test_the_runs_of_check_select_every_test_once():
         assert matches[0] or not eval(quick, {}, values)
 
 
-@pytest.mark.long
 def test_the_parts_of_a_run_are_the_run():
     whole, *parts = (
         collect('test/test_selection.py', *words)

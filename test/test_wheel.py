@@ -23,7 +23,6 @@ import zipfile
 
 import pytest
 from support.checkout import EXECUTABLES, ROOT, clean_environment, copy_package
-from support.long_tests import few_of
 from support.waiting import run
 
 from t3mpc_ros.missing_library import EXTRAS
@@ -111,7 +110,7 @@ def test_the_distributions_hold_every_file_of_the_package(source, archive, wheel
     assert not [name for name in names if name.startswith(('test/', 'docs/'))], 'some of them'
 
 
-@pytest.mark.parametrize('kind', few_of(['sdist', 'wheel']))
+@pytest.mark.parametrize('kind', ['sdist', 'wheel'])
 @pytest.mark.long
 def test_equal_sources_give_equal_distributions(kind, source, request, tmp_path):
     """At another time and place, with another umask, for another time zone and owner of files."""

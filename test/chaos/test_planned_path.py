@@ -206,7 +206,6 @@ def test_what_is_placed_ahead_of_it_is_not_touched():
     assert length(rows) > 4.0  # something is in its way every 5 s
 
 
-@pytest.mark.long
 def test_old_places_are_visited_again():
     """The given path is a small circle: what else is entered is due to the visits."""
 

@@ -196,7 +196,7 @@ class Terminal:
         return line
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_setup_shows_asks_and_restores(ports, tmp_path, capsys, monkeypatch):
     """Nothing is written without a question or --yes; a file restores every setting."""
     _, robot = ports

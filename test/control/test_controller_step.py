@@ -517,7 +517,6 @@ def test_the_gain_that_fits_is_accepted_at_every_rate_and_lag(rate, lag, composi
     assert again.resolved().law == fitted.law
 
 
-@pytest.mark.long
 def test_an_odometry_faster_than_the_rate_is_thinned_out():
     """At half the rate of the odometry, the plan was behind: six times the error."""
     loop = ServoLoop(lambda t: (0.12 + 0.1 * math.sin(2.0 * t), math.sin(1.7 * t)), rate=100.0)

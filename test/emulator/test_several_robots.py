@@ -87,7 +87,6 @@ def test_two_robots_of_different_addresses_drive_side_by_side():
 
 
 @pytest.mark.parametrize('seed, uptime_difference', few_of([*product(range(1, 6), (0.002, 1.0))]))
-@pytest.mark.long
 def test_two_robots_with_one_address_are_named_and_stand(seed, uptime_difference):
     """Both would follow every command: nothing moves while both answer.
 

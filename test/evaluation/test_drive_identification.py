@@ -166,7 +166,6 @@ def test_a_robot_of_another_make_is_identified(tmp_path, lag, dead_time):
         identify_bag(folder, ReportOptions())
 
 
-@pytest.mark.long
 def test_the_drive_file_has_the_gain_by_the_rule(tmp_path):
     tape = recorded(ramps(1, 2500), drive__lag=0.03, noise__variance=0.04)
     drive, _ = identified(tape, tmp_path / 'bag')

@@ -619,7 +619,6 @@ def test_nothing_depends_on_the_order_of_the_runs_or_on_a_resume(
         assert (tmp_path / name).read_text() == (folder / name).read_text(), name
 
 
-@pytest.mark.long
 def test_a_fresh_start_runs_everything_again(folder, begun, tmp_path, monkeypatch):
     monkeypatch.setattr(reproduction, 'write_pictures', lambda *_: {})
     monkeypatch.setattr(reproduction, 'page', lambda *_: '')

@@ -19,7 +19,6 @@ import pytest
 from support.avr_bench import on_avr
 from support.avr_boards import ROBOT
 from support.emulator_bench import Bench, CablePort
-from support.long_tests import few_of
 from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.link.port_actions import LinkState
@@ -51,7 +50,7 @@ def drive(bench):
     return load, ram.get('longest_us', 2)
 
 
-@pytest.mark.parametrize('way', few_of([CableBench, Bench]), ids=['cable', 'radio'])
+@pytest.mark.parametrize('way', [CableBench, Bench], ids=['cable', 'radio'])
 @pytest.mark.long
 def test_the_board_drives_over_the_cable_in_time(way):
     """A signed CMD, a POLL and their RESULT, 50 times a second, while the wheels turn."""

@@ -80,7 +80,6 @@ def read_info(boards: Boards) -> Any:
     return boards.request(frames.Poll(0, 0, 2), frames.Poll(0, 0, 2))
 
 
-@pytest.mark.long
 def test_an_erased_robot_moves_only_after_its_settings() -> None:
     """A new chip once followed whatever host came first on the default channel."""
     with contextmanager(booted)(1, True) as boards:
@@ -115,7 +114,6 @@ def test_an_erased_robot_moves_only_after_its_settings() -> None:
 @pytest.mark.parametrize(
     'cuts', few_of([[0.002, WRITING], [0.001, 0.002, 0.003, 0.005, 0.008, 0.012, WRITING]])
 )
-@pytest.mark.long
 def test_power_loss_during_a_write_leaves_no_mixture(cuts: list[float]) -> None:
     """Power fails at several times: the old settings or the new ones, in both places."""
     build()

@@ -184,7 +184,6 @@ def test_drivers_switch_off_when_idle_and_on_before_a_step(robot):
     assert robot.call('unpowered_pulses') == 0
 
 
-@pytest.mark.long
 def test_clock_wrap_after_hours_at_rest_has_no_effect(robot):
     """2**32 us later an old time stamp equals now, for the idle time and the command age."""
     assert robot.set(core.IDLE_OFF, 1000) == (core.OK, 1000)
@@ -232,6 +231,17 @@ def test_clock_wrap_of_any_width_has_no_effect(robot, wrap, before):
     assert robot.counters()['stale'] == 0
     robot.drive(5000, 5000, 100_000)
     assert robot.status == core.ENABLED | core.MOVING
+
+
+def test_the_idle_time_is_kept_across_a_wrap_of_the_clock(robot):
+    """With the end of the time compared, not its length, the drivers lost their power at once."""
+    assert robot.set(core.IDLE_OFF, 1000) == (core.OK, 1000)
+    robot.poke((1 << 32) - 600_000)
+    robot.send(robot.command(0, 0))
+    robot.run(900_000)
+    assert robot.call('powered')
+    robot.run(200_000)
+    assert not robot.call('powered')
 
 
 def test_counters_wrap_at_32_bits(robot):

@@ -179,7 +179,7 @@ def test_the_skill_is_high_on_unseen_data():
 
 
 @pytest.mark.compiled
-@pytest.mark.long
+@pytest.mark.slow
 def test_random_weights_get_no_authority():
     """With the skill half a horizon ahead alone, a third would get authority."""
     controller = PredictiveController(DEFAULT.with_values({'learning': False}), PERIOD, GAIN)

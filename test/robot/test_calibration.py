@@ -112,7 +112,7 @@ def test_wheel_radius_has_its_stated_uncertainty():
     assert np.mean(uncertainties) < 1e-3 * RADIUS
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_track_gyro_scale_and_bias_have_their_stated_uncertainty():
     generator = np.random.default_rng(2)
     parameters = SimulatedImuParameters(gyro_scale_error=0.03)

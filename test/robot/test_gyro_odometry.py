@@ -352,7 +352,7 @@ def reversals(acceleration=200.0, top=8.0):
 
 
 @pytest.mark.parametrize('period, error', few_of([(0.01, 0.001), (0.005, 0.001), (0.02, 0.015)]))
-@pytest.mark.long
+@pytest.mark.slow
 def test_fast_reversals_are_not_detected_as_slip(period, error):
     """The gyro lags by 4.8 ms: 1 rad/s at 200 rad/s², which without delay would indicate slip.
 
@@ -480,7 +480,7 @@ def test_scale_error_within_tolerance_is_not_slip(tolerance):
 
 
 @pytest.mark.parametrize('period', few_of([0.01, 0.02]))
-@pytest.mark.long
+@pytest.mark.slow
 def test_short_turns_include_the_gyro_delay(period):
     """The gyro outputs the end of a turn after the last step; ignored, each cost 0.2 mrad."""
     robots, odometries = Robots(1, 23), make_odometries()

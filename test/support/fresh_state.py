@@ -351,6 +351,21 @@ def check_configured(entry: Configured) -> None:
     assert not idle, f'without effect: {idle}'
 
 
+def check_all_at_once(entry: Configured) -> None:
+    """Assert that an object with all its dynamic parameters replaced is as one built with them."""
+    changed = entry.parameters
+    for spec in entry.parameters.specs():
+        if spec.name not in entry.triggers:
+            changed = next(alternatives(changed, spec), changed)
+    replaced, built = entry.make(entry.parameters), entry.make(changed)
+    entry.replace(replaced, changed)
+    for each in (replaced, built):
+        entry.settle(each)
+    expect_equal(replaced, built, 'state', entry.late)
+    answers = [entry.drive(each, random.Random(1)) for each in (replaced, built)]
+    expect_equal(*answers, 'answers')
+
+
 def _takes_effect(entry: Configured, changed: Any, usual: list[list[object]]) -> bool:
     """Return whether parameters that are replaced after some use change what follows."""
     thing = entry.make(entry.parameters)

@@ -16,8 +16,15 @@
 import pytest
 
 
-def few_of(values, count=1):
-    """Return the values, or tuples of them, all but the first ``count`` marked as long."""
-    few, others = [*values][:count], [*values][count:]
-    rows = [value if isinstance(value, tuple) else (value,) for value in others]
-    return few + [pytest.param(*row, marks=pytest.mark.long) for row in rows]
+def few_of(values, count=1, step=0):
+    """Return the values, or tuples of them, most marked as long.
+
+    The first ``count`` are not; with a ``step`` each ``step``-th of them is not.
+    """
+    values = [*values]
+    few = range(0, len(values), step) if step else range(count)
+    rows = [value if isinstance(value, tuple) else (value,) for value in values]
+    return [
+        value if index in few else pytest.param(*rows[index], marks=pytest.mark.long)
+        for index, value in enumerate(values)
+    ]
