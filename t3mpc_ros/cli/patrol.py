@@ -140,7 +140,7 @@ def _tune_tracking(options: argparse.Namespace) -> int:
 
 def _safety(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.experiment import print_report
-    from t3mpc_ros.evaluation.patrol.patrol_safety import compare_safety, safety_table
+    from t3mpc_ros.evaluation.patrol.safety_study import compare_safety, safety_table
 
     seconds = 60.0 * options.minutes
     with executor_of(options) as executor:

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition
-    from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters
+    from t3mpc_ros.evaluation.tuning.tuned_parameter_file import TunedParameters
 
 
 DRIVES = {'torque': 'torque', 'servo': 'velocity'}
@@ -119,7 +119,7 @@ def _tuned(
             resume=options.resume,
         )
     from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
-    from t3mpc_ros.evaluation.tuning.tuned_parameters import TuningBudget
+    from t3mpc_ros.evaluation.tuning.tuned_parameter_file import TuningBudget
 
     drives = [DRIVES[options.robot]] if options.robot else list(DRIVES.values())
     return tune_methods(

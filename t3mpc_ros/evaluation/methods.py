@@ -46,7 +46,7 @@ from t3mpc_ros.evaluation.drivers import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.scenario import KINDS, PLANT_OF, Scenario
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
-from t3mpc_ros.evaluation.tuning.tuned_parameters import PACKAGED_FILE, TunedParameters
+from t3mpc_ros.evaluation.tuning.tuned_parameter_file import PACKAGED_FILE, TunedParameters
 from t3mpc_ros.parameters.table import Parameters
 
 FULL = 'full'

@@ -20,7 +20,7 @@ from typing import Any
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from t3mpc_ros.geometry.timing import RealTimeFactor, SampleScheduler, SimulatedTime
+from t3mpc_ros.geometry.sample_clock import RealTimeFactor, SampleScheduler, SimulatedTime
 from t3mpc_ros.geometry.types import NANOSECONDS, Pose
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN

@@ -166,8 +166,8 @@ PATROL = {
         table=SimpleNamespace(keys=())
     ),
     'evaluation.patrol.path_tracking.tune_trackers': {},
-    'evaluation.patrol.patrol_safety.compare_safety': SimpleNamespace(rows=[]),
-    'evaluation.patrol.patrol_safety.safety_table': SimpleNamespace(markdown=str),
+    'evaluation.patrol.safety_study.compare_safety': SimpleNamespace(rows=[]),
+    'evaluation.patrol.safety_study.safety_table': SimpleNamespace(markdown=str),
     'evaluation.patrol.tracking_page.tuning_markdown': '',
     'evaluation.patrol.localization_study.compare_localizations': SimpleNamespace(rows=[]),
     'evaluation.patrol.localization_study.markdown': '',

@@ -49,7 +49,7 @@ from t3mpc_ros.evaluation.tuning.closed_loop_tuning import (
     twin_objective,
 )
 from t3mpc_ros.evaluation.tuning.tune_methods import ClosedLoopObjective
-from t3mpc_ros.evaluation.tuning.tuned_parameters import SMOOTHNESS, TunedParameters
+from t3mpc_ros.evaluation.tuning.tuned_parameter_file import SMOOTHNESS, TunedParameters
 
 PI = 'PI + feed-forward'
 

@@ -30,7 +30,7 @@ from t3mpc_ros.evaluation.paper.study import Extent
 from t3mpc_ros.evaluation.patrol import patrol_comparison
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
 from t3mpc_ros.evaluation.tuning.tune_methods import history_path, tune_methods
-from t3mpc_ros.evaluation.tuning.tuned_parameters import TunedParameters, TuningBudget
+from t3mpc_ros.evaluation.tuning.tuned_parameter_file import TunedParameters, TuningBudget
 
 measured_patrol = cache(patrol_comparison.measured_patrol)
 
@@ -116,6 +116,6 @@ def test_every_study_with_a_file_of_its_runs_is_tried():
         for path in package.rglob('*.py')
         if re.search(r'import .*\b(ResultFile|write_atomically)\b', path.read_text())
     }
-    users -= {'metadata', 'tuned_parameters'}  # a bag; a file that nothing resumes
+    users -= {'metadata', 'tuned_parameter_file'}  # a bag; a file that nothing resumes
     users -= {'result_file', 'patrol', 'parameter_sweep'}  # these remove finished runs only
     assert users == {'experiment', 'cma_search'}

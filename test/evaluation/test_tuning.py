@@ -48,7 +48,7 @@ from t3mpc_ros.evaluation.tuning.tune_methods import (
     objective,
     tune_methods,
 )
-from t3mpc_ros.evaluation.tuning.tuned_parameters import (
+from t3mpc_ros.evaluation.tuning.tuned_parameter_file import (
     PACKAGED_FILE,
     SMOOTHNESS,
     StoreError,

@@ -37,7 +37,7 @@ from t3mpc_ros.evaluation.record import rolling_speeds
 from t3mpc_ros.evaluation.scenario import KINDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
 from t3mpc_ros.evaluation.tuning.tune_methods import ClosedLoopObjective, tune_methods
-from t3mpc_ros.evaluation.tuning.tuned_parameters import (
+from t3mpc_ros.evaluation.tuning.tuned_parameter_file import (
     SMOOTHNESS,
     TunedEntry,
     TunedParameters,

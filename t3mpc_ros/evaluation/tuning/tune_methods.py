@@ -29,7 +29,7 @@ from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.tuning.cma_search import SearchResult, search_best
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, Values, check_names
-from t3mpc_ros.evaluation.tuning.tuned_parameters import (
+from t3mpc_ros.evaluation.tuning.tuned_parameter_file import (
     SMOOTHNESS,
     StoreError,
     TunedEntry,

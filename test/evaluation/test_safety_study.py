@@ -20,7 +20,7 @@ import pytest
 
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.patrol.patrol_run import START, FaultyRanges, SensorFault
-from t3mpc_ros.evaluation.patrol.patrol_safety import (
+from t3mpc_ros.evaluation.patrol.safety_study import (
     RADIUS,
     People,
     PlacedThings,
