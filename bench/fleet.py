@@ -13,7 +13,7 @@
 # limitations under the License.
 """Benchmark of a fleet: robots of this machine in one graph, until its cores are full.
 
-    PYTHONPATH=. .venv/bin/python bench/fleet.py [--seconds 20] [--file FILE] [LAYOUT:ROBOTS ...]
+    PYTHONPATH=. .venv/bin/python bench/fleet.py [--seconds 20] [LAYOUT:ROBOTS ...]
 
 Each robot is a simulated one with reference, controller and recorder at 100 Hz, in a namespace.
 Layouts: ``processes`` (one for each node), ``composed`` (one for each robot), ``domains`` (as
@@ -27,7 +27,6 @@ right to capture packets (root).
 import argparse
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-import csv
 from pathlib import Path
 import shutil
 import socket
@@ -265,24 +264,44 @@ def run(layout: str, robots: int, seconds: float) -> Result:
         )
 
 
+COLUMNS = (
+    *('layout, robots', 'processes', 'cores', 'of it a robot', 'memory of a robot, MB'),
+    *('odom to command, ms: median, 99 %', 'Hz', 'discovery until all run, MB'),
+    *('discovery then, kB/s', 'messages, kB/s', 'bag of a robot, MB/h'),
+)
+
+
+def format_row(found: Result) -> str:
+    """Return a row of the table."""
+    cells = (
+        f'{found.layout}, {found.robots}',
+        f'{found.processes}',
+        f'{found.cores:.2f}',
+        f'{found.cores / found.robots:.2f}',
+        f'{found.memory:.0f}',
+        f'{found.latency:.1f}, {found.latency_99:.0f}',
+        f'{found.rate:.0f}',
+        f'{found.start_discovery:.1f}',
+        f'{found.discovery:.0f}',
+        f'{found.messages:.0f}',
+        f'{found.bag:.0f}',
+    )
+    return f'| {" | ".join(cells)} |'
+
+
 def main() -> None:
-    """Print the figures of some runs, and append them to a file."""
+    """Print the figures of some runs."""
     parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
     parser.add_argument('--seconds', type=float, default=20.0)
-    parser.add_argument('--file', type=Path)
     parser.add_argument('runs', nargs='*', default=RUNS, metavar='LAYOUT:ROBOTS')
     options = parser.parse_args()
-    print(*Result._fields, sep=',')
+    print(f'| {" | ".join(COLUMNS)} |', '|---' * len(COLUMNS) + '|', sep='\n')
     for each in options.runs:
         layout, _, robots = each.partition(':')
         if layout not in LAYOUTS:
             parser.error(f'a layout is one of {", ".join(LAYOUTS)}: got {layout}')
         result = run(layout, int(robots), options.seconds)
-        row = [one if isinstance(one, str | int) else round(one, 4) for one in result]
-        print(*row, sep=',', flush=True)
-        if options.file is not None:
-            with options.file.open('a', newline='') as file:
-                csv.writer(file, lineterminator='\n').writerow(row)
+        print(format_row(result), flush=True)
 
 
 if __name__ == '__main__':

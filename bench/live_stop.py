@@ -14,13 +14,12 @@
 # limitations under the License.
 """Time from a click on E-STOP, or the space bar, until the live page says that the robot stands.
 
-Usage: live_stop.py [--count N] [--json FILE]; needs Chromium with its driver. Prints for each
-condition the median and the worst time until the page says E-STOP, or STOP NOT CONFIRMED, in ms.
+Usage: live_stop.py [--count N]; needs Chromium with its driver. Prints for each
+condition the median and the worst time until the page says E-STOP, or STOP NOT CONFIRMED.
 """
 
 import argparse
 from collections.abc import Callable
-import json
 import os
 from pathlib import Path
 import signal
@@ -132,7 +131,6 @@ def main() -> int:
     """Return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n')[0])
     parser.add_argument('--count', type=int, default=20, help='stops of each condition')
-    parser.add_argument('--json', type=Path)
     options = parser.parse_args()
     with PrivateGraph() as graph, tempfile.TemporaryDirectory() as folder:
         processes = ProcessGroup(Path(folder), graph.environment())
@@ -144,12 +142,12 @@ def main() -> int:
             if page is not None:
                 page.driver.quit()
             processes.end_all()
+    print('| condition | median | worst | page says |', '|---|---|---|---|', sep='\n')
     for name, rows in found.items():
         times = [each for each, _ in rows]
         words = ', '.join(sorted({text.split(':')[0] for _, text in rows}))
-        print(f'{name}: median {statistics.median(times):.0f}, worst {max(times):.0f} ms, {words}')
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1))
+        median, worst = statistics.median(times), max(times)
+        print(f'| {name} | {median:.0f} ms | {worst:.0f} ms | {words} |')
     return 0
 
 

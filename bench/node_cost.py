@@ -116,10 +116,11 @@ def main() -> None:
             results.append(run(Path(folder), options.seconds))
         print(number + 1, {key: round(value, 4) for key, value in results[-1].items()})
     found = {key: statistics.median(each[key] for each in results) for key in results[0]}
+    print('', '| node | share of a core | of the echo |', '|---|---|---|', sep='\n')
     for name in ('echo', *NODES):
-        print(f'{name:20} {found[name]:6.1%} of a core, {found[name] / found["echo"]:.2f} x echo')
-    ratio = found['command_ms'] / found['answer_ms']
-    print(f'odom to command      {found["command_ms"]:.2f} ms, {ratio:.2f} x echo')
+        print(f'| {name} | {100 * found[name]:.1f} % | {found[name] / found["echo"]:.1f} |')
+    print('', f'odom to command: {found["command_ms"]:.2f} ms', sep='\n')
+    print(f'odom to answer of the echo: {found["answer_ms"]:.2f} ms')
 
 
 if __name__ == '__main__':

@@ -184,8 +184,8 @@ def row(name: str, methods: Sequence[str]) -> list[str]:
 
 def main() -> None:
     """Print the table."""
-    print('| path | bound | as given | smoothed | of the bound | ours |', *TRACKERS, sep=' | ')
-    print('|---' * (6 + len(TRACKERS)) + '|')
+    head = 'path', 'bound', 'as given', 'smoothed', 'of the bound', 'ours', *TRACKERS
+    print(f'| {" | ".join(head)} |', '|---' * len(head) + '|', sep='\n')
     for name in SAMPLINGS:
         print(f'| {name} |', ' | '.join(row(name, ('ours', *TRACKERS))), '|', flush=True)
 

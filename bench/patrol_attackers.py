@@ -220,7 +220,8 @@ def main() -> None:
             values = [mean(column) for column in zip(*each, strict=True)]
             cells.append(f'{values[0]:.2f} m; {100 * values[1]:.0f}, {100 * values[2]:.0f}')
         state = schedule_knowledge(switching) if switching else (math.nan, math.nan)
-        cells.append(', '.join(f'{100 * value:.0f}' for value in state))
+        known = ', '.join(f'{100 * value:.0f}' for value in state)
+        cells.append(known if switching else 'no switches')
         print(f'| {name} |', ' | '.join(cells), '|', flush=True)
 
 

@@ -13,6 +13,7 @@
 # limitations under the License.
 """Numbers of the pages are those of the files that commands have written, and of today's code."""
 
+from collections import Counter
 import csv
 from functools import cache
 import random
@@ -228,38 +229,68 @@ def test_the_result_of_the_tutorial_is_that_of_its_controller(tmp_path, monkeypa
     assert f'a difference of {found.mean:+.4f} ± {found.half:.4f}: *worse*' in text
 
 
-SOURCES = re.compile(r'(?:bench|test|docs)/[\w/]+(?:\.\w+)?|t3mpc \w+(?: \w+)?')
-"""A program, a test or a command that a section of ``docs/numbers.yaml`` names."""
-UNNAMED = 'test/', 'docs/'
-"""Sources that a page need not name: tests assert, they do not measure."""
+STATED = 100
+"""Most quantities that nothing of the repository has."""
 
 
 @pytest.mark.parametrize('page', quantities.pages(), ids=lambda page: page.name)
-def test_every_quantity_of_a_page_has_a_source(page):
+def test_every_quantity_of_a_page_is_compared(page):
     """Most numbers of the pages were written by hand, and stayed when a constant changed."""
-    without = {(one.section, one.text) for one, source in quantities.sources(page) if not source}
+    without = {(one.section, one.text) for one, kind in quantities.sources(page) if not kind}
     assert not without, (
-        'not the value of a parameter that the paragraph names; give docs/numbers.yaml an '
-        f'expression, or what the section is from: {sorted(without)}'
+        'not the value of a parameter that the paragraph names, and in no recorded table; give '
+        f'docs/numbers.yaml an expression: {sorted(without)}'
     )
 
 
-@pytest.mark.parametrize('page', quantities.ledger())
-def test_the_sources_of_quantities_are_there(page):
-    text = ((quantities.DOCS if page != 'README.md' else ROOT) / page).read_text()
-    known = {(one.section, one.text): one for one in quantities.quantities(text)}
-    sections = {section for section, _ in known}
+def test_few_quantities_are_only_stated():
+    kinds = [kind for page in quantities.pages() for _, kind in quantities.sources(page)]
+    assert kinds.count('stated') <= STATED
+
+
+@pytest.mark.parametrize('page', [each for each in quantities.ledger() if each.endswith('.md')])
+def test_what_the_numbers_of_a_page_are_compared_with_is_there(page):
+    path = (quantities.DOCS if page != 'README.md' else ROOT) / page
+    compared = Counter()
+    for one, kind in quantities.sources(path):
+        compared[one.section, kind] += 1
+        compared[one.section, one.text] += 1
+        compared['*', one.text] += 1
+    sections = {section for section, _ in compared}
     for section, entries in quantities.ledger()[page].items():
-        assert section in sections, (page, section)
+        assert section in sections | {'*'}, (page, section)
         for name, value in entries.items():
-            if name != 'from':
-                assert (section, name) in known, f'{page}, {section}: {name} is not on the page'
-                shown = known[section, name]
-                assert shown.shows(quantities.evaluated(value)), (page, section, name, value)
+            if name == 'from':
                 continue
-            for source in SOURCES.findall(value):
-                assert source.startswith('t3mpc') or (ROOT / source).exists(), source
-                assert source.startswith(UNNAMED) or source in text, f'{page} names no {source}'
+            if name == 'test':
+                assert page in (ROOT / value).read_text(), f'{value} does not read {page}'
+                assert compared[section, 'test'], (page, section, value)
+            elif name == 'record':
+                assert compared[section, 'record'], (page, section, value)
+            else:
+                names = (
+                    [name]
+                    if name != 'stated'
+                    else [one for some in value.values() for one in some]
+                )
+                for each in names:
+                    assert compared[section, each], f'{page}, {section}: {each} is not on the page'
+
+
+@pytest.mark.parametrize(
+    'record', sorted((ROOT / 'docs' / 'measured').glob('*.txt')), ids=lambda path: path.stem
+)
+def test_records_say_where_they_are_from(record):
+    """Each is of a commit, and a page names the command, or the program that it starts."""
+    head = dict(
+        line.split(': ', 1) for line in record.read_text().partition('\n\n')[0].splitlines()
+    )
+    assert [*head] == [
+        'command', 'version', 'commit', 'python', 'machine', 'date', 'duration', 'load',
+    ]  # fmt: skip
+    assert re.fullmatch('[0-9a-f]{40}', head['commit'])
+    program = re.match(r't3mpc \w+|[\w/.]+', head['command'])[0]
+    assert any(program in page.read_text() for page in quantities.pages()), program
 
 
 def test_defaults_beside_the_names_of_parameters_are_theirs():

@@ -53,6 +53,8 @@ NO_CLOCK = 'no message on /clock yet'
 COMMON_TOPICS = ('/rosout', '/parameter_events', '/diagnostics')
 """Topics that every node publishes."""
 
+DIAGNOSTICS_PERIOD = 1.0
+"""Period of ``/diagnostics``, s."""
 ADAPT_PERIOD = 0.5
 """Time between two comparisons of subscriptions with the offers of publishers, s."""
 
@@ -108,7 +110,7 @@ class BaseNode(Node, Generic[P]):
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', qos.DIAGNOSTICS)
         # Steady time: diagnostics continue while the simulated clock is paused.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_steady_timer(1.0, self._publish_diagnostics)
+        self.create_steady_timer(DIAGNOSTICS_PERIOD, self._publish_diagnostics)
         self._command_publishers = qos.CommandPublishers()
         self._matching: list[qos.MatchingSubscription] = []
         self.create_steady_timer(ADAPT_PERIOD, self._adapt_subscriptions)

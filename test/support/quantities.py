@@ -11,33 +11,39 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Finds the quantities of a page, numbers with a unit, and where they come from.
+"""Finds the quantities of a page, numbers with a unit, and what each is compared with.
 
-A quantity counts as *checked* if it is the default or a bound of a parameter that its paragraph
-names, or the value of an expression, or of a file of results, that ``docs/numbers.yaml`` gives for
-its page. Others are *attributed* to what ``numbers.yaml`` names for their section: the program
-that measured them, a data sheet, the conditions of a measurement.
+A quantity is the default or a bound of a *parameter* that its paragraph names, the value of an
+*expression* that ``docs/numbers.yaml`` gives for it, in a row of a table that the command of a
+*record* has printed, or in a table that a *test* reads from the page. It is *stated* if it is
+listed there with a reason why nothing of the repository has it, as a figure of a data sheet.
 
     PYTHONPATH=.:test .venv/bin/python -m support.quantities [PAGE ...]
 
-lists the quantities of pages that are not checked, with the section and what they come from.
+counts the quantities of all pages, and lists those of some pages that are neither.
 """
 
+from collections import Counter
 from collections.abc import Iterator
+import csv
 from functools import cache
+import inspect
 import math
 from pathlib import Path
 import pkgutil
 import re
 import sys
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import yaml
 
 from support.checkout import ROOT
+from t3mpc_ros.evaluation.cases import CASES
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 
 DOCS = ROOT / 'docs'
 LEDGER = DOCS / 'numbers.yaml'
+sys.path.append(str(DOCS))  # the drawings are a source of quantities
 GENERATED = {'nodes.md', 'api.md', 'equations.md', 'results_tables.md', 'radio_session.md'}
 """Pages that a program writes, or whose numbers are those of equations."""
 
@@ -182,26 +188,146 @@ def stated_defaults(text: str) -> Iterator[tuple[str, Quantity]]:
             yield name, Quantity(section, block, f'{number} {unit}', number, unit)
 
 
+_WORD = re.compile(r"'[^']*'|\$[a-z][\w.]*|\bT3_\w+|\b[a-z]\w*\.[\w.]+")
+
+
 def evaluated(expression: object) -> float:
     """Return the value of an expression of names.
 
-    They are dotted names of the package, ``$parameters``, and constants of the firmware (``T3_``).
+    They are dotted names of the package, ``$parameters``, constants of the firmware (``T3_``), and
+    :data:`FUNCTIONS` of what was measured.
     """
-    names: dict[str, object] = {}
+    names: dict[str, object] = dict(FUNCTIONS)
 
     def named(found: re.Match[str]) -> str:
         text = found[0]
         key = f'_{len(names)}'
+        if text[0] == "'":
+            return text
         if text[0] == '$':
             names[key] = default_of(text[1:])
         else:
-            names[key] = (
-                firmware()[text] if text[0] == 'T' else pkgutil.resolve_name(f't3mpc_ros.{text}')
-            )
+            names[key] = firmware()[text] if text[0] == 'T' else value_of(text)
         return key
 
-    text = re.sub(r'\$[a-z][\w.]*|\bT3_\w+|\b[a-z]\w*\.[\w.]+', named, str(expression))
+    text = _WORD.sub(named, str(expression))
     return float(eval(text, {'__builtins__': {}}, names))
+
+
+@cache
+def recorded_lines(name: str) -> list[str]:
+    """Return the lines of a record that ``bench/record.py`` has written, without emphasis."""
+    path = DOCS / 'measured' / f'{name}.txt'
+    text = (path if path.exists() else DOCS / f'{name}.md').read_text(encoding='utf-8')
+    return [plain(line) for line in text.splitlines()]
+
+
+def plain(line: str) -> str:
+    """Return a line without emphasis."""
+    return ' '.join(line.replace('*', '').split())
+
+
+def record(name: str, row: str, column: str | int = 0, number: int = 0, table: str = '') -> float:
+    """Return a number of the first recorded line that begins with a name, after a title.
+
+    A row of a table has columns, by their heading or their place after the name.
+    """
+    lines = recorded_lines(name)
+    begin = next(n for n, line in enumerate(lines) if table in line)
+    lines = lines[begin:]
+    named = [n for n, line in enumerate(lines) if line.startswith(f'| {row} |')]
+    at = min(
+        named or [n for n, line in enumerate(lines) if line.removeprefix('| ').startswith(row)]
+    )
+    cell = lines[at].removeprefix('| ').removeprefix(row)
+    if lines[at].startswith('|'):
+        cells = lines[at].strip('| ').split(' | ')
+        if isinstance(column, str):
+            top = max(n for n in range(at) if lines[n].startswith('|---'))
+            column = lines[top - 1].strip('| ').split(' | ').index(column) - 1
+        cell = cells[1 + column]
+    return float(re.findall(r'[-+−]?\d+(?:\.\d+)?', cell)[number].replace('−', '-'))
+
+
+@cache
+def runs(robot: str, case: str, method: str, metric: str = 'overall') -> tuple[float, ...]:
+    """Return a metric of the runs of ``docs/results_runs.csv``, in the order of their seeds."""
+    with (DOCS / 'results_runs.csv').open(encoding='utf-8') as file:
+        found = {
+            int(row['seed']): float(row[metric])
+            for row in csv.DictReader(file)
+            if (row['robot'], row['case'], row['controller']) == (robot, case, method)
+        }
+    assert len(found) == 6, (robot, case, method)
+    return tuple(found[seed] for seed in sorted(found))
+
+
+def case(name: str, parameter: str) -> float:
+    """Return a parameter of the robot in a case of the comparisons."""
+    value = CASES[name].changes[parameter]
+    assert isinstance(value, float), (name, parameter)
+    return value
+
+
+def trials(name: str, column: str, begins: str = '') -> list[float]:
+    """Return the values of a column of ``docs/measured/NAME.csv``, of rows that begin so."""
+    with (DOCS / 'measured' / f'{name}.csv').open(encoding='utf-8') as file:
+        rows = list(csv.reader(file))
+    at = rows[0].index(column)
+    return [float(row[at]) for row in rows[1:] if row[0].startswith(begins) and row[at]]
+
+
+_VALUE = re.compile(rf'({_NUMBER}) ?({_UNIT})')
+
+
+def value_with_unit(text: str) -> float:
+    """Return the value of ``30 kΩ`` in SI."""
+    found = _VALUE.search(text)
+    assert found, text
+    return float(found[1].replace(' ', '')) * SCALE[found[2]]
+
+
+def sheet(name: str) -> float:
+    """Return a value that ``docs/numbers.yaml`` declares from a data sheet."""
+    (text,) = [values[name] for values in ledger()[SHEETS].values() if name in values]
+    return value_with_unit(text)
+
+
+def component(name: str) -> float:
+    """Return the value of a component of the schematics."""
+    text = (DOCS / 'schematic.py').read_text(encoding='utf-8')
+    found = re.search(rf"'[^']*\b{name}\b[^']*?(?:\\n| )({_NUMBER} ?(?:{_UNIT}))", text)
+    assert found, name
+    return value_with_unit(found[1])
+
+
+SHEETS = 'data sheets'
+"""Entry of ``docs/numbers.yaml`` with the values of data sheets, by their source."""
+CONFIDENCE = inspect.signature(interval).parameters['confidence'].default
+
+FUNCTIONS = {
+    'record': record,
+    'runs': runs,
+    'case': case,
+    'trials': trials,
+    'sheet': sheet,
+    'component': component,
+    'confidence': CONFIDENCE,
+    'mean': mean,
+    'interval': interval,
+    **{one.__name__: one for one in (min, max, sum, abs, len, math.log, math.radians)},
+    'pi': math.pi,
+}
+"""What an expression may call."""
+
+
+def value_of(name: str) -> object:
+    """Return what a dotted name of the package is; of a field of a dataclass, its default."""
+    owner, _, last = name.rpartition('.')
+    home = '' if owner == 'drawings' else 't3mpc_ros.'
+    found: object = pkgutil.resolve_name(f'{home}{owner}')
+    fields = getattr(found, '__dataclass_fields__', {}) if isinstance(found, type) else {}
+    return fields[last].default if last in fields else getattr(found, last)
 
 
 @cache
@@ -219,9 +345,9 @@ def default_of(name: str) -> float:
 
 
 @cache
-def ledger() -> dict[str, dict[str, dict[str, object]]]:
-    """Return ``docs/numbers.yaml``: page, section, then ``from`` and expressions by quantity."""
-    content: dict[str, dict[str, dict[str, object]]] = yaml.safe_load(
+def ledger() -> dict[str, dict[str, dict[str, Any]]]:
+    """Return ``docs/numbers.yaml``: page, section, then expressions by quantity."""
+    content: dict[str, dict[str, dict[str, Any]]] = yaml.safe_load(
         LEDGER.read_text(encoding='utf-8')
     )
     return content
@@ -234,32 +360,39 @@ def pages() -> list[Path]:
 
 
 def sources(page: Path) -> Iterator[tuple[Quantity, str]]:
-    """Yield each quantity of a page with its source: *checked*, where it is from, or ''."""
+    """Yield each quantity of a page with what has it, ``stated``, or an empty string."""
     known = ledger().get(page.name, {})
     for one in quantities(page.read_text(encoding='utf-8')):
-        entries = known.get(one.section, {})
+        entries = known.get('*', {}) | known.get(one.section, {})
         given = entries.get(one.text)
-        if of_parameter(one) or (given is not None and one.shows(evaluated(given))):
-            yield one, 'checked'
+        row = one.block.startswith('|')
+        if of_parameter(one):
+            yield one, 'parameter'
+        elif given is not None and one.shows(evaluated(given)):
+            yield one, 'expression'
+        elif row and 'record' in entries and plain(one.block) in recorded_lines(entries['record']):
+            yield one, 'record'
+        elif row and 'test' in entries:
+            yield one, 'test'
+        elif any(one.text in texts for texts in entries.get('stated', {}).values()):
+            yield one, 'stated'
         else:
-            yield one, '' if given is not None else str(entries.get('from', ''))
+            yield one, 'attributed' if 'from' in entries and given is None else ''
 
 
 def main() -> None:
-    """Count the quantities of the pages, and list what is not checked."""
-    shown = sys.argv[1:]
+    """Count the quantities of the pages, and list what is not compared."""
+    shown, total = sys.argv[1:], Counter[str]()
     for page in pages():
         found = list(sources(page))
-        rest = [(one, source) for one, source in found if source != 'checked']
-        without = sum(not source for _, source in rest)
-        print(
-            f'{page.name:20} {len(found):4}, checked {len(found) - len(rest):4}, without {without}'
-        )
-        for one, source in rest if page.name in shown else ():
-            at = max(one.block.find(one.text.split()[0]) - 40, 0)
-            print(
-                f'  {one.section[:20]:20} {source[:16]:16} {one.text:12} {one.block[at : at + 80]}'
-            )
+        count = Counter(kind for _, kind in found)
+        total += count
+        print(f'{page.name:20} {len(found):4}', dict(count))
+        for one, kind in found if page.name in shown else ():
+            if kind in ('', 'attributed'):
+                at = max(one.block.find(one.text.split()[0]) - 40, 0)
+                print(f'  {one.section[:20]:20} {one.text:12} {one.block[at : at + 100]}')
+    print(f'{"all":20} {total.total():4}', dict(total))
 
 
 if __name__ == '__main__':

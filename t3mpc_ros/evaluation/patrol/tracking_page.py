@@ -84,6 +84,23 @@ def path_table(study: TrackingStudy, path: str) -> Table:
     return Table(path.capitalize(), head, lines, (OURS,), wrap=True)
 
 
+def summary_table(study: TrackingStudy) -> Table:
+    """Return the rms error and the verdict of each method on each path."""
+    lines = []
+    for name in study.plan.methods:
+        line = [name]
+        for path in study.plan.paths:
+            errors = [
+                1e3 * row['cross_track'] for row in study.table.where(path=path, controller=name)
+            ]
+            own = {'path': path, 'controller': OURS}
+            above = study.table.difference('cross_track', {**own, 'controller': name}, own)
+            judged = f'; {verdict(above)}' if name != OURS and above is not None else ''
+            line.append(format_mean(errors, 2) + judged)
+        lines.append(line)
+    return Table('Error rms, mm; verdict', ('method', *study.plan.paths), lines, (OURS,))
+
+
 def _time(times: Sequence[float]) -> str:
     arrived = [time for time in times if math.isfinite(time)]
     if len(arrived) == len(times):
@@ -117,8 +134,9 @@ EXPLANATION = (
 
 def markdown(study: TrackingStudy) -> str:
     """Return all tables in Markdown."""
-    tables = [path_table(study, path).markdown() for path in study.plan.paths]
-    return '\n\n'.join([description(study.plan), *tables, EXPLANATION])
+    tables = [summary_table(study), *(path_table(study, path) for path in study.plan.paths)]
+    texts = [table.markdown() for table in tables]
+    return '\n\n'.join([description(study.plan), *texts, EXPLANATION])
 
 
 def page(study: TrackingStudy, drawn: Mapping[str, bytes]) -> str:
