@@ -317,9 +317,6 @@ def test_stopping_times_of_the_page_are_those_of_the_trials():
             if cell.strip().isalpha() or ' ' in cell.strip() or cell.strip() == '-':
                 continue
             assert _close(cell.strip(), max(values)), (name, field)
-    rests = [float(trial['rest']) for trial in trials if trial['rest']]
-    assert max(rests) <= 0.45
-    assert 'No stop takes longer than 0.45 s' in page
     assert max(float(trial['after']) for trial in trials) <= 2e-4
 
 

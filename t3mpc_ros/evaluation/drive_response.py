@@ -36,6 +36,8 @@ from t3mpc_ros.evaluation.confidence_intervals import student_quantile
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 
+FINEST_STEP, COARSEST_STEP = 0.002, 0.01
+"""Bounds of the step of the fit, s."""
 LONGEST_DEAD_TIME, LONGEST_LAG = 1.0, 3.0
 """Largest dead time and lag that are searched, s."""
 MOST = 20_000
@@ -122,7 +124,7 @@ def fit_response(command: Series, motion: Series, name: str) -> ResponseFit | No
     if min(len(command), len(motion)) < 3:
         return None
     gap = float(np.median(np.diff(motion.time)))
-    step = min(max(0.25 * gap, 0.002), 0.01)
+    step = min(max(0.25 * gap, FINEST_STEP), COARSEST_STEP)
     start, end = busiest(command, motion, name, MOST * step)
     if not end > start:
         return None

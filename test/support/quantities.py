@@ -188,14 +188,14 @@ def stated_defaults(text: str) -> Iterator[tuple[str, Quantity]]:
             yield name, Quantity(section, block, f'{number} {unit}', number, unit)
 
 
-_WORD = re.compile(r"'[^']*'|\$[a-z][\w.]*|\bT3_\w+|\b[a-z]\w*\.[\w.]+")
+_WORD = re.compile(r"'[^']*'|\$[a-z][\w.]*|(?<!\.)\b[A-Z][A-Z\d_]{3,}|\b[a-z]\w*\.[\w.]+")
 
 
 def evaluated(expression: object) -> float:
     """Return the value of an expression of names.
 
-    They are dotted names of the package, ``$parameters``, constants of the firmware (``T3_``), and
-    :data:`FUNCTIONS` of what was measured.
+    They are dotted names of the package, ``$parameters``, constants of the firmware or the live
+    page, and :data:`FUNCTIONS` of what was measured.
     """
     names: dict[str, object] = dict(FUNCTIONS)
 
@@ -207,7 +207,7 @@ def evaluated(expression: object) -> float:
         if text[0] == '$':
             names[key] = default_of(text[1:])
         else:
-            names[key] = firmware()[text] if text[0] == 'T' else value_of(text)
+            names[key] = constants()[text] if text[0].isupper() else value_of(text)
         return key
 
     text = _WORD.sub(named, str(expression))
@@ -310,6 +310,7 @@ FUNCTIONS = {
     'runs': runs,
     'case': case,
     'trials': trials,
+    'number': float,
     'sheet': sheet,
     'component': component,
     'confidence': CONFIDENCE,
@@ -324,17 +325,24 @@ FUNCTIONS = {
 def value_of(name: str) -> object:
     """Return what a dotted name of the package is; of a field of a dataclass, its default."""
     owner, _, last = name.rpartition('.')
-    home = '' if owner == 'drawings' else 't3mpc_ros.'
+    home = '' if owner.startswith(('drawings', 'bench.')) else 't3mpc_ros.'
     found: object = pkgutil.resolve_name(f'{home}{owner}')
-    fields = getattr(found, '__dataclass_fields__', {}) if isinstance(found, type) else {}
-    return fields[last].default if last in fields else getattr(found, last)
+    if isinstance(found, type):
+        fields = getattr(found, '__dataclass_fields__', {})
+        defaults = {name: field.default for name, field in fields.items()}
+        defaults |= getattr(found, '_field_defaults', {})
+        if last in defaults:
+            return defaults[last]
+    return getattr(found, last)
 
 
 @cache
-def firmware() -> dict[str, float]:
-    """Return the constants of the firmware that are plain numbers."""
-    form = r'#define (T3_\w+) +(?:U?INT\d+_C\()?(\d+)u?\)?(?=\s)'
-    texts = [file.read_text('utf-8') for file in (ROOT / 'firmware' / 'core').glob('*.h')]
+def constants() -> dict[str, float]:
+    """Return the constants of the firmware, and of the live page, that are plain numbers."""
+    form = r'(?:#define|const) (\w+) (?:= )?(?:U?INT\d+_C\()?(\d+)u?\)?(?=[\s;])'
+    folders = (ROOT / 'firmware' / 'core', ROOT / 't3mpc_ros' / 'view' / 'page')
+    files = [file for folder in folders for file in folder.iterdir()]
+    texts = [file.read_text('utf-8') for file in files if file.suffix in ('.h', '.c', '.js')]
     return {name: float(value) for text in texts for name, value in re.findall(form, text)}
 
 

@@ -64,6 +64,8 @@ _ODOMETRY_FIELDS = {
 SIGNAL_NAMES = ('mode', 'signal of the right wheel', 'signal of the left wheel')
 """Numbers of the topic of signals."""
 _TWIST_FIELDS = {'linear': 'linear.x', 'angular': 'angular.z'}
+SWITCH_WINDOW = 0.25
+"""Largest time from a change of the signals to the step of the reference, s."""
 JUMP = 10.0
 """Jump (s) of the stamps against the receive times that indicates a changed clock."""
 
@@ -494,7 +496,7 @@ def _switches(numbers: Mapping[str, Series], reference: Series | None) -> Array:
     found = set()
     for time in times:
         if reference is not None and len(reference) > 1:
-            near = np.flatnonzero(np.abs(reference.time[1:] - time) < 0.25)
+            near = np.flatnonzero(np.abs(reference.time[1:] - time) < SWITCH_WINDOW)
             if near.size:
                 step = sum(np.abs(np.diff(reference[wheel]))[near] for wheel in WHEELS)
                 time = float(reference.time[1:][near[np.argmax(step)]])
