@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.geometry.arena import OCCUPIED_PERCENT, Arena, OccupancyGrid
 from t3mpc_ros.geometry.path_timing import PathTiming, resample
-from t3mpc_ros.geometry.route_planning import SPACING, RoutePlanner
+from t3mpc_ros.geometry.route_planning import SPACING, WAY_OUT, RoutePlanner
 from t3mpc_ros.geometry.types import Array, BodyTwist, Pose, wrap_angle
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
@@ -431,6 +431,16 @@ class PathPlan:
         return points
 
 
+def keeps_off(distances: Array, least: float) -> NDArray[np.bool_]:
+    """Return which points of a path are so far (m) from obstacles, or on the way out from there.
+
+    A robot that finds itself too near, because the map or its pose on it has changed, may leave.
+    """
+    reached = np.maximum.accumulate(distances)
+    found: NDArray[np.bool_] = distances >= np.where(reached < least, WAY_OUT * reached, least)
+    return found
+
+
 def alignments(vectors: Array, direction: Array) -> Array:
     """Return the cosines of the angles between vectors, shape (n, 2), and a direction."""
     sizes = np.maximum(np.hypot(*vectors.T) * math.hypot(*direction), 1e-9)
@@ -621,8 +631,9 @@ class PlannedPath:
     def _leave_unsafe(self) -> None:
         """Leave the path where it leads too near to an obstacle, or over floor not seen."""
         least = self._parameters.distance - REPLAN
-        walls = self._planner.wall_distance(self.plan.points) < least
-        unseen = self._planner.unsafe_distance(self.plan.points[: self._fed]) < least - REPLAN
+        points = self.plan.points
+        walls = ~keeps_off(self._planner.wall_distance(points), least)
+        unseen = ~keeps_off(self._planner.unsafe_distance(points[: self._fed]), least - REPLAN)
         fed = self._fed
         if self._look is None and (walls[1:fed].any() or unseen[1:].any()):
             self._cut()
@@ -651,9 +662,8 @@ class PlannedPath:
         During a look it gets nothing: the look ends with a new begin.
         """
         points = self.plan.points[self._fed :]
-        seen = self._planner.unsafe_distance(points) >= (
-            self._parameters.distance - self._parameters.reserve
-        )
+        away = self._planner.unsafe_distance(self.plan.points[self._fed - 1 :])
+        seen = keeps_off(away, self._parameters.distance - self._parameters.reserve)[1:]
         free = len(points) if seen.all() else int(np.argmin(seen))
         self._seen = self._fed + free
         if free < len(points):

@@ -41,6 +41,8 @@ NEAR_COST, UNSEEN_COST, CLOSE_COST = 1.0, 0.7, 10.0
 seen, and nearer to obstacles than permitted, where a route may only begin."""
 ESCAPE = 0.3
 """Distance from its begin up to which a route may be too near to obstacles, m."""
+WAY_OUT = 0.75
+"""Share of its distance from obstacles that a way keeps which begins too near to them."""
 FAR = 1e3
 """Distance from obstacles where there are none, m."""
 MAX_SWEEPS = 100
@@ -113,14 +115,16 @@ class RoutePlanner:
         away = np.hypot(
             np.arange(columns)[None, :] - place[0], np.arange(rows)[:, None] - place[1]
         )
-        allowed = float(self.wall_distance(np.array([begin]))[0]) - 2.0 * self._step
+        allowed = WAY_OUT * float(self.wall_distance(np.array([begin]))[0])
         escape = (away * self._scale < ESCAPE) & (walls >= min(allowed, self.distance))
         costs[escape & (walls < self.distance)] = CLOSE_COST
         costs[(walls < self.distance) & ~escape] = math.inf
         times: Array = np.full(costs.shape, math.inf)
         # Exact around the begin, where the front is more curved than the grid can show.
         start = (away < 3.0) & np.isfinite(costs)
-        np.copyto(times, away * costs, where=start)
+        dearest = float(costs[start].max(initial=0.0))
+        # Times that grow with the distance: cheap places beyond dear ones were no way down.
+        np.copyto(times, away * (dearest if dearest >= CLOSE_COST else costs), where=start)
         for _ in range(MAX_SWEEPS):
             if not sweep_times(times, costs):
                 break

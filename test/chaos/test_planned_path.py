@@ -353,6 +353,23 @@ def test_a_robot_that_is_walled_in_rests_until_it_is_free():
     assert length(drive(path, room, 30.0)) > 3.0
 
 
+@pytest.mark.parametrize('direction', [0.0, 1.0, 2.5, -1.5])
+def test_a_robot_too_near_to_what_is_marked_leaves(direction):
+    """A place marked a hand's breadth before it, which was none, kept it there for ever."""
+    room = Room()
+    path = planned()
+    drive(path, room, 10.0)
+    x, y, _ = path._pose
+    there = x + 0.19 * math.cos(direction), y + 0.19 * math.sin(direction)
+    room.occupied |= room.near(*there, 0.05)
+    rows = drive(path, room, 40.0)
+    assert length(rows) > 4.0
+    away = room.distances(room.near(*there, 0.05), rows[:, :2])
+    first = int(np.argmax(away > 0.18))
+    assert (np.diff(away[:first]) > -SIZE - 1e-9).all()
+    assert away[first:].min() > 0.14
+
+
 def test_it_begins_anew_at_a_robot_that_does_not_come():
     room = Room()
     room.seen[:] = True
