@@ -341,8 +341,8 @@ OWN_ODOMETRY = 0.001
 """Difference of a step of the pose from that of the wheels (m, rms) up to which the pose is
 counted by the wheels: only then that difference of the turns says more than the way does. A tyre
 that slips turns a robot, too."""
-DRIVING = 0.05
-"""Commanded speed (m/s) above which that difference counts."""
+ON_THE_SPOT, DRIVING = 0.015, 0.05
+"""Commanded speeds (m/s) above which the way counts, and the difference of the turns."""
 RECOVERY_TIME = 5.0
 """Time of driving as commanded after which earlier pauses do not count, s."""
 
@@ -380,15 +380,17 @@ class ContactMonitor:
         x, y = pose.x - last.x, pose.y - last.y
         self._pose = pose
         ahead = math.cos(middle) * x + math.sin(middle) * y
-        self._ahead += ahead
         self._unlike += (ahead - odometry.twist.linear * elapsed) ** 2
         self._steps += 1
+        # On the spot a pose may be corrected, and a tyre slip, without any contact.
+        if abs(command.linear) > ON_THE_SPOT:
+            self._asked += command.linear * elapsed
+            self._ahead += ahead
+            self._left += math.cos(middle) * y - math.sin(middle) * x
+        if abs(command.linear) > DRIVING:
+            self._turn += odometry.twist.angular * elapsed - turn
         if abs(self._ahead) >= self._most:
             self._most, self.furthest = abs(self._ahead), pose
-        self._left += math.cos(middle) * y - math.sin(middle) * x
-        if abs(command.linear) > DRIVING:  # a tyre may slip on the spot without any contact
-            self._turn += odometry.twist.angular * elapsed - turn
-        self._asked += command.linear * elapsed
         self._fastest = max(self._fastest, abs(command.linear))
         self._fastest_turn = max(self._fastest_turn, abs(command.angular))
         self._time += elapsed

@@ -30,6 +30,7 @@ import math
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, Pose, has_moved
 from t3mpc_ros.kernels import TypedKernel, kernel
@@ -189,6 +190,48 @@ class ChangeDetector:
         pose, covariance : of x, y (m), yaw (rad), shape (3, 3)
         beams : readings with the beams that they were taken along, in the frame of the robot
         """
+        limit_ns = round(self.parameters.memory * NANOSECONDS)
+        for place in list(self._places):
+            if place.event is None and stamp_ns - place.last_ns > limit_ns:
+                self._remove(place)
+        changed = False
+        touched: dict[Place, None] = {}
+        for row in self._evidence(pose, covariance, beams):
+            changed |= self._pass(row)
+            for missing, evidence, cell in row.cells():
+                if evidence > 0.0:
+                    touched[self._support(missing, cell, evidence, stamp_ns)] = None
+                elif evidence < 0.0:
+                    changed |= self._oppose(missing, around(cell), -evidence)
+        for place in touched:
+            # Not what another beam of the same readings has ended, or merged with its neighbour.
+            if place in self._places:
+                changed |= self._seen(place, stamp_ns, pose)
+        return changed
+
+    def explained(self, pose: Pose, covariance: Array, beams: Beams) -> NDArray[np.bool_]:
+        """Return which beams contradict the map where it has changed: they do not tell the pose.
+
+        That is where an event is, and at the one place besides where a change is most likely, if
+        it is more likely than not: a robot that is not where it takes itself to be contradicts
+        the map at many places.
+        """
+        likely = {each for each in self._places if each.event is not None}
+        others = (each for each in self._places if each.event is None)
+        best = max(others, key=lambda place: place.evidence, default=None)
+        if best is not None and best.evidence > self.parameters.prior:
+            likely.add(best)
+        found = np.zeros(beams.reading.size, dtype=np.bool_)
+        if likely:
+            for index, row in enumerate(self._evidence(pose, covariance, beams)):
+                found[index] = any(
+                    evidence > 0.0
+                    and any(self._owners[missing].get(each) in likely for each in around(cell))
+                    for missing, evidence, cell in row.cells()
+                )
+        return found
+
+    def _evidence(self, pose: Pose, covariance: Array, beams: Beams) -> 'list[BeamEvidence]':
         found = np.zeros((beams.reading.size, len(BeamEvidence._fields)))
         deviations = self.parameters.deviations * np.sqrt(
             [0.5 * (covariance[0, 0] + covariance[1, 1]), covariance[2, 2]]
@@ -203,28 +246,7 @@ class ChangeDetector:
             self.parameters.deviations,
             found,
         )
-        limit_ns = round(self.parameters.memory * NANOSECONDS)
-        for place in list(self._places):
-            if place.event is None and stamp_ns - place.last_ns > limit_ns:
-                self._remove(place)
-        changed = False
-        touched: dict[Place, None] = {}
-        for row in map(BeamEvidence._make, found.tolist()):
-            changed |= self._pass(row)
-            for missing, evidence, x, y in (
-                (False, row.new, row.end_x, row.end_y),
-                (True, row.missing, row.wall_x, row.wall_y),
-            ):
-                cell = math.floor(x / CELL), math.floor(y / CELL)
-                if evidence > 0.0:
-                    touched[self._support(missing, cell, evidence, stamp_ns)] = None
-                elif evidence < 0.0:
-                    changed |= self._oppose(missing, around(cell), -evidence)
-        for place in touched:
-            # Not what another beam of the same readings has ended, or merged with its neighbour.
-            if place in self._places:
-                changed |= self._seen(place, stamp_ns, pose)
-        return changed
+        return [*map(BeamEvidence._make, found.tolist())]
 
     def _pass(self, row: 'BeamEvidence') -> bool:
         """Lower the evidence of new things over which a ray passes; return whether one ended."""
@@ -395,6 +417,13 @@ class BeamEvidence(NamedTuple):
     """rad"""
     free: float
     """Distance up to which it shows that nothing is there, m."""
+
+    def cells(self) -> tuple[tuple[bool, float, Cell], tuple[bool, float, Cell]]:
+        """Return whether something is missing, the evidence for it, and where, of each kind."""
+        return (
+            (False, self.new, (math.floor(self.end_x / CELL), math.floor(self.end_y / CELL))),
+            (True, self.missing, (math.floor(self.wall_x / CELL), math.floor(self.wall_y / CELL))),
+        )
 
 
 @kernel

@@ -72,6 +72,10 @@ CORRECTION_TIME = 0.5
 """Time constant with which the used pose approaches that of the localizer, s."""
 CORRECTION_SPEED, CORRECTION_RATE = 0.05, 0.2
 """Largest speed of that (m/s, rad/s)."""
+CORRECTION_SHARE, CORRECTION_ARM, CORRECTION_STANDING = 0.2, 0.05, 0.01
+"""Largest share of the way of the odometry, with that of a point so far from the centre (m), by
+which it moves the pose of a robot that is faster than that (m/s): a controller takes a way that is
+too short, or leads aside, for a contact (0.3 and 0.4 of :mod:`t3mpc_ros.control.watchdog`)."""
 JUMP_DISTANCE, JUMP_ANGLE = 0.25, 0.5
 """Distance (m) and angle (rad) from which on the pose is taken at once."""
 STEADY_TIME, STEADY_DISTANCE, STEADY_ANGLE = 3.0, 0.08, 0.08
@@ -281,13 +285,22 @@ class Localizer:
         elapsed = min((stamp_ns - self._updated_ns) / NANOSECONDS, LONGEST_UPDATE)
         self.filter.predict(self._updated, pose, elapsed)
         beams = self._beams(pose)
+        known = self._of_the_map(beams, pose)
         # Averages of the likelihood get used to a wrong place; the share that fits does not.
-        self.filter.correct(beams, 1.0 - self.agreement if self._searching else 0.0)
+        self.filter.correct(known, 1.0 - self.agreement if self._searching else 0.0)
         found = self._publish(pose)
-        self._compare(beams)
+        self._compare(known)
         if self.parameters.changes.enabled:
             self._detect(beams)
         return found
+
+    def _of_the_map(self, beams: Beams, odometry: Pose) -> Beams:
+        """Return the beams without those of what has changed, by the pose before these beams."""
+        if self.result is None or not self.parameters.changes.enabled:
+            return beams
+        expected = pose_in(self.result.odometry_frame, odometry)
+        known = ~self.changes.explained(expected, self.result.covariance, beams)
+        return Beams(*(part[known] for part in beams))
 
     def _detect(self, beams: Beams) -> None:
         """Look for changes of the surroundings where the place is known.
@@ -363,11 +376,18 @@ class PoseCorrection:
         self._target: Pose | None = None
         """As last known."""
         self._stamp_ns = 0
+        self._odometry: Pose | None = None
 
     def step(self, stamp_ns: int, odometry: Pose, localizer: Localizer) -> Pose | None:
         """Return the pose on the map of a pose of the odometry; None: the place is not known."""
         elapsed = min(max((stamp_ns - self._stamp_ns) / NANOSECONDS, 0.0), CORRECTION_TIME)
         self._stamp_ns = stamp_ns
+        last, self._odometry = self._odometry or odometry, odometry
+        way = math.hypot(odometry.x - last.x, odometry.y - last.y)
+        way += CORRECTION_ARM * abs(wrap_angle(odometry.yaw - last.yaw))
+        most = CORRECTION_SPEED * elapsed
+        if way > CORRECTION_STANDING * elapsed:
+            most = min(most, CORRECTION_SHARE * way)
         result = localizer.result
         if result is not None and localizer.state is Localization.LOCALIZED:
             self._target = result.odometry_frame
@@ -384,7 +404,7 @@ class PoseCorrection:
             self._frame = self._target
             return wanted
         share = elapsed / CORRECTION_TIME
-        move = min(share, CORRECTION_SPEED * elapsed / max(away, 1e-9))
+        move = min(share, most / max(away, 1e-9))
         rotate = min(share, CORRECTION_RATE * elapsed / max(abs(turn), 1e-9))
         pose = Pose(pose.x + move * x, pose.y + move * y, wrap_angle(pose.yaw + rotate * turn))
         self._frame = frame_between(pose, odometry)

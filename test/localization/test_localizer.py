@@ -14,11 +14,16 @@
 """A robot in a room that the tests simulate: odometry with drift, eight ranges with noise."""
 
 import math
+import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from t3mpc_ros.geometry.types import ORIGIN, Pose, wrap_angle
+from t3mpc_ros.control.watchdog import ContactMonitor
+from t3mpc_ros.geometry.kinematics import advance_pose
+from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State, wrap_angle
+from t3mpc_ros.localization.change_detection import ChangeKind
 from t3mpc_ros.localization.localizer import (
     Localization,
     Localizer,
@@ -35,14 +40,12 @@ from t3mpc_ros.simulation.world import cast_rays, parse_world
 MOUNTS = sensor_mounts(RangeSensorParameters())
 LEAST, MOST = 0.1, 0.8
 PERIOD = 0.05
-ROOM = parse_world(
-    """
+TEXT = """
 walls: [{points: [[-1.3, -1.0], [1.3, -1.0], [1.3, 1.0], [-1.3, 1.0]], closed: true}]
 boxes: [{center: [0.1, 0.05], size: [0.5, 0.3], yaw: 0.4}]
 circles: [{center: [1.15, 0.8], radius: 0.12}]
-""",
-    'cell',
-)
+"""
+ROOM = parse_world(TEXT, 'cell')
 SEEN = map_of_world(ROOM)
 EVERY = np.arange(len(MOUNTS))
 
@@ -57,11 +60,12 @@ class Drive:
         self.odometry = ORIGIN
         self.drift, self.noise = drift, noise
         self.stamp_ns = 0
+        self.room = ROOM
 
     def distances(self, mounts=MOUNTS):
         out = np.empty(len(mounts))
         which = np.arange(len(mounts))
-        cast_rays(*self.truth, mounts, which, ROOM.segments, ROOM.circles, out)
+        cast_rays(*self.truth, mounts, which, self.room.segments, self.room.circles, out)
         return out
 
     def ranges(self):
@@ -296,6 +300,23 @@ def test_things_that_the_map_lacks_do_not_lead_it_away():
 
 
 @pytest.mark.compiled
+@pytest.mark.parametrize('missing', ['boxes', 'circles'])
+def test_a_thing_that_is_gone_does_not_make_it_doubt_its_place(missing):
+    """It was lost after 20 readings that passed where a box had been: it was no event yet."""
+    localizer, drive = make_localizer(), Drive()
+    follow(localizer, drive, 5.0)
+    drive.room = parse_world(re.sub(rf'^{missing}: .*$', '', TEXT, flags=re.MULTILINE), 'cell')
+    errors = []
+    for _ in range(12):
+        errors.extend(follow(localizer, drive, 5.0))
+        assert localizer.state is Localization.LOCALIZED
+        assert localizer.agreement > 0.6
+    assert np.array(errors)[:, 0].max() < 0.1
+    (found,) = localizer.changes.changes
+    assert found.kind is ChangeKind.MISSING
+
+
+@pytest.mark.compiled
 def test_a_scan_is_used_like_the_ranges():
     localizer, drive = make_localizer(sigma_hit_growth=0.0), Drive(seed=7)
     angles = np.linspace(-math.pi, math.pi, 24, endpoint=False)
@@ -373,6 +394,27 @@ def test_the_corrected_pose_jumps_where_the_robot_is_found():
     changes, pose = drive_corrected(localizer, drive, correction, 60.0)
     assert changes[:, 0].max() > 0.25
     assert math.hypot(pose.x - drive.truth.x, pose.y - drive.truth.y) < 0.06
+
+
+@pytest.mark.parametrize('away', [(0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
+def test_a_correction_is_no_contact(away):
+    """A robot backed off, twice, from nothing, and then took itself to be walled in for ever."""
+    monitor, correction, pose, now = ContactMonitor(), PoseCorrection(), ORIGIN, STANDSTILL
+    frame, touches = ORIGIN, []
+    for k in range(10_000):
+        phase = k // 400 % 5
+        wanted = ((0.3, 0.0), (0.0, 2.0), (0.011, 1.2), (0.1, 0.5), (0.02, 0.0))[phase]
+        step = [min(max(w - n, -a), a) for w, n, a in zip(wanted, now, (0.01, 0.14), strict=True)]
+        now = BodyTwist(now.linear + step[0], now.angular + step[1])
+        pose = advance_pose(pose, now, 0.01)
+        if k % 2400 == 0:  # at each of them once
+            frame = Pose(frame.x + away[0], frame.y + away[1], frame.yaw)
+        localizer = SimpleNamespace(
+            result=SimpleNamespace(odometry_frame=frame), state=Localization.LOCALIZED
+        )
+        found = correction.step(k * 10_000_000, pose, localizer)
+        touches.append(monitor.is_in_contact(State(k * 10_000_000, found, now), now, 0.01))
+    assert not any(touches)
 
 
 def test_there_is_no_corrected_pose_before_the_place_is_known():
