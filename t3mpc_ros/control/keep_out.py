@@ -71,6 +71,10 @@ MARGIN = 25
 """Cells of unknown floor around what is published."""
 ENDING = 5.0
 """Rest of that time with which floor is published as unseen, s."""
+SURELY_SEEN = 0.7
+"""Share of its range up to which a sensor sees every surface across its beam."""
+SURFACE_HALF_WIDTH, SURFACE_DEPTH = 0.04, 0.1
+"""Half the width of what surely is across a beam, and its largest depth, m."""
 CLEARINGS = 4
 """Rays that must pass over an occupied cell to clear it."""
 DIRECTIONS = 48
@@ -180,6 +184,7 @@ class FreeSpaceMap:
         )
         """The cells."""
         self._add_ray = TypedKernel(add_ray)
+        self._find_surface = TypedKernel(find_surface)
         self.clear()
 
     def clear(self) -> None:
@@ -260,6 +265,18 @@ class FreeSpaceMap:
         near: NDArray[np.bool_] = squares[0][:, None] + squares[1][None, :] <= radius**2
         return (spans[0], spans[1]), near
 
+    def surface(self, sensor: int, pose: Pose) -> tuple[float, float] | None:
+        """Return the surface (m) that a sensor of the robot at ``pose`` must see; None: none."""
+        ahead, aside, direction = self._mounts[sensor].tolist()
+        cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
+        x, y = pose.x + cosine * ahead - sine * aside, pose.y + sine * ahead + cosine * aside
+        direction += pose.yaw
+        reach = SURELY_SEEN * self.parameters.range
+        away = self._find_surface(self.grid, x, y, direction, reach)
+        if away == math.inf:
+            return None
+        return x + away * math.cos(direction), y + away * math.sin(direction)
+
     def add_reading(self, sensor: int, reading: float, pose: Pose) -> None:
         """Add a reading (m, REP 117) of a sensor of the robot at ``pose``."""
         ahead, aside, direction = self._mounts[sensor].tolist()
@@ -300,6 +317,34 @@ def has_obstacle(cells: Cells, row: int, column: int, reach: int) -> bool:
             if cells[near_row, near_column] >= OCCUPIED:
                 return True
     return False
+
+
+@kernel
+def find_surface(grid: MapGrid, x: float, y: float, direction: float, reach: float) -> float:
+    """Return the distance (m) of a surface that was seen across a ray, at most ``reach``; inf.
+
+    Walls of a world file and what the robot has touched are not counted: nobody has seen them.
+    """
+    count, step = grid.cells.shape[0], 0.5 * grid.size
+    cosine, sine = math.cos(direction), math.sin(direction)
+    nearest, farthest = math.inf, 0.0
+    for aside in range(-2, 3):
+        offset = 0.5 * aside * SURFACE_HALF_WIDTH
+        found = math.inf
+        for along in range(int(NEAREST_TRUSTED / step) + 1, int(reach / step) + 1):
+            column = int(
+                math.floor((x + along * step * cosine - offset * sine - grid.low) / grid.size)
+            )
+            row = int(
+                math.floor((y + along * step * sine + offset * cosine - grid.low) / grid.size)
+            )
+            if not (0 <= column < count and 0 <= row < count):
+                break
+            if grid.cells[row, column] == OCCUPIED:
+                found = along * step
+                break
+        nearest, farthest = min(nearest, found), max(farthest, found)
+    return nearest if farthest - nearest < SURFACE_DEPTH else math.inf
 
 
 @kernel
@@ -509,6 +554,11 @@ class KeepOut:
         """
         if not self.ranges.accept(sensor, reading, stamp_ns):
             return False
+        if reading == math.inf:
+            if (surface := self.map.surface(sensor, pose)) is not None:
+                self.ranges.miss(sensor, surface)
+            if not self.ranges.sees(sensor):
+                return True
         self.map.add_reading(sensor, reading, pose)
         return True
 

@@ -28,6 +28,9 @@ FROZEN_MOTION, FROZEN_TURN = 0.08, 0.8
 """Motion along its beam (m), or turn (rad), during which a sensor must not read one distance. Its
 noise of 10 mV changes a reading beyond 0.25 m even of a robot that stands, but not a nearer one of
 a robot that drives along a wall: that moves no face along its beam."""
+MISSES, MISSES_APART = 4, 0.3
+"""Number of surfaces, so far (m) from the one before, that a sensor has not seen and the map has,
+without having seen anything in between: it sees nothing at all. One may be old."""
 BRAKES = 0.4
 """Share of the time-out after which the robot brakes."""
 LEAP = 0.1
@@ -42,6 +45,7 @@ class RangeFault(enum.Enum):
     REPEATED = 'repeated: no newer stamps'
     IMPOSSIBLE = 'impossible: not a number, negative or beyond its range'
     FROZEN = 'frozen: one distance while the robot moves'
+    BLIND = 'blind: nothing in range where others have seen something'
 
 
 class SensorRecord:
@@ -67,14 +71,25 @@ class SensorRecord:
         self._reading = math.nan
         self._repeats = 0
         self._along = self._turn = 0.0
+        self._misses = 0
+        self._missed: tuple[float, float] | None = None
+        """The last surface that it has not seen, m."""
 
     def add(self, reading: float) -> None:
         """Add a valid reading."""
         self.pending = True
+        if reading != math.inf:
+            self._misses, self._missed = 0, None
         if reading == self._reading:
             self._repeats += 1
             return
         self._reading, self._repeats, self._along, self._turn = reading, 0, 0.0, 0.0
+
+    def miss(self, surface: tuple[float, float]) -> None:
+        """Count a surface (m) that the map has and it does not see."""
+        if self._missed is None or math.dist(self._missed, surface) > MISSES_APART:
+            self._missed = surface
+            self._misses += 1
 
     def move(self, forward: float, left: float, turn: float) -> None:
         """Add a motion of the robot in its frame (m, rad)."""
@@ -94,13 +109,15 @@ class SensorRecord:
             self.fault = self.cause
         elif moved and self._repeats >= REPEATS and math.isfinite(self._reading):
             self.fault = RangeFault.FROZEN
+        elif self._misses >= MISSES:
+            self.fault = RangeFault.BLIND
 
 
 class RangeMonitor:
     """Decides which range sensors can be relied on, by the stamps of odometry and readings.
 
-    "Nothing in range" and "too near" are no distances: a sensor that is frozen there cannot be
-    told from one before a large room.
+    "Nothing in range" is no distance: a sensor that is frozen there is told from one before a
+    large room by what the others have seen (:meth:`miss`). "Too near" is none, either.
 
     mounts : x, y (m) and direction (rad) of each face in the frame of the robot, shape (s, 3)
     timeout : time without a valid reading after which a sensor is lost, s
@@ -139,6 +156,14 @@ class RangeMonitor:
             return False
         record.add(reading)
         return True
+
+    def miss(self, sensor: int, surface: tuple[float, float]) -> None:
+        """Note that a sensor reads "nothing in range" where the map has a surface (m)."""
+        self._sensors[sensor].miss(surface)
+
+    def sees(self, sensor: int) -> bool:
+        """Return whether "nothing in range" of a sensor says that nothing is there."""
+        return self._sensors[sensor].fault is not RangeFault.BLIND
 
     def update(self, now_ns: int, pose: Pose) -> None:
         """Decide about each sensor at an odometry."""

@@ -19,13 +19,22 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
-from t3mpc_ros.control.keep_out import CAUTIOUS_SPEED, Activity, KeepOutParameters
+from t3mpc_ros.control.keep_out import (
+    CAUTIOUS_SPEED,
+    OCCUPIED,
+    Activity,
+    KeepOut,
+    KeepOutParameters,
+)
 from t3mpc_ros.control.range_monitor import RangeFault, RangeMonitor
 from t3mpc_ros.control.watchdog import Reason
+from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import advance_pose
-from t3mpc_ros.geometry.types import ORIGIN, RANGE_SENSORS, STANDSTILL, BodyTwist, State
+from t3mpc_ros.geometry.types import ORIGIN, RANGE_SENSORS, STANDSTILL, BodyTwist, Pose, State
+from t3mpc_ros.simulation.world import cast_rays
 
 PERIOD_NS = 10_000_000
+NO_CIRCLES = np.empty((0, 3))
 TIMEOUT = KeepOutParameters().range_timeout
 MOUNTS = np.array(KeepOutParameters().mounts).reshape(-1, 3)
 FRONT, SIDES, REAR = (0, 1), (2, 3, 6, 7), (4, 5)
@@ -175,6 +184,58 @@ def test_a_sensor_that_freezes_in_motion_is_found(twist, sensor):
 def test_constant_readings_that_are_no_fault(twist, readings):
     """The last: along a wall near enough that the noise is below the step of the reading."""
     assert not Drive(twist).run(5.0, readings).lost
+
+
+class Room:
+    """A keep-out on an exact robot that circles in a corner of a square room."""
+
+    def __init__(self, world=None):
+        square = 1.2 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])
+        self.walls = np.column_stack([square[:-1], square[1:]])
+        self.keep_out = KeepOut(KeepOutParameters(), BodyTwist(0.3, 2.0), world)
+        self.pose, self.k = Pose(-0.75, -0.95, 0.0), 0
+
+    def run(self, seconds, blind=(), circles=NO_CIRCLES):
+        far, which = np.empty(8), np.arange(8)
+        for _ in range(round(seconds / 0.04)):
+            self.k += 4
+            self.pose = advance_pose(self.pose, BodyTwist(0.1, 0.5), 0.04)
+            cast_rays(*self.pose, MOUNTS, which, self.walls, circles, far)
+            for sensor, distance in enumerate(far):
+                seen = distance < 0.8 and sensor not in blind
+                self.keep_out.add_reading(sensor, distance if seen else math.inf, self.pose)
+            self.keep_out.ranges.update(self.k * PERIOD_NS, self.pose)
+        return self.keep_out.ranges.faults()
+
+
+@pytest.mark.parametrize('sensor', range(8))
+def test_a_sensor_that_sees_nothing_is_found_by_what_others_saw(sensor):
+    room = Room()
+    assert room.run(20.0) == {}
+    found = room.run(40.0, blind=[sensor])
+    assert found == {RANGE_SENSORS[sensor]: RangeFault.BLIND}
+    cells = room.keep_out.map.grid.cells.copy()
+    room.run(20.0, blind=[sensor])
+    assert np.count_nonzero(room.keep_out.map.grid.cells == OCCUPIED) >= (
+        np.count_nonzero(cells == OCCUPIED)
+    )  # its rays clear nothing
+    assert room.run(20.0) == {}  # it sees again
+
+
+def test_things_that_leave_make_no_sensor_blind():
+    """What was there is still in the map where no ray has passed since."""
+    room = Room()
+    people = np.array([[-0.1, -0.5, 0.12], [-0.6, -0.2, 0.12]])
+    assert room.run(20.0, circles=people) == {}
+    for _ in range(40):
+        assert room.run(0.5) == {}
+
+
+def test_what_nobody_has_seen_makes_no_sensor_blind():
+    """Walls of the world file may be missing, and what was touched is not seen."""
+    square = 0.8 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])
+    known = Obstacles(np.column_stack([square[:-1], square[1:]]), NO_CIRCLES)
+    assert Room(known).run(40.0) == {}
 
 
 class KeptOut:

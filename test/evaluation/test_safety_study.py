@@ -93,6 +93,7 @@ def test_faults_of_sensors_change_what_arrives():
     plain = [[(t, t)] for t in (0.9, 1.1, 1.3, 1.5, 2.1)]
     assert arrived('silent') == [plain[0], [], [], [], plain[-1]]
     assert arrived('frozen')[1:4] == [[(0.9, t)] for t in (1.1, 1.3, 1.5)]
+    assert arrived('blind')[1:4] == [[(math.inf, t)] for t in (1.1, 1.3, 1.5)]
     assert arrived('repeated')[1:4] == [[(t, 0.9)] for t in (1.1, 1.3, 1.5)]
     assert arrived('late')[1:4] == [[(t, pytest.approx(t - 0.5))] for t in (1.1, 1.3, 1.5)]
     assert arrived('disordered')[1:4] == [[], [(1.3, 1.3), (1.1, 1.1)], []]

@@ -103,9 +103,11 @@ class SensorFault(NamedTuple):
     """A range sensor that fails for a time of the twin."""
 
     sensor: int
-    kind: Literal['silent', 'frozen', 'nan', 'negative', 'far', 'late', 'repeated', 'disordered']
-    """``late``: stamps are 0.5 s old; ``repeated``: stamps stay; ``disordered``: every second
-    reading comes after the next one."""
+    kind: Literal[
+        'silent', 'frozen', 'blind', 'nan', 'negative', 'far', 'late', 'repeated', 'disordered'
+    ]
+    """``blind``: it reads "nothing in range"; ``late``: stamps are 0.5 s old; ``repeated``: stamps
+    stay; ``disordered``: every second reading comes after the next one."""
     begin: float
     """s"""
     end: float = math.inf
@@ -114,8 +116,8 @@ class SensorFault(NamedTuple):
 
 LATE = 0.5
 """Age of late readings, s."""
-IMPOSSIBLE = {'nan': math.nan, 'negative': -0.3, 'far': 3.0}
-"""Readings that are impossible, m."""
+READINGS = {'blind': math.inf, 'nan': math.nan, 'negative': -0.3, 'far': 3.0}
+"""What sensors with these faults read, m."""
 
 
 class FaultyRanges:
@@ -152,7 +154,7 @@ class FaultyRanges:
             return found
         if kind == 'repeated':
             return [(reading, frozen_ns)]
-        return [(IMPOSSIBLE.get(kind, frozen), stamp_ns)]
+        return [(READINGS.get(kind, frozen), stamp_ns)]
 
 
 @dataclass(frozen=True)
