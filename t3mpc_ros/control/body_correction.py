@@ -108,6 +108,27 @@ WARNED_SCALE, WARNED_DEVIATION = 0.01, 0.004
 CLIP = 2.0
 """Largest innovation that is learnt at once, in its standard deviation."""
 
+WATCHED = 20
+"""Number of blocks that say how well the turn follows the commands: the last five seconds."""
+EXCITED = 2e-4
+"""Mean square of the change of w_c in a period, (rad/s)², from which a block says it."""
+UNEXPLAINED, EXCITED_BLOCKS = 0.3, 8
+"""Share of that change which the turn does not make, from which commands are lost or late, and
+number of blocks from which it is known."""
+ROUGH, CALM_BLOCKS = 0.003, 10
+"""Standard deviation of the turn beyond E20 (rad/s of a wheel) from which it is rough, and number
+of calm blocks from which it is known. Microsteps leave up to 0.0028."""
+WATCHED_QUANTILE = 0.2
+"""Quantile of the blocks that counts: in most of them nothing else disturbs the turn."""
+RINGING, RINGING_MEMORY = 0.04, 0.98
+"""Error of a step (rad/s) beside which the noise of the gyro is small, and forgetting factor of a
+block, of the frequency of the rotors."""
+RINGING_STEPS, RINGING_CORRELATION = 15.0, 0.97
+"""Number of such steps, and correlation of error and acceleration, from which it is known."""
+CALM_CHANGE, CALM_SPEED, RINGING_BLOCKS = 0.06, 0.3, 2
+"""Of a calm block: largest change of w_c in a period, least speed of a wheel (rad/s), and number
+of blocks after a larger change in which the rotors ring."""
+
 
 @dataclass(frozen=True)
 class BodyCorrectionParameters(Parameters):
@@ -183,11 +204,36 @@ class BodyMemory(Structure):
     command_power: float
     authority: float
     """Share of the correction that is in use."""
+    rest_sum: float
+    """Sum of what E20 does not explain of a step, and of its square."""
+    rest_square: float
+    change_square: float
+    """Sum of the squared changes of w_c in a period."""
+    largest_change: float
+    slowest: float
+    """Least speed of a wheel."""
+    steps: int
+    rings: int
+    """Number of blocks in which the rotors ring still."""
+    chain: int
+    """Number of steps since a gap, at most 2; of the last two steps:"""
+    last_achieved: float
+    before_achieved: float
+    last_rest: float
+    ring_count: float
+    """Number of the steps with a large error; sums over them of its square, of its product with
+    the angular acceleration of a wheel, and of the square of that."""
+    ring_error: float
+    ring_product: float
+    ring_acceleration: float
 
 
+WATCH = 'rest_sum', 'rest_square', 'change_square', 'largest_change', 'slowest', 'steps'
+"""Fields of the present block that :func:`watch_block` uses."""
 DRIVE = (
     *('started', 'yaw_error', 'commands', 'above', 'below'),
     *('block_time', 'achieved_sum', 'square_sum', 'rise', 'linked', 'spoilt'),
+    *(*WATCH, 'rings', 'chain', 'ring_count', 'ring_error', 'ring_product', 'ring_acceleration'),
 )
 """Fields of the memory that belong to one drive."""
 SKILL = 'raw_power', 'error_power', 'residual_power', 'command_power', 'authority'
@@ -226,6 +272,9 @@ class BodyState(NamedTuple):
     """Of the estimate, shape (8, 8)."""
     work: Array
     """Work space: row h of E20, and P h, shape (2, 8)."""
+    watched: Array
+    """Unexplained share and roughness of the last blocks, newest first, NaN where a block does not
+    say it, shape (n, 2)."""
 
 
 class BodyCorrection:
@@ -252,6 +301,7 @@ class BodyCorrection:
             np.zeros(ROWS),
             np.zeros((ROWS, ROWS)),
             np.zeros((2, ROWS)),
+            np.full((WATCHED, 2), math.nan),
         )
         self._correct_body = TypedKernel(correct_body)
         self.configure(parameters)
@@ -289,6 +339,22 @@ class BodyCorrection:
         """Estimated bias of the yaw rate of the odometry, rad/s."""
         return float(self._state.estimate[BIAS] * self._turn)
 
+    @property
+    def turning_frequency(self) -> float:
+        r"""Frequency (Hz) at which the robot oscillates in yaw; 0 while it is unknown.
+
+        A rotor that is behind its field by the angle e accelerates: w_a' = (2 pi f)² e for the
+        yaw, so the second derivative of what w_a leaves of E20 is -(2 pi f)² times it. A dead
+        time or a gain that is wrong has no such correlation.
+        """
+        memory = self._memory[0]
+        known = memory.ring_product > RINGING_CORRELATION * math.sqrt(
+            memory.ring_error * memory.ring_acceleration
+        )
+        if not known or memory.ring_count < RINGING_STEPS:
+            return 0.0
+        return math.sqrt(memory.ring_product / memory.ring_error) / (2.0 * math.pi)
+
     def problem(self) -> str:
         """Return what the gyro does to the yaw of the odometry, or nothing."""
         bias, estimate = self.gyro_bias, self._state.estimate
@@ -324,10 +390,33 @@ class BodyCorrection:
             )
         return ''
 
+    def response_problem(self) -> str:
+        """Return how the turn of the robot differs from its commands, or nothing."""
+        found, columns = [], self._state.watched.T
+        for column, least in zip(columns, (EXCITED_BLOCKS, CALM_BLOCKS), strict=True):
+            known = column[~np.isnan(column)]
+            enough = len(known) >= least
+            found.append(float(np.quantile(known, WATCHED_QUANTILE)) if enough else 0.0)
+        share, rough = found
+        if share > UNEXPLAINED:
+            return (
+                f'{share:.0%} of the squared changes of the commands is not in the yaw of odom: '
+                'commands or odometry are lost or late, or the dead time has changed; check the '
+                'link and the processors'
+            )
+        if rough > ROUGH:
+            return (
+                f'the yaw rate of odom is rough by {rough * self._turn:.4f} rad/s beyond the '
+                'commands: commands are lost, the floor is uneven, a wheel is loose, or the gyro '
+                'is noisy'
+            )
+        return ''
+
     def restart(self) -> None:
         """Start a drive: clear yaw error and history; gains and skill are kept."""
         self._state.history[:] = 0.0
         self._state.sums[:] = 0.0
+        self._state.watched[:] = math.nan
         for name in DRIVE:
             setattr(self._memory[0], name, 0)
 
@@ -438,8 +527,10 @@ def correct_body(
             add_to_block(achieved, max(position, 0.0), elapsed, learn, state)
         else:
             memory.linked = False
+            memory.chain = 0
     memory.yaw, memory.started, memory.last_reference = yaw, True, turning
     if memory.block_time >= BLOCK - 0.5 * period:
+        watch_block(state)
         if memory.square_sum > STANDSTILL_SPEED**2 * memory.block_time:
             learn_block(constants, state)
         clear_block(state)
@@ -467,14 +558,34 @@ def add_to_block(
     right = (1.0 - part) * history[newer, 0] + part * history[newer + 1, 0]
     left = (1.0 - part) * history[newer, 1] + part * history[newer + 1, 1]
     commanded = 0.5 * (right - left)
-    if memory.linked:
-        memory.rise += commanded - memory.last
+    change = commanded - memory.last if memory.linked else 0.0
+    memory.rise += change
     memory.last, memory.linked = commanded, True
     memory.block_time += elapsed
     row = state.work[0]
     write_gain_row(0.5 * (right + left), commanded, row)
+    row[GYRO_SCALE], row[BIAS], row[DELAY] = achieved, 1.0, change / elapsed
+    rest = achieved - commanded
+    for j in range(ROWS):
+        rest -= row[j] * state.estimate[j]
     for j in range(GYRO_SCALE):
         state.sums[j] += row[j] * elapsed
+    if memory.chain == 2 and abs(memory.last_rest) > RINGING:
+        bend = achieved - 2.0 * memory.last_achieved + memory.before_achieved
+        bend /= -elapsed * elapsed
+        memory.ring_count += 1.0
+        memory.ring_error += memory.last_rest * memory.last_rest
+        memory.ring_product += memory.last_rest * bend
+        memory.ring_acceleration += bend * bend
+    memory.before_achieved, memory.last_achieved = memory.last_achieved, achieved
+    memory.last_rest, memory.chain = rest, min(memory.chain + 1, 2)
+    slowest = min(abs(right), abs(left))
+    memory.slowest = min(memory.slowest, slowest) if memory.steps else slowest
+    memory.largest_change = max(memory.largest_change, abs(change))
+    memory.change_square += change * change
+    memory.rest_sum += rest
+    memory.rest_square += rest * rest
+    memory.steps += 1
     memory.achieved_sum += achieved * elapsed
     memory.square_sum += 0.5 * (right * right + left * left) * elapsed
     if not learn or abs(achieved - commanded) > OUTLIER + RELATIVE_OUTLIER * abs(commanded):
@@ -486,8 +597,31 @@ def clear_block(state: BodyState) -> None:
     """Begin another block."""
     memory = state.memory[0]
     memory.block_time = memory.achieved_sum = memory.square_sum = memory.rise = 0.0
+    memory.rest_sum = memory.rest_square = memory.change_square = 0.0
+    memory.largest_change = memory.slowest = 0.0
+    memory.steps = 0
     memory.spoilt = False
     state.sums[:] = 0.0
+
+
+@kernel
+def watch_block(state: BodyState) -> None:
+    """Add what the block says of the response: unexplained share, and roughness if it is calm."""
+    memory, watched = state.memory[0], state.watched
+    for j in range(watched.shape[0] - 1, 0, -1):
+        watched[j, 0], watched[j, 1] = watched[j - 1, 0], watched[j - 1, 1]
+    steps = memory.steps
+    variance = memory.rest_square / steps - (memory.rest_sum / steps) ** 2
+    change = memory.change_square / steps
+    watched[0, 0] = variance / change if change > EXCITED else math.nan
+    calm = memory.largest_change < CALM_CHANGE and memory.slowest > CALM_SPEED
+    watched[0, 1] = math.sqrt(max(variance, 0.0)) if calm and memory.rings == 0 else math.nan
+    rings = RINGING_BLOCKS if memory.largest_change >= CALM_CHANGE else memory.rings - 1
+    memory.rings = max(rings, 0)
+    memory.ring_count *= RINGING_MEMORY
+    memory.ring_error *= RINGING_MEMORY
+    memory.ring_product *= RINGING_MEMORY
+    memory.ring_acceleration *= RINGING_MEMORY
 
 
 @kernel

@@ -86,6 +86,11 @@ class CommandShaper:
         self.rate: Array = np.zeros(2)
         """Its derivative until one period later, rad/s², shape (2,)."""
 
+    def retune(self, parameters: CommandShaperParameters) -> None:
+        """Use other frequencies; lower ones as far as the lead allows, which is kept."""
+        most = max(self._ahead - 1.0, 0.0)
+        self._delays[:] = np.minimum(np.array(parameters.delays) / self._period, most)
+
     def reset(self, speeds: Array) -> None:
         """Start at wheel speeds (rad/s), shape (2,), held up to now and for the lead."""
         self._planned[:, 0] = 0.5 * (speeds[0] + speeds[1])

@@ -100,12 +100,17 @@ FEEDBACK_RANGE = {'body': (0.8, 1.2), 'paper': (0.0, 1.4)}
 MIN_DEAD_TIME_CHANGE = 0.0005
 """Smallest change (s) of the dead time in use."""
 
+NO_DEAD_TIME = 0.001
+"""Estimated dead time (s) up to which the lag in use may be too long: there is no shorter one."""
+
 MAX_MISSED = 20
 """Largest number of periods without a step through which a ramp goes on."""
 
 REPORTED_DEAD_TIME, REPORTED_DISTURBANCE = 0.008, 1.0
 """Difference of the dead time from the configured one, and duration of a disturbed response, that
 are reported, s."""
+OTHER_FREQUENCY = 1.25
+"""Ratio of the measured frequency of the rotors to the one in use from which it is used."""
 EARLY = 0.6
 """Share of the period before which an odometry is too early for a step."""
 
@@ -312,7 +317,6 @@ class Controller:
         )
         """Speed filter and last command; a replay sets the recorded commands here."""
         self._lag = parameters.speed_filter.lag
-        self._shaper = CommandShaper(parameters.command_shaper, self._period)
         geometry = parameters.geometry
         self.body = BodyCorrection(
             parameters.body, geometry.wheel_radius, geometry.half_separation, self._period
@@ -334,6 +338,11 @@ class Controller:
 
     def _begin(self) -> None:
         """Begin without odometry, and with the dead time of the parameters."""
+        self._shaper = CommandShaper(self.parameters.command_shaper, self._period)
+        self._turning_frequency = self.parameters.command_shaper.turning_frequency
+        """Frequency for which the commands are shaped, Hz."""
+        self._excess_lag = 0.0
+        """Part of the lag that the response contradicts, s."""
         self.dead_time = self._make_dead_time_estimator()
         """Estimate of the dead time."""
         self._set_dead_time(self.parameters.speed_filter.dead_time)
@@ -375,8 +384,13 @@ class Controller:
         if self.odometry_twist.missing:
             found.append('odom has no twist: its poses are differentiated; publish the twist')
         configured = self.parameters.speed_filter.dead_time
-        in_use = self.actuation.dead_time
-        if abs(in_use - configured) > REPORTED_DEAD_TIME:
+        in_use, lag = self._dead_time, self.parameters.speed_filter.lag
+        if self._excess_lag > 0.0:
+            found.append(
+                f'the robot responds after {in_use + lag:.3f} s, too early for a '
+                f'speed_filter.lag of {lag:g} s: the estimate is in use; set the lag'
+            )
+        elif abs(in_use - configured) > REPORTED_DEAD_TIME:
             found.append(
                 f'the robot responds after {in_use:.3f} s, speed_filter.dead_time is '
                 f'{configured:g} s: the estimate is in use; set the parameter'
@@ -386,7 +400,14 @@ class Controller:
                 'the response to the commands is disturbed, nothing is learnt from it: commands '
                 'or odometry are late, or the dead time has changed'
             )
-        found.append(self.body.problem())
+        frequency = self.parameters.command_shaper.turning_frequency
+        if self._turning_frequency != frequency:
+            found.append(
+                f'the robot oscillates in yaw with {self._turning_frequency:.1f} Hz, '
+                f'command_shaper.turning_frequency is {frequency:g} Hz: commands are shaped for '
+                'the measured one; set both frequencies'
+            )
+        found += [self.body.problem(), self.body.response_problem()]
         return [text for text in found if text]
 
     def get_weights(self) -> dict[str, Array]:
@@ -495,7 +516,10 @@ class Controller:
         restarted = last is not None and stamp < last
         self._last_stamp_ns = self._step_ns = stamp
         elapsed = self._watchdog.elapsed(stamp)
+        had_twist = not self.odometry_twist.missing
         odometry = self.odometry_twist.measured(odometry, restart=elapsed is None)
+        if had_twist and self.odometry_twist.missing:
+            elapsed = None  # the speeds before were no measurements: all estimates begin again
         if restarted:
             self._clear_reference()
             if self.keep_out is not None:
@@ -707,16 +731,32 @@ class Controller:
                 self._sampled.reference,
                 planned,
                 self.actuation.command,
-                self.actuation.dead_time + filtered.lag + 0.5 * self._period,
+                self._dead_time + filtered.lag + 0.5 * self._period,
                 learn=not self.disturbed,
             )
+            self._check_shaper()
             planned = planned + np.array([correction, -correction])
         return self.law.step(speeds, planned, rate, elapsed)
+
+    def _check_shaper(self) -> None:
+        """Shape the commands for the frequency at which the robot turns out to oscillate.
+
+        Its stiffness or its inertia are not those assumed; the other frequency changes alike.
+        """
+        found, assumed = self.body.turning_frequency, self._turning_frequency
+        if found == 0.0 or assumed == 0.0 or self._ahead_ns == 0:
+            return
+        if max(found / assumed, assumed / found) < OTHER_FREQUENCY:
+            return
+        self._turning_frequency = found
+        configured = self.parameters.command_shaper
+        factor = found / configured.turning_frequency
+        self._shaper.retune(CommandShaperParameters(factor * configured.straight_frequency, found))
 
     def _follow_pose(self, odometry: State, begin: Array, end: Array, elapsed: float) -> None:
         """Change the plan from ``begin`` to ``end`` (rad/s) by pose loop and keep-out."""
         parameters, geometry = self.parameters, self.parameters.geometry
-        horizon = self.actuation.dead_time + parameters.speed_filter.lag
+        horizon = self._dead_time + parameters.speed_filter.lag
         reference = self._pose_reference.at(odometry.stamp_ns + round(horizon * NANOSECONDS))
         if reference is None:
             return
@@ -788,7 +828,12 @@ class Controller:
         dead_time, self.disturbed = self.parameters.speed_filter.dead_time, False
         if self.parameters.estimate_dead_time:
             self.disturbed = estimator.step(speeds, actuation.command, elapsed)
-            dead_time = estimator.dead_time_in_use
+            dead_time = estimator.dead_time_in_use - self._excess_lag
+            if self._is_too_fast_for_lag():
+                self._excess_lag = self.parameters.speed_filter.lag - 0.5 * self._period
+                self.dead_time = self._make_dead_time_estimator()
+                self.dead_time.reset(speeds)
+                dead_time = self.dead_time.dead_time_in_use - self._excess_lag
         if self.disturbed:
             self._disturbed_for += elapsed
         else:  # disturbances that come and go are one
@@ -799,18 +844,29 @@ class Controller:
         elif not self.disturbed and self._before_disturbance is not None:
             self._rollback(self._before_disturbance)
             self._before_disturbance = None
-        if abs(dead_time - actuation.dead_time) > MIN_DEAD_TIME_CHANGE:
+        if abs(dead_time - self._dead_time) > MIN_DEAD_TIME_CHANGE:
             self._set_dead_time(dead_time)
 
     def _set_dead_time(self, dead_time: float) -> None:
-        self.actuation.set_dead_time(dead_time)
+        """Use a dead time (s); below 0 the robot responds before its lag has passed."""
+        self._dead_time = dead_time
+        self.actuation.set_dead_time(max(dead_time, 0.0))
         self._dead_time_ns = round(dead_time * NANOSECONDS)
+
+    def _is_too_fast_for_lag(self) -> bool:
+        """Whether wheels that follow their commands do so faster than their lag permits."""
+        lag, estimator = self.parameters.speed_filter.lag, self.dead_time
+        if self.parameters.composition != 'body' or lag <= 0.5 * self._period:
+            return False
+        none = estimator.dead_time < NO_DEAD_TIME
+        known = estimator.dead_time_in_use == estimator.dead_time
+        return none and known and self._excess_lag == 0.0
 
     def _make_dead_time_estimator(self) -> DeadTimeEstimator:
         # The pulses of a stepper ramp over a period, half a period late on average.
         filtered = self.parameters.speed_filter
         return DeadTimeEstimator(
-            replace(filtered, lag=max(filtered.lag, 0.5 * self._period)),
+            replace(filtered, lag=max(filtered.lag - self._excess_lag, 0.5 * self._period)),
             self._period,
             mean_speeds=self.parameters.mean_speeds,
             friction=self.parameters.composition == 'paper',

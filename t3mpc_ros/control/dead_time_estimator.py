@@ -126,8 +126,9 @@ NOISE_PRIOR_RATIO = 1.5
 """Prior of the variance of the innovation, as a multiple of the noise variance."""
 NOISE_PRIOR_COUNT = 100.0
 """Weight of that prior, in measured speeds."""
-MIN_NOISE_VARIANCE = 1e-4
-"""Variance of measured speeds that are configured as exact, (rad/s)²."""
+MIN_NOISE_VARIANCE = 0.01
+"""Least variance of measured speeds, (rad/s)², also where they are configured as exact: counts of
+16 microsteps have 0.006 at 100 Hz."""
 NOISE_MAX_COUNT = 4000.0
 """Number of measured speeds in the estimate of the variance of the innovation."""
 

@@ -40,6 +40,9 @@ def test_each_fault_fits_the_robot_and_the_controller():
         ('no twist in the odometry', 'odom has no twist'),
         ('twist reversed', 'opposite sign'),
         ('rate set to 50, odometry has 100 Hz', 'odom has 100 Hz, but rate is 50 Hz'),
+        ('shaper for another robot', 'the robot oscillates in yaw with'),
+        ('lag 20 ms assumed, none', 'too early for a speed_filter.lag of 0.02 s'),
+        ('disturbance x10', 'the yaw rate of odom is rough by'),
     ],
 )
 def test_a_fault_reaches_the_controller_and_is_named(name, words, monkeypatch):
@@ -48,6 +51,30 @@ def test_a_fault_reaches_the_controller_and_is_named(name, words, monkeypatch):
     numbers, said = run_job((job, job))
     assert words in first_said(FAULTS[name], said)
     assert (numbers['stopped'] > 0.0) == (name == 'twist reversed')
+
+
+def test_commands_that_are_lost_are_named(monkeypatch):
+    monkeypatch.setattr(fault_comparison, 'DURATION', 21.0)
+    job = Job('30 % of the commands lost', FULL, 2001)
+    _, said = run_job((job, job))
+    assert 'commands are lost' in first_said(FAULTS[job.fault], said)
+    exact = Job('none', FULL, 2001)
+    assert run_job((exact, exact))[1] == []
+
+
+def test_wrong_assumptions_that_the_response_contradicts_cost_little(monkeypatch):
+    """They cost up to four times the settled error without them."""
+    monkeypatch.setattr(fault_comparison, 'DURATION', 16.0)
+    names = (
+        'none',
+        'no twist in the odometry',
+        'shaper for another robot',
+        'lag 20 ms assumed, none',
+        'noise 0.04 (rad/s)², none assumed',
+    )
+    jobs = [Job(name, FULL, 2003) for name in names]
+    exact, *wrong = [run_job((job, job))[0]['settled'] for job in jobs]
+    assert max(wrong) < 1.25 * exact
 
 
 def test_what_was_said_before_a_fault_does_not_name_it():
