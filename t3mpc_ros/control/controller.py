@@ -109,6 +109,9 @@ MAX_MISSED = 20
 REPORTED_DEAD_TIME, REPORTED_DISTURBANCE = 0.008, 1.0
 """Difference of the dead time from the configured one, and duration of a disturbed response, that
 are reported, s."""
+INTERVALS, OTHER_RATE = 21, 0.2
+"""Number of intervals between steps whose median is the time for which commands are held, and its
+relative difference from the period from which that counts."""
 OTHER_FREQUENCY = 1.25
 """Ratio of the measured frequency of the rotors to the one in use from which it is used."""
 EARLY = 0.6
@@ -341,6 +344,9 @@ class Controller:
         self._shaper = CommandShaper(self.parameters.command_shaper, self._period)
         self._turning_frequency = self.parameters.command_shaper.turning_frequency
         """Frequency for which the commands are shaped, Hz."""
+        self._intervals: deque[float] = deque(maxlen=INTERVALS)
+        self._longer_hold_ns = 0
+        """Time by which a command is in advance because it is held longer than a period, ns."""
         self._excess_lag = 0.0
         """Part of the lag that the response contradicts, s."""
         self.dead_time = self._make_dead_time_estimator()
@@ -546,6 +552,7 @@ class Controller:
 
         actuation = self.actuation
         dt = self._period if elapsed is None else (stamp - step_ns) / NANOSECONDS
+        self._watch_interval(dt)
         if self.status.reason is Reason.PAUSED and not self._response.responsive:
             # Commands go on as before the pause: nothing is learnt until the robot responds.
             actuation.reset(speeds)
@@ -673,7 +680,7 @@ class Controller:
         finite = odometry.is_finite()
         if finite:
             self._place = odometry.pose
-        effect_ns = stamp + self._dead_time_ns
+        effect_ns = stamp + self._dead_time_ns + self._longer_hold_ns
         if not self._moving:
             self._ahead_ns = self._plan_ahead(effect_ns)
         plan_ns = effect_ns + self._ahead_ns
@@ -737,6 +744,23 @@ class Controller:
             self._check_shaper()
             planned = planned + np.array([correction, -correction])
         return self.law.step(speeds, planned, rate, elapsed)
+
+    def _watch_interval(self, elapsed: float) -> None:
+        """Plan for the time for which commands are held, where odometry has another rate.
+
+        The command realises an acceleration over the period (E19): it is in advance by T / (1 -
+        exp(-T/lag)).
+        """
+        self._intervals.append(elapsed)
+        if self.parameters.composition != 'body' or len(self._intervals) < INTERVALS:
+            return
+        held, period = sorted(self._intervals)[INTERVALS // 2], self._period
+        self._longer_hold_ns, self.dead_time.lateness = 0, 0.0
+        if abs(held / period - 1.0) > OTHER_RATE:
+            lag = self.parameters.speed_filter.lag
+            advance = [time / -math.expm1(-time / lag) for time in (held, period)]
+            self._longer_hold_ns = round((advance[0] - advance[1]) * NANOSECONDS)
+            self.dead_time.lateness = 0.5 * (held - period)
 
     def _check_shaper(self) -> None:
         """Shape the commands for the frequency at which the robot turns out to oscillate.

@@ -223,6 +223,8 @@ class DeadTimeEstimator:
         if not period > 0.0:
             raise ValueError(f'period must be positive: got {period} s')
         self._configured = parameters.dead_time
+        self.lateness = 0.0
+        """Part of the estimate that is no dead time, s: commands are held longer than a period."""
         least = SERVO_VARIANCE if friction else MIN_NOISE_VARIANCE
         variance = max(parameters.noise_variance, least)
         self._drive = Drive(parameters.lag, period, variance, mean_speeds, friction)
@@ -252,7 +254,7 @@ class DeadTimeEstimator:
     @property
     def dead_time_in_use(self) -> float:
         """The configured dead time, or the estimate where it clearly differs, s."""
-        dead_time: float = self._state['dead_time'].item()
+        dead_time: float = self._state['dead_time'].item() - self.lateness
         clear = max(USED_DIFFERENCE, USED_DEVIATIONS * self._state['deviation'].item())
         return dead_time if abs(dead_time - self._configured) > clear else self._configured
 

@@ -68,6 +68,7 @@ def test_wrong_assumptions_that_the_response_contradicts_cost_little(monkeypatch
     names = (
         'none',
         'no twist in the odometry',
+        'rate set to 200, odometry has 100 Hz',
         'shaper for another robot',
         'lag 20 ms assumed, none',
         'noise 0.04 (rad/s)², none assumed',
