@@ -112,7 +112,7 @@ are reported, s."""
 INTERVALS, OTHER_RATE = 21, 0.2
 """Number of intervals between steps whose median is the time for which commands are held, and its
 relative difference from the period from which that counts."""
-OTHER_FREQUENCY = 1.25
+OTHER_FREQUENCY = 1.5
 """Ratio of the measured frequency of the rotors to the one in use from which it is used."""
 EARLY = 0.6
 """Share of the period before which an odometry is too early for a step."""

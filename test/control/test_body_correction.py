@@ -368,3 +368,51 @@ def test_the_filter_is_the_regression_with_the_stated_prior():
         eigenvalues = np.linalg.eigvalsh(after[1:] - before[1:])
         assert eigenvalues[-1] < 2e-7
         assert abs(eigenvalues[1]) < 2e-7
+
+
+class Rotors:
+    """Half of the difference of two rotors, undamped on their fields: the first command rings."""
+
+    def __init__(self, frequency):
+        self.square = (2.0 * math.pi * frequency) ** 2
+        self.speed, self.angle = 0.0, 0.0
+
+    def __call__(self, right, left):
+        before = self.speed
+        for _ in range(10):
+            self.angle += 0.1 * PERIOD * (exact(right, left) - self.speed)
+            self.speed += 0.1 * PERIOD * self.square * self.angle
+        return 0.5 * (before + self.speed)
+
+
+@pytest.mark.parametrize('frequency', [5.0, 9.1, 13.0])
+def test_the_frequency_of_the_rotors_follows_from_the_yaw(frequency):
+    body = Body(Rotors(frequency), max_correction=0.0, max_yaw_correction=0.0)
+    assert body.correction.turning_frequency == 0.0
+    body.run(2.0)
+    assert body.correction.turning_frequency == pytest.approx(frequency, rel=0.1)
+
+
+@pytest.mark.parametrize('response', [exact, miscalibrated])
+def test_a_gain_or_a_delay_is_no_frequency_and_no_lost_command(response):
+    body = Body(response, noise=0.002)
+    body.delay += 0.01
+    body.run(20.0)
+    assert body.correction.turning_frequency == 0.0
+    assert body.correction.response_problem() == ''
+
+
+def test_lost_commands_and_a_rough_yaw_rate_are_named():
+    generator, last = np.random.default_rng(4), [0.0, 0.0]
+
+    def lossy(right, left):
+        if generator.random() > 0.3:
+            last[:] = right, left
+        return exact(*last)
+
+    lost, rough = Body(lossy), Body(exact, noise=0.01)
+    for each, words in ((lost, 'are lost'), (rough, 'is rough by 0.00')):
+        each.run(6.0)
+        assert words in each.correction.response_problem()
+        each.correction.restart()
+        assert each.correction.response_problem() == ''

@@ -72,6 +72,17 @@ def test_the_frequency_of_a_mode_is_cancelled(sign):
     assert abs(math.cos(0.5 * math.pi * other / frequency)) > 0.1
 
 
+def test_another_frequency_is_cancelled_after_it_was_found():
+    shaper = CommandShaper(CommandShaperParameters(6.0, 4.0), PERIOD)
+    shaper.retune(PARAMETERS)
+    lead, values = shaper.lead_ns / 1e9, []
+    for k in range(300):
+        value = math.sin(2.0 * math.pi * PARAMETERS.turning_frequency * (k * PERIOD + lead))
+        shaper.step(np.array([value, -value]), PERIOD)
+        values.append(shaper.reference.copy())
+    assert np.max(np.abs(values[50:])) < 0.15
+
+
 def test_an_oscillator_rests_after_a_shaped_ramp():
     """Undamped rotor on its field: the ring after a ramp is below a tenth of the unshaped one."""
     omega = 2.0 * math.pi * PARAMETERS.straight_frequency
