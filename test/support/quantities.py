@@ -385,7 +385,7 @@ def sources(page: Path) -> Iterator[tuple[Quantity, str]]:
         elif any(one.text in texts for texts in entries.get('stated', {}).values()):
             yield one, 'stated'
         else:
-            yield one, 'attributed' if 'from' in entries and given is None else ''
+            yield one, ''
 
 
 def main() -> None:
@@ -397,7 +397,7 @@ def main() -> None:
         total += count
         print(f'{page.name:20} {len(found):4}', dict(count))
         for one, kind in found if page.name in shown else ():
-            if kind in ('', 'attributed'):
+            if not kind:
                 at = max(one.block.find(one.text.split()[0]) - 40, 0)
                 print(f'  {one.section[:20]:20} {one.text:12} {one.block[at : at + 100]}')
     print(f'{"all":20} {total.total():4}', dict(total))
