@@ -125,6 +125,8 @@ RINGING, RINGING_MEMORY = 0.04, 0.98
 block, of the frequency of the rotors."""
 RINGING_STEPS, RINGING_CORRELATION = 15.0, 0.97
 """Number of such steps, and correlation of error and acceleration, from which it is known."""
+RINGING_RATE = 0.2
+"""Frequency, in cycles a period, from which it is noise of the yaw that alternates."""
 CALM_CHANGE, CALM_SPEED, RINGING_BLOCKS = 0.06, 0.3, 2
 """Of a calm block: largest change of w_c in a period, least speed of a wheel (rad/s), and number
 of blocks after a larger change in which the rotors ring."""
@@ -353,7 +355,8 @@ class BodyCorrection:
         )
         if not known or memory.ring_count < RINGING_STEPS:
             return 0.0
-        return math.sqrt(memory.ring_product / memory.ring_error) / (2.0 * math.pi)
+        frequency = math.sqrt(memory.ring_product / memory.ring_error) / (2.0 * math.pi)
+        return frequency if frequency * self._period < RINGING_RATE else 0.0
 
     def problem(self) -> str:
         """Return what the gyro does to the yaw of the odometry, or nothing."""

@@ -522,9 +522,10 @@ class Controller:
         restarted = last is not None and stamp < last
         self._last_stamp_ns = self._step_ns = stamp
         elapsed = self._watchdog.elapsed(stamp)
-        had_twist = not self.odometry_twist.missing
-        odometry = self.odometry_twist.measured(odometry, restart=elapsed is None)
-        if had_twist and self.odometry_twist.missing:
+        twist = self.odometry_twist
+        found_missing = not twist.missing
+        odometry = twist.measured(odometry, restart=elapsed is None)
+        if found_missing and twist.missing and not twist.known:
             elapsed = None  # the speeds before were no measurements: all estimates begin again
         if restarted:
             self._clear_reference()

@@ -225,6 +225,8 @@ class OdometryTwist:
     def __init__(self) -> None:
         self.missing = False
         """Whether the odometry has no twist: speeds are differences of its pose."""
+        self.known = False
+        """Whether it ever had one."""
         self._anchor: Pose | None = None
         """Pose of the first message with a twist of zero since the last other one."""
         self._last: State | None = None
@@ -235,7 +237,7 @@ class OdometryTwist:
             return odometry
         pose, last, self._last = odometry.pose, self._last, odometry
         if odometry.twist != (0.0, 0.0):
-            self.missing, self._anchor = False, None
+            self.missing, self._anchor, self.known = False, None, True
             return odometry
         if self._anchor is None:
             self._anchor = pose

@@ -680,7 +680,7 @@ FRESH = {
                 lambda c: c.reset(),
                 kept=('._watchdog.enabled',),
                 scratch=(
-                    *('._ahead_ns', '._sampled', '._shaper', '.keep_out._nearest'),
+                    *('._ahead_ns', '._sampled', '.keep_out._nearest'),
                     *below('._tracker.transition', RAMPS),
                     *below('._tracker.law', (LAST[0], *LAST[2:5])),
                     *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
@@ -696,7 +696,7 @@ FRESH = {
                 lambda c: c.reset(),
                 kept=('._watchdog.enabled',),
                 scratch=(
-                    *('._sampled', '._shaper'),
+                    '._sampled',
                     *below('._tracker.transition', RAMPS),
                     *below('._tracker.law', LAST[:5]),
                     *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
@@ -722,7 +722,7 @@ FRESH = {
                 lambda c: (c.reset(), c.set_weights(OTHER_WEIGHTS)),
                 kept=('._watchdog.enabled',),
                 scratch=(
-                    *('._sampled', '._shaper'),
+                    '._sampled',
                     *below('._tracker.transition', RAMPS),
                     *below('._tracker.law', LAST[:5]),
                     *('._trajectory.buffer.samples', '._trajectory.buffer.stamps'),
