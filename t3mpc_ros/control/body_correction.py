@@ -235,6 +235,7 @@ WATCH = 'rest_sum', 'rest_square', 'change_square', 'largest_change', 'slowest',
 DRIVE = (
     *('started', 'yaw_error', 'commands', 'above', 'below'),
     *('block_time', 'achieved_sum', 'square_sum', 'rise', 'linked', 'spoilt'),
+    *('before_achieved', 'last_achieved', 'last_rest'),
     *(*WATCH, 'rings', 'chain', 'ring_count', 'ring_error', 'ring_product', 'ring_acceleration'),
 )
 """Fields of the memory that belong to one drive."""

@@ -62,7 +62,7 @@ def test_commands_that_are_lost_are_named(monkeypatch):
     assert run_job((exact, exact))[1] == []
 
 
-def test_wrong_assumptions_that_the_response_contradicts_cost_little(monkeypatch):
+def test_contradicted_assumptions_cost_little(monkeypatch):
     """They cost up to four times the settled error without them."""
     monkeypatch.setattr(fault_comparison, 'DURATION', 16.0)
     names = (
