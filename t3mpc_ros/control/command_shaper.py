@@ -35,6 +35,9 @@ from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 
+HIGHEST = 1000.0
+"""Largest frequency, Hz."""
+
 
 @dataclass(frozen=True)
 class CommandShaperParameters(Parameters):
@@ -45,14 +48,14 @@ class CommandShaperParameters(Parameters):
         'frequency at which the robot oscillates along its path, sqrt(k/J)/(2 pi) with the '
         'stiffness k of a motor and the inertia J that it accelerates; 0: none',
         'Hz',
-        (0.0, 1000.0),
+        (0.0, HIGHEST),
         source='motor and body of the default robot',
     )
     turning_frequency: float = parameter(
         9.1,
         'frequency at which the robot oscillates in yaw; 0: none',
         'Hz',
-        (0.0, 1000.0),
+        (0.0, HIGHEST),
         source='motor and body of the default robot',
     )
 

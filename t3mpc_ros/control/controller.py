@@ -29,7 +29,11 @@ from t3mpc_ros.control.actuation import (
     wheel_limits,
 )
 from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
-from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParameters
+from t3mpc_ros.control.command_shaper import (
+    HIGHEST,
+    CommandShaper,
+    CommandShaperParameters,
+)
 from t3mpc_ros.control.control_law import (
     MAX_SMOOTHING,
     TERM_NAMES,
@@ -776,7 +780,8 @@ class Controller:
         self._turning_frequency = found
         configured = self.parameters.command_shaper
         factor = found / configured.turning_frequency
-        self._shaper.retune(CommandShaperParameters(factor * configured.straight_frequency, found))
+        straight = min(factor * configured.straight_frequency, HIGHEST)
+        self._shaper.retune(CommandShaperParameters(straight, found))
 
     def _follow_pose(self, odometry: State, begin: Array, end: Array, elapsed: float) -> None:
         """Change the plan from ``begin`` to ``end`` (rad/s) by pose loop and keep-out."""

@@ -24,6 +24,7 @@ from support import waiting
 from support.control_loops import GEOMETRY, LEAD, PERIOD, Loop, ServoLoop, make_state
 from support.long_tests import few_of
 
+from t3mpc_ros.control.body_correction import BodyCorrection
 from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
 from t3mpc_ros.control.controller import (
     Controller,
@@ -515,6 +516,22 @@ def test_the_gain_that_fits_is_accepted_at_every_rate_and_lag(rate, lag, composi
         {'law.gain': fitted.law.gain, 'law.smoothing': fitted.law.smoothing}
     )
     assert again.resolved().law == fitted.law
+
+
+@pytest.mark.parametrize('straight, turning', [(1000.0, 1.0), (1000.0, 999.0), (0.0, 1.0)])
+def test_a_found_frequency_takes_no_other_beyond_its_bound(straight, turning, monkeypatch):
+    """The straight frequency is scaled alike, and 10 000 Hz was an exception of a moving robot."""
+    monkeypatch.setattr(BodyCorrection, 'turning_frequency', 10.0)
+    changes = {
+        'composition': 'body',
+        'law.gain': 0.0,
+        'command_shaper.straight_frequency': straight,
+        'command_shaper.turning_frequency': turning,
+    }
+    loop = ServoLoop(lambda t: (0.12, 0.5), **changes)
+    loop.run(1)
+    assert loop.step().reason is Reason.TRACKING
+    assert any('oscillates in yaw with 10.0 Hz' in text for text in loop.controller.problems())
 
 
 def test_an_odometry_faster_than_the_rate_is_thinned_out():
