@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 import difflib
+import inspect
 from itertools import islice
 import platform
 import sys
@@ -73,6 +74,83 @@ _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_over
 """Parameters (or their first name part) that rclpy declares for every node."""
 
 
+def _with_info(callback: Callable[[Any, dict[str, Any]], None]) -> Callable[..., None]:
+    """Return a callback that gets a message and its information, whichever executor calls it.
+
+    The events executor of rclpy 7.1 passes both as one tuple, the others as two arguments.
+    """
+
+    def called(*received: Any) -> None:
+        message, info = received if len(received) == 2 else received[0]
+        callback(message, info)
+
+    # rclpy passes the information to callbacks of two arguments.
+    called.__signature__ = inspect.signature(lambda message, info: None)
+    return called
+
+
+class MatchingSubscription:
+    """A subscription that requests what all publishers of its topic offer.
+
+    Robots on micro-ROS and TurtleBot 4 publish best effort, which a reliable subscription does
+    not receive. The request is weakened when such a publisher appears. A QoS that the user
+    overrides is kept. ``raw`` messages stay serialized.
+
+    The callback gets each message and its information. Without one no executor waits for them,
+    and the node takes them with :meth:`take_waiting`: to be woken costs more than a step of the
+    controller, so a node with two streams waits for one of them.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        message: type,
+        topic: str,
+        callback: Callable[[Any, dict[str, Any]], None] | None,
+        profile: QoSProfile,
+        *,
+        raw: bool = False,
+    ) -> None:
+        self._node = node
+        called = _with_info(callback) if callback else qos.unused_callback
+        self._arguments = message, topic, called
+        self._group = None if callback else qos.PolledCallbackGroup()
+        self._raw = raw
+        self._overridden = qos.overriding_options(node, topic, 'subscription') is not None
+        self.subscription: Subscription = self._subscribe(profile)
+        """The present subscription."""
+
+    def _subscribe(self, profile: QoSProfile) -> Subscription:
+        return self._node.create_subscription(
+            *self._arguments, profile, callback_group=self._group, raw=self._raw
+        )
+
+    def adapt(self) -> None:
+        """Subscribe again if a publisher does not offer what is requested."""
+        if self._overridden:
+            return
+        present = self.subscription
+        name = present.topic_name
+        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(name)]
+        if qos.compatible_with_all(present.qos_profile, offers):
+            return
+        profile = copy(present.qos_profile)
+        profile.reliability = qos.adapt_request_to_offers(offers).reliability
+        if profile.reliability == present.qos_profile.reliability:
+            return  # the mismatch is another one, which the diagnostics name
+        self._node.destroy_subscription(present)
+        self.subscription = self._subscribe(profile)
+        self._node.get_logger().info(f'{name} is published best effort')
+
+    def take_waiting(self) -> list[Any]:
+        """Return the messages that wait in the queue.
+
+        The executor takes one message of a subscription per cycle: a queue that has filled while
+        it was busy would otherwise stay full, and every message would wait as long.
+        """
+        return [message for message, _ in qos.take_with_info(self.subscription)]
+
+
 class BaseNode(Node, Generic[P]):
     """A node that declares the parameters of one parameter class and publishes diagnostics.
 
@@ -112,7 +190,7 @@ class BaseNode(Node, Generic[P]):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_steady_timer(DIAGNOSTICS_PERIOD, self._publish_diagnostics)
         self._command_publishers = qos.CommandPublishers()
-        self._matching: list[qos.MatchingSubscription] = []
+        self._matching: list[MatchingSubscription] = []
         self.create_steady_timer(ADAPT_PERIOD, self._adapt_subscriptions)
         self._unused_overrides: list[str] | None = None
 
@@ -173,16 +251,16 @@ class BaseNode(Node, Generic[P]):
         profile: QoSProfile,
         *,
         raw: bool = False,
-    ) -> qos.MatchingSubscription:
+    ) -> MatchingSubscription:
         """Return a subscription whose request follows the offers of the publishers.
 
         Without a callback the node takes the messages itself.
         """
-        made = qos.MatchingSubscription(self, msg_type, topic, callback, profile, raw=raw)
+        made = MatchingSubscription(self, msg_type, topic, callback, profile, raw=raw)
         self._matching.append(made)
         return made
 
-    def remove_matching_subscription(self, made: qos.MatchingSubscription) -> None:
+    def remove_matching_subscription(self, made: MatchingSubscription) -> None:
         """Destroy a subscription of :meth:`create_matching_subscription`."""
         self._matching.remove(made)
         self.destroy_subscription(made.subscription)

@@ -46,7 +46,7 @@ from t3mpc_ros.localization.occupancy_map import (
 )
 from t3mpc_ros.localization.range_model import NAMES, Beams
 from t3mpc_ros.nodes import conversions, qos
-from t3mpc_ros.nodes.base_node import NO_CLOCK, OK, WARN, BaseNode
+from t3mpc_ros.nodes.base_node import NO_CLOCK, OK, WARN, BaseNode, MatchingSubscription
 from t3mpc_ros.nodes.conversions import FrameParameters
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 from t3mpc_ros.robot.description import sensor_mounts
@@ -160,8 +160,8 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         self._changes = self.create_publisher(DiagnosticArray, 'map_changes', qos.LATCHED)
         self._markers = self.create_publisher(MarkerArray, 'map_changes/markers', qos.LATCHED)
         self._broadcaster = self._make_broadcaster() if parameters.tf_broadcast else None
-        self._scan: qos.MatchingSubscription | None = None
-        self._ranges: list[qos.MatchingSubscription] = []
+        self._scan: MatchingSubscription | None = None
+        self._ranges: list[MatchingSubscription] = []
         if parameters.scan_topic:
             self._scan = self.create_matching_subscription(
                 LaserScan, parameters.scan_topic, None, qos.SCALARS

@@ -13,9 +13,8 @@
 # limitations under the License.
 """What publishers and subscriptions match by: QoS profiles, overrides, types, mismatches."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
-import inspect
 from typing import Any, Literal
 
 from rclpy.callback_groups import CallbackGroup
@@ -178,88 +177,6 @@ class PolledCallbackGroup(CallbackGroup):
 
 def unused_callback(message: object) -> None:
     """Fill the mandatory callback argument of rclpy in a :class:`PolledCallbackGroup`."""
-
-
-def _with_info(callback: Callable[[Any, dict[str, Any]], None]) -> Callable[..., None]:
-    """Return a callback that gets a message and its information, whichever executor calls it.
-
-    The events executor of rclpy 7.1 passes both as one tuple, the others as two arguments.
-    """
-
-    def called(*received: Any) -> None:
-        message, info = received if len(received) == 2 else received[0]
-        callback(message, info)
-
-    # rclpy passes the information to callbacks of two arguments.
-    called.__signature__ = inspect.signature(lambda message, info: None)
-    return called
-
-
-class MatchingSubscription:
-    """A subscription that requests what all publishers of its topic offer.
-
-    Robots on micro-ROS and TurtleBot 4 publish best effort, which a reliable subscription does
-    not receive. The request is weakened when such a publisher appears. A QoS that the user
-    overrides is kept. ``raw`` messages stay serialized.
-
-    The callback gets each message and its information. Without one no executor waits for them,
-    and the node takes them with :meth:`take_waiting`: to be woken costs more than a step of the
-    controller, so a node with two streams waits for one of them.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        message: type,
-        topic: str,
-        callback: Callable[[Any, dict[str, Any]], None] | None,
-        profile: QoSProfile,
-        *,
-        raw: bool = False,
-    ) -> None:
-        self._node = node
-        called = _with_info(callback) if callback else unused_callback
-        self._arguments = message, topic, called
-        self._group = None if callback else PolledCallbackGroup()
-        self._raw = raw
-        self._overridden = overriding_options(node, topic, 'subscription') is not None
-        self.subscription: Subscription = self._subscribe(profile)
-        """The present subscription."""
-
-    def _subscribe(self, profile: QoSProfile) -> Subscription:
-        return self._node.create_subscription(
-            *self._arguments, profile, callback_group=self._group, raw=self._raw
-        )
-
-    def adapt(self) -> None:
-        """Subscribe again if a publisher does not offer what is requested."""
-        if self._overridden:
-            return
-        present = self.subscription
-        name = present.topic_name
-        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(name)]
-        if compatible_with_all(present.qos_profile, offers):
-            return
-        profile = copy(present.qos_profile)
-        profile.reliability = adapt_request_to_offers(offers).reliability
-        if profile.reliability == present.qos_profile.reliability:
-            return  # the mismatch is another one, which the diagnostics name
-        self._node.destroy_subscription(present)
-        self.subscription = self._subscribe(profile)
-        self._node.get_logger().info(f'{name} is published best effort')
-
-    def take_waiting(self) -> list[Any]:
-        """Return the messages that wait in the queue."""
-        return take_waiting(self.subscription)
-
-
-def take_waiting(subscription: Subscription) -> list[Any]:
-    """Return the messages that wait in the queue of a subscription.
-
-    The executor takes one message of a subscription per cycle: a queue that has filled while it
-    was busy would otherwise stay full, and every message would wait as long.
-    """
-    return [message for message, _ in take_with_info(subscription)]
 
 
 def take_with_info(subscription: Subscription) -> list[tuple[Any, dict[str, Any]]]:

@@ -53,7 +53,14 @@ from t3mpc_ros.geometry.types import (
     State,
 )
 from t3mpc_ros.nodes import conversions, qos
-from t3mpc_ros.nodes.base_node import ACK_TIMEOUT, NO_CLOCK, OK, WARN, BaseNode
+from t3mpc_ros.nodes.base_node import (
+    ACK_TIMEOUT,
+    NO_CLOCK,
+    OK,
+    WARN,
+    BaseNode,
+    MatchingSubscription,
+)
 from t3mpc_ros.nodes.conversions import FrameParameters
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
@@ -179,7 +186,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             # published before; only a transient-local one does, and only from those.
             self.create_matching_subscription(Path, 'path', self._on_path, qos.LATEST)
             if qos.overriding_options(self, 'path', 'subscription') is None:
-                qos.MatchingSubscription(self, Path, 'path', self._on_path, qos.LATCHED)
+                MatchingSubscription(self, Path, 'path', self._on_path, qos.LATCHED)
             self._path_stamps: deque[int] = deque(maxlen=8)
             self._transforms = self._make_transform_buffer()
         elif parameters.plan.enabled:

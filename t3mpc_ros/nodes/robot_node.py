@@ -26,7 +26,7 @@ from std_srvs.srv import SetBool, Trigger
 from t3mpc_ros.geometry.kinematics import frame_between, wheels_from_twist
 from t3mpc_ros.geometry.types import RANGE_SENSORS, BodyTwist, Pose
 from t3mpc_ros.nodes import conversions, qos, robot_topics
-from t3mpc_ros.nodes.base_node import ADAPT_PERIOD, BaseNode
+from t3mpc_ros.nodes.base_node import ADAPT_PERIOD, BaseNode, MatchingSubscription
 from t3mpc_ros.nodes.robot_topics import RobotDescription, RobotTopicParameters
 from t3mpc_ros.robot.description import fixed_frames
 from t3mpc_ros.robot.interface import RobotCommand, RobotInterface, RobotState
@@ -60,7 +60,7 @@ class RobotNode(BaseNode[P]):
         self._command_type = TwistStamped if stamped else Twist
         self._description = self.describe(self.parameters)
         self._create_publishers()
-        self._commands: qos.MatchingSubscription | None = self._subscribe_to_commands()
+        self._commands: MatchingSubscription | None = self._subscribe_to_commands()
         if self.parameters.detect_cmd_vel_type:
             self._mismatches = 0
             self.create_steady_timer(ADAPT_PERIOD, self._adapt_command_type)
@@ -88,7 +88,7 @@ class RobotNode(BaseNode[P]):
 
     # -- commands ---------------------------------------------------------------------------------
 
-    def _subscribe_to_commands(self) -> qos.MatchingSubscription:
+    def _subscribe_to_commands(self) -> MatchingSubscription:
         return self.create_matching_subscription(
             self._command_type, 'cmd_vel', self._on_command, qos.LATEST
         )

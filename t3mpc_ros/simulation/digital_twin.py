@@ -14,13 +14,21 @@
 """Digital twin: board, motors, body, sensors, world and faults behind the robot interface."""
 
 from dataclasses import dataclass, replace
+import heapq
 import math
 from typing import ClassVar
 
 import numpy as np
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
-from t3mpc_ros.geometry.types import RANGE_SENSORS, Pose, State, WheelSpeeds, check_pose
+from t3mpc_ros.geometry.types import (
+    NANOSECONDS,
+    RANGE_SENSORS,
+    Pose,
+    State,
+    WheelSpeeds,
+    check_pose,
+)
 from t3mpc_ros.parameters.table import ParameterError, at_most, group, parameter
 from t3mpc_ros.robot import interface
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON, CommandLimiter, SlipMonitor
@@ -51,10 +59,11 @@ from t3mpc_ros.simulation.sensors.range_sensor import (
     SimulatedRangeSensorParameters,
     SimulatedRangeSensors,
 )
-from t3mpc_ros.simulation.transport_delay import TransportDelay
 from t3mpc_ros.simulation.world import MovingDisc, cast_rays, clearance, grip_at, load_world
 
 BROWN_OUT_REASON = 'brown-out: the board restarts'
+CAPACITY = 1000
+"""Commands in transit at most: 2 s at 500 Hz."""
 _NO_OBSTACLE = (math.inf,) * len(RANGE_SENSORS)
 
 
@@ -506,6 +515,82 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
 
     def _reset_odometry(self) -> None:
         self._odometry.reset()
+
+
+class TransportDelay:
+    """Delays, reorders and loses commands; it never changes, duplicates or creates one.
+
+    All times are those of one clock. When it jumps back, the commands in transit are dropped,
+    because their arrival time is undefined; beyond :data:`CAPACITY` the oldest is dropped. Two
+    numbers of its own generator are drawn for each command whatever its outcome, so that a change
+    of loss does not shift the delays.
+    """
+
+    def __init__(self, generator: np.random.Generator) -> None:
+        self._generator = generator
+        self._in_transit: list[tuple[int, int, interface.RobotCommand]] = []
+        """A heap of (arrival, number, command); the number keeps ties in the order of sending."""
+        self._clock_ns: int | None = None
+        self._sent = 0
+
+    def __len__(self) -> int:
+        """Number of commands in transit."""
+        return len(self._in_transit)
+
+    @property
+    def next_ns(self) -> int | None:
+        """Arrival time of the next command; None when none is in transit."""
+        return self._in_transit[0][0] if self._in_transit else None
+
+    def send(
+        self,
+        command: interface.RobotCommand,
+        now_ns: int,
+        delay_s: float,
+        jitter_s: float,
+        loss: float,
+    ) -> None:
+        """Send a command, which arrives after ``delay_s`` to ``delay_s + jitter_s``.
+
+        The part of the jitter is uniform; ``loss`` is the fraction of the commands that is
+        lost.
+        """
+        if not (0.0 <= delay_s < math.inf and 0.0 <= jitter_s < math.inf):
+            raise ValueError(
+                f'delay_s and jitter_s must be finite and at least 0 s: got {delay_s}, {jitter_s}'
+            )
+        if not 0.0 <= loss <= 1.0:
+            raise ValueError(f'loss must be from 0 to 1: got {loss}')
+        self._check_clock(now_ns)
+        loss_number, jitter_number = self._generator.random(), self._generator.random()
+        self._sent += 1
+        if loss_number < loss:
+            return
+        arrival_ns = now_ns + round((delay_s + jitter_s * jitter_number) * NANOSECONDS)
+        if len(self._in_transit) >= CAPACITY:
+            self._in_transit.remove(min(self._in_transit, key=lambda entry: entry[1]))
+            heapq.heapify(self._in_transit)
+        heapq.heappush(self._in_transit, (arrival_ns, self._sent, command))
+
+    def arrived(self, now_ns: int) -> list[interface.RobotCommand]:
+        """Return the commands that arrived since the last call, in order of arrival.
+
+        The order of sending may differ: the limiter rejects overtaken commands.
+        """
+        self._check_clock(now_ns)
+        commands = []
+        while self._in_transit and self._in_transit[0][0] <= now_ns:
+            commands.append(heapq.heappop(self._in_transit)[2])
+        return commands
+
+    def clear(self) -> None:
+        """Drop the commands in transit, as a restart of the board does."""
+        self._in_transit.clear()
+
+    def _check_clock(self, now_ns: int) -> None:
+        if self._clock_ns is not None and now_ns < self._clock_ns:
+            self.clear()
+        self._clock_ns = now_ns
 
 
 def make_robot(parameters: DigitalTwinParameters) -> PaperRobot | DigitalTwin:

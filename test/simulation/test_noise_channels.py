@@ -25,12 +25,11 @@ from support.fresh_state import alternatives, leaves
 from t3mpc_ros.emulator.plant import Plant
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.robot.interface import RobotCommand
-from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
+from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters, TransportDelay
 from t3mpc_ros.simulation.plant.disturbances import Disturbance, SpeedNoise
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
 from t3mpc_ros.simulation.sensors.imu import SimulatedImu
 from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensors
-from t3mpc_ros.simulation.transport_delay import TransportDelay
 
 NOISY = {'noise.variance': 1.0, 'disturbance.walk_rate': 0.01}
 IMU = {'imu.gyro_drift': 10.0, 'imu.gyro_noise': 0.5}

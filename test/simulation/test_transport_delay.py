@@ -21,7 +21,7 @@ import pytest
 
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.robot.interface import RobotCommand
-from t3mpc_ros.simulation.transport_delay import CAPACITY, TransportDelay
+from t3mpc_ros.simulation.digital_twin import CAPACITY, TransportDelay
 
 MS = 1_000_000
 

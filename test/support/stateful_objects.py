@@ -59,7 +59,7 @@ from t3mpc_ros.mpc.predictive_controller import PredictiveController, Predictive
 from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
 from t3mpc_ros.robot.interface import RobotCommand
-from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
+from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters, TransportDelay
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultParameters, FaultSchedule
 from t3mpc_ros.simulation.plant.paper_plant import (
     PaperRobot,
@@ -71,7 +71,6 @@ from t3mpc_ros.simulation.sensors.range_sensor import (
     SimulatedRangeSensorParameters,
     SimulatedRangeSensors,
 )
-from t3mpc_ros.simulation.transport_delay import TransportDelay
 
 BODY_PARAMETERS = BodyCorrectionParameters(gyro_scale_tolerance=0.001)
 PERIOD, PERIOD_NS = 0.01, 10_000_000
