@@ -117,7 +117,7 @@ def _info(bag: 'BagReader') -> dict[str, Any]:
 
 
 def _info_text(bag: 'BagReader') -> str:
-    from t3mpc_ros.bag.recording.message_losses import message_loss_notes
+    from t3mpc_ros.bag.mcap_file import message_loss_notes
 
     info = _info(bag)
     size = size_text(sum(info['files'].values()))
@@ -458,9 +458,9 @@ def run_replay(options: argparse.Namespace) -> int:
     """Replay the run, print the comparison and the speed, and return 0."""
     from t3mpc_ros.bag.run.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
-    from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
     from t3mpc_ros.evaluation.process_replay.controller_replay import (
         OPEN_LOOP,
+        load_inputs,
         make_controllers,
         replay_controller,
     )
@@ -549,8 +549,11 @@ def run_compare(options: argparse.Namespace) -> int:
     """Print the comparison; return 0 when all is within the tolerances, 3 otherwise."""
     from t3mpc_ros.bag.run.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
-    from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
-    from t3mpc_ros.evaluation.process_replay.controller_replay import OPEN_LOOP, replay_controller
+    from t3mpc_ros.evaluation.process_replay.controller_replay import (
+        OPEN_LOOP,
+        load_inputs,
+        replay_controller,
+    )
     from t3mpc_ros.evaluation.process_replay.replay_comparison import (
         compare,
         compare_bags,

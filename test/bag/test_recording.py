@@ -27,6 +27,8 @@ from t3mpc_ros.bag.mcap_file import (
     MESSAGE_OVERHEAD,
     Attachment,
     SerializedMessage,
+    message_loss_notes,
+    message_loss_record,
     read_mcap_file,
 )
 from t3mpc_ros.bag.metadata import TopicInformation
@@ -37,7 +39,6 @@ from t3mpc_ros.bag.recording.diagnostics_monitor import (
     DiagnosticsMonitor,
     SnapshotRateLimiter,
 )
-from t3mpc_ros.bag.recording.message_losses import message_loss_notes, message_loss_record
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.recording.snapshot import (
     CircularMessageCache,

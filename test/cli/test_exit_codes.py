@@ -82,7 +82,7 @@ def compared(same):
     module = 'evaluation.process_replay.'
     outcome = SimpleNamespace(table=lambda: '', same=same, to_dict=dict)
     return {
-        f'{module}controller_inputs.load_inputs': None,
+        f'{module}controller_replay.load_inputs': None,
         f'{module}controller_replay.replay_controller': None,
         f'{module}replay_comparison.compare': outcome,
     }

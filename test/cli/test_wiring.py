@@ -205,7 +205,7 @@ REPLAYED = SimpleNamespace(steps=100, parameters=SimpleNamespace(rate=100.0))
 OUTCOME = SimpleNamespace(table=text, same=True, to_dict=dict)
 REPLAY = {
     'bag.run.model_file.load_model': {'w': np.ones(1)},
-    'evaluation.process_replay.controller_inputs.load_inputs': 'inputs',
+    'evaluation.process_replay.controller_replay.load_inputs': 'inputs',
     'evaluation.process_replay.controller_replay.make_controllers': [],
     'evaluation.process_replay.controller_replay.replay_controller': REPLAYED,
     'evaluation.process_replay.replay_comparison.compare': OUTCOME,

@@ -39,8 +39,7 @@ from t3mpc_ros.control.actuation import (
 from t3mpc_ros.control.controller import StepperControllerParameters
 from t3mpc_ros.control.jump_transition import CommandLimit
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
-from t3mpc_ros.evaluation.process_replay.controller_replay import replay_controller
+from t3mpc_ros.evaluation.process_replay.controller_replay import load_inputs, replay_controller
 from t3mpc_ros.geometry.types import STANDSTILL
 
 pytestmark = pytest.mark.compiled

@@ -25,8 +25,8 @@ from t3mpc_ros.bag.run.journal import Event
 from t3mpc_ros.bag.run.model_file import save_model
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.evaluation.process_replay.controller_inputs import load_inputs
 from t3mpc_ros.evaluation.process_replay.controller_replay import (
+    load_inputs,
     recompute_scalars,
     replay_controller,
 )

@@ -29,8 +29,7 @@ import numpy as np
 from t3mpc_ros.bag.run.journal import Journal
 from t3mpc_ros.bag.run.model_file import load_model
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, StepperControllerParameters
-from t3mpc_ros.evaluation.process_replay.controller_inputs import CONTROLLER, FIELDS
-from t3mpc_ros.evaluation.process_replay.controller_replay import output_row
+from t3mpc_ros.evaluation.process_replay.controller_replay import CONTROLLER, FIELDS, output_row
 from t3mpc_ros.evaluation.process_replay.replay_bag import (
     LATER,
     controller_bag,

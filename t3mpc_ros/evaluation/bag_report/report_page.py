@@ -18,8 +18,8 @@ from datetime import UTC, datetime
 import math
 from pathlib import Path
 
+from t3mpc_ros.bag.mcap_file import LOSS_CAUSES, LOSSES, UNDISCOVERED
 from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.bag.recording.message_losses import LOSS_CAUSES, LOSSES, UNDISCOVERED
 from t3mpc_ros.evaluation.bag_report.incidents import BRAKING, driving
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.map_changes import map_change_blocks

@@ -21,8 +21,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.bag.columns import CDR_LAYOUTS, TopicColumns, read_columns
-from t3mpc_ros.bag.reader import BagReader, missing_sample_ratio
+from t3mpc_ros.bag.reader import (
+    CDR_LAYOUTS,
+    BagReader,
+    TopicColumns,
+    missing_sample_ratio,
+    read_columns,
+)
 from t3mpc_ros.bag.schema import DataError
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, gaps, several_robots

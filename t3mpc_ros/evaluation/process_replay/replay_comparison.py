@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation import plotting
 from t3mpc_ros.evaluation.plotting import COLOURS
-from t3mpc_ros.evaluation.process_replay.controller_inputs import (
+from t3mpc_ros.evaluation.process_replay.controller_replay import (
     FIELDS,
     ControllerInputs,
     ReplayError,
+    ReplayResult,
 )
-from t3mpc_ros.evaluation.process_replay.controller_replay import ReplayResult
 from t3mpc_ros.geometry.types import Array
 
 Flags = NDArray[np.bool_]

@@ -22,13 +22,14 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import TERM_NAMES, Nt3fsMpcParameters
 from t3mpc_ros.control.controller import Controller, ControllerParameters
-from t3mpc_ros.evaluation.process_replay.controller_inputs import (
+from t3mpc_ros.evaluation.process_replay.controller_replay import (
     SPEEDS,
     ControllerInputs,
     ReplayError,
     load_inputs,
+    make_controllers,
+    replay_steps,
 )
-from t3mpc_ros.evaluation.process_replay.controller_replay import make_controllers, replay_steps
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist
 

@@ -27,13 +27,12 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from std_srvs.srv import Trigger
 
-from t3mpc_ros.bag.mcap_file import Attachment
+from t3mpc_ros.bag.mcap_file import LOSSES, Attachment, message_loss_record
 from t3mpc_ros.bag.recording.diagnostics_monitor import (
     DiagnosticsMonitor,
     NodeFault,
     SnapshotRateLimiter,
 )
-from t3mpc_ros.bag.recording.message_losses import LOSSES, message_loss_record
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.recording.snapshot import CircularMessageCache, SnapshotWriter
 from t3mpc_ros.bag.recording.writer_thread import WriterThread
