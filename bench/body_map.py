@@ -37,11 +37,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from t3mpc_ros.evaluation.confidence_intervals import interval
+from t3mpc_ros.evaluation.experiment import map_jobs
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, LMS, SHAPED_IN_TIME, methods_for
 from t3mpc_ros.evaluation.metrics import Numbers, measure
 from t3mpc_ros.evaluation.scenario import Scenario
-from t3mpc_ros.evaluation.workers import map_jobs
 from t3mpc_ros.geometry.kinematics import twist_from_wheels
 from t3mpc_ros.simulation.digital_twin import DigitalTwin
 

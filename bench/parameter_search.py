@@ -40,11 +40,11 @@ from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.control.controller import StepperControllerParameters
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward
 from t3mpc_ros.evaluation.drivers import MethodSpec, NodeMethod
+from t3mpc_ros.evaluation.experiment import WorkerPool
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, feed_forward_parameters
 from t3mpc_ros.evaluation.metrics import Numbers, measure
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
-from t3mpc_ros.evaluation.workers import WorkerPool
 from t3mpc_ros.parameters.table import ParameterError, ParameterSpec, Value
 
 ALLOWED = 1.5

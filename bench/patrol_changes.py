@@ -39,13 +39,7 @@ import yaml
 
 from t3mpc_ros.chaos.planned_path import PlanParameters
 from t3mpc_ros.chaos.portrait import PortraitParameters
-from t3mpc_ros.evaluation.experiment import (
-    ResultTable,
-    Run,
-    digest,
-    print_report,
-    run_experiment,
-)
+from t3mpc_ros.evaluation.experiment import ResultTable, Run, print_report, run_experiment
 from t3mpc_ros.evaluation.patrol.localization_study import localization_errors
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     START,
@@ -54,6 +48,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     run_patrol,
 )
 from t3mpc_ros.evaluation.record import Record
+from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, State
 from t3mpc_ros.localization.change_detection import Change
 from t3mpc_ros.localization.localizer import Localizer

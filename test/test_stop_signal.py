@@ -147,7 +147,7 @@ def test_the_workers_of_a_killed_process_end_with_it(number, tmp_path):
     program = tmp_path / 'study.py'
     program.write_text(
         'import os, time\n'
-        'from t3mpc_ros.evaluation.workers import WorkerPool\n'
+        'from t3mpc_ros.evaluation.experiment import WorkerPool\n'
         'def task(job):\n'
         '    print(os.getpid(), flush=True)\n'
         '    time.sleep(600.0)\n'

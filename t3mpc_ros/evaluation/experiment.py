@@ -16,31 +16,49 @@
 A study is a list of :class:`Run`; :func:`run_experiment` makes those that its file lacks, here or
 on other machines, and returns a :class:`ResultTable`, from which means, paired differences, claims
 and pages are made.
+
+Worker processes import the main module again: a script that uses more than one worker guards its
+work by ``if __name__ == '__main__':``.
 """
 
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor
-from dataclasses import dataclass, fields, is_dataclass
-from functools import cache
-import hashlib
+from collections.abc import (
+    Callable,
+    Collection,
+    Hashable,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import suppress
+from dataclasses import dataclass
+import multiprocessing
+from multiprocessing.context import SpawnContext, SpawnProcess
 import os
 from pathlib import Path
 import pickle
+import signal
 import sys
-from typing import Any
+from typing import Any, Self, TypeVar
 
-import numpy as np
-
-from t3mpc_ros.evaluation.code_content import code_content
+from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
+from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
-from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.drivers import MethodSpec
+from t3mpc_ros.evaluation.loop import Method, run
 from t3mpc_ros.evaluation.metrics import Numbers, measure
+from t3mpc_ros.evaluation.own_modules import ModuleCarrier
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
-from t3mpc_ros.evaluation.workers import Job, JobError, WorkerPool, map_jobs, workers_for
-from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
-from t3mpc_ros.version import VERSION
+from t3mpc_ros.evaluation.scenario import Scenario
+from t3mpc_ros.parent_process import end_with_parent
 
+GUARD = "a script that uses several processes must begin its work with: if __name__ == '__main__':"
+LOST_PROCESS = f'a worker process ended before its work was done; {GUARD}'
+T = TypeVar('T')
+Job = tuple[Scenario, Method]
+"""What the task of a job gets; the name of the second part is that of the job in errors."""
 RESTARTS = 3
 """How often a pool of processes that lost one is started anew."""
 Report = Callable[[str], None]
@@ -56,7 +74,7 @@ class Run:
     fields: Row
     """Columns that tell the run from the others: ``controller``, ``case``, ``seed`` and so on."""
     key: str = ''
-    """Digest of all that determines its numbers, see :func:`digest`; needed to keep them."""
+    """Digest of all that determines its numbers, see :func:`.digest`; needed to keep them."""
 
 
 class ResultTable(Sequence[Row]):
@@ -196,84 +214,190 @@ def print_report(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-# -- what determines the numbers of a run ---------------------------------------------------------
+# -- who makes the runs ---------------------------------------------------------------------------
 
 
-def digest(*parts: Any) -> str:
-    """Return a digest of version, sources of this package, and the content of ``parts``.
+class JobError(RuntimeError):
+    """A run that failed; the text names method and scenario."""
 
-    Functions and classes of a script count with their source and with what they use, files with
-    their content.
+
+class _WorkerProcess(SpawnProcess):
+    """A worker process: Ctrl-C, which a terminal sends to all, is for its parent."""
+
+    def start(self) -> None:
+        """Start it with the signal blocked, which it inherits and so is from its first moment."""
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _WorkerContext(SpawnContext):
+    """Makes worker processes, spawned and not forked, and knows them.
+
+    A fork would copy whatever threads and locks this process has.
     """
-    content = VERSION, source_digest(), [content_of(part) for part in parts]
-    return hashlib.sha256(repr(content).encode()).hexdigest()[:16]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.processes: list[SpawnProcess] = []
+
+    def Process(self, *arguments: Any, **options: Any) -> SpawnProcess:  # type: ignore[override]
+        """Return a new worker process."""
+        process = _WorkerProcess(*arguments, **options)
+        self.processes.append(process)
+        return process
 
 
-# Sources that only display, record or select. All others, and the tuned values, make stored runs
-# invalid: a needless repetition is better than an outdated result.
-_IRRELEVANT_SOURCES = (
-    'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'evaluation/bag_report/',
-    'evaluation/process_replay/', 'evaluation/comparison',
-    'evaluation/fault_page.py', 'evaluation/plotting.py', 'evaluation/reporting.py',
-    'evaluation/result_file.py', 'evaluation/paper/',
-    'evaluation/patrol/patrol_page.py', 'evaluation/patrol/patrol_figures.py',
-    'evaluation/patrol/tracking_page.py',
-)  # fmt: skip
+class WorkerPool:
+    """Executor that runs jobs, kept warm from one batch to the next.
 
-
-@cache
-def source_digest(package: Path = PACKAGE_DIRECTORY) -> str:
-    """Return a digest of every source and data file that can change the numbers of a run."""
-    suffixes = ('.py', '.npy', '.npz', '.yaml', '.json', '.csv')
-    found = hashlib.sha256()
-    for path in sorted(package.rglob('*')):
-        name = path.relative_to(package).as_posix()
-        if path.suffix in suffixes and not name.startswith(_IRRELEVANT_SOURCES):
-            found.update(name.encode() + b'\0' + hashlib.sha256(path.read_bytes()).digest())
-    return found.hexdigest()[:16]
-
-
-def content_of(value: Any) -> object:
-    """Return what a value is, as text and numbers; equal ones have equal content."""
-    if isinstance(value, str | os.PathLike):
-        return os.fspath(value), _file_digest(value)
-    if value is None or isinstance(value, bool | int | float):
-        return value
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
-        return str(value.dtype), value.shape, content
-    if isinstance(value, Mapping):
-        return [(str(key), content_of(item)) for key, item in value.items()]
-    if isinstance(value, list | tuple):
-        return [content_of(item) for item in value]
-    if is_dataclass(value) and not isinstance(value, type):
-        items = [content_of(getattr(value, item.name)) for item in fields(value)]
-        used = getattr(value, 'resolve', None)  # of a file: what it uses of other files
-        code = [] if used is None else _code(used())
-        return _code(type(value)), items, code
-    return _code(value)
-
-
-def _file_digest(value: str | os.PathLike[str]) -> str:
-    """Return a digest of a file, such as a world or a model; '' if it is none.
-
-    A word without suffix and folder is a name, whatever files there are where the program runs.
+    Jobs share nothing, so results do not depend on who works. ``workers`` are so many processes of
+    this machine, one is this process itself; or an executor, which the caller ends.
     """
-    path = Path(os.path.expanduser(value))
-    if isinstance(value, str) and not path.suffix and path.name == value:
-        return ''
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ''
-    except OSError:
-        return ''
+
+    def __init__(self, workers: int | Executor) -> None:
+        if isinstance(workers, int) and workers < 1:
+            raise ValueError(f'workers must be at least 1: got {workers}')
+        self._workers = workers
+        self._pool: Executor | None = None
+        self._context = _WorkerContext()
+
+    def __enter__(self) -> Self:
+        if isinstance(self._workers, Executor):
+            self._pool = self._workers
+        elif self._workers > 1:
+            _check_guarded()
+            self._pool = ProcessPoolExecutor(
+                self._workers, self._context, _start_worker, (os.getpid(),)
+            )
+        return self
+
+    def __exit__(self, kind: object = None, *_: object) -> None:
+        if kind is not None:
+            # After Ctrl-C or an error nobody waits for the runs that have begun.
+            for process in self._context.processes:
+                if process.is_alive():
+                    process.terminate()
+        if self._pool is not None and self._pool is not self._workers:
+            self._pool.shutdown(cancel_futures=True)
+        self._pool = None
+
+    def map(self, task: Callable[[Any], T], jobs: Iterable[Any]) -> Iterator[tuple[int, T]]:
+        """Yield (index of the job, ``task`` of it) as the jobs are finished.
+
+        ``task`` is a function of a module. JobError: it raised an exception; the jobs not begun
+        are dropped.
+        """
+        if self._pool is None:
+            for index, job in enumerate(jobs):
+                try:
+                    result = task(job)
+                except Exception as error:
+                    raise _job_error(job, error) from error
+                yield index, result
+            return
+        begun: dict[Future[T], tuple[int, Any]] = {}
+        try:
+            for index, job in enumerate(jobs):
+                try:
+                    begun[self._pool.submit(task, job)] = index, job
+                except BrokenExecutor as error:  # a process was lost meanwhile
+                    raise _job_error(job, error) from error
+            for future in as_completed(begun):
+                index, job = begun.pop(future)
+                failure = future.exception()
+                if failure is not None:
+                    raise _job_error(job, failure) from failure
+                yield index, future.result()
+        finally:
+            for future in begun:
+                future.cancel()
 
 
-def _code(value: Any) -> object:
-    """Return the source of a function or class, or of the class of an object and its state."""
-    if hasattr(value, '__qualname__'):
-        return code_content(value, content_of)
-    code = code_content(type(value), content_of)
-    try:
-        return *code, hashlib.sha256(pickle.dumps(value)).hexdigest()
-    except (pickle.PicklingError, AttributeError, TypeError):
-        return code
+def map_jobs(
+    task: Callable[[Any], T],
+    jobs: Sequence[Any],
+    workers: int | Executor = 1,
+    *,
+    progress: bool = False,
+) -> list[T]:
+    """Return ``task`` of every job in their order; ``workers`` as for :class:`WorkerPool`."""
+    found: dict[int, T] = {}
+    with WorkerPool(workers) as pool, progress_bar(len(jobs), show=progress) as bar:
+        for index, result in pool.map(task, jobs):
+            found[index] = result
+            bar.update()
+    return [found[index] for index in range(len(jobs))]
+
+
+def _check_guarded() -> None:
+    """Raise ValueError if the script that is run begins its work without a guard.
+
+    Each worker would import it, do again what comes before, and end where the processes start.
+    """
+    main = sys.modules['__main__']
+    file, frame = getattr(main, '__file__', None), sys._getframe()
+    while frame.f_back is not None:
+        frame = frame.f_back
+        if file and frame.f_code.co_name == '<module>' and frame.f_code.co_filename == file:
+            with suppress(OSError, UnicodeError), open(file, encoding='utf-8') as script:
+                if '__name__' not in script.read():
+                    raise ValueError(GUARD)
+
+
+def _job_error(job: tuple[Any, Any], error: BaseException) -> JobError:
+    scenario, method = job
+    return JobError(f'{getattr(method, "name", method)} on {scenario} failed: {error!r}')
+
+
+def _start_worker(parent: int) -> None:
+    """Prepare a worker process, which ends with its parent, also if that is killed."""
+    end_with_parent(parent)
+    warm_up()
+
+
+def warm_up() -> None:
+    """Load, or compile, every kernel of the loop itself, in both drives."""
+    for robot in PLANTS:
+        scenario = Scenario(robot, NOMINAL, 1, 0.05)
+        run(scenario, MethodSpec('warm up', FeedForward, FeedForwardParameters()))
+
+
+def workers_for(executor: Any, jobs: Sequence[Any]) -> int | Executor:
+    """Return who makes runs: a number of processes, or an executor.
+
+    ``executor`` is one, a Dask client, a number of processes, or None for one on each processor.
+    One run, and runs of an interactive session, which other processes cannot import, are made
+    in this process unless an executor is given.
+    """
+    if callable(make := getattr(executor, 'get_executor', None)):  # a Dask client
+        executor = make(pure=False)
+    if isinstance(executor, Executor):
+        other_machines = type(executor).__module__.startswith('distributed.')
+        return ModuleCarrier(executor) if other_machines else executor
+    if executor is not None and (isinstance(executor, bool) or not isinstance(executor, int)):
+        raise ValueError(
+            'executor must be None, a number of processes, a concurrent.futures.Executor or a '
+            f'Dask client: got {executor!r}'
+        )
+    if executor is not None and executor < 1:
+        raise ValueError(f'executor must be at least 1 process: got {executor}')
+    if getattr(multiprocessing.process.current_process(), '_inheriting', False):
+        # The program of a worker process runs this script again: it would start workers for ever.
+        raise SystemExit(f'error: {LOST_PROCESS}')
+    if executor == 1 or len(jobs) < 2:
+        return 1
+    count = executor or len(os.sched_getaffinity(0))
+    if executor is None and not hasattr(sys.modules['__main__'], '__file__'):
+        return 1
+    if count > 1:
+        try:
+            pickle.dumps(jobs[0])
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise ValueError(
+                'controller, plant and noise must be defined at the top level of a file to be '
+                f'sent to other processes; use executor=1 to stay in this one: got {error}'
+            ) from None
+    return min(count, len(jobs))

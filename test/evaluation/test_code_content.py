@@ -19,8 +19,7 @@ import sys
 import numpy as np
 import pytest
 
-from t3mpc_ros.evaluation.code_content import code_content
-from t3mpc_ros.evaluation.experiment import content_of
+from t3mpc_ros.evaluation.run_digest import code_content, content_of
 
 HELPER = 'GAIN = {gain}\n\n\ndef gain():\n    return {value}\n'
 LAW = """
@@ -68,7 +67,7 @@ def content(tmp_path, monkeypatch):
         (tmp_path / f'{name}.py').write_text(LAW.format(**values))
         sys.modules.pop('used_helper', None)
         importlib.invalidate_caches()
-        return repr(code_content(importlib.import_module(name).Law, content_of))
+        return repr(code_content(importlib.import_module(name).Law))
 
     yield found
     for name in [each for each in sys.modules if each.startswith('used_')]:
@@ -122,4 +121,4 @@ def test_a_closure_is_known_by_its_values():
 
 def test_functions_that_call_each_other_end():
     module = _cell('def a(o):\n    return b(o)\ndef b(o):\n    return a(o)\n')
-    assert len(code_content(module['a'], content_of)) == 2
+    assert len(code_content(module['a'])) == 2

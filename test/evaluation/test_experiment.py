@@ -22,8 +22,8 @@ from importlib import import_module
 import numpy as np
 import pytest
 
-from t3mpc_ros.evaluation.experiment import ResultTable, Run, content_of, run_experiment
-from t3mpc_ros.evaluation.workers import JobError
+from t3mpc_ros.evaluation.experiment import JobError, ResultTable, Run, run_experiment
+from t3mpc_ros.evaluation.run_digest import content_of
 
 ROWS = [
     {'controller': name, 'seed': seed, 'error': error}

@@ -28,6 +28,7 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineControlle
 from t3mpc_ros.evaluation.cases import CASES, PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired, student_quantile
 from t3mpc_ros.evaluation.drivers import MadeMethod, MethodSpec
+from t3mpc_ros.evaluation.experiment import JobError, WorkerPool
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
 from t3mpc_ros.evaluation.record import RATE
@@ -39,7 +40,6 @@ from t3mpc_ros.evaluation.scenario import (
     Scenario,
 )
 from t3mpc_ros.evaluation.simulated_links import NO_FAULTS
-from t3mpc_ros.evaluation.workers import JobError, WorkerPool
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia

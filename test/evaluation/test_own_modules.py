@@ -18,8 +18,8 @@ import sys
 import pytest
 
 from t3mpc_ros.evaluation import own_modules
-from t3mpc_ros.evaluation.experiment import source_digest
 from t3mpc_ros.evaluation.own_modules import SourceText, own_sources, run_carried
+from t3mpc_ros.evaluation.run_digest import source_digest
 from t3mpc_ros.script_error import ScriptError
 
 NAMES = ('carried', 'carried.law', 'carried_helper')

@@ -18,10 +18,11 @@ import math
 
 import pytest
 
-from t3mpc_ros.evaluation import experiment
-from t3mpc_ros.evaluation.experiment import Run, digest, run_experiment, source_digest
+from t3mpc_ros.evaluation import run_digest
+from t3mpc_ros.evaluation.experiment import Run, run_experiment
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.result_file import ResultFile
+from t3mpc_ros.evaluation.run_digest import digest, source_digest
 
 RUNS = [Run((k, 'method'), {'seed': k}, f'key {k}') for k in range(12)]
 
@@ -150,5 +151,5 @@ def test_the_digest_covers_sources_that_change_a_run(tmp_path, monkeypatch):
         seen.add(sources(tmp_path))
     assert len(seen) == 1 + len(relevant)
     known = digest(1)
-    monkeypatch.setattr(experiment, 'source_digest', lambda: 'other')
+    monkeypatch.setattr(run_digest, 'source_digest', lambda: 'other')
     assert digest(1) != known

@@ -27,6 +27,7 @@ from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.cases import ROBOTS
 from t3mpc_ros.evaluation.drivers import MethodSpec
+from t3mpc_ros.evaluation.experiment import JobError
 from t3mpc_ros.evaluation.loop import run as closed_loop_run
 from t3mpc_ros.evaluation.methods import (
     further_definitions,
@@ -56,7 +57,6 @@ from t3mpc_ros.evaluation.tuning.tuned_parameter_file import (
     TunedParameters,
     TuningBudget,
 )
-from t3mpc_ros.evaluation.workers import JobError
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
 

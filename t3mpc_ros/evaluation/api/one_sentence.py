@@ -46,7 +46,7 @@ def sentence(error: BaseException) -> str:
     """Return what went wrong in one sentence: the text of the error, or that of its origin."""
     cause = error.__cause__
     if isinstance(cause, BrokenExecutor) or isinstance(error, BrokenExecutor):
-        from t3mpc_ros.evaluation.workers import LOST_PROCESS
+        from t3mpc_ros.evaluation.experiment import LOST_PROCESS
 
         return LOST_PROCESS
     if isinstance(cause, ScriptError):

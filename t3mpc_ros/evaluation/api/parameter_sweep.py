@@ -34,19 +34,19 @@ from t3mpc_ros.evaluation.api.table_files import Columns, columns_of, writable, 
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.experiment import (
+    Job,
     Report,
     ResultTable,
     Run,
-    digest,
     measured_run,
     print_report,
     run_experiment,
 )
 from t3mpc_ros.evaluation.reporting import Table, format_interval
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
+from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
-from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.script_error import ScriptError

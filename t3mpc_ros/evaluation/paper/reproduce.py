@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from t3mpc_ros.evaluation import open_loop_estimation
-from t3mpc_ros.evaluation.experiment import Report, ResultTable, run_experiment, source_digest
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, run_experiment
 from t3mpc_ros.evaluation.methods import EXACT_MODEL, methods
 from t3mpc_ros.evaluation.paper.claims import all_claims, markdown
 from t3mpc_ros.evaluation.paper.figure_runs import simulate_figure_runs
@@ -33,6 +33,7 @@ from t3mpc_ros.evaluation.paper.study import (
 )
 from t3mpc_ros.evaluation.plotting import write_pictures
 from t3mpc_ros.evaluation.reporting import strict_json, write_columns
+from t3mpc_ros.evaluation.run_digest import source_digest
 from t3mpc_ros.parameters.provenance import machine, provenance
 from t3mpc_ros.version import VERSION
 

@@ -22,13 +22,13 @@ import numpy as np
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
 from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.drivers import MethodSpec
-from t3mpc_ros.evaluation.experiment import Run, digest
+from t3mpc_ros.evaluation.experiment import Job, Run
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import STAGES as METHOD_STAGES
 from t3mpc_ros.evaluation.methods import methods
 from t3mpc_ros.evaluation.record import Record
+from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, KINDS, PLANT_OF, Scenario, held_out
-from t3mpc_ros.evaluation.workers import Job
 
 DRIVES = ('torque', 'velocity')
 """torque: u is applied as the torque theta_bar u, as in the paper; velocity: the wheels follow

@@ -28,7 +28,7 @@ import numpy as np
 
 from t3mpc_ros.chaos.portrait import PortraitParameters
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, digest, run_experiment
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     PatrolScenario,
     contact_count,
@@ -39,6 +39,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
 from t3mpc_ros.evaluation.record import ON_PATH, RATE, Record, spans_of
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.result_file import Row
+from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.geometry.types import Array
 
 CARRIED_AT = 30.0

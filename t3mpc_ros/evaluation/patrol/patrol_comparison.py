@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.planned_path import PlanParameters
 from t3mpc_ros.chaos.portrait import PortraitParameters
-from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, digest, run_experiment
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at, visits
 from t3mpc_ros.evaluation.patrol.patrol_metrics import patrol_metrics
@@ -48,6 +48,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
 )
 from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.result_file import Row
+from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming

@@ -21,7 +21,7 @@ from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
 from t3mpc_ros.evaluation.drivers import MethodSpec, pretrain
-from t3mpc_ros.evaluation.experiment import Run, print_report, run_experiment
+from t3mpc_ros.evaluation.experiment import Job, Run, print_report, run_experiment
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController, ProposedParameters
@@ -38,7 +38,6 @@ from t3mpc_ros.evaluation.scenario import (
 from t3mpc_ros.evaluation.training.fit import periods, skills, stretches
 from t3mpc_ros.evaluation.training.recorded_runs import MIDDLE, NEXT_STEP, pair
 from t3mpc_ros.evaluation.training.training_data import TrainingData
-from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.mpc.predictive_controller import PredictiveController
 

@@ -28,7 +28,7 @@ import numpy as np
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired, rms
 from t3mpc_ros.evaluation.counted_time import START
-from t3mpc_ros.evaluation.experiment import Report
+from t3mpc_ros.evaluation.experiment import Job, Report
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, further_methods, methods, twin_start
 from t3mpc_ros.evaluation.metrics import VARIATION, measure
@@ -43,7 +43,6 @@ from t3mpc_ros.evaluation.tuning.tuned_parameter_file import (
     TunedParameters,
     TuningBudget,
 )
-from t3mpc_ros.evaluation.workers import Job
 from t3mpc_ros.parameters.table import Parameters
 
 TWIN = KINDS['twin'].tuned_for

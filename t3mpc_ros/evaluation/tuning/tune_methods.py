@@ -24,7 +24,7 @@ from typing import Any, Self
 
 from tqdm import tqdm
 
-from t3mpc_ros.evaluation.experiment import Report
+from t3mpc_ros.evaluation.experiment import Job, JobError, Report, WorkerPool
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.tuning.cma_search import SearchResult, search_best
@@ -36,7 +36,6 @@ from t3mpc_ros.evaluation.tuning.tuned_parameter_file import (
     TunedParameters,
     TuningBudget,
 )
-from t3mpc_ros.evaluation.workers import Job, JobError, WorkerPool
 from t3mpc_ros.parameters.table import ParameterError, Parameters
 from t3mpc_ros.version import VERSION
 

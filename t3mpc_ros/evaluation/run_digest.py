@@ -11,30 +11,119 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Content of functions and classes: their source, and what of a user's own code they use.
+"""Digest of all that determines the numbers of a run, by which a run is known.
 
-A run is known by it. The name of a class of a notebook is not enough, nor is its source if it uses
-a constant above it or a module beside it: the rows that a file has of a controller would be taken
-for those of the edited one.
+Of functions and classes it has the source, and what of a user's own code they use. The name of a
+class of a notebook is not enough, nor is its source if it uses a constant above it or a module
+beside it: the rows that a file has of a controller would be taken for those of the edited one.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import fields, is_dataclass
 from functools import cache
+import hashlib
 import inspect
+import os
+from pathlib import Path
+import pickle
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
+import numpy as np
+
 from t3mpc_ros.evaluation.own_modules import is_own, own_text
+from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
+from t3mpc_ros.version import VERSION
 
 DATA = (bool, int, float, complex, str, list, tuple, dict)
 """Kinds of data that a function may use by a name; arrays, too."""
 
 
-def code_content(code: Any, content_of: Callable[[Any], object]) -> list[object]:
+def digest(*parts: Any) -> str:
+    """Return a digest of version, sources of this package, and the content of ``parts``.
+
+    Functions and classes of a script count with their source and with what they use, files with
+    their content.
+    """
+    content = VERSION, source_digest(), [content_of(part) for part in parts]
+    return hashlib.sha256(repr(content).encode()).hexdigest()[:16]
+
+
+# Sources that only display, record or select. All others, and the tuned values, make stored runs
+# invalid: a needless repetition is better than an outdated result.
+_IRRELEVANT_SOURCES = (
+    'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'evaluation/bag_report/',
+    'evaluation/process_replay/', 'evaluation/comparison',
+    'evaluation/fault_page.py', 'evaluation/plotting.py', 'evaluation/reporting.py',
+    'evaluation/result_file.py', 'evaluation/paper/',
+    'evaluation/patrol/patrol_page.py', 'evaluation/patrol/patrol_figures.py',
+    'evaluation/patrol/tracking_page.py',
+)  # fmt: skip
+
+
+@cache
+def source_digest(package: Path = PACKAGE_DIRECTORY) -> str:
+    """Return a digest of every source and data file that can change the numbers of a run."""
+    suffixes = ('.py', '.npy', '.npz', '.yaml', '.json', '.csv')
+    found = hashlib.sha256()
+    for path in sorted(package.rglob('*')):
+        name = path.relative_to(package).as_posix()
+        if path.suffix in suffixes and not name.startswith(_IRRELEVANT_SOURCES):
+            found.update(name.encode() + b'\0' + hashlib.sha256(path.read_bytes()).digest())
+    return found.hexdigest()[:16]
+
+
+def content_of(value: Any) -> object:
+    """Return what a value is, as text and numbers; equal ones have equal content."""
+    if isinstance(value, str | os.PathLike):
+        return os.fspath(value), _file_digest(value)
+    if value is None or isinstance(value, bool | int | float):
+        return value
+    if isinstance(value, np.ndarray) and value.dtype != object:
+        content = hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+        return str(value.dtype), value.shape, content
+    if isinstance(value, Mapping):
+        return [(str(key), content_of(item)) for key, item in value.items()]
+    if isinstance(value, list | tuple):
+        return [content_of(item) for item in value]
+    if is_dataclass(value) and not isinstance(value, type):
+        items = [content_of(getattr(value, item.name)) for item in fields(value)]
+        used = getattr(value, 'resolve', None)  # of a file: what it uses of other files
+        code = [] if used is None else _code(used())
+        return _code(type(value)), items, code
+    return _code(value)
+
+
+def _file_digest(value: str | os.PathLike[str]) -> str:
+    """Return a digest of a file, such as a world or a model; '' if it is none.
+
+    A word without suffix and folder is a name, whatever files there are where the program runs.
+    """
+    path = Path(os.path.expanduser(value))
+    if isinstance(value, str) and not path.suffix and path.name == value:
+        return ''
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ''
+    except OSError:
+        return ''
+
+
+def _code(value: Any) -> object:
+    """Return the source of a function or class, or of the class of an object and its state."""
+    if hasattr(value, '__qualname__'):
+        return code_content(value)
+    code = code_content(type(value))
+    try:
+        return *code, hashlib.sha256(pickle.dumps(value)).hexdigest()
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return code
+
+
+def code_content(code: Any) -> list[object]:
     """Return name and source of a function or class, and of all of one's own that it uses.
 
-    ``content_of`` returns the content of data. Code of libraries counts by its name.
+    Code of libraries counts by its name.
     """
     found: list[object] = []
     seen: set[int] = set()
