@@ -40,7 +40,7 @@ from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import map_jobs
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, LMS, SHAPED_IN_TIME, methods_for
-from t3mpc_ros.evaluation.metrics import Numbers, measure
+from t3mpc_ros.evaluation.record import Numbers, measure
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.kinematics import twist_from_wheels
 from t3mpc_ros.simulation.digital_twin import DigitalTwin
@@ -118,7 +118,7 @@ def run_job(pair: tuple[Job, Job]) -> Numbers:
 
     scenario = Scenario('twin', 'nominal', job.seed)
     with patch.object(DigitalTwin, '_measure', changed):
-        return measure(scenario, run(scenario, methods_for('twin')[job.method]))
+        return measure(run(scenario, methods_for('twin')[job.method]))
 
 
 def main() -> int:

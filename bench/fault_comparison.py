@@ -45,6 +45,7 @@ from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.drivers import NodeDriver, NodeMethod
 from t3mpc_ros.evaluation.experiment import map_jobs
+from t3mpc_ros.evaluation.loop import ReportLink
 from t3mpc_ros.evaluation.methods import (
     EXACT_MODEL,
     FEED_FORWARD,
@@ -54,11 +55,10 @@ from t3mpc_ros.evaluation.methods import (
     SHAPED_IN_TIME,
     methods_for,
 )
-from t3mpc_ros.evaluation.metrics import Numbers, measure
-from t3mpc_ros.evaluation.record import RATE, stamp_of
+from t3mpc_ros.evaluation.record import RATE, Numbers, measure, stamp_of
 from t3mpc_ros.evaluation.reporting import replace_section
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
-from t3mpc_ros.evaluation.simulated_links import NO_FAULTS, LinkFaults, ReportLink
+from t3mpc_ros.evaluation.simulated_links import NO_FAULTS, LinkFaults
 from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist
 from t3mpc_ros.robot.interface import RobotState
 from t3mpc_ros.simulation.fault_injection import FaultEvent
@@ -348,7 +348,7 @@ def run_job(pair: tuple[Job, Job]) -> tuple[Numbers, list[tuple[float, str]]]:
     if isinstance(method, NodeMethod):
         method = Watched(NodeMethod(job.name, {**method.changes, **fault.assumed}))
     with patch.object(loop, 'ReportLink', kind):
-        numbers = measure(scenario, loop.run(scenario, method))
+        numbers = measure(loop.run(scenario, method))
     return numbers, method.made[0].said if isinstance(method, Watched) else []
 
 

@@ -43,7 +43,7 @@ from t3mpc_ros.evaluation.drivers import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.experiment import WorkerPool
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, feed_forward_parameters
-from t3mpc_ros.evaluation.metrics import Numbers, measure
+from t3mpc_ros.evaluation.record import Numbers, measure
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
 from t3mpc_ros.parameters.table import ParameterError, ParameterSpec, Value
 
@@ -125,7 +125,7 @@ def forward(limits: LimitParameters, ramp: float) -> Numbers:
     """Return the errors of feed-forward under limits, with a ramp (rad/s²) at switches."""
     parameters = feed_forward_parameters('twin').with_values({RAMP: ramp})
     scenario = Scenario('twin', 'nominal', SEED, DURATION, own=OwnParts(limits=limits))
-    return measure(scenario, run(scenario, MethodSpec(FEED_FORWARD, FeedForward, parameters)))
+    return measure(run(scenario, MethodSpec(FEED_FORWARD, FeedForward, parameters)))
 
 
 def judge(point: Point) -> Judged:
@@ -137,7 +137,7 @@ def judge(point: Point) -> Judged:
     except ParameterError as error:
         return Judged(point, refused=str(error))
     try:
-        found = measure(scenario, run(scenario, method))
+        found = measure(run(scenario, method))
     except ValueError as error:  # of the controller, which ends
         return Judged(point, failed=str(error), ratio=math.inf)
     usual = forward(parameters.limits, parameters.jump_transition.acceleration)

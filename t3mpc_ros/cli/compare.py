@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation import comparison_page
     from t3mpc_ros.evaluation.api.comparison_runs import Comparison
     from t3mpc_ros.evaluation.api.table_files import columns_of, write_csv
-    from t3mpc_ros.evaluation.comparison import run_plan, step_times
+    from t3mpc_ros.evaluation.comparison import markdown, run_plan, step_times
     from t3mpc_ros.evaluation.experiment import print_report
 
     plan = _plan(options)
@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> int:
     times = step_times(plan, time.perf_counter_ns)
     run_options.print_result(
         options,
-        lambda: comparison_page.markdown(plan, results, times),
+        lambda: markdown(plan, results, times),
         lambda: comparison_page.record(plan, results, times),
     )
     if options.html:

@@ -11,30 +11,59 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Comparison of methods: a plan of cases, methods and seeds, and its experiment."""
+"""Comparison of methods: a plan of cases, methods and seeds, its experiment, and its tables."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
+import math
 import statistics
-from typing import Any, Protocol
+from typing import Any, TypeVar
 
+from t3mpc_ros.evaluation.baselines.baseline_controller import EXACT_INERTIA, FRICTION
+from t3mpc_ros.evaluation.cases import CASES
+from t3mpc_ros.evaluation.confidence_intervals import (
+    Difference,
+    format_interval,
+    holm,
+    interval,
+    mean,
+)
 from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
-from t3mpc_ros.evaluation.loop import Driver, Method, run
-from t3mpc_ros.evaluation.methods import FEED_FORWARD
-from t3mpc_ros.evaluation.scenario import Scenario
+from t3mpc_ros.evaluation.loop import ComparedMethod, Driver, Method, run
+from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, MODEL_ERROR
+from t3mpc_ros.evaluation.record import (
+    DRIFT,
+    METRICS,
+    OVERALL,
+    SETTLED,
+    START,
+    STOPPED,
+    VARIATION,
+    YAW_RATE,
+    YAW_RATE_SETTLED,
+    Metric,
+)
+from t3mpc_ros.evaluation.reporting import (
+    EMPTY_CELL,
+    Table,
+)
+from t3mpc_ros.evaluation.scenario import (
+    HELD_OUT_SEEDS,
+    LEAD,
+    PRETRAINING_SEEDS,
+    TUNING_SEEDS,
+    Scenario,
+)
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
 
 QUICK_SEEDS = tuple(range(201, 207))
 """Default seeds: none of them was used for tuning, or is in a table of the paper's results."""
-
-
-class ComparedMethod(Method, Protocol):
-    """A method that states what it knows."""
-
-    def knowledge(self, scenario: Scenario) -> str:
-        """Return what it knows of robot and reference, for tables."""
-        ...
+BETTER, WORSE, INCONCLUSIVE = 'better', 'worse', 'inconclusive'
+"""Verdicts on a paired difference: that it is below zero or above it, or that this is open."""
+LEVEL = 0.05
+"""Largest probability of one wrong verdict in a table."""
+Key = TypeVar('Key', bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -128,3 +157,229 @@ class TimedMethod:
 def run_plan(plan: ComparisonPlan, workers: Any = 1, report: Report | None = None) -> ResultTable:
     """Return the metrics of every run of a plan; ``workers`` as for :func:`.workers_for`."""
     return run_experiment(plan.runs(), workers=workers, report=report)
+
+
+# -- tables ---------------------------------------------------------------------------------------
+
+
+def difference(
+    plan: ComparisonPlan, results: ResultTable, case: str, method: str, metric: Metric
+) -> Difference | None:
+    """Return the paired difference from the method of reference; None for itself or without it."""
+    first, second = ({'controller': name, 'case': case} for name in (method, plan.against))
+    return None if first == second else results.difference(metric.name, first, second)
+
+
+def verdicts(differences: Mapping[Key, Difference | None], seeds: int) -> dict[Key, str]:
+    """Return the verdict on every paired difference of a table, with Holm's correction.
+
+    Each is the mean over as many ``seeds``. A run that diverged is worse; without a difference
+    there is no verdict.
+    """
+    found = {key: each for key, each in differences.items() if each is not None}
+    certain = holm({key: each.p_value(seeds) for key, each in found.items()}, LEVEL)
+    return {
+        key: WORSE
+        if math.isnan(each.mean)
+        else INCONCLUSIVE
+        if key not in certain
+        else BETTER
+        if each.mean < 0.0
+        else WORSE
+        for key, each in found.items()
+    }
+
+
+def case_differences(
+    plan: ComparisonPlan, results: ResultTable, case: str
+) -> dict[tuple[str, Metric], Difference | None]:
+    """Return the differences that a case is judged by, of every method and metric."""
+    return {
+        (method, metric): difference(plan, results, case, method, metric)
+        for method in plan.methods
+        for metric in judged_metrics(case)
+    }
+
+
+def case_verdicts(
+    plan: ComparisonPlan, results: ResultTable, case: str
+) -> dict[tuple[str, Metric], str]:
+    """Return the verdicts of the table of a case."""
+    return verdicts(case_differences(plan, results, case), len(plan.seeds))
+
+
+def judged_metrics(case: str) -> tuple[Metric, ...]:
+    """Return the metrics that decide a case: of the wheels, or of the body if it is unknown."""
+    if CASES[case].body:
+        return YAW_RATE_SETTLED, YAW_RATE, DRIFT
+    return SETTLED, OVERALL
+
+
+def summary_table(
+    plan: ComparisonPlan,
+    results: ResultTable,
+    judged: Mapping[tuple[str, str], str],
+    step_times: StepTimes | None = None,
+) -> Table:
+    """Return the first judged metric of every method and case, with its verdict in ``judged``.
+
+    Beside it the variation of the command in the first case, and the time of a step, µs.
+    """
+    firsts = {case: judged_metrics(case)[0] for case in plan.cases}
+    rows = []
+    for method in plan.methods:
+        cells = [method]
+        for case, metric in firsts.items():
+            cell = _cell(results.values(metric.name, case=case, controller=method), metric)
+            cells.append(f'{cell} {judged.get((method, case), "")}'.rstrip())
+        variation = results.values(VARIATION.name, case=plan.cases[0], controller=method)
+        cells.append(_cell(variation, VARIATION))
+        if step_times:
+            cells.append(f'{step_times[method]:.0f}')
+        rows.append(tuple(cells))
+    body = [case for case, metric in firsts.items() if metric is not SETTLED]
+    title = 'Settled RMSE of the wheel speeds, rad/s'
+    if body:
+        title += f' ({", ".join(body)}: of the yaw rate of the body)'
+    title += f'; mean ± half the 95 % interval (seeds); verdict against {plan.against}'
+    head = ['method', *plan.cases, f'{VARIATION.heading}, {plan.cases[0]}, {VARIATION.unit}']
+    head += ['step, µs'] if step_times else []
+    return Table(title, head, rows, (FULL,), wrap=True)
+
+
+def first_verdicts(plan: ComparisonPlan, results: ResultTable) -> dict[tuple[str, str], str]:
+    """Return the verdict on the first judged metric of every method and case."""
+    return verdicts(
+        {
+            (method, case): difference(plan, results, case, method, judged_metrics(case)[0])
+            for method in plan.methods
+            for case in plan.cases
+        },
+        len(plan.seeds),
+    )
+
+
+def _cell(values: Sequence[float], metric: Metric) -> str:
+    """Return mean ± half the interval and the number of seeds."""
+    text = format_interval(mean(values), interval(values), '', metric.digits)
+    return f'{text} ({len(values)})'
+
+
+def case_table(plan: ComparisonPlan, results: ResultTable, case: str) -> Table:
+    """Return every metric of a case, and the paired differences of those that decide it."""
+    first = results.where(case=case, controller=next(iter(plan.methods)))[0]
+    metrics = [
+        metric
+        for metric in METRICS
+        if metric.name in first
+        and (
+            metric is not STOPPED
+            or any(each > 0.0 for each in results.values(STOPPED.name, case=case))
+        )
+    ]
+    judged = judged_metrics(case)
+    head = ['method', *(f'{metric.heading}, {metric.unit}' for metric in metrics)]
+    compared = plan.against in plan.methods and len(plan.methods) > 1
+    if compared:
+        for metric in judged:
+            head += [f'{metric.heading} − {plan.against}', 'verdict']
+    head.append('knows')
+    differences = case_differences(plan, results, case)
+    judgement = verdicts(differences, len(plan.seeds))
+    rows = []
+    for method in plan.methods:
+        cells = [method]
+        for metric in metrics:
+            cells.append(_cell(results.values(metric.name, case=case, controller=method), metric))
+        for metric in judged if compared else ():
+            found = differences[method, metric]
+            if found is None:
+                cells += [EMPTY_CELL, EMPTY_CELL]
+            else:
+                text = format_interval(found.mean, found.half, '+', metric.digits)
+                cells += [text, judgement[method, metric]]
+        cells.append(known_by(plan, method, case))
+        rows.append(tuple(cells))
+    title = f'{case}: {CASES[case].text}'
+    return Table(title, head, rows, (FULL,), wrap=True)
+
+
+def known_by(plan: ComparisonPlan, method: str, case: str) -> str:
+    """Return what a method knows in a case, as it states."""
+    return plan.methods[method].knowledge(replace(plan.scenario, case=case))
+
+
+def knowledge_table(plan: ComparisonPlan) -> Table:
+    """Return what the words of the column *knows* mean."""
+    scenario = replace(plan.scenario, case=plan.cases[0])
+    model = scenario.nominal_model()
+    rows = {
+        'all': 'noise variance, limits, geometry, lag and dead time of the estimator (the true '
+        'dead time only where the case says that it is known); state estimate and limits are the '
+        'same for all but the controller of the node, which has its own of the same kind',
+        'reference ahead': f'the reference up to {LEAD:g} s ahead; "now": up to the present',
+        'wheel speeds': 'the measured ones; on the twin those of the step counters',
+        'their difference by the gyro': 'the difference of the wheel speeds is that of the yaw of '
+        'the odometry, which contains the gyro',
+        'estimate of the dead time': 'from commands and measured speeds, by one estimator',
+        f'{EXACT_INERTIA}; inertia × {MODEL_ERROR:g}': 'inertia of the nominal robot, or that '
+        'with an error: in the model of a prediction, or in the torques of a torque drive. '
+        'Where nothing is said, accelerations become torques by the exact one',
+        FRICTION: 'friction and turning of the nominal robot, as a function of the speeds',
+        'weights': 'learnt on the nominal robot before the run',
+        'parameters': f'tuned on other seeds with equal effort for {plan.scenario.kind.tuned_for} '
+        '(t3mpc tune); with the ramp those tuned without it, unless they were tuned with it; of '
+        'the offset-free MPC those of the linear one with preview; '
+        f'{FULL} on the twin and the variants of {FEED_FORWARD} have their defaults',
+    }
+    if plan.scenario.kind.has_gyro:
+        rows['model'] = (
+            f'on the twin a servo with a lag of {1e3 * model.lag:g} ms without friction, which is '
+            'exact for a stepper motor but for the oscillation of its rotor'
+        )
+    return Table('What the methods know', ('word', 'means'), list(rows.items()), text=2, wrap=True)
+
+
+def description(plan: ComparisonPlan) -> str:
+    """Return in one paragraph what was run and how it is counted."""
+    seeds = ', '.join(map(str, plan.seeds))
+    outside = ' (none is used for tuning or in another table)' if _are_outside(plan.seeds) else ''
+    text = (
+        f'{plan.scenario.text}, {plan.scenario.duration:g} s, '
+        f'noise variance {plan.scenario.noise:g} (rad/s)², '
+        f'seeds {seeds}{outside}. '
+        'True wheel speeds against the reference; mean ± half the 95 % interval over the seeds. '
+    )
+    kind = plan.scenario.kind
+    before, after = kind.settling
+    text += (
+        f'The first {START:g} s of control do not count. Settled: without {before:g} s before and '
+        f'{after:g} s after each switch. '
+    )
+    if kind.has_gyro:
+        text += (
+            'Yaw rate and yaw drift are those of the body, from ground truth, against the '
+            'reference; the drift is that at the end. '
+        )
+    return text + (
+        'Variation: total variation of the commanded acceleration per second and wheel. '
+        f"Differences from {plan.against} are paired by seed; better or worse by Student's test "
+        f"at {100.0 * LEVEL:g} % with Holm's correction over all comparisons of a table. In "
+        'brackets the number of seeds.'
+    )
+
+
+def _are_outside(seeds: Sequence[int]) -> bool:
+    return not {*seeds} & {*TUNING_SEEDS, *PRETRAINING_SEEDS, *HELD_OUT_SEEDS}
+
+
+def markdown(
+    plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | None = None
+) -> str:
+    """Return all tables in Markdown."""
+    tables = [
+        summary_table(plan, results, first_verdicts(plan, results), step_times),
+        *(case_table(plan, results, case) for case in plan.cases),
+        knowledge_table(plan),
+    ]
+    return '\n\n'.join([description(plan), *(table.markdown() for table in tables)])

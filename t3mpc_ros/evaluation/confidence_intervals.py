@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Means over seeds with Student's confidence intervals, and paired differences."""
+"""Means over seeds with Student's confidence intervals, paired differences, and their text."""
 
 from collections.abc import Hashable, Mapping, Sequence
 from functools import lru_cache
@@ -97,6 +97,14 @@ def holm(p_values: Mapping[Key, float], level: float = 0.05) -> set[Key]:
             break
         rejected.add(key)
     return rejected
+
+
+def format_interval(middle: float, ci95: float, sign: str = '', digits: int = 3) -> str:
+    """Return a mean ± half its 95 % interval; a single seed has no interval."""
+    if not math.isfinite(middle):
+        return 'diverged'
+    text = f'{middle:{sign}.{digits}f}'
+    return f'{text} ± {ci95:.{digits}f}' if math.isfinite(ci95) else text
 
 
 @lru_cache(maxsize=1024)

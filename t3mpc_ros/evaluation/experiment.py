@@ -47,8 +47,8 @@ from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
 from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.loop import Method, run
-from t3mpc_ros.evaluation.metrics import Numbers, measure
 from t3mpc_ros.evaluation.own_modules import ModuleCarrier
+from t3mpc_ros.evaluation.record import Numbers, measure
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.scenario import Scenario
@@ -132,8 +132,7 @@ class ResultTable(Sequence[Row]):
 
 def measured_run(job: Job) -> Numbers:
     """Return the metrics of one run."""
-    scenario, method = job
-    return measure(scenario, run(scenario, method))
+    return measure(run(*job))
 
 
 def run_experiment(

@@ -18,7 +18,8 @@ once, carries that stamp back, and the robot follows it when it has arrived. Rep
 or lost on their way; what happens to a command on its way is a matter of the robot.
 """
 
-from collections.abc import Generator, Sequence
+from collections import deque
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 import math
 from typing import Any, Protocol
@@ -27,7 +28,7 @@ import numpy as np
 
 from t3mpc_ros.evaluation.record import RATE, Record, broken_off, stamp_of, switch_times
 from t3mpc_ros.evaluation.scenario import LEAD, Scenario
-from t3mpc_ros.evaluation.simulated_links import NO_FAULTS, LinkFaults, ReportLink
+from t3mpc_ros.evaluation.simulated_links import NO_FAULTS, LinkFaults
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
 from t3mpc_ros.simulation.plant_robot import Signals, SimulatedRobot
@@ -72,6 +73,14 @@ class Method(Protocol):
         ...
 
 
+class ComparedMethod(Method, Protocol):
+    """A method that states what it knows."""
+
+    def knowledge(self, scenario: Scenario) -> str:
+        """Return what it knows of robot and reference, for tables."""
+        ...
+
+
 def run(scenario: Scenario, method: Method) -> Record:
     """Return the record of a new driver of a method and the robot of a scenario.
 
@@ -82,7 +91,7 @@ def run(scenario: Scenario, method: Method) -> Record:
     if len(reference.speeds) < known:
         raise ValueError(f'reference must have at least {known} rows: got {len(reference.speeds)}')
     driver = method.driver(scenario)
-    return with_reference(run_loop(scenario_reports(scenario, driver), driver), scenario)
+    return with_scenario(run_loop(scenario_reports(scenario, driver), driver), scenario)
 
 
 def scenario_reports(scenario: Scenario, driver: Driver) -> Loop:
@@ -98,16 +107,23 @@ def scenario_reports(scenario: Scenario, driver: Driver) -> Loop:
     )
 
 
-def with_reference(record: Record, scenario: Scenario) -> Record:
-    """Return the record of a loop with the reference of its scenario."""
+def with_scenario(record: Record, scenario: Scenario) -> Record:
+    """Return the record of a loop with what its metrics need of its scenario."""
     reference, steps = scenario.reference(), scenario.steps
     columns = {
         **record.columns,
         'reference': reference.speeds[:steps],
         'mode': reference.modes[:steps],
     }
-    switches = switch_times(reference.time, reference.modes)
-    return replace(record, columns=columns, drive=scenario.kind.drive, switches=switches)
+    return replace(
+        record,
+        columns=columns,
+        drive=scenario.kind.drive,
+        switches=switch_times(reference.time, reference.modes),
+        settling=scenario.kind.settling,
+        fault_span=scenario.fault_span,
+        geometry=scenario.true_robot().geometry,
+    )
 
 
 def run_loop(loop: Loop, driver: Driver) -> Record:
@@ -173,6 +189,50 @@ def reports_of(
         driver_reasons=tuple(driver_reasons),
     )
     return record if ended < 0 else broken_off(record, ended, periods)
+
+
+class ReportLink:
+    """Reports of a robot on their way to the driver; they arrive in order but for the swapped.
+
+    Equal seeds draw equal numbers, whatever is sent; ``duration`` is that of the run, s.
+    """
+
+    def __init__(self, faults: LinkFaults, seed: int, duration: float) -> None:
+        self._faults = faults
+        self._begin, self._end = faults.span(duration)
+        self._generator = np.random.default_rng((seed, 3))
+        self._queue: deque[tuple[int, RobotState]] = deque()
+        self._sent = 0
+        self._overtaken: RobotState | None = None
+
+    def send(self, state: RobotState) -> None:
+        """Send a report; one that is not late arrives after those before it all the same."""
+        # Two numbers for each report, so that a change of loss does not shift delays.
+        lost, late = self._generator.random(2).tolist()
+        arrival, delay = state.stamp_ns, 0.0
+        if self._begin <= state.stamp_ns / NANOSECONDS < self._end:
+            if lost < self._faults.odometry_loss:
+                return
+            least, most = self._faults.odometry_delay
+            delay = least + (most - least) * late
+            self._sent += 1
+            if self._sent % self._faults.odometry_kept:
+                return
+            swapped = self._faults.odometry_swapped
+            if swapped and self._overtaken is None and self._sent % swapped == 0:
+                self._overtaken = state
+                return
+        arrival += round(delay * NANOSECONDS)
+        arrival = max(arrival, self._queue[-1][0] if self._queue else 0)
+        self._queue.extend([(arrival, state)] * self._faults.odometry_repeated)
+        if self._overtaken is not None:
+            self._queue.append((arrival, self._overtaken))
+            self._overtaken = None
+
+    def arrived(self, now_ns: int) -> Iterator[tuple[int, RobotState]]:
+        """Yield (arrival, report) of what has arrived by ``now_ns``."""
+        while self._queue and self._queue[0][0] <= now_ns:
+            yield self._queue.popleft()
 
 
 def _of_state(state: RobotState) -> Signals:

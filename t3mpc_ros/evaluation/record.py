@@ -11,21 +11,25 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Record of a run: columns over one time axis, and which rows of it count."""
+"""Record of a run: columns over one time axis, which rows of it count, and its metrics.
 
-from collections.abc import Mapping, Sequence
+Which rows count, and which of them are *settled*, has one definition, here, for simulated runs and
+for those in bags; see docs/metrics.md.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.counted_time import EVERYTHING, START, counted_rows
-from t3mpc_ros.geometry.kinematics import WheelGeometry, wheel_speeds
-from t3mpc_ros.geometry.types import NANOSECONDS, Array
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheel_speeds
+from t3mpc_ros.geometry.types import NANOSECONDS, Array, WheelSpeeds
 from t3mpc_ros.robot.interface import RobotStatus
 
 RATE = 100.0
@@ -34,6 +38,28 @@ ON_PATH = 0.05
 """Largest distance from its reference of a robot that is on its path, m."""
 STATUS_FLAGS = RobotStatus._fields
 """Meaning of the column ``flags``."""
+
+START = 3.0
+"""Time of control at the start that no metric counts, s: the reference grows from zero. Of a run
+of less than twice this time, its first half."""
+CROSSING = (0.5, 0.5)
+"""Time before and after a switch within which methods cross from one reference to the other, s."""
+
+
+class SettlingWindow(NamedTuple):
+    """Time about a switch in which a robot is not settled, s."""
+
+    before: float
+    """With preview it leaves the old reference so much earlier."""
+    after: float
+
+
+EVERYTHING = SettlingWindow(0.0, 0.0)
+"""No window: what happens at switches counts."""
+PLANT_WINDOW = SettlingWindow(0.4, 0.6)
+"""Of the paper's plant, whose wheels do not ring."""
+ROBOT_WINDOW = SettlingWindow(0.5, 1.0)
+"""Of every robot with a body: the twin, a real one, and any in a bag."""
 
 COLUMNS: Mapping[str, tuple[str, str]] = {
     'time': ('s', 'since the robot was switched on'),
@@ -87,6 +113,12 @@ class Record:
     """Of each row why the robot does not follow commands; empty where it does."""
     driver_reasons: Sequence[str] = ()
     """Of each row why the driver stops the robot; empty where it drives."""
+    settling: tuple[float, float] = ROBOT_WINDOW
+    """Time before and after each switch that the settled errors leave out, s."""
+    fault_span: tuple[float, float] | None = None
+    """Begin and end (s) of what does not last for the whole run; None without."""
+    geometry: WheelGeometry = WheelGeometry()
+    """Wheels by which the reference turns the body."""
 
     def __getitem__(self, name: str) -> Array:
         """Return a column."""
@@ -155,8 +187,7 @@ class Record:
     ) -> NDArray[np.bool_]:
         """Return which rows count, from ``after`` s of control on.
 
-        ``margins`` (s) about a switch do not, see
-        :func:`t3mpc_ros.evaluation.counted_time.counted_rows`. ValueError if none is left.
+        ``margins`` (s) about a switch do not, see :func:`counted_rows`. ValueError if none counts.
         """
         return some_rows(self.time, self.switches, self.start + after, margins)
 
@@ -180,6 +211,34 @@ class Record:
 def stamp_of(k: int) -> int:
     """Return the instant at which period k begins, ns."""
     return round(k * NANOSECONDS / RATE)
+
+
+def counted_from(begin: float, end: float) -> float:
+    """Return from when on samples count in a run that is controlled from begin to end, s."""
+    return begin + min(START, 0.5 * (end - begin))
+
+
+def counted_rows(
+    time: Array,
+    switches: Array,
+    after: float,
+    end: float,
+    window: tuple[float, float] = EVERYTHING,
+) -> NDArray[np.bool_]:
+    """Return which samples count: from ``after`` to ``end``, outside ``window`` about switches.
+
+    All in s. With the :class:`SettlingWindow` of the robot these are the *settled* samples. Those
+    from a switch on whose crossing the run does not contain whole never count, nor those before it
+    in which preview leaves the old reference: what that costs would count, and not what it gains.
+    """
+    rows: NDArray[np.bool_] = (time >= after) & (time <= end)
+    before, behind = window
+    leaving, crossed = CROSSING
+    for switch in switches.tolist():
+        rows &= (time < switch - before) | (time >= switch + behind)
+        if switch + crossed > end:
+            rows &= time < switch - leaving
+    return rows
 
 
 def some_rows(
@@ -230,3 +289,117 @@ def broken_off(record: Record, row: int, rows: int) -> Record:
         robot_reasons=(*record.robot_reasons[:row], *silent),
         driver_reasons=(*record.driver_reasons[:row], *silent),
     )
+
+
+# -- metrics --------------------------------------------------------------------------------------
+
+AFTER = 2.0
+"""Time after faults before the error after them counts, s."""
+
+
+class MeasuredRun:
+    """A run that went to its end, and which of its rows count."""
+
+    def __init__(self, record: Record) -> None:
+        self.record = record
+        start = counted_from(0.0, float(record.time[-1]) - record.start)
+        self.start = record.start + start
+        """From when on rows count, s."""
+        self.counted = record.counted(start)
+        """Rows that count, with the switches that the run contains whole."""
+        self.settled = record.counted(start, record.settling)
+        """Those away from the switches."""
+
+    @property
+    def yaw_rate_error(self) -> Array | None:
+        """Yaw rate of the body less that of the reference, rad/s; None without a body."""
+        if 'twist' not in self.record.columns:
+            return None
+        right, left = self.record.reference.T
+        wheel = WheelSpeeds(1.0, 0.0)
+        per_difference = twist_from_wheels(wheel, self.record.geometry).angular
+        error: Array = self.record['twist'][:, 1] - per_difference * (right - left)
+        return error
+
+    def drift(self) -> float | None:
+        """Return the difference of the angles turned, rad."""
+        rate = self.yaw_rate_error
+        if rate is None:
+            return None
+        turned = 0.5 * (rate[1:] + rate[:-1]) * np.diff(self.record.time)
+        return abs(float(np.sum(turned[self.counted[1:]])))
+
+    def stopped(self) -> float | None:
+        """Return the time in which robot or driver stop, s; None without a body."""
+        if 'twist' not in self.record.columns:
+            return None
+        share = float(np.mean(self.record.stopped[self.counted]))
+        return share * (float(self.record.time[-1]) - self.start)
+
+    def rms_yaw_rate(self, rows: NDArray[np.bool_]) -> float | None:
+        """Return the root mean square of :attr:`yaw_rate_error` over rows."""
+        rate = self.yaw_rate_error
+        return None if rate is None else rms(rate[rows])
+
+    def rms_part(self, part: int) -> float | None:
+        """Return the settled error before, during or after what does not last for the run."""
+        if not (span := self.record.fault_span):
+            return None
+        time, (begin, end) = self.record.time, span
+        parts = time < begin, (time >= begin) & (time < end), time >= end + AFTER
+        rows = self.settled & parts[part]
+        return rms(self.record.error[rows]) if rows.any() else None
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """One number of a run."""
+
+    name: str
+    heading: str
+    unit: str
+    digits: int
+    value: Callable[[MeasuredRun], float | None]
+    """None where a run has no such number."""
+
+
+SETTLED = Metric('settled', 'settled', 'rad/s', 4, lambda run: rms(run.record.error[run.settled]))
+OVERALL = Metric(
+    'overall', 'with switches', 'rad/s', 4, lambda run: rms(run.record.error[run.counted])
+)
+VARIATION = Metric(
+    'variation', 'variation', 'rad/s³', 1, lambda run: run.record.variation(run.counted)
+)
+YAW_RATE_SETTLED = Metric(
+    'yaw_rate_settled', 'yaw rate settled', 'rad/s', 4, lambda run: run.rms_yaw_rate(run.settled)
+)
+YAW_RATE = Metric('yaw_rate', 'yaw rate', 'rad/s', 4, lambda run: run.rms_yaw_rate(run.counted))
+DRIFT = Metric('drift', 'yaw drift', 'rad', 3, MeasuredRun.drift)
+STOPPED = Metric('stopped', 'stopped', 's', 2, MeasuredRun.stopped)
+BEFORE = Metric('before', 'settled before', 'rad/s', 4, lambda run: run.rms_part(0))
+DURING = Metric('during', 'settled during', 'rad/s', 4, lambda run: run.rms_part(1))
+RECOVERED = Metric('after', 'settled after', 'rad/s', 4, lambda run: run.rms_part(2))
+METRICS = (
+    SETTLED,
+    OVERALL,
+    VARIATION,
+    YAW_RATE_SETTLED,
+    YAW_RATE,
+    DRIFT,
+    STOPPED,
+    BEFORE,
+    DURING,
+    RECOVERED,
+)
+"""All metrics; a run without one leaves it out."""
+Numbers = Mapping[str, float]
+"""Metrics of a run by name; NaN where the run diverged."""
+
+
+def measure(record: Record) -> Numbers:
+    """Return the metrics of a run; NaN for each that it would have, where the run diverged."""
+    run = MeasuredRun(record)
+    with np.errstate(invalid='ignore', over='ignore'):
+        found = {metric.name: metric.value(run) for metric in METRICS}
+    known = {name: value for name, value in found.items() if value is not None}
+    return known if record.finite else dict.fromkeys(known, math.nan)

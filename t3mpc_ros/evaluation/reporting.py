@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.charts import Chart, PageData, Plane, Timeline
-from t3mpc_ros.evaluation.confidence_intervals import interval, mean
+from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.page.page_files import page_file
 
 if TYPE_CHECKING:
@@ -378,14 +378,6 @@ def format_number(value: float) -> str:
     if not math.isfinite(value):
         return '–'
     return f'{value:.0f}' if abs(value) >= 99.95 else f'{value:#.3g}'
-
-
-def format_interval(mean: float, ci95: float, sign: str = '', digits: int = 3) -> str:
-    """Return a mean ± half its 95 % interval; a single seed has no interval."""
-    if not math.isfinite(mean):
-        return 'diverged'
-    text = f'{mean:{sign}.{digits}f}'
-    return f'{text} ± {ci95:.{digits}f}' if math.isfinite(ci95) else text
 
 
 def format_mean(values: Sequence[float], digits: int = 3) -> str:

@@ -13,16 +13,10 @@
 # limitations under the License.
 """Faults of the links between robot and controller: messages that are lost or late."""
 
-from collections import deque
-from collections.abc import Iterator
 from dataclasses import dataclass
 import math
 
-import numpy as np
-
-from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.yaml_files import EntryError, check_list, check_number
-from t3mpc_ros.robot.interface import RobotState
 from t3mpc_ros.script_error import ScriptError
 
 MAX_DELAY = 10.0
@@ -93,47 +87,3 @@ LATER_AND_BACK = LinkFaults(command_delay=(0.03, 0.03), begin=1.0 / 3.0, lasting
 OVERLOAD = LinkFaults(
     command_delay=(0.02, 0.12), odometry_delay=(0.02, 0.12), begin=0.5, lasting=4.0
 )
-
-
-class ReportLink:
-    """Reports of a robot on their way to the driver; they arrive in order but for the swapped.
-
-    Equal seeds draw equal numbers, whatever is sent; ``duration`` is that of the run, s.
-    """
-
-    def __init__(self, faults: LinkFaults, seed: int, duration: float) -> None:
-        self._faults = faults
-        self._begin, self._end = faults.span(duration)
-        self._generator = np.random.default_rng((seed, 3))
-        self._queue: deque[tuple[int, RobotState]] = deque()
-        self._sent = 0
-        self._overtaken: RobotState | None = None
-
-    def send(self, state: RobotState) -> None:
-        """Send a report; one that is not late arrives after those before it all the same."""
-        # Two numbers for each report, so that a change of loss does not shift delays.
-        lost, late = self._generator.random(2).tolist()
-        arrival, delay = state.stamp_ns, 0.0
-        if self._begin <= state.stamp_ns / NANOSECONDS < self._end:
-            if lost < self._faults.odometry_loss:
-                return
-            least, most = self._faults.odometry_delay
-            delay = least + (most - least) * late
-            self._sent += 1
-            if self._sent % self._faults.odometry_kept:
-                return
-            swapped = self._faults.odometry_swapped
-            if swapped and self._overtaken is None and self._sent % swapped == 0:
-                self._overtaken = state
-                return
-        arrival += round(delay * NANOSECONDS)
-        arrival = max(arrival, self._queue[-1][0] if self._queue else 0)
-        self._queue.extend([(arrival, state)] * self._faults.odometry_repeated)
-        if self._overtaken is not None:
-            self._queue.append((arrival, self._overtaken))
-            self._overtaken = None
-
-    def arrived(self, now_ns: int) -> Iterator[tuple[int, RobotState]]:
-        """Yield (arrival, report) of what has arrived by ``now_ns``."""
-        while self._queue and self._queue[0][0] <= now_ns:
-            yield self._queue.popleft()

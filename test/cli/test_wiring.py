@@ -148,7 +148,7 @@ PAPER = 'evaluation.paper.reproduce.reproduce'
 COMPARE = {
     'evaluation.comparison.run_plan': {},
     'evaluation.comparison.step_times': {},
-    'evaluation.comparison_page.markdown': '',
+    'evaluation.comparison.markdown': '',
     'evaluation.comparison_page.record': {},
     'evaluation.comparison_page.page': '',
     'evaluation.methods.require_libraries': None,

@@ -57,9 +57,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     tracking_error,
 )
 from t3mpc_ros.evaluation.charts import MAX_POINTS, PageData, thinned
-from t3mpc_ros.evaluation.metrics import SETTLED, MeasuredRun
-from t3mpc_ros.evaluation.record import Record
-from t3mpc_ros.evaluation.scenario import Scenario
+from t3mpc_ros.evaluation.record import SETTLED, MeasuredRun, Record
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     NAMES,
@@ -331,7 +329,7 @@ def test_a_bag_and_a_run_have_the_same_settled_error(run, duration, switches):
     wanted, error = generator.normal(size=(2, time.size, 2))
     columns = {'time': time, 'reference': wanted, 'speeds': wanted + error}
     record = Record(columns, start=1.5, switches=np.array(switches))
-    simulated = MeasuredRun(Scenario('twin', 'nominal', 1, duration), record)
+    simulated = MeasuredRun(record)
 
     def series(wheels, twist):
         right, left = wheels.T

@@ -34,8 +34,7 @@ from t3mpc_ros.evaluation.methods import (
     method_definitions,
     methods_for,
 )
-from t3mpc_ros.evaluation.metrics import OVERALL, VARIATION, measure
-from t3mpc_ros.evaluation.record import rolling_speeds
+from t3mpc_ros.evaluation.record import OVERALL, VARIATION, measure, rolling_speeds
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning import closed_loop_tuning
 from t3mpc_ros.evaluation.tuning.closed_loop_tuning import (
@@ -86,7 +85,7 @@ def test_the_body_counts_where_baselines_have_the_gyro(definitions, monkeypatch)
         scenario = Scenario('twin', case, 1, 8.0)
         record = run(scenario, method)
         monkeypatch.setattr(closed_loop_tuning, 'run', lambda *_, record=record: record)
-        numbers = measure(scenario, record)
+        numbers = measure(record)
         cost = twin_objective((scenario, method)) - SMOOTHNESS * numbers[VARIATION.name]
         counted = record.time >= 4.5
         ground = rolling_speeds(record, scenario.true_robot().geometry)

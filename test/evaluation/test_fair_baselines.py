@@ -37,21 +37,22 @@ from t3mpc_ros.evaluation.baselines.feed_forward import (
     LmsBodyCorrectionParameters,
 )
 from t3mpc_ros.evaluation.baselines.feedback_control import ProportionalIntegral
-from t3mpc_ros.evaluation.comparison import ComparisonPlan, run_plan, step_times
-from t3mpc_ros.evaluation.comparison_page import (
+from t3mpc_ros.evaluation.comparison import (
     BETTER,
     INCONCLUSIVE,
     WORSE,
+    ComparisonPlan,
     case_table,
     first_verdicts,
-    front,
-    record,
+    run_plan,
+    step_times,
     summary_table,
     verdicts,
 )
+from t3mpc_ros.evaluation.comparison_page import front, record
 from t3mpc_ros.evaluation.confidence_intervals import Difference, holm, paired
 from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeMethod
-from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.loop import ReportLink, run
 from t3mpc_ros.evaluation.methods import (
     FEED_FORWARD,
     FULL,
@@ -66,9 +67,9 @@ from t3mpc_ros.evaluation.methods import (
     methods,
     methods_for,
 )
-from t3mpc_ros.evaluation.metrics import OVERALL, SETTLED, measure
+from t3mpc_ros.evaluation.record import OVERALL, SETTLED, measure
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
-from t3mpc_ros.evaluation.simulated_links import LinkFaults, ReportLink
+from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 T = 0.01
@@ -212,9 +213,7 @@ def test_on_an_exact_body_the_controller_is_feed_forward():
 def test_the_dead_time_is_found(name):
     known = methods_for('twin')
     scenario = Scenario('twin', 'unknown dead time 60 ms', 2002, 20.0)
-    settled = [
-        measure(scenario, run(scenario, known[each]))[SETTLED.name] for each in (name, SHAPED)
-    ]
+    settled = [measure(run(scenario, known[each]))[SETTLED.name] for each in (name, SHAPED)]
     assert settled[0] < 0.5 * settled[1]
 
 
@@ -266,9 +265,7 @@ def test_with_the_ramp_an_ideal_drive_leaves_no_feedback(lag):
 @pytest.mark.slow
 def test_the_ramp_is_worth_more_than_the_gains_at_switches():
     scenario, known = Scenario('servo', 'nominal', 2001, 30.0), methods_for('servo')
-    errors = [
-        measure(scenario, run(scenario, known[name]))[OVERALL.name] for name in (PI, PI + RAMP)
-    ]
+    errors = [measure(run(scenario, known[name]))[OVERALL.name] for name in (PI, PI + RAMP)]
     assert errors[1] < 0.7 * errors[0]
 
 

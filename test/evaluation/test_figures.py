@@ -37,7 +37,6 @@ from t3mpc_ros.evaluation.comparison import ComparisonPlan
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL, methods_for
-from t3mpc_ros.evaluation.metrics import METRICS
 from t3mpc_ros.evaluation.paper import paper_figures
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.results import Results
@@ -58,6 +57,7 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     FieldComparison,
     Tolerances,
 )
+from t3mpc_ros.evaluation.record import METRICS
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.simulation.world import World
 

@@ -34,17 +34,19 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
     ProportionalIntegralParameters,
 )
 from t3mpc_ros.evaluation.cases import NOMINAL, cases_for
-from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, run_plan
-from t3mpc_ros.evaluation.comparison_page import (
+from t3mpc_ros.evaluation.comparison import (
     BETTER,
     INCONCLUSIVE,
+    QUICK_SEEDS,
     WORSE,
+    ComparisonPlan,
     case_table,
     difference,
     judged_metrics,
-    record,
+    run_plan,
     verdicts,
 )
+from t3mpc_ros.evaluation.comparison_page import record
 from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeDriver
 from t3mpc_ros.evaluation.experiment import ResultTable, measured_run
 from t3mpc_ros.evaluation.loop import reports_of, run, run_loop
@@ -55,8 +57,7 @@ from t3mpc_ros.evaluation.methods import (
     methods_for,
     twin_start,
 )
-from t3mpc_ros.evaluation.metrics import DRIFT, SETTLED, STOPPED, YAW_RATE, measure
-from t3mpc_ros.evaluation.record import stamp_of
+from t3mpc_ros.evaluation.record import DRIFT, SETTLED, STOPPED, YAW_RATE, measure, stamp_of
 from t3mpc_ros.evaluation.scenario import (
     HELD_OUT_SEEDS,
     KINDS,
@@ -220,7 +221,7 @@ def test_methods_are_paired():
 def test_every_case_of_the_twin_drives(case):
     """The robot follows in every case: worse than usual, but it does not stop or diverge."""
     scenario, record = twin(case, FEED_FORWARD)
-    numbers = measure(scenario, record)
+    numbers = measure(record)
     assert numbers[SETTLED.name] < 2.0
     assert numbers[STOPPED.name] == 0.0
     assert np.abs(record['sent']).max() > 0.5
@@ -238,8 +239,7 @@ def test_the_miscalibrated_twin_turns_otherwise():
     (_, good), (_, bad) = twin(), twin('miscalibrated')
     moving = good.time > good.start + 1.0
     assert np.abs(good['sent'] - bad['sent'])[moving].max() < 1e-9
-    numbers = [measure(Scenario('twin', case, 201, 4.0), run) for case, run in
-               (('nominal', good), ('miscalibrated', bad))]  # fmt: skip
+    numbers = [measure(record) for record in (good, bad)]
     assert numbers[1][YAW_RATE.name] > 2.0 * numbers[0][YAW_RATE.name]
     assert numbers[1][SETTLED.name] < 0.1
 

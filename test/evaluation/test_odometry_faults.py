@@ -24,10 +24,10 @@ from support.long_tests import few_of
 
 from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.evaluation import loop
+from t3mpc_ros.evaluation.loop import ReportLink
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, methods_for
-from t3mpc_ros.evaluation.metrics import measure
+from t3mpc_ros.evaluation.record import measure
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
-from t3mpc_ros.evaluation.simulated_links import ReportLink
 from t3mpc_ros.geometry.types import STANDSTILL
 from t3mpc_ros.simulation.fault_injection import FaultEvent
 
@@ -111,7 +111,7 @@ def run(monkeypatch, name, fault=None, changes=None, events=()):
     monkeypatch.setattr(loop, 'ReportLink', Link)
     own = OwnParts(robot_parameters=changes or {}, events=tuple(events))
     scenario = Scenario('twin', 'nominal', 2001, DURATION, own=own)
-    return measure(scenario, loop.run(scenario, methods_for('twin')[name]))
+    return measure(loop.run(scenario, methods_for('twin')[name]))
 
 
 def assert_not_much_worse(full, forward):

@@ -21,9 +21,7 @@ import pytest
 from support.records import record_of
 
 from t3mpc_ros.evaluation.confidence_intervals import interval
-from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.metrics import METRICS, measure
 from t3mpc_ros.evaluation.paper.results import Results, estimation
 from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolStudy
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
@@ -34,6 +32,7 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     FieldComparison,
     Tolerances,
 )
+from t3mpc_ros.evaluation.record import METRICS, START, measure
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.kinematics import WheelGeometry, body_speeds
@@ -83,7 +82,7 @@ def test_numbers_of_a_run_on_the_twin():
     record = replace(record, robot_reasons=['stop' if each else '' for each in stopped])
     links = LinkFaults(begin=0.45, lasting=3.0)
     scenario = Scenario('twin', 'nominal', 1, 20.0, own=OwnParts(links=links))
-    found = measure(scenario, record)
+    found = measure(replace(record, settling=kind.settling, fault_span=scenario.fault_span))
     rate = 0.1 * geometry.wheel_radius / geometry.wheel_separation
     assert found['yaw_rate'] == found['yaw_rate_settled'] == pytest.approx(rate)
     counted = time >= kind.start + START

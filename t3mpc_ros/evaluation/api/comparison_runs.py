@@ -27,10 +27,10 @@ from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import ShownAsTables
 from t3mpc_ros.evaluation.api.table_files import Columns, columns_of, writable
 from t3mpc_ros.evaluation.cases import NOMINAL
-from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, run_plan
+from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, case_table, run_plan
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.experiment import ResultTable, print_report
-from t3mpc_ros.evaluation.metrics import METRICS, Metric
+from t3mpc_ros.evaluation.record import METRICS, Metric
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
@@ -65,8 +65,6 @@ class Comparison(ShownAsTables):
         return columns_of(self.rows())
 
     def _tables(self, chosen: str | None = None) -> list[Table]:
-        from t3mpc_ros.evaluation.comparison_page import case_table
-
         known = self.plan.cases
         cases = known if chosen is None else find_names('case', [chosen], known)
         return [case_table(self.plan, self.results, case) for case in cases]

@@ -34,8 +34,8 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
     Observation,
 )
-from t3mpc_ros.evaluation.comparison import ComparedMethod
 from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeMethod
+from t3mpc_ros.evaluation.loop import ComparedMethod
 from t3mpc_ros.evaluation.methods import methods_for, require_libraries
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.types import Array, read_only

@@ -32,7 +32,7 @@ from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import ShownAsTables
 from t3mpc_ros.evaluation.api.table_files import Columns, columns_of, writable, write_parquet
 from t3mpc_ros.evaluation.cases import NOMINAL
-from t3mpc_ros.evaluation.confidence_intervals import interval, mean
+from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.evaluation.experiment import (
     Job,
     Report,
@@ -42,7 +42,7 @@ from t3mpc_ros.evaluation.experiment import (
     print_report,
     run_experiment,
 )
-from t3mpc_ros.evaluation.reporting import Table, format_interval
+from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.evaluation.scenario import Scenario

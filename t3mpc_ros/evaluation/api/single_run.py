@@ -28,10 +28,8 @@ from t3mpc_ros.evaluation.api.result_tables import ShownAsTables
 from t3mpc_ros.evaluation.api.table_files import Columns
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.metrics import METRICS, Numbers, measure
-from t3mpc_ros.evaluation.record import Record, some_rows
+from t3mpc_ros.evaluation.record import METRICS, START, Numbers, Record, measure, some_rows
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
@@ -174,7 +172,7 @@ def simulate(
         )
     for values in record.columns.values():
         values.flags.writeable = False
-    return RunResult(method.name, scenario, record, _columns(record), measure(scenario, record))
+    return RunResult(method.name, scenario, record, _columns(record), measure(record))
 
 
 def _columns(record: Record) -> dict[str, Array]:

@@ -31,9 +31,8 @@ from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
 from t3mpc_ros.evaluation.drivers import MethodDriver
-from t3mpc_ros.evaluation.loop import scenario_reports, with_reference
-from t3mpc_ros.evaluation.metrics import measure
-from t3mpc_ros.evaluation.record import RATE, Record
+from t3mpc_ros.evaluation.loop import scenario_reports, with_scenario
+from t3mpc_ros.evaluation.record import RATE, Record, measure
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
@@ -181,8 +180,8 @@ class _Episode:
         change, self._before = asked - self._before, asked
         info: dict[str, Any] = {}
         if self.record is not None:
-            record = with_reference(self.record, self._scenario)
-            info['metrics'] = dict(measure(self._scenario, record))
+            record = with_scenario(self.record, self._scenario)
+            info['metrics'] = dict(measure(record))
             if not record.finite:
                 return self.observation, -(SPEED**2), True, False, info
         k = round(self._state.stamp_ns * RATE / NANOSECONDS)

@@ -43,8 +43,8 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
 )
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
-from t3mpc_ros.evaluation.counted_time import ROBOT_WINDOW, START, counted_from
 from t3mpc_ros.evaluation.drive_response import ResponseFit
+from t3mpc_ros.evaluation.record import ROBOT_WINDOW, START, counted_from
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
     Block,

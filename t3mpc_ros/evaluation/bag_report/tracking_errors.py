@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation.bag_report.continuity import within_gaps
 from t3mpc_ros.evaluation.bag_report.incidents import BRAKING, Span, driving, find_stops
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.counted_time import ROBOT_WINDOW, counted_from, counted_rows
+from t3mpc_ros.evaluation.record import ROBOT_WINDOW, counted_from, counted_rows
 from t3mpc_ros.evaluation.reporting import format_number
 from t3mpc_ros.evaluation.topic_roles import REFERENCE
 from t3mpc_ros.geometry.types import Array
@@ -86,7 +86,7 @@ def counted_span(time: Array, run: Run) -> Span:
     """Return from when to when errors at ``time`` (s) count; (inf, -inf) if they never do.
 
     The robot is controlled while it is driven and has a reference; the start of that time does not
-    count, see :func:`t3mpc_ros.evaluation.counted_time.counted_from`.
+    count, see :func:`t3mpc_ros.evaluation.record.counted_from`.
     """
     first, last = driving(run)
     if not time.size or not first < last:

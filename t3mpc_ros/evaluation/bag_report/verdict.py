@@ -35,8 +35,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     settled_rmse,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.counted_time import counted_from
-from t3mpc_ros.evaluation.record import ON_PATH
+from t3mpc_ros.evaluation.record import ON_PATH, counted_from
 from t3mpc_ros.evaluation.reporting import format_number
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.types import Array

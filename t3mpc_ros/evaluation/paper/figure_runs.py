@@ -23,7 +23,6 @@ import numpy as np
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.cases import NOMINAL
-from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.experiment import Job, map_jobs
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, methods
@@ -45,7 +44,7 @@ from t3mpc_ros.evaluation.paper.study import (
     Extent,
     study_scenario,
 )
-from t3mpc_ros.evaluation.record import Record, switch_times
+from t3mpc_ros.evaluation.record import START, Record, switch_times
 from t3mpc_ros.geometry.types import Array
 
 NO_PREVIEW = WITHOUT['preview']

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.paper.figure_runs import (
     FigureRuns,
@@ -45,7 +44,7 @@ from t3mpc_ros.evaluation.plotting import (
     new_figure,
     new_panels,
 )
-from t3mpc_ros.evaluation.record import Record
+from t3mpc_ros.evaluation.record import START, Record
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels

@@ -17,11 +17,11 @@ from collections.abc import Iterable, Sequence
 import math
 
 from t3mpc_ros.evaluation.cases import NOMINAL
-from t3mpc_ros.evaluation.confidence_intervals import interval, mean
+from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, STAGES, WITHOUT
-from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, format_interval
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import Row
 
 SITUATION = ('drive', 'noise', 'case')

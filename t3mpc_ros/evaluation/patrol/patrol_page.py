@@ -20,7 +20,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean, paired
+from t3mpc_ros.evaluation.confidence_intervals import (
+    Difference,
+    format_interval,
+    interval,
+    mean,
+    paired,
+)
 from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     BOXES,
     CLEARANCE,
@@ -40,7 +46,6 @@ from t3mpc_ros.evaluation.reporting import (
     Paragraph,
     Picture,
     Table,
-    format_interval,
     format_mean,
     html_page,
 )

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, mean
+from t3mpc_ros.evaluation.confidence_intervals import Difference, format_interval, interval, mean
 from t3mpc_ros.evaluation.patrol.path_tracking import (
     ARRIVED,
     OURS,
@@ -39,7 +39,6 @@ from t3mpc_ros.evaluation.reporting import (
     Paragraph,
     Picture,
     Table,
-    format_interval,
     format_mean,
     html_page,
 )

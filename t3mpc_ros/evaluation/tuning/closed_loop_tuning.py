@@ -27,13 +27,11 @@ import numpy as np
 
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired, rms
-from t3mpc_ros.evaluation.counted_time import START
 from t3mpc_ros.evaluation.experiment import Job, Report
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, further_methods, methods, twin_start
-from t3mpc_ros.evaluation.metrics import VARIATION, measure
 from t3mpc_ros.evaluation.proposed_method import ProposedController
-from t3mpc_ros.evaluation.record import rolling_speeds
+from t3mpc_ros.evaluation.record import START, VARIATION, measure, rolling_speeds
 from t3mpc_ros.evaluation.scenario import KINDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition, SearchRange
 from t3mpc_ros.evaluation.tuning.tune_methods import ClosedLoopObjective, tune_methods
@@ -98,7 +96,7 @@ def twin_objective(job: Job) -> float:
     if scenario.uses_gyro:
         speeds = rolling_speeds(record, scenario.true_robot().geometry)
     rmse = rms((speeds - record.reference)[counted])
-    value = rmse + SMOOTHNESS * measure(scenario, record)[VARIATION.name]
+    value = rmse + SMOOTHNESS * measure(record)[VARIATION.name]
     return value if math.isfinite(value) else math.inf
 
 

@@ -81,14 +81,14 @@ def test_results_are_those_of_the_comparison():
     """The interface adds no second loop: it gives the numbers of the tables."""
     from t3mpc_ros.evaluation.loop import run
     from t3mpc_ros.evaluation.methods import methods_for
-    from t3mpc_ros.evaluation.metrics import measure
+    from t3mpc_ros.evaluation.record import measure
     from t3mpc_ros.evaluation.scenario import Scenario
 
     found = t3.simulate('ADRC', seed=203, **SHORT)
     scenario = Scenario('servo', 'nominal', 203, 4.0)
     expected = run(scenario, methods_for('servo')['ADRC'])
     assert np.array_equal(found.record.speeds, expected.speeds)
-    assert found.metrics == measure(scenario, expected)
+    assert found.metrics == measure(expected)
     assert found.rmse() == pytest.approx(expected.rmse())
 
 
