@@ -48,7 +48,7 @@ from t3mpc_ros.evaluation.scenario import (
     SampledReference,
     Scenario,
 )
-from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, Array, State, WheelSpeeds, wrap_angle
 from t3mpc_ros.parameters.table import Parameters
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand, RobotState
@@ -89,7 +89,7 @@ class NodeDriver:
         """Return the command that follows from a report of the robot."""
         twist, status = self._controller.step(state.odometry)
         self.reason = '' if status.reason.moves else status.reason.value
-        return RobotCommand.from_twist(twist, self._geometry, status.stamp_ns)
+        return RobotCommand(wheels_from_twist(twist, self._geometry), status.stamp_ns)
 
 
 class ObservedReference(NamedTuple):

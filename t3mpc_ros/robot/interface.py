@@ -17,13 +17,12 @@ All of them take a :class:`RobotCommand` and return a :class:`RobotState`; whate
 robot gives a reason.
 """
 
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
-from t3mpc_ros.geometry.types import BodyTwist, State, WheelSpeeds
+from t3mpc_ros.geometry.types import State, WheelSpeeds
 
 ZERO_WHEEL_SPEEDS = WheelSpeeds(0.0, 0.0)
 
@@ -33,11 +32,6 @@ class RobotCommand(NamedTuple):
 
     wheels: WheelSpeeds
     stamp_ns: int
-
-    @classmethod
-    def from_twist(cls, twist: BodyTwist, geometry: WheelGeometry, stamp_ns: int) -> Self:
-        """Return the command for a body twist, by the inverse of (1)."""
-        return cls(wheels_from_twist(twist, geometry), stamp_ns)
 
 
 class WheelAngles(NamedTuple):

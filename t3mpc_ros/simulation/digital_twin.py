@@ -31,7 +31,7 @@ from t3mpc_ros.geometry.types import (
 )
 from t3mpc_ros.parameters.table import ParameterError, at_most, group, parameter
 from t3mpc_ros.robot import interface
-from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON, CommandLimiter, SlipMonitor
+from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON, SlipMonitor
 from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
 from t3mpc_ros.simulation.fault_injection import (
@@ -197,14 +197,7 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         schedule: FaultSchedule | None = None,
         speed_noise: MeasurementNoise | None = None,
     ) -> None:
-        limiter = CommandLimiter(parameters.limiter, parameters.geometry)
-        super().__init__(
-            parameters,
-            parameters.rate,
-            parameters.substeps,
-            parameters.max_catch_up_time,
-            limiter,
-        )
+        super().__init__(parameters)
         disturbance, noise, imu, ranges, channel = (
             np.random.default_rng(part)
             for part in np.random.SeedSequence(parameters.seed).spawn(5)

@@ -16,14 +16,16 @@
 from abc import ABC, abstractmethod
 from collections import deque
 from fractions import Fraction
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
-from t3mpc_ros.parameters.table import Parameters
 from t3mpc_ros.robot.command_limiter import CLOCK_JUMPED_BACK, CommandLimiter
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand, RobotInterface, RobotState
 
-S = TypeVar('S', bound=Parameters)
+if TYPE_CHECKING:  # its robot is one of this kind
+    from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
+
+S = TypeVar('S', bound='PaperRobotParameters')
 
 
 class FixedStepRobot(RobotInterface, ABC, Generic[S]):
@@ -31,25 +33,16 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
 
     The time grid starts at the first instant passed to any method. States are reported once
     per control period; a command takes effect at the integration step in which it arrives. The
-    states depend on the parameters and the calls alone: equal runs are bit-equal. ``rate`` are
-    reports per second, ``substeps`` integration steps between two, and at most
-    ``max_catch_up_time`` (s) of a gap between calls is simulated.
+    states depend on the parameters and the calls alone: equal runs are bit-equal.
     """
 
-    def __init__(
-        self,
-        parameters: S,
-        rate: float,
-        substeps: int,
-        max_catch_up_time: float,
-        limiter: CommandLimiter,
-    ) -> None:
+    def __init__(self, parameters: S) -> None:
         self._parameters = parameters
-        self._limiter = limiter
-        self._substeps = substeps
-        self._max_catch_up_ns = round(max_catch_up_time * NANOSECONDS)
+        self._limiter = CommandLimiter(parameters.limiter, parameters.geometry)
+        self._substeps = substeps = parameters.substeps
+        self._max_catch_up_ns = round(parameters.max_catch_up_time * NANOSECONDS)
         # A ratio of integers keeps the stamps exact however long the robot runs.
-        frequency = Fraction(rate) * substeps / NANOSECONDS
+        frequency = Fraction(parameters.rate) * substeps / NANOSECONDS
         self._top, self._bottom = frequency.as_integer_ratio()
         self._origin_ns: int | None = None
         self._steps_since_origin = 0

@@ -41,7 +41,7 @@ from t3mpc_ros.evaluation.patrol.path_trackers import PathTracker
 from t3mpc_ros.evaluation.record import ON_PATH, RATE, Record, stamp_of
 from t3mpc_ros.evaluation.scenario import KINDS, LEAD
 from t3mpc_ros.geometry.arena import Arena
-from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.path_timing import MotionLimits, PathTiming
 from t3mpc_ros.geometry.types import (
     NANOSECONDS,
@@ -431,7 +431,7 @@ class PathDriver:
             self.reason = '' if status.reason.moves else status.reason.value
         elif self._driving:
             self._twist = self._tracker.step(self._pose)
-        return RobotCommand.from_twist(self._twist, self._geometry, state.stamp_ns)
+        return RobotCommand(wheels_from_twist(self._twist, self._geometry), state.stamp_ns)
 
     def _localised(self, state: RobotState) -> Pose:
         """Return the pose that the controller receives."""

@@ -25,7 +25,7 @@ from t3mpc_ros.geometry.types import Array, Pose, State, WheelSpeeds, check_pose
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, at_most, group, parameter
 from t3mpc_ros.robot import interface
-from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters, ramp_towards
+from t3mpc_ros.robot.command_limiter import CommandLimiterParameters, ramp_towards
 from t3mpc_ros.robot.wheel_odometry import WheelOdometry, WheelOdometryParameters
 from t3mpc_ros.simulation.fixed_step import FixedStepRobot
 from t3mpc_ros.simulation.plant.disturbances import (
@@ -186,14 +186,7 @@ class PaperRobot(FixedStepRobot[PaperRobotParameters]):
             raise ValueError(
                 'drive.kind must be velocity or torque here: stepper is for DigitalTwin'
             )
-        limiter = CommandLimiter(parameters.limiter, parameters.geometry)
-        super().__init__(
-            parameters,
-            parameters.rate,
-            parameters.substeps,
-            parameters.max_catch_up_time,
-            limiter,
-        )
+        super().__init__(parameters)
         self._odometry = WheelOdometry(parameters.odometry, parameters.geometry)
         self._plant = PaperPlant(parameters)
         self._measured = interface.ZERO_WHEEL_SPEEDS
