@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
     """Print the tables and return 0."""
     from t3mpc_ros.evaluation import comparison_page
     from t3mpc_ros.evaluation.api.comparison_runs import Comparison
-    from t3mpc_ros.evaluation.api.table_files import columns_of, write_csv
+    from t3mpc_ros.evaluation.api.result_tables import columns_of, write_csv
     from t3mpc_ros.evaluation.comparison import markdown, run_plan, step_times
     from t3mpc_ros.evaluation.experiment import print_report
 

@@ -48,7 +48,7 @@ from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
 from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.loop import Method, run
 from t3mpc_ros.evaluation.own_modules import ModuleCarrier
-from t3mpc_ros.evaluation.record import Numbers, measure
+from t3mpc_ros.evaluation.record import Record, measure
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.scenario import Scenario
@@ -130,9 +130,9 @@ class ResultTable(Sequence[Row]):
         return paired(list(one.values()), [other[key] for key in one])
 
 
-def measured_run(job: Job) -> Numbers:
-    """Return the metrics of one run."""
-    return measure(run(*job))
+def measured_run(job: Job, numbers: Callable[[Record], Mapping[str, Any]] = measure) -> Row:
+    """Return the numbers of one run, by default its metrics."""
+    return dict(numbers(run(*job)))
 
 
 def run_experiment(

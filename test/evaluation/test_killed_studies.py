@@ -51,7 +51,7 @@ def sweep(folder, begun, monkeypatch):
 
 
 def paper(folder, begun, monkeypatch):
-    def measured(job):
+    def measured(job, numbers):
         begun()
         scenario, method = job
         return {'rmse': scenario.seed / 3.0, 'settled': math.nan, 'chatter': len(method.name)}

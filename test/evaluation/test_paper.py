@@ -28,7 +28,7 @@ import pytest
 from scipy import stats
 from support.records import record_of
 
-from t3mpc_ros.evaluation import open_loop_estimation
+from t3mpc_ros.evaluation import experiment, open_loop_estimation
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.paper import figure_runs, study
@@ -490,7 +490,7 @@ def begun():
         return fake_run(scenario, method)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study, 'run', run)
+        patch.setattr(experiment, 'run', run)
         patch.setattr(figure_runs, 'run', run)
         yield found
 

@@ -28,7 +28,7 @@ from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.references import numbers
-from t3mpc_ros.evaluation.api.table_files import write_csv
+from t3mpc_ros.evaluation.api.result_tables import write_csv
 from t3mpc_ros.geometry.types import Array, read_only
 from t3mpc_ros.script_error import ScriptError
 

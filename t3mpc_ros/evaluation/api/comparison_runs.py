@@ -24,8 +24,7 @@ from t3mpc_ros.evaluation.api.controllers import as_controllers
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.result_tables import ShownAsTables
-from t3mpc_ros.evaluation.api.table_files import Columns, columns_of, writable
+from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, columns_of, writable
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, case_table, run_plan
 from t3mpc_ros.evaluation.confidence_intervals import Difference

@@ -20,7 +20,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from t3mpc_ros.evaluation.api.table_files import writable
+from t3mpc_ros.evaluation.api.result_tables import writable
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.plotting import (

@@ -11,20 +11,25 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""How the results of a script are shown: in a terminal, a notebook and a paper."""
+"""How the results of a script are shown: in a terminal, a notebook, a paper, and as files."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 import os
 from pathlib import Path
 import sys
 from typing import Any
 
+import numpy as np
+
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
-from t3mpc_ros.evaluation.api.table_files import Columns, write_csv, write_parquet
-from t3mpc_ros.evaluation.reporting import Table
+from t3mpc_ros.evaluation.reporting import Table, write_columns
+from t3mpc_ros.parameters.command_line import check_writable
+from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.script_error import ScriptError
+
+Columns = Mapping[str, Sequence[Any] | np.ndarray[Any, Any]]
 
 
 class ShownAsTables(ABC):
@@ -87,3 +92,41 @@ class ShownAsTables(ABC):
     def to_parquet(self, path: str | os.PathLike[str]) -> Path:
         """Write them as Parquet and return the path; needs the extra ``[compare]``."""
         return write_parquet(path, self._columns(), self._details())
+
+
+def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return rows as columns; None where a row does not have a column of another one."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    return {name: [row.get(name) for row in rows] for name in names}
+
+
+def write_csv(path: str | os.PathLike[str], columns: Columns) -> Path:
+    """Write columns as CSV with one line of names, numbers with all their digits."""
+    target = writable(path)
+    write_columns(target, columns)
+    return target
+
+
+def write_parquet(
+    path: str | os.PathLike[str], columns: Columns, details: Mapping[str, str] | None = None
+) -> Path:
+    """Write columns as one Parquet file, with version, commit and ``details`` in its metadata."""
+    import pyarrow
+    import pyarrow.parquet
+
+    target = writable(path)
+    table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
+    texts = {**provenance(), **(details or {})}
+    table = table.replace_schema_metadata({name: str(text) for name, text in texts.items()})
+    # A reader of an interrupted write finds the old file or none, never half of one.
+    part = target.with_name(f'{target.name}.part')
+    pyarrow.parquet.write_table(table, part)
+    part.replace(target)
+    return target
+
+
+def writable(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a file; ParameterError if it cannot be written, as in no folder."""
+    target = Path(path).expanduser()
+    check_writable(target)
+    return target

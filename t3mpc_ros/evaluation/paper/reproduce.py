@@ -15,10 +15,11 @@
 
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from t3mpc_ros.evaluation import open_loop_estimation
-from t3mpc_ros.evaluation.experiment import Report, ResultTable, run_experiment
+from t3mpc_ros.evaluation.experiment import Report, ResultTable, measured_run, run_experiment
 from t3mpc_ros.evaluation.methods import EXACT_MODEL, methods
 from t3mpc_ros.evaluation.paper.claims import all_claims, markdown
 from t3mpc_ros.evaluation.paper.figure_runs import simulate_figure_runs
@@ -28,7 +29,7 @@ from t3mpc_ros.evaluation.paper.study import (
     DRIVES,
     Extent,
     chosen_extent,
-    measured_run,
+    measure,
     study_runs,
 )
 from t3mpc_ros.evaluation.plotting import write_pictures
@@ -127,7 +128,7 @@ def run_study(extent: Extent, options: PaperOptions, report: Report | None) -> R
     """Return the runs of the study; those that the folder of the output holds are not repeated."""
     return run_experiment(
         study_runs(extent),
-        measured_run,
+        partial(measured_run, numbers=measure),
         options.workers,
         store=options.output / RUNS,
         fresh=options.fresh,

@@ -21,8 +21,7 @@ import numpy as np
 
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
 from t3mpc_ros.evaluation.drivers import MethodSpec
-from t3mpc_ros.evaluation.experiment import Job, Run
-from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.experiment import Run
 from t3mpc_ros.evaluation.methods import STAGES as METHOD_STAGES
 from t3mpc_ros.evaluation.methods import methods
 from t3mpc_ros.evaluation.record import START, Record
@@ -156,12 +155,6 @@ def _noises(extent: Extent, method: MethodSpec, case: str) -> tuple[float, ...]:
     if method.baseline:
         return (PAPER_NOISE,) if method.preview and case in extent.baseline_cases else ()
     return extent.perturbed_noises
-
-
-def measured_run(job: Job) -> dict[str, object]:
-    """Return the numbers of one run."""
-    scenario, method = job
-    return measure(run(scenario, method))
 
 
 def measure(record: Record) -> dict[str, object]:
