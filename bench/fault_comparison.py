@@ -299,7 +299,7 @@ class WatchedDriver(NodeDriver):
         """Return the command, and watch the inputs as the node does."""
         command = super().step(state)
         odometry, status = state.odometry, self._controller.status
-        known = None if self._controller.odometry_twist.missing else self._command
+        known = None if self._controller.odometry_twist.replaced else self._command
         following = status.reason is Reason.TRACKING
         self._monitor.update(odometry, self._now_ns, known, following=following)
         self._command = self._controller.actuation.twist if status.reason.moves else None

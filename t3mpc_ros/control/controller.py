@@ -391,8 +391,7 @@ class Controller:
         found = [self.drive_monitor.problem()]
         if self.keep_out is not None and self._last_stamp_ns is not None:
             found.append(self.keep_out.ranges.problem())
-        if self.odometry_twist.missing:
-            found.append('odom has no twist: its poses are differentiated; publish the twist')
+        found.append(self.odometry_twist.problem())
         configured = self.parameters.speed_filter.dead_time
         in_use, lag = self._dead_time, self.parameters.speed_filter.lag
         if self._excess_lag > 0.0:
@@ -527,10 +526,11 @@ class Controller:
         self._last_stamp_ns = self._step_ns = stamp
         elapsed = self._watchdog.elapsed(stamp)
         twist = self.odometry_twist
-        found_missing = not twist.missing
+        believed = not twist.replaced
         odometry = twist.measured(odometry, restart=elapsed is None)
-        if found_missing and twist.missing and not twist.known:
+        if believed and twist.replaced and not (twist.missing and twist.known):
             elapsed = None  # the speeds before were no measurements: all estimates begin again
+            self.dead_time = self._make_dead_time_estimator()
         if restarted:
             self._clear_reference()
             if self.keep_out is not None:

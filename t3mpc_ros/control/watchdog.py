@@ -214,10 +214,86 @@ class InputWatchdog:
 
 MOVED, TURNED = 0.01, 0.05
 """Change of the pose (m, rad) with a twist of zero after which the odometry has no twist."""
+BLOCK_TIME, BLOCKS = 0.5, 6
+"""Time over which twist and pose are compared (s), and the number of comparisons needed."""
+BLOCK_MOTION = 0.05, 0.3
+"""Root of the sum of squares of the motions in them that is needed, m and rad."""
+TWIST_MEMORY = 1.0 - 1.0 / 60.0
+"""Forgetting factor of a comparison: 30 s."""
+TWIST_TOLERANCE, TWIST_CERTAIN = 0.05, 4.0
+"""Deviation of the factor between twist and pose that counts, and its standard deviations."""
+JUMP = 0.1, 0.3
+"""Change of the pose beyond the motion that is a jump, m and rad."""
+
+
+def motion_between(last: Pose, new: Pose) -> tuple[float, float]:
+    """Return how far (m) forward a robot has driven between two poses, and its turn (rad)."""
+    turn = wrap_angle(new.yaw - last.yaw)
+    middle = last.yaw + 0.5 * turn
+    forward = (new.x - last.x) * math.cos(middle) + (new.y - last.y) * math.sin(middle)
+    return forward, turn
+
+
+class TwistFactor:
+    """By how much the twist of the odometry is larger than the change of its pose.
+
+    Both come from the same wheels: a factor of both velocities is a wrong radius or unit in the
+    driver of the robot. Where only the yaw rates differ, gyro or separation of the wheels may be
+    wrong, and the factor is 1.
+    """
+
+    def __init__(self) -> None:
+        self.value = 1.0
+        """The factor in use; 1 unless it is certainly another one."""
+        self._sums = [[0.0] * 3 for _ in range(2)]
+        """Of each velocity, sums of squares of the pose, of products, of squares of the twist."""
+        self._blocks = 0.0
+        self.interrupt()
+
+    def interrupt(self) -> None:
+        """Discard the present comparison: messages are missing."""
+        self._time = 0.0
+        self._block = [[0.0, 0.0], [0.0, 0.0]]
+
+    def update(self, last: State, new: State) -> None:
+        """Compare the twists of two messages in a row with the change of the pose."""
+        elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
+        self._time += elapsed
+        moved = motion_between(last.pose, new.pose)
+        for i, block in enumerate(self._block):
+            by_twist = 0.5 * elapsed * (last.twist[i] + new.twist[i])
+            if abs(moved[i] - by_twist) > JUMP[i]:
+                self.interrupt()
+                return
+            block[0] += moved[i]
+            block[1] += by_twist
+        if self._time < BLOCK_TIME:
+            return
+        for sums, (by_pose, by_twist) in zip(self._sums, self._block, strict=True):
+            products = by_pose * by_pose, by_pose * by_twist, by_twist * by_twist
+            sums[:] = [TWIST_MEMORY * old + more for old, more in zip(sums, products, strict=True)]
+        self._blocks = TWIST_MEMORY * self._blocks + 1.0
+        self.interrupt()
+        self._decide()
+
+    def _decide(self) -> None:
+        (linear, spread), (angular, other_spread) = (self._fit(i) for i in (0, 1))
+        apart = abs(angular - linear) > TWIST_TOLERANCE + TWIST_CERTAIN * other_spread
+        least = max(TWIST_TOLERANCE, TWIST_CERTAIN * spread)
+        self.value = linear if abs(linear - 1.0) > least and linear > 0.0 and not apart else 1.0
+
+    def _fit(self, axis: int) -> tuple[float, float]:
+        """Return the factor of a velocity by least squares, and its standard deviation."""
+        poses, products, twists = self._sums[axis]
+        if self._blocks < BLOCKS - 0.5 or poses < BLOCK_MOTION[axis] ** 2:
+            return 1.0, math.inf
+        factor = products / poses
+        rest = max(twists - factor * products, 0.0) / (self._blocks - 1.0)
+        return factor, math.sqrt(rest / poses)
 
 
 class OdometryTwist:
-    """The twist of the odometry, or the change of its pose where it has none.
+    """The twist of the odometry, or what the change of its pose says where it cannot be right.
 
     Some robots publish a pose only. Their twist of zero would be a robot that does not follow.
     """
@@ -227,28 +303,49 @@ class OdometryTwist:
         """Whether the odometry has no twist: speeds are differences of its pose."""
         self.known = False
         """Whether it ever had one."""
+        self._factor = TwistFactor()
         self._anchor: Pose | None = None
         """Pose of the first message with a twist of zero since the last other one."""
         self._last: State | None = None
+
+    @property
+    def replaced(self) -> bool:
+        """Whether the twist that is used is not the one that was received."""
+        return self.missing or self._factor.value != 1.0
+
+    def problem(self) -> str:
+        """Return what is wrong with the twist, and the remedy; '' if nothing is."""
+        if self.missing:
+            return 'odom has no twist: its poses are differentiated; publish the twist'
+        if self._factor.value == 1.0:
+            return ''
+        return (
+            f'the twist in odom is {self._factor.value:.3f} times the change of its pose, it is '
+            'divided by that: correct radius or units of the wheels in the driver of the robot'
+        )
 
     def measured(self, odometry: State, *, restart: bool) -> State:
         """Return an odometry with its twist; a ``restart`` follows no message before it."""
         if not odometry.is_finite():
             return odometry
         pose, last, self._last = odometry.pose, self._last, odometry
+        follows = not restart and last is not None and last.stamp_ns < odometry.stamp_ns
         if odometry.twist != (0.0, 0.0):
             self.missing, self._anchor, self.known = False, None, True
-            return odometry
+            if follows and last is not None:
+                self._factor.update(last, odometry)
+            else:
+                self._factor.interrupt()
+            linear, angular = odometry.twist
+            factor = self._factor.value
+            return odometry._replace(twist=BodyTwist(linear / factor, angular / factor))
         if self._anchor is None:
             self._anchor = pose
         self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
         if restart or last is None or not self.missing:
             return odometry
         elapsed = (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
-        turn = wrap_angle(pose.yaw - last.pose.yaw)
-        middle = last.pose.yaw + 0.5 * turn
-        x, y = pose.x - last.pose.x, pose.y - last.pose.y
-        forward = x * math.cos(middle) + y * math.sin(middle)
+        forward, turn = motion_between(last.pose, pose)
         return odometry._replace(twist=BodyTwist(forward / elapsed, turn / elapsed))
 
 

@@ -264,7 +264,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             self._received_ns, self._stamp_ns = self.now_ns(), measured.stamp_ns
         self._publish_command(command, status.stamp_ns)
         # Poses alone are differentiated, which says little about a gain.
-        known = None if self._controller.odometry_twist.missing else self._last_command
+        known = None if self._controller.odometry_twist.replaced else self._last_command
         following = status.reason is Reason.TRACKING
         self._input_monitor.update(measured, self.now_ns(), known, following=following)
         self._last_command = command if status.reason.moves else None

@@ -352,6 +352,117 @@ def test_a_message_that_is_not_finite_keeps_the_twist_missing():
     assert found[7:20] + found[21:] == pytest.approx([0.2] * 22)
 
 
+# -- a twist that does not fit to the pose --------------------------------------------------------
+
+
+def twists_of(
+    motion, *, factors=(1.0, 1.0), noise=0.0, seconds=20.0, seed=1, moved=lambda k, pose: pose
+):
+    """Return twist monitor and used twists of a drive; ``motion``: twist by time (s)."""
+    generator, twist, used = np.random.default_rng(seed), OdometryTwist(), []
+    x = y = yaw = 0.0
+    before = np.zeros(2)
+    for k in range(round(100 * seconds)):
+        true = np.array(motion(0.01 * k))
+        linear, angular = 0.5 * (before + true) * (0.01 if k else 0.0)
+        middle = yaw + 0.5 * angular
+        x, y = x + linear * math.cos(middle), y + linear * math.sin(middle)
+        yaw, before = yaw + angular, true
+        measured = true * factors + noise * generator.standard_normal(2)
+        state = State(k * 10 * MS, moved(k, Pose(x, y, yaw)), BodyTwist(*measured.tolist()))
+        used.append(twist.measured(state, restart=k == 0).twist)
+    return twist, np.array(used)
+
+
+def winding(time):
+    return 0.15 + 0.1 * math.sin(1.3 * time), 1.2 * math.sin(0.9 * time)
+
+
+DRIVES = {
+    'winding': winding,
+    'straight': lambda time: (0.2, 0.0),
+    'on the spot': lambda time: (0.0, 1.0),
+    'to and fro': lambda time: (0.2 * math.sin(2.0 * time), 0.0),
+}
+
+
+@pytest.mark.parametrize('factor', [0.5, 0.94, 1.06, 1.1, 2.0])
+@pytest.mark.parametrize('drive', ['winding', 'straight', 'to and fro'])
+def test_a_twist_of_another_scale_is_divided_by_it(drive, factor):
+    """A twist 10 % too large made the settled error 1.5 times that of a simple method."""
+    twist, used = twists_of(DRIVES[drive], factors=(factor, factor), noise=0.005)
+    assert f'{factor:.2f}'[:3] in twist.problem()
+    true = np.array([DRIVES[drive](0.01 * k) for k in range(len(used))])
+    assert np.abs(used[500:] - true[500:]).mean() < 0.01
+    assert np.abs(used[:250] / factor - true[:250]).mean() < 0.01  # before it is known
+
+
+@pytest.mark.parametrize('drive', list(DRIVES))
+@pytest.mark.parametrize('seed', range(5))
+def test_a_twist_that_fits_is_used_as_it_is(drive, seed):
+    twist, _ = twists_of(DRIVES[drive], noise=0.02, seed=seed, seconds=30.0)
+    assert not twist.replaced
+    assert twist.problem() == ''
+
+
+def test_a_factor_of_the_yaw_rate_alone_is_left():
+    """Gyro and wheels differ on a robot whose geometry is wrong: the body correction learns it."""
+    for drive in ('winding', 'on the spot'):
+        twist, _ = twists_of(DRIVES[drive], factors=(1.0, 1.1))
+        assert not twist.replaced
+
+
+def test_corrections_of_the_pose_are_no_factor():
+    """A localisation moves the pose by up to a fifth of the way, now forward and now back."""
+
+    def corrected(k, pose):
+        ahead = 0.02 * math.sin(0.5 * math.tau * k / 100.0)
+        there = ahead * math.cos(pose.yaw), ahead * math.sin(pose.yaw)
+        return Pose(pose.x + there[0], pose.y + there[1], pose.yaw)
+
+    twist, _ = twists_of(winding, moved=corrected, seconds=60.0)
+    assert not twist.replaced
+
+
+def test_a_jump_of_the_pose_is_no_factor():
+    twist, _ = twists_of(
+        winding, moved=lambda k, pose: Pose(pose.x + (k >= 600), pose.y, pose.yaw)
+    )
+    assert not twist.replaced
+
+
+def test_a_twist_beyond_all_reason_is_no_factor():
+    """The watchdog stops the robot by its speed; neither pose nor twist can be trusted."""
+    twist, _ = twists_of(winding, factors=(100.0, 100.0))
+    assert not twist.replaced
+
+
+def test_a_twist_that_is_repaired_is_used_again():
+    parts = OdometryTwist()
+    x, found = 0.0, []
+    for k in range(12000):
+        x += 0.002 if k else 0.0
+        factor = 1.2 if k < 2000 else 1.0
+        state = State(k * 10 * MS, Pose(x, 0.0, 0.0), BodyTwist(0.2 * factor, 0.0))
+        found.append(parts.measured(state, restart=k == 0).twist.linear)
+    assert found[1000] == pytest.approx(0.2)
+    assert found[-1] == pytest.approx(0.2)
+    assert not parts.replaced
+
+
+def test_messages_that_are_missing_are_not_compared():
+    """Across a gap twist and pose say nothing of each other."""
+    twist, x = OdometryTwist(), 0.0
+    for k in range(2000):
+        x += 0.002
+        if k % 20 >= 2:
+            continue
+        wrong = k % 20 == 0  # the first message after each gap
+        state = State(k * 10 * MS, Pose(x, 0.0, 0.0), BodyTwist(0.2, 0.0))
+        twist.measured(state, restart=wrong)
+    assert not twist.replaced
+
+
 # -- pauses of the commands -----------------------------------------------------------------------
 
 

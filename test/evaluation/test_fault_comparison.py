@@ -39,6 +39,7 @@ def test_each_fault_fits_the_robot_and_the_controller():
     [
         ('no twist in the odometry', 'odom has no twist'),
         ('twist reversed', 'opposite sign'),
+        ('twist of the odometry + 10 %', 'times the change of its pose'),
         ('rate set to 50, odometry has 100 Hz', 'odom has 100 Hz, but rate is 50 Hz'),
         ('shaper for another robot', 'the robot oscillates in yaw with'),
         ('lag 20 ms assumed, none', 'too early for a speed_filter.lag of 0.02 s'),
@@ -68,6 +69,7 @@ def test_contradicted_assumptions_cost_little(monkeypatch):
     names = (
         'none',
         'no twist in the odometry',
+        'twist of the odometry + 10 %',
         'rate set to 200, odometry has 100 Hz',
         'shaper for another robot',
         'lag 20 ms assumed, none',
