@@ -15,6 +15,7 @@
 
 import argparse
 from pathlib import Path
+import sys
 
 from t3mpc_ros.cli.run_options import (
     FULL,
@@ -31,6 +32,8 @@ from t3mpc_ros.cli.run_options import (
 from t3mpc_ros.parameters.command_line import parsed_value
 
 OUTPUT = Path('runs') / 'sweep.parquet'
+SOME_FAILED = 3
+"""Exit code: the file was written, but some of its runs failed."""
 
 
 def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -39,7 +42,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         'sweep',
         help='parameters × seeds × cases × controllers, on all processors or a cluster',
         description='Runs every combination and writes one row for each run. Started again after '
-        'an interruption, or with more values, it runs only what the file lacks.',
+        'an interruption, or with more values, it runs only what the file lacks, and runs that '
+        'failed. Exit code 0: every run has its result; 3: some failed; 1: none was made.',
     )
     parser.add_argument(
         'controllers',
@@ -71,8 +75,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the sweep, print its table and return 0."""
-    from t3mpc_ros.evaluation.api.parameter_sweep import sweep
+    """Run the sweep, print its table, and return 0, or :data:`SOME_FAILED`."""
+    from t3mpc_ros.evaluation.api.parameter_sweep import has_failed, sweep
 
     prepare_outputs(options)
     with executor_of(options) as executor:
@@ -91,6 +95,13 @@ def run(options: argparse.Namespace) -> int:
         lambda: f'{found.table()}\n{len(found.rows)} runs: {options.output}',
         lambda: found.rows,
     )
+    if failed := sum(map(has_failed, found.rows)):
+        print(
+            f'{failed} of {len(found.rows)} runs failed, for the reasons in the column error; the '
+            'same command makes these again',
+            file=sys.stderr,
+        )
+        return SOME_FAILED
     return 0
 
 

@@ -62,6 +62,8 @@ class Table:
     """How many of the first columns are text; the others are numbers."""
     wrap: bool = False
     """Whether long cells of a page have several lines."""
+    notes: Sequence[str] = ()
+    """Paragraphs below the table: why a cell has no number, how a verdict is made."""
 
     def markdown(self) -> str:
         """Return the table with its title in Markdown."""
@@ -70,6 +72,8 @@ class Table:
         for row in self.rows:
             name, *cells = _words(row)
             lines.append(_line([f'**{name}**' if name in self.bold else name, *cells]))
+        for note in self.notes:
+            lines += ['', note]
         return '\n'.join(lines)
 
     def html(self) -> str:
@@ -78,7 +82,8 @@ class Table:
         lines = [_html_row('th', self.head, self.text)]
         for row in self.rows:
             lines.append(_html_row('td', _words(row), self.text, row[0] in self.bold))
-        return f'<table>{title}' + ''.join(lines) + '</table>'
+        notes = ''.join(f'<p><small>{html.escape(note)}</small></p>' for note in self.notes)
+        return f'<table>{title}' + ''.join(lines) + f'</table>{notes}'
 
     def latex(self) -> str:
         """Return the table as a LaTeX float with the rules of the package ``booktabs``."""
@@ -89,7 +94,9 @@ class Table:
         lines += [rf'  \begin{{tabular}}{{{places}}}', r'    \toprule', _latex_row(self.head)]
         lines.append(r'    \midrule')
         lines += [_latex_row(_words(row), row[0] in self.bold) for row in self.rows]
-        lines += [r'    \bottomrule', r'  \end{tabular}', r'\end{table}']
+        lines += [r'    \bottomrule', r'  \end{tabular}']
+        lines += [rf'  \par\smallskip{{\footnotesize {_latex(note)}\par}}' for note in self.notes]
+        lines.append(r'\end{table}')
         return '\n'.join(lines) + '\n'
 
 

@@ -99,6 +99,12 @@ def studied(*verdicts):
     }
 
 
+def swept(*errors):
+    rows = [{'error': error} for error in errors]
+    found = SimpleNamespace(table=lambda: 'table', rows=rows)
+    return {'evaluation.api.parameter_sweep.sweep': found}
+
+
 EXPONENTS = 'evaluation.lyapunov_exponents.lyapunov_exponents'
 KEY = frames.KeyState(0, 0, frames.KEY_HELD, 1)
 LOSS, DOUBLE = Damage(0, 9, 'torn', messages=2), Damage(0, 9, 'torn', harmless=True)
@@ -183,6 +189,9 @@ CASES = [
     ('compare --robot servo --cases miscalibrated', {}, 1, 'case must be one of nominal, mass'),
     ('compare --robot servo --gyro', {}, 1, 'gyro is for the twin alone: got robot servo'),
     ('compare --gyro --reference x.csv', {}, 1, '--gyro is for the methods of the package'),
+    ('sweep', swept('', ''), 0, '2 runs: runs/sweep.parquet'),
+    ('sweep', swept('', 'diverged at 1.00 s'), 0, '2 runs: runs/sweep.parquet'),
+    ('sweep', swept('', 'no file', 'no file'), 3, '2 of 3 runs failed'),
     ('paper --seeds 1-3', {}, 1, 'seeds must be of 101-120'),
     ('patrol --paths nothing', {}, 1, 'path must be one of'),
     ('patrol --arena 1 1 2 2', {}, 1, 'arena must contain the start'),

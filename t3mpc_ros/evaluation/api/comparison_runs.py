@@ -20,7 +20,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from t3mpc_ros.evaluation.api.controllers import as_controllers
+from t3mpc_ros.evaluation.api.controllers import as_controllers, check_method
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
@@ -161,6 +161,9 @@ def make_plan(
 ) -> ComparisonPlan:
     """Return what is compared with the first of some controllers."""
     methods = [each.method(scenario.robot) for each in as_controllers(controllers)]
+    chosen = chosen_cases(cases, scenario)
+    for method in methods:
+        check_method(method, scenario, chosen)
     names = [method.name for method in methods]
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise ScriptError(
@@ -169,7 +172,7 @@ def make_plan(
         )
     return ComparisonPlan(
         scenario,
-        chosen_cases(cases, scenario),
+        chosen,
         dict(zip(names, methods, strict=True)),
         checked_seeds(seeds),
         next(iter(names), ''),

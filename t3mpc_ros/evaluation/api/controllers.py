@@ -13,7 +13,7 @@
 # limitations under the License.
 """Controllers of a script: one's own class or function, or a method of the package by name."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
@@ -89,7 +89,9 @@ class Controller:
         """Return it as a method of a robot: ``twin``, ``servo`` or ``torque``."""
         if isinstance(self.source, str) and FILE_SEPARATOR not in self.source:
             return self._packaged(robot, self.source)
-        return OwnMethod(self.name, checked_source(self.source), tuple(self.settings.items()))
+        own = OwnMethod(self.name, checked_source(self.source), tuple(self.settings.items()))
+        own.check_settings()
+        return own
 
     def _packaged(self, robot: str, wanted: str) -> ComparedMethod:
         known = methods_for(robot)
@@ -101,6 +103,16 @@ class Controller:
             return replace(method, name=name, changes={**method.changes, **self.settings})
         assert isinstance(method, MethodSpec)
         return replace(method, name=name, parameters=method.parameters.with_values(self.settings))
+
+
+def check_method(method: ComparedMethod, scenario: Scenario, cases: Sequence[str]) -> None:
+    """Raise ValueError where a run would refuse the parameters of a method.
+
+    Those of the node depend on the robot that it assumes; others are checked when they are set.
+    """
+    if isinstance(method, NodeMethod):
+        for case in cases:
+            method.parameters_for(replace(scenario, case=case))
 
 
 def loaded(spec: str) -> Any:
@@ -245,15 +257,35 @@ class OwnMethod:
         if isinstance(source, type):
             step, made = self._instance(source, settings, nominal_model)
         elif callable(getattr(source, 'step', None)):
-            if settings:
-                raise ScriptError(
-                    f'settings of {self.name} must be given to its class: it is an object already'
-                )
             made = deepcopy(source)
             step = made.step
         else:
             made, step = source, partial(source, **settings)
         return OwnController(self.name, step, made, nominal_model)
+
+    def check_settings(self) -> None:
+        """Raise :class:`ScriptError` for a setting that its class or function does not take."""
+        source, settings = self.source, dict(self.settings)
+        if isinstance(source, FileController):
+            source = source.resolve()
+        if not settings:
+            return
+        if isinstance(source, type) and issubclass(source, BaselineController):
+            source.parameters_type().with_values(settings)
+            return
+        if not isinstance(source, type) and callable(getattr(source, 'step', None)):
+            raise ScriptError(
+                f'settings of {self.name} must be given to its class: it is an object already'
+            )
+        taken = [*inspect.signature(source).parameters.values()]
+        if not isinstance(source, type):  # a function: its first argument is the observation
+            taken = taken[1:]
+        names = [each.name for each in taken if each.name != MODEL]
+        unknown = [name for name in settings if name not in names]
+        if unknown and all(each.kind is not each.VAR_KEYWORD for each in taken):
+            raise ScriptError(
+                f'settings of {self.name} must be {", ".join(names) or "none"}: got {unknown[0]}'
+            )
 
     def driver(self, scenario: Scenario) -> MethodDriver:
         """Return a new driver for a run."""

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds, chosen_cases, find_metric
-from t3mpc_ros.evaluation.api.controllers import as_controllers
+from t3mpc_ros.evaluation.api.controllers import as_controllers, check_method
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence, sentence
 from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
@@ -36,6 +36,7 @@ from t3mpc_ros.evaluation.api.result_tables import (
     writable,
     write_parquet,
 )
+from t3mpc_ros.evaluation.api.single_run import DIVERGED, divergence
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.evaluation.experiment import (
@@ -47,7 +48,8 @@ from t3mpc_ros.evaluation.experiment import (
     print_report,
     run_experiment,
 )
-from t3mpc_ros.evaluation.reporting import Table
+from t3mpc_ros.evaluation.record import Metric, Record, measure
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.evaluation.scenario import Scenario
@@ -99,13 +101,16 @@ class Sweep(ShownAsTables):
     def _tables(self, chosen: str | None = None) -> list[Table]:
         metric = find_metric(chosen or 'overall')
         names = ('controller', *self.parameters, 'case')
-        lines = []
+        lines: list[tuple[str, ...]] = []
+        notes: list[str] = []
         for cell, rows in ResultTable(self.rows).groups(*names).items():
-            values = [row.get(metric.name, math.nan) for row in rows]
-            text = format_interval(mean(values), interval(values), '', metric.digits)
-            lines.append((*map(str, cell), str(len(values)), text))
+            text = _outcome(rows, metric)
+            if reasons := [f'seed {row["seed"]}: {row[ERROR]}' for row in rows if row[ERROR]]:
+                text += f' [{len(notes) + 1}]'
+                notes.append(f'[{len(notes) + 1}] {reasons[0]}')
+            lines.append((*map(str, cell), str(len(rows)), text))
         head = (*names, 'seeds', f'{metric.heading}, {metric.unit}')
-        return [Table('', head, lines, text=1 + len(self.parameters) + 1)]
+        return [Table('', head, lines, text=1 + len(self.parameters) + 1, notes=notes)]
 
     @one_sentence
     def plot(
@@ -128,6 +133,28 @@ class Sweep(ShownAsTables):
         return drawn(lambda: sweep_figure(lines, name, label), path)
 
 
+def has_failed(row: Row) -> bool:
+    """Return whether a run ended with an error; one that diverged has its result."""
+    return bool(row[ERROR]) and not row[ERROR].startswith(DIVERGED)
+
+
+def _outcome(rows: Sequence[Row], metric: Metric) -> str:
+    """Return the mean of a cell, or how many of its runs have none: a mean of the others lies."""
+    failed = sum(map(has_failed, rows))
+    diverged = sum(bool(row[ERROR]) for row in rows) - failed
+    if not failed + diverged:
+        values = [row[metric.name] for row in rows if metric.name in row]
+        if not values:
+            return EMPTY_CELL
+        return format_interval(mean(values), interval(values), '', metric.digits)
+    counts = {'failed': failed, DIVERGED: diverged}
+    return ', '.join(
+        word if count == len(rows) else f'{count} of {len(rows)} {word}'
+        for word, count in counts.items()
+        if count
+    )
+
+
 @one_sentence
 def sweep(
     controllers: Any,
@@ -146,8 +173,10 @@ def sweep(
 ) -> Sweep:
     """Return the metrics of every combination of parameters, seeds, cases and controllers.
 
-    A run that fails, or diverges, is a row with a reason and without numbers. A sweep with a file
-    that is interrupted goes on where it was when it is started again.
+    A run that fails, or diverges, is a row with the reason in ``error`` and without numbers. What
+    :func:`simulate` refuses, such as a parameter that one of the controllers does not have, is
+    refused before the first run. A sweep with a file that is interrupted goes on where it was when
+    it is started again; a run that failed is made again then, one that diverged is not.
 
     Parameters
     ----------
@@ -185,8 +214,8 @@ def sweep(
         rows = list(run_experiment(runs, numbers_or_error, executor, report=report))
     else:
         rows = _run_to_file(path, runs, executor, report)
-    if all(errors := [row[ERROR] for row in rows]):
-        raise ScriptError(f'every run failed: {errors[0]}')
+    if all(map(has_failed, rows)):
+        raise ScriptError(f'every run failed: {rows[0][ERROR]}')
     return Sweep(rows, tuple(parameters), path)
 
 
@@ -204,12 +233,17 @@ def make_runs(
     """
     combinations = [(values, _scenario(setting, values)) for values in _combinations(parameters)]
     chosen = chosen_cases(cases, combinations[0][1])
-    prepared = []
-    for controller in as_controllers(controllers):
+    prepared, given = [], as_controllers(controllers)
+    for controller in given:
         for values, scenario in combinations:
             own = {k: v for k, v in values.items() if not (k in OF_SETTING or k.startswith(ROBOT))}
             source = replace(controller, settings={**controller.settings, **own})
-            prepared.append((controller.name, values, scenario, source.method(scenario.robot)))
+            try:
+                method = source.method(scenario.robot)
+                check_method(method, scenario, chosen)
+            except ValueError as error:
+                raise ScriptError(_refusal(controller.name, values, len(given), error)) from None
+            prepared.append((controller.name, values, scenario, method))
     origin = provenance()
     runs = []
     for seed in seeds:
@@ -231,6 +265,16 @@ def make_runs(
     if len({run.key for run in runs}) < len(runs):
         raise ScriptError('controllers and values must differ: got two runs that are the same')
     return runs
+
+
+def _refusal(name: str, values: Row, controllers: int, error: ValueError) -> str:
+    """Return why no run of a sweep is begun.
+
+    A grid with holes compares nothing, and a wrong name would cost the runs of a night.
+    """
+    combination = ', '.join([name, *(f'{key} {value}' for key, value in values.items())])
+    remedy = '; every controller gets every parameter: sweep each with its own, into one output'
+    return f'no run was begun: {combination}: {error}{remedy if controllers > 1 else ""}'
 
 
 def _scenario(setting: Mapping[str, Any], values: Row) -> Scenario:
@@ -272,9 +316,13 @@ def numbers_or_error(job: Job) -> Row:
     Errors that say nothing about the run itself, such as a missing library, are raised.
     """
     try:
-        return {**measured_run(job), ERROR: ''}
+        return measured_run(job, _numbers)
     except (ValueError, ArithmeticError) as error:
         return {ERROR: sentence(error)}
+
+
+def _numbers(record: Record) -> Row:
+    return {**measure(record), ERROR: divergence(record)}
 
 
 # -- file -----------------------------------------------------------------------------------------
@@ -297,18 +345,21 @@ def _run_to_file(
 ) -> list[Row]:
     """Run what the file and its journal lack, write the file, and remove them from the journal."""
     stored = _read(path)
-    wanted = [run for run in runs if run.key not in stored]
+    wanted = [run for run in runs if run.key not in stored or has_failed(stored[run.key])]
     if stored and report is not None:
         report(f'{path} holds {len(runs) - len(wanted)} of {len(runs)} runs')
-    journal = path.with_name(f'{path.name}.runs.jsonl')
-    made = run_experiment(wanted, numbers_or_error, workers, store=journal, report=report)
+    if not wanted:
+        return [{**run.fields, **stored[run.key]} for run in runs]
+    journal = ResultFile(path.with_name(f'{path.name}.runs.jsonl'))
+    journal.remove({key for key, row in journal.read().items() if has_failed(row)})
+    made = run_experiment(wanted, numbers_or_error, workers, store=journal.path, report=report)
     fresh = {row[RUN]: row for row in made}
-    rows = [fresh.get(run.key) or stored[run.key] for run in runs]
+    rows = [fresh.get(run.key) or {**run.fields, **stored[run.key]} for run in runs]
     keys = {run.key for run in runs}
     write_parquet(
         path, columns_of([*rows, *(row for key, row in stored.items() if key not in keys)])
     )
-    ResultFile(journal).remove(made.keys)
+    journal.remove(made.keys)
     return rows
 
 
@@ -325,4 +376,6 @@ def _read(path: Path) -> dict[str, Row]:
         raise ScriptError(f'{path} is no Parquet file: {error}') from None
     if any(RUN not in row for row in rows):
         raise ScriptError(f'{path} is no file of a sweep: its rows have no column {RUN}')
-    return {row[RUN]: row for row in rows}
+    # A run that failed lacks the columns of the others: they are empty in the file.
+    known = ({name: v for name, v in row.items() if v is not None} for row in rows)
+    return {row[RUN]: row for row in known}

@@ -37,6 +37,7 @@ from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
 SIDES = ('right', 'left')
+DIVERGED = 'diverged'
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -162,16 +163,23 @@ def simulate(
     (given,) = as_controllers([controller])
     method = given.method(scenario.robot)
     record = run(scenario, method)
-    if not record.finite:
-        k = int(np.argmax(~np.isfinite(record.speeds).all(axis=1)))
-        last = record.speeds[max(k - 1, 0)]
-        raise ScriptError(
-            f'the run of {method.name} diverged at {record.time[k]:.2f} s: the last finite wheel '
-            f'speeds were {last[0]:.4g} and {last[1]:.4g} rad/s'
-        )
+    if text := divergence(record):
+        raise ScriptError(f'the run of {method.name} {text}')
     for values in record.columns.values():
         values.flags.writeable = False
     return RunResult(method.name, scenario, record, _columns(record), measure(record))
+
+
+def divergence(record: Record) -> str:
+    """Return when a run left the finite numbers, and from where; '' if it did not."""
+    if record.finite:
+        return ''
+    k = int(np.argmax(~np.isfinite(record.speeds).all(axis=1)))
+    last = record.speeds[max(k - 1, 0)]
+    return (
+        f'{DIVERGED} at {record.time[k]:.2f} s: the last finite wheel speeds were {last[0]:.4g} '
+        f'and {last[1]:.4g} rad/s'
+    )
 
 
 def _columns(record: Record) -> dict[str, Array]:

@@ -14,8 +14,10 @@
 """Sweeps: complete rows, resumption, and the same numbers wherever they are computed."""
 
 from dataclasses import replace
+from functools import partial
 import math
 import os
+import re
 import signal
 import time
 
@@ -55,9 +57,12 @@ def counted(monkeypatch):
     """Return the list of the runs that are computed in this process."""
     runs = []
     measured = parameter_sweep.measured_run
-    monkeypatch.setattr(
-        parameter_sweep, 'measured_run', lambda job: runs.append(job) or measured(job)
-    )
+
+    def count(job, numbers):
+        runs.append(job)
+        return measured(job, numbers)
+
+    monkeypatch.setattr(parameter_sweep, 'measured_run', count)
     return runs
 
 
@@ -93,9 +98,86 @@ def test_a_run_that_fails_is_a_row_with_its_reason():
     assert good['error'] == ''
     assert 'raised ArithmeticError (the gain is too large)' in bad['error']
     assert 'overall' not in bad
-    assert 'diverged' in found.table()
+    assert '| failed [1] |' in found.table()
     with pytest.raises(t3.ScriptError, match='every run failed: .*the gain is too large'):
         t3.sweep(Proportional, {'gain': [2000.0]}, seeds=[1], executor=1, **SHORT)
+
+
+class Made:
+    def step(self, observation):
+        return np.zeros(2)
+
+
+def still(observation):
+    return np.zeros(2)
+
+
+def drives(observation):
+    return np.full(2, 20.0)
+
+
+def raises(observation):
+    raise RuntimeError('no sensor & no_file')
+
+
+def runaway(time, state, command):
+    return np.where(np.abs(state) > 1.0, 1e3 * state * np.abs(state), command - state)
+
+
+def test_a_table_says_which_runs_failed_and_which_diverged():
+    """Every failure, a misspelt parameter too, was *diverged* in a table for a paper."""
+    plant = t3.OdePlant(runaway)
+    found = t3.sweep(
+        [still, drives, raises], {}, plant=plant, seeds=[1, 2], executor=1, duration=2.0
+    )
+    outcomes = [line.split('|')[4].strip() for line in found.table().splitlines() if '|' in line]
+    assert outcomes[3:] == ['diverged [1]', 'failed [2]']
+    for shown in (str(found), found._repr_html_(), found.to_latex()):
+        assert re.search(r'\[1\] seed 1: diverged at \d.\d\d s: the last finite wheel', shown)
+        assert re.search(r'\[2\] seed 1: raises raised RuntimeError \(no sensor', shown)
+    assert r'no sensor \& no\_file' in found.to_latex()
+    assert [row['error'][:8] for row in found.rows[:3]] == ['', 'diverged', 'raises r']
+    assert '–' in found.table('yaw rate'), 'a metric that this robot lacks'
+    rows = [{**row, 'seed': k, 'controller': 'a'} for k, row in enumerate(found.rows)]
+    mixed = parameter_sweep.Sweep(rows, ())
+    assert '| 2 of 6 failed, 2 of 6 diverged [1] |' in mixed.table()
+
+
+def test_a_run_that_failed_is_made_again_from_the_file(tmp_path, counted):
+    """A continued file with such a row could not be printed, and kept it for ever."""
+    pytest.importorskip('pyarrow')
+    make = partial(
+        t3.sweep,
+        *([still, drives, raises], {}),
+        plant=t3.OdePlant(runaway),
+        seeds=[1],
+        duration=2.0,
+        executor=1,
+        output=tmp_path / 'sweep.parquet',
+    )
+    first, again = make(), make()
+    assert [job[1].name for job in counted] == ['still', 'drives', 'raises', 'raises']
+    assert again.table() == first.table()
+    assert '| failed [2] |' in again.table()
+    assert [*tmp_path.iterdir()] == [tmp_path / 'sweep.parquet']
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'text'),
+    [
+        ((['full', Proportional], {'gain': [20.0]}), 'full, gain 20.0: there is no .* law.gain.*'),
+        (('full', {'law.gain': [90.0, 20.0]}), 'law.gain 20.0: law.gain must be from 77.* got 20'),
+        ((Proportional, {'gian': [20.0]}), 'settings of Proportional must be gain: got gian'),
+        ((still, {'gain': [20.0]}), 'settings of still must be none: got gain'),
+        ((t3.Controller(Made()), {'gain': [1.0]}), 'must be given to its class'),
+    ],
+)
+def test_what_simulate_refuses_is_refused_before_any_run(arguments, text, counted):
+    with pytest.raises(t3.ScriptError, match=f'no run was begun: .*{text}') as caught:
+        t3.sweep(*arguments, seeds=[1], executor=1)
+    assert not counted
+    several = 'sweep each with its own' in str(caught.value)
+    assert several == isinstance(arguments[0], list)
 
 
 def test_a_sweep_with_more_values_runs_only_these(tmp_path, counted):
