@@ -44,10 +44,7 @@ from t3mpc_ros.evaluation.record import (
     YAW_RATE_SETTLED,
     Metric,
 )
-from t3mpc_ros.evaluation.reporting import (
-    EMPTY_CELL,
-    Table,
-)
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.scenario import (
     HELD_OUT_SEEDS,
     LEAD,

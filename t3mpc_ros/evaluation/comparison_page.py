@@ -37,19 +37,11 @@ from t3mpc_ros.evaluation.comparison import (
     known_by,
     summary_table,
 )
-from t3mpc_ros.evaluation.confidence_intervals import (
-    Difference,
-    format_interval,
-    interval,
-    mean,
-)
+from t3mpc_ros.evaluation.confidence_intervals import Difference, format_interval, interval, mean
 from t3mpc_ros.evaluation.drivers import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.plotting import drawing, file_of, new_figure, scale_by_size
-from t3mpc_ros.evaluation.record import (
-    METRICS,
-    VARIATION,
-)
+from t3mpc_ros.evaluation.record import METRICS, VARIATION
 from t3mpc_ros.evaluation.reporting import (
     Block,
     Contents,
@@ -59,9 +51,7 @@ from t3mpc_ros.evaluation.reporting import (
     VerdictBox,
     html_page,
 )
-from t3mpc_ros.evaluation.scenario import (
-    Scenario,
-)
+from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.parameters.provenance import machine, provenance
 from t3mpc_ros.version import VERSION
 

@@ -36,7 +36,7 @@ from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, parts
 from t3mpc_ros.evaluation.bag_report.incidents import smooth
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTERS, link_metrics
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
-from t3mpc_ros.evaluation.bag_report.motion import motion_rows
+from t3mpc_ros.evaluation.bag_report.report_page import motion_rows
 from t3mpc_ros.evaluation.bag_report.run_data import BY_BODY, BY_WHEEL, Series, load_run
 from t3mpc_ros.evaluation.drive_response import fit_response, lag_behind, predicted
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, ReportOptions

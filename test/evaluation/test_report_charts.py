@@ -27,11 +27,6 @@ from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.evaluation.bag_report import report_page
 from t3mpc_ros.evaluation.bag_report.causes import Cause, cause_between
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents, Stop, find_incidents
-from t3mpc_ros.evaluation.bag_report.known_results import (
-    KNOWN_RESULTS,
-    MAX_RATIO,
-    known_result,
-)
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.metrics import (
     ChannelMetrics,
@@ -50,7 +45,13 @@ from t3mpc_ros.evaluation.bag_report.run_data import (
     Timing,
 )
 from t3mpc_ros.evaluation.bag_report.tracking_errors import ErrorStatistics
-from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
+from t3mpc_ros.evaluation.bag_report.verdict import (
+    KNOWN_RESULTS,
+    MAX_RATIO,
+    Verdict,
+    judge,
+    known_result,
+)
 from t3mpc_ros.evaluation.charts import Plane
 from t3mpc_ros.evaluation.drive_response import ResponseFit
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH

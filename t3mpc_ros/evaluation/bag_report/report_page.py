@@ -18,9 +18,19 @@ from datetime import UTC, datetime
 import math
 from pathlib import Path
 
+import numpy as np
+
 from t3mpc_ros.bag.mcap_file import LOSS_CAUSES, LOSSES, UNDISCOVERED
 from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.evaluation.bag_report.incidents import BRAKING, driving
+from t3mpc_ros.evaluation.bag_report.incidents import (
+    BRAKING,
+    DEMANDED,
+    PAUSE,
+    STILL,
+    driving,
+    smooth,
+    still_rows,
+)
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.map_changes import map_change_blocks
 from t3mpc_ros.evaluation.bag_report.metrics import (
@@ -29,7 +39,6 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     ReportMetrics,
     compute_metrics,
 )
-from t3mpc_ros.evaluation.bag_report.motion import motion_rows
 from t3mpc_ros.evaluation.bag_report.patrol_section import patrol_blocks
 from t3mpc_ros.evaluation.bag_report.report_charts import (
     LABELS,
@@ -44,7 +53,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
 from t3mpc_ros.evaluation.drive_response import ResponseFit
-from t3mpc_ros.evaluation.record import ROBOT_WINDOW, START, counted_from
+from t3mpc_ros.evaluation.record import ROBOT_WINDOW, START, counted_from, spans_of
 from t3mpc_ros.evaluation.reporting import (
     EMPTY_CELL,
     Block,
@@ -360,3 +369,47 @@ def _contents(recording: BagReader) -> Iterator[Block]:
     for title, values in sorted(recording.metadata_records.items()):
         table = Table('', ['name', 'value'], list(values.items()), text=2, wrap=True)
         yield Details(f'{title}, {len(values)} values', [table])
+
+
+def motion_rows(run: Run) -> list[list[str]]:
+    """Return path length, turning, speeds and stops as rows; none when there are few samples."""
+    motion, command = run.motions.get(run.measured), run.motions.get(COMMAND)
+    if motion is None:
+        return []
+    time, linear = smooth(motion, 'linear')
+    _, angular = smooth(motion, 'angular')
+    known = np.isfinite(linear)
+    if not known.any():
+        return []
+    step = float(time[1] - time[0]) if time.size > 1 else 0.0
+    still = still_rows(linear, angular)
+    spans = [each for each in spans_of(still) if (each.stop - each.start) * step >= PAUSE]
+    stops = [(float(time[each][0]), float(time[each][-1])) for each in spans]
+    lengths = [end - start for start, end in stops]
+    distance = float(np.abs(linear[known]).sum() * step)
+    moving = float(np.count_nonzero(known & ~still) * step)
+    mean, fastest = distance / moving if moving > 0.0 else 0.0, np.abs(linear[known]).max()
+    turned = float(np.abs(angular[known]).sum() * step)
+    rows = [
+        ['path length, forwards and backwards', f'{format_number(distance)} m'],
+        ['turning, both ways', f'{format_number(turned)} rad'],
+        ['speed while moving, mean and largest', f'{mean:.3f} and {fastest:.3f} m/s'],
+        ['time moving', f'{moving:.1f} s'],
+        [
+            'standstills',
+            f'{len(stops)}, {sum(lengths):.1f} s in all, the longest '
+            f'{max(lengths, default=0.0):.1f} s',
+        ],
+    ]
+    if stops:
+        where = ', '.join(f'{start:.1f} to {end:.1f}' for start, end in stops[:5])
+        more = f', and {len(stops) - 5} more' if len(stops) > 5 else ''
+        rows.append(['standstill at', f'{where}{more} s'])
+    if command is not None:
+        commanded = np.zeros(time.size, dtype=np.bool_)
+        for name, least in STILL.items():
+            commanded |= np.abs(command.held(name, time)) > DEMANDED * least
+        commanded &= time >= command.time[0]
+        disobeyed = step * sum(int(np.count_nonzero(commanded[each])) for each in spans)
+        rows.append(['of that, motion was commanded', f'{disobeyed:.1f} s'])
+    return rows
