@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from t3mpc_ros.evaluation.api.bag_columns import BagColumns, read_bag
     from t3mpc_ros.evaluation.api.chaos_generator import ChaosSolution, chaos
     from t3mpc_ros.evaluation.api.comparison_runs import Comparison, compare
-    from t3mpc_ros.evaluation.api.controllers import Controller
     from t3mpc_ros.evaluation.api.fuzzy_system import FuzzySystem, fuzzy
     from t3mpc_ros.evaluation.api.parameter_sweep import Sweep, sweep
     from t3mpc_ros.evaluation.api.plants import NoiseLaw, OdePlant, Robot, StateSpace
     from t3mpc_ros.evaluation.api.references import Waypoints
+    from t3mpc_ros.evaluation.api.script_parts import Controller
     from t3mpc_ros.evaluation.api.single_run import RunResult, simulate
     from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
     from t3mpc_ros.evaluation.simulated_links import LinkFaults
@@ -73,11 +73,11 @@ _HOMES = {
     'evaluation.api.bag_columns': ('BagColumns', 'read_bag'),
     'evaluation.api.chaos_generator': ('ChaosSolution', 'chaos'),
     'evaluation.api.comparison_runs': ('Comparison', 'compare'),
-    'evaluation.api.controllers': ('Controller',),
     'evaluation.api.fuzzy_system': ('FuzzySystem', 'fuzzy'),
     'evaluation.api.parameter_sweep': ('Sweep', 'sweep'),
     'evaluation.api.plants': ('NoiseLaw', 'OdePlant', 'Robot', 'StateSpace'),
     'evaluation.api.references': ('Waypoints',),
+    'evaluation.api.script_parts': ('Controller',),
     'script_error': ('ScriptError',),
     'evaluation.api.single_run': ('RunResult', 'simulate'),
     'evaluation.simulated_links': ('LinkFaults',),

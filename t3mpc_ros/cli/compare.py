@@ -109,7 +109,7 @@ def _plan(options: argparse.Namespace) -> 'ComparisonPlan':
     the comparison.
     """
     from t3mpc_ros.evaluation.api.comparison_runs import make_plan
-    from t3mpc_ros.evaluation.api.own_scenario import own_scenario
+    from t3mpc_ros.evaluation.api.script_parts import own_scenario
     from t3mpc_ros.evaluation.comparison import ComparisonPlan
     from t3mpc_ros.evaluation.methods import default_methods, methods_for, require_libraries
     from t3mpc_ros.parameters.table import find_names

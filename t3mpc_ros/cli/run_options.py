@@ -102,7 +102,7 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
 
 def setting_of(options: argparse.Namespace) -> dict[str, Any]:
     """Return what :func:`add_setting` added, as arguments of a function of the interface."""
-    from t3mpc_ros.evaluation.api.controllers import loaded
+    from t3mpc_ros.evaluation.api.script_parts import loaded
 
     return {
         'plant': options.robot if options.robot in ROBOTS else loaded(options.robot),

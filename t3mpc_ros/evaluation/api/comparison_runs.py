@@ -20,11 +20,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-from t3mpc_ros.evaluation.api.controllers import as_controllers, check_method
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
-from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, columns_of, writable
+from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, case_table, run_plan
 from t3mpc_ros.evaluation.confidence_intervals import Difference

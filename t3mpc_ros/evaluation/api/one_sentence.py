@@ -16,9 +16,12 @@
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor
 from functools import wraps
+from pathlib import Path
+import traceback
 from typing import ParamSpec, TypeVar
 
 from t3mpc_ros.missing_library import remedy
+from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.script_error import ScriptError
 
 P = ParamSpec('P')
@@ -52,3 +55,22 @@ def sentence(error: BaseException) -> str:
     if isinstance(cause, ScriptError):
         return str(cause)
     return str(error) or repr(error)
+
+
+def described(error: BaseException, file: str = '') -> str:
+    """Return an error with its place: the last line of one's own code, in one sentence."""
+    if isinstance(error, SyntaxError):
+        return f'SyntaxError in line {error.lineno}: {error.msg}'
+    frames = traceback.extract_tb(error.__traceback__)
+    package = str(PACKAGE_DIRECTORY)
+    own = [
+        frame
+        for frame in frames
+        if not str(Path(frame.filename).resolve()).startswith(package)
+        and 'site-packages' not in frame.filename
+        and (not file or frame.filename == file)
+    ]
+    text = f'{type(error).__name__} ({error})' if str(error) else type(error).__name__
+    if own:
+        text += f' in {own[-1].name}(), {Path(own[-1].filename).name} line {own[-1].lineno}'
+    return text

@@ -25,9 +25,7 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds, chosen_cases, find_metric
-from t3mpc_ros.evaluation.api.controllers import as_controllers, check_method
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence, sentence
-from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import (
     Columns,
@@ -36,6 +34,7 @@ from t3mpc_ros.evaluation.api.result_tables import (
     writable,
     write_parquet,
 )
+from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.api.single_run import DIVERGED, divergence
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean

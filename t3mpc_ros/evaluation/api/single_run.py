@@ -20,11 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.controllers import as_controllers
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
-from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables
+from t3mpc_ros.evaluation.api.script_parts import as_controllers, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.loop import run

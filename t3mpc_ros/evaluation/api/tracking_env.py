@@ -25,10 +25,9 @@ from gymnasium import spaces
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.api.controllers import Controller, OwnMethod
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
-from t3mpc_ros.evaluation.api.own_scenario import own_scenario
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
+from t3mpc_ros.evaluation.api.script_parts import Controller, OwnMethod, own_scenario
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
 from t3mpc_ros.evaluation.drivers import MethodDriver
 from t3mpc_ros.evaluation.loop import scenario_reports, with_scenario

@@ -22,8 +22,8 @@ import numpy as np
 import pytest
 
 import t3mpc_ros as t3
-from t3mpc_ros.evaluation.api.controllers import loaded
 from t3mpc_ros.evaluation.api.references import sampled
+from t3mpc_ros.evaluation.api.script_parts import loaded
 
 PERIOD = 0.01
 SHORT = {'plant': 'servo', 'duration': 4.0}

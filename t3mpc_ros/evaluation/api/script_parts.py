@@ -11,7 +11,11 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Controllers of a script: one's own class or function, or a method of the package by name."""
+"""What a script gives: its controllers, and the scenario of its runs.
+
+A controller is a class or function of one's own, or a method of the package by name; a scenario
+has a robot, a reference, noise and faults.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
@@ -22,26 +26,30 @@ import importlib.util
 import inspect
 from pathlib import Path
 import sys
-import traceback
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.one_sentence import one_sentence
+from t3mpc_ros.evaluation.api.one_sentence import described, one_sentence
+from t3mpc_ros.evaluation.api.plants import NoiseLaw, OdePlant, Robot, StateSpace, gaussian_noise
+from t3mpc_ros.evaluation.api.references import sampled
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,
     Observation,
 )
+from t3mpc_ros.evaluation.cases import NOMINAL, ROBOTS
 from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.loop import ComparedMethod
 from t3mpc_ros.evaluation.methods import methods_for, require_libraries
-from t3mpc_ros.evaluation.scenario import Scenario
+from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
+from t3mpc_ros.evaluation.simulated_links import LinkFaults
+from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array, read_only
-from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.parameters.table import Parameters, find_names
 from t3mpc_ros.script_error import ScriptError
+from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule, load_schedule
 
 Settings = Mapping[str, Any]
 FILE_SEPARATOR = '.py:'
@@ -386,20 +394,88 @@ def _kept(observation: Observation) -> Observation:
     return replace(observation, **arrays)
 
 
-def described(error: BaseException, file: str = '') -> str:
-    """Return an error with its place: the last line of one's own code, in one sentence."""
-    if isinstance(error, SyntaxError):
-        return f'SyntaxError in line {error.lineno}: {error.msg}'
-    frames = traceback.extract_tb(error.__traceback__)
-    package = str(PACKAGE_DIRECTORY)
-    own = [
-        frame
-        for frame in frames
-        if not str(Path(frame.filename).resolve()).startswith(package)
-        and 'site-packages' not in frame.filename
-        and (not file or frame.filename == file)
-    ]
-    text = f'{type(error).__name__} ({error})' if str(error) else type(error).__name__
-    if own:
-        text += f' in {own[-1].name}(), {Path(own[-1].filename).name} line {own[-1].lineno}'
-    return text
+# -- scenario -------------------------------------------------------------------------------------
+
+
+def own_scenario(
+    plant: Any = 'twin',
+    reference: Any = None,
+    noise: Any = 0.04,
+    faults: Any = None,
+    duration: Any = 60.0,
+    *,
+    case: str = NOMINAL,
+    seed: int = 1,
+    robot_parameters: Mapping[str, Any] | None = None,
+    gyro: bool = False,
+) -> Scenario:
+    """Return one run without its method; arguments as of :func:`simulate`.
+
+    ``robot_parameters`` are changes of the true robot by name, unknown to all methods; ``gyro`` as
+    of :class:`Scenario`. ValueError: wrong use, an unknown name, or a number out of range.
+    """
+    robot, own, text = _robot_of(plant)
+    if isinstance(noise, bool) or not isinstance(noise, int | float | NoiseLaw):
+        raise ScriptError(
+            'noise must be a variance in (rad/s)² or a NoiseLaw: got '
+            f'{type(noise).__name__} {noise!r}'
+        )
+    if isinstance(duration, bool) or not isinstance(duration, int | float):
+        raise ScriptError(f'duration must be a number of seconds: got {duration!r}')
+    law = noise if isinstance(noise, NoiseLaw) else None
+    variance = noise.variance if isinstance(noise, NoiseLaw) else float(noise)
+    own_plant = plant if isinstance(plant, OdePlant | StateSpace) else None
+    if own_plant is not None:
+        law = law or gaussian_noise(variance)
+        if robot_parameters:
+            raise ScriptError(
+                'parameters of the robot must not be given for a plant of your own: got '
+                f'{", ".join(robot_parameters)}'
+            )
+    course = None
+    if reference is not None:
+        geometry = WheelGeometry() if own is None else own.plant_parameters().geometry
+        course, text = sampled(reference, duration, geometry), f'{text}, your reference'
+    links = faults if isinstance(faults, LinkFaults) else None
+    parts = OwnParts(
+        reference=course,
+        links=links,
+        events=_events_of(faults, robot) if links is None else (),
+        noise=law,
+        nominal=None if own is None else own.plant_parameters(KINDS[robot].drive),
+        limits=None if own is None else own.limits(),
+        plant=own_plant,
+        robot_parameters=robot_parameters or {},
+        text=text,
+    )
+    found = Scenario(robot, case, seed, duration, variance, gyro, parts)
+    found.true_robot()  # a wrong parameter of the robot is an error before the runs
+    return found
+
+
+def _robot_of(plant: Any) -> tuple[str, Robot | None, str]:
+    """Return the robot whose methods and metrics apply, a robot of one's own, and what it is."""
+    if isinstance(plant, str):
+        (name,) = find_names('plant', [plant], ROBOTS)
+        return name, None, KINDS[name].text
+    if isinstance(plant, Robot):
+        return 'servo', plant, 'Your robot'
+    if isinstance(plant, OdePlant | StateSpace):
+        robot = 'torque' if plant.drive == 'torque' else 'servo'
+        return robot, plant.robot, f'Your plant ({plant.name})'
+    raise ScriptError(
+        f'plant must be {", ".join(ROBOTS)}, a Robot, an OdePlant or a StateSpace: got '
+        f'{type(plant).__name__} {plant!r}'
+    )
+
+
+def _events_of(faults: Any, robot: str) -> tuple[FaultEvent, ...]:
+    if faults is None:
+        return ()
+    if robot != 'twin':
+        raise ScriptError(
+            'faults must be LinkFaults on a robot other than the twin: got '
+            f'{type(faults).__name__}'
+        )
+    schedule = faults if isinstance(faults, FaultSchedule) else load_schedule(faults)
+    return schedule.events
