@@ -273,7 +273,13 @@ VALUES = {1.0: [0.1, 0.2, 0.4], 2.0: [0.7, 0.8, 1.0, 1.5], 3.0: [0.3]}
 
 def test_a_sweep_shows_means_and_their_intervals():
     rows = [
-        {'controller': name, 'gain': gain, 'case': 'nominal', metric.name: factor * value}
+        {
+            'controller': name,
+            'gain': gain,
+            'case': 'nominal',
+            'error': '',
+            metric.name: factor * value,
+        }
         for factor, name in ((1.0, 'a'), (10.0, 'b'))
         for gain, values in VALUES.items()
         for value in values
