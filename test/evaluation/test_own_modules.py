@@ -13,11 +13,13 @@
 # limitations under the License.
 """Modules of one's own reach the workers of a cluster with each job."""
 
+from concurrent.futures import ThreadPoolExecutor
 import sys
 
 import pytest
 
 from t3mpc_ros.evaluation import own_modules
+from t3mpc_ros.evaluation.api.script_parts import FileController
 from t3mpc_ros.evaluation.own_modules import SourceText, own_sources, run_carried
 from t3mpc_ros.evaluation.run_digest import source_digest
 from t3mpc_ros.script_error import ScriptError
@@ -118,3 +120,15 @@ def test_what_a_worker_lacks_is_one_sentence(package, given, text, finder):
         given = {'carried': SourceText('', '', True), **given}
     with pytest.raises(ScriptError, match=text):
         run_carried(package or source_digest(), given, job('carried.law', 'law'))
+
+
+def test_threads_of_a_worker_wait_for_a_file_that_is_being_run(tmp_path):
+    """A worker of two threads: one found the module of the other, which defined nothing yet."""
+    file = tmp_path / 'slow.py'
+    file.write_text(
+        'import time\ntime.sleep(0.1)\ndef step(observation):\n    return observation\n'
+    )
+    source = FileController(str(file), file.read_text(), 'step')
+    with ThreadPoolExecutor(4) as threads:
+        steps = [*threads.map(lambda _: source.resolve(), range(4))]
+    assert len({*steps}) == 1

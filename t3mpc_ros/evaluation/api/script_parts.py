@@ -26,6 +26,7 @@ import importlib.util
 import inspect
 from pathlib import Path
 import sys
+from threading import RLock
 from types import ModuleType
 from typing import Any
 
@@ -57,6 +58,8 @@ OWN_KNOWLEDGE = 'Observation of each step; NominalModel by an argument model'
 """What a controller of one's own knows."""
 MODEL = 'model'
 """Name of the argument of a class that gets the :class:`NominalModel`."""
+_RUNNING_A_FILE = RLock()
+"""A worker of a cluster has several threads, which begin with the same file."""
 
 
 @dataclass(frozen=True)
@@ -212,9 +215,15 @@ class FileController:
         return f'{Path(self.path).stem}_{digest}'
 
     def _module(self) -> ModuleType:
-        """Return the module of the file, run once in each process."""
-        if self.module in sys.modules:
-            return sys.modules[self.module]
+        """Return the module of the file, run once in each process.
+
+        It is known before it has run, as a dataclass in it needs, but to no other thread.
+        """
+        with _RUNNING_A_FILE:
+            return sys.modules.get(self.module) or self._run()
+
+    def _run(self) -> ModuleType:
+        """Return the module after running the file."""
         spec = importlib.util.spec_from_loader(self.module, None, origin=self.path)
         assert spec is not None
         module = importlib.util.module_from_spec(spec)
