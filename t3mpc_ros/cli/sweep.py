@@ -69,6 +69,9 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.add_argument(
         '--output', type=Path, default=OUTPUT, help=f'Parquet file (default {OUTPUT})'
     )
+    parser.add_argument(
+        '--metric', default='settled', help='column that the table shows (default settled)'
+    )
     add_workers(parser)
     add_json(parser, 'also write the rows')
     parser.set_defaults(run=run)
@@ -76,9 +79,11 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
 
 def run(options: argparse.Namespace) -> int:
     """Run the sweep, print its table, and return 0, or :data:`SOME_FAILED`."""
+    from t3mpc_ros.evaluation.api.comparison_runs import find_metric
     from t3mpc_ros.evaluation.api.parameter_sweep import has_failed, sweep
 
     prepare_outputs(options)
+    metric = find_metric(options.metric).name
     with executor_of(options) as executor:
         found = sweep(
             options.controllers,
@@ -92,7 +97,7 @@ def run(options: argparse.Namespace) -> int:
         )
     print_result(
         options,
-        lambda: f'{found.table()}\n{len(found.rows)} runs: {options.output}',
+        lambda: f'{found.table(metric)}\n{len(found.rows)} runs: {options.output}',
         lambda: found.rows,
     )
     if failed := sum(map(has_failed, found.rows)):

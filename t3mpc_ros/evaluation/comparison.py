@@ -241,7 +241,18 @@ def summary_table(
     title += f'; mean ± half the 95 % interval (seeds); verdict against {plan.against}'
     head = ['method', *plan.cases, f'{VARIATION.heading}, {plan.cases[0]}, {VARIATION.unit}']
     head += ['step, µs'] if step_times else []
-    return Table(title, head, rows, (FULL,), wrap=True)
+    return Table(title, head, rows, (FULL,), wrap=True, notes=_verdict_notes(plan, len(judged)))
+
+
+def _verdict_notes(plan: ComparisonPlan, count: int) -> list[str]:
+    """Return how the verdicts on ``count`` differences of a table are made."""
+    text = (
+        f"Verdict: {BETTER} or {WORSE} than {plan.against} by Student's test of the differences, "
+        f"paired by seed, at {100.0 * LEVEL:g} % with Holm's correction for the {count} "
+        'comparisons of the table. An interval is that of its mean alone: one that leaves zero '
+        f'out may be {INCONCLUSIVE}.'
+    )
+    return [text] if count else []
 
 
 def first_verdicts(plan: ComparisonPlan, results: ResultTable) -> dict[tuple[str, str], str]:
@@ -298,7 +309,8 @@ def case_table(plan: ComparisonPlan, results: ResultTable, case: str) -> Table:
         cells.append(known_by(plan, method, case))
         rows.append(tuple(cells))
     title = f'{case}: {CASES[case].text}'
-    return Table(title, head, rows, (FULL,), wrap=True)
+    notes = _verdict_notes(plan, len(judgement)) if compared else []
+    return Table(title, head, rows, (FULL,), wrap=True, notes=notes)
 
 
 def known_by(plan: ComparisonPlan, method: str, case: str) -> str:
@@ -360,9 +372,7 @@ def description(plan: ComparisonPlan) -> str:
         )
     return text + (
         'Variation: total variation of the commanded acceleration per second and wheel. '
-        f"Differences from {plan.against} are paired by seed; better or worse by Student's test "
-        f"at {100.0 * LEVEL:g} % with Holm's correction over all comparisons of a table. In "
-        'brackets the number of seeds.'
+        'In brackets the number of seeds.'
     )
 
 

@@ -16,7 +16,7 @@
 import base64
 from collections.abc import Iterator, Mapping, Sequence
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 import html
 from importlib import import_module
@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.evaluation.charts import Chart, PageData, Plane, Timeline
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.page.page_files import page_file
+from t3mpc_ros.parameters.table import find_names
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -65,6 +66,21 @@ class Table:
     notes: Sequence[str] = ()
     """Paragraphs below the table: why a cell has no number, how a verdict is made."""
 
+    def with_columns(self, names: Sequence[str]) -> 'Table':
+        """Return the table with its first column and some others, by their headings.
+
+        A heading may lack its unit; one that is named twice takes the next column of this heading.
+        """
+        short = [head.partition(',')[0] for head in self.head]
+        chosen = [0]
+        for name in names:
+            full = name if name in self.head else find_names('column', [name], short)[0]
+            known = self.head if full in self.head else short
+            chosen += [k for k, head in enumerate(known) if head == full and k not in chosen][:1]
+        rows = [[row[k] for k in chosen] for row in self.rows]
+        text = sum(k < self.text for k in chosen)
+        return replace(self, head=[self.head[k] for k in chosen], rows=rows, text=text)
+
     def markdown(self) -> str:
         """Return the table with its title in Markdown."""
         lines = [f'**{self.title}**', ''] if self.title else []
@@ -85,12 +101,14 @@ class Table:
         notes = ''.join(f'<p><small>{html.escape(note)}</small></p>' for note in self.notes)
         return f'<table>{title}' + ''.join(lines) + f'</table>{notes}'
 
-    def latex(self) -> str:
+    def latex(self, label: str = '') -> str:
         """Return the table as a LaTeX float with the rules of the package ``booktabs``."""
         places = 'l' * self.text + 'r' * (len(self.head) - self.text)
         lines = [r'\begin{table}', r'  \centering']
         if self.title:
             lines.append(rf'  \caption{{{_latex(self.title)}}}')
+        if label:
+            lines.append(rf'  \label{{{label}}}')
         lines += [rf'  \begin{{tabular}}{{{places}}}', r'    \toprule', _latex_row(self.head)]
         lines.append(r'    \midrule')
         lines += [_latex_row(_words(row), row[0] in self.bold) for row in self.rows]

@@ -95,13 +95,14 @@ def find_names(kind: str, names: Sequence[str], known: Iterable[str]) -> tuple[s
     known = tuple(known)
     wanted = set()
     for name in names:
-        short = short_name(name)
+        short = short_name(str(name))
         found = [name] if name in known else [each for each in known if short_name(each) == short]
         if len(found) != 1:
             by_short_name = {short_name(each): each for each in known}
             near = difflib.get_close_matches(short, by_short_name, n=1)
             hint = f'; did you mean {by_short_name[near[0]]}?' if near else ''
-            raise ValueError(f'{kind} must be one of {", ".join(known)}: got {name}{hint}')
+            between = '; ' if any(',' in each for each in known) else ', '
+            raise ValueError(f'{kind} must be one of {between.join(known)}: got {name}{hint}')
         wanted |= {*found}
     return tuple(name for name in known if name in wanted)
 

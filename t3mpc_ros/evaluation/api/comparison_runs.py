@@ -25,10 +25,16 @@ from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, columns_of, writable
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL
-from t3mpc_ros.evaluation.comparison import QUICK_SEEDS, ComparisonPlan, case_table, run_plan
+from t3mpc_ros.evaluation.comparison import (
+    QUICK_SEEDS,
+    ComparisonPlan,
+    case_table,
+    judged_metrics,
+    run_plan,
+)
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.experiment import ResultTable, print_report
-from t3mpc_ros.evaluation.record import METRICS, Metric
+from t3mpc_ros.evaluation.record import METRICS, SETTLED, Metric
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
@@ -46,11 +52,15 @@ class Comparison(ShownAsTables):
     results: ResultTable
     """One row for each run: controller, case, seed and metrics by name."""
 
+    @one_sentence
     def table(self, case: str | None = None) -> str:
         """Return the metrics of a case in Markdown: means over the seeds with 95 % intervals.
 
         Differences are paired by seed, with the verdict ``better``, ``worse`` or
-        ``inconclusive``. Without a case: of all of them, one below the other.
+        ``inconclusive``. An interval is that of its difference alone; the verdict is stricter, by
+        Holm's correction for all comparisons of the table, so that at most one table in twenty has
+        a wrong one: an interval that leaves zero out may be inconclusive. Without a case: of all
+        of them, one below the other.
         """
         return '\n\n'.join(table.markdown() for table in self._tables(case))
 
@@ -67,15 +77,32 @@ class Comparison(ShownAsTables):
         cases = known if chosen is None else find_names('case', [chosen], known)
         return [case_table(self.plan, self.results, case) for case in cases]
 
+    def _paper_columns(self, table: Table) -> Sequence[str]:
+        heading = judged_metrics(table.title.partition(':')[0])[0].heading
+        first = (f'{heading},', f'{heading} −')
+        return [head for head in table.head if head.startswith(first) or head == 'verdict'][:3]
+
     @one_sentence
-    def values(self, controller: str, metric: str = 'overall', case: str = '') -> list[float]:
+    def plot(self, path: str | os.PathLike[str] | None = None, *, case: str = '') -> Any:
+        """Return a Matplotlib figure of every seed, and the mean, of the metric that decides.
+
+        By default that of the first case; written to ``path``, a .png, .pdf or .svg, if given.
+        """
+        from t3mpc_ros.evaluation.api.figures import drawn
+        from t3mpc_ros.evaluation.comparison_page import draw_seeds
+
+        (chosen,) = find_names('case', [case or self.plan.cases[0]], self.plan.cases)
+        return drawn(lambda: draw_seeds(self.plan, self.results, chosen), path)
+
+    @one_sentence
+    def values(self, controller: Any, metric: str = SETTLED.name, case: str = '') -> list[float]:
         """Return a metric of a controller, one number for each seed."""
         chosen = self._chosen(controller, case)
         return self.results.values(find_metric(metric).name, **chosen)
 
     @one_sentence
     def difference(
-        self, controller: str, metric: str = 'overall', case: str = ''
+        self, controller: Any, metric: str = SETTLED.name, case: str = ''
     ) -> Difference | None:
         """Return the paired difference of a metric from the first controller, with its interval.
 
@@ -89,9 +116,10 @@ class Comparison(ShownAsTables):
             else self.results.difference(find_metric(metric).name, first, second)
         )
 
-    def _chosen(self, controller: str, case: str) -> dict[str, str]:
-        """Return controller and case by their names, or parts of them."""
-        (name,) = find_names('controller', [controller], self.plan.methods)
+    def _chosen(self, controller: Any, case: str) -> dict[str, str]:
+        """Return the names of a controller, given as to :func:`compare`, and of a case."""
+        (given,) = as_controllers([controller])
+        (name,) = find_names('controller', [given.name], self.plan.methods)
         (chosen,) = find_names('case', [case or self.plan.cases[0]], self.plan.cases)
         return {'controller': name, 'case': chosen}
 
@@ -200,7 +228,10 @@ def checked_seeds(seeds: Any) -> tuple[int, ...]:
 
 
 def find_metric(name: str) -> Metric:
-    """Return the metric of a name, of which a part of the spelling may differ."""
+    """Return the metric of a name, or of the heading that it has in tables."""
     known = {metric.name: metric for metric in METRICS}
+    headings = {metric.heading: metric for metric in METRICS}
+    if name in headings:
+        return headings[name]
     (found,) = find_names('metric', [name], known)
     return known[found]

@@ -47,7 +47,7 @@ from t3mpc_ros.evaluation.experiment import (
     print_report,
     run_experiment,
 )
-from t3mpc_ros.evaluation.record import Metric, Record, measure
+from t3mpc_ros.evaluation.record import SETTLED, Metric, Record, measure
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.run_digest import digest
@@ -87,7 +87,7 @@ class Sweep(ShownAsTables):
         return columns_of(self.rows)
 
     @one_sentence
-    def table(self, metric: str = 'overall') -> str:
+    def table(self, metric: str = SETTLED.name) -> str:
         """Return a metric in Markdown: mean and 95 % interval over the seeds of each cell."""
         return self._tables(metric)[0].markdown()
 
@@ -98,7 +98,7 @@ class Sweep(ShownAsTables):
         return self.columns
 
     def _tables(self, chosen: str | None = None) -> list[Table]:
-        metric = find_metric(chosen or 'overall')
+        metric = find_metric(chosen or SETTLED.name)
         names = ('controller', *self.parameters, 'case')
         lines: list[tuple[str, ...]] = []
         notes: list[str] = []
@@ -113,7 +113,10 @@ class Sweep(ShownAsTables):
 
     @one_sentence
     def plot(
-        self, parameter: str, metric: str = 'overall', path: str | os.PathLike[str] | None = None
+        self,
+        parameter: str,
+        metric: str = SETTLED.name,
+        path: str | os.PathLike[str] | None = None,
     ) -> Any:
         """Return a Matplotlib figure of a metric over a swept parameter, a line per controller.
 

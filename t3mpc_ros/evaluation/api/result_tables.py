@@ -15,6 +15,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 import os
 from pathlib import Path
@@ -64,13 +65,43 @@ class ShownAsTables(ABC):
     def _repr_html_(self) -> str:
         return '\n'.join(table.html() for table in self._tables())
 
+    def _paper_columns(self, table: Table) -> Sequence[str]:
+        """Return the columns that a paper needs, by their headings."""
+        return table.head
+
     @one_sentence
-    def to_latex(self, chosen: str | None = None) -> str:
+    def to_latex(
+        self,
+        chosen: str | None = None,
+        *,
+        columns: Sequence[str] | None = None,
+        label: str = '',
+        caption: str = '',
+    ) -> str:
         """Return the tables in LaTeX, with the rules of its package ``booktabs``.
 
-        ``chosen`` is a case of a comparison, or a metric of a sweep; by default as ``str`` shows.
+        Parameters
+        ----------
+        chosen
+            A case of a comparison, or a metric of a sweep or a run; by default as ``str`` shows.
+        columns
+            Columns beside the first one, by their headings, with or without the unit. By default
+            all; of a comparison those of the metric that decides, its difference and verdict.
+        label, caption
+            Of a single table; by default without a label, and with the caption of ``str``.
         """
-        return '\n'.join(table.latex() for table in self._tables(chosen))
+        tables = self._tables(chosen)
+        if (label or caption) and len(tables) > 1:
+            raise ScriptError(
+                f'label and caption are of one table: choose one of {len(tables)} cases'
+            )
+        return '\n'.join(
+            replace(
+                table.with_columns(self._paper_columns(table) if columns is None else columns),
+                title=caption or table.title,
+            ).latex(label)
+            for table in tables
+        )
 
     @one_sentence
     def to_frame(self) -> Any:

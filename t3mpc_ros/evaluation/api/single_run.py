@@ -32,6 +32,7 @@ from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
@@ -95,10 +96,13 @@ class RunResult(ShownAsTables):
         return {'controller': self.controller, 'scenario': str(self.scenario)}
 
     def _tables(self, chosen: str | None = None) -> list[Table]:
+        known = [metric for metric in METRICS if metric.name in self.metrics]
+        if chosen is not None:
+            names = find_names('metric', [chosen], [metric.name for metric in known])
+            known = [metric for metric in known if metric.name in names]
         rows = [
             (metric.heading, f'{self.metrics[metric.name]:.{metric.digits}f}', metric.unit)
-            for metric in METRICS
-            if metric.name in self.metrics
+            for metric in known
         ]
         return [Table(f'{self.controller}: {self.scenario}', ('metric', 'value', 'unit'), rows)]
 

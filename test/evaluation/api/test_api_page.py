@@ -17,9 +17,13 @@ import inspect
 import re
 import runpy
 
+import pytest
 from support.checkout import ROOT
 
 import t3mpc_ros as t3
+from t3mpc_ros.evaluation.api.script_parts import check_method
+from t3mpc_ros.evaluation.cases import NOMINAL
+from t3mpc_ros.evaluation.scenario import Scenario
 
 PAGE = ROOT / 'docs' / 'api.md'
 GENERATOR = runpy.run_path(str(PAGE.with_name('api_page.py')))
@@ -44,3 +48,17 @@ def test_every_argument_is_described():
         described = re.findall(r'`\*?(\w+)', ', '.join(items))
         arguments = [each for each in inspect.signature(function).parameters if each != 'path']
         assert {*arguments} <= {*described}, name
+
+
+CALLS = {
+    call
+    for page in PAGE.parent.glob('*.md')
+    for call in re.findall(r"t3\.Controller\('[^)]*\)", page.read_text())
+}
+
+
+@pytest.mark.parametrize('call', sorted(CALLS))
+def test_a_controller_on_a_page_exists(call):
+    """The tutorial had one with a gain that the twin refuses."""
+    method = eval(call, {'t3': t3}).method('twin')
+    check_method(method, Scenario('twin', NOMINAL, 1), [NOMINAL])

@@ -23,6 +23,8 @@ import numpy as np
 import pytest
 
 import t3mpc_ros as t3
+from t3mpc_ros.evaluation.comparison import markdown
+from t3mpc_ros.evaluation.reporting import html_page
 
 SHORT = {'plant': 'servo', 'duration': 4.0}
 MAKERS = {
@@ -90,7 +92,7 @@ def test_a_result_in_a_notebook_is_small_and_its_tables(result):
 
 
 def test_the_latex_of_a_result_has_its_cells(result):
-    text = result.to_latex()
+    text = result.to_latex(columns=cells_of(str(result))[0])
     rows = [line for line in text.splitlines() if line.endswith(r'\\')]
     table = cells_of(str(result))
     assert len(rows) == len(table)
@@ -105,8 +107,55 @@ def test_the_latex_of_a_result_has_its_cells(result):
         assert text.count(rule) == text.count('begin{tabular}')
 
 
+def test_the_latex_of_a_comparison_is_a_table_for_a_paper():
+    """It had twelve columns, one of them with 130 characters, and no label."""
+    comparison = made('comparison')
+    text = comparison.to_latex('nominal', label='tab:mine', caption='Mine & others')
+    assert r'method & settled, rad/s & settled $-$ full & verdict \\' in text
+    assert text.splitlines()[2:4] == [r'  \caption{Mine \& others}', r'  \label{tab:mine}']
+    chosen = comparison.to_latex('nominal', columns=['verdict', 'variation', 'verdict'])
+    assert r'method & verdict & variation, rad/s$^3$ & verdict \\' in chosen
+    for wrong, reason in (
+        (
+            {'columns': ['setled']},
+            'column must be one of method, settled, .* did you mean settled',
+        ),
+        ({'label': 'tab:mine'}, 'label and caption are of one table: choose one of 2 cases'),
+    ):
+        with pytest.raises(t3.ScriptError, match=reason):
+            comparison.to_latex(**wrong)
+
+
+def test_a_table_with_verdicts_says_how_they_are_made():
+    """``+0.0570 ± 0.0333 inconclusive`` reads as a contradiction."""
+    comparison = made('comparison')
+    note = 'for the 2 comparisons of the table. An interval is that of its mean alone'
+    page = html_page('', comparison._tables('nominal'))
+    for text in (str(comparison), comparison._repr_html_(), comparison.to_latex()):
+        assert text.count(note) == 2
+    assert page.count(note) == 1
+    summary = markdown(comparison.plan, comparison.results)
+    assert summary.count("by Student's test of the differences") == 3, 'one below each table'
+
+
+def test_the_metric_of_a_result_is_by_default_the_settled_one():
+    comparison, swept = made('comparison'), made('sweep')
+    for shown in (swept.table(), swept.to_latex()):
+        assert 'settled, rad/s' in shown
+    assert comparison.values('full') == comparison.values('full', 'settled')
+    heading = comparison.values('full', 'with switches')
+    assert heading == comparison.values(t3.Controller('full'), 'overall')
+    assert comparison.difference('PI + feed-forward').mean == pytest.approx(
+        np.subtract(comparison.values('PI + feed-forward'), comparison.values('full')).mean()
+    )
+    (axis,) = comparison.plot(case='friction x3').axes
+    assert axis.get_xlabel() == 'settled / (rad/s)'
+    assert [each.get_text() for each in axis.get_yticklabels()] == ['full', 'PI + feed-forward']
+
+
 def test_one_case_or_metric_is_chosen_by_its_name():
     comparison, swept = made('comparison'), made('sweep')
+    assert made('run').to_latex('variation').count('rad/s') == 1
     assert comparison.to_latex().count('tabular}') == 4
     assert comparison.to_latex('friction x3').count('tabular}') == 2
     assert swept.to_latex('variation') != swept.to_latex()

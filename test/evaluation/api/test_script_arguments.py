@@ -229,6 +229,15 @@ METHODS = {
         lambda **given: compared().table(**given), t3.Comparison.table, {},
         {'case': 'friction x3'},
     ),
+    'plot of a comparison': (
+        lambda **given: compared().plot(**given), t3.Comparison.plot, {},
+        {'path': 'new.png', 'case': 'friction x3'},
+    ),
+    'to_latex': (
+        lambda **given: compared().to_latex(**given), t3.Comparison.to_latex,
+        {'chosen': 'nominal'},
+        {'chosen': 'friction x3', 'columns': ['variation'], 'label': 'a', 'caption': 'b'},
+    ),
     'values': (
         lambda **given: compared().values(**given), t3.Comparison.values, {'controller': PI},
         {'controller': 'ADRC', 'metric': 'variation', 'case': 'friction x3'},
