@@ -29,6 +29,8 @@ import t3mpc_ros
 PAGE = Path(__file__).with_name('api.md')
 MARK = '<!-- generated from here on: .venv/bin/python docs/api_page.py -->'
 FUNCTIONS, TAKEN, RETURNED = 'Functions', 'What a function takes', 'What a function returns'
+ENVIRONMENT = ('TrackingEnv', 'vector_of', 'accelerations_of')
+"""Names of ``t3mpc_ros.gym``."""
 SECTIONS = {
     FUNCTIONS: ('simulate', 'compare', 'sweep', 'read_bag', 'chaos', 'fuzzy'),
     TAKEN: (
@@ -59,6 +61,10 @@ def with_api(page):
             lines += _markdown(documented)
             if title != FUNCTIONS:
                 lines += _members(documented, public, made=title == TAKEN)
+    lines += ['', '## Environment of Gymnasium, from `t3mpc_ros.gym`']
+    for name in ENVIRONMENT:
+        documented = package[f'evaluation.api.tracking_env.{name}']
+        lines += ['', f'### `{name}`', '', *_markdown(documented)]
     return page[: page.index(MARK)] + '\n'.join(lines) + '\n'
 
 

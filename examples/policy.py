@@ -17,7 +17,7 @@ import gymnasium
 import numpy as np
 
 import t3mpc_ros as t3
-from t3mpc_ros.evaluation.api.tracking_env import ACCELERATION, vector_of
+from t3mpc_ros.gym import accelerations_of, vector_of
 
 
 class Policy:
@@ -36,7 +36,7 @@ class Policy:
 
     def step(self, observation):
         """Return the accelerations of the wheels, rad/s²: it is a controller, too."""
-        return ACCELERATION * np.clip(self.action(vector_of(observation)), -1.0, 1.0)
+        return accelerations_of(self.action(vector_of(observation)))
 
 
 def episode(env, weights, seed):
@@ -45,7 +45,7 @@ def episode(env, weights, seed):
     seen, _ = env.reset(seed=seed)
     ended = False
     while not ended:
-        seen, reward, terminated, truncated, _ = env.step(policy.action(seen).astype(np.float32))
+        seen, reward, terminated, truncated, _ = env.step(policy.action(seen))
         rewards.append(reward)
         ended = terminated or truncated
     return float(np.mean(rewards))

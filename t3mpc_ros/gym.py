@@ -13,7 +13,9 @@
 # limitations under the License.
 """Environments of Gymnasium: importing this module registers ``t3mpc_ros/Tracking-v0``.
 
-``gymnasium.make('t3mpc_ros.gym:t3mpc_ros/Tracking-v0')`` imports it by itself.
+``gymnasium.make('t3mpc_ros.gym:t3mpc_ros/Tracking-v0')`` imports it by itself. A policy is a
+controller for ``t3mpc_ros.compare`` whose ``step`` returns ``accelerations_of`` its action for the
+``vector_of`` an observation.
 """
 
 from t3mpc_ros.missing_library import remedy
@@ -23,4 +25,11 @@ try:
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(remedy(error) or str(error), name=error.name) from error
 
+from t3mpc_ros.evaluation.api.tracking_env import (
+    TrackingEnv,
+    accelerations_of,
+    vector_of,
+)
+
+__all__ = ['TrackingEnv', 'accelerations_of', 'vector_of']
 register('t3mpc_ros/Tracking-v0', 't3mpc_ros.evaluation.api.tracking_env:TrackingEnv')

@@ -23,7 +23,7 @@ from typing import Any
 import gymnasium
 from gymnasium import spaces
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
@@ -57,12 +57,17 @@ FIRST_SEED = 100_000
 
 
 def vector_of(observation: Observation) -> Vector:
-    """Return what a policy sees of an observation, shape (19,), about -1 to 1, within 10.
+    """Return what a policy sees of an observation, shape (19,), about -1 to 1, cut at 10.
 
-    Pairs have the right wheel first: error of the estimated speed, reference, last command and
-    unexplained acceleration, each over its scale; the change of the reference up to 10, 50, 100,
-    200 and 400 ms ahead; the yaw rate over 8 rad/s, 0 where it is not known. A controller of one's
-    own that uses a policy calls it; it needs the attribute ``preview = True``.
+    A controller of one's own that uses a policy calls it, and has ``preview = True``. Entries, the
+    right wheel first:
+
+    - 0, 1: estimated speed less the reference, rad/s
+    - 2, 3: reference over 10 rad/s
+    - 4, 5: last commanded wheel speed over 10 rad/s
+    - 6, 7: unexplained acceleration over 60 rad/s²
+    - 8 to 17: reference 1, 5, 10, 20 and 40 control periods ahead less that of now, over 10 rad/s
+    - 18: yaw rate over 8 rad/s, 0 where it is not known
     """
     reference, future = observation.reference, observation.future
     if future is None:
@@ -80,6 +85,19 @@ def vector_of(observation: Observation) -> Vector:
     return found
 
 
+def accelerations_of(action: ArrayLike) -> Array:
+    """Return the accelerations (rad/s²) of both wheels that the environment makes of an action.
+
+    A controller whose ``step`` returns them has the numbers of the episode, to the last bit, if
+    the policy gives the same action to both: one that is rounded to float32 for the environment
+    alone is another.
+    """
+    given = np.asarray(action, dtype=np.float64)
+    if given.shape != (2,) or not np.isfinite(given).all():
+        raise ScriptError(f'action must be two finite numbers: got {action!r}')
+    return ACCELERATION * np.clip(given, -1.0, 1.0)
+
+
 class _Previewing:
     """Stands for the policy where the loop asks what a method needs."""
 
@@ -93,11 +111,12 @@ class _Previewing:
 class TrackingEnv(gymnasium.Env[Vector, Vector]):
     """Track a reference with two wheels; one step is one control period of 10 ms.
 
-    Action: accelerations of the right and the left wheel over 60 rad/s², shape (2,), from -1 to 1.
-    Observation: :func:`vector_of`. Reward: less the squared error of both true wheel speeds,
-    (rad/s)², and 0.001 of the squared change of the action. An episode is truncated at its end,
-    where ``info['metrics']`` has the numbers of :func:`t3mpc_ros.compare`, and terminated if the
-    robot diverges. Equal seeds and actions give equal episodes, to the last bit.
+    Action: accelerations of the right and the left wheel over 60 rad/s², shape (2,), from -1 to 1;
+    see :func:`accelerations_of`. Observation: :func:`vector_of`. Reward: less the squared error of
+    both true wheel speeds, (rad/s)², and 0.001 of the squared change of the action. An episode is
+    truncated at its end, where ``info['metrics']`` has the numbers of :func:`t3mpc_ros.compare`,
+    and terminated if the robot diverges. Equal seeds and actions give equal episodes, to the last
+    bit.
 
     Parameters
     ----------
@@ -171,11 +190,9 @@ class _Episode:
 
     def step(self, action: Vector) -> tuple[Vector, float, bool, bool, dict[str, Any]]:
         """Return what :meth:`TrackingEnv.step` does."""
-        given = np.asarray(action, dtype=np.float64)
-        if given.shape != (2,) or not np.isfinite(given).all():
-            raise ScriptError(f'action must be two finite numbers: got {action!r}')
-        asked = np.clip(given, -1.0, 1.0)
-        self._send(self._driver.command_for(ACCELERATION * asked))
+        accelerations = accelerations_of(action)
+        asked = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0)
+        self._send(self._driver.command_for(accelerations))
         change, self._before = asked - self._before, asked
         info: dict[str, Any] = {}
         if self.record is not None:

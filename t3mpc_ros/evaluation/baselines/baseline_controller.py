@@ -155,28 +155,40 @@ class Observation:
     """Input of a method at one step; right wheel first, valid until the next step.
 
     Times count from the instant at which the returned acceleration takes effect.
+
+    Attributes
+    ----------
+    speeds
+        Estimated chi at that instant, rad/s, shape (2,).
+    unexplained
+        Estimated disturbance acceleration d = chi' - u, rad/s², shape (2,).
+    reference
+        r at that instant, rad/s, shape (2,); extrapolated by its slope without preview.
+    next_reference
+        r one period later, shape (2,); ``(next_reference - reference) / T`` feeds forward.
+    command
+        Last commanded wheel speeds, rad/s, shape (2,); unused with the torque drive.
+    future
+        Preview: r at that instant and each period after it, shape (n, 2), n >= 2. None for a
+        method without preview.
+    elapsed
+        Control periods since the observation before; more than 1 after lost measurements.
+    late
+        Control periods until that instant: the dead time in use.
+    yaw_rate
+        Mean yaw rate of the odometry since the observation before, rad/s; NaN at the first one,
+        and for a robot without a pose. On the twin it contains the gyro.
     """
 
     speeds: Array
-    """Estimated chi at that instant, rad/s, shape (2,)."""
     unexplained: Array
-    """Estimated disturbance acceleration d = chi' - u, rad/s², shape (2,)."""
     reference: Array
-    """r at that instant, rad/s, shape (2,); extrapolated by its slope without preview."""
     next_reference: Array
-    """r one period later, shape (2,); ``(next_reference - reference) / T`` feeds forward."""
     command: Array
-    """Last commanded wheel speeds, rad/s, shape (2,); unused with the torque drive."""
     future: Array | None
-    """Preview: r at that instant and each period after it, shape (n, 2), n >= 2.
-    None for a method without preview."""
     elapsed: int = 1
-    """Control periods since the observation before; more than 1 after lost measurements."""
     late: int = 0
-    """Control periods until that instant: the dead time in use."""
     yaw_rate: float = math.nan
-    """Mean yaw rate of the odometry since the observation before, rad/s; NaN at the first one, and
-    for a robot without a pose. On the twin it contains the gyro."""
 
 
 class BaselineController(ABC):

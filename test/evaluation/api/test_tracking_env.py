@@ -14,11 +14,14 @@
 """The environment of Gymnasium is the loop of every other run, with a policy as its controller."""
 
 import importlib
+import inspect
+import runpy
 import sys
 import warnings
 
 import numpy as np
 import pytest
+from support.checkout import ROOT
 
 import t3mpc_ros as t3
 
@@ -87,6 +90,34 @@ def test_an_episode_is_the_run_of_the_same_controller(plant, faults):
         plain = -np.sum(error**2, axis=1)
         assert np.all(rewards[: len(plain)] <= plain + 1e-9)
         assert np.mean(plain - rewards[: len(plain)]) < 0.01
+
+
+class Watched(gymnasium.Wrapper):
+    def step(self, action):
+        *found, self.info = self.env.step(action)
+        return *found, self.info
+
+
+def test_the_policy_of_the_example_is_the_controller_it_trains():
+    """It rounded its actions to float32 for the environment alone: 0.2256281296(7150|5436)."""
+    example = runpy.run_path(str(ROOT / 'examples' / 'policy.py'))
+    env, weights = Watched(gymnasium.make(NAME, **SHORT)), [-0.37, 5.3, 0.1, 0.2]
+    example['episode'](env, weights, 7)
+    run = t3.simulate(example['Policy'](weights), seed=7, **SHORT)
+    assert env.info['metrics'] == dict(run.metrics)
+
+
+def test_a_policy_sees_what_the_page_says():
+    future = np.arange(82.0).reshape(41, 2)
+    pairs = [np.array(pair) for pair in ((9.0, 8.0), (30.0, 60.0), (1.0, 3.0), (5.0, -10.0))]
+    speeds, unexplained, reference, command = pairs
+    observation = t3.Observation(
+        speeds, unexplained, reference, reference, command, future, yaw_rate=4.0
+    )
+    ahead = np.concatenate([future[k] - reference for k in (1, 5, 10, 20, 40)]) / 10.0
+    wanted = [8.0, 5.0, 0.1, 0.3, 0.5, -1.0, 0.5, 1.0, *ahead, 0.5]
+    assert vector_of(observation) == pytest.approx(wanted)
+    assert inspect.getdoc(t3.Observation).count('shape (2,)') == 5, 'help() says what they are'
 
 
 def test_equal_seeds_are_equal_episodes_and_other_ones_differ():
