@@ -82,7 +82,7 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.api.comparison_runs import find_metric
     from t3mpc_ros.evaluation.api.parameter_sweep import has_failed, sweep
 
-    prepare_outputs(options)
+    prepare_outputs(options, options.output)
     metric = find_metric(options.metric).name
     with executor_of(options) as executor:
         found = sweep(

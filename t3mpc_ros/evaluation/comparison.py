@@ -268,7 +268,9 @@ def first_verdicts(plan: ComparisonPlan, results: ResultTable) -> dict[tuple[str
 
 
 def _cell(values: Sequence[float], metric: Metric) -> str:
-    """Return mean ± half the interval and the number of seeds."""
+    """Return mean ± half the interval and the number of seeds, or how many diverged."""
+    if diverged := sum(map(math.isnan, values)):
+        return f'{diverged} of {len(values)} diverged'
     text = format_interval(mean(values), interval(values), '', metric.digits)
     return f'{text} ({len(values)})'
 

@@ -468,3 +468,12 @@ def test_seeds_are_a_range_or_one():
     for text in ('', 'a-b', '5-3', '-3', '1-20000'):
         with pytest.raises(ArgumentTypeError, match='must be A-B'):
             seed_range(text)
+
+
+def test_a_cell_says_how_many_of_its_runs_diverged():
+    """One of five was *diverged (5)*."""
+    methods = {'feed-forward': methods_for('servo')['feed-forward']}
+    plan = ComparisonPlan(Scenario('servo', NOMINAL, 1), (NOMINAL,), methods, (1, 2))
+    row = {'controller': 'feed-forward', 'case': NOMINAL}
+    results = ResultTable([{**row, 'settled': value} for value in (0.1, math.nan)])
+    assert '| 1 of 2 diverged |' in case_table(plan, results, NOMINAL).markdown()

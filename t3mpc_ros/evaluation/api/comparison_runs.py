@@ -133,7 +133,7 @@ class Comparison(ShownAsTables):
         """Write tables and figures as one page and return the path."""
         from t3mpc_ros.evaluation.comparison_page import page
 
-        target = writable(path)
+        target = writable(path, '.html')
         target.write_text(page(self.plan, self.results), encoding='utf-8')
         return target
 

@@ -35,7 +35,6 @@ from t3mpc_ros.evaluation.plotting import (
 )
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.script_error import ScriptError
 
 
 def drawn(draw: Callable[[], Any], path: str | os.PathLike[str] | None) -> Any:
@@ -43,9 +42,7 @@ def drawn(draw: Callable[[], Any], path: str | os.PathLike[str] | None) -> Any:
     with matplotlib.rc_context(STYLE):
         figure = draw()
     if path is not None:
-        target = writable(path)
-        if target.suffix not in (suffixes := [f'.{kind}' for kind in DATES]):
-            raise ScriptError(f'path must end in {", ".join(suffixes)}: got {target}')
+        target = writable(path, *(f'.{kind}' for kind in DATES))
         target.write_bytes(file_of(figure, target.suffix.removeprefix('.')))
     return figure
 

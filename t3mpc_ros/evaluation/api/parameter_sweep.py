@@ -28,6 +28,7 @@ from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds, chosen_cases
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence, sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import (
+    PARQUET,
     Columns,
     ShownAsTables,
     columns_of,
@@ -63,7 +64,6 @@ ROBOT = 'robot.'
 OF_SETTING = ('noise', 'duration')
 RUN, ERROR = 'run', 'error'
 """Columns: digest of all that determines a run, and why it has no numbers; '' with them."""
-SUFFIX = '.parquet'
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -334,9 +334,7 @@ def _checked_path(output: str | os.PathLike[str] | None) -> Path | None:
     """Return the path; a missing library is an error before the runs, not after them."""
     if output is None:
         return None
-    path = writable(output)
-    if path.suffix != SUFFIX:
-        raise ScriptError(f'output must end in {SUFFIX}: got {path}')
+    path = writable(output, PARQUET)
     import pyarrow.parquet  # noqa: F401
 
     return path

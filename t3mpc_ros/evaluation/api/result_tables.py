@@ -30,6 +30,7 @@ from t3mpc_ros.parameters.command_line import check_writable
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.script_error import ScriptError
 
+PARQUET = '.parquet'
 Columns = Mapping[str, Sequence[Any] | np.ndarray[Any, Any]]
 
 
@@ -117,12 +118,12 @@ class ShownAsTables(ABC):
     @one_sentence
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the columns as CSV, one row for each run or period, and return the path."""
-        return write_csv(path, self._columns())
+        return write_csv(writable(path, '.csv'), self._columns())
 
     @one_sentence
     def to_parquet(self, path: str | os.PathLike[str]) -> Path:
         """Write them as Parquet and return the path; needs the extra ``[compare]``."""
-        return write_parquet(path, self._columns(), self._details())
+        return write_parquet(writable(path, PARQUET), self._columns(), self._details())
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
@@ -156,8 +157,10 @@ def write_parquet(
     return target
 
 
-def writable(path: str | os.PathLike[str]) -> Path:
-    """Return the path of a file; ParameterError if it cannot be written, as in no folder."""
+def writable(path: str | os.PathLike[str], *suffixes: str) -> Path:
+    """Return the path of a file; ValueError if it cannot be written, or has another suffix."""
     target = Path(path).expanduser()
+    if suffixes and target.suffix not in suffixes:
+        raise ScriptError(f'path must end in {", ".join(suffixes)}: got {target}')
     check_writable(target)
     return target

@@ -301,7 +301,8 @@ class OwnMethod:
         unknown = [name for name in settings if name not in names]
         if unknown and all(each.kind is not each.VAR_KEYWORD for each in taken):
             raise ScriptError(
-                f'settings of {self.name} must be {", ".join(names) or "none"}: got {unknown[0]}'
+                f'settings of {_plain_name(source)} must be {", ".join(names) or "none"}: got '
+                f'{unknown[0]}'
             )
 
     def driver(self, scenario: Scenario) -> MethodDriver:
@@ -363,11 +364,13 @@ class OwnController(BaselineController):
             asked = self._step(_kept(observation))
         except Exception as error:
             text = f'{self._name} raised {described(error)}, at {self._time():.2f} s'
-            raise ScriptError(text) from None
+            raise ScriptError(f'{text}{_remedy(error, observation)}') from None
         if not (
             isinstance(asked, np.ndarray) and asked.shape == (2,) and asked.dtype.kind in 'fiu'
         ):
-            what = f'shape {asked.shape}' if isinstance(asked, np.ndarray) else repr(asked)
+            what = repr(asked)
+            if isinstance(asked, np.ndarray):
+                what = f'shape {asked.shape} of {asked.dtype}'
             raise ScriptError(
                 f'{self._name} must return a numpy array of shape (2,), the accelerations of the '
                 f'right and the left wheel in rad/s²: got {what} at {self._time():.2f} s'
@@ -387,6 +390,15 @@ class OwnController(BaselineController):
 
     def _time(self) -> float:
         return self._steps * self._period
+
+
+def _remedy(error: Exception, observation: Observation) -> str:
+    """Return what to do about a mistake in a step that its error does not name."""
+    if 'read-only' in str(error):
+        return '; change a copy, such as observation.speeds.copy()'
+    if isinstance(error, TypeError) and 'NoneType' in str(error) and observation.future is None:
+        return '; observation.future is None without preview = True in the class'
+    return ''
 
 
 def _kept(observation: Observation) -> Observation:

@@ -32,7 +32,7 @@ from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.parameters.table import find_names
+from t3mpc_ros.parameters.table import find_names, nearest_hint
 from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
@@ -63,7 +63,9 @@ class RunResult(ShownAsTables):
     def __getitem__(self, name: str) -> Array:
         """Return a column."""
         if name not in self.columns:
-            raise ScriptError(f'column must be one of {", ".join(self.columns)}: got {name!r}')
+            known = ', '.join(self.columns)
+            hint = nearest_hint(str(name), self.columns)
+            raise ScriptError(f'column must be one of {known}: got {name!r}{hint}')
         return self.columns[name]
 
     @property
@@ -78,6 +80,9 @@ class RunResult(ShownAsTables):
         On the twin the time counts from the end of its standstill of 1.5 s.
         """
         none: Array = np.zeros(0)
+        length = float(self.columns['time'][-1]) - self.record.start
+        if not 0.0 <= after <= length:
+            raise ScriptError(f'after must be from 0 to {length:g} s: got {after:g}')
         begin = after + self.record.start
         return rms(self.error[some_rows(self.columns['time'], none, begin)])
 

@@ -347,7 +347,7 @@ def test_a_file_of_another_kind_is_left_alone(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_the_command_writes_the_same_rows(tmp_path, capsys):
     parquet = pytest.importorskip('pyarrow.parquet')
-    path = tmp_path / 'sweep.parquet'
+    path = tmp_path / 'runs' / 'sweep.parquet'  # no folder yet, as of the default output
     words = ['--set', 'gain=10.0,20.0', '--robot', 'servo', '--duration', '2', '--seeds', '1-2']
     code = main(['sweep', 'ADRC', *words, '--workers', '1', '--output', str(path)])
     assert code == 0

@@ -13,6 +13,7 @@
 # limitations under the License.
 """Wrong use is one sentence: it names the thing, the bound, the value, and what to do next."""
 
+from functools import cache
 from pathlib import Path
 import subprocess
 import sys
@@ -50,6 +51,22 @@ def unstable(time, state, command):
 
 def wrong_states(time, state, command):
     return np.zeros(3)
+
+
+def changes_what_it_sees(observation):
+    error = observation.speeds
+    error -= observation.reference
+    return error
+
+
+@cache
+def finished():
+    return t3.simulate('feed-forward', plant='servo', duration=4.0)
+
+
+@cache
+def compared():
+    return t3.compare('feed-forward', seeds=[1], plant='servo', duration=4.0, executor=1)
 
 
 class NoStep:
@@ -113,6 +130,55 @@ WRONG = {
     'a controller that raises': (
         lambda: t3.simulate(raises, **SHORT),
         r'raises raised ZeroDivisionError \(.*zero\) in raises\(\), test_wrong_use.py line \d+',
+    ),
+    'an observation that is changed': (
+        lambda: t3.simulate(changes_what_it_sees, **SHORT),
+        r'read-only\) in .*, at 0.00 s; change a copy, such as observation.speeds.copy\(\)',
+    ),
+    'a preview that was not asked for': (
+        lambda: t3.simulate(lambda seen: seen.future[0], **SHORT),
+        'observation.future is None without preview = True in the class',
+    ),
+    'array of another kind': (
+        lambda: t3.simulate(lambda seen: np.array([1j, 2j]), **SHORT),
+        r'array of shape \(2,\), .* got shape \(2,\) of complex128 at 0.00 s',
+    ),
+    'settings of a class': (
+        lambda: t3.simulate(t3.Controller(WrongArguments, {'gian': 2.0}), **SHORT),
+        'settings of WrongArguments must be gain: got gian',
+    ),
+    'misspelt column': (
+        lambda: finished()['sped_right'],
+        "column must be one of time, .* got 'sped_right'; did you mean speed_right",
+    ),
+    'CSV by another name': (lambda: finished().to_csv('a.xlsx'), 'must end in .csv: got a.xlsx'),
+    'Parquet by another name': (
+        lambda: finished().to_parquet('a.csv'),
+        'path must end in .parquet: got a.csv',
+    ),
+    'page by another name': (
+        lambda: compared().to_html('a.pdf'),
+        'path must end in .html: got a.pdf',
+    ),
+    'generator by another name': (
+        lambda: t3.chaos(tspan=(0.0, 0.1)).to_csv('a.txt'),
+        'path must end in .csv: got a.txt',
+    ),
+    'times outside of a run': (
+        lambda: finished().rmse(after=-1.0),
+        'after must be from 0 to 3.99 s: got -1',
+    ),
+    'case of a comparison': (
+        lambda: compared().table('heavy'),
+        'case must be one of nominal: got heavy',
+    ),
+    'controller of a comparison': (
+        lambda: compared().values(NoStep),
+        'controller must be one of feed-forward: got NoStep',
+    ),
+    'names with commas': (
+        lambda: t3.simulate('MPC'),
+        r'linear MPC preview, exact model; .*: got MPC',
     ),
     'a plant that diverges': (
         lambda: t3.simulate(
