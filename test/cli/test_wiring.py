@@ -356,7 +356,7 @@ TABLE = {
     ),
     'sweep': (
         {
-            'evaluation.api.parameter_sweep.sweep': SimpleNamespace(table=text, rows=[]),
+            'evaluation.api.parameter_sweep.sweep': SimpleNamespace(table=str, rows=[]),
             **SHARED,
         },
         {
@@ -372,6 +372,7 @@ TABLE = {
             '--seeds 3-4': {'sweep.seeds': (3, 4)},
             '--cases disturbance': {'sweep.cases': ('disturbance',)},
             '--output new.parquet': {'sweep.output': 'new.parquet'},
+            '--metric "with switches"': {'text': 'overall\n0 runs: runs/sweep.parquet\n'},
             '--json new.json': {'files': 'new.json'},
             **workers('sweep.executor'),
         },

@@ -38,10 +38,10 @@ measured_patrol = cache(patrol_comparison.measured_patrol)
 def sweep(folder, begun, monkeypatch):
     pytest.importorskip('pyarrow')
 
-    def measured(job):
+    def measured(job, numbers):
         begun()
         scenario, method = job
-        return {'overall': scenario.seed / method.parameters.gain}
+        return {'overall': scenario.seed / method.parameters.gain, 'error': ''}
 
     monkeypatch.setattr(parameter_sweep, 'measured_run', measured)
     path, values = folder / 'sweep.parquet', {'gain': [10.0, 20.0]}
