@@ -46,9 +46,9 @@ from mcap.records import (
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
+from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.metadata import NO_START_NS, BagMetadata, FileInformation, TopicInformation
 from t3mpc_ros.bag.qos import QosError, QosProfile, profiles_from_yaml
-from t3mpc_ros.bag.schema import BagError
 
 MCAP_SUFFIX = '.mcap'
 MAGIC = b'\x89MCAP0\r\n'

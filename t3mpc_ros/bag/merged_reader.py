@@ -18,10 +18,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from t3mpc_ros.bag.mcap_file import RECEIVE_TIME, SerializedMessage
+from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.qos import TRANSIENT_LOCAL
 from t3mpc_ros.bag.reader import BagFile, BagReader, merge_streams, merge_topics
-from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter
 from t3mpc_ros.geometry.types import NANOSECONDS
 

@@ -45,9 +45,9 @@ from t3mpc_ros.bag.mcap_file import (
     read_errors,
     read_mcap_file,
 )
+from t3mpc_ros.bag.message_definitions import BagError, DataError, UnknownTopicError
 from t3mpc_ros.bag.metadata import METADATA_FILE_NAME, TopicInformation
 from t3mpc_ros.bag.qos import UNLIMITED, QosProfile
-from t3mpc_ros.bag.schema import BagError, DataError, UnknownTopicError
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
 
 Integers = NDArray[np.int64]

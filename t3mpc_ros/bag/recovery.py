@@ -50,8 +50,8 @@ from t3mpc_ros.bag.mcap_file import (
     read_summary,
     record_head,
 )
+from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.metadata import read_origin, write_metadata
-from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 LIBRARY_MARK = 'recovered by t3mpc_ros'

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 import re
 
-from t3mpc_ros.bag.schema import BagError
+from t3mpc_ros.bag.message_definitions import BagError
 
 
 class TopicFilterError(BagError):

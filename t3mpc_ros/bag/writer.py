@@ -26,6 +26,12 @@ from mcap.writer import CompressionType, Writer
 
 from t3mpc_ros.atomic_file import sync_folder
 from t3mpc_ros.bag.mcap_file import MCAP_SUFFIX, Attachment, collect_metadata
+from t3mpc_ros.bag.message_definitions import (
+    BagError,
+    DataError,
+    MessageDefinitions,
+    UnknownTopicError,
+)
 from t3mpc_ros.bag.metadata import (
     BagMetadata,
     FileInformation,
@@ -33,7 +39,6 @@ from t3mpc_ros.bag.metadata import (
     write_metadata,
 )
 from t3mpc_ros.bag.qos import QosProfile, dump_yaml, profiles_to_yaml
-from t3mpc_ros.bag.schema import BagError, DataError, MessageDefinitions, UnknownTopicError
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 _MEDIA_TYPES = {'.npz': 'application/zip', '.yaml': 'application/yaml', '.csv': 'text/csv'}

@@ -456,7 +456,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
 
 def run_replay(options: argparse.Namespace) -> int:
     """Replay the run, print the comparison and the speed, and return 0."""
-    from t3mpc_ros.bag.run.model_file import load_model
+    from t3mpc_ros.bag.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
     from t3mpc_ros.evaluation.process_replay.controller_replay import (
         OPEN_LOOP,
@@ -547,7 +547,7 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
 
 def run_compare(options: argparse.Namespace) -> int:
     """Print the comparison; return 0 when all is within the tolerances, 3 otherwise."""
-    from t3mpc_ros.bag.run.model_file import load_model
+    from t3mpc_ros.bag.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
     from t3mpc_ros.evaluation.process_replay.controller_replay import (
         OPEN_LOOP,

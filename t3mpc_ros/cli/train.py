@@ -63,7 +63,7 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the model, print its skill and return 0."""
-    from t3mpc_ros.bag.run.model_file import save_model
+    from t3mpc_ros.bag.model_file import save_model
 
     if options.bags:
         if options.robot != 'servo':
@@ -90,7 +90,7 @@ def run_bags(options: argparse.Namespace) -> int:
 
     Raises as :func:`run`.
     """
-    from t3mpc_ros.bag.run.model_file import save_model
+    from t3mpc_ros.bag.model_file import save_model
     from t3mpc_ros.evaluation.training.recorded_runs import fit_bags
 
     model = fit_bags(options.bags, keep_predictor=options.keep_predictor, count=options.folds)

@@ -28,8 +28,8 @@ from sensor_msgs.msg import Range
 from std_msgs.msg import Float64, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
-from t3mpc_ros.bag.run.journal import Journal, parameters_to_json
-from t3mpc_ros.bag.run.model_file import ModelError, find_model, load_model, save_model
+from t3mpc_ros.bag.controller_journal import Journal, parameters_to_json
+from t3mpc_ros.bag.model_file import ModelError, find_model, load_model, save_model
 from t3mpc_ros.control.controller import (
     SCALAR_NAMES,
     Controller,

@@ -30,6 +30,7 @@ from t3mpc_ros.bag.merged_reader import (
     alignment_offsets_ns,
     transient_local_count,
 )
+from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.player import (
     PlaybackParameters,
     PlaybackTimeline,
@@ -46,7 +47,6 @@ from t3mpc_ros.bag.qos import (
     read_qos_overrides,
 )
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter, parse_remappings
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.parameters.table import ParameterError

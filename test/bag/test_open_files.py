@@ -34,13 +34,13 @@ from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag import writer as writer_module
 from t3mpc_ros.bag.mcap_file import Attachment, has_mcap_magic, read_mcap_file
 from t3mpc_ros.bag.merged_reader import MergedReader
+from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions
 from t3mpc_ros.bag.metadata import BagMetadata, read_origin, write_metadata
+from t3mpc_ros.bag.model_file import ModelError, load_model, save_model
 from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline, ReadAheadQueue
 from t3mpc_ros.bag.qos import QosError, read_qos_overrides
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery import recover_bag
-from t3mpc_ros.bag.run.model_file import ModelError, load_model, save_model
-from t3mpc_ros.bag.schema import BagError, MessageDefinitions
 from t3mpc_ros.bag.writer import SYNC_PERIOD_NS, BagWriter, read_attachment
 from t3mpc_ros.evaluation.result_file import ResultFile
 from t3mpc_ros.radio.protocol.authentication import read_key

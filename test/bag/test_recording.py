@@ -31,6 +31,7 @@ from t3mpc_ros.bag.mcap_file import (
     message_loss_record,
     read_mcap_file,
 )
+from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.player import PlaybackParameters
 from t3mpc_ros.bag.reader import open_bag
@@ -47,7 +48,6 @@ from t3mpc_ros.bag.recording.snapshot import (
     unused_folder,
 )
 from t3mpc_ros.bag.recording.writer_thread import WriterThread
-from t3mpc_ros.bag.schema import BagError, MessageDefinitions
 from t3mpc_ros.bag.topic_filter import TopicFilter, TopicFilterError
 from t3mpc_ros.bag.writer import (
     AttachmentError,

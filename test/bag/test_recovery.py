@@ -38,6 +38,7 @@ from support.long_tests import few_of
 
 from t3mpc_ros.bag import recovery
 from t3mpc_ros.bag.mcap_file import MAGIC, read_mcap_file
+from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery import (
@@ -51,7 +52,6 @@ from t3mpc_ros.bag.recovery import (
     recover_bag,
     recover_file,
 )
-from t3mpc_ros.bag.schema import MessageDefinitions
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.bag import size_text

@@ -23,8 +23,8 @@ from unittest.mock import MagicMock
 
 import pytest
 
+from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.recovery import Damage, FileResult, RecoveryOutputError, RecoveryResult
-from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.cli import process_group
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup

@@ -109,7 +109,7 @@ def context(value):
     return lambda **_: nullcontext(value)
 
 
-SHARED = {'evaluation.api.run_executors.cluster': context(5)}
+SHARED = {'evaluation.api.dask_workers.cluster': context(5)}
 CSV = 'time,right,left\n' + ''.join(f'{0.01 * k:.2f},1.0,2.0\n' for k in range(300))
 OWN_RATE = tuple([0.0, 0.0] for _ in range(6100))
 """Slope of that reference over a run and a second."""
@@ -187,7 +187,7 @@ TRAIN = {
     'evaluation.training.simulated_runs.fit_simulated_runs': ({}, MODEL),
     'evaluation.training.simulated_runs.assess': '',
     'evaluation.training.recorded_runs.fit_bags': MODEL,
-    'bag.run.model_file.save_model': None,
+    'bag.model_file.save_model': None,
 }
 OF_BAGS = {
     'bag': {'fit_bags.folders.1': 'bag'},
@@ -204,7 +204,7 @@ FAULTS = {
 REPLAYED = SimpleNamespace(steps=100, parameters=SimpleNamespace(rate=100.0))
 OUTCOME = SimpleNamespace(table=text, same=True, to_dict=dict)
 REPLAY = {
-    'bag.run.model_file.load_model': {'w': np.ones(1)},
+    'bag.model_file.load_model': {'w': np.ones(1)},
     'evaluation.process_replay.controller_replay.load_inputs': 'inputs',
     'evaluation.process_replay.controller_replay.make_controllers': [],
     'evaluation.process_replay.controller_replay.replay_controller': REPLAYED,

@@ -405,7 +405,7 @@ def test_the_certificate_holds_along_a_noise_free_run():
 
 
 def test_the_weights_survive_saving_and_loading(tmp_path):
-    from t3mpc_ros.bag.run.model_file import ModelError, load_model, save_model
+    from t3mpc_ros.bag.model_file import ModelError, load_model, save_model
 
     def reference(t):
         return np.array([2.0 * math.sin(t), 1.0]), np.array([2.0 * math.cos(t), 0.0])
@@ -431,7 +431,7 @@ def test_the_weights_survive_saving_and_loading(tmp_path):
 
 
 def test_a_model_of_another_format_is_rejected(tmp_path, monkeypatch):
-    from t3mpc_ros.bag.run import model_file
+    from t3mpc_ros.bag import model_file
 
     path = tmp_path / 'old.npz'
     monkeypatch.setattr(model_file, 'FORMAT', 0)

@@ -28,7 +28,7 @@ from support.golden_bags import ControllerBag, RecordedController
 from support.properties import PROPERTY
 
 from bench import other_robots
-from t3mpc_ros.bag.run.journal import Event
+from t3mpc_ros.bag.controller_journal import Event
 from t3mpc_ros.control.actuation import (
     LEAST_SHORTFALL,
     LimitParameters,

@@ -36,10 +36,15 @@ from support.long_tests import few_of
 from support.other_parameters import with_other_value
 from support.robot_bags import write_with_records
 
+from t3mpc_ros.bag.controller_journal import (
+    Event,
+    Journal,
+    parameters_from_json,
+    parameters_to_json,
+)
+from t3mpc_ros.bag.message_definitions import BagError
+from t3mpc_ros.bag.model_file import save_model
 from t3mpc_ros.bag.reader import open_bag, read_columns
-from t3mpc_ros.bag.run.journal import Event, Journal, parameters_from_json, parameters_to_json
-from t3mpc_ros.bag.run.model_file import save_model
-from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.writer import BagWriter, DataError
 from t3mpc_ros.cli.bag import add_compare_parser, add_replay_parser
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters

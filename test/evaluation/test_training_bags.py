@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from support.training_runs import START, STEP, TrainingRun
 
-from t3mpc_ros.bag.run.model_file import load_model, read_model_header
+from t3mpc_ros.bag.model_file import load_model, read_model_header
 from t3mpc_ros.cli.bag import add_train_parser
 from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.evaluation.drivers import MethodSpec

@@ -20,15 +20,15 @@ import numpy as np
 import pytest
 from support.training_runs import GEOMETRY, TrainingRun
 
-from t3mpc_ros.bag.run import model_file
-from t3mpc_ros.bag.run.model_file import (
+from t3mpc_ros.bag import model_file
+from t3mpc_ros.bag.message_definitions import BagError
+from t3mpc_ros.bag.model_file import (
     ModelError,
     find_model,
     load_model,
     read_model_header,
     save_model,
 )
-from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.controller import Controller, ControllerParameters

@@ -29,8 +29,8 @@ from support.launch_files import arguments_of, nodes_of
 from support.waiting import wait_for_end, wait_for_text
 import yaml
 
+from t3mpc_ros.bag.model_file import find_model, load_model, read_model_header
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.run.model_file import find_model, load_model, read_model_header
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.process_group import installed_file
 from t3mpc_ros.control.controller import Controller

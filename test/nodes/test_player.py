@@ -38,9 +38,9 @@ from support.ros_graph import LATCHED, diagnostic, diagnostic_level, odometry, r
 from support.waiting import wait_until
 
 from t3mpc_ros.bag.merged_reader import MergedReader
+from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.base_node import OK, WARN

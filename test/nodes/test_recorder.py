@@ -37,8 +37,8 @@ from support.ros_graph import (
 )
 from support.waiting import wait_for_acknowledgement
 
+from t3mpc_ros.bag.model_file import find_model, load_model, save_model
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.run.model_file import find_model, load_model, save_model
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
 from t3mpc_ros.geometry.types import ORIGIN

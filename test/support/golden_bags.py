@@ -26,8 +26,8 @@ import zlib
 
 import numpy as np
 
-from t3mpc_ros.bag.run.journal import Journal
-from t3mpc_ros.bag.run.model_file import load_model
+from t3mpc_ros.bag.controller_journal import Journal
+from t3mpc_ros.bag.model_file import load_model
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, StepperControllerParameters
 from t3mpc_ros.evaluation.process_replay.controller_replay import CONTROLLER, FIELDS, output_row
 from t3mpc_ros.evaluation.process_replay.replay_bag import (

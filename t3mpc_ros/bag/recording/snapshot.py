@@ -20,9 +20,14 @@ from pathlib import Path
 import re
 
 from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
+from t3mpc_ros.bag.message_definitions import (
+    BagError,
+    DataError,
+    MessageDefinitions,
+    UnknownTypeError,
+)
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.recording.writer_thread import WriterThread
-from t3mpc_ros.bag.schema import BagError, DataError, MessageDefinitions, UnknownTypeError
 from t3mpc_ros.bag.writer import BagWriter
 
 SNAPSHOT_RECORD = 'snapshot'

@@ -22,7 +22,7 @@ import threading
 from typing import TypeVar
 
 from t3mpc_ros.bag.mcap_file import SerializedMessage
-from t3mpc_ros.bag.schema import BagError
+from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.writer import BagWriter
 
 T = TypeVar('T')

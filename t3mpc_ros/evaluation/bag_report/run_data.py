@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.bag.message_definitions import DataError
 from t3mpc_ros.bag.reader import (
     CDR_LAYOUTS,
     BagReader,
@@ -28,7 +29,6 @@ from t3mpc_ros.bag.reader import (
     missing_sample_ratio,
     read_columns,
 )
-from t3mpc_ros.bag.schema import DataError
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, gaps, several_robots
 from t3mpc_ros.evaluation.bag_report.link_history import (

@@ -26,15 +26,15 @@ import zlib
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.bag.mcap_file import message_loss_notes
-from t3mpc_ros.bag.reader import BagReader, TopicColumns, open_bag, read_columns
-from t3mpc_ros.bag.run.journal import (
+from t3mpc_ros.bag.controller_journal import (
     COMMAND_EVENTS,
     Event,
     parameters_from_json,
     reading_from_value,
 )
-from t3mpc_ros.bag.run.model_file import load_model
+from t3mpc_ros.bag.mcap_file import message_loss_notes
+from t3mpc_ros.bag.model_file import load_model
+from t3mpc_ros.bag.reader import BagReader, TopicColumns, open_bag, read_columns
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, ControllerParameters, Status
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import topic_roles
@@ -95,7 +95,7 @@ class ControllerSession:
     first: int
     """Index of its first row over all sessions."""
     rows: Integers
-    """The journal, as in :data:`~t3mpc_ros.bag.run.journal.JOURNAL_COLUMNS`, shape (n, 5)."""
+    """The journal, shape (n, 5), see :data:`~t3mpc_ros.bag.controller_journal.JOURNAL_COLUMNS`."""
     taken: ConsumedMessages
     exact: Flags
     """Whether all inputs are in the bag, so that the output must be equal, shape (n,)."""
@@ -433,7 +433,7 @@ def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> Cons
     """Return the messages that the controller processed, by its journal.
 
     ``rows`` is the journal of one session of the controller, shape (n, 5), see
-    :mod:`t3mpc_ros.bag.run.journal`; stamps of the messages are in order of receipt.
+    :mod:`t3mpc_ros.bag.controller_journal`; stamps of the messages are in order of receipt.
     """
     number, event, stamp, handed, value = rows.T
     steps = event == Event.STEP

@@ -26,9 +26,9 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from t3mpc_ros.bag.merged_reader import MergedReader
+from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline, ReadAheadQueue
 from t3mpc_ros.bag.qos import read_qos_overrides
-from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode

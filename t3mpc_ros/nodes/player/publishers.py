@@ -29,9 +29,9 @@ from rclpy.qos import (
 )
 
 from t3mpc_ros.bag.merged_reader import MergedReader
+from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.player import VELOCITY_TYPES, velocity_command_risk
 from t3mpc_ros.bag.qos import UNLIMITED, QosProfile, adapt_offer_to_recorded_offers
-from t3mpc_ros.bag.schema import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.base_node import BaseNode

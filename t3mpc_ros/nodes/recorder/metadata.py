@@ -17,7 +17,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from t3mpc_ros.bag.mcap_file import Attachment
-from t3mpc_ros.bag.run.model_file import find_model
+from t3mpc_ros.bag.model_file import find_model
 from t3mpc_ros.bag.writer import AttachmentError, read_attachment
 from t3mpc_ros.parameters.provenance import provenance
 

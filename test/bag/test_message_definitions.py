@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from t3mpc_ros.bag.schema import (
+from t3mpc_ros.bag.message_definitions import (
     SEPARATOR,
     BagError,
     MessageDefinitions,
