@@ -442,6 +442,9 @@ counted by the wheels: only then that difference of the turns says more than the
 that slips turns a robot, too."""
 ON_THE_SPOT, DRIVING = 0.015, 0.05
 """Commanded speeds (m/s) above which the way counts, and the difference of the turns."""
+TIGHT = 0.1
+"""Radius of a curve (m) below which the robot turns rather than drives: the correction of a pose
+may be a fifth of the way of a point beside it, and most of that of its centre."""
 RECOVERY_TIME = 5.0
 """Time of driving as commanded after which earlier pauses do not count, s."""
 
@@ -482,7 +485,7 @@ class ContactMonitor:
         self._unlike += (ahead - odometry.twist.linear * elapsed) ** 2
         self._steps += 1
         # On the spot a pose may be corrected, and a tyre slip, without any contact.
-        if abs(command.linear) > ON_THE_SPOT:
+        if abs(command.linear) > max(ON_THE_SPOT, TIGHT * abs(command.angular)):
             self._asked += command.linear * elapsed
             self._ahead += ahead
             self._left += math.cos(middle) * y - math.sin(middle) * x

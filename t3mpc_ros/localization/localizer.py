@@ -63,6 +63,9 @@ LONGEST_UPDATE = 60.0
 of its gyro."""
 LARGEST_STEP = 1.0
 """Distance between two messages of the odometry from which on it has restarted, m."""
+JUMP_STEP, JUMP_SPEED = (0.1, 0.3), (3.0, 12.0)
+"""Motion between two messages (m, rad), and speeds (m/s, rad/s) of robots that are faster than any
+of this kind, beyond both of which the odometry has jumped, and the robot has not."""
 SYSTEMATIC = 0.01, 0.01, 0.007
 """Standard deviations (m, m, rad) of what particles do not know, because it repeats: offsets of
 the sensors and the age of their readings; the errors measured on the twin."""
@@ -270,13 +273,16 @@ class Localizer:
         if last is not None and is_out_of_order(stamp_ns, last_ns, DISORDER):
             return False
         self._odometry, self._stamp_ns = pose, stamp_ns
-        restarted = last is not None and (
-            stamp_ns < last_ns or has_moved(last, pose, LARGEST_STEP, math.inf)
-        )
-        if restarted:
+        if last is not None and has_jumped(last, pose, stamp_ns - last_ns):
             self._pending.clear()
             self._updated, self._updated_ns = pose, stamp_ns
-            return False
+            if self.result is None:
+                return False
+            frame = frame_kept(self.result.odometry_frame, last, pose)
+            self.result = self.result._replace(
+                stamp_ns=stamp_ns, pose=pose_in(frame, pose), odometry_frame=frame
+            )
+            return True
         if self._updated is None:
             return self._publish(pose)
         parameters = self.parameters
@@ -380,9 +386,15 @@ class PoseCorrection:
 
     def step(self, stamp_ns: int, odometry: Pose, localizer: Localizer) -> Pose | None:
         """Return the pose on the map of a pose of the odometry; None: the place is not known."""
-        elapsed = min(max((stamp_ns - self._stamp_ns) / NANOSECONDS, 0.0), CORRECTION_TIME)
+        elapsed_ns = stamp_ns - self._stamp_ns
+        elapsed = min(max(elapsed_ns / NANOSECONDS, 0.0), CORRECTION_TIME)
         self._stamp_ns = stamp_ns
         last, self._odometry = self._odometry or odometry, odometry
+        jumped = has_jumped(last, odometry, elapsed_ns)
+        if jumped and self._frame is not None and self._target is not None:
+            self._frame = frame_kept(self._frame, last, odometry)
+            self._target = frame_kept(self._target, last, odometry)
+            return pose_in(self._frame, odometry)
         way = math.hypot(odometry.x - last.x, odometry.y - last.y)
         way += CORRECTION_ARM * abs(wrap_angle(odometry.yaw - last.yaw))
         most = CORRECTION_SPEED * elapsed
@@ -409,6 +421,18 @@ class PoseCorrection:
         pose = Pose(pose.x + move * x, pose.y + move * y, wrap_angle(pose.yaw + rotate * turn))
         self._frame = frame_between(pose, odometry)
         return pose
+
+
+def has_jumped(last: Pose, new: Pose, elapsed_ns: int) -> bool:
+    """Return whether the odometry has restarted or was set, seen by its time or its motion."""
+    elapsed = elapsed_ns / NANOSECONDS
+    far = min(JUMP_STEP[0] + JUMP_SPEED[0] * elapsed, LARGEST_STEP)
+    return elapsed_ns < 0 or has_moved(last, new, far, JUMP_STEP[1] + JUMP_SPEED[1] * elapsed)
+
+
+def frame_kept(frame: Pose, last: Pose, new: Pose) -> Pose:
+    """Return the origin of an odometry that has jumped while the robot was where it was."""
+    return frame_between(pose_in(frame, last), new)
 
 
 def pose_in(frame: Pose, pose: Pose) -> Pose:

@@ -29,6 +29,7 @@ from t3mpc_ros.localization.localizer import (
     Localizer,
     LocalizerParameters,
     PoseCorrection,
+    pose_in,
 )
 from t3mpc_ros.localization.occupancy_map import map_of_world
 from t3mpc_ros.localization.particle_filter import moved_pose, odometry_motion
@@ -206,19 +207,33 @@ def test_a_pose_that_is_given_is_taken():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize('restart', ['pose', 'stamp'])
-def test_a_restart_of_the_odometry_moves_no_particle(restart):
-    """A board that restarts counts from zero again; the robot has not moved."""
-    localizer, drive = make_localizer(), Drive()
+@pytest.mark.parametrize('jump', ['far', 'in yaw', 'near', 'stamp'])
+def test_odometry_that_jumps_moves_neither_particle_nor_pose(jump):
+    """A board that restarts counts from zero again; the robot has not moved.
+
+    A jump of 0.76 m and 33 degrees, below a metre, was taken for a motion: the robot was lost for
+    five seconds, and the used pose 0.2 m off for half a minute.
+    """
+    localizer, drive, correction = make_localizer(), Drive(), PoseCorrection()
     follow(localizer, drive, 20.0)
-    before = localizer.filter.poses.copy()
-    drive.odometry = Pose(3.0, -2.0, 1.0)
-    if restart == 'stamp':  # counted from zero again, near where it was
-        x, y, yaw = localizer._odometry
-        drive.odometry = Pose(x - 0.4, y + 0.2, yaw)
-    drive.stamp_ns = drive.stamp_ns if restart == 'pose' else 0
-    assert not localizer.add_odometry(drive.stamp_ns, drive.odometry)
-    assert np.array_equal(localizer.filter.poses, before)
+    correction.step(drive.stamp_ns, drive.odometry, localizer)
+    at, before = localizer.filter.poses.copy(), drive.odometry
+    used = pose_in(localizer.result.odometry_frame, before)
+    x, y, yaw = before
+    drive.odometry = {
+        'far': Pose(3.0, -2.0, 1.0),
+        'in yaw': Pose(x, y, yaw - 1.2),
+        'near': Pose(x + 0.57, y + 0.5, yaw + 0.58),
+        'stamp': Pose(x - 0.4, y + 0.2, yaw),
+    }[jump]
+    drive.stamp_ns = 0 if jump == 'stamp' else drive.stamp_ns + 10_000_000
+    kept = correction.step(drive.stamp_ns, drive.odometry, localizer)
+    assert kept == pytest.approx(used, abs=1e-9)
+    assert localizer.add_odometry(drive.stamp_ns, drive.odometry)
+    assert localizer.result.pose == pytest.approx(used, abs=1e-9)
+    assert np.array_equal(localizer.filter.poses, at)
+    kept = correction.step(drive.stamp_ns + 10_000_000, drive.odometry, localizer)
+    assert kept == pytest.approx(used, abs=1e-9)
     assert rms(follow(localizer, drive, 10.0))[0] < 0.03
 
 
@@ -398,16 +413,26 @@ def test_the_corrected_pose_jumps_where_the_robot_is_found():
 
 @pytest.mark.parametrize('away', [(0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
 def test_a_correction_is_no_contact(away):
-    """A robot backed off, twice, from nothing, and then took itself to be walled in for ever."""
+    """A robot backed off, twice, from nothing, and then took itself to be walled in for ever.
+
+    In tight curves it still did so: most of the way of its centre is then the correction.
+    """
     monitor, correction, pose, now = ContactMonitor(), PoseCorrection(), ORIGIN, STANDSTILL
     frame, touches = ORIGIN, []
-    for k in range(10_000):
-        phase = k // 400 % 5
-        wanted = ((0.3, 0.0), (0.0, 2.0), (0.011, 1.2), (0.1, 0.5), (0.02, 0.0))[phase]
+    for k in range(17_000):
+        phase = k // 400 % 6
+        wanted = [
+            (0.3, 0.0),
+            (0.0, 2.0),
+            (0.011, 1.2),
+            (0.1, 0.5),
+            (0.02, 0.0),
+            (0.04, 2.0),
+        ][phase]
         step = [min(max(w - n, -a), a) for w, n, a in zip(wanted, now, (0.01, 0.14), strict=True)]
         now = BodyTwist(now.linear + step[0], now.angular + step[1])
         pose = advance_pose(pose, now, 0.01)
-        if k % 2400 == 0:  # at each of them once
+        if k % 2800 == 0:  # at each of them once
             frame = Pose(frame.x + away[0], frame.y + away[1], frame.yaw)
         localizer = SimpleNamespace(
             result=SimpleNamespace(odometry_frame=frame), state=Localization.LOCALIZED

@@ -22,7 +22,11 @@ import numpy as np
 import pytest
 from support.properties import STATEFUL
 
-from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
+from t3mpc_ros.geometry.kinematics import (
+    WheelGeometry,
+    twist_from_wheels,
+    wheels_from_twist,
+)
 from t3mpc_ros.geometry.types import BodyTwist, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters
@@ -56,7 +60,9 @@ def test_command_within_limits_passes_unchanged_without_delay():
 
 def test_twist_and_wheel_speed_commands_are_equivalent():
     limiter = make_fast_limiter()
-    assert limiter.accept(RobotCommand.from_twist(BodyTwist(0.2, 1.0), GEOMETRY, 0), 0) == ''
+    assert (
+        limiter.accept(RobotCommand(wheels_from_twist(BodyTwist(0.2, 1.0), GEOMETRY), 0), 0) == ''
+    )
     twist = twist_from_wheels(limiter.advance(0, 0.01).wheels, GEOMETRY)
     assert twist == pytest.approx((0.2, 1.0))
 
@@ -73,7 +79,7 @@ def test_limits_scale_both_wheels_and_keep_curvature():
         )
         limiter = CommandLimiter(limits, GEOMETRY)
         wanted = BodyTwist(*(generator.uniform(-1.0, 1.0, 2) * 10.0 ** generator.uniform(-2, 6)))
-        limiter.accept(RobotCommand.from_twist(wanted, GEOMETRY, 0), 0)
+        limiter.accept(RobotCommand(wheels_from_twist(wanted, GEOMETRY), 0), 0)
         limited_command = limiter.advance(0, 1e4)
         twist = twist_from_wheels(limited_command.wheels, GEOMETRY)
         factor = twist.linear / wanted.linear
@@ -99,7 +105,7 @@ def test_non_finite_command_is_rejected_and_stops_the_robot(bad):
         assert limited_command.target == (0.0, 0.0)
         assert 'not finite' in limited_command.reason
     assert 'not finite' in limiter.accept(
-        RobotCommand.from_twist(BodyTwist(0.1, bad), GEOMETRY, 0), 0
+        RobotCommand(wheels_from_twist(BodyTwist(0.1, bad), GEOMETRY), 0), 0
     )
     assert limiter.accept(command(5.0, 5.0), 0) == ''
     assert limiter.advance(0, 0.01).reason == ''
@@ -109,7 +115,7 @@ def test_overflowing_command_is_rejected_as_non_finite():
     limiter = make_fast_limiter()
     assert 'not finite' in limiter.accept(command(1.7e308, 1.7e308), 0)
     assert 'not finite' in limiter.accept(
-        RobotCommand.from_twist(BodyTwist(1.7e308, 0.0), GEOMETRY, 0), 0
+        RobotCommand(wheels_from_twist(BodyTwist(1.7e308, 0.0), GEOMETRY), 0), 0
     )
     assert limiter.advance(0, 0.01).wheels == (0.0, 0.0)
 

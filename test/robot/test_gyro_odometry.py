@@ -157,7 +157,8 @@ def test_normalized_estimation_error_matches_the_covariance():
 
 @pytest.mark.compiled
 @pytest.mark.slow
-def test_standstill_corrects_half_of_the_yaw_drift():
+def test_a_standstill_does_not_make_the_pose_jump():
+    """After 12 min without one it moved the pose by 0.76 m and 33 degrees in a period."""
     count = 40
     changes = {'gyro_scale_tolerance': 0.0, 'gyro_bias_drift': 5e-4}
     robots, odometries = Robots(count, 2), make_odometries(count, **changes)
@@ -167,13 +168,14 @@ def test_standstill_corrects_half_of_the_yaw_drift():
         robots.move(*(RADIUS * PERIOD * speeds), PERIOD)
         for index, sample in enumerate(robots.gyro()):
             odometries[index].update(*(PERIOD * speeds[:, index]), sample, PERIOD)
-    before = robots.yaw_errors(odometries)
+    poses, before = [odometry.pose for odometry in odometries], [each.bias for each in odometries]
     robots.stand(odometries, 2.0)
-    after = robots.yaw_errors(odometries)
-    # W(T) of a random walk W explains half of int W dt: variance T³/3 becomes T³/12.
-    assert np.std(after) / np.std(before) == pytest.approx(0.5, abs=0.12)
+    jumps = np.abs(np.array([odometry.pose for odometry in odometries]) - poses)
+    assert np.hypot(*jumps[:, :2].T).max() < 0.021
+    assert 0.01 < jumps[:, 2].max() < 0.041
+    assert np.std(robots.bias - before) > 5.0 * np.std(robots.bias - [o.bias for o in odometries])
     sure = np.sqrt([odometry.covariance[2, 2] for odometry in odometries])
-    assert np.std(after / sure) == pytest.approx(1.0, abs=0.25)
+    assert np.std(robots.yaw_errors(odometries) / sure) == pytest.approx(1.0, abs=0.25)
 
 
 @pytest.mark.parametrize('gyro_state', ['none', 'disabled', 'unknown bias'])
@@ -295,7 +297,7 @@ def test_bias_is_estimated_at_standstill_and_again_after_a_jump():
 
 @pytest.mark.parametrize('part', few_of([0.25, 0.5, 0.75]))
 @pytest.mark.slow
-def test_bias_jump_in_motion_is_half_corrected_at_standstill(part):
+def test_a_bias_jump_in_motion_is_in_the_covariance(part):
     """A jump of 1 deg/s is not flagged; the next standstill measures it, but not its time."""
     robots, odometries = Robots(1, 8), make_odometries()
     robots.stand(odometries, 3.0)
@@ -305,11 +307,11 @@ def test_bias_jump_in_motion_is_half_corrected_at_standstill(part):
     drifted = robots.yaw_errors(odometries)[0]
     assert drifted == pytest.approx((1.0 - part) * 10.0 * DEGREE, abs=0.6 * DEGREE)
     robots.stand(odometries, 3.0)
-    left = robots.yaw_errors(odometries)[0]
-    assert drifted - left == pytest.approx(4.5 * DEGREE, abs=1.0 * DEGREE)
+    # Until the jump is confirmed it looks like a robot that somebody turns.
+    assert robots.yaw_errors(odometries)[0] == pytest.approx(drifted, abs=2.5 * DEGREE)
+    assert odometries[0].bias == pytest.approx(robots.bias[0], abs=0.01 * DEGREE)
     sure = math.sqrt(odometries[0].covariance[2, 2])
-    assert abs(left) < 2.0 * sure
-    assert sure == pytest.approx(10.0 * DEGREE / math.sqrt(12.0), rel=0.3)
+    assert sure == pytest.approx(10.0 * DEGREE / math.sqrt(3.0), rel=0.3)
 
 
 def test_large_bias_jump_in_motion_is_flagged():
