@@ -75,6 +75,13 @@ SURELY_SEEN = 0.7
 """Share of its range up to which a sensor sees every surface across its beam."""
 SURFACE_HALF_WIDTH, SURFACE_DEPTH = 0.04, 0.1
 """Half the width of what surely is across a beam, and its largest depth, m."""
+NEW_WITHIN, NEW_APART, NEW_EXTENT = 0.6, 0.1, 0.2
+"""Reading up to which a hit on free floor is a thing that has come (m), its least distance from
+what was there (m), and the distance up to which it may extend to its sides and behind (m): one
+beam sees one point of it."""
+NEW_FOR, JUST_SEEN = 2.0, 0.3
+"""Time for which a thing has come, and may move on (s), and time for which floor around it that
+was seen to be free is so (s)."""
 CLEARINGS = 4
 """Rays that must pass over an occupied cell to clear it."""
 DIRECTIONS = 48
@@ -398,8 +405,38 @@ def add_ray(
     # Nearer than the sensor measures: only if nothing is known to be there already.
     if hit < 0.1 and has_obstacle(grid.cells, row, column, 4):
         return
+    if hit < NEW_WITHIN and has_come(grid, now - NEW_FOR, row, column, int(NEW_APART / size)):
+        forget_around(grid, now - JUST_SEEN, row, column, int(NEW_EXTENT / size))
     grid.cells[row, column] = OCCUPIED
     grid.cleared[row, column] = 0
+
+
+@kernel
+def has_come(grid: MapGrid, since: float, row: int, column: int, reach: int) -> bool:
+    """Return whether a cell was free and nothing was near it at an instant (s)."""
+    count = grid.cells.shape[0]
+    if since <= 0.0 or (grid.cells[row, column] != FREE and grid.seen[row, column] < since):
+        return False
+    for up in range(max(row - reach, 0), min(row + reach + 1, count)):
+        for right in range(max(column - reach, 0), min(column + reach + 1, count)):
+            state = grid.cells[up, right]
+            # An obstacle was last seen to be free before it came.
+            if state == KNOWN or (state == OCCUPIED and grid.seen[up, right] < since):
+                return False
+    return True
+
+
+@kernel
+def forget_around(grid: MapGrid, since: float, row: int, column: int, reach: int) -> None:
+    """Count free floor around a cell as unseen, but where a ray has passed since an instant."""
+    count = grid.cells.shape[0]
+    for up in range(max(row - reach, 0), min(row + reach + 1, count)):
+        for right in range(max(column - reach, 0), min(column + reach + 1, count)):
+            apart = (up - row) ** 2 + (right - column) ** 2
+            if apart > reach * reach or grid.seen[up, right] >= since:
+                continue
+            if grid.cells[up, right] == FREE:
+                grid.cells[up, right] = UNKNOWN
 
 
 @dataclass(frozen=True)

@@ -304,3 +304,84 @@ def test_it_begins_with_the_obstacles_of_a_saved_map():
             keep_out.map.add_reading(1, 0.75, Pose(0.0, 0.02, 0.0))
         assert _state(keep_out, 0.51, -0.03) == FREE
         keep_out.reset()
+
+
+# -- things that come ------------------------------------------------------------------------
+
+
+class Floor:
+    """A keep-out on floor that was seen free for ten seconds, in an open place."""
+
+    def __init__(self, obstacles=None):
+        self.keep_out = _seen(obstacles)
+        self.map = self.keep_out.map
+        self.map.now = 10.0
+        self.map.grid.seen[self.map.grid.cells == FREE] = 9.0
+
+    def hit(self, distance, seconds=0.0):
+        """Let sensor 0 of a robot at the origin, at (0.10, 0.05), read a distance (m)."""
+        self.map.now += seconds
+        self.keep_out.map.add_reading(0, distance, ORIGIN)
+
+    def is_free(self, x, y):
+        return _state(self.keep_out, x, y) == FREE
+
+
+def test_floor_around_a_thing_that_came_counts_as_unseen():
+    """A pillar 30 cm wide is one hit for a beam: the robot turned from it into its side."""
+    floor = Floor()
+    floor.hit(0.4)
+    x, y = 0.5, 0.05
+    assert _state(floor.keep_out, x, y) == OCCUPIED
+    hidden = [(x + 0.18, y), (x, y + 0.18), (x, y - 0.18), (x - 0.08, y + 0.15)]
+    assert not any(floor.is_free(*place) for place in hidden)
+    assert floor.is_free(x + 0.24, y)
+    assert floor.is_free(x, y + 0.24)
+    assert floor.is_free(0.3, y)  # the beam has just passed over it
+
+
+def test_floor_that_a_beam_has_just_seen_beside_it_stays_free():
+    floor = Floor()
+    floor.keep_out.map.add_reading(1, math.inf, ORIGIN)
+    floor.hit(0.4, 0.2)
+    assert floor.is_free(0.45, -0.05)
+    assert not floor.is_free(0.45, 0.2)
+
+
+def test_one_who_walks_on_takes_the_unseen_floor_along():
+    """Hits of somebody who walks are near the last one: each is where nothing was before."""
+    floor = Floor()
+    for k in range(12):
+        floor.hit(0.5 - 0.02 * k, 0.067)
+        floor.map.grid.seen[floor.map.grid.cells == FREE] = floor.map.now - 0.5
+    assert not floor.is_free(0.38 - 0.08, 0.05 + 0.15)
+
+
+def test_a_thing_that_stays_has_come_only_once():
+    floor = Floor()
+    floor.hit(0.4)
+    floor.map.grid.cells[floor.map.grid.cells == UNKNOWN] = FREE  # it was looked at
+    floor.hit(0.4, 3.0)
+    floor.hit(0.42)
+    assert floor.is_free(0.5, 0.2)
+
+
+@pytest.mark.parametrize('kind', ['world', 'seen for long', 'far'])
+def test_what_was_there_or_is_far_has_not_come(kind):
+    """Noise of a wall, and a reading of things that are hardly seen, hide no floor."""
+    wall = np.array([[0.55, -1.0, 0.55, 1.0]])
+    floor = Floor(Obstacles(segments=wall) if kind == 'world' else None)
+    if kind == 'seen for long':
+        grid = floor.map.grid
+        column = math.floor((0.55 - grid.low) / grid.size)
+        grid.cells[:, column], grid.seen[:, column] = OCCUPIED, 0.0
+    for k in range(40):
+        floor.hit((0.66 if kind == 'far' else 0.45) + 0.03 * math.sin(k), 0.04)
+    assert floor.is_free(0.5 if kind != 'far' else 0.7, 0.2)
+
+
+def test_a_robot_that_begins_knows_of_nothing_that_came():
+    floor = Floor()
+    floor.map.now = 1.0
+    floor.hit(0.4)
+    assert floor.is_free(0.5, 0.2)

@@ -116,3 +116,16 @@ def test_a_robot_whose_sensors_fail_rests_within_half_a_second():
 def test_a_run_that_ends_before_the_sensors_fail_is_refused():
     with pytest.raises(ValueError, match=r'at least 40 s \(0\.67 min\).* got 6 s'):
         compare_safety([1], 6.0)
+
+
+@pytest.mark.parametrize('ahead', [0.5, -0.1, -0.4])
+def test_only_what_a_beam_had_met_was_seen(ahead):
+    """Two beams look ahead, 0.1 m apart: who comes from beside them is met by the bumper."""
+    text = f'moving: [{{radius: 0.1, points: [[1, {ahead}], [0.16, {ahead / 4}]], speed: 0.3}}]'
+    (found,) = contacts(_record(np.zeros(500), 0.0), parse_world(text, 'a'))
+    assert found.seen == (abs(ahead) < 0.2)
+    wall = contacts(_record(np.full(9, 1.0), 0.0), parse_world(WALL, 'a'))
+    assert [each.seen for each in wall] == [True]
+    hidden = 'circles: [{center: [1, 0], radius: 0.1, unseen: true}]'
+    below = contacts(_record(np.full(9, 1.0), 0.0), parse_world(hidden, 'a'))
+    assert [each.seen for each in below] == [False]

@@ -41,8 +41,10 @@ from t3mpc_ros.evaluation.record import RATE, Record, spans_of
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.geometry.types import Array, State
+from t3mpc_ros.robot.description import sensor_mounts
+from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
-from t3mpc_ros.simulation.world import MovingDisc, World, clearance, parse_world
+from t3mpc_ros.simulation.world import MovingDisc, World, cast_rays, clearance, parse_world
 
 ROOM = (4.0, 3.0)
 """Size of the room, m."""
@@ -59,6 +61,9 @@ SAME_PLACE = 0.3
 """Distance between two contacts that are at one place, m."""
 BOUNCE = 1.0
 """Longest gap within one contact, s: a bumper bounces."""
+SEEN_WITHIN, SEEN_FOR = 0.75, 0.5
+"""Distance at which a sensor surely sees what is across its beam (m), and the time for which a
+beam must have met a thing that the robot has seen: that in which it comes to rest (s)."""
 OWN_SPEED = 0.005
 """Speed towards what it touches above which the robot has run into it, m/s."""
 RADIUS = BumperParameters().radius
@@ -180,6 +185,8 @@ class Contact(NamedTuple):
     """Speed of the robot towards what it touches at the begin, m/s; 0 where it was run into."""
     place: tuple[float, float]
     """Where the robot was, m."""
+    seen: bool
+    """Whether a beam had met the thing for :data:`SEEN_FOR` before."""
 
 
 def gaps(record: Record, world: World) -> tuple[Array, Array]:
@@ -215,8 +222,33 @@ def contacts(record: Record, world: World) -> list[Contact]:
         pushes = [each.stop - each.start for each in spans_of(gap[rows] < -PUSHES)]
         speed = max(float(closing[max(begin - 3, 0) : begin + 1].max()), 0.0)
         place = tuple(record['truth'][begin, :2].tolist())
-        found.append(Contact(begin / RATE, max(pushes, default=0) / RATE, speed, place))
+        pushing = max(pushes, default=0) / RATE
+        found.append(Contact(begin / RATE, pushing, speed, place, was_seen(record, world, begin)))
     return found
+
+
+def was_seen(record: Record, world: World, begin: int) -> bool:
+    """Return whether a beam had met what is touched at a row; walls and boxes always were."""
+    x, y, _ = record['truth'][begin].tolist()
+    time = START + float(record.time[begin])
+    plain, hidden = clearance(x, y, world.segments, world.circles), clearance(x, y, *world.unseen)
+    there = [each for each in world.moving if each.appears <= time < each.vanishes]
+    away = [math.dist(each.position(time), (x, y)) - each.radius for each in there]
+    if not away or min(away) > min(plain, hidden):
+        return plain < hidden
+    thing = there[int(np.argmin(away))]
+    mounts = sensor_mounts(RangeSensorParameters())
+    which, out, nothing = np.arange(len(mounts)), np.empty(len(mounts)), np.empty((0, 4))
+    for row in range(max(begin - round(SEEN_FOR * RATE), 0), -1, -1):
+        time = START + float(record.time[row])
+        if time < thing.appears:
+            return False
+        circle = np.array([[*thing.position(time), thing.radius]])
+        x, y, yaw = record['truth'][row].tolist()
+        cast_rays(x, y, yaw, mounts, which, nothing, circle, out)
+        if out.min() < SEEN_WITHIN:
+            return True
+    return False
 
 
 def at_places(found: Sequence[Contact]) -> list[list[Contact]]:
@@ -259,7 +291,8 @@ def safety_run(case: str, seed: int, duration: float) -> tuple[Record, World]:
 def measured_safety(job: tuple[tuple[str, float], int]) -> Row:
     """Return the row of a case.
 
-    ``contacts``, those to which the robot moved; ``run_into``, those to which it did not;
+    ``contacts``, those to which the robot moved; ``contacts_seen``, those of them with what a beam
+    had met for :data:`SEEN_FOR`; ``run_into``, those to which it did not;
     ``most_at_a_place``; ``fastest_again``, speed of the fastest contact after the first at its
     place (m/s); ``pushing``, longest time of pushing (s); ``driven`` (m); ``ended``, reason of a
     stop that lasts to the end. Of a case with faults ``rest``, time from the fault to the last
@@ -274,6 +307,7 @@ def measured_safety(job: tuple[tuple[str, float], int]) -> Row:
     steps = np.hypot(*np.diff(record['truth'][:, :2], axis=0).T)
     row: Row = {
         'contacts': len(own),
+        'contacts_seen': sum(each.seen for each in own),
         'places': len(places),
         'run_into': len(found) - len(own),
         'most_at_a_place': max(map(len, places), default=0),
@@ -321,6 +355,7 @@ HEAD = (
     'case',
     'runs',
     'runs with contact',
+    'with what was seen',
     'places touched',
     'most contacts at a place',
     'fastest after the first, m/s',
@@ -345,13 +380,16 @@ def safety_table(table: ResultTable) -> Table:
                 return f'{goes_on} of {len(rows)} drive on'
             return f'{max(values):.{digits}f}'
 
-        touched = sum(bool(row['contacts']) for row in rows)
+        touched, seen = (
+            sum(bool(row[name]) for row in rows) for name in ('contacts', 'contacts_seen')
+        )
         places = sum(row['places'] for row in rows)
         lines.append(
             [
                 case,
                 str(len(rows)),
                 str(touched),
+                str(seen),
                 str(places),
                 worst('most_at_a_place', 0),
                 worst('fastest_again', 3),
