@@ -22,12 +22,13 @@ import zipfile
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.version import VERSION
 
 FORMAT = 1
 """Version of the format; incremented if the meaning of an array changes."""
 
-PACKAGED = Path(__file__).resolve().parents[2] / 'evaluation' / 'training'
+PACKAGED = PACKAGE_DIRECTORY / 'evaluation' / 'training'
 """Folder of the model files that come with the package."""
 
 _HEADER = 'header'
