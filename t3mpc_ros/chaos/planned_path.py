@@ -53,8 +53,8 @@ TURN_COST = 0.4
 """Way that is as bad as a right angle where a detour joins the path, m."""
 FEED = 150
 """Points ahead of the reference that are driven without another look at the map."""
-PASSED = 4
-"""Points that the reference may have passed beyond the length that it drove: it cuts corners."""
+CORNER = 0.04
+"""Length that the reference may have passed beyond that which it drove, m: it cuts corners."""
 STOP = 5
 """Points before floor that has not been seen at which the path stops."""
 WIDTHS = 0.2, 0.15, 0.1, 0.07, 0.04
@@ -515,7 +515,7 @@ class PlannedPath:
         self._rested = 0.0
         """Time at rest before floor that has not been seen, s."""
         self._driven = 0.0
-        """Length that the reference drove since the last map, m."""
+        """Length that the reference drove beyond the first point of the plan, m."""
         self._near_time = 0.0
         """When the robot was near the reference last, s."""
         self._look: _Look | None = None
@@ -619,11 +619,14 @@ class PlannedPath:
 
     def _go_on(self) -> None:
         """Remove the points that the reference has passed."""
-        # Not farther than it drove: where the path crosses itself, another place is as near.
-        most = min(self._fed, math.ceil(self._driven / SPACING) + PASSED)
-        self._driven = 0.0
-        away = self.plan.points[:most] - np.array(self._pose[:2])
-        place = int(np.argmin(np.hypot(*away.T)))
+        points = self.plan.points[: self._fed]
+        lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+        place = self._fed - 1
+        if not (self._timing.standing and self._timing.arrived):
+            # Not farther than it drove: where the path crosses itself, another place is as near.
+            near = points[lengths <= self._driven + CORNER]
+            place = int(np.argmin(np.hypot(*(near - np.array(self._pose[:2])).T)))
+        self._driven = min(max(self._driven - float(lengths[place]), 0.0), CORNER)
         self.plan.remember(self.plan.points[: place + 1], self._time)
         self.plan.forget(place)
         self._fed -= place

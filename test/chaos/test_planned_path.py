@@ -326,6 +326,26 @@ def test_a_charger_that_cannot_be_is_refused(wrong, words):
         PlanParameters.from_dict({f'charging.{name}': value for name, value in wrong.items()})
 
 
+@pytest.mark.parametrize('spacing', [0.002, 0.004, 0.01, 0.02])
+def test_a_path_of_any_spacing_goes_on(spacing):
+    """The plan counted points as if they were 1 cm apart; a patrol stood for 14 minutes.
+
+    In tight curves they are nearer: it fell behind, until all points that may be driven without
+    another look at the map lay ahead of where it took the reference to be.
+    """
+    turn = [0.0]
+
+    def circles():
+        turn[0] += 1.0
+        angle = np.arange(turn[0] - 1.0, turn[0], spacing / 0.3)
+        return 0.3 * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)])
+
+    path = planned(circles, revisit_distance=0.0)
+    rows = drive(path, Room(reach=9.0), 60.0)
+    assert min(length(part) for part in np.array_split(rows, 6)) > 1.0
+    assert len(path.plan.points) < 2000
+
+
 def test_equal_seeds_give_equal_paths_and_others_do_not():
     def positions(seed):
         room = Room()
