@@ -474,7 +474,9 @@ class ContactMonitor:
     def is_in_contact(self, odometry: State, command: BodyTwist, elapsed: float) -> bool:
         """Whether something holds, turns or pushes aside a robot that is commanded to drive."""
         pose, last = odometry.pose, self._pose
-        if last is None or command.linear * self._asked < 0.0:
+        tight = ON_THE_SPOT < abs(command.linear) < TIGHT * abs(command.angular)
+        if last is None or command.linear * self._asked < 0.0 or tight:
+            # Not only left out: the noise of a pose cancels in a sum without gaps alone.
             self.restart(pose)
             return False
         turn = wrap_angle(pose.yaw - last.yaw)
@@ -485,7 +487,7 @@ class ContactMonitor:
         self._unlike += (ahead - odometry.twist.linear * elapsed) ** 2
         self._steps += 1
         # On the spot a pose may be corrected, and a tyre slip, without any contact.
-        if abs(command.linear) > max(ON_THE_SPOT, TIGHT * abs(command.angular)):
+        if abs(command.linear) > ON_THE_SPOT:
             self._asked += command.linear * elapsed
             self._ahead += ahead
             self._left += math.cos(middle) * y - math.sin(middle) * x

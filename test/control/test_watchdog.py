@@ -31,6 +31,7 @@ from t3mpc_ros.control.watchdog import (
     RECOVERY_TIME,
     STANDING_TIME,
     TRIALS,
+    ContactMonitor,
     DriveMonitor,
     InputWatchdog,
     OdometryTwist,
@@ -461,6 +462,25 @@ def test_messages_that_are_missing_are_not_compared():
         state = State(k * 10 * MS, Pose(x, 0.0, 0.0), BodyTwist(0.2, 0.0))
         twist.measured(state, restart=wrong)
     assert not twist.replaced
+
+
+@pytest.mark.parametrize('bend', [0.8, 1.2, 1.6])
+@pytest.mark.parametrize('seed', range(3))
+def test_noise_of_a_pose_in_curves_is_no_contact(bend, seed):
+    """Sums with gaps do not cancel the noise of a pose, which contact was taken from."""
+    generator, monitor = np.random.default_rng(seed), ContactMonitor()
+    pose, now, touches = Pose(0.0, 0.0, 0.0), STANDSTILL, 0
+    for k in range(20_000):
+        restless = float(generator.normal(0.0, 0.15))  # it follows that noise
+        command = BodyTwist(0.12, bend * (1.0 + 0.3 * math.sin(0.02 * k)) + restless)
+        now = BodyTwist(
+            *(n + 0.1 * (c - n) for n, c in zip(now, command, strict=True))
+        )  # behind by 0.1 s
+        pose = advance_pose(pose, now, 0.01)
+        x, y, yaw = np.array(pose) + generator.standard_normal(3) * (0.003, 0.003, 0.005)
+        odometry = State(k * 10 * MS, Pose(float(x), float(y), float(yaw)), now)
+        touches += monitor.is_in_contact(odometry, command, 0.01)
+    assert touches == 0
 
 
 # -- pauses of the commands -----------------------------------------------------------------------
