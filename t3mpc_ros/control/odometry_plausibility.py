@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from t3mpc_ros.control.watchdog import JUMP
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, State, wrap_angle
 
@@ -38,8 +39,6 @@ MANY_MISSING = 0.02
 """Share of missing messages that is reported."""
 LATE = 0.1
 """Delay beyond the median from which a message is late, s."""
-JUMP = 0.1, 0.3
-"""Change of the pose beyond the motion that is a jump, m and rad."""
 
 FILTER_TIME = 0.2
 """Time constant of each of the three stages of the filter, s."""

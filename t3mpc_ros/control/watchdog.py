@@ -226,12 +226,12 @@ JUMP = 0.1, 0.3
 """Change of the pose beyond the motion that is a jump, m and rad."""
 
 
-def motion_between(last: Pose, new: Pose) -> tuple[float, float]:
-    """Return how far (m) forward a robot has driven between two poses, and its turn (rad)."""
+def motion_between(last: Pose, new: Pose) -> tuple[float, float, float]:
+    """Return the way ahead and to the left (m) between two poses, and the turn (rad)."""
     turn = wrap_angle(new.yaw - last.yaw)
     middle = last.yaw + 0.5 * turn
-    forward = (new.x - last.x) * math.cos(middle) + (new.y - last.y) * math.sin(middle)
-    return forward, turn
+    x, y, cosine, sine = new.x - last.x, new.y - last.y, math.cos(middle), math.sin(middle)
+    return cosine * x + sine * y, cosine * y - sine * x, turn
 
 
 class TwistFactor:
@@ -259,13 +259,13 @@ class TwistFactor:
         """Compare the twists of two messages in a row with the change of the pose."""
         elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
         self._time += elapsed
-        moved = motion_between(last.pose, new.pose)
-        for i, block in enumerate(self._block):
+        ahead, _, turn = motion_between(last.pose, new.pose)
+        for i, (block, by_pose) in enumerate(zip(self._block, (ahead, turn), strict=True)):
             by_twist = 0.5 * elapsed * (last.twist[i] + new.twist[i])
-            if abs(moved[i] - by_twist) > JUMP[i]:
+            if abs(by_pose - by_twist) > JUMP[i]:
                 self.interrupt()
                 return
-            block[0] += moved[i]
+            block[0] += by_pose
             block[1] += by_twist
         if self._time < BLOCK_TIME:
             return
@@ -329,15 +329,16 @@ class OdometryTwist:
         if not odometry.is_finite():
             return odometry
         pose, last, self._last = odometry.pose, self._last, odometry
-        follows = not restart and last is not None and last.stamp_ns < odometry.stamp_ns
         if odometry.twist != (0.0, 0.0):
             self.missing, self._anchor, self.known = False, None, True
-            if follows and last is not None:
-                self._factor.update(last, odometry)
-            else:
+            if last is None or restart or odometry.stamp_ns <= last.stamp_ns:
                 self._factor.interrupt()
-            linear, angular = odometry.twist
+            else:
+                self._factor.update(last, odometry)
             factor = self._factor.value
+            if factor == 1.0:
+                return odometry
+            linear, angular = odometry.twist
             return odometry._replace(twist=BodyTwist(linear / factor, angular / factor))
         if self._anchor is None:
             self._anchor = pose
@@ -345,8 +346,8 @@ class OdometryTwist:
         if restart or last is None or not self.missing:
             return odometry
         elapsed = (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
-        forward, turn = motion_between(last.pose, pose)
-        return odometry._replace(twist=BodyTwist(forward / elapsed, turn / elapsed))
+        ahead, _, turn = motion_between(last.pose, pose)
+        return odometry._replace(twist=BodyTwist(ahead / elapsed, turn / elapsed))
 
 
 EVIDENCE_WEIGHT = 20
@@ -479,18 +480,15 @@ class ContactMonitor:
             # Not only left out: the noise of a pose cancels in a sum without gaps alone.
             self.restart(pose)
             return False
-        turn = wrap_angle(pose.yaw - last.yaw)
-        middle = last.yaw + 0.5 * turn
-        x, y = pose.x - last.x, pose.y - last.y
+        ahead, left, turn = motion_between(last, pose)
         self._pose = pose
-        ahead = math.cos(middle) * x + math.sin(middle) * y
         self._unlike += (ahead - odometry.twist.linear * elapsed) ** 2
         self._steps += 1
         # On the spot a pose may be corrected, and a tyre slip, without any contact.
         if abs(command.linear) > ON_THE_SPOT:
             self._asked += command.linear * elapsed
             self._ahead += ahead
-            self._left += math.cos(middle) * y - math.sin(middle) * x
+            self._left += left
         if abs(command.linear) > DRIVING:
             self._turn += odometry.twist.angular * elapsed - turn
         if abs(self._ahead) >= self._most:
