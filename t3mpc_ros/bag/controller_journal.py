@@ -68,12 +68,7 @@ class Event(enum.IntEnum):
     """A command was published in a gap of the odometry."""
 
 
-COMMAND_EVENTS = (
-    Event.STEP,
-    Event.STEP_WITHOUT_ODOMETRY,
-    Event.ODOMETRY_TIMEOUT,
-    Event.FINISH,
-)
+COMMAND_EVENTS = (Event.STEP, Event.STEP_WITHOUT_ODOMETRY, Event.ODOMETRY_TIMEOUT, Event.FINISH)
 """Events that publish a command, before the row of the journal is published."""
 
 

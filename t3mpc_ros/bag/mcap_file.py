@@ -417,9 +417,7 @@ def collect_metadata(folder: Path) -> tuple[BagMetadata, tuple[str, ...]]:
 
 
 def message_loss_record(
-    dropped: Mapping[str, int],
-    lost: Mapping[str, int],
-    undiscovered: Mapping[str, int],
+    dropped: Mapping[str, int], lost: Mapping[str, int], undiscovered: Mapping[str, int]
 ) -> dict[str, str]:
     """Return the metadata record of missing messages, by cause (:data:`LOSS_CAUSES`) and topic."""
     causes = dict(zip(LOSS_CAUSES, (dropped, lost, undiscovered), strict=True))

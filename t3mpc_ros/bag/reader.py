@@ -34,17 +34,7 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from t3mpc_ros.bag.mcap_file import (
-    END_NS,
-    MCAP_SUFFIX,
-    Attachment,
-    McapFile,
-    SerializedMessage,
-    find_files,
-    has_mcap_magic,
-    read_errors,
-    read_mcap_file,
-)
+from t3mpc_ros.bag import mcap_file
 from t3mpc_ros.bag.message_definitions import BagError, DataError, UnknownTopicError
 from t3mpc_ros.bag.metadata import METADATA_FILE_NAME, TopicInformation
 from t3mpc_ros.bag.qos import UNLIMITED, QosProfile
@@ -65,7 +55,7 @@ SQLITE_SUFFIX, ROS1_SUFFIX = '.db3', '.bag'
 _RUN_BAG = 'bag'
 """Folder of the bag in the folder of a run, beside its logs and its report."""
 
-_STORAGES = {MCAP_SUFFIX: 'mcap', SQLITE_SUFFIX: 'sqlite3', ROS1_SUFFIX: 'ROS 1'}
+_STORAGES = {mcap_file.MCAP_SUFFIX: 'mcap', SQLITE_SUFFIX: 'sqlite3', ROS1_SUFFIX: 'ROS 1'}
 _COMPRESSION = re.compile(r'^\s*compression_format:\s*[\'"]?\w', re.MULTILINE)
 _STEP = re.compile(r'(\w+)\[(\d+)\]')
 
@@ -80,7 +70,7 @@ class RosbagsFile:
         self.path = path
         self.metadata_records: Mapping[str, Mapping[str, str]] = {}
         self.damaged: dict[int, int] = {}
-        with read_errors(str(path), DataError):
+        with mcap_file.read_errors(str(path), DataError):
             self._reader: Any = (Ros1Reader if path.suffix == ROS1_SUFFIX else Reader)(path)
             self._reader.open()
         self.message_count: int = self._reader.message_count
@@ -93,17 +83,17 @@ class RosbagsFile:
         self,
         topics: Collection[str] | None = None,
         start_ns: int = 0,
-        stop_ns: int = END_NS,
+        stop_ns: int = mcap_file.END_NS,
         skip_damaged: bool = False,
-    ) -> Iterator[SerializedMessage]:
+    ) -> Iterator[mcap_file.SerializedMessage]:
         """Yield messages as :meth:`McapFile.messages`; damaged ones are always an error."""
         selected = [x for x in self._reader.connections if topics is None or x.topic in topics]
         if not selected or start_ns > self.end_ns:
             return  # the library would read all topics for an empty selection
         last_ns = min(stop_ns, UNLIMITED)  # the largest integer of sqlite3
-        with read_errors(str(self.path), DataError):
+        with mcap_file.read_errors(str(self.path), DataError):
             for item, stamp_ns, data in self._reader.messages(selected, start_ns, last_ns):
-                yield SerializedMessage(item.topic, stamp_ns, stamp_ns, bytes(data))
+                yield mcap_file.SerializedMessage(item.topic, stamp_ns, stamp_ns, bytes(data))
 
     def close(self) -> None:
         """Close the file; idempotent."""
@@ -112,7 +102,7 @@ class RosbagsFile:
             reader.close()
 
 
-BagFile = McapFile | RosbagsFile
+BagFile = mcap_file.McapFile | RosbagsFile
 
 
 class BagReader:
@@ -158,7 +148,7 @@ class BagReader:
 
     def serialized_messages(
         self, topics: Collection[str] | None = None
-    ) -> Iterator[SerializedMessage]:
+    ) -> Iterator[mcap_file.SerializedMessage]:
         """Yield the serialized messages of ``topics``, or of all, in order of receipt."""
         return merge_streams((file.start_ns, file.messages(topics)) for file in self.files)
 
@@ -170,17 +160,19 @@ class BagReader:
         for message in self.serialized_messages([topic]):
             yield (message.received_ns - self.start_ns) / NANOSECONDS, self.decode(message)
 
-    def decode(self, message: SerializedMessage) -> Any:
+    def decode(self, message: mcap_file.SerializedMessage) -> Any:
         """Return a message of this bag as an object."""
         type_name = self.topics[message.topic].type_name
-        with read_errors(message.topic, DataError):
+        with mcap_file.read_errors(message.topic, DataError):
             if type_name not in self._decoders:
                 self._decoders[type_name] = self._make_decoder(type_name)
             return self._decoders[type_name](message.data, type_name)
 
     def _make_decoder(self, type_name: str) -> Callable[[bytes, str], Any]:
         """Return the function that decodes messages of a type by its definition in the bag."""
-        definitions = [f.definition(type_name) for f in self.files if isinstance(f, McapFile)]
+        definitions = [
+            f.definition(type_name) for f in self.files if isinstance(f, mcap_file.McapFile)
+        ]
         if text := next(filter(None, definitions), ''):
             store: Any = get_typestore(Stores.EMPTY)
             store.register(get_types_from_msg(text, type_name))
@@ -214,9 +206,9 @@ class BagReader:
         names = ['received', 'stamp', *fields]
         return {name: np.ascontiguousarray(table[:, i]) for i, name in enumerate(names)}
 
-    def attachments(self) -> dict[str, Attachment]:
+    def attachments(self) -> dict[str, mcap_file.Attachment]:
         """Return the attachments by name; the newest of each name."""
-        files = [file for file in self.files if isinstance(file, McapFile)]
+        files = [file for file in self.files if isinstance(file, mcap_file.McapFile)]
         found = [pair for file in files for pair in file.attachments()]
         found.sort(key=lambda pair: pair[0])
         return {item.name: item for _, item in found}
@@ -255,13 +247,13 @@ def open_bag(path: Path | str) -> BagReader:
         if _is_compressed(path):
             others = [path]
         else:
-            complete, incomplete = find_files(path)
+            complete, incomplete = mcap_file.find_files(path)
             files.extend(complete)
             others = sorted(path.glob(f'*{SQLITE_SUFFIX}'))
     elif not path.stat().st_size:
         raise BagError(f'{path} is empty: it has no byte')
-    elif path.suffix == MCAP_SUFFIX or has_mcap_magic(path):
-        if (file := read_mcap_file(path)) is not None:
+    elif path.suffix == mcap_file.MCAP_SUFFIX or mcap_file.has_mcap_magic(path):
+        if (file := mcap_file.read_mcap_file(path)) is not None:
             files.append(file)
         else:
             incomplete = (path.name,)
@@ -296,13 +288,15 @@ def merge_topics(topics: Iterable[TopicInformation]) -> dict[str, TopicInformati
 
 
 def merge_streams(
-    streams: Iterable[tuple[int, Iterator[SerializedMessage]]],
-) -> Iterator[SerializedMessage]:
+    streams: Iterable[tuple[int, Iterator[mcap_file.SerializedMessage]]],
+) -> Iterator[mcap_file.SerializedMessage]:
     """Merge sorted streams of messages by receive time; equal times keep the order of streams.
 
     Each stream comes with a lower bound of its receive times, before which it is not read.
     """
-    heap: list[tuple[int, int, SerializedMessage | None, Iterator[SerializedMessage]]]
+    heap: list[
+        tuple[int, int, mcap_file.SerializedMessage | None, Iterator[mcap_file.SerializedMessage]]
+    ]
     heap = [(start_ns, number, None, stream) for number, (start_ns, stream) in enumerate(streams)]
     heapq.heapify(heap)
     while heap:

@@ -20,36 +20,14 @@ import shutil
 from typing import Any, BinaryIO
 import zlib
 
+from mcap import records
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Header,
-    Message,
-    Metadata,
-    Schema,
-)
 from mcap.stream_reader import breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import Writer
 
 from t3mpc_ros.atomic_file import atomic_file, sync_folder
-from t3mpc_ros.bag.mcap_file import (
-    MAGIC,
-    MCAP_SUFFIX,
-    FileWindow,
-    RecordError,
-    chunk_data,
-    chunk_message_count,
-    collect_metadata,
-    read_mcap_file,
-    read_record,
-    read_summary,
-    record_head,
-)
+from t3mpc_ros.bag import mcap_file
 from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.metadata import read_origin, write_metadata
 from t3mpc_ros.geometry.types import NANOSECONDS
@@ -247,7 +225,7 @@ def recover_bag(
                 raise
             size = path.stat().st_size
             results.append(FileResult(path.name, size, damages=[Damage(0, size, str(error))]))
-    metadata, _ = collect_metadata(output)
+    metadata, _ = mcap_file.collect_metadata(output)
     if (origin := read_origin(files[0].parent)) is not None:  # usually missing
         metadata = replace(metadata, custom_data=origin[0], ros_distro=origin[1])
     write_metadata(output, metadata)
@@ -258,13 +236,13 @@ def recover_bag(
 def default_output(source: Path | str) -> Path:
     """Return the default output folder: beside the input, with the suffix ``_recovered``."""
     source = Path(source).absolute()
-    stem = source.name if source.is_dir() else source.name.removesuffix(MCAP_SUFFIX)
+    stem = source.name if source.is_dir() else source.name.removesuffix(mcap_file.MCAP_SUFFIX)
     return source.with_name(f'{stem}_recovered')
 
 
 def _files(source: Path) -> list[Path]:
     if source.is_dir():
-        files = sorted(path for path in source.glob(f'*{MCAP_SUFFIX}') if path.is_file())
+        files = sorted(path for path in source.glob(f'*{mcap_file.MCAP_SUFFIX}') if path.is_file())
         sqlite = [] if files else list(source.glob('*.db3'))
     elif source.is_file():
         files = [source]
@@ -297,9 +275,11 @@ def _check_output(source: Path, output: Path) -> None:
 
 
 def _recover_file(path: Path, folder: Path, progress: Progress) -> FileResult:
-    target = folder / (path.name if path.suffix == MCAP_SUFFIX else f'{path.name}{MCAP_SUFFIX}')
+    suffix = '' if path.suffix == mcap_file.MCAP_SUFFIX else mcap_file.MCAP_SUFFIX
+    target = folder / f'{path.name}{suffix}'
     with path.open('rb') as source:
-        if read_mcap_file(path) is not None:  # the chunks are verified by a pass without output
+        if mcap_file.read_mcap_file(path) is not None:
+            # The chunks are verified by a pass without output.
             result = recover_file(source, None, path.name, progress)
             if result.clean and not result.damages and not result.notes:
                 result.copied = True
@@ -336,16 +316,16 @@ class _FileRecovery:
     """One pass over the records of a file."""
 
     def __init__(self, source: BinaryIO, output: BinaryIO | None, name: str) -> None:
-        self._window = FileWindow(source)
-        found = read_summary(self._window)
-        if found is None and self._window.read(0, len(MAGIC)) != MAGIC:
+        self._window = mcap_file.FileWindow(source)
+        found = mcap_file.read_summary(self._window)
+        if found is None and self._window.read(0, len(mcap_file.MAGIC)) != mcap_file.MAGIC:
             raise UnreadableError(f'{name} contains no MCAP data')
         self._summary: Summary | None
         self._summary, self._end = found or (None, self._window.size)
         self._result = FileResult(name, self._window.size, ended=found is not None)
         if self._summary is None:
             self._result.notes.append('the file has no index, or a damaged one')
-        self._chunks: dict[int, ChunkIndex] = {}
+        self._chunks: dict[int, records.ChunkIndex] = {}
         self._places: list[int] = []
         """Starts of the chunks, attachments and metadata records in the index."""
         if self._summary:
@@ -359,7 +339,7 @@ class _FileRecovery:
         self._writer = output and Writer(output, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
 
     def run(self, progress: Progress) -> FileResult:
-        result, position = self._result, len(MAGIC)
+        result, position = self._result, len(mcap_file.MAGIC)
         if self._writer:
             self._writer.start(*self._header(position))
         while position < self._end:
@@ -367,11 +347,11 @@ class _FileRecovery:
             record = None
             try:
                 kind = Opcode.CHUNK if position in self._chunks else 0
-                record, end = read_record(self._window, position, kind)
+                record, end = mcap_file.read_record(self._window, position, kind)
                 self._take(record)
-            except RecordError as error:
+            except mcap_file.RecordError as error:
                 end = self._skip(position, str(error), record)
-            if isinstance(record, DataEnd):
+            if isinstance(record, records.DataEnd):
                 result.ended = True
                 self._verify_data_checksum(position, record.data_section_crc)
                 break
@@ -387,21 +367,21 @@ class _FileRecovery:
     def _header(self, position: int) -> tuple[str, str]:
         """Return the profile and the library of the new file."""
         try:
-            record, _ = read_record(self._window, position, Opcode.HEADER)
-        except RecordError:
-            record = Header('ros2', '')
+            record, _ = mcap_file.read_record(self._window, position, Opcode.HEADER)
+        except mcap_file.RecordError:
+            record = records.Header('ros2', '')
         return record.profile, f'{record.library}; {LIBRARY_MARK}'.lstrip('; ')
 
     # -- records ----------------------------------------------------------------------------------
 
     def _take(self, record: Any) -> None:
         """Copy a record outside of the chunks, or all records of a chunk."""
-        if isinstance(record, Chunk):
-            chunk_data(record)  # verifies the checksum
+        if isinstance(record, records.Chunk):
+            mcap_file.chunk_data(record)  # verifies the checksum
             try:
                 inner = breakup_chunk(record)
             except Exception as error:  # the library raises anything on damaged bytes
-                raise RecordError(f'a chunk cannot be read: {error}') from error
+                raise mcap_file.RecordError(f'a chunk cannot be read: {error}') from error
             if self._writer:
                 self._writer.flush()  # a chunk ends where one of the input does
             for each in inner:
@@ -411,7 +391,7 @@ class _FileRecovery:
 
     def _take_content(self, record: Any, checked: bool) -> None:
         writer = self._writer
-        if isinstance(record, Message):
+        if isinstance(record, records.Message):
             topic = self._known_topic(record.channel_id)
             if topic is None:
                 self._unnamed += 1
@@ -419,42 +399,42 @@ class _FileRecovery:
             topic.kept += 1
             topic.unchecked += not checked
             if writer:
-                number = self._written[Channel, record.channel_id][1]
+                number = self._written[records.Channel, record.channel_id][1]
                 stamps = record.log_time, record.data, record.publish_time
                 writer.add_message(number, *stamps, record.sequence)
-        elif isinstance(record, Schema):
+        elif isinstance(record, records.Schema):
             self._take_schema(record)
-        elif isinstance(record, Channel):
+        elif isinstance(record, records.Channel):
             self._take_channel(record)
-        elif isinstance(record, Metadata) and writer:
+        elif isinstance(record, records.Metadata) and writer:
             writer.flush()
             writer.add_metadata(record.name, record.metadata)
-        elif isinstance(record, Attachment) and writer:
+        elif isinstance(record, records.Attachment) and writer:
             writer.flush()
             writer.add_attachment(
                 record.create_time, record.log_time, record.name, record.media_type, record.data
             )
 
-    def _take_schema(self, record: Schema) -> None:
-        if self._written.get((Schema, record.id), (None,))[0] != record:
+    def _take_schema(self, record: records.Schema) -> None:
+        if self._written.get((records.Schema, record.id), (None,))[0] != record:
             number = 0
             if self._writer:
                 number = self._writer.register_schema(record.name, record.encoding, record.data)
-            self._written[Schema, record.id] = record, number
+            self._written[records.Schema, record.id] = record, number
 
-    def _take_channel(self, record: Channel) -> None:
+    def _take_channel(self, record: records.Channel) -> None:
         """Copy a channel whose schema is known, here or in the summary."""
-        if self._written.get((Channel, record.id), (None,))[0] == record:
+        if self._written.get((records.Channel, record.id), (None,))[0] == record:
             return
         if self._summary and record.schema_id in self._summary.schemas:
             self._take_schema(self._summary.schemas[record.schema_id])
-        schema, number = self._written.get((Schema, record.schema_id), (None, 0))
+        schema, number = self._written.get((records.Schema, record.schema_id), (None, 0))
         if schema is None and record.schema_id:
             return
         if self._writer:
             about = record.topic, record.message_encoding, number, dict(record.metadata)
             number = self._writer.register_channel(*about)
-        self._written[Channel, record.id] = record, number
+        self._written[records.Channel, record.id] = record, number
         topic = TopicResult(record.topic, schema.name if schema else '')
         self._topics[record.id] = self._result.topics.setdefault(record.topic, topic)
 
@@ -472,15 +452,15 @@ class _FileRecovery:
         The index of the file knows it. Without index it is at the end of the record, if a record
         is there; else nothing behind the damage is read.
         """
-        _, end = record_head(self._window, start)
+        _, end = mcap_file.record_head(self._window, start)
         index, messages, span_ns = self._chunks.get(start), None, None
         if self._chunks:
             end = next((place for place in self._places if place > start), self._end)
         elif not self._begins_record(end):
             end = self._window.size
         if index:
-            messages = chunk_message_count(self._window, index)
-        if chunk := index or (record if isinstance(record, Chunk) else None):
+            messages = mcap_file.chunk_message_count(self._window, index)
+        if chunk := index or (record if isinstance(record, records.Chunk) else None):
             span_ns = chunk.message_start_time, chunk.message_end_time
         # Between the places in the index there is nothing that is not repeated elsewhere.
         harmless = bool(self._chunks) and start not in self._places
@@ -489,8 +469,8 @@ class _FileRecovery:
 
     def _begins_record(self, position: int) -> bool:
         try:
-            read_record(self._window, position)
-        except RecordError:
+            mcap_file.read_record(self._window, position)
+        except mcap_file.RecordError:
             return False
         return True
 

@@ -32,12 +32,7 @@ from t3mpc_ros.bag.message_definitions import (
     MessageDefinitions,
     UnknownTopicError,
 )
-from t3mpc_ros.bag.metadata import (
-    BagMetadata,
-    FileInformation,
-    TopicInformation,
-    write_metadata,
-)
+from t3mpc_ros.bag.metadata import BagMetadata, FileInformation, TopicInformation, write_metadata
 from t3mpc_ros.bag.qos import QosProfile, dump_yaml, profiles_to_yaml
 from t3mpc_ros.geometry.types import NANOSECONDS
 
@@ -205,11 +200,7 @@ class BagWriter:
                 )
 
     def add_topic(
-        self,
-        name: str,
-        type_name: str,
-        profiles: Iterable[QosProfile] = (),
-        type_hash: str = '',
+        self, name: str, type_name: str, profiles: Iterable[QosProfile] = (), type_hash: str = ''
     ) -> None:
         """Add a topic before its first message; adding it again has no effect.
 

@@ -16,13 +16,7 @@
 import argparse
 from pathlib import Path
 
-from t3mpc_ros.cli.run_options import (
-    add_outputs,
-    add_workers,
-    executor_of,
-    prepare_outputs,
-    print_result,
-)
+from t3mpc_ros.cli import run_options
 
 
 def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -36,8 +30,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.add_argument(
         '--output', type=Path, help='page whose table is to be replaced, docs/faults.md say'
     )
-    add_outputs(parser)
-    add_workers(parser)
+    run_options.add_outputs(parser)
+    run_options.add_workers(parser)
     parser.set_defaults(run=run)
 
 
@@ -58,10 +52,10 @@ def run(options: argparse.Namespace) -> int:
         for fault_run in FAULT_RUNS
         if not options.names or fault_run.fault in options.names
     ]
-    prepare_outputs(options)
-    with executor_of(options) as executor:
+    run_options.prepare_outputs(options)
+    with run_options.executor_of(options) as executor:
         rows = study_faults(fault_runs, executor, print_report)
-    print_result(options, lambda: fault_page.console_text(rows), lambda: list(rows))
+    run_options.print_result(options, lambda: fault_page.console_text(rows), lambda: list(rows))
     if options.output:
         fault_page.update_page(options.output, rows)
     if options.html:

@@ -78,12 +78,7 @@ def _run(words: Sequence[str]) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from t3mpc_ros.cli.demo import (
-        DemoInterruptedError,
-        DemoOptions,
-        parse_settings,
-        run_demo,
-    )
+    from t3mpc_ros.cli.demo import DemoInterruptedError, DemoOptions, parse_settings, run_demo
 
     if options.patrol and options.robot != 'twin':
         print(f'error: --patrol needs --robot twin: got {options.robot}', file=sys.stderr)
@@ -309,8 +304,7 @@ def _parser(
     for module in (paper, compare, sweep, patrol, tune, train, faults, view, graph):
         module.add_parser(commands)
     completing = commands.add_parser(
-        'completion',
-        help='print what bash or zsh completes: eval "$(t3mpc completion bash)"',
+        'completion', help='print what bash or zsh completes: eval "$(t3mpc completion bash)"'
     )
     completing.add_argument('shell', choices=('bash', 'zsh'))
     completing.set_defaults(run=_complete)

@@ -17,14 +17,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from t3mpc_ros.cli.run_options import (
-    add_json,
-    add_seeds,
-    add_workers,
-    executor_of,
-    prepare_outputs,
-    print_result,
-)
+from t3mpc_ros.cli import run_options
 
 
 def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -35,8 +28,10 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.add_argument(
         '--quick', action='store_true', help='few seeds and short runs: shows that all works'
     )
-    add_seeds(parser, '', 'the runs', counted=True, text='the 20 held-out ones, quick: 3')
-    add_seeds(
+    run_options.add_seeds(
+        parser, '', 'the runs', counted=True, text='the 20 held-out ones, quick: 3'
+    )
+    run_options.add_seeds(
         parser,
         '',
         'the comparison without a controller (86)',
@@ -44,11 +39,11 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         counted=True,
         text='20, quick: 2',
     )
-    add_workers(parser)
+    run_options.add_workers(parser)
     parser.add_argument(
         '--output', type=Path, help='folder (default runs/paper, or runs/paper-quick)'
     )
-    add_json(parser, 'also write the results')
+    run_options.add_json(parser, 'also write the results')
     parser.add_argument(
         '--fresh', action='store_true', help='discard the runs that the folder holds'
     )
@@ -61,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.methods import NMPC, require_libraries
     from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, reproduce
 
-    prepare_outputs(options)
+    run_options.prepare_outputs(options)
     require_libraries([NMPC])
     output = options.output or Path('runs') / ('paper-quick' if options.quick else 'paper')
     chosen = PaperOptions(
@@ -71,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
         estimation_seeds=options.estimation_seeds,
         fresh=options.fresh,
     )
-    with executor_of(options) as executor:
+    with run_options.executor_of(options) as executor:
         text, numbers = reproduce(replace(chosen, workers=executor), print_report)
-    print_result(options, lambda: text, lambda: numbers)
+    run_options.print_result(options, lambda: text, lambda: numbers)
     return 0

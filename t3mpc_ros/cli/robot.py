@@ -25,12 +25,7 @@ from typing import Any, TypeVar
 from t3mpc_ros.cli import robot_calibrate
 from t3mpc_ros.cli.command import ArgumentParser, ask_line, check_two_ports
 from t3mpc_ros.cli.run_options import STANDARD_OUTPUT, add_json, print_result
-from t3mpc_ros.parameters.command_line import (
-    bounded_float,
-    bounded_int,
-    check_writable,
-    parse_assignments,
-)
+from t3mpc_ros.parameters import command_line
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.parameters.yaml_files import YamlError, file_errors, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
@@ -38,6 +33,7 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
 from t3mpc_ros.radio.tool import (
     channel_scan,
+    eeprom_records,
     jog,
     key_provisioning,
     link_test,
@@ -45,12 +41,6 @@ from t3mpc_ros.radio.tool import (
     robot_info,
     robot_log,
     robot_settings,
-)
-from t3mpc_ros.radio.tool.eeprom_records import (
-    SENSOR_COUNT,
-    SENSORS,
-    RobotSettings,
-    check_settings,
 )
 from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, ProcedureError, Script
 from t3mpc_ros.radio.tool.robot_settings import SettingsFileError, StoredSettings
@@ -140,7 +130,7 @@ def _setup(options: argparse.Namespace, stop: StopSignal) -> int:
     loaded = _load_settings(options.load) if options.load is not None else None
     compared = _load_settings(options.diff) if options.diff is not None else None
     if options.save is not None:
-        check_writable(options.save)
+        command_line.check_writable(options.save)
     stored = _run_at_board(robot_settings.read_settings(), options, stop)
     if loaded is not None or changes:
         base = loaded._asdict() if loaded is not None else {}
@@ -165,7 +155,7 @@ def _setup(options: argparse.Namespace, stop: StopSignal) -> int:
 
 def _store_settings(
     stored: StoredSettings,
-    wanted: RobotSettings,
+    wanted: eeprom_records.RobotSettings,
     options: argparse.Namespace,
     stop: StopSignal,
 ) -> StoredSettings:
@@ -187,7 +177,7 @@ def _show_log(options: argparse.Namespace, stop: StopSignal) -> int:
     return EXIT_OK
 
 
-def _load_settings(path: Path) -> RobotSettings:
+def _load_settings(path: Path) -> eeprom_records.RobotSettings:
     try:
         return robot_settings.settings_of_file(read_yaml(path))
     except (YamlError, SettingsFileError) as error:
@@ -273,7 +263,7 @@ def _doctor(options: argparse.Namespace, stop: StopSignal) -> int:
     from t3mpc_ros.cli import robot_doctor
     from t3mpc_ros.radio.tool.bench_checklist import FAIL
 
-    check_writable(options.report)
+    command_line.check_writable(options.report)
     check_two_ports(options.port, options.robot_port)
     if not options.no_questions and not sys.stdin.isatty():
         raise ProcedureError('the checklist asks questions at a terminal: or use --no-questions')
@@ -321,7 +311,7 @@ def _link_parameters(options: argparse.Namespace) -> LinkParameters:
         with _named(options.params_file):
             LinkParameters.from_dict(values)
     texts = [text.removeprefix('link.') for text in options.set]
-    return LinkParameters.from_dict(values | parse_assignments(LinkParameters, texts))
+    return LinkParameters.from_dict(values | command_line.parse_assignments(LinkParameters, texts))
 
 
 def _read_link_parameters(path: Path) -> dict[str, object]:
@@ -359,7 +349,7 @@ def _setting(name: str, convert: Callable[[str], object]) -> Callable[[str], obj
     def parse(text: str) -> object:
         try:
             value = convert(text)
-            check_settings(RobotSettings()._replace(**{name: value}))  # type: ignore[arg-type]
+            eeprom_records.check_settings(eeprom_records.RobotSettings()._replace(**{name: value}))  # type: ignore[arg-type]
         except (ValueError, SettingsFileError) as error:
             raise argparse.ArgumentTypeError(str(error)) from error
         return value
@@ -369,7 +359,7 @@ def _setting(name: str, convert: Callable[[str], object]) -> Callable[[str], obj
 
 def _sensors(text: str) -> tuple[str, ...]:
     names = tuple(text.split(','))
-    return SENSOR_COUNT * names if len(names) == 1 else names
+    return eeprom_records.SENSOR_COUNT * names if len(names) == 1 else names
 
 
 def _revolutions(text: str) -> float:
@@ -410,7 +400,7 @@ def program_parser() -> argparse.ArgumentParser:
     add_json(ping)
     add = ping.add_argument
     text = 'number of requests to each (default 200)'
-    add('--count', type=bounded_int(1, 100_000), default=200, help=text)
+    add('--count', type=command_line.bounded_int(1, 100_000), default=200, help=text)
 
     text = 'list the channels on which the robot answers'
     scan = link_command('scan', _scan, text, False)
@@ -423,7 +413,7 @@ def program_parser() -> argparse.ArgumentParser:
     add('wheel', choices=(jog.LEFT, jog.RIGHT))
     add('revolutions', type=_revolutions, metavar='REVOLUTIONS', help='negative: backward')
     text = 'wheel speed, rad/s (default 2)'
-    add('--speed', type=bounded_float(0.2, 10.0), default=2.0, help=text)
+    add('--speed', type=command_line.bounded_float(0.2, 10.0), default=2.0, help=text)
     add('--yes', action='store_true', help='do not ask whether the wheels are in the air')
 
     add_json(link_command('parameters', _show_parameters, 'list the board parameters', True))
@@ -435,7 +425,7 @@ def program_parser() -> argparse.ArgumentParser:
     add = link_command('doctor', _doctor, text, True).add_argument
     add('--robot-port', required=True, help='USB port of the robot board')
     text = 'requests of the link test (default 200)'
-    add('--count', type=bounded_int(10, 100_000), default=200, help=text)
+    add('--count', type=command_line.bounded_int(10, 100_000), default=200, help=text)
     add('--drive', action='store_true', help='turn each wheel once, after a confirmation')
     add('--no-questions', action='store_true', help='skip what only a person can judge')
     text = 'HTML file (default doctor.html); the same as JSON beside it'
@@ -474,7 +464,8 @@ def _add_settings_commands(
         '--sensors',
         type=_setting('sensors', _sensors),
         metavar='TYPE[,…]',
-        help=f'distance sensors, one type or {SENSOR_COUNT}: {", ".join(SENSORS)}',
+        help=f'distance sensors, one type or {eeprom_records.SENSOR_COUNT}: '
+        f'{", ".join(eeprom_records.SENSORS)}',
     )
     add('--diff', type=Path, metavar='FILE', help='compare with a file; exit code 1 if different')
     add('--load', type=Path, metavar='FILE', help='write the settings of a file')

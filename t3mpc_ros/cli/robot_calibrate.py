@@ -144,10 +144,7 @@ def _changed(link: LinkParameters) -> dict[str, object]:
 
 
 def calibrate(
-    options: argparse.Namespace,
-    parameters: LinkParameters,
-    key: bytes,
-    stop: Callable[[], bool],
+    options: argparse.Namespace, parameters: LinkParameters, key: bytes, stop: Callable[[], bool]
 ) -> int:
     """Run the wizard; save what it found, also if the user ends it; return the exit code."""
     if not (options.port or options.robot_port):

@@ -19,15 +19,7 @@ import os
 from pathlib import Path
 from typing import TypeVar
 
-from t3mpc_ros.evaluation.reporting import (
-    Block,
-    Mark,
-    Table,
-    Tiles,
-    VerdictBox,
-    html_page,
-    strict_json,
-)
+from t3mpc_ros.evaluation import reporting
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool import jog, link_test, procedure
 from t3mpc_ros.radio.tool.bench_checklist import (
@@ -144,22 +136,24 @@ def _write(checks: Sequence[Check], path: Path) -> None:
         'open': f'nothing failed; {counts[SKIPPED]} checks were skipped',
         'good': 'all checks passed',
     }[kind]
-    rows: list[list[str | Mark]] = [
+    rows: list[list[str | reporting.Mark]] = [
         [
             check.name,
-            Mark(check.verdict, _MARKS[check.verdict]),
+            reporting.Mark(check.verdict, _MARKS[check.verdict]),
             str(check.step or ''),
             check.value,
             check.remedy if check.verdict == FAIL else '',
         ]
         for check in checks
     ]
-    blocks: list[Block] = [
-        VerdictBox(headline, failed, kind),
-        Tiles([(str(count), verdict) for verdict, count in counts.items()]),
-        Table('', ['check', 'verdict', 'step', 'found', 'remedy'], rows, text=5, wrap=True),
+    blocks: list[reporting.Block] = [
+        reporting.VerdictBox(headline, failed, kind),
+        reporting.Tiles([(str(count), verdict) for verdict, count in counts.items()]),
+        reporting.Table(
+            '', ['check', 'verdict', 'step', 'found', 'remedy'], rows, text=5, wrap=True
+        ),
     ]
-    path.write_text(html_page('Bench checklist of the robot', blocks), encoding='utf-8')
+    path.write_text(reporting.html_page('Bench checklist of the robot', blocks), encoding='utf-8')
     data = path.with_suffix('.json')
-    data.write_text(strict_json([check._asdict() for check in checks]), encoding='utf-8')
+    data.write_text(reporting.strict_json([check._asdict() for check in checks]), encoding='utf-8')
     print(f'{path}, {data}: {headline}')

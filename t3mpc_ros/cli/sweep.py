@@ -17,18 +17,7 @@ import argparse
 from pathlib import Path
 import sys
 
-from t3mpc_ros.cli.run_options import (
-    FULL,
-    NOMINAL,
-    add_json,
-    add_seeds,
-    add_setting,
-    add_workers,
-    executor_of,
-    prepare_outputs,
-    print_result,
-    setting_of,
-)
+from t3mpc_ros.cli import run_options
 from t3mpc_ros.parameters.command_line import parsed_value
 
 OUTPUT = Path('runs') / 'sweep.parquet'
@@ -48,7 +37,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.add_argument(
         'controllers',
         nargs='*',
-        default=[FULL],
+        default=[run_options.FULL],
         metavar='CONTROLLER',
         help='name of a method, or FILE.py:NAME (default full)',
     )
@@ -61,10 +50,14 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         metavar='NAME=V,V,…',
         help='values of a parameter of the controller, of noise or duration, or of robot.NAME',
     )
-    add_setting(parser)
-    add_seeds(parser, '1-5', 'reference and robot')
+    run_options.add_setting(parser)
+    run_options.add_seeds(parser, '1-5', 'reference and robot')
     parser.add_argument(
-        '--cases', nargs='+', default=(NOMINAL,), metavar='CASE', help='by name (default nominal)'
+        '--cases',
+        nargs='+',
+        default=(run_options.NOMINAL,),
+        metavar='CASE',
+        help='by name (default nominal)',
     )
     parser.add_argument(
         '--output', type=Path, default=OUTPUT, help=f'Parquet file (default {OUTPUT})'
@@ -72,8 +65,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.add_argument(
         '--metric', default='settled', help='column that the table shows (default settled)'
     )
-    add_workers(parser)
-    add_json(parser, 'also write the rows')
+    run_options.add_workers(parser)
+    run_options.add_json(parser, 'also write the rows')
     parser.set_defaults(run=run)
 
 
@@ -82,20 +75,20 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.api.comparison_runs import find_metric
     from t3mpc_ros.evaluation.api.parameter_sweep import has_failed, sweep
 
-    prepare_outputs(options, options.output)
+    run_options.prepare_outputs(options, options.output)
     metric = find_metric(options.metric).name
-    with executor_of(options) as executor:
+    with run_options.executor_of(options) as executor:
         found = sweep(
             options.controllers,
             dict(options.set),
             seeds=options.seeds,
             cases=options.cases,
-            **setting_of(options),
+            **run_options.setting_of(options),
             output=options.output,
             executor=executor,
             progress=True,
         )
-    print_result(
+    run_options.print_result(
         options,
         lambda: f'{found.table(metric)}\n{len(found.rows)} runs: {options.output}',
         lambda: found.rows,

@@ -69,11 +69,7 @@ def run(options: argparse.Namespace) -> int:
         if options.robot != 'servo':
             raise ValueError(f'robot must be servo for bags: got {options.robot}')
         return run_bags(options)
-    from t3mpc_ros.evaluation.training.simulated_runs import (
-        assess,
-        fit_simulated_runs,
-        origin,
-    )
+    from t3mpc_ros.evaluation.training.simulated_runs import assess, fit_simulated_runs, origin
 
     if options.keep_predictor:
         raise ValueError('--keep-predictor is for bags')

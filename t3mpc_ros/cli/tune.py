@@ -18,14 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from t3mpc_ros.cli.run_options import (
-    add_json,
-    add_topic_options,
-    add_workers,
-    executor_of,
-    print_result,
-    report_options,
-)
+from t3mpc_ros.cli import run_options
 from t3mpc_ros.parameters.command_line import bounded_int
 
 if TYPE_CHECKING:
@@ -65,7 +58,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         type=bounded_int(1, 100_000),
         help=f'of each method with each robot (default {EVALUATIONS}; twin {TWIN_EVALUATIONS})',
     )
-    add_workers(parser)
+    run_options.add_workers(parser)
     parser.add_argument(
         '--output',
         type=Path,
@@ -74,8 +67,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.add_argument(
         '--resume', action='store_true', help='go on where the last tuning was interrupted'
     )
-    add_json(parser, 'also write the parameters')
-    add_topic_options(parser.add_argument_group('with a bag'))
+    run_options.add_json(parser, 'also write the parameters')
+    run_options.add_topic_options(parser.add_argument_group('with a bag'))
     parser.set_defaults(run=run)
 
 
@@ -94,9 +87,9 @@ def run(options: argparse.Namespace) -> int:
     names = find_names('method', options.methods, [method.name for method in known])
     methods = [method for method in known if method.name in names or not names]
     require_libraries(method.name for method in methods)
-    with executor_of(options) as executor:
+    with run_options.executor_of(options) as executor:
         store = _tuned(options, methods, executor)
-    print_result(options, store.table, store.to_dict)
+    run_options.print_result(options, store.table, store.to_dict)
     return 0
 
 
@@ -149,9 +142,9 @@ def _identify(options: argparse.Namespace) -> int:
         )
     if options.methods or options.evaluations or options.resume:
         raise ValueError('methods, --evaluations and --resume are for simulated robots: got a bag')
-    found = identify_bag(bag, report_options(options))
+    found = identify_bag(bag, run_options.report_options(options))
     text = drive_file(*found, bag_display_name(bag))
-    print_result(options, lambda: text.rstrip('\n'), lambda: drive_record(*found))
+    run_options.print_result(options, lambda: text.rstrip('\n'), lambda: drive_record(*found))
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         options.output.write_text(text, encoding='utf-8')

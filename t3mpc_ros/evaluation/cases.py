@@ -115,8 +115,7 @@ CASES: Mapping[str, Case] = {
         later={'twin': {'gyro_bias_jump': 0.05}},
     ),
     'gyro dead': _gyro(
-        'from half of the run on the gyro does not respond',
-        later={'twin': {'gyro_dead': True}},
+        'from half of the run on the gyro does not respond', later={'twin': {'gyro_dead': True}}
     ),
     'mass +30 %': Case(
         'body mass and inertia 30 % above nominal',

@@ -19,6 +19,7 @@ import math
 import statistics
 from typing import Any, TypeVar
 
+from t3mpc_ros.evaluation import record
 from t3mpc_ros.evaluation.baselines.baseline_controller import EXACT_INERTIA, FRICTION
 from t3mpc_ros.evaluation.cases import CASES
 from t3mpc_ros.evaluation.confidence_intervals import (
@@ -32,18 +33,6 @@ from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.loop import ComparedMethod, Driver, Method, run
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, MODEL_ERROR
-from t3mpc_ros.evaluation.record import (
-    DRIFT,
-    METRICS,
-    OVERALL,
-    SETTLED,
-    START,
-    STOPPED,
-    VARIATION,
-    YAW_RATE,
-    YAW_RATE_SETTLED,
-    Metric,
-)
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.scenario import (
     HELD_OUT_SEEDS,
@@ -77,11 +66,7 @@ class ComparisonPlan:
     """The method with which every other is compared."""
 
     def __post_init__(self) -> None:
-        for what, chosen in (
-            ('case', self.cases),
-            ('method', self.methods),
-            ('seed', self.seeds),
-        ):
+        for what, chosen in (('case', self.cases), ('method', self.methods), ('seed', self.seeds)):
             if not chosen:
                 raise ValueError(f'at least one {what} must be given')
 
@@ -160,7 +145,7 @@ def run_plan(plan: ComparisonPlan, workers: Any = 1, report: Report | None = Non
 
 
 def difference(
-    plan: ComparisonPlan, results: ResultTable, case: str, method: str, metric: Metric
+    plan: ComparisonPlan, results: ResultTable, case: str, method: str, metric: record.Metric
 ) -> Difference | None:
     """Return the paired difference from the method of reference; None for itself or without it."""
     first, second = ({'controller': name, 'case': case} for name in (method, plan.against))
@@ -189,7 +174,7 @@ def verdicts(differences: Mapping[Key, Difference | None], seeds: int) -> dict[K
 
 def case_differences(
     plan: ComparisonPlan, results: ResultTable, case: str
-) -> dict[tuple[str, Metric], Difference | None]:
+) -> dict[tuple[str, record.Metric], Difference | None]:
     """Return the differences that a case is judged by, of every method and metric."""
     return {
         (method, metric): difference(plan, results, case, method, metric)
@@ -200,16 +185,16 @@ def case_differences(
 
 def case_verdicts(
     plan: ComparisonPlan, results: ResultTable, case: str
-) -> dict[tuple[str, Metric], str]:
+) -> dict[tuple[str, record.Metric], str]:
     """Return the verdicts of the table of a case."""
     return verdicts(case_differences(plan, results, case), len(plan.seeds))
 
 
-def judged_metrics(case: str) -> tuple[Metric, ...]:
+def judged_metrics(case: str) -> tuple[record.Metric, ...]:
     """Return the metrics that decide a case: of the wheels, or of the body if it is unknown."""
     if CASES[case].body:
-        return YAW_RATE_SETTLED, YAW_RATE, DRIFT
-    return SETTLED, OVERALL
+        return record.YAW_RATE_SETTLED, record.YAW_RATE, record.DRIFT
+    return record.SETTLED, record.OVERALL
 
 
 def summary_table(
@@ -229,17 +214,21 @@ def summary_table(
         for case, metric in firsts.items():
             cell = _cell(results.values(metric.name, case=case, controller=method), metric)
             cells.append(f'{cell} {judged.get((method, case), "")}'.rstrip())
-        variation = results.values(VARIATION.name, case=plan.cases[0], controller=method)
-        cells.append(_cell(variation, VARIATION))
+        variation = results.values(record.VARIATION.name, case=plan.cases[0], controller=method)
+        cells.append(_cell(variation, record.VARIATION))
         if step_times:
             cells.append(f'{step_times[method]:.0f}')
         rows.append(tuple(cells))
-    body = [case for case, metric in firsts.items() if metric is not SETTLED]
+    body = [case for case, metric in firsts.items() if metric is not record.SETTLED]
     title = 'Settled RMSE of the wheel speeds, rad/s'
     if body:
         title += f' ({", ".join(body)}: of the yaw rate of the body)'
     title += f'; mean ± half the 95 % interval (seeds); verdict against {plan.against}'
-    head = ['method', *plan.cases, f'{VARIATION.heading}, {plan.cases[0]}, {VARIATION.unit}']
+    head = [
+        'method',
+        *plan.cases,
+        f'{record.VARIATION.heading}, {plan.cases[0]}, {record.VARIATION.unit}',
+    ]
     head += ['step, µs'] if step_times else []
     return Table(title, head, rows, (FULL,), wrap=True, notes=_verdict_notes(plan, len(judged)))
 
@@ -267,7 +256,7 @@ def first_verdicts(plan: ComparisonPlan, results: ResultTable) -> dict[tuple[str
     )
 
 
-def _cell(values: Sequence[float], metric: Metric) -> str:
+def _cell(values: Sequence[float], metric: record.Metric) -> str:
     """Return mean ± half the interval and the number of seeds, or how many diverged."""
     if diverged := sum(map(math.isnan, values)):
         return f'{diverged} of {len(values)} diverged'
@@ -280,11 +269,11 @@ def case_table(plan: ComparisonPlan, results: ResultTable, case: str) -> Table:
     first = results.where(case=case, controller=next(iter(plan.methods)))[0]
     metrics = [
         metric
-        for metric in METRICS
+        for metric in record.METRICS
         if metric.name in first
         and (
-            metric is not STOPPED
-            or any(each > 0.0 for each in results.values(STOPPED.name, case=case))
+            metric is not record.STOPPED
+            or any(each > 0.0 for each in results.values(record.STOPPED.name, case=case))
         )
     ]
     judged = judged_metrics(case)
@@ -364,8 +353,8 @@ def description(plan: ComparisonPlan) -> str:
     kind = plan.scenario.kind
     before, after = kind.settling
     text += (
-        f'The first {START:g} s of control do not count. Settled: without {before:g} s before and '
-        f'{after:g} s after each switch. '
+        f'The first {record.START:g} s of control do not count. Settled: without {before:g} s '
+        f'before and {after:g} s after each switch. '
     )
     if kind.has_gyro:
         text += (

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.evaluation import reporting
 from t3mpc_ros.evaluation.fault_study import ALLOWED, BEGIN, DURATION, ODOMETRY_WRONG
 from t3mpc_ros.evaluation.plotting import (
     COLOURS,
@@ -29,17 +30,6 @@ from t3mpc_ros.evaluation.plotting import (
     legend_above,
     new_figure,
     scale_by_size,
-)
-from t3mpc_ros.evaluation.reporting import (
-    EMPTY_CELL,
-    Block,
-    Contents,
-    Heading,
-    Picture,
-    Table,
-    VerdictBox,
-    html_page,
-    replace_section,
 )
 from t3mpc_ros.evaluation.result_file import Row
 
@@ -94,8 +84,8 @@ def hidden(row: Row) -> bool:
 
 def table_row(row: Row) -> tuple[str, ...]:
     """Return the cells of a table."""
-    after = EMPTY_CELL if row['after'] is None else f'{row["after"]:.2f}'
-    undetected = ', '.join(row['undetected']) or EMPTY_CELL
+    after = reporting.EMPTY_CELL if row['after'] is None else f'{row["after"]:.2f}'
+    undetected = ', '.join(row['undetected']) or reporting.EMPTY_CELL
     if hidden(row):
         undetected = (UNREPORTED if row['ranges'] else UNDETECTED) + undetected
     return (
@@ -103,7 +93,7 @@ def table_row(row: Row) -> tuple[str, ...]:
         outcome_sentence(row),
         f'{row["before"]:.2f}, {row["during"]:.2f}, {after}',
         f'{_place(*row["odometry_before"])}; {_place(*row["odometry_after"])}',
-        ', '.join(filter(None, [*row['detected'], row['ranges']])) or EMPTY_CELL,
+        ', '.join(filter(None, [*row['detected'], row['ranges']])) or reporting.EMPTY_CELL,
         undetected,
     )
 
@@ -118,7 +108,7 @@ def by_course(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
 def markdown_tables(rows: Sequence[Row]) -> str:
     """Return a table for each course, one row for each outcome."""
     return '\n'.join(
-        f'### {title}\n\n{Table("", TABLE_HEAD, [*map(table_row, chosen)]).markdown()}\n'
+        f'### {title}\n\n{reporting.Table("", TABLE_HEAD, [*map(table_row, chosen)]).markdown()}\n'
         for title, chosen in by_course(rows)
     )
 
@@ -156,7 +146,7 @@ faster (root mean square) the wheels turn than they roll.
 
 def update_page(page: Path, rows: Sequence[Row]) -> None:
     """Replace the section between the marks of a page."""
-    replace_section(page, BEGIN_MARK, END_MARK, page_section(rows))
+    reporting.replace_section(page, BEGIN_MARK, END_MARK, page_section(rows))
 
 
 def _short(reason: str) -> str:
@@ -171,25 +161,25 @@ def _place(metres: float, angle: float) -> str:
 
 def page(rows: Sequence[Row]) -> str:
     """Return the page as self-contained HTML."""
-    blocks: list[Block] = [_verdict(rows)]
+    blocks: list[reporting.Block] = [_verdict(rows)]
     for number, (title, chosen) in enumerate(by_course(rows)):
         worst = max(chosen, key=lambda row: row['during'])
         seen = (
             f'{title}: error of the wheels before, during and after each fault; the largest '
             f'during one is {worst["during"]:.2f} rad/s, of {worst["name"]}.'
         )
-        blocks.append(Heading(title))
+        blocks.append(reporting.Heading(title))
         if figure := drawing(_draw_errors, chosen):
-            blocks.append(Picture(seen, file_of(figure, 'svg'), seen))
+            blocks.append(reporting.Picture(seen, file_of(figure, 'svg'), seen))
         if number == 0:
-            blocks.append(Contents())
+            blocks.append(reporting.Contents())
         cells = [[cell.replace('`', '').replace('**', '') for cell in table_row(row)]
                  for row in chosen]  # fmt: skip
-        blocks.append(Table('', TABLE_HEAD, cells, text=len(TABLE_HEAD), wrap=True))
-    return html_page('Fault study of the closed loop', blocks)
+        blocks.append(reporting.Table('', TABLE_HEAD, cells, text=len(TABLE_HEAD), wrap=True))
+    return reporting.html_page('Fault study of the closed loop', blocks)
 
 
-def _verdict(rows: Sequence[Row]) -> VerdictBox:
+def _verdict(rows: Sequence[Row]) -> reporting.VerdictBox:
     """Return how many faults end in which way."""
     count = Counter(row['verdict'] for row in rows)
     reasons = [f'{count[kind]} {text}.' for kind, text in _ENDINGS.items() if count[kind]]
@@ -197,17 +187,17 @@ def _verdict(rows: Sequence[Row]) -> VerdictBox:
         reasons.append(f'Not detected by robot or controller: {", ".join(names)}.')
     if count['unbounded']:
         beyond = '; '.join(map(_run_name, [row for row in rows if row['verdict'] == 'unbounded']))
-        return VerdictBox(f'Not every fault stays bounded: {beyond}', reasons, 'bad')
+        return reporting.VerdictBox(f'Not every fault stays bounded: {beyond}', reasons, 'bad')
     lost = [row for row in rows if ODOMETRY_WRONG in row['undetected']]
     if not lost:
-        return VerdictBox('Every fault stays bounded', reasons, 'good')
+        return reporting.VerdictBox('Every fault stays bounded', reasons, 'good')
     worst = max(lost, key=lambda row: row['odometry_after'][0])
     headline = (
         f'Every fault stays within the limits, but the odometry is wrong at the end of '
         f'{len(lost)} of {len(rows)} runs, by up to {_place(*worst["odometry_after"])} '
         f'({_run_name(worst)})'
     )
-    return VerdictBox(headline, reasons, 'open')
+    return reporting.VerdictBox(headline, reasons, 'open')
 
 
 def _run_name(row: Row) -> str:

@@ -20,6 +20,7 @@ from importlib import import_module
 from typing import TypeVar
 
 from t3mpc_ros.control.command_shaper import CommandShaperParameters
+from t3mpc_ros.evaluation.baselines import feedback_control
 from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import AdaptiveIntervalType2, AdaptiveType1
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
@@ -31,13 +32,6 @@ from t3mpc_ros.evaluation.baselines.feed_forward import (
     FeedForwardParameters,
     LmsBodyCorrection,
     LmsBodyCorrectionParameters,
-)
-from t3mpc_ros.evaluation.baselines.feedback_control import (
-    ComputedTorque,
-    DisturbanceRejection,
-    FeedbackBaseline,
-    ProportionalIntegral,
-    SlidingMode,
 )
 from t3mpc_ros.evaluation.baselines.linear_mpc import LinearMpc, LinearMpcPreview
 from t3mpc_ros.evaluation.baselines.nonlinear_mpc import CasadiNmpc
@@ -181,12 +175,12 @@ _INNER = {'load_share': 0.0, 'inner_gain': 15.0}
 _BASELINES: tuple[
     tuple[str, type[BaselineController], Mapping[str, float], tuple[SearchRange, ...]], ...
 ] = (
-    ('PI + feed-forward', ProportionalIntegral, {}, (_GAIN, _INTEGRAL)),
-    ('ADRC', DisturbanceRejection, {}, _ADRC),
-    ('sliding mode', SlidingMode, {}, _SLIDING),
+    ('PI + feed-forward', feedback_control.ProportionalIntegral, {}, (_GAIN, _INTEGRAL)),
+    ('ADRC', feedback_control.DisturbanceRejection, {}, _ADRC),
+    ('sliding mode', feedback_control.SlidingMode, {}, _SLIDING),
     (
         'computed torque',
-        ComputedTorque,
+        feedback_control.ComputedTorque,
         {},
         (_GAIN, _INTEGRAL, SearchRange('belief', 0.0, 1.3, log=False)),
     ),
@@ -240,7 +234,7 @@ def further_definitions() -> list[MethodDefinition]:
     """
     found = []
     for name, kind, changes, ranges in _BASELINES:
-        if issubclass(kind, FeedbackBaseline):
+        if issubclass(kind, feedback_control.FeedbackBaseline):
             start = kind.parameters_type().with_values(
                 {**changes, 'jump_transition.preview': True}
             )

@@ -33,17 +33,11 @@ from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, find_names
+from t3mpc_ros.simulation import plant_robot
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule, load_schedule
 from t3mpc_ros.simulation.plant.disturbances import MeasurementNoise
 from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParameters
-from t3mpc_ros.simulation.plant_robot import (
-    LinkDelay,
-    NoisyPlant,
-    Plant,
-    PlantRobot,
-    SimulatedRobot,
-)
 
 TUNING_SEEDS = tuple(range(1, 10))
 """Seeds for tuning."""
@@ -105,7 +99,7 @@ class SampledReference:
 class PlantSource(Protocol):
     """A plant of a script, as plain data."""
 
-    def simulation(self) -> Plant:
+    def simulation(self) -> plant_robot.Plant:
         """Return the plant at its start, without noise."""
         ...
 
@@ -264,7 +258,7 @@ class Scenario:
         """Return the true robot, as it is when the run begins."""
         return self.kind.true_robot(self).with_values(self.own.robot_parameters)
 
-    def simulation(self) -> SimulatedRobot:
+    def simulation(self) -> plant_robot.SimulatedRobot:
         """Return the robot of a new run."""
         return self.kind.simulation(self)
 
@@ -326,25 +320,27 @@ class RobotKind:
             }
         )
 
-    def simulation(self, scenario: Scenario) -> SimulatedRobot:
+    def simulation(self, scenario: Scenario) -> plant_robot.SimulatedRobot:
         """Return the robot of a new run."""
         parameters, own = scenario.true_robot(), scenario.own
-        plant: Plant
+        plant: plant_robot.Plant
         if own.noise is None:
             plant = PaperPlant(parameters)
         else:
             quiet = parameters.with_values({'noise.variance': 0.0})
             inner = PaperPlant(quiet) if own.plant is None else own.plant.simulation()
-            plant = NoisyPlant(inner, own.noise.simulation(parameters.seed))
+            plant = plant_robot.NoisyPlant(inner, own.noise.simulation(parameters.seed))
         later = scenario.parts.later.get(scenario.robot)
         links = scenario.links
         least, most = links.command_delay
-        return PlantRobot(
+        return plant_robot.PlantRobot(
             plant,
             parameters,
             parameters.with_values(later) if later else None,
             stamp_of(scenario.change_step),
-            LinkDelay(least, most - least, links.command_loss, *links.span(scenario.duration)),
+            plant_robot.LinkDelay(
+                least, most - least, links.command_loss, *links.span(scenario.duration)
+            ),
             scenario.seed,
         )
 
@@ -421,7 +417,7 @@ class TwinKind(RobotKind):
             {'noise.variance': float(scenario.noise), **scenario.parts.changes}
         )
 
-    def simulation(self, scenario: Scenario) -> SimulatedRobot:
+    def simulation(self, scenario: Scenario) -> plant_robot.SimulatedRobot:
         """Return the robot of a new run."""
         parameters = scenario.true_robot()
         assert isinstance(parameters, DigitalTwinParameters)

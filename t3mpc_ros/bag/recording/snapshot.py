@@ -142,10 +142,7 @@ class SnapshotWriter:
         time = datetime.fromtimestamp(now_ns / 1e9)
         name = snapshot_folder_name(f'{time:%Y_%m_%d-%H_%M_%S}', reason)
         folder = unused_folder(self._folder, name)
-        records = {
-            **metadata_records,
-            SNAPSHOT_RECORD: {'reason': reason, 'time_ns': str(now_ns)},
-        }
+        records = {**metadata_records, SNAPSHOT_RECORD: {'reason': reason, 'time_ns': str(now_ns)}}
         topics = dict(self._topics)  # the recorder adds others meanwhile
         self.busy = True
 

@@ -20,18 +20,12 @@ import os
 from pathlib import Path
 from typing import Any
 
+from t3mpc_ros.evaluation import comparison
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, columns_of, writable
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL
-from t3mpc_ros.evaluation.comparison import (
-    QUICK_SEEDS,
-    ComparisonPlan,
-    case_table,
-    judged_metrics,
-    run_plan,
-)
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.experiment import ResultTable, print_report
 from t3mpc_ros.evaluation.record import METRICS, SETTLED, Metric
@@ -48,7 +42,7 @@ from t3mpc_ros.simulation.fault_injection import FaultSchedule
 class Comparison(ShownAsTables):
     """Result of a comparison: the metrics of every run, and what is made of them."""
 
-    plan: ComparisonPlan
+    plan: comparison.ComparisonPlan
     results: ResultTable
     """One row for each run: controller, case, seed and metrics by name."""
 
@@ -75,10 +69,10 @@ class Comparison(ShownAsTables):
     def _tables(self, chosen: str | None = None) -> list[Table]:
         known = self.plan.cases
         cases = known if chosen is None else find_names('case', [chosen], known)
-        return [case_table(self.plan, self.results, case) for case in cases]
+        return [comparison.case_table(self.plan, self.results, case) for case in cases]
 
     def _paper_columns(self, table: Table) -> Sequence[str]:
-        heading = judged_metrics(table.title.partition(':')[0])[0].heading
+        heading = comparison.judged_metrics(table.title.partition(':')[0])[0].heading
         first = (f'{heading},', f'{heading} −')
         return [head for head in table.head if head.startswith(first) or head == 'verdict'][:3]
 
@@ -142,7 +136,7 @@ class Comparison(ShownAsTables):
 def compare(
     controllers: Any,
     *,
-    seeds: Iterable[int] = QUICK_SEEDS,
+    seeds: Iterable[int] = comparison.QUICK_SEEDS,
     cases: Sequence[str] = (NOMINAL,),
     reference: Any = None,
     plant: Any = 'twin',
@@ -180,12 +174,14 @@ def compare(
     """
     scenario = own_scenario(plant, reference, noise, faults, duration)
     plan = make_plan(controllers, seeds, cases, scenario)
-    return Comparison(plan, run_plan(plan, executor, print_report if progress else None))
+    return Comparison(
+        plan, comparison.run_plan(plan, executor, print_report if progress else None)
+    )
 
 
 def make_plan(
     controllers: Any, seeds: Iterable[int], cases: str | Sequence[str], scenario: Scenario
-) -> ComparisonPlan:
+) -> comparison.ComparisonPlan:
     """Return what is compared with the first of some controllers."""
     methods = [each.method(scenario.robot) for each in as_controllers(controllers)]
     chosen = chosen_cases(cases, scenario)
@@ -197,7 +193,7 @@ def make_plan(
             f'controllers must have different names, see Controller(name=…): got {repeated[0]} '
             'more than once'
         )
-    return ComparisonPlan(
+    return comparison.ComparisonPlan(
         scenario,
         chosen,
         dict(zip(names, methods, strict=True)),

@@ -24,17 +24,10 @@ from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.evaluation.api import result_tables
 from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds, chosen_cases, find_metric
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence, sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.result_tables import (
-    PARQUET,
-    Columns,
-    ShownAsTables,
-    columns_of,
-    writable,
-    write_parquet,
-)
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.api.single_run import DIVERGED, divergence
 from t3mpc_ros.evaluation.cases import NOMINAL
@@ -67,7 +60,7 @@ RUN, ERROR = 'run', 'error'
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Sweep(ShownAsTables):
+class Sweep(result_tables.ShownAsTables):
     """Result of a sweep: one row for each run.
 
     A row holds ``controller``, the swept parameters by name, ``robot``, ``reference``, ``case``,
@@ -84,7 +77,7 @@ class Sweep(ShownAsTables):
     @property
     def columns(self) -> dict[str, list[Any]]:
         """The rows as columns."""
-        return columns_of(self.rows)
+        return result_tables.columns_of(self.rows)
 
     @one_sentence
     def table(self, metric: str = SETTLED.name) -> str:
@@ -94,7 +87,7 @@ class Sweep(ShownAsTables):
     def _summary(self) -> str:
         return f'{", ".join(self.parameters)}; {len(self.rows)} runs'
 
-    def _columns(self) -> Columns:
+    def _columns(self) -> result_tables.Columns:
         return self.columns
 
     def _tables(self, chosen: str | None = None) -> list[Table]:
@@ -334,7 +327,7 @@ def _checked_path(output: str | os.PathLike[str] | None) -> Path | None:
     """Return the path; a missing library is an error before the runs, not after them."""
     if output is None:
         return None
-    path = writable(output, PARQUET)
+    path = result_tables.writable(output, result_tables.PARQUET)
     import pyarrow.parquet  # noqa: F401
 
     return path
@@ -356,8 +349,11 @@ def _run_to_file(
     fresh = {row[RUN]: row for row in made}
     rows = [fresh.get(run.key) or {**run.fields, **stored[run.key]} for run in runs]
     keys = {run.key for run in runs}
-    write_parquet(
-        path, columns_of([*rows, *(row for key, row in stored.items() if key not in keys)])
+    result_tables.write_parquet(
+        path,
+        result_tables.columns_of(
+            [*rows, *(row for key, row in stored.items() if key not in keys)]
+        ),
     )
     journal.remove(made.keys)
     return rows

@@ -345,11 +345,7 @@ class OwnController(BaselineController):
     parameters_type = NoParameters
 
     def __init__(
-        self,
-        name: str,
-        step: Callable[[Observation], Any],
-        made: Any,
-        nominal_model: NominalModel,
+        self, name: str, step: Callable[[Observation], Any], made: Any, nominal_model: NominalModel
     ) -> None:
         super().__init__(NoParameters(), nominal_model)
         self.preview = bool(getattr(made, 'preview', False))  # type: ignore[misc]

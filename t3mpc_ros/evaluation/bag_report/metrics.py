@@ -20,16 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
+from t3mpc_ros.evaluation.bag_report import tracking_errors
 from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents, find_incidents
 from t3mpc_ros.evaluation.bag_report.link_history import LinkMetrics, link_metrics
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
-from t3mpc_ros.evaluation.bag_report.tracking_errors import (
-    ErrorStatistics,
-    errors_of,
-    format_pair,
-    path_distance,
-)
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
@@ -120,9 +115,9 @@ UNMEASURED = 'not measured'
 class ChannelMetrics:
     """Tracking metrics of one channel; NaN where the bag holds no data."""
 
-    overall: ErrorStatistics
+    overall: tracking_errors.ErrorStatistics
     """RMSE while driven, without the initial transient."""
-    settled: ErrorStatistics
+    settled: tracking_errors.ErrorStatistics
     """RMSE also without the windows around switches."""
     chatter: float
     """Total variation of the commanded speed per second."""
@@ -186,7 +181,7 @@ class ReportMetrics:
             pair = [value(self, each.name) for each in self.channels]
             if any(map(math.isfinite, pair)):
                 units = [unit.format(each.unit) for each in self.channels]
-                found.append((format_pair(pair, units), f'{title}, {names}'))
+                found.append((tracking_errors.format_pair(pair, units), f'{title}, {names}'))
         rows = [(title, unit, value(self)) for title, unit, value in RUN_NUMBERS]
         rows += [
             (f'{title}, {name}', unit, value(link))
@@ -269,7 +264,7 @@ LINK_NUMBERS: tuple[tuple[str, str, Callable[[LinkMetrics], float]], ...] = (
 
 def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
     """Return the summary metrics of ``run``."""
-    errors = errors_of(run, run.measured)
+    errors = tracking_errors.errors_of(run, run.measured)
     command, reference = run.motions.get(COMMAND), run.motions.get(REFERENCE)
     wheels = {
         wheel: ChannelMetrics(
@@ -291,7 +286,7 @@ def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
         missing=missing.get(ODOMETRY, math.nan),
         latency_99=math.nan if prompt is None else float(np.percentile(prompt['value'], 99.0)),
     )
-    distance = path_distance(run)
+    distance = tracking_errors.path_distance(run)
     return ReportMetrics(
         report=report,
         duration=run.duration,

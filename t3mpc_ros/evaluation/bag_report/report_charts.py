@@ -566,10 +566,6 @@ SECTIONS = (
         '500 cycles.',
         link,
     ),
-    Section(
-        'Punctuality of the loop',
-        'By receive times at the recorder.',
-        timing,
-    ),
+    Section('Punctuality of the loop', 'By receive times at the recorder.', timing),
 )
 """In the order of the report."""

@@ -22,15 +22,7 @@ import numpy as np
 
 from t3mpc_ros.bag.mcap_file import LOSS_CAUSES, LOSSES, UNDISCOVERED
 from t3mpc_ros.bag.reader import BagReader, open_bag
-from t3mpc_ros.evaluation.bag_report.incidents import (
-    BRAKING,
-    DEMANDED,
-    PAUSE,
-    STILL,
-    driving,
-    smooth,
-    still_rows,
-)
+from t3mpc_ros.evaluation.bag_report import incidents
 from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.map_changes import map_change_blocks
 from t3mpc_ros.evaluation.bag_report.metrics import (
@@ -40,16 +32,9 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     compute_metrics,
 )
 from t3mpc_ros.evaluation.bag_report.patrol_section import patrol_blocks
-from t3mpc_ros.evaluation.bag_report.report_charts import (
-    LABELS,
-    SECTIONS,
-    Section,
-    undetermined,
-)
+from t3mpc_ros.evaluation.bag_report.report_charts import LABELS, SECTIONS, Section, undetermined
 from t3mpc_ros.evaluation.bag_report.run_data import Run, load_run
-from t3mpc_ros.evaluation.bag_report.tracking_errors import (
-    errors_of,
-)
+from t3mpc_ros.evaluation.bag_report.tracking_errors import errors_of
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
 from t3mpc_ros.evaluation.drive_response import ResponseFit
@@ -197,7 +182,7 @@ def _losses(recording: BagReader, run: Run) -> tuple[list[str], list[str]]:
     """
     unusual, usual = [], []
     record = recording.metadata_records.get(LOSSES, {})
-    first, last = driving(run)
+    first, last = incidents.driving(run)
     counted = counted_from(first, last) if first < last else math.inf
     early = all(float(each.time[0]) <= counted for each in run.motions.values())
     for cause, text in LOSS_CAUSES.items():
@@ -264,7 +249,7 @@ def _errors(run: Run) -> list[Block]:
 
 def extents(run: Run) -> str:
     """Return the description of the time in which errors are counted."""
-    first, last = driving(run)
+    first, last = incidents.driving(run)
     start = f'its first {START:g} s, of less than {2 * START:g} s the first half'
     if COMMAND not in run.motions:
         extent = (
@@ -276,8 +261,8 @@ def extents(run: Run) -> str:
     else:
         extent = (
             f'Driven: from the first command other than zero, at {first:.1f} s, to the last, at '
-            f'{last:.1f} s, without {start}, and without each stop, from {BRAKING:g} s before to '
-            f'{ROBOT_WINDOW.after:g} s after it.'
+            f'{last:.1f} s, without {start}, and without each stop, from '
+            f'{incidents.BRAKING:g} s before to {ROBOT_WINDOW.after:g} s after it.'
         )
     return (
         f'{extent} Settled: also without the {ROBOT_WINDOW.before:g} s before each switch, in '
@@ -356,10 +341,7 @@ def _complaints(run: Run) -> list[Block]:
         return []
     rows = [[level, who, what, format_number(when)] for when, level, who, what in run.complaints]
     head = ['level', 'node', 'message', 'first at / s']
-    return [
-        Heading('Warnings and errors of the nodes'),
-        Table('', head, rows, text=3, wrap=True),
-    ]
+    return [Heading('Warnings and errors of the nodes'), Table('', head, rows, text=3, wrap=True)]
 
 
 def _contents(recording: BagReader) -> Iterator[Block]:
@@ -376,14 +358,16 @@ def motion_rows(run: Run) -> list[list[str]]:
     motion, command = run.motions.get(run.measured), run.motions.get(COMMAND)
     if motion is None:
         return []
-    time, linear = smooth(motion, 'linear')
-    _, angular = smooth(motion, 'angular')
+    time, linear = incidents.smooth(motion, 'linear')
+    _, angular = incidents.smooth(motion, 'angular')
     known = np.isfinite(linear)
     if not known.any():
         return []
     step = float(time[1] - time[0]) if time.size > 1 else 0.0
-    still = still_rows(linear, angular)
-    spans = [each for each in spans_of(still) if (each.stop - each.start) * step >= PAUSE]
+    still = incidents.still_rows(linear, angular)
+    spans = [
+        each for each in spans_of(still) if (each.stop - each.start) * step >= incidents.PAUSE
+    ]
     stops = [(float(time[each][0]), float(time[each][-1])) for each in spans]
     lengths = [end - start for start, end in stops]
     distance = float(np.abs(linear[known]).sum() * step)
@@ -407,8 +391,8 @@ def motion_rows(run: Run) -> list[list[str]]:
         rows.append(['standstill at', f'{where}{more} s'])
     if command is not None:
         commanded = np.zeros(time.size, dtype=np.bool_)
-        for name, least in STILL.items():
-            commanded |= np.abs(command.held(name, time)) > DEMANDED * least
+        for name, least in incidents.STILL.items():
+            commanded |= np.abs(command.held(name, time)) > incidents.DEMANDED * least
         commanded &= time >= command.time[0]
         disobeyed = step * sum(int(np.count_nonzero(commanded[each])) for each in spans)
         rows.append(['of that, motion was commanded', f'{disobeyed:.1f} s'])

@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.evaluation.bag_report import report_charts
 from t3mpc_ros.evaluation.bag_report.incidents import driving
 from t3mpc_ros.evaluation.bag_report.metrics import (
     CHANNEL_NUMBERS,
@@ -30,13 +31,6 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
     SPEED_ERRORS,
     ReportMetrics,
     compute_metrics,
-)
-from t3mpc_ros.evaluation.bag_report.report_charts import (
-    TERM_COLOURS,
-    TERM_DASHES,
-    extent_of,
-    is_long,
-    line,
 )
 from t3mpc_ros.evaluation.bag_report.report_page import verdict_box
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, load_run
@@ -81,7 +75,7 @@ MAX_SAMPLES = 2000
 """Samples of a reference that are compared."""
 GROUP = 3
 """Blocks of a group of charts: heading, charts, and what their time is."""
-MAX_RUNS = len(TERM_COLOURS)
+MAX_RUNS = len(report_charts.TERM_COLOURS)
 """Runs that a page compares."""
 DISTANCE = Channel('distance', 'distance from the path', 'distance', 'm')
 """What is compared of two robots that follow poses."""
@@ -333,18 +327,18 @@ def _charts(runs: Sequence[ComparedRun]) -> Iterator[Block]:
     """Yield the overlaid charts, with the time since the first command to move."""
     first = runs[0]
     channels = [c for c in first.run.channels if all(c in each.run.channels for each in runs)]
-    looks = list(zip(runs, TERM_COLOURS, TERM_DASHES, strict=False))
+    looks = list(zip(runs, report_charts.TERM_COLOURS, report_charts.TERM_DASHES, strict=False))
     reference = first.run.motions.get(REFERENCE)
     for heading, title, pick in OVERLAID:
         found = [
             (each.label, colour, _shifted(each, series), dash)
             for each, colour, dash in looks
-            if is_long(series := pick(each.run))
+            if report_charts.is_long(series := pick(each.run))
         ]
         charts = []
         for channel in channels:
             lines = [
-                line(label, colour, series, channel.name, dash=dash)
+                report_charts.line(label, colour, series, channel.name, dash=dash)
                 for label, colour, series, dash in found
             ]
             seen = f'{channel.title.capitalize()} of {len(runs)} runs over each other.'
@@ -353,9 +347,11 @@ def _charts(runs: Sequence[ComparedRun]) -> Iterator[Block]:
                 named = zip(runs, map(format_number, sizes), strict=True)
                 text = ', '.join(f'{each.label} {size}' for each, size in named)
                 seen = f'Settled RMSE: {text} {channel.unit}.'
-            elif is_long(reference):
+            elif report_charts.is_long(reference):
                 label, shown = f'reference of {first.label}', _shifted(first, reference)
-                lines.append(line(label, 'reference', shown, channel.name, dash=(6, 4)))
+                lines.append(
+                    report_charts.line(label, 'reference', shown, channel.name, dash=(6, 4))
+                )
             extent = _settled_extent(runs, channel.name) if title == 'Error' else None
             if lines:
                 name = f'{title}, {channel.title}'
@@ -365,7 +361,7 @@ def _charts(runs: Sequence[ComparedRun]) -> Iterator[Block]:
     curves = [
         Curve(each.label, colour, motion.time - each.start, motion['x'], motion['y'], dash)
         for each, colour, dash in looks
-        if is_long(motion := each.run.motions.get(each.run.measured))
+        if report_charts.is_long(motion := each.run.motions.get(each.run.measured))
     ]
     if curves:
         ends = ', '.join(f'{c.label} at {c.x[-1]:.2f}, {c.y[-1]:.2f} m' for c in curves)
@@ -379,7 +375,7 @@ def _settled_extent(runs: Sequence[ComparedRun], name: str) -> tuple[float, floa
         error = tracking_error(each.run, each.run.measured)
         if error is not None:
             rows = driven(error.time, each.run) & settled(error.time, each.run)
-            found.append(extent_of(error, rows, [name]))
+            found.append(report_charts.extent_of(error, rows, [name]))
     known = [each for each in found if each is not None]
     return (min(low for low, _ in known), max(high for _, high in known)) if known else None
 

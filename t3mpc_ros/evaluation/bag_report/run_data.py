@@ -30,12 +30,8 @@ from t3mpc_ros.bag.reader import (
     read_columns,
 )
 from t3mpc_ros.control.controller import WHEELS
+from t3mpc_ros.evaluation.bag_report import link_history
 from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, gaps, several_robots
-from t3mpc_ros.evaluation.bag_report.link_history import (
-    DiagnosticEvent,
-    LinkHistory,
-    read_diagnostics,
-)
 from t3mpc_ros.evaluation.bag_report.map_changes import RecordedChange, read_map_changes
 from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
 from t3mpc_ros.evaluation.topic_roles import (
@@ -168,11 +164,11 @@ class Run:
     """Times of the switches of the reference."""
     lead: float
     """Median lead (s) of the reference stamps over their receive times."""
-    complaints: tuple[DiagnosticEvent, ...]
+    complaints: tuple[link_history.DiagnosticEvent, ...]
     """From diagnostics: first time, level, node, text."""
-    changes: tuple[DiagnosticEvent, ...]
+    changes: tuple[link_history.DiagnosticEvent, ...]
     """Likewise, each time that a node got worse."""
-    links: tuple[LinkHistory, ...]
+    links: tuple[link_history.LinkHistory, ...]
     """Radio links in the diagnostics."""
     oddities: tuple[str, ...]
     """Sentences on what is unusual in the bag, and what was done about it."""
@@ -234,7 +230,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         else:
             motions[name] = _motion(table['stamp'] - clock.origin, table, geometry)
     oddities += _oddities_of_motions(topics, raw)
-    diagnostics = read_diagnostics(recording, choice.namespaces[0])
+    diagnostics = link_history.read_diagnostics(recording, choice.namespaces[0])
     expected = NAMES if choice.ours else (REFERENCE, ODOMETRY, COMMAND)
     return Run(
         duration=recording.duration,

@@ -51,11 +51,7 @@ def statistics(error: Array, period: float = math.nan) -> ErrorStatistics:
     if not size.size:
         return ErrorStatistics(math.nan, math.nan, math.nan, 0, 0.0)
     return ErrorStatistics(
-        rms(size),
-        float(size.mean()),
-        float(size.max()),
-        int(size.size),
-        size.size * period,
+        rms(size), float(size.mean()), float(size.max()), int(size.size), size.size * period
     )
 
 
@@ -128,10 +124,7 @@ def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, Error
     calm = moving & settled(error.time, run)
     period = float(np.median(np.diff(error.time))) if len(error) > 1 else math.nan
     return {
-        wheel: (
-            statistics(error[wheel][moving], period),
-            statistics(error[wheel][calm], period),
-        )
+        wheel: (statistics(error[wheel][moving], period), statistics(error[wheel][calm], period))
         for wheel, *_ in run.channels
     }
 

@@ -38,20 +38,11 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
+from t3mpc_ros.evaluation.baselines import predictive_baseline
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
     Observation,
     WheelLoads,
-)
-from t3mpc_ros.evaluation.baselines.predictive_baseline import (
-    BoxProgram,
-    ExtrapolationParameters,
-    PredictiveBaseline,
-    PredictiveParameters,
-    WheelModel,
-    response_matrix,
-    torque_units,
-    wheel_model,
 )
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter, with_default
@@ -63,7 +54,7 @@ MAX_RESPONSE_LENGTH = 1000
 
 
 @dataclass(frozen=True)
-class DynamicMatrixPreviewParameters(PredictiveParameters):
+class DynamicMatrixPreviewParameters(predictive_baseline.PredictiveParameters):
     """Parameters of dynamic matrix control with preview."""
 
     moves: int = parameter(
@@ -93,7 +84,9 @@ class DynamicMatrixPreviewParameters(PredictiveParameters):
 
 
 @dataclass(frozen=True)
-class DynamicMatrixParameters(ExtrapolationParameters, DynamicMatrixPreviewParameters):
+class DynamicMatrixParameters(
+    predictive_baseline.ExtrapolationParameters, DynamicMatrixPreviewParameters
+):
     """Parameters of dynamic matrix control without preview."""
 
     moves: int = with_default(DynamicMatrixPreviewParameters, 'moves', 12)
@@ -108,7 +101,9 @@ class Responses(NamedTuple):
     """h_j, to an acceleration that acts on the wheel, (rad/s)/(rad/s²)."""
 
 
-def identify_step_responses(model: WheelModel, inner_gain: float, least: int) -> Responses:
+def identify_step_responses(
+    model: predictive_baseline.WheelModel, inner_gain: float, least: int
+) -> Responses:
     """Return the step responses of a wheel from two simulations of ``model``.
 
     ``inner_gain`` is K0 of the loop that is closed around it first, 1/s, 0 when it settles by
@@ -138,7 +133,7 @@ def identify_step_responses(model: WheelModel, inner_gain: float, least: int) ->
     return Responses(steps[:length].copy(), loads[:length].copy())
 
 
-class DynamicMatrix(PredictiveBaseline):
+class DynamicMatrix(predictive_baseline.PredictiveBaseline):
     """Dynamic matrix control without preview: it extrapolates the reference by its slope."""
 
     parameters_type: ClassVar[type[Parameters]] = DynamicMatrixParameters
@@ -147,20 +142,20 @@ class DynamicMatrix(PredictiveBaseline):
         super().__init__(parameters, nominal_model)
         table, period = self.parameters, nominal_model.period
         self._inner_gain = table.inner_gain if self._torque else 0.0
-        model = wheel_model(nominal_model, table.model_error)
+        model = predictive_baseline.wheel_model(nominal_model, table.model_error)
         n = table.horizon
         self.responses = identify_step_responses(model, self._inner_gain, n + 1)
         """Step responses of the wheel model."""
         self._static = float(self.responses.loads[-1])
         """Steady speed (rad/s) by which a wheel misses its set point per rad/s² on it."""
-        self._response = response_matrix(self.responses.steps[:n], table.moves)
+        self._response = predictive_baseline.response_matrix(self.responses.steps[:n], table.moves)
         weight = (table.move_time / period) ** 2
         self._reach = nominal_model.acceleration * period
         if self._inner_gain and self.preview:
             # A set point that is planned ahead should not outrun the motors, going straight on.
-            self._reach = float(torque_units(nominal_model)[0].sum()) * period
+            self._reach = float(predictive_baseline.torque_units(nominal_model)[0].sum()) * period
         hessian = self._response.T @ self._response + weight * np.eye(table.moves)
-        self._wheels = [BoxProgram(hessian, self._reach) for _ in range(2)]
+        self._wheels = [predictive_baseline.BoxProgram(hessian, self._reach) for _ in range(2)]
         self._loads = WheelLoads(nominal_model, inertia_factor=table.model_error)
         self._bias_share = -math.expm1(-period / table.bias_time)
         self._outputs: Array | None = None

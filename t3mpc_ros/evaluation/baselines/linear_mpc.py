@@ -37,26 +37,20 @@ from typing import ClassVar
 
 import numpy as np
 
+from t3mpc_ros.evaluation.baselines import predictive_baseline
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
     Observation,
     WheelLoads,
-)
-from t3mpc_ros.evaluation.baselines.predictive_baseline import (
-    BoxProgram,
-    ExtrapolationParameters,
-    ObserverBaseline,
-    ObserverParameters,
-    PredictiveParameters,
-    response_matrix,
-    wheel_model,
 )
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 
 @dataclass(frozen=True)
-class LinearMpcPreviewParameters(ObserverParameters, PredictiveParameters):
+class LinearMpcPreviewParameters(
+    predictive_baseline.ObserverParameters, predictive_baseline.PredictiveParameters
+):
     """Parameters of linear MPC with preview."""
 
     load_share: float = parameter(
@@ -67,11 +61,11 @@ class LinearMpcPreviewParameters(ObserverParameters, PredictiveParameters):
 
 
 @dataclass(frozen=True)
-class LinearMpcParameters(ExtrapolationParameters, LinearMpcPreviewParameters):
+class LinearMpcParameters(predictive_baseline.ExtrapolationParameters, LinearMpcPreviewParameters):
     """Parameters of linear MPC without preview."""
 
 
-class LinearMpc(ObserverBaseline):
+class LinearMpc(predictive_baseline.ObserverBaseline):
     """Linear MPC without preview: it extrapolates the reference by its slope."""
 
     parameters_type: ClassVar[type[Parameters]] = LinearMpcParameters
@@ -80,18 +74,18 @@ class LinearMpc(ObserverBaseline):
         super().__init__(parameters, nominal_model)
         table = self.parameters
         n = table.horizon
-        self._model = model = wheel_model(nominal_model, table.model_error)
+        self._model = model = predictive_baseline.wheel_model(nominal_model, table.model_error)
         self._loads = WheelLoads(nominal_model, inertia_factor=table.model_error)
         self._decay = model.pole ** np.arange(1, n + 1)[:, np.newaxis]
         once = model.pole ** np.arange(n)
         # What a load, a held command and the moves of either wheel add to the next N speeds.
-        self._by_load = response_matrix(model.give * once, n)
+        self._by_load = predictive_baseline.response_matrix(model.give * once, n)
         steps = model.push * once if self._torque else np.cumsum(model.push * once)
         self._held: Array = (np.zeros(n) if self._torque else steps)[:, np.newaxis]
-        self._by_move = response_matrix(steps, n)
+        self._by_move = predictive_baseline.response_matrix(steps, n)
         squares = self._by_move.T @ self._by_move + self._damping
         hessian = np.asarray(np.kron(self._units.T @ self._units, squares), dtype=np.float64)
-        self._program = BoxProgram(hessian, self._reach)
+        self._program = predictive_baseline.BoxProgram(hessian, self._reach)
         self._expected_speeds: Array | None = None
         """What the last horizon expects for now with no command."""
 

@@ -16,11 +16,7 @@
 import numpy as np
 
 from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
-from t3mpc_ros.evaluation.baselines.baseline_controller import (
-    NominalModel,
-    Observation,
-    future_jump,
-)
+from t3mpc_ros.evaluation.baselines import baseline_controller
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
 
 
@@ -35,7 +31,7 @@ class PlannedReference:
     def __init__(
         self,
         parameters: JumpTransitionParameters,
-        nominal_model: NominalModel,
+        nominal_model: baseline_controller.NominalModel,
         lag: float,
         ahead: int = 0,
     ) -> None:
@@ -53,7 +49,7 @@ class PlannedReference:
         self.reachable, self.rate = self._transition.reachable, self._transition.rate
         """rbar (rad/s), and its derivative (rad/s²) until one period later; shape (2,)."""
 
-    def step(self, observation: Observation) -> None:
+    def step(self, observation: baseline_controller.Observation) -> None:
         """Update :attr:`reachable` and :attr:`rate`."""
         future, ahead, elapsed = observation.future, self._ahead, observation.elapsed
         if future is None or len(future) < ahead + 3:
@@ -69,7 +65,7 @@ class PlannedReference:
             self._announced = effect + 1
         last = effect + len(future) - 2
         for instant in range(max(self._announced, effect) + 1, last + 1):
-            if found := future_jump(future, instant - effect, self._period):
+            if found := baseline_controller.future_jump(future, instant - effect, self._period):
                 self._transition.announce(instant * self._period_ns, *found)
         self._announced = max(self._announced, last)
         self._effect, self._future = effect, future.copy()

@@ -23,51 +23,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.controller import WHEELS
+from t3mpc_ros.evaluation import plotting
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.methods import FULL
-from t3mpc_ros.evaluation.paper.figure_runs import (
-    FigureRuns,
-    broken_at_switches,
-    estimated_unknown,
-    explained,
-    largest_switch,
-    switches_of,
-    true_unknown,
-)
+from t3mpc_ros.evaluation.paper import figure_runs
 from t3mpc_ros.evaluation.paper.results import Results, label
 from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, PARTS, SETTLING, STAGES, WITHOUT
-from t3mpc_ros.evaluation.plotting import (
-    COLOURS,
-    legend_above,
-    mark_switches,
-    new_figure,
-    new_panels,
-)
 from t3mpc_ros.evaluation.record import START, Record
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, Array, WheelSpeeds
 
-REFERENCE_COLOUR, DRIVEN = COLOURS[REFERENCE], COLOURS[TRUTH]
-COMMAND, MEASURED = COLOURS['applied'], COLOURS[ODOMETRY]
+REFERENCE_COLOUR, DRIVEN = plotting.COLOURS[REFERENCE], plotting.COLOURS[TRUTH]
+COMMAND, MEASURED = plotting.COLOURS['applied'], plotting.COLOURS[ODOMETRY]
 
 
-def path(showcase: FigureRuns) -> Any:
+def path(showcase: figure_runs.FigureRuns) -> Any:
     """Return the path on the floor of the simulated robot, the paper's Fig. 8."""
     run = showcase.velocity
-    figure = new_figure(5.0)
+    figure = plotting.new_figure(5.0)
     axis = figure.subplots()
     reference, driven = floor_path(run.reference, run.time), floor_path(run.speeds, run.time)
     axis.plot(*reference.T, color=REFERENCE_COLOUR, linewidth=1.0, label='reference')
     axis.plot(*driven.T, color=DRIVEN, linewidth=1.6, label='driven')
     axis.plot(*driven[0], 'o', color=REFERENCE_COLOUR, markersize=6, label='start')
     at = driven[1:][np.diff(run['mode']) != 0]
-    axis.plot(*at.T, 'D', color=COLOURS['switch'], markersize=5, label='switch')
+    axis.plot(*at.T, 'D', color=plotting.COLOURS['switch'], markersize=5, label='switch')
     axis.set_aspect('equal', adjustable='datalim')
     axis.set(xlabel='x / m', ylabel='y / m')
-    legend_above(figure, axis)
+    plotting.legend_above(figure, axis)
     return figure
 
 
@@ -88,7 +74,7 @@ def floor_path(speeds: Array, time: Array) -> Array:
     return places
 
 
-def path_in_words(showcase: FigureRuns) -> str:
+def path_in_words(showcase: figure_runs.FigureRuns) -> str:
     """Return how long the way was and where it ended."""
     run = showcase.velocity
     reference, driven = floor_path(run.reference, run.time), floor_path(run.speeds, run.time)
@@ -100,7 +86,7 @@ def path_in_words(showcase: FigureRuns) -> str:
     )
 
 
-def portrait_in_words(showcase: FigureRuns) -> str:
+def portrait_in_words(showcase: figure_runs.FigureRuns) -> str:
     """Return how closely the simulated robot's wheels followed."""
     run = showcase.velocity
     settled = run.rmse(margins=SETTLING)
@@ -109,10 +95,10 @@ def portrait_in_words(showcase: FigureRuns) -> str:
 
 def portrait(run: Record) -> Any:
     """Return the phase portrait of the wheels and of their reference, Fig. 9 and 14."""
-    figure = new_figure(3.4)
+    figure = plotting.new_figure(3.4)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     # The robot's way through a switch is part of its portrait, the reference's jump is not.
-    reference = broken_at_switches(run, run.reference)
+    reference = figure_runs.broken_at_switches(run, run.reference)
     for axis, values, colour, title in (
         (axes[0], reference, REFERENCE_COLOUR, 'reference'),
         (axes[1], run.speeds, DRIVEN, 'robot'),
@@ -123,10 +109,10 @@ def portrait(run: Record) -> Any:
     return figure
 
 
-def modes(showcase: FigureRuns) -> Any:
+def modes(showcase: figure_runs.FigureRuns) -> Any:
     """Return which chaotic signal drives which output, the paper's Fig. 10."""
     run = showcase.torque
-    figure, axes = new_panels(2, 1.25)
+    figure, axes = plotting.new_panels(2, 1.25)
     index = run['mode'].astype(int) % len(showcase.pairs)
     signals = np.array(showcase.pairs)[index]
     end = run.time[-1] + run.time[1] - run.time[0]
@@ -143,7 +129,7 @@ def modes(showcase: FigureRuns) -> Any:
     return figure
 
 
-def outputs(showcase: FigureRuns) -> Any:
+def outputs(showcase: figure_runs.FigureRuns) -> Any:
     """Return both outputs with their references, whole run and one switch, the paper's Fig. 11."""
     run = showcase.torque
     dots = {'color': MEASURED, 'marker': '.', 'linestyle': '', 'ms': 2.5, 'label': 'measured'}
@@ -152,11 +138,11 @@ def outputs(showcase: FigureRuns) -> Any:
     columns = ((run.reference, reference), (run.speeds, driven))
     samples = run['measured'], dots
     figure, axes = run_and_zoom(run, 'speed / rad/s', 0.4, 1.6, columns, samples)
-    legend_above(figure, axes[0][-1])
+    plotting.legend_above(figure, axes[0][-1])
     return figure
 
 
-def control(showcase: FigureRuns) -> Any:
+def control(showcase: figure_runs.FigureRuns) -> Any:
     """Return the control signals with their total variation, the paper's Fig. 12."""
     run = showcase.torque
     effort = run['acceleration']
@@ -168,31 +154,34 @@ def control(showcase: FigureRuns) -> Any:
     return figure
 
 
-def estimates(showcase: FigureRuns) -> Any:
+def estimates(showcase: figure_runs.FigureRuns) -> Any:
     """Return the estimates g with their targets, the paper's Fig. 13."""
     run = showcase.torque
-    target = {'color': COLOURS['target'], 'lw': 0.9, 'label': 'unknown, $\\dot\\chi - u$'}
-    found = {'color': COLOURS['estimate'], 'lw': 1.3, 'label': 'estimate g'}
-    columns = ((true_unknown(run), target), (estimated_unknown(run)[:-1], found))
+    target = {'color': plotting.COLOURS['target'], 'lw': 0.9, 'label': 'unknown, $\\dot\\chi - u$'}
+    found = {'color': plotting.COLOURS['estimate'], 'lw': 1.3, 'label': 'estimate g'}
+    columns = (
+        (figure_runs.true_unknown(run), target),
+        (figure_runs.estimated_unknown(run)[:-1], found),
+    )
     figure, axes = run_and_zoom(run, 'rad/s²', 2.0, 4.0, columns)
-    for axis, wheel, share in zip(axes[:, 0], WHEELS, explained(run), strict=True):
+    for axis, wheel, share in zip(axes[:, 0], WHEELS, figure_runs.explained(run), strict=True):
         axis.set_title(f'{wheel} wheel, {100 * share:.0f} % of the variance explained')
-    legend_above(figure, axes[0][-1])
+    plotting.legend_above(figure, axes[0][-1])
     return figure
 
 
-def preview(showcase: FigureRuns) -> Any:
+def preview(showcase: figure_runs.FigureRuns) -> Any:
     """Return both wheels about a switch, with preview and without."""
     run, blind = showcase.velocity, showcase.blind
-    middle = largest_switch(run)
+    middle = figure_runs.largest_switch(run)
     if middle is None:
         return None
     before, after = 0.3, 0.8
     rows = rows_between(run, run.time[middle] - before, run.time[middle] + after)
     time = run.time[rows] - run.time[middle]
-    figure, axes = new_panels(2, 2.1)
+    figure, axes = plotting.new_panels(2, 2.1)
     for axis, i in zip(axes, range(2), strict=True):
-        axis.axvline(0.0, color=COLOURS['switch'], linewidth=0.8, linestyle=(0, (4, 3)))
+        axis.axvline(0.0, color=plotting.COLOURS['switch'], linewidth=0.8, linestyle=(0, (4, 3)))
         reference = {'color': REFERENCE_COLOUR, 'lw': 1.0, 'label': 'reference'}
         axis.step(time, run.reference[rows, i], where='post', **reference)
         axis.plot(time, run.speeds[rows, i], color=DRIVEN, lw=1.6, label='with preview')
@@ -200,7 +189,7 @@ def preview(showcase: FigureRuns) -> Any:
         axis.set(title=f'{WHEELS[i]} wheel', ylabel='speed / rad/s')
         axis.margins(x=0.0)
     axes[-1].set_xlabel(f'time from the switch at {run.time[middle]:.0f} s / s')
-    legend_above(figure, axes[0])
+    plotting.legend_above(figure, axes[0])
     return figure
 
 
@@ -221,17 +210,17 @@ def run_and_zoom(
     ``before`` and ``after`` are times about the switch, s; samples are drawn there alone.
     """
     stretches = [np.arange(run.time.size)]
-    middle = largest_switch(run)
+    middle = figure_runs.largest_switch(run)
     if middle is not None:
         switch = run.time[middle]
         stretches.append(rows_between(run, switch - before, switch + after))
-    figure = new_figure(4.6)
+    figure = plotting.new_figure(4.6)
     ratios = {'width_ratios': (1.7, 1.0)[: len(stretches)]}
     axes = figure.subplots(2, len(stretches), sharex='col', squeeze=False, gridspec_kw=ratios)
     for i, wheel in enumerate(WHEELS):
         axes[i, 0].set(title=f'{wheel} wheel', ylabel=unit)
         for k, (axis, rows) in enumerate(zip(axes[i], stretches, strict=True)):
-            mark_switches(axis, switches_of(run))
+            plotting.mark_switches(axis, figure_runs.switches_of(run))
             for values, style in (samples, *columns) if samples and k else columns:
                 shown = rows[rows < len(values)]
                 axis.plot(*thinned(run.time[shown], values[shown, i]), **style)
@@ -286,7 +275,7 @@ def rmse_bars(results: Results) -> Any:
     }
     colours = colours_of(results)
     longest = max(map(len, shown.values()))
-    figure = new_figure(0.9 + len(shown) * (0.5 + 0.23 * longest))
+    figure = plotting.new_figure(0.9 + len(shown) * (0.5 + 0.23 * longest))
     axes = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
     for axis, (drive, rows) in zip(axes, shown.items(), strict=True):
         places = np.arange(len(rows))
@@ -313,7 +302,7 @@ def noise_growth(results: Results) -> Any:
         return None
     colours = colours_of(results)
     baselines = results.means.unique('controller', baseline=True)
-    figure = new_figure(5.6 + 0.16 * len(baselines) / 3)
+    figure = plotting.new_figure(5.6 + 0.16 * len(baselines) / 3)
     drives = results.drives
     axes = figure.subplots(2, len(drives), sharex=True, sharey='row', squeeze=False)
     for column, drive in zip(axes.T, drives, strict=True):
@@ -341,14 +330,14 @@ def noise_growth(results: Results) -> Any:
     axes[0, 0].set_ylim(bottom=0.0)  # not before every line is there: it fixes the top, too
     axes[0, 0].set_ylabel('RMSE / rad/s')
     axes[1, 0].set_ylabel('RMSE less that without noise / rad/s')
-    legend_above(figure, *axes[0], columns=3)
+    plotting.legend_above(figure, *axes[0], columns=3)
     return figure
 
 
 def ablation_bars(results: Results) -> Any:
     """Return the RMSE of the controller's stages in every case at the paper's noise."""
     drives = results.drives
-    figure = new_figure(0.6 + 2.3 * len(drives))
+    figure = plotting.new_figure(0.6 + 2.3 * len(drives))
     panels = figure.subplots(len(drives), 1, squeeze=False)[:, 0]
     width = 0.85 / len(STAGES)
     for axis, drive in zip(panels, drives, strict=True):
@@ -366,7 +355,7 @@ def ablation_bars(results: Results) -> Any:
         axis.set_axisbelow(True)
         axis.set_ylim(bottom=0.0)
         axis.set(title=f'{drive} drive, noise {PAPER_NOISE:g}', ylabel='RMSE / rad/s')
-    legend_above(figure, panels[0])
+    plotting.legend_above(figure, panels[0])
     return figure
 
 
@@ -374,7 +363,7 @@ def parts(results: Results) -> Any:
     """Return the effect of adding and of leaving out each part, with 95 % intervals."""
     drives = results.drives
     most = max(len(results.cases(drive)) for drive in drives)
-    figure = new_figure(1.0 + len(drives) * (0.5 + 0.3 * most))
+    figure = plotting.new_figure(1.0 + len(drives) * (0.5 + 0.3 * most))
     axes = figure.subplots(len(drives), len(PARTS), squeeze=False, sharey='row')
     for row, drive in zip(axes, drives, strict=True):
         cases = results.cases(drive)
@@ -403,23 +392,23 @@ def parts(results: Results) -> Any:
         row[0].set_ylim(len(cases) - 0.5, -0.5)
         row[0].set_ylabel(f'{drive} drive')
     figure.supxlabel('paired difference of RMSE / rad/s; left of zero: better with it', fontsize=9)
-    legend_above(figure, axes[0, 0])
+    plotting.legend_above(figure, axes[0, 0])
     return figure
 
 
-def portraits(showcase: FigureRuns, results: Results) -> Any:
+def portraits(showcase: figure_runs.FigureRuns, results: Results) -> Any:
     """Return phase portraits of several methods in closed loop (Fig. 15)."""
     colours = colours_of(results)
     shown = showcase.portraits
     columns = min(3, len(shown))
     rows = math.ceil(len(shown) / columns)
-    figure = new_figure(0.6 + 2.2 * rows)
+    figure = plotting.new_figure(0.6 + 2.2 * rows)
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axis in axes.flat[len(shown) :]:
         axis.set_visible(False)
     for axis, (name, run) in zip(axes.flat, shown.items(), strict=False):
         counted = run.time >= START
-        reference = broken_at_switches(run, run.reference)
+        reference = figure_runs.broken_at_switches(run, run.reference)
         axis.plot(reference[:, 1], reference[:, 0], color=REFERENCE_COLOUR, linewidth=0.7)
         speeds = run.speeds[counted]
         axis.plot(speeds[:, 1], speeds[:, 0], color=colours[name], linewidth=0.8, alpha=0.9)
@@ -429,13 +418,13 @@ def portraits(showcase: FigureRuns, results: Results) -> Any:
     return figure
 
 
-def estimation_portraits(showcase: FigureRuns) -> Any:
+def estimation_portraits(showcase: figure_runs.FigureRuns) -> Any:
     """Return phase portraits of (86) by kind of fuzzy system, the paper's Fig. 15."""
     shown = showcase.estimated
-    figure = new_figure(2.7)
+    figure = plotting.new_figure(2.7)
     axes = figure.subplots(1, len(shown), sharex=True, sharey=True, squeeze=False)
     true = showcase.driven
-    palette = (OURS, COLOURS['estimate'], COLOURS['feedforward'])
+    palette = (OURS, plotting.COLOURS['estimate'], plotting.COLOURS['feedforward'])
     for axis, (kind, found), colour in zip(axes.flat, shown.items(), palette, strict=False):
         miss = rms(found - true)
         axis.plot(found[:, 1], found[:, 0], color=colour, linewidth=0.7, label='estimated')

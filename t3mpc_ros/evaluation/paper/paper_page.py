@@ -17,25 +17,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from t3mpc_ros.evaluation import reporting
 from t3mpc_ros.evaluation.paper import paper_figures
 from t3mpc_ros.evaluation.paper.claims import Claim
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.results import Results
 from t3mpc_ros.evaluation.paper.study import WITHOUT
-from t3mpc_ros.evaluation.reporting import (
-    Block,
-    Contents,
-    Details,
-    Group,
-    Heading,
-    Items,
-    Mark,
-    Paragraph,
-    Picture,
-    Table,
-    VerdictBox,
-    html_page,
-)
 
 BEYOND = 'Not in the paper.'
 
@@ -47,7 +34,7 @@ class ExhibitData:
     results: Results
     showcase: FigureRuns
     claims: Sequence[Claim]
-    tables: Mapping[str, Sequence[Table]]
+    tables: Mapping[str, Sequence[reporting.Table]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,14 +238,14 @@ def page(title: str, origin: str, material: ExhibitData, pictures: Mapping[str, 
         _exhibit(each, material, pictures)
         for each in sorted(EXHIBITS, key=lambda each: each.stem != HEADLINE)
     )
-    return html_page(
+    return reporting.html_page(
         title,
         [
-            Paragraph(origin, 'quiet'),
-            VerdictBox(f'Claims: {counted(material.claims)}.', [], 'apart'),
+            reporting.Paragraph(origin, 'quiet'),
+            reporting.VerdictBox(f'Claims: {counted(material.claims)}.', [], 'apart'),
             headline,
-            Contents(),
-            Heading('Claims'),
+            reporting.Contents(),
+            reporting.Heading('Claims'),
             _claims('What this project claims', material.claims, 'ours'),
             _claims('What the paper claims', material.claims, 'paper'),
             *others,
@@ -272,38 +259,40 @@ def counted(claims: Sequence[Claim]) -> str:
     return ', '.join(f'{verdicts.count(kind)} {kind}' for kind in list(_KINDS)[:4])
 
 
-def _claims(title: str, claims: Sequence[Claim], origin: str) -> Details:
+def _claims(title: str, claims: Sequence[Claim], origin: str) -> reporting.Details:
     chosen = [claim for claim in claims if claim.origin == origin]
     rows = [(claim.text, claim.found, _mark(claim.verdict)) for claim in chosen]
-    table = Table('', ('claim', 'found', ''), rows, text=3, wrap=True)
-    return Details(f'{title}: {counted(chosen)}', [table], opened=True)
+    table = reporting.Table('', ('claim', 'found', ''), rows, text=3, wrap=True)
+    return reporting.Details(f'{title}: {counted(chosen)}', [table], opened=True)
 
 
-def _exhibit(exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, bytes]) -> Group:
+def _exhibit(
+    exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, bytes]
+) -> reporting.Group:
     claims = exhibit.decided_by(material.claims)
-    found: list[Sequence[str | Mark]] = [
+    found: list[Sequence[str | reporting.Mark]] = [
         (f'{claim.text}: {claim.found}', _mark(claim.verdict)) for claim in claims
     ]
     if not found:
         found = [(exhibit.finding(material) if exhibit.finding else exhibit.caption,)]
     sides = [
-        Items([(exhibit.paper,)], 'side', 'The paper'),
-        Items(found, 'side', 'Found here'),
+        reporting.Items([(exhibit.paper,)], 'side', 'The paper'),
+        reporting.Items(found, 'side', 'Found here'),
     ]
-    blocks: list[Block] = [
-        Heading(exhibit.title, _mark(exhibit.mark(material.claims))),
-        Group(sides, 'div', 'sides'),
+    blocks: list[reporting.Block] = [
+        reporting.Heading(exhibit.title, _mark(exhibit.mark(material.claims))),
+        reporting.Group(sides, 'div', 'sides'),
     ]
     if figure := pictures.get(exhibit.stem):
-        blocks.append(Picture(exhibit.title, figure, exhibit.caption))
+        blocks.append(reporting.Picture(exhibit.title, figure, exhibit.caption))
     elif exhibit.stem:
-        blocks.append(Paragraph('Left out: nothing of it was measured.', 'quiet'))
+        blocks.append(reporting.Paragraph('Left out: nothing of it was measured.', 'quiet'))
     shown = material.tables.get(exhibit.tables, ())
     blocks += shown[:2]
     if more := shown[2:]:
-        blocks.append(Details(f'{len(more)} more tables', more))
-    return Group(blocks)
+        blocks.append(reporting.Details(f'{len(more)} more tables', more))
+    return reporting.Group(blocks)
 
 
-def _mark(verdict: str) -> Mark:
-    return Mark(verdict, _KINDS[verdict])
+def _mark(verdict: str) -> reporting.Mark:
+    return reporting.Mark(verdict, _KINDS[verdict])

@@ -243,10 +243,7 @@ def feedback_slope(parameters: Nt3fsMpcParameters) -> float:
 
 
 def skills(
-    parameters: PredictiveParameters,
-    span: float,
-    weights: dict[str, Array],
-    parts: list[Segment],
+    parameters: PredictiveParameters, span: float, weights: dict[str, Array], parts: list[Segment]
 ) -> Array:
     """Return the skill of weights on a run: next step and middle of the horizon, (2, m).
 

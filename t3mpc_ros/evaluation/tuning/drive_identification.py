@@ -26,12 +26,8 @@ from pathlib import Path
 import numpy as np
 
 from t3mpc_ros.bag.reader import open_bag
+from t3mpc_ros.control import dead_time_estimator
 from t3mpc_ros.control.controller import WHEELS, ControllerParameters, StepperControllerParameters
-from t3mpc_ros.control.dead_time_estimator import (
-    IDENTIFIED_DEVIATION,
-    MIN_DEVIATION,
-    MIN_NOISE_VARIANCE,
-)
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, load_run
 from t3mpc_ros.evaluation.drive_response import (
     DEAD_TIME,
@@ -178,10 +174,10 @@ def _identified(
         difference = float(best.times[i] - other.times[i])
         spread = math.sqrt(max(float(best.covariance[i, i]), 0.0) + doubt * difference**2)
         value = float(best.times[i])
-        floor = MODEL_DEVIATION * value if i == LAG else MIN_DEVIATION
+        floor = MODEL_DEVIATION * value if i == LAG else dead_time_estimator.MIN_DEVIATION
         spread = math.hypot(spread, floor)
         rough = MAX_RELATIVE_DEVIATION * value if i == LAG else 0.5 * period
-        bound = max(IDENTIFIED_DEVIATION, rough)
+        bound = max(dead_time_estimator.IDENTIFIED_DEVIATION, rough)
         if not spread <= bound:
             raise IdentificationError(
                 f'the standard deviation of the {what} must be at most {1e3 * bound:.1f} ms: got '
@@ -210,7 +206,7 @@ def _white_variance(errors: Array) -> Estimate:
     second = np.diff(errors, 2, axis=1)
     value = float((second**2).mean()) / 6.0
     relative = math.sqrt(2.0 * (1.0 + 8.0 / 9.0 + 1.0 / 18.0) / second.size)
-    return Estimate(value, math.hypot(relative * value, MIN_NOISE_VARIANCE))
+    return Estimate(value, math.hypot(relative * value, dead_time_estimator.MIN_NOISE_VARIANCE))
 
 
 def _rounded_rate(rate: float) -> float:
@@ -241,10 +237,7 @@ def fitting_parameters(
 
 def drive_record(drive: IdentifiedDrive, composition: str) -> dict[str, object]:
     """Return the drive, with standard deviations, and the parameters that fit it as plain data."""
-    return {
-        'drive': asdict(drive),
-        'parameters': fitting_parameters(drive, composition).to_dict(),
-    }
+    return {'drive': asdict(drive), 'parameters': fitting_parameters(drive, composition).to_dict()}
 
 
 def drive_file(drive: IdentifiedDrive, composition: str, source: str) -> str:
