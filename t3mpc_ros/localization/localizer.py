@@ -84,6 +84,11 @@ JUMP_DISTANCE, JUMP_ANGLE = 0.25, 0.5
 STEADY_TIME, STEADY_DISTANCE, STEADY_ANGLE = 3.0, 0.08, 0.08
 """Largest corrections of the odometry (m, rad) in a time (s) with which readings may contradict
 the map: the filter is not in doubt."""
+DRIFT_TIME = 30.0
+"""Time constant with which the drift of the odometry's yaw is measured, s."""
+LARGEST_DRIFT, LARGEST_CHANGE = 0.02, 0.03
+"""Largest drift, and largest that counts from one update to the next, rad/s: the bias of a warm
+gyro stays below; a slip turns the odometry faster."""
 AGREEMENT_DECAY = 0.05
 """Decay of the share of readings that fit, per telling reading."""
 
@@ -201,6 +206,10 @@ class Localizer:
         self._updated: Pose | None = None
         """Odometry at the last update."""
         self._updated_ns = 0
+        self._drift = 0.0
+        """Of the odometry's yaw, rad/s: a gyro measures its bias only at rest."""
+        self._turned = 0.0
+        """Turn by it since the last update, rad."""
         self._pending: dict[int, tuple[Pose, Beams]] = {}
         """Beams since the last update by sensor, each with the odometry at its instant."""
         if parameters.set_initial_pose:
@@ -286,10 +295,12 @@ class Localizer:
         if self._updated is None:
             return self._publish(pose)
         parameters = self.parameters
-        if not has_moved(self._updated, pose, parameters.update_min_d, parameters.update_min_a):
+        self._turn(pose, min((stamp_ns - last_ns) / NANOSECONDS, DISORDER))
+        turned = pose._replace(yaw=pose.yaw + self._turned)
+        if not has_moved(self._updated, turned, parameters.update_min_d, parameters.update_min_a):
             return False
         elapsed = min((stamp_ns - self._updated_ns) / NANOSECONDS, LONGEST_UPDATE)
-        self.filter.predict(self._updated, pose, elapsed)
+        self.filter.predict(self._updated, turned, elapsed)
         beams = self._beams(pose)
         known = self._of_the_map(beams, pose)
         # Averages of the likelihood get used to a wrong place; the share that fits does not.
@@ -299,6 +310,24 @@ class Localizer:
         if self.parameters.changes.enabled:
             self._detect(beams)
         return found
+
+    def _turn(self, odometry: Pose, elapsed: float) -> None:
+        """Turn the origin of the odometry about the robot as its yaw drifts."""
+        if self._drift == 0.0 or self.result is None:
+            return
+        turn = self._drift * elapsed
+        self._turned += turn
+        expected = pose_in(self.result.odometry_frame, odometry)
+        frame = frame_between(expected._replace(yaw=expected.yaw + turn), odometry)
+        self.result = self.result._replace(odometry_frame=frame)
+
+    def _learn_drift(self, correction: float) -> None:
+        """Follow the drift by a correction (rad) of the yaw since the last update."""
+        elapsed = (self._stamp_ns - self._updated_ns) / NANOSECONDS
+        if elapsed > 0.0:
+            change = min(max(correction / elapsed, -LARGEST_CHANGE), LARGEST_CHANGE)
+            drift = self._drift + elapsed / (DRIFT_TIME + elapsed) * change
+            self._drift = min(max(drift, -LARGEST_DRIFT), LARGEST_DRIFT)
 
     def _of_the_map(self, beams: Beams, odometry: Pose) -> Beams:
         """Return the beams without those of what has changed, by the pose before these beams."""
@@ -345,6 +374,9 @@ class Localizer:
             expected = pose_in(self.result.odometry_frame, odometry)
             if has_moved(expected, estimate.pose, JUMP_DISTANCE, JUMP_ANGLE):
                 self._searching = True  # until the readings have fitted there for some time
+            elif self.state is Localization.LOCALIZED:
+                self._learn_drift(wrap_angle(estimate.pose.yaw - expected.yaw))
+        self._turned = 0.0
         self._updated, self._updated_ns = odometry, self._stamp_ns
         self.share = estimate.share
         covariance = estimate.covariance + np.diag(np.square(SYSTEMATIC))

@@ -485,6 +485,61 @@ def test_a_search_ends_when_readings_fit_for_some_time():
 
 
 @pytest.mark.compiled
+def turned_too_far(localizer, drive, seconds):
+    """Drive; return the mean of the estimated yaw less the true one, rad."""
+    gaps = []
+    for _ in range(round(seconds / PERIOD)):
+        follow(localizer, drive, PERIOD)
+        gaps.append(wrap_angle(localizer.result.pose.yaw - drive.truth.yaw))
+    return float(np.mean(gaps))
+
+
+def yaw_errors(drift):
+    """Return mean errors of half a minute: after a drift of a minute, and a minute after it."""
+    localizer, drive = make_localizer(), Drive(drift=drift)
+    turned_too_far(localizer, drive, 60.0)
+    drifting = turned_too_far(localizer, drive, 30.0)
+    drive.drift = 0.0
+    turned_too_far(localizer, drive, 60.0)
+    return np.array([drifting, turned_too_far(localizer, drive, 30.0)])
+
+
+def test_the_drift_of_a_gyro_is_measured_by_the_map():
+    """A patrol was 2 degrees and 24 mm off after its gyro had drifted for twelve minutes.
+
+    At its next rest the gyro measures its bias, and the odometry drifts no more. The errors of a
+    drive without a drift come from the length of its odometry.
+    """
+    assert abs(yaw_errors(-0.009) - yaw_errors(0.0)).max() < 0.005
+
+
+def test_a_robot_at_rest_does_not_turn_with_its_gyro():
+    """Its pose loop followed the odometry, which did not turn then, and the robot did."""
+    localizer, drive = make_localizer(), Drive(drift=0.009)
+    turned_too_far(localizer, drive, 90.0)
+    yaw = drive.truth.yaw
+    for _ in range(round(20.0 / PERIOD)):
+        drive.stamp_ns += round(PERIOD * 1e9)
+        drive.odometry = moved_pose(drive.odometry, (0.0, 0.0, drive.drift * PERIOD))
+        for sensor, reading in enumerate(drive.ranges().tolist()):
+            localizer.add_range(sensor, reading)
+        localizer.add_odometry(drive.stamp_ns, drive.odometry)
+        used = pose_in(localizer.result.odometry_frame, drive.odometry)
+        assert abs(wrap_angle(used.yaw - yaw)) < 0.04  # 0.18 by the odometry
+
+
+@pytest.mark.parametrize('angle', [-0.3, 0.3])
+def test_a_slip_is_no_drift(angle):
+    after = []
+    for slip in (0.0, angle):
+        localizer, drive = make_localizer(), Drive(drift=0.0)
+        turned_too_far(localizer, drive, 60.0)
+        drive.odometry = moved_pose(drive.odometry, (0.0, 0.0, slip))
+        turned_too_far(localizer, drive, 10.0)
+        after.append(turned_too_far(localizer, drive, 20.0))
+    assert abs(after[1] - after[0]) < 0.003
+
+
 def test_a_slip_is_no_reason_to_look_elsewhere():
     """A turn that the odometry missed led to another place that looked alike, 1.4 m away."""
     for seed in (1, 2, 3):
