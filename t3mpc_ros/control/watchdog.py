@@ -437,6 +437,10 @@ sideways, as along what it touches."""
 CONTACT_TURN = 0.25
 """Difference of the turns by pose and by wheels within that motion (rad): what the robot touches
 turns it."""
+THROWN, THROWN_LAGS, THROWN_MEMORY = 0.4, (0.2, 0.1), 1.0
+"""Turn (rad) in about that memory (s) which nothing commanded: a robot that meets something at
+full speed, off its middle, is thrown about and turns back rather than drives. Commands and pose
+are compared behind these lags (s); without a contact the turn of the twin stays below 0.28 rad."""
 OWN_ODOMETRY = 0.001
 """Difference of a step of the pose from that of the wheels (m, rms) up to which the pose is
 counted by the wheels: only then that difference of the turns says more than the way does. A tyre
@@ -465,7 +469,9 @@ class ContactMonitor:
         self.restart(None)
 
     def restart(self, pose: Pose | None) -> None:
-        """Begin a new piece at a pose."""
+        """Begin a new piece at a pose; at none, a new drive."""
+        if pose is None:
+            self._asked_rate = self._rate = self._thrown = 0.0
         self._pose = pose
         self._most = self._unlike = 0.0
         self._steps = 0
@@ -475,6 +481,9 @@ class ContactMonitor:
     def is_in_contact(self, odometry: State, command: BodyTwist, elapsed: float) -> bool:
         """Whether something holds, turns or pushes aside a robot that is commanded to drive."""
         pose, last = odometry.pose, self._pose
+        if last is not None and self._is_thrown(motion_between(last, pose)[2], command, elapsed):
+            self.restart(pose)
+            return True
         tight = ON_THE_SPOT < abs(command.linear) < TIGHT * abs(command.angular)
         if last is None or command.linear * self._asked < 0.0 or tight:
             # Not only left out: the noise of a pose cancels in a sum without gaps alone.
@@ -508,6 +517,20 @@ class ContactMonitor:
             touches |= abs(self._turn) > CONTACT_TURN + CONTACT_LEAD * self._fastest_turn
         self.restart(pose)
         return touches
+
+    def _is_thrown(self, turn: float, command: BodyTwist, elapsed: float) -> bool:
+        """Return whether the robot turns (rad in this step) as nothing has commanded."""
+        if not elapsed > 0.0:
+            return False
+        lag, own_lag = (elapsed / (each + elapsed) for each in THROWN_LAGS)
+        self._asked_rate += lag * (command.angular - self._asked_rate)
+        self._rate += own_lag * (turn / elapsed - self._rate)
+        permitted = min(max(self._rate, min(self._asked_rate, 0.0)), max(self._asked_rate, 0.0))
+        self._thrown += elapsed * (self._rate - permitted - self._thrown / THROWN_MEMORY)
+        if abs(self._thrown) < THROWN:
+            return False
+        self._thrown = 0.0
+        return True
 
 
 class DriveMonitor:

@@ -483,6 +483,38 @@ def test_noise_of_a_pose_in_curves_is_no_contact(bend, seed):
     assert touches == 0
 
 
+def touches_of(turned, seconds, seed=0):
+    """Return when (s) contact is found of a robot that turns as ``turned(time, asked)``, rad/s."""
+    generator, monitor, pose = np.random.default_rng(seed), ContactMonitor(), Pose(0.0, 0.0, 0.0)
+    now, asked, times = STANDSTILL, [0.0] * 6, []
+    for k in range(round(100 * seconds)):
+        wanted = 4.0 * (-1.0) ** (k // 150)  # from one curve into the other, at 15 rad/s²
+        turn = asked[-1] + min(max(wanted - asked[-1], -0.15), 0.15)
+        asked.append(turn)
+        # The robot follows after 50 ms, and with a lag of 50 ms.
+        now = BodyTwist(0.3, now.angular + (asked[-6] - now.angular) / 6.0)
+        driven = BodyTwist(0.3, turned(0.01 * k, now.angular))
+        pose = advance_pose(pose, driven, 0.01)
+        x, y, yaw = np.array(pose) + generator.standard_normal(3) * (0.003, 0.003, 0.005)
+        odometry = State(k * 10 * MS, Pose(float(x), float(y), float(yaw)), driven)
+        if monitor.is_in_contact(odometry, BodyTwist(0.3, turn), 0.01):
+            times.append(0.01 * k)
+    return times
+
+
+@pytest.mark.parametrize('sign', [-1.0, 1.0])
+def test_a_robot_that_is_thrown_about_has_met_something(sign):
+    """It drove on, turned by a radian, and met the same box again at full speed."""
+    assert not touches_of(lambda _, asked: asked, 60.0)
+    begin = 2.3 if sign > 0.0 else 3.8  # in the middle of a curve to the other side
+
+    def thrown(time, asked):
+        return sign * 3.0 if begin < time < begin + 0.4 else asked
+
+    (found, *_) = touches_of(thrown, 5.0)
+    assert begin < found < begin + 0.4
+
+
 # -- pauses of the commands -----------------------------------------------------------------------
 
 
