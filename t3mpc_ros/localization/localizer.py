@@ -49,7 +49,7 @@ from t3mpc_ros.localization.range_model import (
     RangeModel,
     RangeModelParameters,
     explained_readings,
-    no_beams,
+    joined,
 )
 from t3mpc_ros.parameters.table import Parameters, group, parameter
 
@@ -91,6 +91,9 @@ LARGEST_DRIFT, LARGEST_CHANGE = 0.02, 0.03
 gyro stays below; a slip turns the odometry faster."""
 AGREEMENT_DECAY = 0.05
 """Decay of the share of readings that fit, per telling reading."""
+DOUBTFUL_AGREEMENT, OTHERS_AGREEMENT = 0.3, 0.8
+"""Share of the readings of a sensor that fit below which they are not used, and share of the
+median sensor from which on it is the sensor, not the place, that is wrong."""
 
 
 @dataclass(frozen=True)
@@ -194,6 +197,8 @@ class Localizer:
         """Pose of the last update; None before the first."""
         self.agreement = 1.0 if parameters.set_initial_pose else parameters.lost_agreement
         """Share of the telling readings that fit to the map, of the last 20 or so."""
+        self._fits = np.ones(len(mounts))
+        """That share for each range sensor."""
         self._searching = not parameters.set_initial_pose
         """Whether random particles are added until the readings fit for some time."""
         self._frames: deque[tuple[int, Pose]] = deque()
@@ -230,6 +235,7 @@ class Localizer:
     def _restart(self, *, searching: bool) -> None:
         self._searching, self.share = searching, 0.0
         self.agreement = self.parameters.lost_agreement if searching else 1.0
+        self._fits[:] = 1.0
         self._pending.clear()
         self._updated = None  # the next odometry is an update without a motion
 
@@ -245,6 +251,13 @@ class Localizer:
         largest = float(np.diag(self.result.covariance).max())
         known = math.sqrt(largest) <= self.parameters.localized_deviation
         return Localization.LOCALIZED if known else Localization.SEARCHING
+
+    @property
+    def doubtful(self) -> tuple[int, ...]:
+        """Sensors whose readings contradict the map while those of the others fit."""
+        if np.median(self._fits) < OTHERS_AGREEMENT:
+            return ()
+        return tuple(np.flatnonzero(self._fits < DOUBTFUL_AGREEMENT).tolist())
 
     def add_range(self, sensor: int, reading: float, stamp_ns: int | None = None) -> None:
         """Add a reading (m, REP 117) taken where the last odometry was.
@@ -301,12 +314,17 @@ class Localizer:
             return False
         elapsed = min((stamp_ns - self._updated_ns) / NANOSECONDS, LONGEST_UPDATE)
         self.filter.predict(self._updated, turned, elapsed)
-        beams = self._beams(pose)
+        taken, doubtful = self._take_beams(pose), self.doubtful
+        beams = joined([each for sensor, each in taken.items() if sensor not in doubtful])
         known = self._of_the_map(beams, pose)
         # Averages of the likelihood get used to a wrong place; the share that fits does not.
         self.filter.correct(known, 1.0 - self.agreement if self._searching else 0.0)
         found = self._publish(pose)
         self._compare(known)
+        for sensor, each in taken.items():
+            if sensor != SCAN:
+                share = self._fits[sensor]
+                self._fits[sensor] = self._followed(share, self._of_the_map(each, pose))
         if self.parameters.changes.enabled:
             self._detect(beams)
         return found
@@ -355,18 +373,15 @@ class Localizer:
         else:
             self.changes.forget()
 
-    def _beams(self, pose: Pose) -> Beams:
-        """Return the beams since the last update in the frame of the robot."""
+    def _take_beams(self, pose: Pose) -> dict[int, Beams]:
+        """Return the beams since the last update by sensor, in the frame of the robot."""
         back = frame_between(ORIGIN, pose)
-        parts = [
-            (transformed(there, beams.origin), *beams[1:])
-            for _, (there, beams) in sorted(self._pending.items())
-        ]
+        found = {
+            sensor: beams._replace(origin=transformed(back, transformed(there, beams.origin)))
+            for sensor, (there, beams) in sorted(self._pending.items())
+        }
         self._pending.clear()
-        if not parts:
-            return no_beams()
-        origin, reading, limits = map(np.concatenate, zip(*parts, strict=True))
-        return Beams(transformed(back, origin), reading, limits)
+        return found
 
     def _publish(self, odometry: Pose) -> bool:
         estimate = self.filter.estimate()
@@ -388,16 +403,21 @@ class Localizer:
 
     def _compare(self, beams: Beams) -> None:
         """Update the share of readings that fit to the map at the estimate."""
-        assert self.result is not None
-        pose = np.array(self.result.pose)
-        telling, fitting = explained_readings(pose, self._field, beams, self._model)
-        if telling:
-            decay = 1.0 - (1.0 - AGREEMENT_DECAY) ** telling
-            self.agreement += decay * (fitting / telling - self.agreement)
+        self.agreement = self._followed(self.agreement, beams)
         if self.agreement < self.parameters.lost_agreement:
             self._searching = True
         elif self.agreement >= FOUND_AGREEMENT and self.share >= KNOWN_SHARE:
             self._searching = False
+
+    def _followed(self, share: float, beams: Beams) -> float:
+        """Return a share of fitting readings after those of beams at the estimate."""
+        assert self.result is not None
+        pose = np.array(self.result.pose)
+        telling, fitting = explained_readings(pose, self._field, beams, self._model)
+        if not telling:
+            return share
+        decay = 1.0 - (1.0 - AGREEMENT_DECAY) ** telling
+        return share + decay * (fitting / telling - share)
 
 
 class PoseCorrection:

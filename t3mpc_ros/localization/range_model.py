@@ -25,6 +25,7 @@ has the probability :math:`z_{hit}\,\Phi((e - z_{max})/\sigma) + z_{max}`, one t
 is evidence, too: eight beams of 0.8 m see none in the middle of a room.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import NamedTuple
@@ -235,6 +236,7 @@ def explained_readings(
     return telling, fitting
 
 
-def no_beams() -> Beams:
-    """Return beams without a reading."""
-    return Beams(np.empty((0, 3)), np.empty(0), np.empty((0, 2)))
+def joined(parts: Sequence[Beams]) -> Beams:
+    """Return the beams of several sensors."""
+    nothing = Beams(np.empty((0, 3)), np.empty(0), np.empty((0, 2)))
+    return Beams(*map(np.concatenate, zip(nothing, *parts, strict=True)))

@@ -374,8 +374,13 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
             x, y, yaw = np.sqrt(np.diag(localizer.result.covariance)).tolist()
             values |= {'x_std_m': x, 'y_std_m': y, 'yaw_std_rad': yaw}
         state = localizer.state
-        level = OK if state is Localization.LOCALIZED else WARN
-        return level, state.value, values
+        if state is not Localization.LOCALIZED:
+            return WARN, state.value, values
+        if doubtful := ', '.join(map(str, localizer.doubtful)):
+            values['doubtful_sensors'] = doubtful
+            text = f'range sensor {doubtful} contradicts the map and is not used: look at it'
+            return WARN, f'{state.value}; {text}', values
+        return OK, state.value, values
 
 
 def _stamp_ns(message: Range | LaserScan) -> int | None:
