@@ -43,6 +43,7 @@ from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.control.odometry_plausibility import InputMonitor
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import loop
+from t3mpc_ros.evaluation.cases import NO_FAULTS, LinkFaults
 from t3mpc_ros.evaluation.drivers import NodeDriver, NodeMethod
 from t3mpc_ros.evaluation.experiment import map_jobs
 from t3mpc_ros.evaluation.loop import ReportLink
@@ -58,7 +59,6 @@ from t3mpc_ros.evaluation.methods import (
 from t3mpc_ros.evaluation.record import RATE, Numbers, measure, stamp_of
 from t3mpc_ros.evaluation.reporting import replace_section
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
-from t3mpc_ros.evaluation.simulated_links import NO_FAULTS, LinkFaults
 from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist
 from t3mpc_ros.robot.interface import RobotState
 from t3mpc_ros.simulation.fault_injection import FaultEvent

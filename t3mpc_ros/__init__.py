@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from t3mpc_ros.evaluation.api.script_parts import Controller
     from t3mpc_ros.evaluation.api.single_run import RunResult, simulate
     from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
-    from t3mpc_ros.evaluation.simulated_links import LinkFaults
+    from t3mpc_ros.evaluation.cases import LinkFaults
     from t3mpc_ros.script_error import ScriptError
     from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 
@@ -80,7 +80,7 @@ _HOMES = {
     'evaluation.api.script_parts': ('Controller',),
     'script_error': ('ScriptError',),
     'evaluation.api.single_run': ('RunResult', 'simulate'),
-    'evaluation.simulated_links': ('LinkFaults',),
+    'evaluation.cases': ('LinkFaults',),
     'simulation.fault_injection': ('FaultEvent', 'FaultSchedule'),
     _BASELINE: ('NominalModel', 'Observation'),
 }

@@ -15,20 +15,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+import math
 from pathlib import Path
 
-from t3mpc_ros.evaluation.simulated_links import (
-    DROPOUTS,
-    HALF_RATE,
-    JITTER,
-    LATER,
-    LATER_AND_BACK,
-    NO_FAULTS,
-    OVERLOAD,
-    REPEATED,
-    SWAPPED,
-    LinkFaults,
-)
+from t3mpc_ros.parameters.yaml_files import EntryError, check_list, check_number
+from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.plant.disturbances import DisturbanceParameters
 
 ROBOTS = ('twin', 'servo', 'torque')
@@ -37,6 +28,66 @@ PLANTS = ('servo', 'torque')
 PATCHES = Path(__file__).with_name('patches.yaml')
 """World with slippery patches."""
 NOMINAL = 'nominal'
+
+
+MAX_DELAY = 10.0
+"""Largest delay of a message, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkFaults:
+    """Faults of the links between robot and controller."""
+
+    command_loss: float = 0.0
+    """Fraction of the commands that is lost."""
+    command_delay: tuple[float, float] = (0.0, 0.0)
+    """Least and largest additional delay of a command, s; uniform between them. A command that
+    arrives after a later one is ignored."""
+    odometry_loss: float = 0.0
+    """Fraction of the measurements that is lost."""
+    odometry_delay: tuple[float, float] = (0.0, 0.0)
+    """Least and largest delay of a measurement, s; they arrive in order but for the swapped."""
+    begin: float = 0.0
+    """Begin of the faults, as a share of the run."""
+    lasting: float = math.inf
+    """Duration of the faults, s."""
+    odometry_swapped: int = 0
+    """Of so many measurements each the last arrives after its successor; 0: none."""
+    odometry_repeated: int = 1
+    """How often each measurement arrives."""
+    odometry_kept: int = 1
+    """Of so many measurements each only the last is sent: a lower rate than the nodes assume."""
+
+    def __post_init__(self) -> None:
+        try:
+            self._check()
+        except EntryError as error:
+            raise ScriptError(str(error)) from None
+
+    def _check(self) -> None:
+        for name in ('command_loss', 'odometry_loss', 'begin'):
+            check_number(getattr(self, name), name, 0.0, 1.0)
+        check_number(self.lasting, 'lasting', 0.0, math.inf, 's')
+        for name in ('command_delay', 'odometry_delay'):
+            pair = getattr(self, name)
+            given = list(pair) if isinstance(pair, tuple) else pair
+            least, most = check_list(given, name, 2, 2)
+            check_number(least, f'the least {name}', 0.0, MAX_DELAY, 's')
+            check_number(most, f'the largest {name}', least, MAX_DELAY, 's')
+        for name, least in (('swapped', 0), ('repeated', 1), ('kept', 1)):
+            count = getattr(self, f'odometry_{name}')
+            if isinstance(count, bool) or not isinstance(count, int) or count < least:
+                raise ScriptError(
+                    f'odometry_{name} must be a whole number of at least {least}: got {count!r}'
+                )
+
+    def span(self, duration: float) -> tuple[float, float]:
+        """Return begin and end (s) of the faults in a run of ``duration`` seconds."""
+        begin = self.begin * duration
+        return begin, begin + self.lasting
+
+
+NO_FAULTS = LinkFaults()
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,29 +217,39 @@ CASES: Mapping[str, Case] = {
     ),
     'dead time +30 ms': Case(
         'at half of the run commands begin to take 30 ms more',
-        links=LATER,
+        links=LinkFaults(command_delay=(0.03, 0.03), begin=0.5),
         robots=('twin', 'servo'),
     ),
     'dead time +30 ms and back': Case(
         'for 20 s from a third of the run on, commands take 30 ms more',
-        links=LATER_AND_BACK,
+        links=LinkFaults(command_delay=(0.03, 0.03), begin=1.0 / 3.0, lasting=20.0),
         robots=('twin', 'servo'),
     ),
-    'dropouts': Case('10 % of the commands and 10 % of the measurements are lost', links=DROPOUTS),
+    'dropouts': Case(
+        '10 % of the commands and 10 % of the measurements are lost',
+        links=LinkFaults(command_loss=0.1, odometry_loss=0.1),
+    ),
     'jitter': Case(
-        'each command is up to 20 ms late, and each measurement up to 10 ms', links=JITTER
+        'each command is up to 20 ms late, and each measurement up to 10 ms',
+        links=LinkFaults(command_delay=(0.0, 0.02), odometry_delay=(0.0, 0.01)),
     ),
     'overload': Case(
         'for 4 s from half of the run on, each command and each measurement is 20 to 120 ms late',
-        links=OVERLOAD,
+        links=LinkFaults(
+            command_delay=(0.02, 0.12), odometry_delay=(0.02, 0.12), begin=0.5, lasting=4.0
+        ),
     ),
     'swapped': Case(
-        'of 20 measurements each, one arrives after its successor', links=SWAPPED, robots=('twin',)
+        'of 20 measurements each, one arrives after its successor',
+        links=LinkFaults(odometry_swapped=20),
+        robots=('twin',),
     ),
-    'repeated': Case('each measurement arrives twice', links=REPEATED, robots=('twin',)),
+    'repeated': Case(
+        'each measurement arrives twice', links=LinkFaults(odometry_repeated=2), robots=('twin',)
+    ),
     'half rate': Case(
         'measurements at 50 Hz, where every method expects 100 Hz',
-        links=HALF_RATE,
+        links=LinkFaults(odometry_kept=2),
         robots=('twin',),
     ),
 }

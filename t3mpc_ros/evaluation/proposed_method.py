@@ -29,7 +29,7 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
     Observation,
     WheelLoads,
-    future_jump,
+    announce_jumps,
 )
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
@@ -122,11 +122,9 @@ class ProposedController(BaselineController):
         elif future is None:
             self._announce_current_jump(now_ns, observation)
         if future is not None:
-            # Lost measurements or a longer dead time reveal several periods at once.
-            last = effect + len(future) - 2
-            for instant in range(max(self._announced, effect) + 1, last + 1):
-                self._announce_future_jump(instant * self._period_ns, future, instant - effect)
-            self._announced = max(self._announced, last)
+            self._announced = announce_jumps(
+                self._tracker.transition, future, effect, self._announced, self._period
+            )
         self._expected = observation.next_reference.copy()
         self._slope = (observation.next_reference - observation.reference) / self._period
         u = self._tracker.step(
@@ -145,11 +143,6 @@ class ProposedController(BaselineController):
     def applied(self, acceleration: Array, *, limited: bool) -> None:
         """Take note of the u that the drive's limits let through."""
         self._tracker.law.set_applied(acceleration, saturated=limited)
-
-    def _announce_future_jump(self, instant_ns: int, future: Array, j: int) -> None:
-        """Announce a jump at row j of the future, seen by the rows around it."""
-        if found := future_jump(future, j, self._period):
-            self._tracker.transition.announce(instant_ns, *found)
 
     def _announce_current_jump(self, now_ns: int, observation: Observation) -> None:
         """Announce a jump that has just happened."""

@@ -27,9 +27,8 @@ from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel
-from t3mpc_ros.evaluation.cases import CASES, NOMINAL, ROBOTS, Case, cases_for
+from t3mpc_ros.evaluation.cases import CASES, NOMINAL, ROBOTS, Case, LinkFaults, cases_for
 from t3mpc_ros.evaluation.record import PLANT_WINDOW, RATE, ROBOT_WINDOW, stamp_of
-from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, find_names

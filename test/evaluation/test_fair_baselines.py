@@ -37,6 +37,7 @@ from t3mpc_ros.evaluation.baselines.feed_forward import (
     LmsBodyCorrectionParameters,
 )
 from t3mpc_ros.evaluation.baselines.feedback_control import ProportionalIntegral
+from t3mpc_ros.evaluation.cases import LinkFaults
 from t3mpc_ros.evaluation.comparison import (
     BETTER,
     INCONCLUSIVE,
@@ -69,7 +70,6 @@ from t3mpc_ros.evaluation.methods import (
 )
 from t3mpc_ros.evaluation.record import OVERALL, SETTLED, measure
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
-from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 T = 0.01

@@ -25,7 +25,7 @@ from support.records import record_of
 from t3mpc_ros.control.actuation import VelocityActuation
 from t3mpc_ros.evaluation import drivers
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
-from t3mpc_ros.evaluation.cases import CASES, PLANTS
+from t3mpc_ros.evaluation.cases import CASES, NO_FAULTS, PLANTS
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean, paired, student_quantile
 from t3mpc_ros.evaluation.drivers import MadeMethod, MethodSpec
 from t3mpc_ros.evaluation.experiment import JobError, WorkerPool
@@ -39,7 +39,6 @@ from t3mpc_ros.evaluation.scenario import (
     TUNING_SEEDS,
     Scenario,
 )
-from t3mpc_ros.evaluation.simulated_links import NO_FAULTS
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import Parameters, parameter
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia

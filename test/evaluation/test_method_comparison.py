@@ -33,7 +33,7 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
     ProportionalIntegral,
     ProportionalIntegralParameters,
 )
-from t3mpc_ros.evaluation.cases import NOMINAL, cases_for
+from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults, cases_for
 from t3mpc_ros.evaluation.comparison import (
     BETTER,
     INCONCLUSIVE,
@@ -66,7 +66,6 @@ from t3mpc_ros.evaluation.scenario import (
     Scenario,
     noisy_twin,
 )
-from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, WheelSpeeds
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters

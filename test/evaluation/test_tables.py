@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from support.records import record_of
 
+from t3mpc_ros.evaluation.cases import LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.paper.results import Results, estimation
@@ -34,7 +35,6 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
 )
 from t3mpc_ros.evaluation.record import METRICS, START, measure
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
-from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.kinematics import WheelGeometry, body_speeds
 
 

@@ -30,7 +30,7 @@ from t3mpc_ros.evaluation.api.one_sentence import one_sentence, sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.api.single_run import DIVERGED, divergence
-from t3mpc_ros.evaluation.cases import NOMINAL
+from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.evaluation.experiment import (
     Job,
@@ -46,7 +46,6 @@ from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.evaluation.scenario import Scenario
-from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.script_error import ScriptError

@@ -40,12 +40,11 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
     Observation,
 )
-from t3mpc_ros.evaluation.cases import NOMINAL, ROBOTS
+from t3mpc_ros.evaluation.cases import NOMINAL, ROBOTS, LinkFaults
 from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.loop import ComparedMethod
 from t3mpc_ros.evaluation.methods import methods_for, require_libraries
 from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario
-from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array, read_only
 from t3mpc_ros.parameters.table import Parameters, find_names

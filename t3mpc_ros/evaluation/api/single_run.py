@@ -24,13 +24,12 @@ from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, own_scenario
-from t3mpc_ros.evaluation.cases import NOMINAL
+from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.record import METRICS, START, Numbers, Record, measure, some_rows
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.scenario import Scenario
-from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import find_names, nearest_hint
 from t3mpc_ros.script_error import ScriptError

@@ -29,11 +29,11 @@ from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.script_parts import Controller, OwnMethod, own_scenario
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation
+from t3mpc_ros.evaluation.cases import LinkFaults
 from t3mpc_ros.evaluation.drivers import MethodDriver
 from t3mpc_ros.evaluation.loop import scenario_reports, with_scenario
 from t3mpc_ros.evaluation.record import RATE, Record, measure
 from t3mpc_ros.evaluation.scenario import Scenario
-from t3mpc_ros.evaluation.simulated_links import LinkFaults
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.robot.interface import RobotCommand
 from t3mpc_ros.script_error import ScriptError

@@ -31,8 +31,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from t3mpc_ros.control.jump_transition import MotorLimit
-from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.control.jump_transition import (
+    JumpTransition,
+    JumpTransitionParameters,
+    MotorLimit,
+)
+from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
@@ -102,6 +106,21 @@ def future_jump(future: Array, j: int, period: float) -> tuple[Array, Array] | N
     if np.max(np.abs(jump)) <= JUMP or np.max(np.abs(before)) > JUMP:
         return None
     return jump, (future[j + 1] - future[j]) / period
+
+
+def announce_jumps(
+    transition: JumpTransition, future: Array, effect: int, announced: int, period: float
+) -> int:
+    """Announce the jumps of a known future that begins in period ``effect``; return up to where.
+
+    Those up to period ``announced`` are announced already. Lost measurements or a longer dead time
+    reveal several periods at once.
+    """
+    period_ns, last = round(period * NANOSECONDS), effect + len(future) - 2
+    for instant in range(max(announced, effect) + 1, last + 1):
+        if found := future_jump(future, instant - effect, period):
+            transition.announce(instant * period_ns, *found)
+    return max(announced, last)
 
 
 class WheelLoads:
@@ -239,3 +258,57 @@ class BaselineController(ABC):
 
     def set_weights(self, weights: Mapping[str, Array]) -> None:  # noqa: B027
         """Start from weights that :meth:`get_weights` returned after another run."""
+
+
+class PlannedReference:
+    """Reachable reference ``ahead`` periods after the answer begins to act.
+
+    It announces the jumps of the known future to a :class:`JumpTransition`, and goes on along it
+    through periods without an observation. ``lag`` (s) is that of the servo by which the ramps
+    are early; 0 where the reference is ahead of it already.
+    """
+
+    def __init__(
+        self,
+        parameters: JumpTransitionParameters,
+        nominal_model: NominalModel,
+        lag: float,
+        ahead: int = 0,
+    ) -> None:
+        self._period = nominal_model.period
+        self._period_ns = round(self._period * NANOSECONDS)
+        self._ahead = ahead
+        self._transition = JumpTransition(parameters, lag, self._period, nominal_model.motor_limit)
+        self._steps = 0
+        """Control periods since the first observation."""
+        self._effect = 0
+        """Period in which the last answer began to act."""
+        self._announced = 0
+        """Period up to which jumps are announced."""
+        self._future: Array = np.zeros((0, 2))
+        self.reachable, self.rate = self._transition.reachable, self._transition.rate
+        """rbar (rad/s), and its derivative (rad/s²) until one period later; shape (2,)."""
+
+    def step(self, observation: Observation) -> None:
+        """Update :attr:`reachable` and :attr:`rate`."""
+        future, ahead, elapsed = observation.future, self._ahead, observation.elapsed
+        if future is None or len(future) < ahead + 3:
+            rows = 0 if future is None else len(future)
+            raise ValueError(f'future must have at least {ahead + 3} rows: got {rows}')
+        if self._future.size > 0:
+            # Periods without an observation: the ramps go on, along the future known before them.
+            for missed in range(1, min(elapsed, len(self._future) - ahead - 1)):
+                self._cross(self._effect + missed, self._future[ahead + missed :])
+            self._steps += elapsed
+        effect = self._steps + observation.late
+        if self._future.size == 0:
+            self._announced = effect + 1
+        self._announced = announce_jumps(
+            self._transition, future, effect, self._announced, self._period
+        )
+        self._effect, self._future = effect, future.copy()
+        self._cross(effect, future[ahead:])
+
+    def _cross(self, effect: int, future: Array) -> None:
+        """Update the reachable reference for the rows from ``future[0]`` to ``future[1]``."""
+        self._transition.step((effect + self._ahead) * self._period_ns, future[0], future[1])

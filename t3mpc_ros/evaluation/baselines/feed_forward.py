@@ -37,8 +37,8 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,
     Observation,
+    PlannedReference,
 )
-from t3mpc_ros.evaluation.baselines.planned_reference import PlannedReference
 from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.parameters.table import Parameters, group, parameter
 

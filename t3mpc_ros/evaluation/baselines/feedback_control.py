@@ -51,9 +51,9 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,
     Observation,
+    PlannedReference,
     WheelLoads,
 )
-from t3mpc_ros.evaluation.baselines.planned_reference import PlannedReference
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import Parameters, group, parameter
 

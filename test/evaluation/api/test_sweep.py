@@ -29,7 +29,7 @@ from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation import run_digest
 from t3mpc_ros.evaluation.api import parameter_sweep
 from t3mpc_ros.evaluation.api.parameter_sweep import make_runs
-from t3mpc_ros.evaluation.simulated_links import LinkFaults
+from t3mpc_ros.evaluation.cases import LinkFaults
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
 
 SHORT = {'plant': 'servo', 'duration': 2.0}
