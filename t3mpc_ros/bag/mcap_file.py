@@ -265,7 +265,9 @@ class McapFile:
             each.id: each.topic for each in channels if topics is None or each.topic in topics
         }
         with self.path.open('rb') as file, read_errors(str(self.path)):
-            if not self._indexed():
+            statistics: Any = self._summary.statistics
+            if not statistics.chunk_count == len(self._summary.chunk_indexes) > 0:
+                # Not every message is in a chunk with an index.
                 for _, channel, message in NonSeekingReader(file).iter_messages(
                     set(names.values()), starting_at=max(start_ns, 0), ending_before=stop_ns
                 ):
@@ -321,11 +323,6 @@ class McapFile:
         """Return name, media type and size in bytes of each attachment."""
         indexes = self._summary.attachment_indexes
         return [(item.name, item.media_type, item.data_size) for item in indexes]
-
-    def _indexed(self) -> bool:
-        """Return whether every message is in a chunk with an index."""
-        statistics: Any = self._summary.statistics
-        return bool(statistics.chunk_count == len(self._summary.chunk_indexes) > 0)
 
 
 def _chunk_messages(

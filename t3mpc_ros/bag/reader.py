@@ -342,15 +342,14 @@ def _topic_information(connection: Any) -> TopicInformation:
     return TopicInformation(
         connection.topic,
         connection.msgtype,
-        tuple(QosProfile.from_object(each, _nanoseconds) for each in offers),
+        tuple(
+            QosProfile.from_object(each, lambda at: int(at.sec * NANOSECONDS + at.nsec))
+            for each in offers
+        ),
         connection.digest,
         connection.msgcount,
         getattr(connection.ext, 'serialization_format', 'ros1'),
     )
-
-
-def _nanoseconds(time: Any) -> int:
-    return int(time.sec * NANOSECONDS + time.nsec)
 
 
 def _field_getter(path: str) -> Callable[[Any], Any]:

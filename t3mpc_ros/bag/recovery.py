@@ -192,21 +192,10 @@ def recover_bag(
     sequence numbers; channels, schemas, attachments and metadata records are kept as well, and
     ``metadata.yaml`` is generated. The input is not changed.
 
-    Parameters
-    ----------
-    source
-        An MCAP file of any writer, or a folder of MCAP files; sub-folders are ignored.
-    output
-        A folder that is empty or does not exist.
-
-    Raises
-    ------
-    RecoveryOutputError
-        ``output`` is, or is in, the folder of the bag, or is not empty.
-    UnreadableError
-        There is no MCAP file, or the only one contains no message that can be read.
-    OSError
-        Reading or writing failed; an incomplete output file is removed.
+    ``source`` is an MCAP file of any writer, or a folder of such, without its sub-folders.
+    RecoveryOutputError: ``output`` is, or is in, the folder of the bag, or is not empty.
+    UnreadableError: there is no MCAP file, or the only one contains no message that can be read.
+    OSError: reading or writing failed; an incomplete output file is removed.
     """
     source, output = Path(source), Path(output)
     files = _files(source)

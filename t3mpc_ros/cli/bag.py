@@ -28,7 +28,6 @@ from t3mpc_ros.cli.train import add_bag_options, run_bags
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 
 if TYPE_CHECKING:  # help and completion do without the libraries for bags, which load slowly
-    from t3mpc_ros.bag.metadata import TopicInformation
     from t3mpc_ros.bag.qos import QosProfile
     from t3mpc_ros.bag.reader import BagReader
     from t3mpc_ros.bag.recovery import Damage, FileResult, RecoveryResult
@@ -112,7 +111,10 @@ def _info(bag: 'BagReader') -> dict[str, Any]:
             if isinstance(file, McapFile)
             for name, media_type, size in file.attachment_sizes()
         ],
-        'rates': {topic.name: _rate(bag, topic) for topic in bag.topics.values()},
+        'rates': {  # mean, Hz; 0 for a bag without duration
+            topic.name: topic.message_count / bag.duration if bag.duration > 0.0 else 0.0
+            for topic in bag.topics.values()
+        },
     }
 
 
@@ -160,11 +162,6 @@ def _size(path: Path) -> int:
     """Return the size of a file, or of the files in a folder, in bytes."""
     files = path.iterdir() if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files)
-
-
-def _rate(bag: 'BagReader', topic: 'TopicInformation') -> float:
-    """Return the mean rate of a topic in Hz; 0 for a bag without duration."""
-    return topic.message_count / bag.duration if bag.duration > 0.0 else 0.0
 
 
 def _qos_text(profile: 'QosProfile') -> str:

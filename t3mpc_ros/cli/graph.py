@@ -42,7 +42,7 @@ def add_parser(commands: Any) -> None:
     listing.set_defaults(run=_with_graph(_list_topics))
     info = words.add_parser('info', help='types, publishers and subscriptions of a topic')
     info.add_argument('topic')
-    info.set_defaults(run=_with_graph(_show_topic))
+    info.set_defaults(run=_with_graph(lambda graph, given: print(graph.topic_text(given.topic))))
     echo = words.add_parser('echo', help='messages of a topic')
     echo.add_argument('topic')
     echo.add_argument('--field', default='', help='one field, for example pose.pose.position')
@@ -63,8 +63,14 @@ def add_parser(commands: Any) -> None:
     for parser in (describing, getting, setting):
         parser.add_argument('node')
         parser.add_argument('name')
-    describing.set_defaults(run=_with_graph(_describe_parameter))
-    getting.set_defaults(run=_with_graph(_get_parameter))
+    describing.set_defaults(
+        run=_with_graph(
+            lambda graph, given: print(graph.parameter_description(given.node, given.name))
+        )
+    )
+    getting.set_defaults(
+        run=_with_graph(lambda graph, given: print(graph.parameter_text(given.node, given.name)))
+    )
     setting.add_argument('value', help='in YAML: 0.3, true, [1.0, 2.0], text')
     setting.set_defaults(run=_with_graph(_set_parameter))
 
@@ -78,29 +84,25 @@ def add_parser(commands: Any) -> None:
 
 
 def _with_graph(
-    run: Callable[['Graph', argparse.Namespace], int],
+    run: Callable[['Graph', argparse.Namespace], int | None],
 ) -> Callable[[argparse.Namespace], int]:
+    """Return a command that runs in the graph; its exit code is 0 where it returns none."""
+
     def run_in_graph(options: argparse.Namespace) -> int:
         from t3mpc_ros.nodes.graph_tools import graph  # takes a second
 
         with StopSignal() as stop, graph(stop) as opened:
-            return run(opened, options)
+            return run(opened, options) or 0
 
     return run_in_graph
 
 
-def _list_topics(graph: 'Graph', options: argparse.Namespace) -> int:
+def _list_topics(graph: 'Graph', options: argparse.Namespace) -> None:
     for name, kinds in graph.topics().items():
         print(f'{name} [{", ".join(kinds)}]' if options.show_types else name)
-    return 0
 
 
-def _show_topic(graph: 'Graph', options: argparse.Namespace) -> int:
-    print(graph.topic_text(options.topic))
-    return 0
-
-
-def _echo(graph: 'Graph', options: argparse.Namespace) -> int:
+def _echo(graph: 'Graph', options: argparse.Namespace) -> None:
     from t3mpc_ros.nodes.graph_tools import message_text
 
     for message in graph.messages(options.topic):
@@ -108,10 +110,9 @@ def _echo(graph: 'Graph', options: argparse.Namespace) -> int:
             print(f'{message_text(message, options.field)}---', flush=True)
             if options.once:
                 break
-    return 0
 
 
-def _rate(graph: 'Graph', options: argparse.Namespace) -> int:
+def _rate(graph: 'Graph', options: argparse.Namespace) -> None:
     from t3mpc_ros.nodes.graph_tools import rate_text
 
     arrivals: deque[float] = deque(maxlen=WINDOW)
@@ -124,26 +125,14 @@ def _rate(graph: 'Graph', options: argparse.Namespace) -> int:
             due += REPORT_PERIOD
             if text := rate_text(arrivals):
                 print(text, flush=True)
-    return 0
 
 
-def _list_parameters(graph: 'Graph', options: argparse.Namespace) -> int:
+def _list_parameters(graph: 'Graph', options: argparse.Namespace) -> None:
     if options.node:
         print('\n'.join(graph.parameter_names(options.node)))
-        return 0
+        return
     for node in graph.nodes():
         print('\n  '.join([f'{node}:', *graph.parameter_names(node)]))
-    return 0
-
-
-def _describe_parameter(graph: 'Graph', options: argparse.Namespace) -> int:
-    print(graph.parameter_description(options.node, options.name))
-    return 0
-
-
-def _get_parameter(graph: 'Graph', options: argparse.Namespace) -> int:
-    print(graph.parameter_text(options.node, options.name))
-    return 0
 
 
 def _set_parameter(graph: 'Graph', options: argparse.Namespace) -> int:
@@ -155,14 +144,13 @@ def _set_parameter(graph: 'Graph', options: argparse.Namespace) -> int:
     return 0
 
 
-def _call(graph: 'Graph', options: argparse.Namespace) -> int:
+def _call(graph: 'Graph', options: argparse.Namespace) -> None:
     from t3mpc_ros.nodes.graph_tools import message_text
 
     values = yaml.safe_load(options.values)
     if not isinstance(values, dict):
         raise ValueError(f'the fields must be a YAML mapping, like {{data: true}}: got {values!r}')
     print(message_text(graph.call_by_name(options.service, values)), end='')
-    return 0
 
 
 def _stop(graph: 'Graph', options: argparse.Namespace) -> int:

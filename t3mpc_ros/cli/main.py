@@ -21,7 +21,7 @@ from importlib import import_module
 import os
 from pathlib import Path
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 import webbrowser
 
 from t3mpc_ros.cli import compare, faults, graph, paper, patrol, sweep, train, tune, view
@@ -29,10 +29,6 @@ from t3mpc_ros.cli.command import ArgumentParser, reject_removed, run_command
 from t3mpc_ros.cli.run_options import add_json, add_seeds, prepare_outputs, print_result
 from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.parameters.command_line import bounded_float
-
-if TYPE_CHECKING:
-    from t3mpc_ros.evaluation.bag_report.verdict import Verdict
-
 
 SECONDS = bounded_float(1.0, 86_400.0, 'seconds')
 
@@ -97,10 +93,7 @@ def _demo(options: argparse.Namespace) -> int:
     print(figures.summary())
     if not options.headless:
         webbrowser.open(figures.report.resolve().as_uri())
-    return _demo_exit_code(figures.verdict)
-
-
-def _demo_exit_code(verdict: 'Verdict') -> int:
+    verdict = figures.verdict
     if verdict.sound:
         return 0
     # No lack of time damages a recording.

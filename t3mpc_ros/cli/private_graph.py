@@ -48,7 +48,10 @@ class PrivateGraph:
     """
 
     def __init__(self) -> None:
-        avoided = used_domains(Path('/proc/net')) | _domain_of_caller()
+        avoided = used_domains(Path('/proc/net'))
+        of_caller = os.environ.get('ROS_DOMAIN_ID', '')  # in which a robot of the caller may run
+        if of_caller.isdigit():
+            avoided.add(int(of_caller))
         candidates = [domain for domain in DOMAINS if domain not in avoided]
         for domain in random.SystemRandom().sample(candidates, len(candidates)):
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -108,9 +111,3 @@ def used_domains(tables: Path) -> set[int]:
             if port >= _PORT_BASE:
                 found.add((port - _PORT_BASE) // _DOMAIN_PORTS)
     return found
-
-
-def _domain_of_caller() -> set[int]:
-    """Return the domain in which a robot of the caller may run."""
-    text = os.environ.get('ROS_DOMAIN_ID', '')
-    return {int(text)} if text.isdigit() else set()

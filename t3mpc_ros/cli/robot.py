@@ -15,7 +15,6 @@
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 import math
 import os
 from pathlib import Path
@@ -305,11 +304,7 @@ def _key_option(options: argparse.Namespace) -> bytes:
 
 
 def _link_parameters(options: argparse.Namespace) -> LinkParameters:
-    values: dict[str, object] = {}
-    if options.params_file is not None:
-        values.update(_read_link_parameters(options.params_file))
-        with _named(options.params_file):
-            LinkParameters.from_dict(values)
+    values = {} if options.params_file is None else _read_link_parameters(options.params_file)
     texts = [text.removeprefix('link.') for text in options.set]
     return LinkParameters.from_dict(values | command_line.parse_assignments(LinkParameters, texts))
 
@@ -319,20 +314,16 @@ def _read_link_parameters(path: Path) -> dict[str, object]:
     with file_errors(path, ParameterError):
         content: Any = read_yaml(path)
     try:
-        return dict(_flat_items(content['/**']['ros__parameters']['link']))
+        values = dict(_flat_items(content['/**']['ros__parameters']['link']))
     except (KeyError, TypeError, AttributeError) as error:
         raise ParameterError(
             f'{path} must be a parameter file of t3mpc robot setup, with link below /**'
         ) from error
-
-
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Name the file in the error of a parameter."""
     try:
-        yield
+        LinkParameters.from_dict(values)
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
+    return values
 
 
 def _flat_items(group: dict[str, object]) -> Iterator[tuple[str, object]]:
@@ -451,11 +442,10 @@ def _add_settings_commands(
     add('--channel', type=_setting('channel', int), help='2400 MHz plus this')
     add('--rate', choices=frames.RATES, help='bit/s; 250k only with nRF24L01+ chips')
     add('--power', choices=frames.POWERS, help='of the transmitter of the robot, dBm')
-    for name, convert, text in (
-        ('microsteps', int, 'as set by the jumpers of the drivers'),
-        ('steps_per_turn', int, 'full steps of a turn of the wheel'),
-    ):
-        add(f'--{name.replace("_", "-")}', type=_setting(name, convert), help=text)
+    text = 'as set by the jumpers of the drivers'
+    add('--microsteps', type=_setting('microsteps', int), help=text)
+    text = 'full steps of a turn of the wheel'
+    add('--steps-per-turn', type=_setting('steps_per_turn', int), help=text)
     add('--invert', choices=('none', 'left', 'right', 'both'), help='wheels that turn backward')
     add('--divider', type=_setting('divider', float), help='of the battery voltage, 4: 1/4 of it')
     text = 'wired: the battery is measured, and the robot stops when it measures nothing'

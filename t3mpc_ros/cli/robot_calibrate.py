@@ -176,7 +176,8 @@ def calibrate(
         _report('interrupted')
         code = _EXIT_INTERRUPTED
     if wizard.calibration != start:
-        path.write_text(calibration_file(wizard.calibration, _today(), link))
+        today = datetime.date.today().isoformat()
+        path.write_text(calibration_file(wizard.calibration, today, link))
         _show(f'{path}: saved; ros2 launch t3mpc_ros robot.launch.py params_file:={path}')
     return code
 
@@ -196,10 +197,6 @@ def _check_steps(steps: Sequence[str], available: Sequence[str]) -> None:
 
 def _show(text: str) -> None:
     print(text, flush=True)
-
-
-def _today() -> str:
-    return datetime.date.today().isoformat()
 
 
 def _asker(stop: Callable[[], bool]) -> Callable[[str], str]:

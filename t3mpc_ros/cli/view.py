@@ -15,7 +15,7 @@
 
 import argparse
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 import sys
 import time
@@ -83,12 +83,12 @@ def _view(options: argparse.Namespace) -> int:
 
         run = LiveRun()
         with view_node(run, options.namespace) as node:
-            if options.read_only:
-                with PageServer(run, None, options.port, time.monotonic) as server:
-                    _announce(server, options)
-                    node.spin(stop)
-                return 0
-            with _commanded_page(run, node, options) as server:
+            page: AbstractContextManager[PageServer] = (
+                PageServer(run, None, options.port, time.monotonic)
+                if options.read_only
+                else _commanded_page(run, node, options)
+            )
+            with page as server:
                 _announce(server, options)
                 node.spin(stop)
     return 0

@@ -343,7 +343,8 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
 def description(plan: ComparisonPlan) -> str:
     """Return in one paragraph what was run and how it is counted."""
     seeds = ', '.join(map(str, plan.seeds))
-    outside = ' (none is used for tuning or in another table)' if _are_outside(plan.seeds) else ''
+    used = {*TUNING_SEEDS, *PRETRAINING_SEEDS, *HELD_OUT_SEEDS} & {*plan.seeds}
+    outside = '' if used else ' (none is used for tuning or in another table)'
     text = (
         f'{plan.scenario.text}, {plan.scenario.duration:g} s, '
         f'noise variance {plan.scenario.noise:g} (rad/s)², '
@@ -365,10 +366,6 @@ def description(plan: ComparisonPlan) -> str:
         'Variation: total variation of the commanded acceleration per second and wheel. '
         'In brackets the number of seeds.'
     )
-
-
-def _are_outside(seeds: Sequence[int]) -> bool:
-    return not {*seeds} & {*TUNING_SEEDS, *PRETRAINING_SEEDS, *HELD_OUT_SEEDS}
 
 
 def markdown(

@@ -83,12 +83,8 @@ def evaluate_outcome(
     the fault and ``odometry_after``, at the end of the run: its error (m, rad).
 
     ``detected``: signs that robot or controller show; ``ranges`` before and at a wall, which the
-    loop does not use; ``undetected``: effects that only ground truth shows.
-
-    Parameters
-    ----------
-    begin, end
-        Those of the fault, s; the end may lie beyond the record.
+    loop does not use; ``undetected``: effects that only ground truth shows. ``end`` of the fault
+    may lie beyond the record.
     """
     last = float(record.time[-1])
     stays = end >= last
@@ -341,7 +337,7 @@ def measured_fault(job: tuple[FaultRun, NodeMethod]) -> Row:
     event = trial.event
     parameters = trial.scenario().true_robot()
     assert isinstance(parameters, DigitalTwinParameters)
-    record = _run(trial)
+    record = run(trial.scenario(), METHOD)
     undisturbed_run = undisturbed(trial.course, trial.duration)
     if event is None:
         touches = record['contact_force'] > 0.0
@@ -356,11 +352,7 @@ def measured_fault(job: tuple[FaultRun, NodeMethod]) -> Row:
 @lru_cache(maxsize=8)
 def undisturbed(course: str, duration: float) -> Record:
     """Return the run on a course without fault and walls."""
-    return _run(FaultRun('none', course, None, '', duration))
-
-
-def _run(trial: FaultRun) -> Record:
-    return run(trial.scenario(), METHOD)
+    return run(FaultRun('none', course, None, '', duration).scenario(), METHOD)
 
 
 @cache

@@ -44,20 +44,16 @@ class Driver(Protocol):
     @property
     def reason(self) -> str:
         """Why it stops the robot; empty where it drives."""
-        ...
 
     @property
     def signals(self) -> Signals:
         """What it decided last, beside the command."""
-        ...
 
     def begin(self, k: int, *, enabled: bool) -> None:
         """Begin period k: take the reference that becomes known in it; drive, or stop."""
-        ...
 
     def step(self, state: RobotState) -> RobotCommand:
         """Return the command that follows from a report of the robot."""
-        ...
 
 
 class Method(Protocol):
@@ -66,11 +62,9 @@ class Method(Protocol):
     @property
     def name(self) -> str:
         """Name in tables and errors."""
-        ...
 
     def driver(self, scenario: Scenario) -> Driver:
         """Return a new driver."""
-        ...
 
 
 class ComparedMethod(Method, Protocol):
@@ -78,7 +72,6 @@ class ComparedMethod(Method, Protocol):
 
     def knowledge(self, scenario: Scenario) -> str:
         """Return what it knows of robot and reference, for tables."""
-        ...
 
 
 def run(scenario: Scenario, method: Method) -> Record:

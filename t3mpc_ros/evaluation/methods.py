@@ -273,7 +273,7 @@ def methods(drive: str, store: TunedParameters | None = None) -> dict[str, Metho
     for each in method_definitions():
         parameters = tuned.applied(each.name, drive, each.start[drive])
         if each.name == FULL:
-            found |= _proposed_methods(parameters)
+            found |= _variants(parameters, {**STAGES, **WITHOUT})
             continue
         found[each.name] = MethodSpec(each.name, each.controller_type, parameters, True)
     for name in ('linear MPC preview', NMPC):
@@ -315,10 +315,13 @@ def tuned_parameters(tuned: TunedParameters, name: str, drive: str, start: Tunab
     return start
 
 
-def _proposed_methods(full: Parameters) -> dict[str, MethodSpec]:
+def _variants(
+    full: Parameters, parts: Mapping[str, Mapping[str, object]]
+) -> dict[str, MethodSpec]:
+    """Return the proposed controller with changes of its parameters, by name."""
     return {
         name: MethodSpec(name, ProposedController, full.with_values(changes), True, baseline=False)
-        for name, changes in {**STAGES, **WITHOUT}.items()
+        for name, changes in parts.items()
     }
 
 
@@ -337,10 +340,7 @@ def methods_for(robot: str) -> Mapping[str, MethodSpec | NodeMethod]:
         found[IN_TIME] = MethodSpec(IN_TIME, FeedForward, parameters)
         return found | table | further
     parts = {FULL: {}, FULL_WRONG: {'inertia_error': MODEL_ERROR}, **TORQUE_PARTS}
-    full = table[FULL].parameters.with_values(ON_TORQUE)
-    for name, changes in parts.items():
-        parameters = full.with_values(changes)
-        found[name] = MethodSpec(name, ProposedController, parameters, True, baseline=False)
+    found |= _variants(table[FULL].parameters.with_values(ON_TORQUE), parts)
     found[PAPER_PARTS] = replace(table[FULL], name=PAPER_PARTS)
     return found | {name: each for name, each in table.items() if each.baseline} | further
 

@@ -100,7 +100,6 @@ class PlantSource(Protocol):
 
     def simulation(self) -> plant_robot.Plant:
         """Return the plant at its start, without noise."""
-        ...
 
 
 class NoiseSource(Protocol):
@@ -108,7 +107,6 @@ class NoiseSource(Protocol):
 
     def simulation(self, seed: int) -> MeasurementNoise:
         """Return the noise of a run."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -142,13 +142,9 @@ def sampled(source: Any, duration: float, geometry: WheelGeometry) -> SampledRef
 
 def numbers(name: str, given: Any, shape: str) -> Array:
     """Return finite numbers as an array, or raise :class:`ScriptError` with the name."""
-    with warnings.catch_warnings(action='error', category=ComplexWarning):
-        return _finite_numbers(name, given, shape)
-
-
-def _finite_numbers(name: str, given: Any, shape: str) -> Array:
     try:
-        found = np.array(given, dtype=np.float64)
+        with warnings.catch_warnings(action='error', category=ComplexWarning):
+            found = np.array(given, dtype=np.float64)
     except ComplexWarning:
         raise ScriptError(f'{name} must be real numbers: got complex ones') from None
     except (TypeError, ValueError):

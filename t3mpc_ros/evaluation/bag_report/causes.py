@@ -137,11 +137,6 @@ PATTERNS = (
 """Of two that a text contains the earlier one is meant."""
 
 
-def source_of(node: str) -> int:
-    """Return whose diagnostics a status name is of."""
-    return _SOURCES.get(node.split(':')[0].rpartition('/')[2].strip(), ROBOT)
-
-
 def cause_of(event: DiagnosticEvent, *, stops: bool = True) -> Cause | None:
     """Return the cause that a warning or error stands for.
 
@@ -149,7 +144,9 @@ def cause_of(event: DiagnosticEvent, *, stops: bool = True) -> Cause | None:
     """
     _, level, node, text = event
     found = next((each for each in PATTERNS if each.text in text and level != 'ok'), None)
-    source = MACHINE if found and found.name == OVERLOADED else source_of(node)
+    source = _SOURCES.get(node.split(':')[0].rpartition('/')[2].strip(), ROBOT)
+    if found and found.name == OVERLOADED:
+        source = MACHINE
     if found is not None and found.stops == stops:
         return Cause(found.name, found.remedy, f'{node}: {text}', source)
     if found is None and stops and level == 'error' and source != MACHINE:

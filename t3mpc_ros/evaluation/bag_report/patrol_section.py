@@ -34,6 +34,7 @@ LEAST_DISTANCE, LEAST_SIZE = 2.0, 0.5
 BODY = 0.11
 """Radius of the robot, m: cells whose centre it cannot reach do not count."""
 _SAMPLE = 0.05
+"""Least time between two positions that are evaluated, s."""
 
 
 def followed_reference(run: Run) -> Series | None:
@@ -49,7 +50,8 @@ def patrol_blocks(run: Run) -> Iterator[Block]:
     motion = run.motions.get(run.measured)
     if motion is None or len(motion) < 2:
         return
-    time, x, y = _thinned(motion)
+    rarely = np.concatenate([[True], np.diff(np.floor(motion.time / _SAMPLE)) > 0.0])
+    time, x, y = motion.time[rarely], motion['x'][rarely], motion['y'][rarely]
     distance = float(np.hypot(np.diff(x), np.diff(y)).sum())
     if time.size < 2 or distance < LEAST_DISTANCE or max(np.ptp(x), np.ptp(y)) < LEAST_SIZE:
         return
@@ -105,13 +107,6 @@ def patrol_blocks(run: Run) -> Iterator[Block]:
     yield Paragraph(
         f'A grid of 20 × 20 cells over {where}; evenness 1: the same time in each.{short}', 'quiet'
     )
-
-
-def _thinned(motion: Series) -> tuple[Array, Array, Array]:
-    """Return time (s) and position (m), at most every :data:`_SAMPLE` seconds."""
-    ticks = np.floor(motion.time / _SAMPLE)
-    rows = np.concatenate([[True], np.diff(ticks) > 0.0])
-    return motion.time[rows], motion['x'][rows], motion['y'][rows]
 
 
 def _grid(run: Run, x: Array, y: Array) -> tuple[CoverageGrid, str]:

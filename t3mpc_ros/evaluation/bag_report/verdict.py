@@ -118,7 +118,11 @@ def judge(
     ``counted`` is the time in which errors count, s; ``missing`` the share of odometry,
     ``latency_99`` the 99th percentile from odometry to command, s; NaN if unknown.
     """
-    findings = [_Finding(text, remedy=_recovery(text), spoils=True) for text in run.damage]
+    recovery = '`t3mpc bag recover` writes their messages to a new bag.'
+    findings = [
+        _Finding(text, remedy=recovery if 'truncated' in text else '', spoils=True)
+        for text in run.damage
+    ]
     damaged = bool(findings)
     if lacking := _lacking(run):
         said = _Finding(_without(run, lacking), 'Data missing: tracking cannot be judged')
@@ -204,11 +208,6 @@ def duration_text(seconds: float) -> str:
 
 
 # -- the recording --------------------------------------------------------------------------------
-
-
-def _recovery(damage: str) -> str:
-    known = 'truncated' in damage
-    return '`t3mpc bag recover` writes their messages to a new bag.' if known else ''
 
 
 def _lacking(run: Run) -> tuple[str, ...]:

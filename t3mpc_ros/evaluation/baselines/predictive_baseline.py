@@ -143,16 +143,11 @@ def response_matrix(steps: Array, moves: int) -> Array:
 def predict_reference(known: Array, fade: float, rows: int, *, preview: bool) -> Array:
     """Return the reference expected 0 ... N periods after the answer begins to act, rad/s.
 
-    Parameters
-    ----------
-    known
-        The first rows, shape (n, 2), n >= 2. With preview, in which they may contain jumps, they
-        are continued by their last slope, or by the one before where that is flatter, so that a
-        jump in the last row is not taken for a slope.
-    fade
-        Share of the slope that is left after a period, beyond what is known.
-    rows
-        N + 1.
+    known : the first rows, shape (n, 2), n >= 2. With preview, in which they may contain jumps,
+        they are continued by their last slope, or by the one before where that is flatter, so that
+        a jump in the last row is not taken for a slope
+    fade : share of the slope that is left after a period, beyond what is known
+    rows : N + 1
     """
     missing = rows - len(known)
     if missing <= 0:

@@ -161,10 +161,7 @@ def periods(
 def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -> PredictorFit:
     """Return the predictor fitted to all of a run in periods, see :func:`periods`.
 
-    Raises
-    ------
-    TrainingError
-        There is too little data, or v_p moved too little to identify its effect.
+    TrainingError: there is too little data, or v_p moved too little to identify its effect.
     """
     predictive, period = parameters.predictive, 1.0 / parameters.rate
     timing = SampleTiming(period, predictive.decimation, predictive.average)

@@ -188,12 +188,7 @@ def fit_bags(
     less independent than bags, so the skill is slightly optimistic. With ``keep_predictor`` the
     predictor stays pre-trained on the nominal loop: for bags in which v_p moved too little.
 
-    Raises
-    ------
-    TrainingError
-        A bag cannot be used, or the bags do not belong together.
-    BagError
-        A bag cannot be read.
+    TrainingError: a bag cannot be used, or the bags do not belong together.
     """
     runs: dict[str, TrainingData] = {}
     origins, lines = [], []

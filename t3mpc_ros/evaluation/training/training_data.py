@@ -79,12 +79,7 @@ class TrainingData:
 def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters, list[str]]:
     """Return the data of a bag, the parameters of the run, and remarks for the user.
 
-    Raises
-    ------
-    TrainingError
-        Topics or parameters are missing, or the parameters contradict the recorded commands.
-    BagError
-        The bag cannot be read.
+    TrainingError: topics or parameters are missing, or contradict the recorded commands.
     """
     try:
         inputs = load_inputs(folder)

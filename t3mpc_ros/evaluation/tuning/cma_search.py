@@ -95,23 +95,12 @@ def search_best(
 
     The last point is the mean of the distribution, where the search believes the optimum to be,
     unless no generation was completed before. Equal arguments give equal results, bit for bit,
-    however often the search was interrupted and resumed.
+    however often the search was interrupted and resumed. ``objective`` is to be made small.
 
-    Parameters
-    ----------
-    objective
-        To be made small. Called for the start and for each generation.
-    report
-        Called after each generation.
-    path, resume
-        File of the evaluations, one a line, and whether those it holds are made again.
-    about
-        Plain data that tells this objective from others: their lines in the file are left alone.
-
-    Raises
-    ------
-    ValueError
-        Too few evaluations, or an objective that returns another number of values.
+    ``path`` is the file of the evaluations, one a line; without ``resume`` what it holds is thrown
+    away. ``about`` is plain data that tells this objective from others, whose lines in the file
+    are left alone. ValueError: too few evaluations, or an objective that returns another number of
+    values.
     """
     if evaluations < 1:
         raise ValueError(f'evaluations must be at least 1: got {evaluations}')

@@ -59,11 +59,8 @@ class SearchRange:
 class SearchSpace:
     """The tuned parameters of one table, as the unit cube; coordinates are in order of ``ranges``.
 
-    Raises
-    ------
-    ParameterError
-        A name that the table does not have, or has no number for; a range that is empty, or goes
-        beyond the parameter's own bounds.
+    ParameterError: a name that the table does not have, or has no number for; a range that is
+    empty, or goes beyond the parameter's own bounds.
     """
 
     def __init__(self, table: type[Parameters], ranges: Sequence[SearchRange]) -> None:

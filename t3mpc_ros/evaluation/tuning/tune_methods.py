@@ -78,11 +78,8 @@ class ClosedLoopObjective:
     ) -> list[float]:
         """Return the mean objective of each candidate, infinite where a run diverged or failed.
 
-        Raises
-        ------
-        JobError
-            Runs failed with every candidate of a method that never ran before: it is at fault
-            then, not the parameters. Or a process was lost.
+        JobError if a process was lost, or runs failed with every candidate of a method that never
+        ran before: it is at fault then, not the parameters.
         """
         try:
             objectives: list[float | None] = [*self.objectives(method, drive, candidates)]
@@ -139,30 +136,15 @@ def tune_methods(
 ) -> TunedParameters:
     """Return the best parameters of each method in each of its drives.
 
-    Each pair has a search of its own with the same budget. The file is written after
-    each, and the history of each search beside it; what the file holds of other methods stays.
+    Each pair has a search of its own with the same budget; ``resume`` goes on with searches that
+    were interrupted. The file ``path`` is written after each, and the history of each search
+    beside it; what the file holds of other methods stays.
 
-    Parameters
-    ----------
-    drives
-        Keys of the start parameters: ``'torque'``, ``'velocity'``, or ``'twin'`` with its own
-        ``evaluate``; a method without start parameters for one is left out there.
-    path
-        Where the tuned parameters are kept.
-    report
-        Receives messages; with None there is no progress line either.
-    resume
-        Go on with searches that were interrupted.
-    evaluate
-        What evaluates in place of the closed loop.
-
-    Raises
-    ------
-    ValueError
-        Methods of the same name; a drive no method is meant for; or a file that holds other
-        methods tuned in the same drive with another budget, which could not be compared.
-    RuntimeError
-        For some method no parameters gave a finite objective; all others are kept.
+    ``drives`` are keys of the start parameters: ``'torque'``, ``'velocity'``, or ``'twin'`` with
+    its own ``evaluate`` in place of the closed loop. Without ``report`` there is no progress line
+    either. ValueError: methods of one name, a drive that no method is meant for, or a file with
+    other methods tuned in the same drive with another budget. RuntimeError: for some method no
+    parameters gave a finite objective; all others are kept.
     """
     check_names(methods)
     for drive in drives:
