@@ -342,17 +342,12 @@ def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
         'Several bags are compared with the first in comparison.html. Exit code 0: written, '
         'whatever the verdict; 1: nothing can be read.',
     )
-    parser.add_argument(
-        'bags', type=Path, nargs='+', metavar='BAG', help='folder of a bag, or its one file'
-    )
-    parser.add_argument('--output', type=Path, help='folder for the report (default: beside it)')
+    add = parser.add_argument
+    add('bags', type=Path, nargs='+', metavar='BAG', help='folder of a bag, or its one file')
+    add('--output', type=Path, help='folder for the report (default: beside it)')
     add_topic_options(parser)
-    parser.add_argument(
-        '--reference',
-        default='',
-        metavar='TOPIC',
-        help='what the robot was to follow: odometry or a twist',
-    )
+    text = 'what the robot was to follow: odometry or a twist'
+    add('--reference', default='', metavar='TOPIC', help=text)
     add_json(parser, 'write verdict and numbers')
     parser.set_defaults(run=run_report)
 
@@ -386,8 +381,9 @@ def add_animate_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
         'rays where they are known, and beside it the speeds against their references with the '
         'errors below. The bag may be of any robot with odometry.',
     )
-    parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its one file')
-    parser.add_argument('--output', type=Path, required=True, metavar='FILE', help='a .gif')
+    add = parser.add_argument
+    add('bag', type=Path, metavar='BAG', help='folder of the bag, or its one file')
+    add('--output', type=Path, required=True, metavar='FILE', help='a .gif')
     for name, default, metavar, kind, text in (
         ('start', 0.0, 'S', bounded_float(0.0, 1e9, 's'), 'start, s (default 0)'),
         ('duration', math.inf, 'S', bounded_float(0.0, math.inf, 's'), 's (default: to the end)'),
@@ -396,8 +392,8 @@ def add_animate_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
         ('rate', 10.0, 'HZ', bounded_float(0.1, 50.0, 'Hz'), 'frames per second (default 10)'),
         ('width', 760, 'PIXELS', bounded_int(200, 4000), 'of the picture (default 760)'),
     ):  # fmt: skip
-        parser.add_argument(f'--{name}', type=kind, default=default, metavar=metavar, help=text)
-    parser.add_argument('--namespace', help='of the robot, where the bag holds several')
+        add(f'--{name}', type=kind, default=default, metavar=metavar, help=text)
+    add('--namespace', help='of the robot, where the bag holds several')
     parser.set_defaults(run=run_animate)
 
 
@@ -425,11 +421,10 @@ def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
         'them. With other parameters it computes what would have been commanded; the recorded '
         'robot does not respond to that.',
     )
-    parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
-    parser.add_argument(
-        '--output', type=Path, metavar='DIR', help='write a bag of what was computed'
-    )
-    parser.add_argument('--method', action=RemovedOption, nargs='?', help=argparse.SUPPRESS)
+    add = parser.add_argument
+    add('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
+    add('--output', type=Path, metavar='DIR', help='write a bag of what was computed')
+    add('--method', action=RemovedOption, nargs='?', help=argparse.SUPPRESS)
     add_input_options(parser)
     add_json(parser, 'write speed and comparison')
     parser.set_defaults(run=run_replay)
@@ -437,18 +432,13 @@ def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
 
 def add_input_options(parser: argparse.ArgumentParser) -> None:
     """Add the options that choose the controller inputs of a bag."""
-    parser.add_argument(
-        '--set',
-        dest='parameters',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help='another setting than the recorded one, law.gain=90 say; may be given again',
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    text = 'another setting than the recorded one, law.gain=90 say; may be given again'
+    add('--set', dest='parameters', action='append', default=[], metavar='NAME=VALUE', help=text)
+    add(
         '--model', type=Path, metavar='FILE', help='model file to begin with (default: as the bag)'
     )
-    parser.add_argument('--namespace', help='of the robot, where the bag holds several')
+    add('--namespace', help='of the robot, where the bag holds several')
 
 
 def run_replay(options: argparse.Namespace) -> int:
@@ -513,30 +503,19 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
         'With two: what they hold of one run. Exit code 0: all within the tolerances; 3: '
         'something differs; 1: it cannot be compared.',
     )
-    parser.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
-    parser.add_argument('other', type=Path, nargs='?', metavar='OTHER', help='another bag')
-    parser.add_argument(
-        '--abs',
-        type=float,
-        metavar='TOL',
-        help='absolute tolerance, SI units (default 1e-9; elsewhere than where it was recorded '
-        'take 1e-6)',
+    add = parser.add_argument
+    add('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
+    add('other', type=Path, nargs='?', metavar='OTHER', help='another bag')
+    text = (
+        'absolute tolerance, SI units (default 1e-9; elsewhere than where it was recorded '
+        'take 1e-6)'
     )
-    parser.add_argument(
-        '--rel', type=float, metavar='TOL', help='share of the recorded number (default 1e-9)'
-    )
-    parser.add_argument(
-        '--field',
-        dest='fields',
-        action='append',
-        default=[],
-        metavar='F=TOL',
-        help='absolute tolerance of one field, or of several by a name with *; may be given again',
-    )
-    parser.add_argument(
-        '--picture', type=Path, metavar='FILE', help='draw the first divergence as PNG'
-    )
-    parser.add_argument('--update-golden', action=RemovedOption, nargs='?', help=argparse.SUPPRESS)
+    add('--abs', type=float, metavar='TOL', help=text)
+    add('--rel', type=float, metavar='TOL', help='share of the recorded number (default 1e-9)')
+    text = 'absolute tolerance of one field, or of several by a name with *; may be given again'
+    add('--field', dest='fields', action='append', default=[], metavar='F=TOL', help=text)
+    add('--picture', type=Path, metavar='FILE', help='draw the first divergence as PNG')
+    add('--update-golden', action=RemovedOption, nargs='?', help=argparse.SUPPRESS)
     add_input_options(parser)
     add_json(parser, 'write the comparison')
     parser.set_defaults(run=run_compare)

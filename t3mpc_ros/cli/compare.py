@@ -34,13 +34,12 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         description='Compares the controller with every baseline; with your own controllers, '
         'compares them with the full controller in the nominal case.',
     )
-    parser.add_argument(
-        'own',
-        nargs='*',
-        metavar='FILE.py:NAME',
-        help='a controller of your own: a class with step(observation), or a function of the '
-        'observation',
+    add = parser.add_argument
+    text = (
+        'a controller of your own: a class with step(observation), or a function of the '
+        'observation'
     )
+    add('own', nargs='*', metavar='FILE.py:NAME', help=text)
     run_options.add_setting(parser)
     run_options.add_seeds(
         parser,
@@ -48,22 +47,14 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         'reference and robot; none of the default ones, a quick look, was used for tuning or is '
         'in another table',
     )
-    parser.add_argument(
-        '--cases',
-        nargs='+',
-        default=(),
-        metavar='CASE',
-        help='by name (default: all; with your own controllers: nominal)',
+    text = 'by name (default: all; with your own controllers: nominal)'
+    add('--cases', nargs='+', default=(), metavar='CASE', help=text)
+    text = (
+        'by name; all: with stages and ablations of the controller (default: the full '
+        'controller and every baseline; with your own controllers: the full controller)'
     )
-    parser.add_argument(
-        '--methods',
-        nargs='+',
-        default=(),
-        metavar='METHOD',
-        help='by name; all: with stages and ablations of the controller (default: the full '
-        'controller and every baseline; with your own controllers: the full controller)',
-    )
-    parser.add_argument(
+    add('--methods', nargs='+', default=(), metavar='METHOD', help=text)
+    add(
         '--gyro',
         action='store_true',
         help='twin: baselines take the yaw rate from the gyro in every case, not only where the '
@@ -71,9 +62,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     )
     run_options.add_workers(parser)
     run_options.add_outputs(parser, 'write every number')
-    parser.add_argument(
-        '--csv', type=Path, help='write a row for each run, with commit and machine'
-    )
+    add('--csv', type=Path, help='write a row for each run, with commit and machine')
     parser.set_defaults(run=run)
 
 

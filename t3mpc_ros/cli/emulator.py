@@ -122,40 +122,19 @@ def program_parser() -> argparse.ArgumentParser:
     add('--link', type=Path, required=True, help='path of the port, made as a symbolic link')
     add('--robot-link', type=Path, help='path of the USB console of the robot board')
     add('--world', default='', help='world around the robot; default: no obstacles')
-    add(
-        '--loss',
-        type=bounded_float(0.0, 1.0),
-        default=0.0,
-        help='share of lost radio packets, each way (default 0)',
-    )
-    add(
-        '--fault',
-        action='append',
-        default=[],
-        metavar='NAME:AT[:FOR[:VALUE]]',
-        help='fault with start (s), duration (s) and value; repeatable',
-    )
+    text = 'share of lost radio packets, each way (default 0)'
+    add('--loss', type=bounded_float(0.0, 1.0), default=0.0, help=text)
+    text = 'fault with start (s), duration (s) and value; repeatable'
+    add('--fault', action='append', default=[], metavar='NAME:AT[:FOR[:VALUE]]', help=text)
     add('--key', type=Path, help='file with the key of the robot; default: open link')
     add('--erased', action='store_true', help='new board: no settings, so it does not move yet')
     add('--seed', type=int, default=1, help='seed of all random generators (default 1)')
-    add(
-        '--real-time-factor',
-        type=bounded_float(0.01, 100.0),
-        default=1.0,
-        help='virtual seconds per second (default 1)',
-    )
-    add(
-        '--restart-on-open',
-        action='store_true',
-        help='opening a port reboots its board, as on most boards',
-    )
-    add(
-        '--set',
-        action='append',
-        default=[],
-        metavar='NAME=VALUE',
-        help='parameter, such as robot_clock_error or twin.load_change; repeatable',
-    )
+    text = 'virtual seconds per second (default 1)'
+    add('--real-time-factor', type=bounded_float(0.01, 100.0), default=1.0, help=text)
+    text = 'opening a port reboots its board, as on most boards'
+    add('--restart-on-open', action='store_true', help=text)
+    text = 'parameter, such as robot_clock_error or twin.load_change; repeatable'
+    add('--set', action='append', default=[], metavar='NAME=VALUE', help=text)
     return parser
 
 

@@ -241,31 +241,17 @@ def _parser(
     demo.add_argument('--headless', action='store_true', help='no bar, no browser')
     demo.add_argument('--view', action='store_true', help='show the run on a live page')
     demo.add_argument('--seed', type=int, help='seed of reference and robot')
-    demo.add_argument(
-        '--patrol',
-        action='store_true',
-        help='patrol the world room on a chaotic path; without --seed it is unpredictable',
+    text = 'patrol the world room on a chaotic path; without --seed it is unpredictable'
+    demo.add_argument('--patrol', action='store_true', help=text)
+    text = (
+        "twin: the stepper robot with all its parts (default); servo: the paper's plant; "
+        'emulator: the twin on an emulated board, driven over a serial port and a radio'
     )
-    demo.add_argument(
-        '--robot',
-        choices=('twin', 'servo', 'emulator'),
-        default='twin',
-        help="twin: the stepper robot with all its parts (default); servo: the paper's plant; "
-        'emulator: the twin on an emulated board, driven over a serial port and a radio',
-    )
-    demo.add_argument(
-        '--loss',
-        type=_share,
-        default=0.0,
-        help='share of radio packets lost each way, with --robot emulator (default 0)',
-    )
-    demo.add_argument(
-        '--set',
-        action='append',
-        default=[],
-        metavar='NODE.NAME=VALUE',
-        help='parameter of a node, such as controller.law.gain=90; may be given again',
-    )
+    demo.add_argument('--robot', choices=('twin', 'servo', 'emulator'), default='twin', help=text)
+    text = 'share of radio packets lost each way, with --robot emulator (default 0)'
+    demo.add_argument('--loss', type=_share, default=0.0, help=text)
+    text = 'parameter of a node, such as controller.law.gain=90; may be given again'
+    demo.add_argument('--set', action='append', default=[], metavar='NODE.NAME=VALUE', help=text)
     demo.set_defaults(run=_demo)
 
     for name, text in PROGRAMS.items():
@@ -278,11 +264,9 @@ def _parser(
     )
     add_seeds(estimation, '1-5', 'the runs', counted=True)
     estimation.add_argument('--duration', type=SECONDS, default=60.0, help='seconds (default 60)')
+    text = 'normalised gain of all kinds, 1/s² (default 40)'
     estimation.add_argument(
-        '--gain',
-        type=bounded_float(0.0, 1e6, '1/s²'),
-        default=40.0,
-        help='normalised gain of all kinds, 1/s² (default 40)',
+        '--gain', type=bounded_float(0.0, 1e6, '1/s²'), default=40.0, help=text
     )
     add_json(estimation)
     estimation.set_defaults(run=_estimation)

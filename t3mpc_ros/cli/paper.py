@@ -25,9 +25,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser = commands.add_parser(
         'paper', help='every figure and table of the paper, and the verdict on its claims'
     )
-    parser.add_argument(
-        '--quick', action='store_true', help='few seeds and short runs: shows that all works'
-    )
+    add = parser.add_argument
+    add('--quick', action='store_true', help='few seeds and short runs: shows that all works')
     run_options.add_seeds(
         parser, '', 'the runs', counted=True, text='the 20 held-out ones, quick: 3'
     )
@@ -40,13 +39,9 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         text='20, quick: 2',
     )
     run_options.add_workers(parser)
-    parser.add_argument(
-        '--output', type=Path, help='folder (default runs/paper, or runs/paper-quick)'
-    )
+    add('--output', type=Path, help='folder (default runs/paper, or runs/paper-quick)')
     run_options.add_json(parser, 'also write the results')
-    parser.add_argument(
-        '--fresh', action='store_true', help='discard the runs that the folder holds'
-    )
+    add('--fresh', action='store_true', help='discard the runs that the folder holds')
     parser.set_defaults(run=run)
 
 

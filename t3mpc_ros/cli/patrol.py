@@ -33,29 +33,26 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser = commands.add_parser(
         'patrol', help='coverage and predictability of the chaotic patrol against other paths'
     )
-    parser.add_argument(
-        '--robot',
-        choices=('exact', 'twin'),
-        default='exact',
-        help='exact: a robot that is always on its reference, in an empty room (default); twin: '
+    add = parser.add_argument
+    text = (
+        'exact: a robot that is always on its reference, in an empty room (default); twin: '
         'the simulated robot among unknown boxes with keep-out, which takes about as long as it '
-        'drives',
+        'drives'
     )
-    parser.add_argument(
+    add('--robot', choices=('exact', 'twin'), default='exact', help=text)
+    add(
         '--planned',
         action='store_true',
         help='as --robot twin, and the path goes around what the robot has seen; the robot rests '
         'and looks before floor that it has not',
     )
     add_seeds(parser, DEFAULT_SEEDS, 'path, robot and room')
-    parser.add_argument(
-        '--minutes',
-        type=bounded_float(0.1, 1440.0, 'min'),
-        default=18.0,
-        help='of each patrol (default 18, three times what the boustrophedon needs); from 2.2 on '
-        'with predictability',
+    text = (
+        'of each patrol (default 18, three times what the boustrophedon needs); from 2.2 on '
+        'with predictability'
     )
-    parser.add_argument(
+    add('--minutes', type=bounded_float(0.1, 1440.0, 'min'), default=18.0, help=text)
+    add(
         '--arena',
         type=float,
         nargs=4,
@@ -63,25 +60,20 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         metavar=('LEFT', 'BOTTOM', 'RIGHT', 'TOP'),
         help='where the paths lie, around the start at 0 0, m (default -1.75 -1.25 1.75 1.25)',
     )
-    parser.add_argument(
-        '--paths', nargs='+', default=(), metavar='PATH', help='by name (default: all)'
-    )
-    parser.add_argument(
-        '--tracking',
-        nargs='?',
-        const='compare',
-        choices=('compare', 'tune'),
-        help='instead: how exactly the simulated robot follows a straight line, a square, a '
+    add('--paths', nargs='+', default=(), metavar='PATH', help='by name (default: all)')
+    text = (
+        'instead: how exactly the simulated robot follows a straight line, a square, a '
         'figure of eight and a recorded path, with and without each part of the controller and '
-        'by pure pursuit; tune: errors of the choices of gains and lookaheads on another path',
+        'by pure pursuit; tune: errors of the choices of gains and lookaheads on another path'
     )
-    parser.add_argument(
+    add('--tracking', nargs='?', const='compare', choices=('compare', 'tune'), help=text)
+    add(
         '--safety',
         action='store_true',
         help='instead: what the simulated robot touches when its range sensors fail, things are '
         'placed in its way, people step in or boxes are below its beams',
     )
-    parser.add_argument(
+    add(
         '--localization',
         action='store_true',
         help='instead: how well the simulated robot knows its place in a known room, by odometry '
@@ -89,9 +81,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     )
     add_workers(parser)
     add_json(parser, 'also write every run')
-    parser.add_argument(
-        '--output', type=Path, default=OUTPUT, help=f'folder of the page (default {OUTPUT})'
-    )
+    add('--output', type=Path, default=OUTPUT, help=f'folder of the page (default {OUTPUT})')
     parser.set_defaults(run=run)
 
 

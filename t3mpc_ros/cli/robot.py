@@ -450,13 +450,11 @@ def _add_settings_commands(
     add('--divider', type=_setting('divider', float), help='of the battery voltage, 4: 1/4 of it')
     text = 'wired: the battery is measured, and the robot stops when it measures nothing'
     add('--battery', choices=('wired', 'unwired'), help=text)
-    add(
-        '--sensors',
-        type=_setting('sensors', _sensors),
-        metavar='TYPE[,…]',
-        help=f'distance sensors, one type or {eeprom_records.SENSOR_COUNT}: '
-        f'{", ".join(eeprom_records.SENSORS)}',
+    text = (
+        f'distance sensors, one type or {eeprom_records.SENSOR_COUNT}: '
+        f'{", ".join(eeprom_records.SENSORS)}'
     )
+    add('--sensors', type=_setting('sensors', _sensors), metavar='TYPE[,…]', help=text)
     add('--diff', type=Path, metavar='FILE', help='compare with a file; exit code 1 if different')
     add('--load', type=Path, metavar='FILE', help='write the settings of a file')
     add('--save', type=Path, metavar='FILE', help='write a parameter file, for the host as well')

@@ -238,21 +238,16 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         help='USB port of the robot board: the second pass, at rest; without --port, the steps '
         'that need no radio',
     )
-    add(
-        '--save',
-        type=Path,
-        default=Path('calibration.yaml'),
-        metavar='FILE',
-        help='parameter file of the result (default calibration.yaml); its values are kept where '
-        'a step is left out',
+    text = (
+        'parameter file of the result (default calibration.yaml); its values are kept where '
+        'a step is left out'
     )
-    add(
-        '--steps',
-        type=_steps,
-        metavar='STEP,…',
-        help=f'some of {", ".join(STEPS)}; default: with --robot-port {" and ".join(USB_STEPS)}, '
-        'without it the others, without --port rest as well',
+    add('--save', type=Path, default=Path('calibration.yaml'), metavar='FILE', help=text)
+    text = (
+        f'some of {", ".join(STEPS)}; default: with --robot-port {" and ".join(USB_STEPS)}, '
+        'without it the others, without --port rest as well'
     )
+    add('--steps', type=_steps, metavar='STEP,…', help=text)
     for flag, kind, default, text in (
         ('--wheel-radius', bounded_float(0.005, 1.0), geometry.wheel_radius, 'nominal, m'),
         ('--wheel-separation', bounded_float(0.01, 5.0), geometry.wheel_separation, 'nominal, m'),
@@ -261,14 +256,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
         ('--speed', bounded_float(0.2, 8.0), usual.speed, 'wheel speed, rad/s'),
     ):
         add(flag, type=kind, default=default, help=f'{text} (default {default:g})')
-    add(
-        '--distances',
-        type=_distances,
-        default=usual.distances,
-        metavar='M,…',
-        help='from the distance sensors to the board, m (default '
-        f'{",".join(map(str, usual.distances))})',
+    text = (
+        'from the distance sensors to the board, m (default '
+        f'{",".join(map(str, usual.distances))})'
     )
+    add('--distances', type=_distances, default=usual.distances, metavar='M,…', help=text)
     for name, value, unit, text in (
         ('distance', 1e3 * MARKS.distance, 'mm', 'of a mark on the floor'),
         ('angle', math.degrees(MARKS.angle), 'degrees', 'of a direction read from a mark'),

@@ -33,32 +33,21 @@ STANDARD_OUTPUT = Path('-')
 
 def add_setting(parser: argparse.ArgumentParser) -> None:
     """Add robot, reference, noise and duration of the runs."""
-    parser.add_argument(
-        '--robot',
-        default='twin',
-        metavar='twin|servo|torque|FILE.py:NAME',
-        help='twin: the stepper robot, ground truth of its body included (default); servo, '
-        "torque: the paper's plant with that drive; or your own Robot, OdePlant or StateSpace",
+    add = parser.add_argument
+    text = (
+        'twin: the stepper robot, ground truth of its body included (default); servo, '
+        "torque: the paper's plant with that drive; or your own Robot, OdePlant or StateSpace"
     )
-    parser.add_argument(
-        '--reference',
-        type=Path,
-        metavar='CSV',
-        help='columns time,right,left (s, rad/s) or time,linear,angular (s, m/s, rad/s) in place '
-        'of the chaotic reference',
+    add('--robot', default='twin', metavar='twin|servo|torque|FILE.py:NAME', help=text)
+    text = (
+        'columns time,right,left (s, rad/s) or time,linear,angular (s, m/s, rad/s) in place '
+        'of the chaotic reference'
     )
-    parser.add_argument(
-        '--noise',
-        type=bounded_float(0.0, 100.0, '(rad/s)²'),
-        default=0.04,
-        help='variance of the measured wheel speeds, (rad/s)² (default 0.04)',
-    )
-    parser.add_argument(
-        '--duration',
-        type=bounded_float(2.0, 3600.0, 's'),
-        default=60.0,
-        help='of each run, s (default 60)',
-    )
+    add('--reference', type=Path, metavar='CSV', help=text)
+    text = 'variance of the measured wheel speeds, (rad/s)² (default 0.04)'
+    add('--noise', type=bounded_float(0.0, 100.0, '(rad/s)²'), default=0.04, help=text)
+    text = 'of each run, s (default 60)'
+    add('--duration', type=bounded_float(2.0, 3600.0, 's'), default=60.0, help=text)
 
 
 def add_seeds(
@@ -149,18 +138,13 @@ def prepare_outputs(options: argparse.Namespace, *further: Path | None) -> None:
 
 def add_topic_options(parser: argparse._ActionsContainer) -> None:
     """Add which topics of a bag are whose, and the wheel geometry that it may lack."""
-    parser.add_argument('--namespace', help='whose topics (default: those of most known topics)')
-    parser.add_argument('--odom', default='', metavar='TOPIC', help='odometry')
-    parser.add_argument('--cmd-vel', default='', metavar='TOPIC', help='commands')
-    parser.add_argument(
-        '--wheel-radius',
-        type=float,
-        metavar='M',
-        help='radius of the wheels in m (default: as recorded)',
-    )
-    parser.add_argument(
-        '--track', type=float, metavar='M', help='distance between the wheels in m, likewise'
-    )
+    add = parser.add_argument
+    add('--namespace', help='whose topics (default: those of most known topics)')
+    add('--odom', default='', metavar='TOPIC', help='odometry')
+    add('--cmd-vel', default='', metavar='TOPIC', help='commands')
+    text = 'radius of the wheels in m (default: as recorded)'
+    add('--wheel-radius', type=float, metavar='M', help=text)
+    add('--track', type=float, metavar='M', help='distance between the wheels in m, likewise')
 
 
 def report_options(options: argparse.Namespace) -> 'ReportOptions':

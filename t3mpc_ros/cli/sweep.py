@@ -34,14 +34,10 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         'an interruption, or with more values, it runs only what the file lacks, and runs that '
         'failed. Exit code 0: every run has its result; 3: some failed; 1: none was made.',
     )
-    parser.add_argument(
-        'controllers',
-        nargs='*',
-        default=[run_options.FULL],
-        metavar='CONTROLLER',
-        help='name of a method, or FILE.py:NAME (default full)',
-    )
-    parser.add_argument(
+    add = parser.add_argument
+    text = 'name of a method, or FILE.py:NAME (default full)'
+    add('controllers', nargs='*', default=[run_options.FULL], metavar='CONTROLLER', help=text)
+    add(
         '--set',
         nargs='+',
         action='extend',
@@ -52,19 +48,10 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     )
     run_options.add_setting(parser)
     run_options.add_seeds(parser, '1-5', 'reference and robot')
-    parser.add_argument(
-        '--cases',
-        nargs='+',
-        default=(run_options.NOMINAL,),
-        metavar='CASE',
-        help='by name (default nominal)',
-    )
-    parser.add_argument(
-        '--output', type=Path, default=OUTPUT, help=f'Parquet file (default {OUTPUT})'
-    )
-    parser.add_argument(
-        '--metric', default='settled', help='column that the table shows (default settled)'
-    )
+    text = 'by name (default nominal)'
+    add('--cases', nargs='+', default=(run_options.NOMINAL,), metavar='CASE', help=text)
+    add('--output', type=Path, default=OUTPUT, help=f'Parquet file (default {OUTPUT})')
+    add('--metric', default='settled', help='column that the table shows (default settled)')
     run_options.add_workers(parser)
     run_options.add_json(parser, 'also write the rows')
     parser.set_defaults(run=run)

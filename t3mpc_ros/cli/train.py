@@ -44,21 +44,15 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
 
 def add_bag_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of training from bags, see :func:`run_bags`."""
-    parser.add_argument(
-        '--output', type=Path, default=OUTPUT, help=f'model file to write (default {OUTPUT})'
+    add = parser.add_argument
+    add('--output', type=Path, default=OUTPUT, help=f'model file to write (default {OUTPUT})')
+    text = 'learn only the fuzzy coefficients from the bags, because v_p moved too little'
+    add('--keep-predictor', action='store_true', help=text)
+    text = (
+        'blocks into which one bag alone is cut to be cross-validated; of several bags '
+        f'each is a fold (default {FOLDS})'
     )
-    parser.add_argument(
-        '--keep-predictor',
-        action='store_true',
-        help='learn only the fuzzy coefficients from the bags, because v_p moved too little',
-    )
-    parser.add_argument(
-        '--folds',
-        type=int,
-        default=FOLDS,
-        help='blocks into which one bag alone is cut to be cross-validated; of several bags '
-        f'each is a fold (default {FOLDS})',
-    )
+    add('--folds', type=int, default=FOLDS, help=text)
 
 
 def run(options: argparse.Namespace) -> int:

@@ -46,27 +46,20 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         'With a bag of any robot with cmd_vel and odom: identifies lag, dead time and noise of '
         'the drive, and prints a parameter file of the controller with the gain that fits.',
     )
-    parser.add_argument('methods', nargs='*', metavar='METHOD', help='by name (default all)')
-    parser.add_argument(
+    add = parser.add_argument
+    add('methods', nargs='*', metavar='METHOD', help='by name (default all)')
+    add(
         '--robot',
         metavar='twin|servo|torque|BAG',
         help="twin: the stepper robot; servo, torque: the paper's plant with that drive; or the "
         'folder or file of a bag (default servo and torque)',
     )
-    parser.add_argument(
-        '--evaluations',
-        type=bounded_int(1, 100_000),
-        help=f'of each method with each robot (default {EVALUATIONS}; twin {TWIN_EVALUATIONS})',
-    )
+    text = f'of each method with each robot (default {EVALUATIONS}; twin {TWIN_EVALUATIONS})'
+    add('--evaluations', type=bounded_int(1, 100_000), help=text)
     run_options.add_workers(parser)
-    parser.add_argument(
-        '--output',
-        type=Path,
-        help=f'file to write (default {OUTPUT}; with a bag none but the standard output)',
-    )
-    parser.add_argument(
-        '--resume', action='store_true', help='go on where the last tuning was interrupted'
-    )
+    text = f'file to write (default {OUTPUT}; with a bag none but the standard output)'
+    add('--output', type=Path, help=text)
+    add('--resume', action='store_true', help='go on where the last tuning was interrupted')
     run_options.add_json(parser, 'also write the parameters')
     run_options.add_topic_options(parser.add_argument_group('with a bag'))
     parser.set_defaults(run=run)

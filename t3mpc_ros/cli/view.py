@@ -46,19 +46,11 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument('--bag', type=Path, help='show this recording instead of a live robot')
     parser.add_argument('--namespace', default='', help='namespace of the robot (default: none)')
-    parser.add_argument(
-        '--port',
-        type=bounded_int(0, 65535),
-        default=DEFAULT_PORT,
-        help=f'TCP port on 127.0.0.1, 0: any free one (default {DEFAULT_PORT})',
-    )
+    text = f'TCP port on 127.0.0.1, 0: any free one (default {DEFAULT_PORT})'
+    parser.add_argument('--port', type=bounded_int(0, 65535), default=DEFAULT_PORT, help=text)
     parser.add_argument('--read-only', action='store_true', help='show only, take no commands')
-    parser.add_argument(
-        '--runs',
-        type=Path,
-        default=Path('runs'),
-        help='folder for what the page records (default: runs)',
-    )
+    text = 'folder for what the page records (default: runs)'
+    parser.add_argument('--runs', type=Path, default=Path('runs'), help=text)
     parser.add_argument('--headless', action='store_true', help='open no browser')
     parser.set_defaults(run=_view)
 
