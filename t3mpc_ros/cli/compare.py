@@ -70,9 +70,10 @@ def run(options: argparse.Namespace) -> int:
     """Print the tables and return 0."""
     from t3mpc_ros.evaluation import comparison_page
     from t3mpc_ros.evaluation.api.comparison_runs import Comparison
-    from t3mpc_ros.evaluation.api.result_tables import columns_of, write_csv
+    from t3mpc_ros.evaluation.api.result_tables import writable
     from t3mpc_ros.evaluation.comparison import markdown, run_plan, step_times
     from t3mpc_ros.evaluation.experiment import print_report
+    from t3mpc_ros.evaluation.reporting import columns_of, write_columns
 
     plan = _plan(options)
     run_options.prepare_outputs(options, options.csv)
@@ -87,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
     if options.html:
         options.html.write_text(comparison_page.page(plan, results, times), encoding='utf-8')
     if options.csv:
-        write_csv(options.csv, columns_of(Comparison(plan, results).rows()))
+        write_columns(writable(options.csv), columns_of(Comparison(plan, results).rows()))
     return 0
 
 

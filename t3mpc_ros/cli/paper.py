@@ -14,7 +14,6 @@
 """``t3mpc paper``: reproduces figures, tables and claims of the paper."""
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
 
 from t3mpc_ros.cli import run_options
@@ -49,19 +48,20 @@ def run(options: argparse.Namespace) -> int:
     """Write everything and return 0."""
     from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.methods import NMPC, require_libraries
-    from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, reproduce
+    from t3mpc_ros.evaluation.paper.reproduce import reproduce
 
     run_options.prepare_outputs(options)
     require_libraries([NMPC])
     output = options.output or Path('runs') / ('paper-quick' if options.quick else 'paper')
-    chosen = PaperOptions(
-        output=output,
-        quick=options.quick,
-        seeds=options.seeds,
-        estimation_seeds=options.estimation_seeds,
-        fresh=options.fresh,
-    )
     with run_options.executor_of(options) as executor:
-        text, numbers = reproduce(replace(chosen, workers=executor), print_report)
+        text, numbers = reproduce(
+            output,
+            quick=options.quick,
+            seeds=options.seeds,
+            estimation_seeds=options.estimation_seeds,
+            workers=executor,
+            fresh=options.fresh,
+            report=print_report,
+        )
     run_options.print_result(options, lambda: text, lambda: numbers)
     return 0

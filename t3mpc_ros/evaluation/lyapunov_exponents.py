@@ -16,20 +16,20 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.system import QuadraticSystem, Terms, jacobian, right_hand_side
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 
 
 def lyapunov_exponents(
     system: QuadraticSystem,
-    initial: NDArray[np.float64] | None = None,
+    initial: Array | None = None,
     duration: float = 400.0,
     step: float = 1e-3,
     settle: float = 20.0,
     interval: int = 5,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return the exponents (1/s), the largest first, shape (d,).
 
     State and tangent vectors are integrated together by the classical Runge-Kutta method. Every
@@ -69,12 +69,7 @@ def lyapunov_exponents(
 
 
 @kernel
-def _slopes(
-    terms: Terms,
-    point: NDArray[np.float64],
-    out: NDArray[np.float64],
-    derivative: NDArray[np.float64],
-) -> None:
+def _slopes(terms: Terms, point: Array, out: Array, derivative: Array) -> None:
     """Write the slope of state (column 0) and tangents (the others), shape (d, d + 1)."""
     size = point.shape[0]
     right_hand_side(terms, point[:, 0], out[:, 0])
@@ -88,9 +83,7 @@ def _slopes(
 
 
 @kernel
-def _shift(
-    base: NDArray[np.float64], factor: float, slopes: NDArray[np.float64], out: NDArray[np.float64]
-) -> None:
+def _shift(base: Array, factor: float, slopes: Array, out: Array) -> None:
     """Write base + factor * slopes into ``out``, which may be ``base``; nothing is allocated."""
     for i in range(base.shape[0]):
         for j in range(base.shape[1]):
@@ -100,10 +93,10 @@ def _shift(
 @kernel
 def _accumulate_growth(
     terms: Terms,
-    state: NDArray[np.float64],
-    tangents: NDArray[np.float64],
-    growth: NDArray[np.float64],
-    work: NDArray[np.float64],
+    state: Array,
+    tangents: Array,
+    growth: Array,
+    work: Array,
     step: float,
     interval: int,
     rounds: int,

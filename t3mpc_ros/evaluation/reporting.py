@@ -362,6 +362,12 @@ def replace_section(page: Path, begin: str, end: str, section: str) -> None:
     page.write_text(head + begin + section + end + tail, encoding='utf-8')
 
 
+def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    """Return rows as columns; None where a row does not have a column of another one."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: [row.get(name) for row in rows] for name in names}
+
+
 def write_columns(
     path: Path, columns: Mapping[str, Sequence[object] | NDArray[np.generic]]
 ) -> None:

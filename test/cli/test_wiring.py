@@ -312,17 +312,17 @@ TABLE = {
     'paper': (
         {PAPER: ('', {}), 'evaluation.methods.require_libraries': None, **SHARED},
         {
-            '': {'reproduce.options.output': 'runs/paper', 'reproduce.options.seeds': None},
+            '': {'reproduce.output': 'runs/paper', 'reproduce.seeds': None},
             '--quick': {
-                'reproduce.options.quick': True,
-                'reproduce.options.output': 'runs/paper-quick',
+                'reproduce.quick': True,
+                'reproduce.output': 'runs/paper-quick',
             },
-            '--seeds 104-105': {'reproduce.options.seeds': (104, 105)},
-            '--estimation-seeds 5-6': {'reproduce.options.estimation_seeds': (5, 6)},
-            '--output new': {'reproduce.options.output': 'new'},
+            '--seeds 104-105': {'reproduce.seeds': (104, 105)},
+            '--estimation-seeds 5-6': {'reproduce.estimation_seeds': (5, 6)},
+            '--output new': {'reproduce.output': 'new'},
             '--json new.json': {'files': 'new.json'},
-            '--fresh': {'reproduce.options.fresh': True},
-            **workers('reproduce.options.workers'),
+            '--fresh': {'reproduce.fresh': True},
+            **workers('reproduce.workers'),
         },
     ),
     'compare': (

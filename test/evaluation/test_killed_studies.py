@@ -25,7 +25,7 @@ import t3mpc_ros as t3
 from t3mpc_ros.evaluation.api import parameter_sweep
 from t3mpc_ros.evaluation.methods import FULL, method_definitions, methods
 from t3mpc_ros.evaluation.paper import reproduce, study
-from t3mpc_ros.evaluation.paper.reproduce import PaperOptions, run_study
+from t3mpc_ros.evaluation.paper.reproduce import run_study
 from t3mpc_ros.evaluation.paper.study import Extent
 from t3mpc_ros.evaluation.patrol import patrol_comparison
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, compare_patrols
@@ -59,7 +59,7 @@ def paper(folder, begun, monkeypatch):
     monkeypatch.setattr(reproduce, 'measured_run', measured)
     monkeypatch.setattr(study, 'methods', lambda drive: {FULL: methods(drive)[FULL]})
     extent = Extent((101, 102), 6.0, ('nominal',), (0.04,))
-    return list(map(str, run_study(extent, PaperOptions(folder), None)))
+    return list(map(str, run_study(extent, folder)))
 
 
 def patrols(folder, begun, monkeypatch):

@@ -43,7 +43,7 @@ from t3mpc_ros.evaluation.paper.figure_runs import (
 )
 from t3mpc_ros.evaluation.paper.paper_figures import floor_path
 from t3mpc_ros.evaluation.paper.paper_page import EXHIBITS, counted
-from t3mpc_ros.evaluation.paper.reproduce import RUNS, PaperOptions, reproduce
+from t3mpc_ros.evaluation.paper.reproduce import RUNS, reproduce
 from t3mpc_ros.evaluation.paper.results import Results, all_tables
 from t3mpc_ros.evaluation.paper.study import (
     DRIVES,
@@ -498,8 +498,7 @@ def begun():
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory, begun):
     output = tmp_path_factory.mktemp('paper')
-    options = PaperOptions(output, quick=True, seeds=(101, 102), estimation_seeds=(1,))
-    reproduce(options)
+    reproduce(output, quick=True, seeds=(101, 102), estimation_seeds=(1,))
     return output
 
 
@@ -612,8 +611,8 @@ def test_nothing_depends_on_the_order_of_the_runs_or_on_a_resume(
     (tmp_path / RUNS).write_text(''.join(lines[::-3]) + lines[1][:-9])
     begun.clear()
     with ThreadPoolExecutor(3) as executor:
-        options = PaperOptions(tmp_path, True, (101, 102), (1,), executor)
-        reproduce(options)
+        options = {'seeds': (101, 102), 'estimation_seeds': (1,), 'workers': executor}
+        reproduce(tmp_path, quick=True, **options)
     assert len(begun) < len(lines)
     for name in ('results.json', 'results.csv', 'tables.md'):
         assert (tmp_path / name).read_text() == (folder / name).read_text(), name
@@ -626,5 +625,5 @@ def test_a_fresh_start_runs_everything_again(folder, begun, tmp_path, monkeypatc
     (tmp_path / RUNS).write_text(text := (folder / RUNS).read_text())
     begun.clear()
     options = {'quick': True, 'seeds': (101, 102), 'estimation_seeds': (1,), 'fresh': True}
-    reproduce(PaperOptions(tmp_path, **options))
+    reproduce(tmp_path, **options)
     assert len(begun) >= len(text.splitlines())  # and those of the figures

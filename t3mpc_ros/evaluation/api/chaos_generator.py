@@ -28,7 +28,8 @@ from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.references import numbers
-from t3mpc_ros.evaluation.api.result_tables import writable, write_csv
+from t3mpc_ros.evaluation.api.result_tables import writable
+from t3mpc_ros.evaluation.reporting import write_columns
 from t3mpc_ros.geometry.types import Array, read_only
 from t3mpc_ros.script_error import ScriptError
 
@@ -76,7 +77,9 @@ class ChaosSolution:
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write time and states as CSV and return the path."""
         states = {f'y{i + 1}': self.y[:, i] for i in range(self.system.size)}
-        return write_csv(writable(path, '.csv'), {'t': self.t, **states})
+        target = writable(path, '.csv')
+        write_columns(target, {'t': self.t, **states})
+        return target
 
 
 @one_sentence

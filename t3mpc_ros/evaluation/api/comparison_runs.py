@@ -23,13 +23,13 @@ from typing import Any
 from t3mpc_ros.evaluation import comparison
 from t3mpc_ros.evaluation.api.one_sentence import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, columns_of, writable
+from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, writable
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.experiment import ResultTable, print_report
 from t3mpc_ros.evaluation.record import METRICS, SETTLED, Metric
-from t3mpc_ros.evaluation.reporting import Table
+from t3mpc_ros.evaluation.reporting import Table, columns_of
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.parameters.provenance import machine, provenance
 from t3mpc_ros.parameters.table import find_names

@@ -42,7 +42,7 @@ from t3mpc_ros.evaluation.experiment import (
     run_experiment,
 )
 from t3mpc_ros.evaluation.record import SETTLED, Metric, Record, measure
-from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, columns_of
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.evaluation.scenario import Scenario
@@ -76,7 +76,7 @@ class Sweep(result_tables.ShownAsTables):
     @property
     def columns(self) -> dict[str, list[Any]]:
         """The rows as columns."""
-        return result_tables.columns_of(self.rows)
+        return columns_of(self.rows)
 
     @one_sentence
     def table(self, metric: str = SETTLED.name) -> str:
@@ -349,10 +349,7 @@ def _run_to_file(
     rows = [fresh.get(run.key) or {**run.fields, **stored[run.key]} for run in runs]
     keys = {run.key for run in runs}
     result_tables.write_parquet(
-        path,
-        result_tables.columns_of(
-            [*rows, *(row for key, row in stored.items() if key not in keys)]
-        ),
+        path, columns_of([*rows, *(row for key, row in stored.items() if key not in keys)])
     )
     journal.remove(made.keys)
     return rows

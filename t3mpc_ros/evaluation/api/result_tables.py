@@ -118,25 +118,14 @@ class ShownAsTables(ABC):
     @one_sentence
     def to_csv(self, path: str | os.PathLike[str]) -> Path:
         """Write the columns as CSV, one row for each run or period, and return the path."""
-        return write_csv(writable(path, '.csv'), self._columns())
+        target = writable(path, '.csv')
+        write_columns(target, self._columns())
+        return target
 
     @one_sentence
     def to_parquet(self, path: str | os.PathLike[str]) -> Path:
         """Write them as Parquet and return the path; needs the extra ``[compare]``."""
         return write_parquet(writable(path, PARQUET), self._columns(), self._details())
-
-
-def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
-    """Return rows as columns; None where a row does not have a column of another one."""
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    return {name: [row.get(name) for row in rows] for name in names}
-
-
-def write_csv(path: str | os.PathLike[str], columns: Columns) -> Path:
-    """Write columns as CSV with one line of names, numbers with all their digits."""
-    target = writable(path)
-    write_columns(target, columns)
-    return target
 
 
 def write_parquet(

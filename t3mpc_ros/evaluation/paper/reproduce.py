@@ -14,7 +14,7 @@
 """Reproduction of the paper: runs experiments, writes results, tables, figures and the page."""
 
 from concurrent.futures import Executor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
@@ -36,43 +36,36 @@ RUNS = 'runs.jsonl'
 """Finished runs, in the folder of the output."""
 
 
-@dataclass(frozen=True, slots=True)
-class PaperOptions:
-    """Options of the reproduction."""
-
-    output: Path
-    quick: bool = False
-    seeds: tuple[int, ...] | None = None
-    """Held-out seeds of each experiment; None for all, or three when quick."""
-    estimation_seeds: tuple[int, ...] | None = None
-    """The same of the comparison (86)."""
-    workers: int | Executor = 1
-    """As for :class:`WorkerPool`."""
-    fresh: bool = False
-    """Whether runs that are there already are thrown away."""
-
-
 def reproduce(
-    options: PaperOptions, report: Report | None = None
+    output: Path,
+    *,
+    quick: bool = False,
+    seeds: tuple[int, ...] | None = None,
+    estimation_seeds: tuple[int, ...] | None = None,
+    workers: int | Executor = 1,
+    fresh: bool = False,
+    report: Report | None = None,
 ) -> tuple[str, dict[str, object]]:
     """Return a summary in a few lines and the numbers; write everything into the output folder.
 
     ``results.json``, ``results.csv`` (means), ``runs.csv`` (a row for each run), ``tables.md``,
-    ``paper.html`` and ``figures/*.png``. None
-    of them depends on how many processes worked, or on which runs were there already. ``report``
-    receives a line for each step; with None there is no progress line either.
+    ``paper.html`` and ``figures/*.png``. None of them depends on how many processes worked, or on
+    which runs were there already; ``fresh`` throws these away. ``report`` receives a line for each
+    step; with None there is no progress line either.
+
+    ``seeds`` are held-out ones of each run, by default all, or three with ``quick``;
+    ``estimation_seeds`` the same of the comparison (86).
     """
     write = report or (lambda text: None)
-    output, workers = options.output, options.workers
-    extent = chosen_extent(quick=options.quick, seeds=options.seeds)
-    results = Results(run_study(extent, options, report))
+    extent = chosen_extent(quick=quick, seeds=seeds)
+    results = Results(run_study(extent, output, workers, fresh=fresh, report=report))
     write('  runs for the figures')
     showcase = simulate_figure_runs(extent, results, workers)
     write('  estimation without a controller (86)')
-    seeds = options.estimation_seeds or tuple(range(1, 3 if options.quick else 21))
-    variances = (0.0, 0.04) if options.quick else open_loop_estimation.VARIANCES
+    alone = estimation_seeds or tuple(range(1, 3 if quick else 21))
+    variances = (0.0, 0.04) if quick else open_loop_estimation.VARIANCES
     estimated = open_loop_estimation.compare(
-        seeds=seeds, duration=extent.duration, variances=variances
+        seeds=alone, duration=extent.duration, variances=variances
     )
     write('  figures and page')
     claims = (*all_claims(results.runs, estimated), *showcase.claims())
@@ -83,12 +76,12 @@ def reproduce(
     content: dict[str, object] = {
         'version': VERSION,
         'parameters': {
-            'quick': options.quick,
+            'quick': quick,
             'seeds': list(extent.seeds),
             'duration': extent.duration,
             'noises': list(extent.noises),
             'cases': list(extent.cases),
-            'estimation_seeds': len(seeds),
+            'estimation_seeds': len(alone),
             'estimation_noises': list(variances),
             'methods': {
                 drive: {name: asdict(each.parameters) for name, each in methods(drive).items()}
@@ -113,29 +106,36 @@ def reproduce(
         {each.stem: each.draw for each in EXHIBITS if each.draw}, material, output / 'figures'
     )
     title = "The paper's figures and tables, reproduced"
-    html = page(title, _origin(extent, options), material, drawn)
+    html = page(title, _origin(extent, quick=quick), material, drawn)
     (output / 'paper.html').write_text(html, encoding='utf-8')
     return f'claims: {counted(claims)}\n{output / "paper.html"}', content
 
 
-def run_study(extent: Extent, options: PaperOptions, report: Report | None) -> ResultTable:
+def run_study(
+    extent: Extent,
+    output: Path,
+    workers: int | Executor = 1,
+    *,
+    fresh: bool = False,
+    report: Report | None = None,
+) -> ResultTable:
     """Return the runs of the study; those that the folder of the output holds are not repeated."""
     return run_experiment(
         study_runs(extent),
         partial(measured_run, numbers=measure),
-        options.workers,
-        store=options.output / RUNS,
-        fresh=options.fresh,
+        workers,
+        store=output / RUNS,
+        fresh=fresh,
         report=report,
     )
 
 
-def _origin(extent: Extent, options: PaperOptions) -> str:
+def _origin(extent: Extent, *, quick: bool) -> str:
     words = [
         f'version {VERSION}, sources {source_digest()}',
         f'{len(extent.seeds)} held-out seeds, runs of {extent.duration:g} s at 100 Hz',
         'RMSE of true wheel speeds, both wheels, first 3 s left out',
     ]
-    if options.quick:
+    if quick:
         words.insert(0, 'a quick look: too few seeds and too short runs to conclude from')
     return ' · '.join(words)
