@@ -125,6 +125,10 @@ class BagReader:
         """Receive time of the first message."""
         self.end_ns = max((file.end_ns for file in some), default=0)
         """Receive time of the last message."""
+        self.duration = (self.end_ns - self.start_ns) / NANOSECONDS
+        """Seconds between the first and the last message."""
+        self.storage = _STORAGES.get(self.files[0].path.suffix, 'other') if files else ''
+        """Name of the file format."""
         self.message_count = sum(file.message_count for file in files)
         self.topics: dict[str, TopicInformation] = merge_topics(
             topic for file in files for topic in file.topics
@@ -135,16 +139,6 @@ class BagReader:
         for file in files:
             self.metadata_records |= file.metadata_records
         self._decoders: dict[str, Callable[[bytes, str], Any]] = {}
-
-    @property
-    def duration(self) -> float:
-        """Seconds between the first and the last message."""
-        return (self.end_ns - self.start_ns) / NANOSECONDS
-
-    @property
-    def storage(self) -> str:
-        """Name of the file format."""
-        return _STORAGES.get(self.files[0].path.suffix, 'other')
 
     def serialized_messages(
         self, topics: Collection[str] | None = None

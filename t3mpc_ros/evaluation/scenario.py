@@ -203,11 +203,6 @@ class Scenario:
         return round(self.duration * RATE)
 
     @property
-    def change_step(self) -> int:
-        """The period at whose start a robot that changes during the run does so."""
-        return round(0.5 * self.steps)
-
-    @property
     def links(self) -> LinkFaults:
         """Faults of the links between robot and driver."""
         return self.parts.links if self.own.links is None else self.own.links
@@ -334,7 +329,7 @@ class RobotKind:
             plant,
             parameters,
             parameters.with_values(later) if later else None,
-            stamp_of(scenario.change_step),
+            stamp_of(round(0.5 * scenario.steps)),
             plant_robot.LinkDelay(
                 least, most - least, links.command_loss, *links.span(scenario.duration)
             ),

@@ -112,6 +112,8 @@ class PageServer:
                 'another one with --port, 0 for any free port'
             ) from None  # fmt: skip
         self.port: int = self._server.server_address[1]
+        self.url = f'http://{ADDRESS}:{self.port}/'
+        """Address of the page."""
         self._thread = Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
 
     def news(self, cursor: Cursor) -> str:
@@ -129,11 +131,6 @@ class PageServer:
             texts[cursor] = text
         return text
 
-    @property
-    def url(self) -> str:
-        """Address of the page."""
-        return f'http://{ADDRESS}:{self.port}/'
-
     def __enter__(self) -> Self:
         self._thread.start()
         return self
@@ -146,9 +143,8 @@ class PageServer:
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
     block_on_close = False
-    request_queue_size = (
-        128  # what a suspended program finds waiting; beyond it, a stop waits longer
-    )
+    # What a suspended program finds waiting; beyond it, a stop waits longer.
+    request_queue_size = 128
 
     def __init__(self, address: tuple[str, int], page: PageServer) -> None:
         self.page = page

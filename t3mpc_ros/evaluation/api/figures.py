@@ -20,72 +20,69 @@ from typing import Any
 import matplotlib
 import numpy as np
 
+from t3mpc_ros.evaluation import plotting
 from t3mpc_ros.evaluation.api.result_tables import writable
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
-from t3mpc_ros.evaluation.plotting import (
-    COLOURS,
-    DATES,
-    STYLE,
-    add_legend,
-    file_of,
-    name_time,
-    new_figure,
-    new_panels,
-)
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 
 
 def drawn(draw: Callable[[], Any], path: str | os.PathLike[str] | None) -> Any:
     """Return a figure in the style of the package, after writing it to ``path`` if given."""
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(plotting.STYLE):
         figure = draw()
     if path is not None:
-        target = writable(path, *(f'.{kind}' for kind in DATES))
-        target.write_bytes(file_of(figure, target.suffix.removeprefix('.')))
+        target = writable(path, *(f'.{kind}' for kind in plotting.DATES))
+        target.write_bytes(plotting.file_of(figure, target.suffix.removeprefix('.')))
     return figure
 
 
 def run_figure(name: str, columns: Mapping[str, Array]) -> Any:
     """Return speeds and error of each wheel over time."""
-    figure, axes = new_panels(3, 1.5)
+    figure, axes = plotting.new_panels(3, 1.5)
     time = columns['time']
     for axis, side in zip(axes, ('right', 'left'), strict=False):
         speed, reference = columns[f'speed_{side}'], columns[f'reference_{side}']
-        axis.plot(*thinned(time, reference), color=COLOURS[REFERENCE], lw=1.0, label='reference')
-        axis.plot(*thinned(time, speed), color=COLOURS[TRUTH], lw=1.0, label=name)
+        axis.plot(
+            *thinned(time, reference), color=plotting.COLOURS[REFERENCE], lw=1.0, label='reference'
+        )
+        axis.plot(*thinned(time, speed), color=plotting.COLOURS[TRUTH], lw=1.0, label=name)
         axis.set_ylabel('rad/s')
         axis.set_title(f'{side} wheel')
         error = speed - reference
         strength = 1.0 if side == 'right' else 0.45
         label = f'{side} wheel'
         axes[2].plot(
-            *thinned(time, error), color=COLOURS['error'], lw=0.8, alpha=strength, label=label
+            *thinned(time, error),
+            color=plotting.COLOURS['error'],
+            lw=0.8,
+            alpha=strength,
+            label=label,
         )
     axes[2].set_title('error')
     axes[2].set_ylabel('rad/s')
-    name_time(axes)
-    add_legend(axes[0])
-    add_legend(axes[2])
+    plotting.name_time(axes)
+    plotting.add_legend(axes[0])
+    plotting.add_legend(axes[2])
     return figure
 
 
 def lines_figure(time: Array, lines: Mapping[str, Array]) -> Any:
     """Return one panel for each quantity over time."""
-    figure, axes = new_panels(len(lines), 1.1)
+    figure, axes = plotting.new_panels(len(lines), 1.1)
     for axis, (name, values) in zip(axes, lines.items(), strict=True):
-        axis.plot(*thinned(time, values), color=COLOURS['value'], lw=0.9)
+        axis.plot(*thinned(time, values), color=plotting.COLOURS['value'], lw=0.9)
         axis.set_title(name)
-    name_time(axes)
+    plotting.name_time(axes)
     return figure
 
 
 def plane_figure(x: Array, y: Array, names: tuple[str, str]) -> Any:
     """Return one line in the plane."""
-    figure = new_figure(4.2)
+    figure = plotting.new_figure(4.2)
     axis = figure.subplots()
-    axis.plot(x, y, color=COLOURS['value'], lw=0.5)
+    axis.plot(x, y, color=plotting.COLOURS['value'], lw=0.5)
     axis.set_xlabel(names[0])
     axis.set_ylabel(names[1])
     return figure
@@ -93,7 +90,7 @@ def plane_figure(x: Array, y: Array, names: tuple[str, str]) -> Any:
 
 def sweep_figure(lines: Mapping[str, Mapping[float, list[float]]], name: str, label: str) -> Any:
     """Return means with 95 % intervals over the values of a parameter, a line for each name."""
-    figure = new_figure(3.2)
+    figure = plotting.new_figure(3.2)
     axis = figure.subplots()
     for line, values in lines.items():
         ordered = sorted(values)
@@ -103,5 +100,5 @@ def sweep_figure(lines: Mapping[str, Mapping[float, list[float]]], name: str, la
         axis.errorbar(ordered, means, yerr=shown, marker='o', markersize=3, capsize=2, label=line)
     axis.set_xlabel(name)
     axis.set_ylabel(label)
-    add_legend(axis)
+    plotting.add_legend(axis)
     return figure

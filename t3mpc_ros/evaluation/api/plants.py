@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -211,6 +211,8 @@ class StateSpace:
     drive: str = 'velocity'
     initial: ArrayLike | None = None
     robot: Robot = field(default_factory=Robot)
+    name: ClassVar[str] = 'state space'
+    """Name in errors."""
 
     @one_sentence
     def __post_init__(self) -> None:
@@ -230,11 +232,6 @@ class StateSpace:
             if matrix.ndim != 2:
                 raise ScriptError(f'{name} must be a matrix: got the shape {matrix.shape}')
         return found[0], found[1], found[2]
-
-    @property
-    def name(self) -> str:
-        """Name in errors."""
-        return 'state space'
 
     def simulation(self) -> 'OwnSimulation':
         """Return the plant at its start."""

@@ -36,16 +36,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from t3mpc_ros.evaluation.baselines import predictive_baseline
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     NominalModel,
     Observation,
     WheelLoads,
-)
-from t3mpc_ros.evaluation.baselines.predictive_baseline import (
-    BoxProgram,
-    ObserverBaseline,
-    ObserverParameters,
-    PredictiveParameters,
 )
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
@@ -54,7 +49,9 @@ from t3mpc_ros.simulation.plant.dynamics import BodyParameters, coriolis_factor,
 
 
 @dataclass(frozen=True)
-class CasadiNmpcParameters(ObserverParameters, PredictiveParameters):
+class CasadiNmpcParameters(
+    predictive_baseline.ObserverParameters, predictive_baseline.PredictiveParameters
+):
     """Parameters of nonlinear MPC."""
 
     model_error: float = parameter(
@@ -151,7 +148,7 @@ def condense(by_speed: Array, push: Array, lasting: bool, response: Array, closi
                 response[2 * j + i, column] = total
 
 
-class CasadiNmpc(ObserverBaseline):
+class CasadiNmpc(predictive_baseline.ObserverBaseline):
     """Nonlinear MPC with preview; needs CasADi."""
 
     parameters_type: ClassVar[type[Parameters]] = CasadiNmpcParameters
@@ -165,7 +162,7 @@ class CasadiNmpc(ObserverBaseline):
         self._loads = WheelLoads(nominal_model, scaled_body(nominal_model, table.model_error))
         # Here the unknowns of one period, right and left, stand next to each other.
         self._weights = np.kron(self._damping, self._units.T @ self._units)
-        self._program = BoxProgram(self._weights + np.eye(2 * n), self._reach)
+        self._program = predictive_baseline.BoxProgram(self._weights + np.eye(2 * n), self._reach)
         self._give = nominal_model.period
         if not self._torque:
             self._give = nominal_model.share * nominal_model.lag

@@ -208,14 +208,9 @@ class PredictiveBaseline(BaselineController):
         """What it knows, see :attr:`BaselineController.knowledge`."""
         found, factor = super().knowledge, self.parameters.model_error
         found.append(EXACT_INERTIA if factor == 1.0 else f'inertia × {factor:g}')
-        if self.knows_friction:
+        if getattr(self.parameters, 'load_share', 1.0):
             found.append(FRICTION)
         return found
-
-    @property
-    def knows_friction(self) -> bool:
-        """Whether the model has the friction of the nominal robot."""
-        return bool(getattr(self.parameters, 'load_share', 1.0))
 
     def step(self, observation: Observation) -> Array:
         """Return u, rad/s², shape (2,)."""

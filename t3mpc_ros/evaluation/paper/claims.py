@@ -348,7 +348,7 @@ def settled_share(runs: ResultTable, drive: str, limit: float) -> Finding:
 def grows_slightly(runs: ResultTable, drive: str) -> Finding:
     """Compare the growth of RMSE with noise with :data:`SLIGHTLY`."""
     full, _ = growths(runs, drive)
-    growth, margin = full.share, paired(np.zeros(full.seeds), full.beyond(SLIGHTLY))
+    growth, margin = full.share, paired(np.zeros_like(full.ends[0]), full.beyond(SLIGHTLY))
     return Finding(growth <= SLIGHTLY, f'{100 * growth:+.0f} %', {'growth': growth}, [margin])
 
 
@@ -361,7 +361,7 @@ def others_grow(runs: ResultTable, drive: str) -> Finding:
         shares[low] > 0.5,
         f'from {100 * shares[low]:+.0f} % ({low}) to {100 * shares[high]:+.0f} % ({high})',
         shares,
-        [paired(each.beyond(0.5), np.zeros(each.seeds)) for each in others.values()],
+        [paired(each.beyond(0.5), np.zeros_like(each.ends[0])) for each in others.values()],
     )
 
 
@@ -444,11 +444,6 @@ class Growth(NamedTuple):
     def share(self) -> float:
         """Growth relative to the RMSE without noise."""
         return self.last / self.first - 1.0
-
-    @property
-    def seeds(self) -> int:
-        """How many."""
-        return len(self.ends[0])
 
     def beyond(self, share: float) -> Array:
         """Return the growth of each seed beyond a share of its start, rad/s."""

@@ -22,14 +22,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import TERM_NAMES, Nt3fsMpcParameters
 from t3mpc_ros.control.controller import Controller, ControllerParameters
-from t3mpc_ros.evaluation.process_replay.controller_replay import (
-    SPEEDS,
-    ControllerInputs,
-    ReplayError,
-    load_inputs,
-    make_controllers,
-    replay_steps,
-)
+from t3mpc_ros.evaluation.process_replay import controller_replay
 from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist
 
@@ -82,9 +75,9 @@ def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters
     TrainingError: topics or parameters are missing, or contradict the recorded commands.
     """
     try:
-        inputs = load_inputs(folder)
-        controllers = make_controllers(inputs)
-    except ReplayError as error:
+        inputs = controller_replay.load_inputs(folder)
+        controllers = controller_replay.make_controllers(inputs)
+    except controller_replay.ReplayError as error:
         raise TrainingError(str(error)) from error
     revisions = [each for session in inputs.sessions for each in session.parameters.values()]
     parameters = revisions[-1].resolved()
@@ -113,10 +106,14 @@ def load_training_data(folder: Path) -> tuple[TrainingData, ControllerParameters
 
 
 def _replayed(
-    inputs: ControllerInputs, controllers: list[Controller], parameters: ControllerParameters
+    inputs: controller_replay.ControllerInputs,
+    controllers: list[Controller],
+    parameters: ControllerParameters,
 ) -> TrainingData:
     """Return inputs and decisions of the controller at each step, by a replay of its journal."""
-    recorded = np.stack([inputs.recorded[name] for name in SPEEDS], axis=1).tolist()
+    recorded = np.stack(
+        [inputs.recorded[name] for name in controller_replay.SPEEDS], axis=1
+    ).tolist()
     exact = inputs.exact
     patience = parameters.watchdog.odometry_timeout * NANOSECONDS
     # The residual of announced jumps is evaluated after it has decayed for a period.
@@ -124,7 +121,7 @@ def _replayed(
     rows: list[tuple[Array, ...]] = []
     flags: list[tuple[bool, bool]] = []
     last_ns, last = 0, None
-    for row, controller, twist, status in replay_steps(inputs, controllers):
+    for row, controller, twist, status in controller_replay.replay_steps(inputs, controllers):
         if not status.reason.moves:
             last = None
         if not status.reason.moves or status.stamp_ns == last_ns:  # at rest, or a duplicate

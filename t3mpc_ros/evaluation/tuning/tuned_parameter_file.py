@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Self, TypeVar
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.evaluation.reporting import Table
+from t3mpc_ros.evaluation.reporting import Table, strict_json
 from t3mpc_ros.evaluation.scenario import PLANT_OF, TUNING_SEEDS, Scenario
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
@@ -149,8 +149,7 @@ class TunedParameters(dict[tuple[str, str], TunedEntry]):
 
     def save(self, path: Path) -> None:
         """Write the file, whole or not at all."""
-        text = json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
-        write_atomically(path, text + '\n')
+        write_atomically(path, strict_json(self.to_dict()))
 
     def entry(self, method: str, drive: str) -> TunedEntry:
         """Return what was found for a method in a drive."""
