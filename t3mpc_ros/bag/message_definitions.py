@@ -75,7 +75,8 @@ class MessageDefinitions:
             self._collect(own, texts, needed_by='')
             parts = [_with_newline(texts.pop(own))]
             for name, text in texts.items():
-                parts.append(f'{SEPARATOR}\nMSG: {_short_name(name)}\n{_with_newline(text)}')
+                short = name.replace('/msg/', '/')
+                parts.append(f'{SEPARATOR}\nMSG: {short}\n{_with_newline(text)}')
             self._schemas[type_name] = ''.join(parts)
         return self._schemas[type_name]
 
@@ -121,10 +122,6 @@ def _full_name(type_name: str) -> str:
     if not match:
         raise UnknownTypeError(f'a message type must be package/msg/Name: got {type_name!r}')
     return f'{match["package"]}/msg/{match["name"]}'
-
-
-def _short_name(name: str) -> str:
-    return name.replace('/msg/', '/')
 
 
 def _with_newline(text: str) -> str:

@@ -16,7 +16,7 @@
 import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 import zlib
 
 import numpy as np
@@ -52,7 +52,6 @@ class Line:
 class Chart:
     """Quantities of one unit over time."""
 
-    show: ClassVar[str] = 'chart'
     title: str
     unit: str
     lines: Sequence[Line]
@@ -79,7 +78,6 @@ class Curve:
 class Plane:
     """Curves in a plane with one unit, such as paths on the floor."""
 
-    show: ClassVar[str] = 'plane'
     title: str
     unit: str
     curves: Sequence[Curve]
@@ -99,7 +97,6 @@ class Timeline:
     charts of the page; ``note`` is not.
     """
 
-    show: ClassVar[str] = 'timeline'
     events: Sequence[tuple[float, str, str]]
 
 

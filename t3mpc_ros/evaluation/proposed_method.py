@@ -91,7 +91,6 @@ class ProposedController(BaselineController):
         self._announced = 0
         """Instant up to which the jumps of the known future are announced, in periods."""
         self._expected: Array = np.zeros(2)
-        self._slope: Array = np.zeros(2)
         self.terms = self._tracker.law.terms
         """The law's terms of the last step, rows as in ``TERM_NAMES``, rad/s², shape (5, 2)."""
 
@@ -120,13 +119,16 @@ class ProposedController(BaselineController):
             self._begun, self._announced = True, effect
             self._tracker.begin(now_ns, observation.speeds, observation.reference)
         elif future is None:
-            self._announce_current_jump(now_ns, observation)
+            # A jump is known when it has happened.
+            jump = observation.reference - self._expected
+            if np.max(np.abs(jump)) > JUMP:
+                slope = (observation.next_reference - observation.reference) / self._period
+                self._tracker.transition.announce(now_ns, jump, slope)
         if future is not None:
             self._announced = announce_jumps(
                 self._tracker.transition, future, effect, self._announced, self._period
             )
         self._expected = observation.next_reference.copy()
-        self._slope = (observation.next_reference - observation.reference) / self._period
         u = self._tracker.step(
             now_ns,
             observation.speeds,
@@ -143,13 +145,6 @@ class ProposedController(BaselineController):
     def applied(self, acceleration: Array, *, limited: bool) -> None:
         """Take note of the u that the drive's limits let through."""
         self._tracker.law.set_applied(acceleration, saturated=limited)
-
-    def _announce_current_jump(self, now_ns: int, observation: Observation) -> None:
-        """Announce a jump that has just happened."""
-        jump = observation.reference - self._expected
-        if np.max(np.abs(jump)) > JUMP:
-            slope = (observation.next_reference - observation.reference) / self._period
-            self._tracker.transition.announce(now_ns, jump, slope)
 
     def _randomize_predictor(self, seed: int) -> None:
         """Set random output weights with the magnitude of the pretrained ones."""

@@ -26,7 +26,7 @@ import math
 from pathlib import Path
 import re
 import sys
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,6 @@ class Mark(NamedTuple):
 class Table:
     """A table of words; its first column names the rows."""
 
-    show: ClassVar[str] = 'table'
     title: str
     head: Sequence[str]
     rows: Sequence[Sequence[str | Mark]]
@@ -169,7 +168,6 @@ def _latex_row(cells: Sequence[str], bold: bool = False) -> str:
 class Heading:
     """Title of what follows."""
 
-    show: ClassVar[str] = 'heading'
     text: str
     mark: Mark | None = None
 
@@ -178,7 +176,6 @@ class Heading:
 class Paragraph:
     """A paragraph; its kind is '' or ``quiet``."""
 
-    show: ClassVar[str] = 'paragraph'
     text: str
     kind: str = ''
 
@@ -187,7 +184,6 @@ class Paragraph:
 class VerdictBox:
     """What a page says first; its kind is ``good``, ``open``, ``bad`` or ``apart``."""
 
-    show: ClassVar[str] = 'verdict'
     headline: str
     reasons: Sequence[str]
     kind: str
@@ -199,14 +195,11 @@ class VerdictBox:
 class Contents:
     """Links to the headings of the page, then what the cursor of its charts shows."""
 
-    show: ClassVar[str] = 'contents'
-
 
 @dataclass(frozen=True, slots=True)
 class Tiles:
     """Main figures, each with what it is."""
 
-    show: ClassVar[str] = 'tiles'
     items: Sequence[tuple[str, str]]
 
 
@@ -214,7 +207,6 @@ class Tiles:
 class Items:
     """A list of the kind ``notes``, or ``side`` for one of two columns."""
 
-    show: ClassVar[str] = 'items'
     items: Sequence[Sequence[str | Mark]]
     kind: str = 'notes'
     title: str = ''
@@ -224,7 +216,6 @@ class Items:
 class Picture:
     """An SVG file, contained in the page: sharp at every size, and on paper."""
 
-    show: ClassVar[str] = 'picture'
     title: str
     svg: bytes
     caption: str = ''
@@ -239,7 +230,6 @@ class Picture:
 class Details:
     """Blocks below a line of summary, which opens and closes them."""
 
-    show: ClassVar[str] = 'details'
     summary: str
     blocks: 'Sequence[Block]'
     opened: bool = False
@@ -249,7 +239,6 @@ class Details:
 class Group:
     """Blocks in one element."""
 
-    show: ClassVar[str] = 'group'
     blocks: 'Sequence[Block]'
     tag: str = 'section'
     kind: str = ''

@@ -627,7 +627,7 @@ def make_controllers(
     controllers = []
     for session in inputs.sessions:
         parameters = session.parameters[session.start].with_values(changes or {})
-        controller = Controller(parameters, _obstacles(parameters), _saved_map(parameters))
+        controller = Controller(parameters, *_keep_out(parameters))
         controller.warm_up()
         if session.model is not None:
             controller.set_weights(session.model)
@@ -635,22 +635,16 @@ def make_controllers(
     return controllers
 
 
-def _obstacles(parameters: ControllerParameters) -> Obstacles:
-    """Return the known obstacles of a keep-out; ReplayError if their world is not here."""
-    if not parameters.keep_out.enabled:
-        return Obstacles()
+def _keep_out(parameters: ControllerParameters) -> tuple[Obstacles, OccupancyGrid | None]:
+    """Return known obstacles and saved map of a keep-out; ReplayError if one is not here."""
+    table = parameters.keep_out
+    if not table.enabled:
+        return Obstacles(), None
     try:
-        return load_world(parameters.keep_out.world).obstacles
+        obstacles = load_world(table.world).obstacles
+        return obstacles, load_map(table.yaml_filename) if table.yaml_filename else None
     except WorldError as error:
         raise ReplayError(f'keep_out.world: {error}') from error
-
-
-def _saved_map(parameters: ControllerParameters) -> OccupancyGrid | None:
-    """Return the map with which a keep-out begins; ReplayError if it is not here."""
-    if not (parameters.keep_out.enabled and parameters.keep_out.yaml_filename):
-        return None
-    try:
-        return load_map(parameters.keep_out.yaml_filename)
     except MapError as error:
         raise ReplayError(f'keep_out.yaml_filename: {error}') from error
 
