@@ -48,49 +48,35 @@ T = TypeVar('T')
 class PlaybackParameters(Parameters):
     """Bags to play, selection of topics, rate and time range."""
 
+    prefix = 'play.'
     uris: tuple[str, ...] = parameter(
         (),
         'bags to play, merged by time of receipt: folders or files, MCAP or sqlite3',
         name='storage.uris',
     )
-    align_bags: bool = parameter(
-        False, 'shift every bag to the start time of the first one', name='play.align_bags'
-    )
+    align_bags: bool = parameter(False, 'shift every bag to the start time of the first one')
     bag_offsets: tuple[float, ...] = parameter(
-        (),
-        'time offset of each bag, after the alignment; empty = none',
-        's',
-        name='play.bag_offsets',
+        (), 'time offset of each bag, after the alignment; empty = none', 's'
     )
     rate: float = parameter(
-        1.0,
-        'playback rate: seconds of the bag per second',
-        name='play.rate',
-        bounds=(0.01, 100.0),
-        dynamic=True,
+        1.0, 'playback rate: seconds of the bag per second', bounds=(0.01, 100.0), dynamic=True
     )
-    loop: bool = parameter(False, 'restart at the end', name='play.loop')
+    loop: bool = parameter(False, 'restart at the end')
     start_offset: float = parameter(
         0.0,
         'start of the playback, after the first message; transient-local messages from before it '
         'are published first',
         's',
         (0.0, None),
-        name='play.start_offset',
     )
     playback_duration: float = parameter(
-        0.0,
-        'duration of the playback in bag time; 0 = to the end',
-        's',
-        (0.0, None),
-        name='play.playback_duration',
+        0.0, 'duration of the playback in bag time; 0 = to the end', 's', (0.0, None)
     )
     playback_until: float = parameter(
         0.0,
         'end of the playback, after the first message; 0 = the end of the bag',
         's',
         (0.0, None),
-        name='play.playback_until',
     )
     topics: tuple[str, ...] = parameter(
         (),
@@ -103,53 +89,31 @@ class PlaybackParameters(Parameters):
         name='play.regex_to_filter',
     )
     exclude_topics: tuple[str, ...] = parameter(
-        (), 'topics that are not played; * matches any text', name='play.exclude_topics'
+        (), 'topics that are not played; * matches any text'
     )
     exclude_regex: str = parameter(
-        '',
-        'do not play topics whose full name matches this regular expression; empty = none',
-        name='play.exclude_regex',
+        '', 'do not play topics whose full name matches this regular expression; empty = none'
     )
     remappings: tuple[str, ...] = parameter(
         (), 'new names of topics, each as old:=new', name='play.topic_remapping_options'
     )
     clock_publish_frequency: float = parameter(
-        0.0,
-        'rate of /clock; 0 = no /clock',
-        'Hz',
-        (0.0, 1000.0),
-        name='play.clock_publish_frequency',
+        0.0, 'rate of /clock; 0 = no /clock', 'Hz', (0.0, 1000.0)
     )
     clock_publish_on_topic_publish: bool = parameter(
-        False,
-        'publish /clock also before each message',
-        name='play.clock_publish_on_topic_publish',
+        False, 'publish /clock also before each message'
     )
     start_paused: bool = parameter(
-        False,
-        'start paused: wait for ~/resume, ~/play_next or the space bar',
-        name='play.start_paused',
+        False, 'start paused: wait for ~/resume, ~/play_next or the space bar'
     )
     seek_time: float = parameter(
-        0.0,
-        'target of ~/seek, after the first message',
-        's',
-        (0.0, None),
-        name='play.seek_time',
-        dynamic=True,
+        0.0, 'target of ~/seek, after the first message', 's', (0.0, None), dynamic=True
     )
     play_next_count: int = parameter(
-        1,
-        'number of messages that ~/play_next plays',
-        name='play.play_next_count',
-        bounds=(1, 1_000_000),
-        dynamic=True,
+        1, 'number of messages that ~/play_next plays', bounds=(1, 1_000_000), dynamic=True
     )
     read_ahead_queue_size: int = parameter(
-        1000,
-        'number of messages read ahead',
-        name='play.read_ahead_queue_size',
-        bounds=(1, 1_000_000),
+        1000, 'number of messages read ahead', bounds=(1, 1_000_000)
     )
 
     def check_consistency(self) -> None:

@@ -197,8 +197,8 @@ def parameter(
     """Return a dataclass field that is one parameter of its table.
 
     ``name`` is the ROS name within the table, which may contain dots; without it the attribute
-    gives the name. Lower and upper bound are inclusive, None is none; for a tuple they apply to
-    each element.
+    gives the name, after the table's ``prefix``. Lower and upper bound are inclusive, None is
+    none; for a tuple they apply to each element.
     """
     details = {
         'unit': unit,
@@ -242,6 +242,8 @@ class Parameters:
     Subclasses are frozen dataclasses; :meth:`check_consistency` checks relations between
     parameters.
     """
+
+    prefix = ''
 
     def __post_init__(self) -> None:
         for entry in _entries(type(self)):
@@ -401,7 +403,7 @@ def _declared(table: type[Parameters]) -> Iterator[_Entry]:
         if 'spec' in item.metadata:
             many = get_origin(hint) is tuple
             kind = get_args(hint)[0] if many else hint
-            name = item.metadata['name'] or item.name
+            name = item.metadata['name'] or table.prefix + item.name
             default: Any = item.default
             spec = ParameterSpec(name, kind, many, default, **item.metadata['spec'])
             yield _Entry(spec, (item.name,))

@@ -25,11 +25,11 @@ MEBIBYTE = 2**20
 class RecordingParameters(Parameters):
     """Parameters of a recording."""
 
+    prefix = 'storage.'
     uri: str = parameter(
         '',
         'folder of the bag; empty = bag_<time> in the working directory; an existing bag is '
         'continued',
-        name='storage.uri',
     )
     topics: tuple[str, ...] = parameter(
         (
@@ -75,11 +75,7 @@ class RecordingParameters(Parameters):
         name='record.topic_types',
     )
     chunk_size: int = parameter(
-        262_144,
-        'size at which a chunk is compressed and written',
-        'B',
-        (1024, 2**26),
-        name='storage.chunk_size',
+        262_144, 'size at which a chunk is compressed and written', 'B', (1024, 2**26)
     )
     chunk_duration: float = parameter(
         0.5,
@@ -87,33 +83,21 @@ class RecordingParameters(Parameters):
         'loses the messages of this time plus at most 0.1 s',
         's',
         (0.05, 60.0),
-        name='storage.chunk_duration',
     )
     max_bagfile_size: int = parameter(
-        0,
-        'size at which the next file of the bag begins; 0 = never',
-        'B',
-        (0, None),
-        name='storage.max_bagfile_size',
+        0, 'size at which the next file of the bag begins; 0 = never', 'B', (0, None)
     )
     max_bagfile_duration: float = parameter(
-        0.0,
-        'duration at which the next file of the bag begins; 0 = never',
-        's',
-        (0.0, None),
-        name='storage.max_bagfile_duration',
+        0.0, 'duration at which the next file of the bag begins; 0 = never', 's', (0.0, None)
     )
     max_cache_size: int = parameter(
         64 * MEBIBYTE,
         'maximum memory of the write queue; further messages are dropped, counted and reported',
         'B',
         (65_536, 2**34),
-        name='storage.max_cache_size',
     )
     snapshot_mode: bool = parameter(
-        False,
-        'record snapshots only, to wait for rare events over days',
-        name='storage.snapshot_mode',
+        False, 'record snapshots only, to wait for rare events over days'
     )
     snapshot_duration: float = parameter(
         30.0,
@@ -121,14 +105,12 @@ class RecordingParameters(Parameters):
         'time to a bag in the folder snapshots; 0 = no snapshots',
         's',
         (0.0, 3600.0),
-        name='storage.snapshot_duration',
     )
     snapshot_cache_size: int = parameter(
         128 * MEBIBYTE,
         'maximum memory of the messages of a snapshot; at this limit a snapshot covers less time',
         'B',
         (65_536, 2**34),
-        name='storage.snapshot_cache_size',
     )
     monitored_nodes: tuple[str, ...] = parameter(
         ('controller', 'sim_robot', 'radio_bridge'),
