@@ -75,12 +75,11 @@ def add_info_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParse
     parser.set_defaults(run=_run_info)
 
 
-def _run_info(options: argparse.Namespace) -> int:
+def _run_info(options: argparse.Namespace) -> None:
     from t3mpc_ros.bag.reader import open_bag
 
     with open_bag(options.bag) as bag:
         print_result(options, lambda: _info_text(bag), lambda: _info(bag))
-    return 0
 
 
 def _info(bag: 'BagReader') -> dict[str, Any]:
@@ -352,8 +351,8 @@ def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
     parser.set_defaults(run=run_report)
 
 
-def run_report(options: argparse.Namespace) -> int:
-    """Write the report, print its summary and return 0."""
+def run_report(options: argparse.Namespace) -> None:
+    """Write the report and print its summary."""
     from t3mpc_ros.evaluation.bag_report.report_page import write_report
 
     wanted = report_options(options)
@@ -364,12 +363,11 @@ def run_report(options: argparse.Namespace) -> int:
 
         path, text, record = write_comparison(options.bags, output, wanted)
         print_result(options, lambda: f'{text}\n{path}', lambda: record)
-        return 0
+        return
     figures = write_report(options.bags[0], output, wanted)
     print_result(
         options, lambda: f'{figures.verdict.text()}\n{figures.summary()}', figures.to_dict
     )
-    return 0
 
 
 def add_animate_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -397,8 +395,8 @@ def add_animate_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
     parser.set_defaults(run=run_animate)
 
 
-def run_animate(options: argparse.Namespace) -> int:
-    """Write the animation and return 0."""
+def run_animate(options: argparse.Namespace) -> None:
+    """Write the animation."""
     from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions, animate_bag
     from t3mpc_ros.evaluation.topic_roles import ReportOptions
 
@@ -408,7 +406,6 @@ def run_animate(options: argparse.Namespace) -> int:
     wanted = ReportOptions(namespace=options.namespace)
     written = animate_bag(options.bag, options.output, chosen, wanted, progress=True)
     print(f'{written}: {size_text(written.stat().st_size)}')
-    return 0
 
 
 def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -441,8 +438,8 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     add('--namespace', help='of the robot, where the bag holds several')
 
 
-def run_replay(options: argparse.Namespace) -> int:
-    """Replay the run, print the comparison and the speed, and return 0."""
+def run_replay(options: argparse.Namespace) -> None:
+    """Replay the run; print the comparison and the speed."""
     from t3mpc_ros.bag.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
     from t3mpc_ros.evaluation.process_replay.controller_replay import (
@@ -487,7 +484,6 @@ def run_replay(options: argparse.Namespace) -> int:
         record['output'] = str(write_replay(inputs, again, options.output))
         text += f'\nwritten to {record["output"]}'
     print_result(options, lambda: text, lambda: record)
-    return 0
 
 
 SAME, DIFFERS = 0, 3

@@ -70,16 +70,15 @@ class RemovedOption(argparse.Action):
 def run_command(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> int:
     """Return the exit code of the chosen subcommand: its own, or 1 after an error.
 
-    A wrong command line ends the program with 2. Each subcommand sets ``run``,
-    which takes the options and returns the exit code.
+    A wrong command line ends the program with 2. Each subcommand sets ``run``, which takes the
+    options and returns the exit code, or nothing for 0.
     """
     options = parser.parse_args(arguments)
     try:
-        code: int = options.run(options)
+        return int(options.run(options) or 0)
     except (OSError, RuntimeError, ValueError) as error:
         print(f'error: {sentence(error)}', file=sys.stderr)
         return 1
-    return code
 
 
 def ask_line(question: str, stop: Callable[[], bool]) -> str:

@@ -66,8 +66,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.set_defaults(run=run)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Print the tables and return 0."""
+def run(options: argparse.Namespace) -> None:
+    """Print the tables."""
     from t3mpc_ros.evaluation import comparison_page
     from t3mpc_ros.evaluation.api.comparison_runs import Comparison
     from t3mpc_ros.evaluation.api.result_tables import writable
@@ -89,7 +89,6 @@ def run(options: argparse.Namespace) -> int:
         options.html.write_text(comparison_page.page(plan, results, times), encoding='utf-8')
     if options.csv:
         write_columns(writable(options.csv), columns_of(Comparison(plan, results).rows()))
-    return 0
 
 
 def _plan(options: argparse.Namespace) -> 'ComparisonPlan':

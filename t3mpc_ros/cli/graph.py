@@ -85,14 +85,14 @@ def add_parser(commands: Any) -> None:
 
 def _with_graph(
     run: Callable[['Graph', argparse.Namespace], int | None],
-) -> Callable[[argparse.Namespace], int]:
-    """Return a command that runs in the graph; its exit code is 0 where it returns none."""
+) -> Callable[[argparse.Namespace], int | None]:
+    """Return a command that runs in the graph."""
 
-    def run_in_graph(options: argparse.Namespace) -> int:
+    def run_in_graph(options: argparse.Namespace) -> int | None:
         from t3mpc_ros.nodes.graph_tools import graph  # takes a second
 
         with StopSignal() as stop, graph(stop) as opened:
-            return run(opened, options) or 0
+            return run(opened, options)
 
     return run_in_graph
 

@@ -111,7 +111,7 @@ def _new_run(folder: Path) -> Path:
     return output
 
 
-def _estimation(options: argparse.Namespace) -> int:
+def _estimation(options: argparse.Namespace) -> None:
     from t3mpc_ros.evaluation.open_loop_estimation import compare, records
     from t3mpc_ros.evaluation.paper.results import estimation
 
@@ -124,10 +124,9 @@ def _estimation(options: argparse.Namespace) -> int:
         lambda: '\n\n'.join(table.markdown() for table in estimation(results)),
         lambda: records(results),
     )
-    return 0
 
 
-def _exponents(options: argparse.Namespace) -> int:
+def _exponents(options: argparse.Namespace) -> None:
     from t3mpc_ros.chaos.system import hyperchaotic_system
     from t3mpc_ros.evaluation.lyapunov_exponents import lyapunov_exponents
 
@@ -142,24 +141,22 @@ def _exponents(options: argparse.Namespace) -> int:
         ),
         lambda: {'exponents': [*values], 'sum': sum(values), 'duration': options.duration},
     )
-    return 0
 
 
-def _compile(options: argparse.Namespace) -> int:
+def _compile(options: argparse.Namespace) -> None:
     """Compile the kernels in two processes, each with about half of the work; or remove them."""
     if options.remove:
         from t3mpc_ros.kernels import remove_compiled
 
         for folder in remove_compiled(os.environ):
             print(f'removed {folder}')
-        return 0
+        return
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
     with ProcessPoolExecutor(2, get_context('spawn')) as pool:
         for part in [pool.submit(_compile_controllers), pool.submit(_compile_robots)]:
             part.result()
-    return 0
 
 
 def _compile_robots() -> None:
@@ -207,13 +204,12 @@ def _compile_controllers() -> None:
         run(Scenario(robot, NOMINAL, 1, 1.0), spec)
 
 
-def _complete(options: argparse.Namespace) -> int:
+def _complete(options: argparse.Namespace) -> None:
     """Print what a shell reads to complete commands and options."""
     import shtab
 
     parser = _parser({name: _program(name).program_parser() for name in PROGRAMS})
     print(shtab.complete(parser, options.shell))
-    return 0
 
 
 def _program(name: str) -> Any:

@@ -44,8 +44,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.set_defaults(run=run)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Write everything and return 0."""
+def run(options: argparse.Namespace) -> None:
+    """Write everything."""
     from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.methods import NMPC, require_libraries
     from t3mpc_ros.evaluation.paper.reproduce import reproduce
@@ -64,4 +64,3 @@ def run(options: argparse.Namespace) -> int:
             report=print_report,
         )
     run_options.print_result(options, lambda: text, lambda: numbers)
-    return 0

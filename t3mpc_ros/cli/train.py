@@ -55,14 +55,15 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
     add('--folds', type=int, default=FOLDS, help=text)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Write the model, print its skill and return 0."""
+def run(options: argparse.Namespace) -> None:
+    """Write the model and print its skill."""
     from t3mpc_ros.bag.model_file import save_model
 
     if options.bags:
         if options.robot != 'servo':
             raise ValueError(f'robot must be servo for bags: got {options.robot}')
-        return run_bags(options)
+        run_bags(options)
+        return
     from t3mpc_ros.evaluation.training.simulated_runs import assess, fit_simulated_runs, origin
 
     if options.keep_predictor:
@@ -72,11 +73,10 @@ def run(options: argparse.Namespace) -> int:
     save_model(options.output, pretrained, {**used.to_dict(), 'drive': drive}, origin(drive))
     print(assess(drive, options.seeds, progress=True))
     print(f'saved {options.output.resolve()}')
-    return 0
 
 
-def run_bags(options: argparse.Namespace) -> int:
-    """Write the model of ``options.bags``, print its skill and return 0.
+def run_bags(options: argparse.Namespace) -> None:
+    """Write the model of ``options.bags`` and print its skill.
 
     Raises as :func:`run`.
     """
@@ -87,4 +87,3 @@ def run_bags(options: argparse.Namespace) -> int:
     print(model.text)
     save_model(options.output, model.learnt, model.parameters.to_dict(), model.origin)
     print(f'saved {options.output.resolve()}')
-    return 0

@@ -65,8 +65,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.set_defaults(run=run)
 
 
-def run(options: argparse.Namespace) -> int:
-    """Tune every method, or identify the drive in a bag; print the result and return 0."""
+def run(options: argparse.Namespace) -> None:
+    """Tune every method, or identify the drive in a bag; print the result."""
     from t3mpc_ros.evaluation.methods import (
         further_definitions,
         method_definitions,
@@ -75,7 +75,8 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.parameters.table import find_names
 
     if options.robot not in (None, TWIN, *DRIVES):
-        return _identify(options)
+        _identify(options)
+        return
     known = [*method_definitions(), *further_definitions()]
     names = find_names('method', options.methods, [method.name for method in known])
     methods = [method for method in known if method.name in names or not names]
@@ -83,7 +84,6 @@ def run(options: argparse.Namespace) -> int:
     with run_options.executor_of(options) as executor:
         store = _tuned(options, methods, executor)
     run_options.print_result(options, store.table, store.to_dict)
-    return 0
 
 
 def _tuned(
@@ -119,8 +119,8 @@ def _tuned(
     )
 
 
-def _identify(options: argparse.Namespace) -> int:
-    """Print the parameter file for the robot in the bag ``options.robot`` and return 0."""
+def _identify(options: argparse.Namespace) -> None:
+    """Print the parameter file for the robot in the bag ``options.robot``."""
     from t3mpc_ros.evaluation.topic_roles import bag_display_name
     from t3mpc_ros.evaluation.tuning.drive_identification import (
         drive_file,
@@ -141,4 +141,3 @@ def _identify(options: argparse.Namespace) -> int:
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         options.output.write_text(text, encoding='utf-8')
-    return 0

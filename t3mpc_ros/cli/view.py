@@ -55,7 +55,7 @@ def add_parser(commands: Any) -> None:
     parser.set_defaults(run=_view)
 
 
-def _view(options: argparse.Namespace) -> int:
+def _view(options: argparse.Namespace) -> None:
     # Imported only when it is used: `t3mpc --help` stays fast.
     from t3mpc_ros.view.live_run import LiveRun
     from t3mpc_ros.view.server import PageServer
@@ -70,7 +70,7 @@ def _view(options: argparse.Namespace) -> int:
                 _announce(server, options)
                 while not stop():
                     time.sleep(0.1)
-            return 0
+            return
         from t3mpc_ros.nodes.viewer import view_node  # takes a second
 
         run = LiveRun()
@@ -83,7 +83,6 @@ def _view(options: argparse.Namespace) -> int:
             with page as server:
                 _announce(server, options)
                 node.spin(stop)
-    return 0
 
 
 @contextmanager

@@ -93,7 +93,7 @@ def bag_program(*arguments):
     add_replay_parser(commands)
     add_compare_parser(commands)
     options = parser.parse_args([str(argument) for argument in arguments])
-    return options.run(options)
+    return options.run(options) or 0
 
 
 def columns_of(path, topics):

@@ -133,7 +133,7 @@ def program(*arguments):
     parser = argparse.ArgumentParser(prog='bag')
     add_train_parser(parser.add_subparsers(required=True))
     options = parser.parse_args([str(argument) for argument in arguments])
-    return options.run(options)
+    return options.run(options) or 0
 
 
 @pytest.mark.long
