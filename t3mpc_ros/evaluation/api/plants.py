@@ -211,8 +211,7 @@ class StateSpace:
     drive: str = 'velocity'
     initial: ArrayLike | None = None
     robot: Robot = field(default_factory=Robot)
-    name: ClassVar[str] = 'state space'
-    """Name in errors."""
+    name: ClassVar[str] = 'state space'  # in errors
 
     @one_sentence
     def __post_init__(self) -> None:
