@@ -39,7 +39,7 @@ from t3mpc_ros.control.speed_filter import SpeedFilterParameters, SpeedKalmanFil
 from t3mpc_ros.geometry.kinematics import WheelGeometry, body_speeds
 from t3mpc_ros.geometry.types import Array, BodyTwist
 from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
-from t3mpc_ros.parameters.table import Parameters, parameter
+from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 SHORTFALL, LEAST_SHORTFALL = 0.25, 0.3
 """Share of the command, and speed (rad/s), by which a wheel at a limit is slower than commanded:
@@ -103,6 +103,24 @@ class LimitParameters(Parameters):
         name='wheel.max_acceleration',
         dynamic=True,
     )
+    deadband: float = parameter(
+        0.0,
+        'wheel speed up to which stop or this speed is commanded, whichever is nearer: stepper '
+        'motors ring at single microsteps, the nominal robot least with 0.05',
+        'rad/s',
+        (0.0, 0.1),
+        name='wheel.deadband_velocity',
+        dynamic=True,
+        source='nav2_velocity_smoother',
+    )
+
+    def check_consistency(self) -> None:
+        """Raise :class:`ParameterError` if the deadband is not below the largest wheel speed."""
+        if self.deadband > 0.1 * self.wheel_speed:
+            raise ParameterError(
+                'wheel.deadband_velocity must be at most a tenth of wheel.max_velocity, '
+                f'{0.1 * self.wheel_speed:g} rad/s: got {self.deadband:g}'
+            )
 
 
 class VelocityActuation:
@@ -127,8 +145,8 @@ class VelocityActuation:
         """Estimated chi at the last measurement, rad/s, shape (2,)."""
         self.predicted = state.predicted
         """Predicted chi when the next command takes effect, rad/s, shape (2,)."""
-        self._limits = wheel_limits(limits, geometry)
         self._geometry = geometry
+        self.configure(limits)
         self._lengths = geometry.wheel_radius, geometry.half_separation
         self.takes_speeds = drive == 'velocity'
         """Whether the drive takes wheel speeds, not torques."""
@@ -141,6 +159,8 @@ class VelocityActuation:
         """Acceleration u that the last command realises, rad/s², shape (2,)."""
         self.command: Array = np.zeros(2)
         """Last commanded wheel speeds, rad/s, shape (2,); zeros with a torque drive."""
+        self._wanted = np.zeros(2)
+        """The same before the deadband, from which the limits go on."""
         self._actuation_command = TypedKernel(actuation_command)
         self.reset(np.zeros(2))
 
@@ -171,6 +191,7 @@ class VelocityActuation:
     def configure(self, limits: LimitParameters) -> None:
         """Use new limits from the next command on."""
         self._limits = wheel_limits(limits, self._geometry)
+        self._deadband = limits.deadband
 
     def reset(self, speeds: Array, last_command: Array | None = None) -> None:
         """Restart at measured wheel speeds, rad/s, shape (2,).
@@ -193,6 +214,14 @@ class VelocityActuation:
         elif self.takes_speeds:
             right, left = speeds.tolist()
             self.command[:] = speeds * limit_scale(right, left, self._limits[0])
+        self._wanted[:] = self.command
+
+    def _apply_deadband(self) -> None:
+        for wheel, speed in enumerate(self._wanted.tolist()):
+            if 0.0 < abs(speed) < self._deadband:
+                nearest = 0.0 if abs(speed) < 0.5 * self._deadband else self._deadband
+                speed = math.copysign(nearest, speed)
+            self.command[wheel] = speed
 
     def observe(self, measured: Array, dt: float) -> None:
         """Update the filter with wheel speeds (rad/s) measured ``dt`` s after the last update.
@@ -215,12 +244,13 @@ class VelocityActuation:
         self.limited = self._actuation_command(
             contiguous(acceleration),
             self.predicted,
-            self.command,
+            self._wanted,
             self._limits,
             max(elapsed, self._period),
             self._period / self._servo_step,
             self.applied,
         )
+        self._apply_deadband()
         return self.applied
 
     def send_speeds(self, wheels: Array) -> None:
@@ -228,8 +258,9 @@ class VelocityActuation:
         self._sent = True
         right, left = wheels.tolist()
         self.limited = limit_command(
-            right, left, self.command, self._limits, self._period, self.command
+            right, left, self._wanted, self._limits, self._period, self._wanted
         )
+        self._apply_deadband()
         self.applied[:] = 0.0
 
     def set_command(self, wheels: Array) -> None:
@@ -240,7 +271,7 @@ class VelocityActuation:
             raise ValueError(f'wheels must be two finite numbers: got {wheels}')
         self._sent = True
         self.limited = False
-        self.command[:] = wheels
+        self.command[:] = self._wanted[:] = wheels
         self.applied[:] = (self.command - self.predicted) * (self._servo_step / self._period)
 
 

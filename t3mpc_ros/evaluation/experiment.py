@@ -338,9 +338,12 @@ def _check_guarded() -> None:
                     raise ValueError(GUARD)
 
 
-def _job_error(job: tuple[Any, Any], error: BaseException) -> JobError:
-    scenario, method = job
-    return JobError(f'{getattr(method, "name", method)} on {scenario} failed: {error!r}')
+def _job_error(job: Any, error: BaseException) -> JobError:
+    text = str(job)
+    if isinstance(job, tuple) and len(job) == 2:
+        scenario, method = job
+        text = f'{getattr(method, "name", method)} on {scenario}'
+    return JobError(f'{text} failed: {error!r}')
 
 
 def _start_worker(parent: int) -> None:

@@ -174,6 +174,24 @@ def test_the_applied_acceleration_is_that_of_the_limited_command():
     assert 100 < limited <= 500
 
 
+@pytest.mark.parametrize('acceleration', [1.0, 30.0])
+def test_a_deadband_leaves_out_slow_commands(acceleration):
+    """Neither in a sweep through zero nor at small limits, where a step is below the deadband."""
+    limits = LimitParameters(wheel_acceleration=acceleration, deadband=0.05)
+    drive, commands, wanted = _drive(limits), [], []
+    for k in range(2000):
+        goal = 0.2 * math.sin(0.01 * k) * np.array([1.0, -1.0])
+        drive.observe(drive.command, T)
+        drive.send_speeds(goal)
+        commands.append(drive.command.copy())
+        wanted.append(goal)
+    commands, wanted = np.array(commands), np.array(wanted)
+    slow = np.abs(wanted) < 0.05
+    assert np.isin(np.abs(commands[slow]), (0.0, 0.05)).all()
+    assert np.abs(commands - wanted).max() <= 0.025 + 1e-12
+    assert np.array_equal(commands[~slow], wanted[~slow])
+
+
 def test_an_unknown_drive_or_period_is_rejected():
     with pytest.raises(ValueError, match='drive must be'):
         _drive(kind='warp')
