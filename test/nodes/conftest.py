@@ -16,6 +16,19 @@
 from types import SimpleNamespace
 
 import pytest
+from support.waiting import Processes
+
+from t3mpc_ros.cli.private_graph import PrivateGraph
+
+
+@pytest.fixture(scope='module')
+def shared_processes(tmp_path_factory):
+    """Return a process group in a graph of its own for all tests of a file."""
+    with PrivateGraph() as private:
+        started = Processes(tmp_path_factory.mktemp('log'), private.environment())
+        yield started
+        for name in list(started.running()):
+            started.kill(name)
 
 
 @pytest.fixture

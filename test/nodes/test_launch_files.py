@@ -337,7 +337,7 @@ def test_sim_starts_tracks_and_ends_with_ctrl_c(to_group, start, slow, tmp_path)
     words.append(f'params_file:={slow}')
     with start('launch_files', *words) as launch:
         launch.wait_for('tracking')
-        time.sleep(8.0)
+        time.sleep(7.0)
         codes = end(launch, to_group)
     assert codes == dict.fromkeys((*LOOP, 'recorder'), 0)
     bag = only_bag(tmp_path)

@@ -22,9 +22,10 @@ from support.robot_page import FOCUS, LATCHED, UNCONFIRMED, RobotPage
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timed]
 
 
-@pytest.fixture
-def page(processes):
-    page = RobotPage(processes)
+@pytest.fixture(scope='module')
+def page(shared_processes):
+    """Return the page of one robot; the last test kills its program."""
+    page = RobotPage(shared_processes)
     yield page
     page.driver.quit()
 
@@ -35,7 +36,7 @@ def test_every_one_of_twelve_tabs_stops_the_robot(page):
         page.open_tabs(count)
         page.click()
         page.release()
-    page.driver.switch_to.window(page.driver.window_handles[0])
+    page.close_tabs()
     page.click()
     page.release()
 
@@ -65,7 +66,8 @@ def test_the_space_bar_stops_wherever_the_focus_is(page):
     assert len(page.run('return sent')) == sent
 
 
-def test_a_stop_that_nobody_confirms_is_asked_for_again(page, processes):
+def test_a_stop_that_nobody_confirms_is_asked_for_again(page, shared_processes):
+    processes = shared_processes
     # Suspended: the page says so, asks again, and the stop is executed when the program goes on.
     view = processes.pid('view')
     os.kill(view, signal.SIGSTOP)
@@ -100,6 +102,7 @@ def test_a_stop_that_nobody_confirms_is_asked_for_again(page, processes):
 
     # Killed: the same, and the page that loads itself anew asks again.
     processes.kill('view')
+    page.wait_for_headline('This page has lost its program')
     page.click()
     page.wait_for_headline(UNCONFIRMED)
     page.start_view(page.port)

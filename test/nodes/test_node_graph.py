@@ -29,6 +29,7 @@ from rclpy.qos import DurabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu, Range
 from std_srvs.srv import SetBool
+from support.long_tests import few_of
 from support.ros_graph import (
     LATCHED,
     diagnostic,
@@ -101,7 +102,7 @@ def wait_for_warning(harness, name, words, levels=(WARN, ERROR)):
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize('stamped', [False, True])
+@pytest.mark.parametrize('stamped', few_of([False, True]))
 def test_another_type_on_cmd_vel_is_a_warning(stamped, harness):
     """ROS 2 connects only endpoints of equal type and reports nothing about the others."""
     robot = harness.add(SimRobotNode, enable_stamped_cmd_vel=stamped)

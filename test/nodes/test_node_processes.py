@@ -131,16 +131,14 @@ class Run:
             processes.wait_ready(name)
         processes.wait_for('controller', 'tracking')
         self._record(self.bag)
-        observer.wait_for_motion(1.5)
         for victim in VICTIMS:
             self._kill(victim, 1.5)
             self._start(victim)
             observer.wait_for_motion(1.5)
         self.codes = [processes.stop('recorder')]
-        self._record(self.last_bag)
+        self._start_recorder(self.last_bag)
         self._kill('recorder', 0.5)
         self._record(self.last_bag)
-        observer.wait_for_motion(1.5)
         self.end_ns = time.time_ns()
         order = ('reference_generator', 'controller', 'sim_robot', 'recorder')
         self.codes += processes.stop_all(order).values()
@@ -150,6 +148,12 @@ class Run:
         self._processes.wait_ready(name)
 
     def _record(self, bag):
+        """Start a recorder and wait until it receives all."""
+        self._start_recorder(bag)
+        # The publishers discover it, too: a lost message of discovery is repeated after 3 s.
+        self._observer.wait_for_motion(3.5)
+
+    def _start_recorder(self, bag):
         """Start a recorder and wait until it has subscribed."""
         known = self._observer.recorders()
         self._start('recorder', **{'storage.uri': str(bag)})
@@ -157,8 +161,6 @@ class Run:
             lambda: len(self._observer.recorders() - known) == len(RECORDED),
             'the recorder has not discovered the topics',
         )
-        # The publishers discover it, too: a lost message of discovery is repeated after 3 s.
-        self._observer.wait_for_motion(3.5)
 
     def _kill(self, victim, pause):
         """Kill a process and wait; the other ones run on."""

@@ -330,7 +330,7 @@ def test_a_damaged_bag_is_played_with_a_warning_and_a_count(harness, logged, tmp
         assert len(chunks) > 5
         content.seek(chunks[3].chunk_start_offset + chunks[3].chunk_length - 60)
         content.write(bytes(60))
-    player = play(harness, bag, play__subscriber_timeout=0.0)
+    player = play(harness, bag, play__subscriber_timeout=0.0, play__rate=10.0)
     harness.spin_until(lambda: player.exit_requested)
     assert player.exit_code == 0
     damaged = diagnostic(player, 'damaged')
@@ -358,7 +358,7 @@ def test_a_bag_that_plays_nothing_is_an_error(kept, given, words, harness, logge
         for chunk in () if kept else make_reader(content).get_summary().chunk_indexes:
             content.seek(chunk.chunk_start_offset + chunk.chunk_length - 60)
             content.write(bytes(60))
-    player = play(harness, bag, play__subscriber_timeout=0.0, **given)
+    player = play(harness, bag, play__subscriber_timeout=0.0, play__rate=10.0, **given)
     harness.spin_until(lambda: player.exit_requested)
     assert player.exit_code == bool(words)
     assert [words in line for line in logged('nothing was played')] == [True] * bool(words)

@@ -182,16 +182,16 @@ class _PathDrive:
 
 def test_paths_of_volatile_and_latched_publishers_drive_once(harness):
     """Planners are volatile, and got no connection; RViz and scripts latch."""
-    harness.create_publisher(Path, 'path', LATCHED).publish(_path([(0.5, -0.2), (1.0, -0.2)]))
+    harness.create_publisher(Path, 'path', LATCHED).publish(_path([(0.5, -0.2), (0.75, -0.2)]))
     drive = _PathDrive(harness, path_mode='append')
     drive.until(lambda m: speed(m) > 0.1)
     drive.until(lambda m: speed(m) == 0.0)
-    assert drive.received[-1].pose.pose.position.x == pytest.approx(1.0, abs=1e-6)
+    assert drive.received[-1].pose.pose.position.x == pytest.approx(0.75, abs=1e-6)
     planner = harness.connected_publisher(Path, 'path')
-    planner.publish(_path([(1.0, -0.2), (1.5, -0.2)]))
+    planner.publish(_path([(0.75, -0.2), (1.0, -0.2)]))
     drive.until(lambda m: speed(m) > 0.1)
     drive.until(lambda m: speed(m) == 0.0)
-    assert drive.received[-1].pose.pose.position.x == pytest.approx(1.5, abs=1e-6)
+    assert drive.received[-1].pose.pose.position.x == pytest.approx(1.0, abs=1e-6)
     assert min(_speeds(drive.received)) >= 0.0
     assert 'no message passes' not in reason(drive.node)
     assert diagnostic(drive.node, 'path_under_way') is False

@@ -66,6 +66,14 @@ class RobotPage(Browser):
             self.driver.switch_to.new_window('tab')
             self.open()
 
+    def close_tabs(self):
+        """Close all tabs but the first."""
+        first, *others = self.driver.window_handles
+        for each in others:
+            self.driver.switch_to.window(each)
+            self.driver.close()
+        self.driver.switch_to.window(first)
+
     def wait_for_headline(self, words):
         self.wait(
             lambda: self.text('headline').startswith(words),
