@@ -76,33 +76,31 @@ def test_every_equation_and_every_correction_has_exactly_one_row():
     assert len(NUMBERED) >= 86 + 14
 
 
-@pytest.mark.parametrize('row', ROWS, ids=lambda row: row[0][:30])
-def test_no_cell_is_empty_and_references_are_well_formed(row):
-    assert len(row) == (4 if row in NUMBERED else 3)
-    assert all(row)
-    assert row[-2] == ', '.join(f'`{path}::{name}`' for path, name in _named(row))
-    assert row[-1] == ', '.join(f'`{path}::{name}`' for path, name in TEST.findall(row[-1]))
-    assert _named(row)
-    assert TEST.search(row[-1])
+def test_no_cell_is_empty_and_references_are_well_formed():
+    for row in ROWS:
+        assert len(row) == (4 if row in NUMBERED else 3), row
+        assert all(row), row
+        assert row[-2] == ', '.join(f'`{path}::{name}`' for path, name in _named(row))
+        assert row[-1] == ', '.join(f'`{path}::{name}`' for path, name in TEST.findall(row[-1]))
+        assert _named(row), row
+        assert TEST.search(row[-1]), row
 
 
-@pytest.mark.parametrize('path, name', FUNCTIONS)
-def test_every_function_named_exists(path, name):
-    found = reduce(getattr, name.split('.'), _module(path))
-    assert found.__doc__
+def test_every_function_named_exists():
+    for path, name in FUNCTIONS:
+        assert reduce(getattr, name.split('.'), _module(path)).__doc__, name
 
 
-@pytest.mark.parametrize('row', NUMBERED, ids=lambda row: row[0])
-def test_the_docstring_contains_the_equation_number(row):
+def test_the_docstring_contains_the_equation_number():
     """A range such as (16)-(19) does not count for the numbers between its ends."""
-    for path, name in _named(row):
+    for number, path, name in ((row[0], *each) for row in NUMBERED for each in _named(row)):
         module = _module(path)
         texts = [module.__doc__]
         for part in name.split('.'):
             module = getattr(module, part)
             texts.append(module.__doc__)
-        number = rf'(?<![\w]){re.escape(row[0])}(?!\d)'
-        assert any(re.search(number, text) for text in texts if text), f'{path}::{name}'
+        words = rf'(?<![\w]){re.escape(number)}(?!\d)'
+        assert any(re.search(words, text) for text in texts if text), f'{path}::{name}'
 
 
 def test_each_number_is_in_a_docstring_below_module_level():
@@ -111,21 +109,22 @@ def test_each_number_is_in_a_docstring_below_module_level():
         assert any(row[0] in one.__doc__ for one in own), row[0]
 
 
-@pytest.mark.parametrize('path, name', TESTS, ids=lambda value: value.split('/')[-1])
 @pytest.mark.slow
-def test_every_test_named_exists(path, name):
-    assert name in {node.name for node in _tree(path).body if isinstance(node, ast.FunctionDef)}
+def test_every_test_named_exists():
+    for path, name in TESTS:
+        functions = (each for each in _tree(path).body if isinstance(each, ast.FunctionDef))
+        assert name in {each.name for each in functions}, path
 
 
-@pytest.mark.parametrize('row', ROWS, ids=lambda row: row[0][:30])
 @pytest.mark.slow
-def test_a_test_of_each_row_reaches_a_function_of_that_row(row):
+def test_a_test_of_each_row_reaches_a_function_of_that_row():
     """The test's file imports the function's module, or a module that imports it."""
-    reached = set()
-    for path, _ in TEST.findall(row[-1]):
-        direct = _imported(path)
-        reached |= direct.union(*(_imported(file) for file in direct))
-    assert reached & {path for path, _ in _named(row)}
+    for row in ROWS:
+        reached = set()
+        for path, _ in TEST.findall(row[-1]):
+            direct = _imported(path)
+            reached |= direct.union(*(_imported(file) for file in direct))
+        assert reached & {path for path, _ in _named(row)}, row
 
 
 @cache

@@ -175,8 +175,6 @@ def test_inconclusive_tests_alone_have_an_exit_code_of_their_own(tmp_path):
     text = CERTAIN.format(busy=0.0) + WAITS
     done, outcomes = run_pytest(tmp_path, text, '-k', 'test_wait or test_sound')
     assert (done.returncode, len(outcomes)) == (6, 5)
-    done, outcomes = run_pytest(tmp_path, text, '-k', 'test_sound')
-    assert (done.returncode, outcomes) == (0, {'test_sound': 'passed'})
 
 
 def test_a_timeout_on_a_quiet_machine_is_a_failure(tmp_path):
@@ -348,6 +346,7 @@ def test_every_wait_of_a_test_is_one_that_can_be_inconclusive():
     """Other time-outs would be failures on a busy machine."""
     own = {TESTS / 'support' / 'waiting.py'}
     texts = {path: path.read_text() for path in TESTS.rglob('*.py') if path not in own}
-    words = re.compile('|'.join((*CLOCKS, 'sleep', 'spin_once', 'imeout', r'\.wait')))
+    calls = '|'.join((*CLOCKS, 'sleep', 'spin_once', 'wait'))
+    words = re.compile(rf'\.(?:{calls})\(|imeout')  # most files have none and are not parsed
     found = {path.name: waits(text) for path, text in texts.items() if words.search(text)}
     assert {name: lines for name, lines in found.items() if lines} == {}

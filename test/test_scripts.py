@@ -183,6 +183,18 @@ def checkout(tmp_path):
     return Checkout(tmp_path)
 
 
+@pytest.fixture(scope='module')
+def ready(tmp_path_factory):
+    """Return a checkout that is set up, for tests that change no more than its program.
+
+    Regression: a folder launch/__pycache__ ended every script without a message.
+    """
+    made = Checkout(tmp_path_factory.mktemp('ready'))
+    (made.root / 'launch' / '__pycache__').mkdir()
+    assert made.run('t3mpc').returncode == 0
+    return made
+
+
 def test_run_sets_up_once_and_passes_arguments_on(checkout, tmp_path):
     first = checkout.run('t3mpc', 'two words', '-x')
     assert (first.returncode, first.stdout) == (0, 't3mpc got two words -x\n'), first.stderr
@@ -215,12 +227,6 @@ def test_a_stale_environment_is_updated(names, checkout):
         assert checkout.done() == UPDATE, name
     checkout.run('t3mpc')
     assert checkout.done() == []
-
-
-def test_compiled_files_beside_the_launch_file_are_ignored(checkout):
-    """Regression: a folder launch/__pycache__ ended every script without a message."""
-    (checkout.root / 'launch' / '__pycache__').mkdir()
-    assert checkout.run('t3mpc').returncode == 0
 
 
 @pytest.mark.long
@@ -501,15 +507,14 @@ def test_an_unreachable_index_is_an_error_with_a_remedy(index, tmp_path):
     assert not (root / '.venv' / 'stamp').exists()
 
 
-def test_a_sourced_ros_does_not_enter_the_local_environment(checkout, tmp_path):
+def test_a_sourced_ros_does_not_enter_the_local_environment(ready, tmp_path):
     """Regression: modules and libraries of a system ROS took precedence."""
     libraries = tmp_path / 'ros' / 'lib'
     libraries.mkdir(parents=True)
     (libraries / 'librcl.so').touch()
-    checkout.run('t3mpc')
-    program = checkout.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
+    program = ready.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
     program.write_text('#!/bin/sh\nenv\n')
-    output = checkout.run(
+    output = ready.run(
         't3mpc',
         PYTHONPATH=tmp_path / 'ros',
         AMENT_PREFIX_PATH=tmp_path / 'ros',
@@ -519,16 +524,15 @@ def test_a_sourced_ros_does_not_enter_the_local_environment(checkout, tmp_path):
         PYTHONDONTWRITEBYTECODE='1',
     ).stdout
     environment = dict(line.split('=', 1) for line in output.splitlines() if '=' in line)
-    assert environment['AMENT_PREFIX_PATH'] == str(checkout.root / '.venv')
+    assert environment['AMENT_PREFIX_PATH'] == str(ready.root / '.venv')
     assert environment['LD_LIBRARY_PATH'] == str(tmp_path / 'own')
     assert environment['ROS_DOMAIN_ID'] == '7'
     assert not {'PYTHONPATH', 'RMW_IMPLEMENTATION', 'PYTHONDONTWRITEBYTECODE'} & set(environment)
 
 
-def test_programs_run_in_a_locale_of_utf8(checkout):
+def test_programs_run_in_a_locale_of_utf8(ready):
     """In another, Python failed on its own path file if the path of the checkout had an umlaut."""
-    checkout.run('t3mpc')
-    program = checkout.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
+    program = ready.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
     program.write_text('#!/bin/sh\necho "$LC_ALL"\n')
     none = {'LC_ALL': '', 'LC_CTYPE': '', 'LANG': ''}
     for given, seen in (
@@ -537,21 +541,20 @@ def test_programs_run_in_a_locale_of_utf8(checkout):
         (none, 'C.UTF-8'),
         (none | {'LANG': 'C.UTF-8'}, ''),
     ):
-        assert checkout.run('t3mpc', **given).stdout == f'{seen}\n', given
+        assert ready.run('t3mpc', **given).stdout == f'{seen}\n', given
 
 
-def test_matplotlib_has_a_folder_without_a_home(checkout):
+def test_matplotlib_has_a_folder_without_a_home(ready):
     """Each of its commands began with a warning of two lines, and listed all fonts again."""
-    checkout.run('t3mpc')
-    program = checkout.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
+    program = ready.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
     program.write_text('#!/bin/sh\necho "$MPLCONFIGDIR"\n')
-    own = f'{checkout.root}/.venv/matplotlib'
+    own = f'{ready.root}/.venv/matplotlib'
     for home, given, seen in (
-        (checkout.root, '', ''),
+        (ready.root, '', ''),
         ('/dev/null', '', own),
         ('/dev/null', '/chosen', '/chosen'),
     ):
-        assert checkout.run('t3mpc', HOME=home, MPLCONFIGDIR=given).stdout == f'{seen}\n'
+        assert ready.run('t3mpc', HOME=home, MPLCONFIGDIR=given).stdout == f'{seen}\n'
 
 
 real_environment = pytest.mark.skipif(
