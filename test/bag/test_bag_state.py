@@ -27,14 +27,12 @@ from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
 from t3mpc_ros.bag.merged_reader import ScheduledMessage
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline
-from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.recording.snapshot import CircularMessageCache
 from t3mpc_ros.bag.writer import BagWriter
 
 SECOND, MS = 10**9, 10**6
 START = 1_700_000_000 * SECOND
 NUMBER = 'std_msgs/msg/Float64'
-LATCHED = QosProfile(durability='transient_local')
 DEFINITIONS = MessageDefinitions()
 
 

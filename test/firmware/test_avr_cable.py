@@ -13,8 +13,6 @@
 # limitations under the License.
 """The real firmware of the robot in simavr, driven over its USB, beside the radio."""
 
-import math
-
 import pytest
 from support.avr_bench import on_avr
 from support.avr_boards import ROBOT
@@ -26,7 +24,6 @@ from t3mpc_ros.radio.link.port_actions import LinkState
 pytestmark = [needing(*AVR), pytest.mark.slow]
 
 KEY = bytes(range(16))
-STEP = math.tau / 3200
 
 
 class CableBench(Bench):

@@ -23,8 +23,6 @@ pytestmark = needing(*AVR)
 
 EXTERNAL_RESET, WATCHDOG_RESET = 2, 8
 TIMER_0_INTERRUPTS = 0x6E  # TIMSK0 of the ATmega2560
-KEY_ADDRESS = 8
-SLOW_GAP = 20  # 5 ms: a signed HELLO takes four hashes
 
 
 # -- motion and stops -----------------------------------------------------------------------------
