@@ -110,7 +110,7 @@ CHECKS = {
 }
 
 
-@pytest.mark.parametrize('name', few_of(NAMES, 4))
+@pytest.mark.parametrize('name', few_of(NAMES, 2))
 def test_an_example_runs_and_shows_what_it_says(name, tmp_path):
     """Also where its folder is not there yet: those that a reader starts ended with an error."""
     CHECKS[name](load_example(name), tmp_path / 'made')

@@ -176,7 +176,7 @@ def own(tmp_path_factory):
 # -- truncated files ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('places', few_of([60, 1000]))
+@pytest.mark.parametrize('places', few_of([25, 1000]))
 @pytest.mark.slow
 def test_a_truncated_bag_keeps_its_complete_chunks_only(places, own):
     whole, ends, end = inside(own).items, chunk_ends(own), end_of_data(own)
@@ -245,7 +245,7 @@ def is_subsequence(part, whole):
 
 
 @pytest.mark.parametrize(
-    'kind, trials', few_of([*product(('own', 'lz4', 'none'), (50,)), ('own', 300)], 3)
+    'kind, trials', few_of([*product(('own', 'lz4', 'none'), (20,)), ('own', 300)], 3)
 )
 @pytest.mark.slow
 def test_flipped_bits_never_change_a_checksummed_message(own, kind, trials):
@@ -269,7 +269,7 @@ def test_many_flipped_bits_never_crash_the_recovery(own):
     rng = random.Random(9)
     unchunked = foreign_file(use_chunking=False)
     whole = inside(own).messages
-    for trial in range(40):
+    for trial in range(20):
         for content, covered in ((own, True), (unchunked, False)):
             _, result = salvaged(flipped(content, rng, 1 + trial % 20))
             kept = inside(result).messages

@@ -17,6 +17,7 @@ import math
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.keep_out import (
@@ -208,7 +209,7 @@ class Room:
         return self.keep_out.ranges.faults()
 
 
-@pytest.mark.parametrize('sensor', range(8))
+@pytest.mark.parametrize('sensor', few_of(range(8), step=3))
 def test_a_sensor_that_sees_nothing_is_found_by_what_others_saw(sensor):
     room = Room()
     assert room.run(20.0) == {}
@@ -291,7 +292,7 @@ def test_all_silent_brakes_stops_and_goes_on_by_itself():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize('lost', range(8))
+@pytest.mark.parametrize('lost', few_of(range(8), step=3))
 def test_with_one_sensor_lost_the_robot_drives_slowly(lost):
     robot = KeptOut()
     begin = robot.run_until_fast()

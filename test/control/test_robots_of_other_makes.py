@@ -97,7 +97,7 @@ def follow(file, rate, lag, dead_time):
             ('generic.yaml', 50.0, 0.1, 0.05),
             ('generic.yaml', 50.0, 0.03, 0.02),
         ],
-        3,
+        2,
     ),
 )
 @pytest.mark.slow

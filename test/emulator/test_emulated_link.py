@@ -28,6 +28,13 @@ from t3mpc_ros.radio.link.port_actions import LinkState
 pytestmark = pytest.mark.slow
 
 KEY = bytes(range(16))
+STRICTER = {
+    'drop_bytes', 'flip_bits', 'duplicate_bytes', 'insert_bytes', 'split', 'reorder', 'delay',
+    'stall', 'silence', 'jam', 'robot_reset', 'dongle_reset', 'radio_dead', 'imu_absent',
+    'button', 'close_port',
+}  # fmt: skip
+"""Faults from which test_avr_faults shows more than the recovery, on this emulator too."""
+KINDS = sorted((kind.name for kind in FAULT_KINDS), key=STRICTER.__contains__)
 
 
 def test_counters_equal_the_pulses_of_the_plant():
@@ -136,7 +143,7 @@ def test_a_reset_stops_the_pulses_and_the_wheels_coast():
 
 
 @pytest.mark.parametrize('keyed', few_of([True, False]))
-@pytest.mark.parametrize('name', [kind.name for kind in FAULT_KINDS])
+@pytest.mark.parametrize('name', few_of(KINDS, len(FAULT_KINDS) - len(STRICTER)))
 def test_the_link_recovers_from_every_fault(name, keyed):
     bench = Bench(key=KEY if keyed else b'')
     bench.connect()

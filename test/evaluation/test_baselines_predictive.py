@@ -390,7 +390,7 @@ def test_knowing_the_friction_helps_where_the_estimate_is_late(kind, drive):
 
 
 @pytest.mark.parametrize('drive', few_of(DRIVES))
-@pytest.mark.parametrize('kind', [LinearMpc, LinearMpcPreview, CasadiNmpc])
+@pytest.mark.parametrize('kind', few_of([CasadiNmpc, LinearMpc, LinearMpcPreview]))
 def test_observer_parts_noise_from_following(kind, drive):
     """With a true model a slow observer follows as sharply, and feeds back far less noise."""
     reference = _wander(400)

@@ -263,6 +263,7 @@ def test_with_the_ramp_an_ideal_drive_leaves_no_feedback(lag):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_ramp_is_worth_more_than_the_gains_at_switches():
     scenario, known = Scenario('servo', 'nominal', 2001, 30.0), methods_for('servo')
     errors = [measure(run(scenario, known[name]))[OVERALL.name] for name in (PI, PI + RAMP)]

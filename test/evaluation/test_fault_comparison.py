@@ -63,6 +63,7 @@ def test_commands_that_are_lost_are_named(monkeypatch):
     assert run_job((exact, exact))[1] == []
 
 
+@pytest.mark.long
 def test_contradicted_assumptions_cost_little(monkeypatch):
     """They cost up to four times the settled error without them."""
     monkeypatch.setattr(fault_comparison, 'DURATION', 16.0)

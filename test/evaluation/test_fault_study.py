@@ -204,21 +204,6 @@ def test_the_page_has_a_row_for_every_trial_and_no_other():
     assert page_section([]).partition('\n###')[0].split(END_MARK)[0].strip() in PAGE.read_text()
 
 
-def test_a_known_delay_costs_little():
-    """What hurts is not the delay but not to know of it: the controller finds it out."""
-    own = OwnParts(robot_parameters={'faults.command_delay': 0.1})
-    errors = []
-    for dead_time, estimated in ((0.01, False), (0.01, True), (0.11, True)):
-        changes = {'speed_filter.dead_time': dead_time, 'estimate_dead_time': estimated}
-        scenario = Scenario('twin', 'nominal', 1, 10.0, own=own)
-        record = run(scenario, NodeMethod('changed', changes))
-        rows = record.rows(5.0, 10.0)
-        errors.append(np.sqrt(np.mean(record.error[rows] ** 2)))
-    assert errors[0] > 0.1
-    assert errors[1] < 0.2 * errors[0]
-    assert errors[2] < 0.2 * errors[0]
-
-
 # --- the judge ----------------------------------------------------------------------------------
 
 AT = fault_run('chaotic', 'gyro_dead')

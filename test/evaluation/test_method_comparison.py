@@ -216,7 +216,7 @@ def test_methods_are_paired():
     assert not np.array_equal(mine.reference, another.reference)
 
 
-@pytest.mark.parametrize('case', cases_for('twin'))
+@pytest.mark.parametrize('case', few_of(cases_for('twin'), step=3))
 def test_every_case_of_the_twin_drives(case):
     """The robot follows in every case: worse than usual, but it does not stop or diverge."""
     scenario, record = twin(case, FEED_FORWARD)

@@ -22,7 +22,6 @@ import math
 import pytest
 from support.long_tests import few_of
 
-from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.loop import ReportLink
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, methods_for
@@ -134,30 +133,9 @@ def test_faults_of_the_gyro_cost_no_more_than_without_feedback(monkeypatch, name
     assert_not_much_worse(*found)
 
 
-def test_a_gyro_with_the_scale_of_its_data_sheet_is_not_followed(monkeypatch):
-    changes = {'imu.gyro_scale_error': 0.03}
-    found = [run(monkeypatch, method, changes=changes) for method in (FULL, FEED_FORWARD)]
-    assert_not_much_worse(*found)
-
-
 def test_an_odometry_without_twist_is_differentiated(monkeypatch):
     """Its errors were five times those of an open loop, for ever."""
     exact = run(monkeypatch, FULL)
     found = run(monkeypatch, FULL, without_twist)
     assert found['overall'] < 1.1 * exact['overall']
     assert found['settled'] < 1.6 * exact['settled']
-
-
-def test_messages_that_were_overtaken_are_counted(monkeypatch):
-    made = []
-
-    class Counted(Controller):
-        def __init__(self, *arguments):
-            super().__init__(*arguments)
-            made.append(self)
-
-    monkeypatch.setattr('t3mpc_ros.evaluation.drivers.Controller', Counted)
-    run(monkeypatch, FULL, swapped(20))
-    assert made[0].ignored_odometry == int(DURATION * 100) // 20 - 1
-    made[0].reset()
-    assert made[0].ignored_odometry == 0

@@ -43,6 +43,7 @@ def test_values_that_destabilised_are_refused_or_harmless(monkeypatch):
     assert worst.ratio > 0.1
 
 
+@pytest.mark.long
 def test_a_point_that_is_bad_is_found_and_reduced(monkeypatch):
     monkeypatch.setattr(parameter_search, 'DURATION', 8.0)
     point = {'composition': 'paper', 'law.gain': 1.0, 'body.yaw_gain': 0.5, 'use_fuzzy': True}

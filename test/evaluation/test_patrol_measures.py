@@ -195,20 +195,10 @@ def test_a_closed_curve_is_predicted_exactly():
 
 
 @pytest.mark.slow
-def test_noise_is_not_predicted_beyond_its_correlation():
-    """An observer with a glance at the second half would have a skill here."""
-    generator = np.random.default_rng(3)
-    t = np.arange(0.0, 601.0)
-    skills = _best(t, *generator.standard_normal((2, t.size)))
-    assert skills[0] < 0.25  # the line between two points is known half-way
-    assert skills[1:] == pytest.approx([0.0, 0.0, 0.0], abs=0.02)
-
-
-@pytest.mark.slow
 def test_skill_of_a_gauss_markov_process_is_its_correlation():
     """The best predictor of a Gauss-Markov process has the skill exp(-2 h / T)."""
     generator = np.random.default_rng(4)
-    t = np.arange(0.0, 1200.0, 0.25)
+    t = np.arange(0.0, 900.0, 0.25)
     keep = math.exp(-0.25 / 6.0)
     path = np.empty((t.size, 2))
     path[0] = generator.standard_normal(2)

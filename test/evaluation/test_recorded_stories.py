@@ -60,9 +60,10 @@ def test_the_first_sentence_tells_the_story_everywhere(name, tmp_path, capsys):
     assert re.fullmatch(story.sentence, sentence), sentence
     assert kind == story.kind
     assert printed.startswith(sentence)
-    banner = read_all(recorded_run(bag))[0]['facts']['banner']
-    assert banner['headline'] == sentence
-    assert (banner['kind'] == 'good') == (kind == 'good')
+    if name in ('good', 'e-stop'):
+        banner = read_all(recorded_run(bag))[0]['facts']['banner']
+        assert banner['headline'] == sentence
+        assert (banner['kind'] == 'good') == (kind == 'good')
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ import math
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.geometry.types import NANOSECONDS, Pose
 from t3mpc_ros.localization.change_detection import (
@@ -168,7 +169,7 @@ def test_equal_readings_give_equal_events():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', few_of(range(4)))
 def test_no_readings_of_a_fan_of_beams_are_too_much(seed):
     """One beam saw a thing over which another one passed: its place had no cell, and no middle."""
     generator = np.random.default_rng(seed)

@@ -19,6 +19,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.control.watchdog import ContactMonitor
 from t3mpc_ros.geometry.kinematics import advance_pose
@@ -187,6 +188,7 @@ def test_a_robot_that_is_carried_is_lost_and_found_again():
     assert error(localizer, drive)[0] < 0.05
 
 
+@pytest.mark.long
 @pytest.mark.compiled
 def test_without_recovery_a_carried_robot_stays_lost():
     """The recovery is what finds it: without random particles nothing does."""
@@ -315,7 +317,7 @@ def test_things_that_the_map_lacks_do_not_lead_it_away():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize('missing', ['boxes', 'circles'])
+@pytest.mark.parametrize('missing', few_of(['boxes', 'circles']))
 def test_a_thing_that_is_gone_does_not_make_it_doubt_its_place(missing):
     """It was lost after 20 readings that passed where a box had been: it was no event yet."""
     localizer, drive = make_localizer(), Drive()
@@ -426,8 +428,8 @@ def test_the_corrected_pose_jumps_where_the_robot_is_found():
     assert math.hypot(pose.x - drive.truth.x, pose.y - drive.truth.y) < 0.06
 
 
-@pytest.mark.parametrize('away', [(0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)])
-def test_a_correction_is_no_contact(away):
+@pytest.mark.parametrize('x, y', few_of([(0.2, 0.0), (0.0, 0.2), (-0.2, 0.0), (0.0, -0.2)], 2))
+def test_a_correction_is_no_contact(x, y):
     """A robot backed off, twice, from nothing, and then took itself to be walled in for ever.
 
     In tight curves it still did so: most of the way of its centre is then the correction.
@@ -448,7 +450,7 @@ def test_a_correction_is_no_contact(away):
         now = BodyTwist(now.linear + step[0], now.angular + step[1])
         pose = advance_pose(pose, now, 0.01)
         if k % 2800 == 0:  # at each of them once
-            frame = Pose(frame.x + away[0], frame.y + away[1], frame.yaw)
+            frame = Pose(frame.x + x, frame.y + y, frame.yaw)
         localizer = SimpleNamespace(
             result=SimpleNamespace(odometry_frame=frame), state=Localization.LOCALIZED
         )

@@ -180,7 +180,7 @@ def test_commands_within_the_torque_lose_no_steps():
     """
     motor = StepperMotorParameters()
     generator = np.random.default_rng(4)
-    for _ in range(30):
+    for _ in range(12):
         robot = drivetrain(motor, friction=FrictionParameters())
         for _ in range(12):
             speed = generator.uniform(-12.0, 12.0)

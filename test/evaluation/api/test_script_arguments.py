@@ -298,7 +298,8 @@ def test_every_argument_changes_what_is_done(name, tmp_path, monkeypatch, capsys
     if 'output' in changes:
         pytest.importorskip('pyarrow')
     first = observed(function, base, capsys)
-    assert observed(function, base, capsys) == first
+    if name in METHODS:  # one_run_is_the_same_in_every_function repeats runs
+        assert observed(function, base, capsys) == first
     for argument, value in changes.items():
         assert observed(function, {**base, argument: value}, capsys) != first, argument
 
@@ -334,7 +335,7 @@ WRITERS = {
 ENDS = {'to_csv': '.csv', 'to_parquet': '.parquet', 'to_html': '.html', 'plot': '.png'}
 
 
-@pytest.mark.parametrize('name', few_of(WRITERS, 2))
+@pytest.mark.parametrize('name', few_of(WRITERS, step=3))
 def test_a_file_that_exists_is_replaced(name, tmp_path):
     make, writers = WRITERS[name]
     result = make()
