@@ -199,7 +199,7 @@ def test_a_second_reader_of_the_port_causes_no_wrong_command(harness, served):
     foreign_node = os.open(board.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     dice = random.Random(4)
     count = len(board.followed)
-    for _ in range(60):
+    for _ in range(30):
         foreign = Command(
             1 + dice.randrange(255), dice.randrange(256), 1, 20, -9000, 9000, dice.randrange(2**32)
         )

@@ -38,7 +38,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 
 pytestmark = [pytest.mark.ros, pytest.mark.timed]
 
-SLOTS = 5
+SLOTS = 3
 """Recorders at a time."""
 
 
