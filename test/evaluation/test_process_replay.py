@@ -47,6 +47,7 @@ from t3mpc_ros.bag.model_file import save_model
 from t3mpc_ros.bag.reader import open_bag, read_columns
 from t3mpc_ros.bag.writer import BagWriter, DataError
 from t3mpc_ros.cli.bag import add_compare_parser, add_replay_parser
+from t3mpc_ros.control import watchdog
 from t3mpc_ros.control.controller import ControllerParameters, StepperControllerParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
@@ -526,7 +527,15 @@ BUILT = {
 
 
 @pytest.fixture(scope='module')
-def plain_runs(tmp_path_factory):
+def turned_by_hand():
+    """Let the robot of these runs turn whatever is commanded, which otherwise is a contact."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(watchdog, 'THROWN', math.inf)
+        yield
+
+
+@pytest.fixture(scope='module')
+def plain_runs(tmp_path_factory, turned_by_hand):
     """Return the run with the usual parameters of a row of the table."""
     made = functools.cache(
         lambda items: built_run(tmp_path_factory.mktemp('run') / 'plain', dict(items))
