@@ -222,6 +222,8 @@ TWIST_MEMORY = 1.0 - 1.0 / 60.0
 """Forgetting factor of a comparison: 30 s."""
 TWIST_TOLERANCE, TWIST_CERTAIN = 0.05, 4.0
 """Deviation of the factor between twist and pose that counts, and its standard deviations."""
+SIDEWAYS = 0.2
+"""Share of the way by which a pose may go aside: the cosine of such an angle is tolerable."""
 JUMP = 0.1, 0.3
 """Change of the pose beyond the motion that is a jump, m and rad."""
 
@@ -247,19 +249,20 @@ class TwistFactor:
         """The factor in use; 1 unless it is certainly another one."""
         self._sums = [[0.0] * 3 for _ in range(2)]
         """Of each velocity, sums of squares of the pose, of products, of squares of the twist."""
-        self._blocks = 0.0
+        self._blocks = self._aside = 0.0
         self.interrupt()
 
     def interrupt(self) -> None:
         """Discard the present comparison: messages are missing."""
-        self._time = 0.0
+        self._time = self._left = 0.0
         self._block = [[0.0, 0.0], [0.0, 0.0]]
 
     def update(self, last: State, new: State) -> None:
         """Compare the twists of two messages in a row with the change of the pose."""
         elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
         self._time += elapsed
-        ahead, _, turn = motion_between(last.pose, new.pose)
+        ahead, left, turn = motion_between(last.pose, new.pose)
+        self._left += left
         for i, (block, by_pose) in enumerate(zip(self._block, (ahead, turn), strict=True)):
             by_twist = 0.5 * elapsed * (last.twist[i] + new.twist[i])
             if abs(by_pose - by_twist) > JUMP[i]:
@@ -273,13 +276,16 @@ class TwistFactor:
             products = by_pose * by_pose, by_pose * by_twist, by_twist * by_twist
             sums[:] = [TWIST_MEMORY * old + more for old, more in zip(sums, products, strict=True)]
         self._blocks = TWIST_MEMORY * self._blocks + 1.0
+        self._aside = TWIST_MEMORY * self._aside + self._left**2
         self.interrupt()
         self._decide()
 
     def _decide(self) -> None:
         (linear, spread), (angular, other_spread) = (self._fit(i) for i in (0, 1))
-        apart = abs(angular - linear) > TWIST_TOLERANCE + TWIST_CERTAIN * other_spread
+        apart = abs(angular - linear) > 0.5 * abs(linear - 1.0) + TWIST_CERTAIN * other_spread
         least = max(TWIST_TOLERANCE, TWIST_CERTAIN * spread)
+        # After the yaw was set, the robot goes aside by its pose, and its way ahead is shorter.
+        apart |= self._aside > SIDEWAYS**2 * self._sums[0][0]
         self.value = linear if abs(linear - 1.0) > least and linear > 0.0 and not apart else 1.0
 
     def _fit(self, axis: int) -> tuple[float, float]:
