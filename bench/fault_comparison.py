@@ -14,7 +14,7 @@
 # limitations under the License.
 """Faults and wrong assumptions: the controller of the node beside simple ones on the twin.
 
-Usage: fault_comparison.py [--seeds 2001-2003] [--nmpc-seeds 2001-2002] [--only TEXT] [--workers N]
+Usage: fault_comparison.py [--seeds 2001-2006] [--nmpc-seeds 2001-2006] [--only TEXT] [--workers N]
                            [--page docs/faults.md]
 
 For each row the errors, settled and with switches, of full, of the simple methods and of the NMPC
@@ -418,8 +418,8 @@ def seeds_of(text: str) -> range:
 def main() -> int:
     """Print the table; return 1 if full is too much worse, or a fault is not named."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n', maxsplit=1)[0])
-    parser.add_argument('--seeds', type=seeds_of, default='2001-2003')
-    parser.add_argument('--nmpc-seeds', type=seeds_of, default='2001-2002')
+    parser.add_argument('--seeds', type=seeds_of, default='2001-2006')
+    parser.add_argument('--nmpc-seeds', type=seeds_of, default='2001-2006')
     parser.add_argument('--only', default='', help='rows whose name contains this')
     parser.add_argument('--workers', type=int, default=2)
     parser.add_argument('--page', type=Path, help='page with the marks of the table')
