@@ -206,8 +206,8 @@ setup(
     ],
     entry_points={
         'console_scripts': [
-            *(f'{node} = {NAME}.nodes.entry_point:{node}' for node in NODES if not FOR_PIP),
-            f't3mpc = {NAME}.cli.executable:t3mpc',
+            *(f'{node} = {NAME}.nodes.entry_points:{node}' for node in NODES if not FOR_PIP),
+            f't3mpc = {NAME}.cli.entry_point:t3mpc',
         ],
     },
 )

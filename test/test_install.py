@@ -188,7 +188,7 @@ def test_the_installed_program_computes_lyapunov_exponents(tree):
 def test_colcon_test_runs_the_tests_and_reports_them(copied):
     """Without pytest as a test dependency it ran nothing and reported success."""
     workspace = copied.source.parent.parent
-    some = ['--pytest-args', 'test/geometry/test_sample_clock.py']
+    some = ['--pytest-args', 'test/geometry/test_sample_scheduler.py']
     for words in (['test', *some], ['test-result', '--all']):
         done = subprocess.run(
             [*copied.colcon, *words],

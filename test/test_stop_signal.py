@@ -62,7 +62,7 @@ def test_a_signal_during_the_start_ends_the_process_with_code_0():
     assert subprocess.run([sys.executable, '-c', program], check=False).returncode == 0
 
 
-@pytest.mark.parametrize(('module', 'code'), [('nodes.entry_point', 0), ('cli.executable', 130)])
+@pytest.mark.parametrize(('module', 'code'), [('nodes.entry_points', 0), ('cli.entry_point', 130)])
 def test_ctrl_c_while_an_executable_imports_is_quiet(module, code):
     """It ended with a traceback of 34 lines."""
     program = (

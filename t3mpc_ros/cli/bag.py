@@ -22,7 +22,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from t3mpc_ros.cli.command import ArgumentParser, RemovedOption, run_command
+from t3mpc_ros.cli.argument_parser import ArgumentParser, RemovedOption, run_command
 from t3mpc_ros.cli.run_options import add_json, add_topic_options, print_result, report_options
 from t3mpc_ros.cli.train import add_bag_options, run_bags
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
@@ -479,7 +479,7 @@ def run_replay(options: argparse.Namespace) -> None:
         **outcome.to_dict(),
     }
     if options.output:
-        from t3mpc_ros.evaluation.process_replay.replay_bag import write_replay
+        from t3mpc_ros.evaluation.process_replay.replay_writer import write_replay
 
         record['output'] = str(write_replay(inputs, again, options.output))
         text += f'\nwritten to {record["output"]}'

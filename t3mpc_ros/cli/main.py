@@ -24,8 +24,8 @@ import sys
 from typing import Any
 import webbrowser
 
-from t3mpc_ros.cli import compare, faults, graph, paper, patrol, sweep, train, tune, view
-from t3mpc_ros.cli.command import ArgumentParser, reject_removed, run_command
+from t3mpc_ros.cli import compare, faults, paper, patrol, ros2_commands, sweep, train, tune, view
+from t3mpc_ros.cli.argument_parser import ArgumentParser, reject_removed, run_command
 from t3mpc_ros.cli.run_options import add_json, add_seeds, prepare_outputs, print_result
 from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.parameters.command_line import bounded_float
@@ -113,7 +113,7 @@ def _new_run(folder: Path) -> Path:
 
 def _estimation(options: argparse.Namespace) -> None:
     from t3mpc_ros.evaluation.open_loop_estimation import compare, records
-    from t3mpc_ros.evaluation.paper.results import estimation
+    from t3mpc_ros.evaluation.paper.paper_tables import estimation
 
     prepare_outputs(options)
     results = compare(
@@ -274,7 +274,7 @@ def _parser(
     add_json(exponents)
     exponents.set_defaults(run=_exponents)
 
-    for module in (paper, compare, sweep, patrol, tune, train, faults, view, graph):
+    for module in (paper, compare, sweep, patrol, tune, train, faults, view, ros2_commands):
         module.add_parser(commands)
     completing = commands.add_parser(
         'completion', help='print what bash or zsh completes: eval "$(t3mpc completion bash)"'

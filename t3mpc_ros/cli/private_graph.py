@@ -25,7 +25,7 @@ import socket
 from typing import Self
 
 from t3mpc_ros.cli.process_group import installed_file
-from t3mpc_ros.nodes.process import provide_log_directory
+from t3mpc_ros.nodes.node_main import provide_log_directory
 
 DOMAINS = range(1, 102)
 """Domains of private graphs: 0 is the default of all robots, those above use ephemeral ports."""

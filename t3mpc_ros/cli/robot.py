@@ -22,24 +22,24 @@ import sys
 from typing import Any, TypeVar
 
 from t3mpc_ros.cli import robot_calibrate
-from t3mpc_ros.cli.command import ArgumentParser, ask_line, check_two_ports
+from t3mpc_ros.cli.argument_parser import ArgumentParser, ask_line, check_two_ports
 from t3mpc_ros.cli.run_options import STANDARD_OUTPUT, add_json, print_result
 from t3mpc_ros.parameters import command_line
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.parameters.yaml_files import YamlError, file_errors, read_yaml
+from t3mpc_ros.parameters.yaml_checks import YamlError, file_errors, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
 from t3mpc_ros.radio.tool import (
     channel_scan,
     eeprom_records,
-    jog,
     key_provisioning,
     link_test,
     procedure,
     robot_info,
     robot_log,
     robot_settings,
+    wheel_jog,
 )
 from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, ProcedureError, Script
 from t3mpc_ros.radio.tool.robot_settings import SettingsFileError, StoredSettings
@@ -234,7 +234,7 @@ def _jog(options: argparse.Namespace, stop: StopSignal) -> int:
     if not options.yes and not _ask(motion, stop):
         print('t3mpc robot: nothing was moved', file=sys.stderr)
         return EXIT_INTERRUPTED if stop() else EXIT_FAILED
-    task = jog.Jog(
+    task = wheel_jog.Jog(
         parameters,
         _key_option(options),
         os.urandom,
@@ -245,7 +245,7 @@ def _jog(options: argparse.Namespace, stop: StopSignal) -> int:
     )
     procedure.run_at_port(task, options.port, stop)
     if task.result is not None:
-        print(jog.format_result(task.result, options.wheel, options.revolutions))
+        print(wheel_jog.format_result(task.result, options.wheel, options.revolutions))
     if task.error:
         raise ProcedureError(task.error)
     return EXIT_OK
@@ -401,7 +401,7 @@ def program_parser() -> argparse.ArgumentParser:
 
     text = 'turn one wheel, with both wheels in the air'
     add = link_command('jog', _jog, text, True).add_argument
-    add('wheel', choices=(jog.LEFT, jog.RIGHT))
+    add('wheel', choices=(wheel_jog.LEFT, wheel_jog.RIGHT))
     add('revolutions', type=_revolutions, metavar='REVOLUTIONS', help='negative: backward')
     text = 'wheel speed, rad/s (default 2)'
     add('--speed', type=command_line.bounded_float(0.2, 10.0), default=2.0, help=text)

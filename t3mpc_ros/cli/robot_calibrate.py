@@ -22,11 +22,11 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from t3mpc_ros.cli.command import ask_line, check_two_ports
+from t3mpc_ros.cli.argument_parser import ask_line, check_two_ports
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_writable
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.parameters.yaml_files import file_errors, parameter_file, read_yaml
+from t3mpc_ros.parameters.yaml_checks import file_errors, parameter_file, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool.calibration_wizard import (
     STEPS,

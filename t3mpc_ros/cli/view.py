@@ -27,7 +27,7 @@ from t3mpc_ros.stop_signal import StopSignal
 
 if TYPE_CHECKING:
     from t3mpc_ros.nodes.viewer import ViewNode
-    from t3mpc_ros.view.live_run import LiveRun
+    from t3mpc_ros.view.run_status import LiveRun
     from t3mpc_ros.view.server import PageServer
 
 DEFAULT_PORT = 8765
@@ -57,12 +57,12 @@ def add_parser(commands: Any) -> None:
 
 def _view(options: argparse.Namespace) -> None:
     # Imported only when it is used: `t3mpc --help` stays fast.
-    from t3mpc_ros.view.live_run import LiveRun
+    from t3mpc_ros.view.run_status import LiveRun
     from t3mpc_ros.view.server import PageServer
 
     with StopSignal() as stop:
         if options.bag is not None:
-            from t3mpc_ros.cli.recorded_run import recorded_run
+            from t3mpc_ros.cli.bag_view import recorded_run
 
             print(f'reading {options.bag}', file=sys.stderr, flush=True)
             shown = recorded_run(options.bag, options.namespace or None)
@@ -90,7 +90,7 @@ def _commanded_page(
     run: 'LiveRun', node: 'ViewNode', options: argparse.Namespace
 ) -> 'Iterator[PageServer]':
     """Yield a page whose commands the node executes, but for those of the recorder."""
-    from t3mpc_ros.cli.run_recorder import RunRecorder
+    from t3mpc_ros.cli.view_recorder import RunRecorder
     from t3mpc_ros.view.server import PageServer
 
     def command(name: str, arguments: Mapping[str, Any], asked: float) -> str:

@@ -49,7 +49,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.control.range_monitor import RangeMonitor
+from t3mpc_ros.control.range_fault_detection import RangeMonitor
 from t3mpc_ros.geometry.arena import OCCUPIED_PERCENT, Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.types import STANDSTILL, Array, BodyTwist, Pose, has_moved, wrap_angle
 from t3mpc_ros.kernels import TypedKernel, kernel

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.charts import Chart, PageData, Plane, Timeline
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
-from t3mpc_ros.page.page_files import page_file
+from t3mpc_ros.page.assets import page_file
 from t3mpc_ros.parameters.table import find_names
 
 if TYPE_CHECKING:

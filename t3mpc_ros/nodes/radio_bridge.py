@@ -29,8 +29,7 @@ from typing import Any, ClassVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
-from t3mpc_ros.nodes.robot_node import RobotNode
-from t3mpc_ros.nodes.robot_topics import (
+from t3mpc_ros.nodes.robot_messages import (
     FOLLOWING,
     RobotDescription,
     RobotTopicParameters,
@@ -38,6 +37,7 @@ from t3mpc_ros.nodes.robot_topics import (
     state_values,
     state_warnings,
 )
+from t3mpc_ros.nodes.robot_node import RobotNode
 from t3mpc_ros.parameters.table import group, parameter
 from t3mpc_ros.radio.link.port_actions import Close, LinkState, Open, Wait, Write
 from t3mpc_ros.radio.link.standstill_reasons import ROBOT_USB

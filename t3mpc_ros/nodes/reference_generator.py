@@ -42,7 +42,7 @@ from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY, SALT_BYTES, finger
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, points_from_frame
 from t3mpc_ros.geometry.path_file import load_path
 from t3mpc_ros.geometry.path_timing import PathError, check_points
-from t3mpc_ros.geometry.sample_clock import SampleScheduler
+from t3mpc_ros.geometry.sample_scheduler import SampleScheduler
 from t3mpc_ros.geometry.types import (
     NANOSECONDS,
     ORIGIN,

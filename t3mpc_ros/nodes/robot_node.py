@@ -25,9 +25,9 @@ from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.geometry.kinematics import frame_between, wheels_from_twist
 from t3mpc_ros.geometry.types import RANGE_SENSORS, BodyTwist, Pose
-from t3mpc_ros.nodes import conversions, qos, robot_topics
+from t3mpc_ros.nodes import conversions, qos, robot_messages
 from t3mpc_ros.nodes.base_node import ADAPT_PERIOD, BaseNode, MatchingSubscription
-from t3mpc_ros.nodes.robot_topics import RobotDescription, RobotTopicParameters
+from t3mpc_ros.nodes.robot_messages import RobotDescription, RobotTopicParameters
 from t3mpc_ros.robot.description import fixed_frames
 from t3mpc_ros.robot.interface import RobotCommand, RobotInterface, RobotState
 
@@ -197,11 +197,11 @@ class RobotNode(BaseNode[P]):
         _, range_sensor, battery = robot.sensors
         self._imu_publisher = self.create_publisher(Imu, 'imu/data_raw', qos.STREAM)
         self._battery_publisher = self.create_publisher(BatteryState, 'battery_state', qos.SCALARS)
-        self._battery_message = robot_topics.battery_message(battery)
+        self._battery_message = robot_messages.battery_message(battery)
         self._ranges = []
         for name in RANGE_SENSORS if parameters.range_rate else ():
             frame = self._frame(parameters.frame_names.range_sensor(name))
-            message = robot_topics.range_message(range_sensor, frame)
+            message = robot_messages.range_message(range_sensor, frame)
             publisher = self.create_publisher(Range, f'range/{name}', qos.SCALARS)
             self._ranges.append((publisher, message))
         if parameters.enable_static_tf:
@@ -210,13 +210,13 @@ class RobotNode(BaseNode[P]):
     def _set_covariances(self) -> None:
         geometry, variance = self._description.geometry, self._description.variance
         self._twist_covariances = {
-            slipping: robot_topics.twist_covariance(geometry, math.inf if slipping else variance)
+            slipping: robot_messages.twist_covariance(geometry, math.inf if slipping else variance)
             for slipping in (False, True)
         }
         self._slipping: bool | None = None
         if self._description.sensors is not None:
             frame = self._frame(self.parameters.imu_frame_id)
-            self._imu_message = robot_topics.imu_message(self._description.sensors[0], frame)
+            self._imu_message = robot_messages.imu_message(self._description.sensors[0], frame)
 
     def _frame(self, name: str) -> str:
         return self.parameters.prefixed(name, self.get_namespace())
@@ -261,18 +261,18 @@ class RobotNode(BaseNode[P]):
         stamp_ns = state.stamp_ns
         if state.imu is not None:
             self._imu_publisher.publish(
-                robot_topics.fill_imu(self._imu_message, state.imu, stamp_ns)
+                robot_messages.fill_imu(self._imu_message, state.imu, stamp_ns)
             )
         if self._is_due(self.parameters.range_rate):
             infinity = self.parameters.range_infinity
             for (publisher, message), distance in zip(self._ranges, state.ranges, strict=False):
                 if not math.isnan(distance):
                     publisher.publish(
-                        robot_topics.fill_range(message, distance, stamp_ns, infinity=infinity)
+                        robot_messages.fill_range(message, distance, stamp_ns, infinity=infinity)
                     )
         if state.battery is not None and self._is_due(BATTERY_RATE):
             self._battery_publisher.publish(
-                robot_topics.fill_battery(self._battery_message, state.battery, stamp_ns)
+                robot_messages.fill_battery(self._battery_message, state.battery, stamp_ns)
             )
 
     def _is_due(self, rate: float) -> bool:

@@ -20,12 +20,11 @@ from typing import Any
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from t3mpc_ros.geometry.sample_clock import RealTimeFactor, SampleScheduler, SimulatedTime
+from t3mpc_ros.geometry.sample_scheduler import RealTimeFactor, SampleScheduler, SimulatedTime
 from t3mpc_ros.geometry.types import NANOSECONDS, Pose
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN
-from t3mpc_ros.nodes.robot_node import RobotNode
-from t3mpc_ros.nodes.robot_topics import (
+from t3mpc_ros.nodes.robot_messages import (
     FOLLOWING,
     RobotDescription,
     RobotTopicParameters,
@@ -33,6 +32,7 @@ from t3mpc_ros.nodes.robot_topics import (
     state_values,
     state_warnings,
 )
+from t3mpc_ros.nodes.robot_node import RobotNode
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 from t3mpc_ros.robot.interface import RobotState
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters, make_robot

@@ -53,7 +53,7 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry, wheels_from_twist
 from t3mpc_ros.geometry.path_timing import PathError, check_points
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, State
 from t3mpc_ros.nodes import conversions
-from t3mpc_ros.nodes.process import own_context
+from t3mpc_ros.nodes.node_main import own_context
 from t3mpc_ros.nodes.qos import PolledCallbackGroup, full_name, take_with_info
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters, plain_value
 from t3mpc_ros.robot.description import sensor_mounts
@@ -110,7 +110,8 @@ class CommandFailedError(RuntimeError):
 class ViewNode(Node):
     """Collects samples, facts and reports of the robot in a namespace, and executes commands.
 
-    ``sink``, a :class:`t3mpc_ros.view.live_run.LiveRun`, gets them in the thread of :meth:`spin`.
+    ``sink``, a :class:`~t3mpc_ros.view.run_status.LiveRun`, gets them in the thread of
+    :meth:`spin`.
     """
 
     def __init__(self, sink: Any, namespace: str = '') -> None:

@@ -40,7 +40,7 @@ from t3mpc_ros.simulation.fault_injection import (
     active_faults,
     load_schedule,
 )
-from t3mpc_ros.simulation.fixed_step import FixedStepRobot
+from t3mpc_ros.simulation.fixed_step_robot import FixedStepRobot
 from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
 from t3mpc_ros.simulation.plant.disturbances import Disturbance, MeasurementNoise, SpeedNoise
 from t3mpc_ros.simulation.plant.drivetrain import Drivetrain, Load, TyreParameters, max_rate

@@ -21,7 +21,7 @@ import math
 import os
 from pathlib import Path
 
-from t3mpc_ros.parameters import yaml_files
+from t3mpc_ros.parameters import yaml_checks
 from t3mpc_ros.parameters.table import (
     ParameterError,
     Parameters,
@@ -139,19 +139,19 @@ class FaultEvent:
     def __post_init__(self) -> None:
         try:
             object.__setattr__(
-                self, 'at', yaml_files.check_number(self.at, 'at', 0.0, _MAX_TIME, 's')
+                self, 'at', yaml_checks.check_number(self.at, 'at', 0.0, _MAX_TIME, 's')
             )
             if self.duration != math.inf:
-                duration = yaml_files.check_number(
+                duration = yaml_checks.check_number(
                     self.duration, 'for', MIN_DURATION, _MAX_TIME, 's'
                 )
                 object.__setattr__(self, 'duration', duration)
-        except yaml_files.EntryError as error:
+        except yaml_checks.EntryError as error:
             raise ScheduleError(str(error)) from None
         if not isinstance(self.fault, str) or self.fault not in FAULTS:
             raise ScheduleError(
                 f'fault must be one of {", ".join(FAULTS)}: '
-                f'got {yaml_files.shortened(self.fault)}{nearest_hint(str(self.fault), FAULTS)}'
+                f'got {yaml_checks.shortened(self.fault)}{nearest_hint(str(self.fault), FAULTS)}'
             )
         try:
             object.__setattr__(self, 'value', FAULTS[self.fault].check(self.value))
@@ -244,19 +244,19 @@ def load_schedule(name_or_path: str | Path) -> FaultSchedule:
                 f'got {name}{nearest_hint(str(name), bundled)}'
             )
         path = SCHEDULES_FOLDER / f'{name}.yaml'
-    with yaml_files.file_errors(name, ScheduleError):
-        content = yaml_files.read_yaml(path)
+    with yaml_checks.file_errors(name, ScheduleError):
+        content = yaml_checks.read_yaml(path)
         if isinstance(content, dict):
-            content = yaml_files.check_entry(content, 'the schedule', ('events',))['events']
+            content = yaml_checks.check_entry(content, 'the schedule', ('events',))['events']
         return FaultSchedule(
-            map(_event, count(), yaml_files.check_list(content, 'events')), path.stem
+            map(_event, count(), yaml_checks.check_list(content, 'events')), path.stem
         )
 
 
 def _event(index: int, content: object) -> FaultEvent:
     where = f'events[{index}]'
-    entry = yaml_files.check_entry(content, where, ('at', 'fault', 'value'), ('for',))
+    entry = yaml_checks.check_entry(content, where, ('at', 'fault', 'value'), ('for',))
     try:
         return FaultEvent(entry['at'], entry['fault'], entry['value'], entry.get('for', math.inf))
     except ScheduleError as error:
-        raise yaml_files.EntryError(f'{where}.{error}') from None
+        raise yaml_checks.EntryError(f'{where}.{error}') from None

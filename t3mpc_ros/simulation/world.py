@@ -31,7 +31,7 @@ import numpy.typing as npt
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
-from t3mpc_ros.parameters import yaml_files
+from t3mpc_ros.parameters import yaml_checks
 from t3mpc_ros.parameters.table import nearest_hint
 
 WORLDS_FOLDER = Path(__file__).resolve().parent / 'worlds'
@@ -219,8 +219,8 @@ def load_world(path_or_name: str | Path) -> World:
     if path_or_name in names:
         path = WORLDS_FOLDER / f'{path_or_name}.yaml'
     try:
-        text = yaml_files.read_text(path)
-    except yaml_files.YamlError as error:
+        text = yaml_checks.read_text(path)
+    except yaml_checks.YamlError as error:
         if not isinstance(error.__cause__, FileNotFoundError):
             raise WorldError(f'{path} {error}') from error
         raise WorldError(
@@ -235,16 +235,16 @@ def parse_world(text: str, source: str) -> World:
 
     Errors begin with ``source``; without ``name`` in the text, its stem is that of the world.
     """
-    with yaml_files.file_errors(source, WorldError):
-        return _world(yaml_files.parse_yaml(text), Path(source).stem)
+    with yaml_checks.file_errors(source, WorldError):
+        return _world(yaml_checks.parse_yaml(text), Path(source).stem)
 
 
 def _world(content: object, stem: str) -> World:
     lists = ('walls', 'boxes', 'circles', 'patches', 'moving', 'chargers')
-    read = yaml_files.check_entry(content, 'the world', (), ('name', *lists))
+    read = yaml_checks.check_entry(content, 'the world', (), ('name', *lists))
     name = read.get('name', stem)
     if not isinstance(name, str) or not name:
-        raise yaml_files.EntryError(f'name must be a text: got {yaml_files.shortened(name)}')
+        raise yaml_checks.EntryError(f'name must be a text: got {yaml_checks.shortened(name)}')
     pieces: dict[bool, list[tuple[float, ...]]] = {False: [], True: []}
     """Walls by whether they are unseen."""
     boxes = []
@@ -269,13 +269,16 @@ def _world(content: object, stem: str) -> World:
     options = 'start', 'appears', 'vanishes', 'repeat', 'unseen'
     moving = [_moving(*each) for each in _entries(read, 'moving', MAX_MOVING, way, *options)]
     patches = [
-        (*_disc(where, each), yaml_files.check_number(each['grip'], f'{where}.grip', 0.0, 1.0))
+        (
+            *_disc(where, each),
+            yaml_checks.check_number(each['grip'], f'{where}.grip', 0.0, 1.0),
+        )
         for where, each in _entries(read, 'patches', MAX_PATCHES, (*disc, 'grip'))
     ]
     chargers = [
         (
             *_disc(where, each),
-            yaml_files.check_number(each['current'], f'{where}.current', 0.0, MAX_CURRENT, 'A'),
+            yaml_checks.check_number(each['current'], f'{where}.current', 0.0, MAX_CURRENT, 'A'),
         )
         for where, each in _entries(read, 'chargers', MAX_CHARGERS, (*disc, 'current'))
     ]
@@ -292,15 +295,15 @@ def _world(content: object, stem: str) -> World:
 
 
 def _flag(read: dict[str, Any], where: str, key: str) -> bool:
-    return yaml_files.check_flag(read.get(key, False), f'{where}.{key}')
+    return yaml_checks.check_flag(read.get(key, False), f'{where}.{key}')
 
 
 def _moving(where: str, read: dict[str, Any]) -> MovingDisc:
     def number(key: str, low: float, high: float, unit: str, default: float = 0.0) -> float:
         value = read.get(key, default)
-        return yaml_files.check_number(value, f'{where}.{key}', low, high, unit)
+        return yaml_checks.check_number(value, f'{where}.{key}', low, high, unit)
 
-    given = yaml_files.check_list(read['points'], f'{where}.points', 1, MAX_SEGMENTS)
+    given = yaml_checks.check_list(read['points'], f'{where}.points', 1, MAX_SEGMENTS)
     points = [_pair(point, f'{where}.points[{index}]') for index, point in enumerate(given)]
     return MovingDisc(
         number('radius', MIN_SIZE, MAX_COORDINATE, 'm'),
@@ -324,7 +327,7 @@ def _without(rows: Array, others: Array) -> Array:
 
 def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:
     closed = _flag(read, where, 'closed')
-    given = yaml_files.check_list(
+    given = yaml_checks.check_list(
         read['points'], f'{where}.points', 3 if closed else 2, MAX_SEGMENTS + 1
     )
     points = [_pair(point, f'{where}.points[{index}]') for index, point in enumerate(given)]
@@ -332,7 +335,7 @@ def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:
         length = math.dist(points[index - 1], points[index])
         if length < MIN_SIZE:
             last = '; leave the last point out, closed adds it' if index == 0 else ''
-            raise yaml_files.EntryError(
+            raise yaml_checks.EntryError(
                 f'{where}.points[{index}] must be at least {MIN_SIZE:g} m from the point before '
                 f'it: got {length:g} m{last}'
             )
@@ -341,13 +344,15 @@ def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:
 
 def _box(read: dict[str, Any], where: str) -> tuple[float, float, float, float, float]:
     # More than a full turn is a yaw in degrees.
-    yaw = yaml_files.check_number(read.get('yaw', 0.0), f'{where}.yaw', -math.tau, math.tau, 'rad')
+    yaw = yaml_checks.check_number(
+        read.get('yaw', 0.0), f'{where}.yaw', -math.tau, math.tau, 'rad'
+    )
     size = _pair(read['size'], f'{where}.size', MIN_SIZE)
     return *_pair(read['center'], f'{where}.center'), *size, yaw
 
 
 def _disc(where: str, read: dict[str, Any]) -> tuple[float, float, float]:
-    radius = yaml_files.check_number(
+    radius = yaml_checks.check_number(
         read['radius'], f'{where}.radius', MIN_SIZE, MAX_COORDINATE, 'm'
     )
     return *_pair(read['center'], f'{where}.center'), radius
@@ -369,22 +374,22 @@ def _sides(
 def _entries(
     read: dict[str, Any], name: str, most: int, needed: tuple[str, ...], *optional: str
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    for index, content in enumerate(yaml_files.check_list(read.get(name, []), name, 0, most)):
+    for index, content in enumerate(yaml_checks.check_list(read.get(name, []), name, 0, most)):
         where = f'{name}[{index}]'
-        yield where, yaml_files.check_entry(content, where, needed, optional)
+        yield where, yaml_checks.check_entry(content, where, needed, optional)
 
 
 def _pair(content: object, where: str, low: float = -MAX_COORDINATE) -> tuple[float, float]:
-    x, y = yaml_files.check_list(content, where, 2, 2)
+    x, y = yaml_checks.check_list(content, where, 2, 2)
     return (
-        yaml_files.check_number(x, f'{where}[0]', low, MAX_COORDINATE, 'm'),
-        yaml_files.check_number(y, f'{where}[1]', low, MAX_COORDINATE, 'm'),
+        yaml_checks.check_number(x, f'{where}[0]', low, MAX_COORDINATE, 'm'),
+        yaml_checks.check_number(y, f'{where}[1]', low, MAX_COORDINATE, 'm'),
     )
 
 
 def _check_count(count: int) -> None:
     if count > MAX_SEGMENTS:
-        raise yaml_files.EntryError(
+        raise yaml_checks.EntryError(
             f'walls and boxes must have at most {MAX_SEGMENTS} segments together: '
             f'got {count} or more'
         )

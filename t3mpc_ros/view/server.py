@@ -35,7 +35,7 @@ from threading import Thread
 from typing import Any, Self
 from urllib.parse import parse_qs, urlsplit
 
-from t3mpc_ros.page.page_files import PAGE_FILES, page_file
+from t3mpc_ros.page.assets import PAGE_FILES, page_file
 from t3mpc_ros.view.live_data import Cursor, Json, LiveData
 
 ADDRESS = '127.0.0.1'

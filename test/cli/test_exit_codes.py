@@ -70,7 +70,7 @@ def answered(good):
 
 def jogged(error=''):
     task = SimpleNamespace(result=None, error=error)
-    return {'radio.tool.jog.Jog': task, 'radio.tool.procedure.run_at_port': None}
+    return {'radio.tool.wheel_jog.Jog': task, 'radio.tool.procedure.run_at_port': None}
 
 
 def recovered(ended, *damages):
@@ -89,7 +89,7 @@ def compared(same):
 
 
 def graph(**answers):
-    return {'nodes.graph_tools.graph': nullcontext(MagicMock(**answers))}
+    return {'nodes.graph_client.graph': nullcontext(MagicMock(**answers))}
 
 
 def studied(*verdicts):

@@ -184,9 +184,9 @@ MODEL = SimpleNamespace(
     text='', learnt={}, parameters=SimpleNamespace(to_dict=dict), origin={}, to_dict=dict
 )
 TRAIN = {
-    'evaluation.training.simulated_runs.fit_simulated_runs': ({}, MODEL),
-    'evaluation.training.simulated_runs.assess': '',
-    'evaluation.training.recorded_runs.fit_bags': MODEL,
+    'evaluation.training.simulation_fit.fit_simulated_runs': ({}, MODEL),
+    'evaluation.training.simulation_fit.assess': '',
+    'evaluation.training.bag_fit.fit_bags': MODEL,
     'bag.model_file.save_model': None,
 }
 OF_BAGS = {
@@ -210,7 +210,7 @@ REPLAY = {
     'evaluation.process_replay.controller_replay.replay_controller': REPLAYED,
     'evaluation.process_replay.replay_comparison.compare': OUTCOME,
     'evaluation.process_replay.replay_comparison.compare_bags': OUTCOME,
-    'evaluation.process_replay.replay_bag.write_replay': 'there',
+    'evaluation.process_replay.replay_writer.write_replay': 'there',
     'evaluation.process_replay.replay_comparison.write_divergence_figure': None,
 }
 REPORT = SimpleNamespace(verdict=SimpleNamespace(text=text), summary=text, to_dict=dict)
@@ -223,8 +223,8 @@ BAG = {
 VIEW = {
     'nodes.viewer.view_node': context(SimpleNamespace(spin=lambda stop: None, command=print)),
     'view.server.PageServer': context(SimpleNamespace(url='http://page')),
-    'cli.recorded_run.recorded_run': 'run',
-    'cli.run_recorder.RunRecorder': SimpleNamespace(close=lambda: None),
+    'cli.bag_view.recorded_run': 'run',
+    'cli.view_recorder.RunRecorder': SimpleNamespace(close=lambda: None),
 }
 GRAPH = MagicMock()
 GRAPH.topics.return_value = {'/odom': ['nav_msgs/msg/Odometry']}
@@ -237,8 +237,8 @@ GRAPH.parameter_description.return_value = 'a rate'
 GRAPH.set_parameter.return_value = ''
 GRAPH.stop_robots.return_value = {'/e_stop': ''}
 SEEN = {
-    'nodes.graph_tools.graph': context(GRAPH),
-    'nodes.graph_tools.message_text': lambda message, field: f'{message} {field}\n',
+    'nodes.graph_client.graph': context(GRAPH),
+    'nodes.graph_client.message_text': lambda message, field: f'{message} {field}\n',
 }
 BOARD = MagicMock()
 EMULATOR = {
@@ -263,7 +263,7 @@ ROBOT = {
     'radio.tool.channel_scan.recommend': (True, ''),
     'radio.tool.robot_info.read_robot_info': 'result',
     'radio.tool.robot_info.format_robot_info': '',
-    'radio.tool.jog.Jog': SimpleNamespace(result=None, error=''),
+    'radio.tool.wheel_jog.Jog': SimpleNamespace(result=None, error=''),
     'radio.tool.key_provisioning.write_key': 'state',
     'radio.tool.key_provisioning.read_key_state': frames.KeyState(
         0, 0, frames.KEY_HELD, key_check(KEY)
@@ -966,10 +966,10 @@ def test_what_arrives_is_printed_at_once(command, monkeypatch, tmp_path):
             seen.append(path.read_text())
 
     clock = SimpleNamespace(time=0.0)
-    monkeypatch.setattr('t3mpc_ros.cli.graph.time.monotonic', lambda: clock.time)
+    monkeypatch.setattr('t3mpc_ros.cli.ros2_commands.time.monotonic', lambda: clock.time)
     opened = MagicMock(messages=messages)
-    monkeypatch.setattr('t3mpc_ros.nodes.graph_tools.graph', lambda stop: nullcontext(opened))
-    monkeypatch.setattr('t3mpc_ros.nodes.graph_tools.message_text', lambda message, _: message)
+    monkeypatch.setattr('t3mpc_ros.nodes.graph_client.graph', lambda stop: nullcontext(opened))
+    monkeypatch.setattr('t3mpc_ros.nodes.graph_client.message_text', lambda message, _: message)
     with path.open('w') as pipe:
         monkeypatch.setattr(sys, 'stdout', pipe)
         assert main(['topic', command, '/odom']) == 0

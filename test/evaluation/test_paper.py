@@ -43,8 +43,8 @@ from t3mpc_ros.evaluation.paper.figure_runs import (
 )
 from t3mpc_ros.evaluation.paper.paper_figures import floor_path
 from t3mpc_ros.evaluation.paper.paper_page import EXHIBITS, counted
+from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables
 from t3mpc_ros.evaluation.paper.reproduce import RUNS, reproduce
-from t3mpc_ros.evaluation.paper.results import Results, all_tables
 from t3mpc_ros.evaluation.paper.study import (
     DRIVES,
     INTENDED_CASES,

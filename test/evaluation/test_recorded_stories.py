@@ -33,8 +33,8 @@ from support.bag_messages import (
 from support.page_data import read_all
 from support.recorded_stories import STORIES, TWIN, Story
 
+from t3mpc_ros.cli.bag_view import recorded_run
 from t3mpc_ros.cli.main import main as t3mpc
-from t3mpc_ros.cli.recorded_run import recorded_run
 from t3mpc_ros.evaluation.bag_report.causes import cause_of
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 

@@ -28,7 +28,8 @@ from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
-from t3mpc_ros.evaluation.training import recorded_runs
+from t3mpc_ros.evaluation.training import bag_fit
+from t3mpc_ros.evaluation.training.bag_fit import fit_bags, mean_and_spread, spread_text
 from t3mpc_ros.evaluation.training.fit import (
     explained,
     fit_coefficients,
@@ -37,8 +38,7 @@ from t3mpc_ros.evaluation.training.fit import (
     skills,
     stretches,
 )
-from t3mpc_ros.evaluation.training.recorded_runs import fit_bags, mean_and_spread, spread_text
-from t3mpc_ros.evaluation.training.simulated_runs import training_data_of
+from t3mpc_ros.evaluation.training.simulation_fit import training_data_of
 from t3mpc_ros.evaluation.training.training_data import TrainingData
 
 pytestmark = pytest.mark.slow
@@ -142,10 +142,10 @@ def test_the_model_file_is_loaded_and_says_where_it_is_from(
 ):
     path, asked = tmp_path / 'model.npz', []
     monkeypatch.setattr(
-        recorded_runs, 'fit_bags', lambda folders, **how: asked.append((folders, how)) or model
+        fit_bags, 'fit_bags', lambda folders, **how: asked.append((folders, how)) or model
     )
     assert program('train', *bags, '--output', path) == 0
-    assert asked == [(bags, {'keep_predictor': False, 'count': recorded_runs.FOLDS})]
+    assert asked == [(bags, {'keep_predictor': False, 'count': bag_fit.FOLDS})]
     said = capsys.readouterr().out
     assert model.text in said
     assert f'saved {path}' in said

@@ -35,6 +35,7 @@ from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.speed_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.proposed_method import ProposedParameters
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS
+from t3mpc_ros.evaluation.training.bag_fit import blocks, fit_bags
 from t3mpc_ros.evaluation.training.fit import (
     estimate_move_effect,
     explained,
@@ -45,7 +46,6 @@ from t3mpc_ros.evaluation.training.fit import (
     skills,
     stretches,
 )
-from t3mpc_ros.evaluation.training.recorded_runs import blocks, fit_bags
 from t3mpc_ros.evaluation.training.training_data import (
     TrainingData,
     TrainingError,

@@ -60,7 +60,7 @@ def logged(capfd):
 @pytest.fixture
 def execute(graph, capfd):
     """Return a function that runs an executable in this process until its nodes have started."""
-    from t3mpc_ros.nodes.process import run
+    from t3mpc_ros.nodes.node_main import run
 
     class Stop:
         exit_at_once = False

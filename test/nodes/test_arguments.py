@@ -22,7 +22,7 @@ import pytest
 
 import t3mpc_ros
 from t3mpc_ros.nodes.arguments import Origin, parameter_origins, unmatched_files
-from t3mpc_ros.nodes.process import provide_log_directory
+from t3mpc_ros.nodes.node_main import provide_log_directory
 from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
 
 
@@ -207,7 +207,7 @@ def test_a_folder_that_cannot_be_written_is_replaced(given, replaced, tmp_path):
 @pytest.mark.slow
 def test_ros_starts_without_a_home_folder(tmp_path):
     """Every node said that its command line was invalid."""
-    code = 'from t3mpc_ros.nodes.process import init_ros; init_ros([])'
+    code = 'from t3mpc_ros.nodes.node_main import init_ros; init_ros([])'
     environment = {k: v for k, v in os.environ.items() if k != 'ROS_LOG_DIR'}
     for home in (str(tmp_path), os.devnull):
         words = [sys.executable, '-c', code]

@@ -21,7 +21,7 @@ from support.waiting import wait_until
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.nodes.composed import ComposedNode
-from t3mpc_ros.nodes.process import make_executor
+from t3mpc_ros.nodes.node_main import make_executor
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.parameters.table import ParameterError
 

@@ -27,8 +27,8 @@ from std_msgs.msg import Float64
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State, WheelSpeeds, wrap_angle
-from t3mpc_ros.nodes import conversions, robot_topics
-from t3mpc_ros.nodes.robot_topics import state_values, state_warnings
+from t3mpc_ros.nodes import conversions, robot_messages
+from t3mpc_ros.nodes.robot_messages import state_values, state_warnings
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 from t3mpc_ros.robot.interface import (
     ZERO_WHEEL_SPEEDS,
@@ -258,7 +258,7 @@ def test_imu_covariance_is_the_variance_of_its_samples():
     sensor = SimulatedImu(parameters, np.random.default_rng(3))
     still = np.zeros((3, 2))
     samples = np.array([sensor.measure(still, 0.01) for _ in range(20_000)])
-    message = robot_topics.imu_message(parameters, 'a/imu')
+    message = robot_messages.imu_message(parameters, 'a/imu')
     turn, push = message.angular_velocity_covariance, message.linear_acceleration_covariance
     claimed = (turn[8], push[0], push[4])
     np.testing.assert_allclose(samples.var(axis=0), claimed, rtol=0.1)
@@ -267,9 +267,9 @@ def test_imu_covariance_is_the_variance_of_its_samples():
         matrix = np.array(covariance).reshape(3, 3)
         np.testing.assert_array_equal(matrix, np.diag(np.diag(matrix)))
         assert all(covariance[place] == 1e6 for place in unknown)
-    noisier = robot_topics.imu_message(ImuParameters(gyro_noise=0.05), 'imu_link')
+    noisier = robot_messages.imu_message(ImuParameters(gyro_noise=0.05), 'imu_link')
     assert noisier.angular_velocity_covariance[8] > 50.0 * turn[8]
-    robot_topics.fill_imu(message, ImuSample(0.5, 1.0, -2.0), 7)
+    robot_messages.fill_imu(message, ImuSample(0.5, 1.0, -2.0), 7)
     assert conversions.ns_from_time(message.header.stamp) == 7
     assert message.header.frame_id == 'a/imu'
     turn, push = message.angular_velocity, message.linear_acceleration
@@ -294,8 +294,8 @@ FLOATS = np.float32
 )
 def test_a_distance_follows_rep_117_after_serialization(distance, infinity, expected):
     """Ranges are serialized in single precision; a value at a limit must stay within it."""
-    message = robot_topics.range_message(RangeSensorParameters(), 'left_front_range_link')
-    robot_topics.fill_range(message, distance, 7, infinity=infinity)
+    message = robot_messages.range_message(RangeSensorParameters(), 'left_front_range_link')
+    robot_messages.fill_range(message, distance, 7, infinity=infinity)
     received = deserialize_message(serialize_message(message), Range)
     assert received.range == expected
     assert received.radiation_type == Range.INFRARED
@@ -307,14 +307,14 @@ def test_a_distance_follows_rep_117_after_serialization(distance, infinity, expe
 
 def test_a_discharging_battery_has_a_negative_current():
     parameters = BatteryParameters(cells=4, capacity=2.0)
-    message = robot_topics.battery_message(parameters)
-    robot_topics.fill_battery(message, BatteryReading(15.0, 0.5, 0.75), 7)
+    message = robot_messages.battery_message(parameters)
+    robot_messages.fill_battery(message, BatteryReading(15.0, 0.5, 0.75), 7)
     assert (message.voltage, message.current, message.percentage) == (15.0, -0.5, 0.75)
     assert (message.charge, message.design_capacity) == (1.5, 2.0)
     assert message.power_supply_status == message.POWER_SUPPLY_STATUS_DISCHARGING
     assert len(message.cell_voltage) == 4
     assert np.isnan([*message.cell_voltage, message.temperature, message.capacity]).all()
-    robot_topics.fill_battery(message, BatteryReading(15.0, math.nan, math.nan), 8)
+    robot_messages.fill_battery(message, BatteryReading(15.0, math.nan, math.nan), 8)
     assert np.isnan([message.current, message.charge, message.percentage]).all()
 
 
@@ -324,10 +324,10 @@ def test_the_covariance_of_a_twist_is_that_of_its_wheels():
     rng = np.random.default_rng(9)
     wheels = rng.normal(scale=math.sqrt(variance), size=(20_000, 2))
     twists = np.array([twist_from_wheels(WheelSpeeds(*pair), geometry) for pair in wheels])
-    covariance = np.array(robot_topics.twist_covariance(geometry, variance)).reshape(6, 6)
+    covariance = np.array(robot_messages.twist_covariance(geometry, variance)).reshape(6, 6)
     np.testing.assert_allclose([covariance[0, 0], covariance[5, 5]], twists.var(axis=0), rtol=0.05)
     assert covariance[1, 1] == 1e6
-    misled = np.array(robot_topics.twist_covariance(geometry, math.inf)).reshape(6, 6)
+    misled = np.array(robot_messages.twist_covariance(geometry, math.inf)).reshape(6, 6)
     np.testing.assert_array_equal(misled, 1e6 * np.eye(6))
 
 
@@ -337,7 +337,7 @@ def test_count_variance_is_that_of_quantisation():
     angles = np.cumsum(rng.uniform(0.01, 0.05, 20_000))
     counted = np.diff(np.floor(angles / step) * step) / period
     error = counted - np.diff(angles) / period
-    assert robot_topics.count_variance(step, period) == pytest.approx(error.var(), rel=0.05)
+    assert robot_messages.count_variance(step, period) == pytest.approx(error.var(), rel=0.05)
 
 
 # -- diagnostics ----------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from support.ros_graph import diagnostic, odometry, reason, twist
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.base_node import WARN, BaseNode
 from t3mpc_ros.nodes.controller import ControllerNode
-from t3mpc_ros.nodes.process import make_executor
+from t3mpc_ros.nodes.node_main import make_executor
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 from t3mpc_ros.parameters.table import ParameterError

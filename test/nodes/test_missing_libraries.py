@@ -50,7 +50,7 @@ def test_nodes_without_bags_need_no_bag_library(without, graph, tmp_path):
     file = tmp_path / 'shared.yaml'
     file.write_text('/**: {ros__parameters: {play.rate: 1.0, publish_clok: false, law.gian: 1.0}}')
     start = (
-        'import sys; from t3mpc_ros.nodes.process import run\n'
+        'import sys; from t3mpc_ros.nodes.node_main import run\n'
         'class Stop:\n'
         '    def __call__(self): return True\n'
         "for name in ('reference_generator', 'controller', 'sim_robot', 'radio_bridge'):\n"

@@ -32,7 +32,7 @@ from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.chaos.pose_reference import PortraitSource
 from t3mpc_ros.chaos.reference import ChaoticReference
 from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
-from t3mpc_ros.control.range_monitor import RangeFault
+from t3mpc_ros.control.range_fault_detection import RangeFault
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist
 from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN

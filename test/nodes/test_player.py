@@ -379,7 +379,7 @@ def test_a_bag_that_cannot_be_played_so_is_refused(given, error, words, harness,
 
 # -- in a terminal --------------------------------------------------------------------------------
 
-PROGRAM = 'import sys; from t3mpc_ros.nodes.entry_point import player; sys.exit(player())'
+PROGRAM = 'import sys; from t3mpc_ros.nodes.entry_points import player; sys.exit(player())'
 
 
 class Terminal:

@@ -40,7 +40,7 @@ from support.ros_graph import (
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.base_node import OK, WARN
-from t3mpc_ros.nodes.robot_topics import count_variance, imu_message, twist_covariance
+from t3mpc_ros.nodes.robot_messages import count_variance, imu_message, twist_covariance
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
 from t3mpc_ros.parameters.table import ParameterError
 

@@ -27,7 +27,7 @@ from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.handshake import Session
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
-from t3mpc_ros.radio.link.setpoint import SetpointArbiter
+from t3mpc_ros.radio.link.setpoint_arbitration import SetpointArbiter
 from t3mpc_ros.radio.link.statistics import DiagnosticLevel, LinkStatistics
 from t3mpc_ros.radio.link.telemetry import CommandTiming, TelemetryDecoder
 from t3mpc_ros.radio.link.transaction import TransactionLayer

@@ -30,11 +30,11 @@ from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Hello, StatusF
 from t3mpc_ros.radio.protocol.framing import FrameDecoder
 from t3mpc_ros.radio.tool import (
     channel_scan,
-    jog,
     key_provisioning,
     link_test,
     robot_info,
     robot_settings,
+    wheel_jog,
 )
 from t3mpc_ros.radio.tool.channel_scan import ChannelResult
 from t3mpc_ros.radio.tool.eeprom_records import SENSORS, RobotSettings
@@ -265,13 +265,13 @@ def test_each_of_two_robots_follows_its_own_host_only():
     """Both receive every packet of the dongle; before they are set up, neither moves."""
     benches = [ToolBench(erased=True) for _ in range(2)]
     for bench in benches:
-        bench.jog(jog.LEFT, 0.2)
+        bench.jog(wheel_jog.LEFT, 0.2)
         assert bench.board.counters == (0, 0)
     hosts = [host_of(write(bench, seed)) for seed, bench in enumerate(benches)]
     for number, host in enumerate(hosts):
         before = [bench.board.counters for bench in benches]
         for bench in benches:
-            bench.jog(jog.LEFT, 0.2, link=host)
+            bench.jog(wheel_jog.LEFT, 0.2, link=host)
         moved = [bench.board.counters != old for bench, old in zip(benches, before, strict=True)]
         assert moved == [number == 0, number == 1]
 
@@ -504,7 +504,8 @@ def test_key_mismatch_is_reported(here, there, expected):
 
 
 @pytest.mark.parametrize(
-    'key, wheel, revolutions', [(b'', jog.LEFT, 1.0), (KEY, jog.LEFT, -0.3), (KEY, jog.RIGHT, 0.5)]
+    'key, wheel, revolutions',
+    [(b'', wheel_jog.LEFT, 1.0), (KEY, wheel_jog.LEFT, -0.3), (KEY, wheel_jog.RIGHT, 0.5)],
 )
 def test_jog_turns_one_wheel_and_disables_the_drives(key, wheel, revolutions):
     bench = ToolBench(key)
@@ -514,19 +515,19 @@ def test_jog_turns_one_wheel_and_disables_the_drives(key, wheel, revolutions):
     assert result.target == revolutions * TURN
     assert abs(result.counted - result.target) <= 10
     assert result.other == 0
-    counters = dict(zip((jog.LEFT, jog.RIGHT), bench.board.counters, strict=True))
+    counters = dict(zip((wheel_jog.LEFT, wheel_jog.RIGHT), bench.board.counters, strict=True))
     assert counters.pop(wheel) == result.counted
     assert list(counters.values()) == [0]
     assert not bench.board.powered
     assert reported == []
-    text = jog.format_result(result, wheel, revolutions)
+    text = wheel_jog.format_result(result, wheel, revolutions)
     assert ('forward' in text) == (revolutions > 0)
 
 
 def test_jog_respects_speed_and_acceleration():
     bench, speeds = ToolBench(), []
     bench.each = lambda bench: speeds.append((bench.now_ns, bench.board.speeds[0] / 1e6))
-    task, _ = bench.jog(jog.LEFT, 1.0, speed=1.5)
+    task, _ = bench.jog(wheel_jog.LEFT, 1.0, speed=1.5)
     assert task.error == ''
     assert max(speed for _, speed in speeds) == pytest.approx(1.5, abs=0.001)
     for (before_ns, before), (after_ns, after) in zip(speeds, speeds[1:], strict=False):
@@ -535,8 +536,14 @@ def test_jog_respects_speed_and_acceleration():
 
 def test_an_interrupted_jog_stops_and_disables_the_drives():
     bench = ToolBench()
-    task = jog.Jog(
-        LinkParameters(), b'', random.Random(1).randbytes, jog.LEFT, 5.0, 3.0, lambda text: None
+    task = wheel_jog.Jog(
+        LinkParameters(),
+        b'',
+        random.Random(1).randbytes,
+        wheel_jog.LEFT,
+        5.0,
+        3.0,
+        lambda text: None,
     )
 
     def interrupt(bench):
@@ -563,7 +570,7 @@ def test_a_blocked_jog_ends_with_the_reason(fault, expected):
             bench.emulator.inject(fault, 1000.0)
 
     bench.each = block
-    task, _ = bench.jog(jog.LEFT, 5.0)
+    task, _ = bench.jog(wheel_jog.LEFT, 5.0)
     assert expected in task.error
     bench.emulator.run_to(bench.now_ns + 1_000_000_000)
     assert bench.board.speeds == (0, 0)
@@ -572,7 +579,7 @@ def test_a_blocked_jog_ends_with_the_reason(fault, expected):
 def test_jog_reports_a_robot_that_does_not_answer():
     bench = ToolBench()
     bench.emulator.inject('jam', math.inf)
-    task, reported = bench.jog(jog.LEFT, 1.0)
+    task, reported = bench.jog(wheel_jog.LEFT, 1.0)
     assert 'does not answer' in task.error
     assert reported == [task.error]
     assert task.result is None
@@ -586,7 +593,7 @@ def test_unplugging_the_dongle_ends_the_jog_and_stops_the_robot():
             bench.emulator.inject('close_port', 1000.0)
 
     bench.each = pull
-    task, _ = bench.jog(jog.RIGHT, 5.0)
+    task, _ = bench.jog(wheel_jog.RIGHT, 5.0)
     assert 'not there' in task.error
     bench.emulator.run_to(bench.now_ns + 1_000_000_000)
     assert bench.board.speeds == (0, 0)

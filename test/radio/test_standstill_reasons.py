@@ -23,7 +23,7 @@ import pytest
 from support.emulator_bench import RobotBench
 from support.radio_bench import FakeRobot, LinkBench
 
-from t3mpc_ros.nodes import robot_topics
+from t3mpc_ros.nodes import robot_messages
 from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.protocol import frames
@@ -58,7 +58,7 @@ def reported(bench):
     """Return the warnings in diagnostics, most important first."""
     state = bench.robot.advance(bench.now_ns)
     well = bench.robot.quality(bench.now_ns)
-    return '; '.join([*robot_topics.state_warnings(state), *([well.text] if well.text else [])])
+    return '; '.join([*robot_messages.state_warnings(state), *([well.text] if well.text else [])])
 
 
 @cause('no command yet')

@@ -18,7 +18,7 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.geometry.sample_clock import SampleScheduler
+from t3mpc_ros.geometry.sample_scheduler import SampleScheduler
 from t3mpc_ros.geometry.types import Pose, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.interface import RobotCommand, RobotInterface, RobotState

@@ -30,7 +30,7 @@ from t3mpc_ros.bag.controller_journal import Journal
 from t3mpc_ros.bag.model_file import load_model
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, StepperControllerParameters
 from t3mpc_ros.evaluation.process_replay.controller_replay import CONTROLLER, FIELDS, output_row
-from t3mpc_ros.evaluation.process_replay.replay_bag import (
+from t3mpc_ros.evaluation.process_replay.replay_writer import (
     LATER,
     controller_bag,
     float_bytes,

@@ -53,7 +53,7 @@ from t3mpc_ros.emulator.link.serial_line import SerialLine
 from t3mpc_ros.emulator.plant import Plant
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.sample_clock import RealTimeFactor, SampleScheduler, SimulatedTime
+from t3mpc_ros.geometry.sample_scheduler import RealTimeFactor, SampleScheduler, SimulatedTime
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, WheelSpeeds
 from t3mpc_ros.mpc.predictive_controller import PredictiveController, PredictiveParameters
 from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters

@@ -21,7 +21,7 @@ import pytest
 from support.page_data import read_all
 
 from t3mpc_ros.view.live_data import MAX_CHANGES, MAX_EVENTS, SPAN, Cursor, LiveData
-from t3mpc_ros.view.live_run import LOST, LOST_REMEDY, MAX_AGE, LiveRun, NodeReport, banner
+from t3mpc_ros.view.run_status import LOST, LOST_REMEDY, MAX_AGE, LiveRun, NodeReport, banner
 
 
 def test_readers_of_any_pace_get_every_sample_once_and_in_order():

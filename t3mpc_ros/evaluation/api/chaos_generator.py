@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
-from t3mpc_ros.evaluation.api.one_sentence import one_sentence
+from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.references import numbers
 from t3mpc_ros.evaluation.api.result_tables import writable
 from t3mpc_ros.evaluation.reporting import write_columns

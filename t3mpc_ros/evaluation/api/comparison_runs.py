@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from t3mpc_ros.evaluation import comparison
-from t3mpc_ros.evaluation.api.one_sentence import one_sentence
+from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, writable
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario

@@ -26,7 +26,7 @@ import numpy as np
 
 from t3mpc_ros.evaluation.api import result_tables
 from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds, chosen_cases, find_metric
-from t3mpc_ros.evaluation.api.one_sentence import one_sentence, sentence
+from t3mpc_ros.evaluation.api.error_messages import one_sentence, sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.api.single_run import DIVERGED, divergence

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from t3mpc_ros.control.actuation import LimitParameters
-from t3mpc_ros.evaluation.api.one_sentence import described, one_sentence
+from t3mpc_ros.evaluation.api.error_messages import described, one_sentence
 from t3mpc_ros.evaluation.api.references import numbers
 from t3mpc_ros.geometry.types import Array, WheelSpeeds, read_only
 from t3mpc_ros.mpc.pretraining import matrix_exponential

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.exceptions import ComplexWarning
 from numpy.typing import ArrayLike, NDArray
 
-from t3mpc_ros.evaluation.api.one_sentence import one_sentence
+from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.baselines.baseline_controller import JUMP
 from t3mpc_ros.evaluation.record import RATE
 from t3mpc_ros.evaluation.scenario import SampledReference

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.one_sentence import one_sentence
+from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.reporting import Table, write_columns
 from t3mpc_ros.parameters.command_line import check_writable
 from t3mpc_ros.parameters.provenance import provenance

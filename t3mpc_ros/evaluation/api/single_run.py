@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api.one_sentence import one_sentence
+from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, own_scenario

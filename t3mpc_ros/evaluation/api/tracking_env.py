@@ -25,7 +25,7 @@ from gymnasium import spaces
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from t3mpc_ros.evaluation.api.one_sentence import one_sentence
+from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.script_parts import Controller, OwnMethod, own_scenario
 from t3mpc_ros.evaluation.baselines.baseline_controller import Observation

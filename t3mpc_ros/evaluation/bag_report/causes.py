@@ -21,7 +21,7 @@ from collections.abc import Sequence
 import math
 from typing import NamedTuple
 
-from t3mpc_ros.evaluation.bag_report.link_history import DiagnosticEvent
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import DiagnosticEvent
 
 ROBOT, CONTROLLER, MACHINE = 0, 1, 2
 """Sources of causes in the order in which they are reported."""

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report.continuity import POSE_JUMP, gaps, pose_jumps
-from t3mpc_ros.evaluation.bag_report.link_history import COUNTED
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED
 from t3mpc_ros.evaluation.bag_report.metrics import (
     UNMEASURED,
     WINDOW,

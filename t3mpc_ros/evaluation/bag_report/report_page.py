@@ -23,7 +23,7 @@ import numpy as np
 from t3mpc_ros.bag.mcap_file import LOSS_CAUSES, LOSSES, UNDISCOVERED
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.evaluation.bag_report import incidents
-from t3mpc_ros.evaluation.bag_report.link_history import COUNTED, LinkMetrics
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED, LinkMetrics
 from t3mpc_ros.evaluation.bag_report.map_changes import map_change_blocks
 from t3mpc_ros.evaluation.bag_report.metrics import (
     LINK_NUMBERS,

@@ -30,7 +30,7 @@ from t3mpc_ros.bag.reader import (
     read_columns,
 )
 from t3mpc_ros.control.controller import WHEELS
-from t3mpc_ros.evaluation.bag_report import link_history
+from t3mpc_ros.evaluation.bag_report import diagnostic_history
 from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, gaps, several_robots
 from t3mpc_ros.evaluation.bag_report.map_changes import RecordedChange, read_map_changes
 from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
@@ -164,11 +164,11 @@ class Run:
     """Times of the switches of the reference."""
     lead: float
     """Median lead (s) of the reference stamps over their receive times."""
-    complaints: tuple[link_history.DiagnosticEvent, ...]
+    complaints: tuple[diagnostic_history.DiagnosticEvent, ...]
     """From diagnostics: first time, level, node, text."""
-    changes: tuple[link_history.DiagnosticEvent, ...]
+    changes: tuple[diagnostic_history.DiagnosticEvent, ...]
     """Likewise, each time that a node got worse."""
-    links: tuple[link_history.LinkHistory, ...]
+    links: tuple[diagnostic_history.LinkHistory, ...]
     """Radio links in the diagnostics."""
     oddities: tuple[str, ...]
     """Sentences on what is unusual in the bag, and what was done about it."""
@@ -230,7 +230,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         else:
             motions[name] = _motion(table['stamp'] - clock.origin, table, geometry)
     oddities += _oddities_of_motions(topics, raw)
-    diagnostics = link_history.read_diagnostics(recording, choice.namespaces[0])
+    diagnostics = diagnostic_history.read_diagnostics(recording, choice.namespaces[0])
     expected = NAMES if choice.ours else (REFERENCE, ODOMETRY, COMMAND)
     return Run(
         duration=recording.duration,

@@ -36,7 +36,7 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
     torque_robot,
 )
 from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD, Claim
-from t3mpc_ros.evaluation.paper.results import Results, rank
+from t3mpc_ros.evaluation.paper.paper_tables import Results, rank
 from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, SETTLING, WITHOUT, Extent, study_scenario
 from t3mpc_ros.evaluation.record import START, Record, switch_times
 from t3mpc_ros.geometry.types import Array

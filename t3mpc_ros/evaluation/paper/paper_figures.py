@@ -28,7 +28,7 @@ from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.paper import figure_runs
-from t3mpc_ros.evaluation.paper.results import Results, label
+from t3mpc_ros.evaluation.paper.paper_tables import Results, label
 from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, PARTS, SETTLING, STAGES, WITHOUT
 from t3mpc_ros.evaluation.record import START, Record
 from t3mpc_ros.evaluation.result_file import Row

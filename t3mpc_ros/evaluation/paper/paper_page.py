@@ -21,7 +21,7 @@ from t3mpc_ros.evaluation import reporting
 from t3mpc_ros.evaluation.paper import paper_figures
 from t3mpc_ros.evaluation.paper.claims import Claim
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
-from t3mpc_ros.evaluation.paper.results import Results
+from t3mpc_ros.evaluation.paper.paper_tables import Results
 from t3mpc_ros.evaluation.paper.study import WITHOUT
 
 BEYOND = 'Not in the paper.'

@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation.methods import EXACT_MODEL, methods
 from t3mpc_ros.evaluation.paper.claims import all_claims, markdown
 from t3mpc_ros.evaluation.paper.figure_runs import simulate_figure_runs
 from t3mpc_ros.evaluation.paper.paper_page import EXHIBITS, ExhibitData, counted, page
-from t3mpc_ros.evaluation.paper.results import Results, all_tables, csv_columns
+from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables, csv_columns
 from t3mpc_ros.evaluation.paper.study import DRIVES, Extent, chosen_extent, measure, study_runs
 from t3mpc_ros.evaluation.plotting import write_pictures
 from t3mpc_ros.evaluation.reporting import strict_json, write_columns

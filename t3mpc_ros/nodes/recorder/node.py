@@ -29,13 +29,13 @@ from std_srvs.srv import Trigger
 
 from t3mpc_ros.bag.mcap_file import LOSSES, Attachment, message_loss_record
 from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions, UnknownTypeError
-from t3mpc_ros.bag.recording.diagnostics_monitor import (
+from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
+from t3mpc_ros.bag.recording.snapshot import CircularMessageCache, SnapshotWriter
+from t3mpc_ros.bag.recording.snapshot_trigger import (
     DiagnosticsMonitor,
     NodeFault,
     SnapshotRateLimiter,
 )
-from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
-from t3mpc_ros.bag.recording.snapshot import CircularMessageCache, SnapshotWriter
 from t3mpc_ros.bag.recording.writer_thread import WriterThread
 from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.bag.writer import BagWriter, FolderError

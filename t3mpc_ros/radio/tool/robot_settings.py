@@ -18,7 +18,7 @@ import string
 from typing import Any, NamedTuple
 
 from t3mpc_ros.parameters.table import number_hint
-from t3mpc_ros.parameters.yaml_files import parameter_file, shortened
+from t3mpc_ros.parameters.yaml_checks import parameter_file, shortened
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD
 from t3mpc_ros.radio.tool import eeprom_records

@@ -27,7 +27,7 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, at_most, grou
 from t3mpc_ros.robot import interface
 from t3mpc_ros.robot.command_limiter import CommandLimiterParameters, ramp_towards
 from t3mpc_ros.robot.wheel_odometry import WheelOdometry, WheelOdometryParameters
-from t3mpc_ros.simulation.fixed_step import FixedStepRobot
+from t3mpc_ros.simulation.fixed_step_robot import FixedStepRobot
 from t3mpc_ros.simulation.plant.disturbances import (
     Disturbance,
     DisturbanceParameters,

@@ -15,7 +15,7 @@
 
 import pytest
 
-from t3mpc_ros.parameters.yaml_files import (
+from t3mpc_ros.parameters.yaml_checks import (
     MAX_FILE_SIZE,
     YamlError,
     parse_yaml,

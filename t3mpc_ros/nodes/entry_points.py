@@ -25,7 +25,7 @@ _STOP.exit_at_once = True  # no robot moves yet, and no file is open
 
 def _main(name: str) -> None:
     """Run the executable of a node and end the process."""
-    from t3mpc_ros.nodes.process import main
+    from t3mpc_ros.nodes.node_main import main
 
     main(name, _STOP)
 

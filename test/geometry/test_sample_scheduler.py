@@ -16,7 +16,7 @@
 import numpy as np
 import pytest
 
-from t3mpc_ros.geometry.sample_clock import RealTimeFactor, SampleScheduler, SimulatedTime
+from t3mpc_ros.geometry.sample_scheduler import RealTimeFactor, SampleScheduler, SimulatedTime
 
 MS = 1_000_000
 

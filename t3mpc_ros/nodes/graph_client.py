@@ -39,7 +39,7 @@ import yaml
 
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.conversions import message_class
-from t3mpc_ros.nodes.process import own_context
+from t3mpc_ros.nodes.node_main import own_context
 from t3mpc_ros.nodes.remote_parameters import (
     parameter_message,
     parameter_row,

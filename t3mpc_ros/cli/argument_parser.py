@@ -20,7 +20,7 @@ import select
 import sys
 from typing import Any
 
-from t3mpc_ros.evaluation.api.one_sentence import sentence
+from t3mpc_ros.evaluation.api.error_messages import sentence
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.version import VERSION
 

@@ -25,7 +25,7 @@ import yaml
 from t3mpc_ros.stop_signal import StopSignal
 
 if TYPE_CHECKING:
-    from t3mpc_ros.nodes.graph_tools import Graph
+    from t3mpc_ros.nodes.graph_client import Graph
 
 REPORT_PERIOD = 1.0
 """Time between two lines of a rate, s."""
@@ -89,7 +89,7 @@ def _with_graph(
     """Return a command that runs in the graph."""
 
     def run_in_graph(options: argparse.Namespace) -> int | None:
-        from t3mpc_ros.nodes.graph_tools import graph  # takes a second
+        from t3mpc_ros.nodes.graph_client import graph  # takes a second
 
         with StopSignal() as stop, graph(stop) as opened:
             return run(opened, options)
@@ -103,7 +103,7 @@ def _list_topics(graph: 'Graph', options: argparse.Namespace) -> None:
 
 
 def _echo(graph: 'Graph', options: argparse.Namespace) -> None:
-    from t3mpc_ros.nodes.graph_tools import message_text
+    from t3mpc_ros.nodes.graph_client import message_text
 
     for message in graph.messages(options.topic):
         if message is not None:
@@ -113,7 +113,7 @@ def _echo(graph: 'Graph', options: argparse.Namespace) -> None:
 
 
 def _rate(graph: 'Graph', options: argparse.Namespace) -> None:
-    from t3mpc_ros.nodes.graph_tools import rate_text
+    from t3mpc_ros.nodes.graph_client import rate_text
 
     arrivals: deque[float] = deque(maxlen=WINDOW)
     due = time.monotonic() + REPORT_PERIOD
@@ -145,7 +145,7 @@ def _set_parameter(graph: 'Graph', options: argparse.Namespace) -> int:
 
 
 def _call(graph: 'Graph', options: argparse.Namespace) -> None:
-    from t3mpc_ros.nodes.graph_tools import message_text
+    from t3mpc_ros.nodes.graph_client import message_text
 
     values = yaml.safe_load(options.values)
     if not isinstance(values, dict):

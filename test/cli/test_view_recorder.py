@@ -19,7 +19,7 @@ import pytest
 from support.page_data import read_all
 from support.waiting import wait_until
 
-from t3mpc_ros.cli.run_recorder import RunRecorder
+from t3mpc_ros.cli.view_recorder import RunRecorder
 from t3mpc_ros.view.live_data import LiveData
 
 pytestmark = pytest.mark.slow

@@ -27,7 +27,7 @@ from t3mpc_ros.control.keep_out import (
     KeepOut,
     KeepOutParameters,
 )
-from t3mpc_ros.control.range_monitor import RangeFault, RangeMonitor
+from t3mpc_ros.control.range_fault_detection import RangeFault, RangeMonitor
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import advance_pose

@@ -21,9 +21,9 @@ from rclpy.node import Node
 from std_srvs.srv import SetBool
 import yaml
 
-from t3mpc_ros.nodes import graph_tools
+from t3mpc_ros.nodes import graph_client
 from t3mpc_ros.nodes.conversions import quaternion_from_yaw
-from t3mpc_ros.nodes.graph_tools import Graph, GraphError, message_text, rate_text
+from t3mpc_ros.nodes.graph_client import Graph, GraphError, message_text, rate_text
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
@@ -53,7 +53,7 @@ def asked(harness):
 @pytest.fixture
 def nothing_comes(monkeypatch):
     """Return a function after which a thing that is not there is not waited for long."""
-    return lambda: monkeypatch.setattr(graph_tools, 'DISCOVERY', 0.2)
+    return lambda: monkeypatch.setattr(graph_client, 'DISCOVERY', 0.2)
 
 
 @pytest.mark.ros
@@ -122,7 +122,7 @@ def test_services_are_called_with_the_type_of_the_graph(asked, harness, nothing_
 
 @pytest.mark.ros
 def test_stop_stops_every_robot_whatever_its_namespace(asked, harness, monkeypatch):
-    monkeypatch.setattr(graph_tools, 'LISTING', 0.3)
+    monkeypatch.setattr(graph_client, 'LISTING', 0.3)
     assert asked('stop_robots') == {}
     robots = [harness.add(SimRobotNode, namespace=name) for name in (None, 'east', 'far/west')]
 
