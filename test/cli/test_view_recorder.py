@@ -62,7 +62,7 @@ def recording(tmp_path, monkeypatch):
     for name, text in (('recorder', RECORDER), ('t3mpc', REPORT)):
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o755)
-    for module in ('process_group', 'run_recorder'):
+    for module in ('process_group', 'view_recorder'):
         monkeypatch.setattr(f't3mpc_ros.cli.{module}.executable', lambda name: tmp_path / name)
     made = Recording(tmp_path / 'runs')
     yield made
