@@ -472,6 +472,8 @@ class ContactMonitor:
         self._pose: Pose | None = None
         self.furthest = ORIGIN
         """Where the robot came, the last time that it advanced: what holds it may turn it."""
+        self.wheels_stood = False
+        """Whether the wheels did not turn either, when the last contact was found."""
         self.restart(None)
 
     def restart(self, pose: Pose | None) -> None:
@@ -481,7 +483,7 @@ class ContactMonitor:
         self._pose = pose
         self._most = self._unlike = 0.0
         self._steps = 0
-        self._asked = self._ahead = self._left = self._turn = self._time = 0.0
+        self._asked = self._ahead = self._left = self._turn = self._time = self._driven = 0.0
         self._fastest = self._fastest_turn = 0.0
 
     def is_in_contact(self, odometry: State, command: BodyTwist, elapsed: float) -> bool:
@@ -489,21 +491,22 @@ class ContactMonitor:
         pose, last = odometry.pose, self._pose
         if last is not None and self._is_thrown(motion_between(last, pose)[2], command, elapsed):
             self.restart(pose)
+            self.wheels_stood = False
             return True
-        tight = ON_THE_SPOT < abs(command.linear) < TIGHT * abs(command.angular)
-        if last is None or command.linear * self._asked < 0.0 or tight:
-            # Not only left out: the noise of a pose cancels in a sum without gaps alone.
+        slowest = max(ON_THE_SPOT, TIGHT * abs(command.angular))
+        if last is None or command.linear * self._asked < 0.0 or abs(command.linear) < slowest:
+            # Not only left out: the noise of a pose cancels in a sum without gaps alone. On the
+            # spot a pose may be corrected, and a tyre slip, without any contact.
             self.restart(pose)
             return False
         ahead, left, turn = motion_between(last, pose)
         self._pose = pose
         self._unlike += (ahead - odometry.twist.linear * elapsed) ** 2
         self._steps += 1
-        # On the spot a pose may be corrected, and a tyre slip, without any contact.
-        if abs(command.linear) > ON_THE_SPOT:
-            self._asked += command.linear * elapsed
-            self._ahead += ahead
-            self._left += left
+        self._asked += command.linear * elapsed
+        self._driven += odometry.twist.linear * elapsed
+        self._ahead += ahead
+        self._left += left
         if abs(command.linear) > DRIVING:
             self._turn += odometry.twist.angular * elapsed - turn
         if abs(self._ahead) >= self._most:
@@ -521,6 +524,7 @@ class ContactMonitor:
         touches |= abs(self._left) > most * asked
         if self._unlike <= self._steps * OWN_ODOMETRY**2:
             touches |= abs(self._turn) > CONTACT_TURN + CONTACT_LEAD * self._fastest_turn
+        self.wheels_stood = abs(self._driven) < least * asked
         self.restart(pose)
         return touches
 
@@ -561,6 +565,8 @@ class DriveMonitor:
         self.contact = False
         """Whether this pause began because something held the robot."""
         self._trials = 0
+        self._stopped = False
+        """Whether a pause began because something held the robot, or it stopped by itself."""
         self._ended = False
         self._pause = 0.0
         self.begin()
@@ -599,10 +605,13 @@ class DriveMonitor:
                 return Reason.PAUSED
             self.begin()
             return Reason.TRACKING
-        self.contact = self._feels and self.contact_monitor.is_in_contact(
-            odometry, command, elapsed
-        )
-        stands = self._stands(odometry, command, elapsed) or self.contact
+        held = self._feels and self.contact_monitor.is_in_contact(odometry, command, elapsed)
+        # A robot that stops by itself, after a slip, drives on after a pause; what holds it will
+        # hold it again.
+        by_itself = self.contact_monitor.wheels_stood and not self._stopped
+        self._stopped = self._stopped or held
+        self.contact = held and not by_itself
+        stands = self._stands(odometry, command, elapsed) or held
         if stands or self._is_opposed(odometry.twist, command, elapsed):
             return self._begin_pause()
         if following:
@@ -610,6 +619,7 @@ class DriveMonitor:
             self._well += elapsed
             if self._moved and self._well > RECOVERY_TIME:
                 self.pauses = self._trials = 0
+                self._stopped = False
         elif self._moved:
             self._astray += elapsed
             if self._astray > ASTRAY_TIME:

@@ -495,6 +495,21 @@ def test_noise_of_a_pose_in_curves_is_no_contact(bend, seed):
     assert touches == 0
 
 
+@pytest.mark.parametrize('seed', range(4))
+def test_noise_of_a_pose_of_a_creeping_robot_is_no_contact(seed):
+    """It stops every half a second, as along a path that is planned anew; it backed off once."""
+    generator, monitor = np.random.default_rng(seed), ContactMonitor()
+    pose, now, touches = Pose(0.0, 0.0, 0.0), STANDSTILL, 0
+    for k in range(30_000):
+        command = BodyTwist(0.075 * (1.0 - math.cos(0.13 * k)), 0.1)
+        now = BodyTwist(*(n + 0.06 * (c - n) for n, c in zip(now, command, strict=True)))
+        pose = advance_pose(pose, now, 0.01)
+        x, y, yaw = np.array(pose) + generator.standard_normal(3) * (0.003, 0.003, 0.005)
+        odometry = State(k * 10 * MS, Pose(float(x), float(y), float(yaw)), now)
+        touches += monitor.is_in_contact(odometry, command, 0.01)
+    assert touches == 0
+
+
 def touches_of(turned, seconds, seed=0):
     """Return when (s) contact is found of a robot that turns as ``turned(time, asked)``, rad/s."""
     generator, monitor, pose = np.random.default_rng(seed), ContactMonitor(), Pose(0.0, 0.0, 0.0)
@@ -673,6 +688,35 @@ def test_pose_or_twist_alone_show_that_a_robot_moves(part):
         state = State(k * 10_000_000, pose, moving)
         reason = monitor.decide(state, BodyTwist(0.2, 0.0), 0.01, following=True)
         assert reason is Reason.TRACKING
+
+
+def contacts_of(wheels_turn, comes_free):
+    """Return whether each pause is for a contact of a robot that stops after a second."""
+    monitor, x, found, released = DriveMonitor(feels=True), 0.0, [], False
+    for k in range(800):
+        paused = bool(found) and monitor.pauses == len(found) and monitor._pause > 0.0
+        released |= paused and comes_free
+        moves = k < 100 or released
+        command = STANDSTILL if paused else BodyTwist(0.2, 0.0)
+        x += 0.01 * command.linear * moves
+        turning = moves or wheels_turn
+        twist = BodyTwist(command.linear * turning, 0.0)
+        state = State(k * 10 * MS, Pose(x, 0.0, 0.0), twist)
+        before = monitor.pauses
+        monitor.decide(state, command, 0.01, following=turning)
+        if monitor.pauses > before:
+            found.append(monitor.contact)
+    return found
+
+
+def test_a_robot_that_stopped_by_itself_is_not_held():
+    """After a slip on oil it stopped its wheels; the floor there was marked for good.
+
+    What does not move after the pause either is held, whether its wheels turn or not.
+    """
+    assert contacts_of(wheels_turn=False, comes_free=True) == [False]
+    assert contacts_of(wheels_turn=True, comes_free=True) == [True]
+    assert contacts_of(wheels_turn=False, comes_free=False)[:2] == [False, True]
 
 
 def test_noise_of_a_standing_robot_is_no_motion():
