@@ -1,4 +1,3 @@
-#!/usr/bin/env python3
 # Copyright 2026 The t3mpc_ros developers
 #
 # Licensed under the Apache License, Version 2.0 (the "License");
@@ -11,6 +10,7 @@
 # distributed under the License is distributed on an "AS IS" BASIS,
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
+# limitations under the License.
 """Where the settled error of the wheels on the twin comes from: zero crossings and microsteps.
 
 ``python bench/zero_crossings.py``: a table in Markdown. For the controller of the node, nominal
