@@ -500,7 +500,7 @@ def test_noise_of_a_pose_of_a_creeping_robot_is_no_contact(seed):
     """It stops every half a second, as along a path that is planned anew; it backed off once."""
     generator, monitor = np.random.default_rng(seed), ContactMonitor()
     pose, now, touches = Pose(0.0, 0.0, 0.0), STANDSTILL, 0
-    for k in range(30_000):
+    for k in range(15_000):
         command = BodyTwist(0.075 * (1.0 - math.cos(0.13 * k)), 0.1)
         now = BodyTwist(*(n + 0.06 * (c - n) for n, c in zip(now, command, strict=True)))
         pose = advance_pose(pose, now, 0.01)

@@ -521,6 +521,7 @@ def yaw_errors(drift):
     return np.array([drifting, turned_too_far(localizer, drive, 30.0)])
 
 
+@pytest.mark.compiled
 def test_the_drift_of_a_gyro_is_measured_by_the_map():
     """A patrol was 2 degrees and 24 mm off after its gyro had drifted for twelve minutes.
 
@@ -530,6 +531,7 @@ def test_the_drift_of_a_gyro_is_measured_by_the_map():
     assert abs(yaw_errors(-0.009) - yaw_errors(0.0)).max() < 0.005
 
 
+@pytest.mark.compiled
 def test_a_robot_at_rest_does_not_turn_with_its_gyro():
     """Its pose loop followed the odometry, which did not turn then, and the robot did."""
     localizer, drive = make_localizer(), Drive(drift=0.009)
@@ -545,6 +547,7 @@ def test_a_robot_at_rest_does_not_turn_with_its_gyro():
         assert abs(wrap_angle(used.yaw - yaw)) < 0.04  # 0.18 by the odometry
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('angle', [-0.3, 0.3])
 def test_a_slip_is_no_drift(angle):
     after = []
