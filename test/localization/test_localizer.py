@@ -349,6 +349,7 @@ def test_a_sensor_that_contradicts_the_map_is_not_used(sensor, wrong):
     assert localizer.doubtful == ()
 
 
+@pytest.mark.compiled
 def test_a_scan_is_used_like_the_ranges():
     localizer, drive = make_localizer(sigma_hit_growth=0.0), Drive(seed=7)
     angles = np.linspace(-math.pi, math.pi, 24, endpoint=False)
@@ -501,7 +502,6 @@ def test_a_search_ends_when_readings_fit_for_some_time():
     assert not early
 
 
-@pytest.mark.compiled
 def turned_too_far(localizer, drive, seconds):
     """Drive; return the mean of the estimated yaw less the true one, rad."""
     gaps = []
@@ -560,6 +560,7 @@ def test_a_slip_is_no_drift(angle):
     assert abs(after[1] - after[0]) < 0.003
 
 
+@pytest.mark.compiled
 def test_a_slip_is_no_reason_to_look_elsewhere():
     """A turn that the odometry missed led to another place that looked alike, 1.4 m away."""
     for seed in (1, 2, 3):
