@@ -21,7 +21,6 @@ with coarser microsteps, and with a deadband of the commands (``wheel.deadband_v
 
 import argparse
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -45,8 +44,8 @@ MICROSTEPS = 16, 8
 def measured(job: tuple[int, int, float]) -> tuple[float, float, list[float]]:
     """Return settled error, variation, and the shares of the power of a seed."""
     seed, microsteps, left_out = job
-    robot: dict[str, Any] = {'motor.microsteps': microsteps} if microsteps != 16 else {}
-    scenario = Scenario('twin', 'nominal', seed, own=OwnParts(robot_parameters=robot))
+    own = OwnParts(robot_parameters={'motor.microsteps': microsteps})
+    scenario = Scenario('twin', 'nominal', seed, own=own)
     method = methods_for('twin')[FULL]
     changes = {**method.changes, 'wheel.deadband_velocity': left_out}
     record = run(scenario, replace(method, changes=changes))
@@ -68,10 +67,10 @@ def main() -> None:
     parser.add_argument('--workers', type=int, default=1, help='processes (default 1)')
     options = parser.parse_args()
     cases = [(f'{steps} microsteps', steps, 0.0) for steps in MICROSTEPS]
-    cases += [(f'deadband {speed:g} rad/s', 16, speed) for speed in LEFT_OUT]
+    cases += [(f'deadband {speed:g} rad/s', MICROSTEPS[0], speed) for speed in LEFT_OUT]
     seeds = range(4001, 4001 + options.seeds)
     jobs = [(seed, steps, speed) for _, steps, speed in cases for seed in seeds]
-    found = list(map_jobs(measured, jobs, options.workers))
+    found = map_jobs(measured, jobs, options.workers)
     rows = []
     for number, (name, *_) in enumerate(cases):
         runs = found[number * len(seeds) : (number + 1) * len(seeds)]

@@ -156,7 +156,7 @@ class VelocityActuation:
         self._servo_step = 1.0 - math.exp(-period / lag)
         self._disturbance_gain = self._servo_step * lag / period if self.takes_speeds else 1.0
         self.applied: Array = np.zeros(2)
-        """Acceleration u that the last command realises, rad/s², shape (2,)."""
+        """Acceleration u that the last command realises before the deadband, rad/s², (2,)."""
         self.command: Array = np.zeros(2)
         """Last commanded wheel speeds, rad/s, shape (2,); zeros with a torque drive."""
         self._wanted = np.zeros(2)
@@ -218,9 +218,10 @@ class VelocityActuation:
 
     def _apply_deadband(self) -> None:
         for wheel, speed in enumerate(self._wanted.tolist()):
-            if 0.0 < abs(speed) < self._deadband:
-                nearest = 0.0 if abs(speed) < 0.5 * self._deadband else self._deadband
-                speed = math.copysign(nearest, speed)
+            if abs(speed) < 0.5 * self._deadband:
+                speed = 0.0
+            elif abs(speed) < self._deadband:
+                speed = math.copysign(self._deadband, speed)
             self.command[wheel] = speed
 
     def observe(self, measured: Array, dt: float) -> None:

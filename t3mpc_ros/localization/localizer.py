@@ -255,8 +255,8 @@ class Localizer:
     @property
     def doubtful(self) -> tuple[int, ...]:
         """Sensors whose readings contradict the map while those of the others fit."""
-        if np.median(self._fits) < OTHERS_AGREEMENT:
-            return ()
+        if self._fits.size == 0 or np.median(self._fits) < OTHERS_AGREEMENT:
+            return ()  # a scan alone has no sensors to compare
         return tuple(np.flatnonzero(self._fits < DOUBTFUL_AGREEMENT).tolist())
 
     def add_range(self, sensor: int, reading: float, stamp_ns: int | None = None) -> None:
@@ -315,18 +315,17 @@ class Localizer:
         elapsed = min((stamp_ns - self._updated_ns) / NANOSECONDS, LONGEST_UPDATE)
         self.filter.predict(self._updated, turned, elapsed)
         taken, doubtful = self._take_beams(pose), self.doubtful
-        beams = joined([each for sensor, each in taken.items() if sensor not in doubtful])
-        known = self._of_the_map(beams, pose)
+        of_the_map = {sensor: self._of_the_map(each, pose) for sensor, each in taken.items()}
+        known = joined([each for name, each in of_the_map.items() if name not in doubtful])
         # Averages of the likelihood get used to a wrong place; the share that fits does not.
         self.filter.correct(known, 1.0 - self.agreement if self._searching else 0.0)
         found = self._publish(pose)
         self._compare(known)
-        for sensor, each in taken.items():
+        for sensor, each in of_the_map.items():
             if sensor != SCAN:
-                share = self._fits[sensor]
-                self._fits[sensor] = self._followed(share, self._of_the_map(each, pose))
+                self._fits[sensor] = self._followed(self._fits[sensor], each)
         if self.parameters.changes.enabled:
-            self._detect(beams)
+            self._detect(joined([each for name, each in taken.items() if name not in doubtful]))
         return found
 
     def _turn(self, odometry: Pose, elapsed: float) -> None:

@@ -367,6 +367,12 @@ def test_a_scan_is_used_like_the_ranges():
     assert turned < math.radians(1.0)
 
 
+def test_a_robot_without_range_sensors_has_no_doubtful_one():
+    """With a scan alone each update warned of the mean of nothing."""
+    localizer = Localizer(make_localizer().parameters, SEEN, np.empty((0, 3)), (LEAST, MOST))
+    assert localizer.doubtful == ()
+
+
 @pytest.mark.compiled
 def test_equal_inputs_give_equal_bits():
     results = []
