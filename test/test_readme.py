@@ -31,7 +31,7 @@ import sys
 import pytest
 from support.launch_files import arguments_of, nodes_of
 from support.missing_tools import needs
-from support.waiting import run, wait_for_end, wait_for_text
+from support.waiting import WaitTimeoutError, run, wait_for_end, wait_for_text
 import yaml
 
 from t3mpc_ros.cli import bag, emulator, robot
@@ -417,6 +417,9 @@ def _work(command, output, tmp_path):
             code = wait_for_end(process, 240.0)
         if code != slow:
             break
+    if command.startswith(DEMO) and code == 3:
+        # A poor run: a robot without a processor drives late.
+        raise WaitTimeoutError(log.read_text())
     # 3: the file has no end, as the page says.
     assert code == (3 if 'broken' in command else 0), f'{command}: {log.read_text()}'
     assert 'Traceback' not in log.read_text()
