@@ -352,13 +352,16 @@ def run_job(pair: tuple[Job, Job]) -> tuple[Numbers, list[tuple[float, str]]]:
     return numbers, method.made[0].said if isinstance(method, Watched) else []
 
 
-def first_said(fault: Fault, said: Iterable[tuple[float, str]]) -> str:
-    """Return what the diagnostics said within 5 s of the begin of a fault, and not before."""
+def first_said(fault: Fault, said: Iterable[tuple[float, str]], limit: float = NAMED) -> str:
+    """Return what the diagnostics said within 5 s of the begin of a fault, and not before.
+
+    ``limit`` is another time, s.
+    """
     said = [(time - fault.begin, text) for time, text in said]
     before = {kind(text) for time, text in said if time < 0.0}
     found: dict[str, str] = {}
     for time, text in said:
-        if 0.0 <= time <= NAMED and kind(text) not in before:
+        if 0.0 <= time <= limit and kind(text) not in before:
             found.setdefault(kind(text), f'{text} ({time:.0f} s)')
     return '; '.join(found.values())
 
@@ -388,22 +391,26 @@ def row(name: str, found: Found) -> tuple[str, bool]:
     best = np.min([errors[each] for each in fault.comparable], axis=0)
     ratio = float(np.max(np.divide(errors[FULL], best)))
     cost = max(mean(name, FULL, metric) / mean('none', FULL, metric) for metric in counted)
-    stopped, texts = mean(name, FULL, 'stopped'), []
+    stopped, texts, later = mean(name, FULL, 'stopped'), [], 0
     for seed in seeds(FULL):
         said = found[Job(name, FULL, seed)][1]
         texts.append(first_said(fault, said))
+        later += bool(first_said(fault, said, DURATION))
         stopped += sum(text in stops for _, text in said) and 0.005
     named, count = sum(map(bool, texts)), len(texts)
     text = re.sub(r'(:|;| \(\d).*', '', max(texts, key=bool))
     cells = [*errors.values(), [mean(name, EXACT, metric) for metric in counted]]
     worse = ratio > MARGIN and stopped == 0.0
     silent = named < count and cost > MARGIN and name != 'none'
+    said_of = f'{named} of {count}' if named else '–'
+    if later > named:
+        said_of = f'{named} of {count}, later {later}'
     shown = [
         f'{name} †' if fault.body else name,
         *(' / '.join('–' if math.isnan(x) else f'{x:.4f}' for x in cell) for cell in cells),
         f'**{ratio:.2f}**' if worse else f'{ratio:.2f}',
         f'{stopped:.1f}' if stopped else '–',
-        f'**{named} of {count}**' if silent else f'{named} of {count}' if named else '–',
+        f'**{said_of}**' if silent else said_of,
         text,
     ]
     return f'| {" | ".join(shown)} |', not (worse or silent)

@@ -106,6 +106,9 @@ MIN_DEAD_TIME_CHANGE = 0.0005
 
 NO_DEAD_TIME = 0.001
 """Estimated dead time (s) up to which the lag in use may be too long: there is no shorter one."""
+TOO_FAST = 8.0
+"""Likelihood ratio, 2 log, of a response before the lag has passed above which the lag in use is
+too long: that of 2.8 standard deviations."""
 
 MAX_MISSED = 20
 """Largest number of periods without a step through which a ramp goes on."""
@@ -394,7 +397,7 @@ class Controller:
         found.append(self.odometry_twist.problem())
         configured = self.parameters.speed_filter.dead_time
         in_use, lag = self._dead_time, self.parameters.speed_filter.lag
-        if self._excess_lag > 0.0:
+        if self._excess_lag > 0.0 and in_use < -NO_DEAD_TIME:
             found.append(
                 f'the robot responds after {in_use + lag:.3f} s, too early for a '
                 f'speed_filter.lag of {lag:g} s: the estimate is in use; set the lag'
@@ -888,9 +891,10 @@ class Controller:
         lag, estimator = self.parameters.speed_filter.lag, self.dead_time
         if self.parameters.composition != 'body' or lag <= 0.5 * self._period:
             return False
-        none = estimator.dead_time < NO_DEAD_TIME
-        known = estimator.dead_time_in_use == estimator.dead_time
-        return none and known and self._excess_lag == 0.0
+        if self._excess_lag > 0.0 or estimator.dead_time > NO_DEAD_TIME:
+            return False
+        configured = self.parameters.speed_filter.dead_time
+        return estimator.evidence_against(configured) > TOO_FAST
 
     def _make_dead_time_estimator(self) -> DeadTimeEstimator:
         # The pulses of a stepper ramp over a period, half a period late on average.

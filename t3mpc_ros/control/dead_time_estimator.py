@@ -263,6 +263,19 @@ class DeadTimeEstimator:
         """Standard deviation of the estimate from the noise, s."""
         return float(self._state['deviation'][0])
 
+    def evidence_against(self, dead_time: float) -> float:
+        """Return 2 log of the likelihood ratio of the best dead time and another one, s.
+
+        The best one may be below 0, where the parabola of the smallest dead times has its minimum.
+        """
+        estimate = self.estimate
+        costs = estimate.accepted.costs
+        slope, curvature = 0.5 * (costs[2] - costs[0]), costs[2] - 2.0 * costs[1] + costs[0]
+        _, least, _ = minimum(costs)
+        if slope > curvature > 0.0:
+            least = costs[1] - 0.5 * slope**2 / curvature
+        return float((cost_at(costs, dead_time) - least) / estimate.noise_ratio)
+
     def reset(self, speeds: Array) -> None:
         """Restart at measured wheel speeds (rad/s) with equal commands; the estimate is kept.
 
@@ -622,6 +635,8 @@ def set_estimate(estimate: Any) -> None:
     variance = second / total - (first / total) ** 2
     if variance < GRID_STEP**2:
         variance = 2.0 * ratio / curvature
+        if variance > GRID_STEP**2:  # at the end of the grid the costs may bend down
+            variance = (0.5 * GRID_STEP) ** 2
     if variance < MIN_DEVIATION**2:
         scale(accepted, variance / MIN_DEVIATION**2)
         variance = MIN_DEVIATION**2

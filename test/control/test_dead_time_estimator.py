@@ -145,6 +145,41 @@ def test_dead_time_and_lag_are_identified_as_a_sum():
     np.testing.assert_allclose(sums, 0.05, atol=0.002)
 
 
+def test_evidence_is_that_of_the_deviations_between():
+    """2 log of the likelihood ratio is the square of the number of standard deviations."""
+    for seed in range(3):
+        estimator, record = run(simulate(smooth_commands(10.0, seed), 0.03, seed))
+        found, deviation = record[-1, :2]
+        for other in (found - 0.008, found + 0.012):
+            expected = ((other - found) / deviation) ** 2
+            assert estimator.evidence_against(other) == pytest.approx(expected, rel=0.15)
+        assert estimator.evidence_against(found) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize('configured', [0.0, 0.01])
+def test_a_response_before_its_lag_has_passed_shows_early(configured):
+    """A lag of 20 ms that the robot has not: its best dead time is below 0, where no grid is.
+
+    It was not seen before the deviation from 10 ms was clear, for up to six seconds.
+    """
+    shown, none = [], []
+    for seed in range(6):
+        command = smooth_commands(3.0, seed)
+        drive = simulate(command, 0.005, seed, lag=0.0005)
+        shown.append(run(drive, lag=0.02, configured=configured)[0].evidence_against(configured))
+        drive = simulate(command, configured, seed, lag=0.02)
+        none.append(run(drive, lag=0.02, configured=configured)[0].evidence_against(configured))
+    assert np.median(shown) > 8.0
+    assert max(none) < 4.0
+
+
+def test_a_drive_without_dead_time_is_identified():
+    """The costs bend down at the end of the grid, so the deviation stayed that of the prior."""
+    for seed in range(3):
+        _, record = run(simulate(smooth_commands(10.0, seed), 0.0, seed))
+        assert record[at(5.0) :, 3].max() == 0.0
+
+
 def test_the_estimate_is_invariant_to_the_scale_of_the_speeds():
     drive = simulate(smooth_commands(10.0, 5), 0.04, 5)
     scaled = Drive(10.0 * drive.command, 10.0 * drive.measured)
