@@ -64,6 +64,9 @@ CASES: Mapping[str, PatrolScenario] = {
         localization='filter', range_loss=0.2, robot=dict(TRIPLED)
     ),
     'carried by 1 m and 90 degrees': PatrolScenario(localization='filter', carried_at=CARRIED_AT),
+    'carried, noise x 3, 20 % lost': PatrolScenario(
+        localization='filter', range_loss=0.2, robot=dict(TRIPLED), carried_at=CARRIED_AT
+    ),
 }
 """The cases by name."""
 
