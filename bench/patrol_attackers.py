@@ -40,8 +40,12 @@ from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.evaluation.confidence_intervals import mean
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at, visits
-from t3mpc_ros.evaluation.patrol.entropies import delay_vectors, resampled, square_distances
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
+from t3mpc_ros.evaluation.patrol.time_series_analysis import (
+    delay_vectors,
+    resampled,
+    square_distances,
+)
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming
 from t3mpc_ros.geometry.types import Array

@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from t3mpc_ros.chaos.planned_path import PlanParameters
+from t3mpc_ros.chaos.patrol_planner import PlanParameters
 from t3mpc_ros.chaos.portrait import PortraitParameters
 from t3mpc_ros.evaluation.experiment import ResultTable, Run, print_report, run_experiment
 from t3mpc_ros.evaluation.patrol.localization_study import localization_errors

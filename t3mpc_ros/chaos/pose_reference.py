@@ -22,7 +22,7 @@ from typing import Protocol
 
 import numpy as np
 
-from t3mpc_ros.chaos.planned_path import PlannedPath, PlanParameters
+from t3mpc_ros.chaos.patrol_planner import PlannedPath, PlanParameters
 from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.secret_random import SecretRandom

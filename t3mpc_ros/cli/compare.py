@@ -18,7 +18,7 @@ from pathlib import Path
 import time
 from typing import TYPE_CHECKING
 
-from t3mpc_ros.cli import run_options
+from t3mpc_ros.cli import shared_options
 
 if TYPE_CHECKING:
     from t3mpc_ros.evaluation.comparison import ComparisonPlan
@@ -40,8 +40,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         'observation'
     )
     add('own', nargs='*', metavar='FILE.py:NAME', help=text)
-    run_options.add_setting(parser)
-    run_options.add_seeds(
+    shared_options.add_setting(parser)
+    shared_options.add_seeds(
         parser,
         DEFAULT_SEEDS,
         'reference and robot; none of the default ones, a quick look, was used for tuning or is '
@@ -60,8 +60,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         help='twin: baselines take the yaw rate from the gyro in every case, not only where the '
         'robot is miscalibrated',
     )
-    run_options.add_workers(parser)
-    run_options.add_outputs(parser, 'write every number')
+    shared_options.add_workers(parser)
+    shared_options.add_outputs(parser, 'write every number')
     add('--csv', type=Path, help='write a row for each run, with commit and machine')
     parser.set_defaults(run=run)
 
@@ -76,11 +76,11 @@ def run(options: argparse.Namespace) -> None:
     from t3mpc_ros.evaluation.reporting import columns_of, write_columns
 
     plan = _plan(options)
-    run_options.prepare_outputs(options, options.csv)
-    with run_options.executor_of(options) as executor:
+    shared_options.prepare_outputs(options, options.csv)
+    with shared_options.executor_of(options) as executor:
         results = run_plan(plan, executor, print_report)
     times = step_times(plan, time.perf_counter_ns)
-    run_options.print_result(
+    shared_options.print_result(
         options,
         lambda: markdown(plan, results, times),
         lambda: comparison_page.record(plan, results, times),
@@ -103,13 +103,15 @@ def _plan(options: argparse.Namespace) -> 'ComparisonPlan':
     from t3mpc_ros.evaluation.methods import default_methods, methods_for, require_libraries
     from t3mpc_ros.parameters.table import find_names
 
-    own = bool(options.own or options.reference or options.robot not in run_options.ROBOTS)
+    own = bool(options.own or options.reference or options.robot not in shared_options.ROBOTS)
     if own and options.gyro:
         raise ValueError('--gyro is for the methods of the package: got your own')
-    scenario = own_scenario(**run_options.setting_of(options), gyro=options.gyro)
+    scenario = own_scenario(**shared_options.setting_of(options), gyro=options.gyro)
     if own:
-        chosen = [*(options.methods or [run_options.FULL]), *options.own]
-        return make_plan(chosen, options.seeds, options.cases or (run_options.NOMINAL,), scenario)
+        chosen = [*(options.methods or [shared_options.FULL]), *options.own]
+        return make_plan(
+            chosen, options.seeds, options.cases or (shared_options.NOMINAL,), scenario
+        )
     known = methods_for(scenario.robot)
     wanted = list(known) if options.methods == ['all'] else options.methods
     names = find_names('method', wanted, known) or default_methods(scenario.robot)

@@ -16,7 +16,7 @@
 import argparse
 from pathlib import Path
 
-from t3mpc_ros.cli import run_options
+from t3mpc_ros.cli import shared_options
 
 
 def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -30,8 +30,8 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     parser.add_argument(
         '--output', type=Path, help='page whose table is to be replaced, docs/faults.md say'
     )
-    run_options.add_outputs(parser)
-    run_options.add_workers(parser)
+    shared_options.add_outputs(parser)
+    shared_options.add_workers(parser)
     parser.set_defaults(run=run)
 
 
@@ -52,10 +52,10 @@ def run(options: argparse.Namespace) -> int:
         for fault_run in FAULT_RUNS
         if not options.names or fault_run.fault in options.names
     ]
-    run_options.prepare_outputs(options)
-    with run_options.executor_of(options) as executor:
+    shared_options.prepare_outputs(options)
+    with shared_options.executor_of(options) as executor:
         rows = study_faults(fault_runs, executor, print_report)
-    run_options.print_result(options, lambda: fault_page.console_text(rows), lambda: list(rows))
+    shared_options.print_result(options, lambda: fault_page.console_text(rows), lambda: list(rows))
     if options.output:
         fault_page.update_page(options.output, rows)
     if options.html:

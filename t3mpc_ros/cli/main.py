@@ -26,7 +26,7 @@ import webbrowser
 
 from t3mpc_ros.cli import compare, faults, paper, patrol, ros2_commands, sweep, train, tune, view
 from t3mpc_ros.cli.argument_parser import ArgumentParser, reject_removed, run_command
-from t3mpc_ros.cli.run_options import add_json, add_seeds, prepare_outputs, print_result
+from t3mpc_ros.cli.shared_options import add_json, add_seeds, prepare_outputs, print_result
 from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.parameters.command_line import bounded_float
 

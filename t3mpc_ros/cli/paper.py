@@ -16,7 +16,7 @@
 import argparse
 from pathlib import Path
 
-from t3mpc_ros.cli import run_options
+from t3mpc_ros.cli import shared_options
 
 
 def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
@@ -26,10 +26,10 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     )
     add = parser.add_argument
     add('--quick', action='store_true', help='few seeds and short runs: shows that all works')
-    run_options.add_seeds(
+    shared_options.add_seeds(
         parser, '', 'the runs', counted=True, text='the 20 held-out ones, quick: 3'
     )
-    run_options.add_seeds(
+    shared_options.add_seeds(
         parser,
         '',
         'the comparison without a controller (86)',
@@ -37,9 +37,9 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         counted=True,
         text='20, quick: 2',
     )
-    run_options.add_workers(parser)
+    shared_options.add_workers(parser)
     add('--output', type=Path, help='folder (default runs/paper, or runs/paper-quick)')
-    run_options.add_json(parser, 'also write the results')
+    shared_options.add_json(parser, 'also write the results')
     add('--fresh', action='store_true', help='discard the runs that the folder holds')
     parser.set_defaults(run=run)
 
@@ -50,10 +50,10 @@ def run(options: argparse.Namespace) -> None:
     from t3mpc_ros.evaluation.methods import NMPC, require_libraries
     from t3mpc_ros.evaluation.paper.reproduce import reproduce
 
-    run_options.prepare_outputs(options)
+    shared_options.prepare_outputs(options)
     require_libraries([NMPC])
     output = options.output or Path('runs') / ('paper-quick' if options.quick else 'paper')
-    with run_options.executor_of(options) as executor:
+    with shared_options.executor_of(options) as executor:
         text, numbers = reproduce(
             output,
             quick=options.quick,
@@ -63,4 +63,4 @@ def run(options: argparse.Namespace) -> None:
             fresh=options.fresh,
             report=print_report,
         )
-    run_options.print_result(options, lambda: text, lambda: numbers)
+    shared_options.print_result(options, lambda: text, lambda: numbers)

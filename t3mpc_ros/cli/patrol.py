@@ -19,7 +19,13 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from t3mpc_ros.cli.run_options import add_json, add_seeds, add_workers, executor_of, print_result
+from t3mpc_ros.cli.shared_options import (
+    add_json,
+    add_seeds,
+    add_workers,
+    executor_of,
+    print_result,
+)
 from t3mpc_ros.parameters.command_line import bounded_float
 
 DEFAULT_SEEDS = '101-105'

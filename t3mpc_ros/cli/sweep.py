@@ -17,7 +17,7 @@ import argparse
 from pathlib import Path
 import sys
 
-from t3mpc_ros.cli import run_options
+from t3mpc_ros.cli import shared_options
 from t3mpc_ros.parameters.command_line import parsed_value
 
 OUTPUT = Path('runs') / 'sweep.parquet'
@@ -36,7 +36,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     )
     add = parser.add_argument
     text = 'name of a method, or FILE.py:NAME (default full)'
-    add('controllers', nargs='*', default=[run_options.FULL], metavar='CONTROLLER', help=text)
+    add('controllers', nargs='*', default=[shared_options.FULL], metavar='CONTROLLER', help=text)
     add(
         '--set',
         nargs='+',
@@ -46,14 +46,14 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         metavar='NAME=V,V,…',
         help='values of a parameter of the controller, of noise or duration, or of robot.NAME',
     )
-    run_options.add_setting(parser)
-    run_options.add_seeds(parser, '1-5', 'reference and robot')
+    shared_options.add_setting(parser)
+    shared_options.add_seeds(parser, '1-5', 'reference and robot')
     text = 'by name (default nominal)'
-    add('--cases', nargs='+', default=(run_options.NOMINAL,), metavar='CASE', help=text)
+    add('--cases', nargs='+', default=(shared_options.NOMINAL,), metavar='CASE', help=text)
     add('--output', type=Path, default=OUTPUT, help=f'Parquet file (default {OUTPUT})')
     add('--metric', default='settled', help='column that the table shows (default settled)')
-    run_options.add_workers(parser)
-    run_options.add_json(parser, 'also write the rows')
+    shared_options.add_workers(parser)
+    shared_options.add_json(parser, 'also write the rows')
     parser.set_defaults(run=run)
 
 
@@ -62,20 +62,20 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.api.comparison_runs import find_metric
     from t3mpc_ros.evaluation.api.parameter_sweep import has_failed, sweep
 
-    run_options.prepare_outputs(options, options.output)
+    shared_options.prepare_outputs(options, options.output)
     metric = find_metric(options.metric).name
-    with run_options.executor_of(options) as executor:
+    with shared_options.executor_of(options) as executor:
         found = sweep(
             options.controllers,
             dict(options.set),
             seeds=options.seeds,
             cases=options.cases,
-            **run_options.setting_of(options),
+            **shared_options.setting_of(options),
             output=options.output,
             executor=executor,
             progress=True,
         )
-    run_options.print_result(
+    shared_options.print_result(
         options,
         lambda: f'{found.table(metric)}\n{len(found.rows)} runs: {options.output}',
         lambda: found.rows,

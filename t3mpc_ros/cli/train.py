@@ -16,7 +16,7 @@
 import argparse
 from pathlib import Path
 
-from t3mpc_ros.cli.run_options import add_seeds
+from t3mpc_ros.cli.shared_options import add_seeds
 
 DRIVES = {'servo': 'velocity', 'torque': 'torque'}
 OUTPUT = Path('model.npz')

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from t3mpc_ros.cli import run_options
+from t3mpc_ros.cli import shared_options
 from t3mpc_ros.parameters.command_line import bounded_int
 
 if TYPE_CHECKING:
@@ -56,12 +56,12 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
     )
     text = f'of each method with each robot (default {EVALUATIONS}; twin {TWIN_EVALUATIONS})'
     add('--evaluations', type=bounded_int(1, 100_000), help=text)
-    run_options.add_workers(parser)
+    shared_options.add_workers(parser)
     text = f'file to write (default {OUTPUT}; with a bag none but the standard output)'
     add('--output', type=Path, help=text)
     add('--resume', action='store_true', help='go on where the last tuning was interrupted')
-    run_options.add_json(parser, 'also write the parameters')
-    run_options.add_topic_options(parser.add_argument_group('with a bag'))
+    shared_options.add_json(parser, 'also write the parameters')
+    shared_options.add_topic_options(parser.add_argument_group('with a bag'))
     parser.set_defaults(run=run)
 
 
@@ -81,9 +81,9 @@ def run(options: argparse.Namespace) -> None:
     names = find_names('method', options.methods, [method.name for method in known])
     methods = [method for method in known if method.name in names or not names]
     require_libraries(method.name for method in methods)
-    with run_options.executor_of(options) as executor:
+    with shared_options.executor_of(options) as executor:
         store = _tuned(options, methods, executor)
-    run_options.print_result(options, store.table, store.to_dict)
+    shared_options.print_result(options, store.table, store.to_dict)
 
 
 def _tuned(
@@ -94,7 +94,7 @@ def _tuned(
 
     output = options.output or OUTPUT
     if options.robot == TWIN:
-        from t3mpc_ros.evaluation.tuning.closed_loop_tuning import tune_twin, twin_definitions
+        from t3mpc_ros.evaluation.tuning.twin_tuning import tune_twin, twin_definitions
 
         return tune_twin(
             twin_definitions(methods),
@@ -135,9 +135,9 @@ def _identify(options: argparse.Namespace) -> None:
         )
     if options.methods or options.evaluations or options.resume:
         raise ValueError('methods, --evaluations and --resume are for simulated robots: got a bag')
-    found = identify_bag(bag, run_options.report_options(options))
+    found = identify_bag(bag, shared_options.report_options(options))
     text = drive_file(*found, bag_display_name(bag))
-    run_options.print_result(options, lambda: text.rstrip('\n'), lambda: drive_record(*found))
+    shared_options.print_result(options, lambda: text.rstrip('\n'), lambda: drive_record(*found))
     if options.output:
         options.output.parent.mkdir(parents=True, exist_ok=True)
         options.output.write_text(text, encoding='utf-8')

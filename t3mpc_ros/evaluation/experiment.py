@@ -36,10 +36,10 @@ from typing import Any, Self, TypeVar
 
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters
 from t3mpc_ros.evaluation.cases import NOMINAL, PLANTS
+from t3mpc_ros.evaluation.cluster_modules import ModuleCarrier
 from t3mpc_ros.evaluation.confidence_intervals import Difference, paired
 from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.loop import Method, run
-from t3mpc_ros.evaluation.module_upload import ModuleCarrier
 from t3mpc_ros.evaluation.record import Record, measure
 from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.evaluation.result_file import ResultFile, Row

@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.module_upload import is_own, own_text
+from t3mpc_ros.evaluation.cluster_modules import is_own, own_text
 from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.version import VERSION
 

@@ -25,7 +25,7 @@ import pytest
 from support.long_tests import few_of
 
 from t3mpc_ros.cli.main import main
-from t3mpc_ros.cli.run_options import ROBOTS, seed_range
+from t3mpc_ros.cli.shared_options import ROBOTS, seed_range
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
 from t3mpc_ros.evaluation.baselines.feed_forward import FeedForward, FeedForwardParameters

@@ -26,15 +26,15 @@ from t3mpc_ros.evaluation.patrol.coverage import (
     time_to_cover,
     visits,
 )
-from t3mpc_ros.evaluation.patrol.entropies import (
+from t3mpc_ros.evaluation.patrol.patrol_metrics import patrol_metrics
+from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, predictability
+from t3mpc_ros.evaluation.patrol.time_series_analysis import (
     delay_vectors,
     divergence,
     ordinal_shares,
     permutation_entropy,
     spectral_entropy,
 )
-from t3mpc_ros.evaluation.patrol.patrol_metrics import patrol_metrics
-from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, predictability
 
 AREA = Rectangle((-1.8, -1.3), (1.8, 1.3))
 

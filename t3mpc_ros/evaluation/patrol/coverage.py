@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.patrol.entropies import check_path, normalised_entropy
+from t3mpc_ros.evaluation.patrol.time_series_analysis import check_path, normalised_entropy
 from t3mpc_ros.geometry.types import Array
 
 

@@ -25,14 +25,14 @@ from t3mpc_ros.evaluation.patrol.coverage import (
     time_to_cover,
     visits,
 )
-from t3mpc_ros.evaluation.patrol.entropies import (
+from t3mpc_ros.evaluation.patrol.predictability import predictability
+from t3mpc_ros.evaluation.patrol.time_series_analysis import (
     delay_vectors,
     divergence,
     permutation_entropy,
     resampled,
     spectral_entropy,
 )
-from t3mpc_ros.evaluation.patrol.predictability import predictability
 from t3mpc_ros.geometry.types import Array
 
 SHARES = (0.5, 0.9, 0.95)
@@ -83,7 +83,7 @@ def patrol_metrics(
     Raises
     ------
     ValueError
-        Not a path: see :func:`~t3mpc_ros.evaluation.patrol.entropies.check_path`.
+        Not a path: see :func:`~t3mpc_ros.evaluation.patrol.time_series_analysis.check_path`.
     """
     found = visits(t, x, y, grid)
     exponent = permutation = spectral = error = math.nan
@@ -126,8 +126,8 @@ def patrol_metrics(
 def path_exponent(t: Array, x: Array, y: Array) -> float:
     """Return the largest Lyapunov exponent of a path, 1/s; NaN if it never moves.
 
-    By :func:`~t3mpc_ros.evaluation.patrol.entropies.divergence` of delay vectors of x and y
-    with 0, 1 and 2 s of past; neighbours are more than 10 s apart and followed for 20 s.
+    By :func:`~t3mpc_ros.evaluation.patrol.time_series_analysis.divergence` of delay vectors of x
+    and y with 0, 1 and 2 s of past; neighbours are more than 10 s apart and followed for 20 s.
     """
     points = delay_vectors(resampled(t, x, y, _STEP), _EXPONENT_LAGS)
     if not np.ptp(points, axis=0).any():

@@ -29,7 +29,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.chaos.planned_path import PlannedPath, PlanParameters
+from t3mpc_ros.chaos.patrol_planner import PlannedPath, PlanParameters
 from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
 from t3mpc_ros.chaos.pose_reference import PathClock, WaitParameters
 from t3mpc_ros.chaos.reference import ReferenceParameters

@@ -38,7 +38,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.patrol.entropies import (
+from t3mpc_ros.evaluation.patrol.time_series_analysis import (
     delay_vectors,
     resampled,
     square_distances,

@@ -36,8 +36,10 @@ from t3mpc_ros.evaluation.methods import (
 )
 from t3mpc_ros.evaluation.record import OVERALL, VARIATION, measure, rolling_speeds
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
-from t3mpc_ros.evaluation.tuning import closed_loop_tuning
-from t3mpc_ros.evaluation.tuning.closed_loop_tuning import (
+from t3mpc_ros.evaluation.tuning import twin_tuning
+from t3mpc_ros.evaluation.tuning.tune_methods import ClosedLoopObjective
+from t3mpc_ros.evaluation.tuning.tuned_parameter_file import SMOOTHNESS, TunedParameters
+from t3mpc_ros.evaluation.tuning.twin_tuning import (
     CASES,
     FULL_RANGES,
     TRAINING,
@@ -47,8 +49,6 @@ from t3mpc_ros.evaluation.tuning.closed_loop_tuning import (
     twin_definitions,
     twin_objective,
 )
-from t3mpc_ros.evaluation.tuning.tune_methods import ClosedLoopObjective
-from t3mpc_ros.evaluation.tuning.tuned_parameter_file import SMOOTHNESS, TunedParameters
 
 PI = 'PI + feed-forward'
 
@@ -84,7 +84,7 @@ def test_the_body_counts_where_baselines_have_the_gyro(definitions, monkeypatch)
     for case, body in (('nominal', False), ('miscalibrated', True)):
         scenario = Scenario('twin', case, 1, 8.0)
         record = run(scenario, method)
-        monkeypatch.setattr(closed_loop_tuning, 'run', lambda *_, record=record: record)
+        monkeypatch.setattr(twin_tuning, 'run', lambda *_, record=record: record)
         numbers = measure(record)
         cost = twin_objective((scenario, method)) - SMOOTHNESS * numbers[VARIATION.name]
         counted = record.time >= 4.5
@@ -136,8 +136,8 @@ def test_defaults_stay_unless_others_are_better(
     def cost(job):
         return job[1].changes['body.yaw_gain']
 
-    monkeypatch.setattr(closed_loop_tuning, 'twin_objective', cost)
-    monkeypatch.setattr(closed_loop_tuning, 'validate', lambda *_: Difference(mean, half))
+    monkeypatch.setattr(twin_tuning, 'twin_objective', cost)
+    monkeypatch.setattr(twin_tuning, 'validate', lambda *_: Difference(mean, half))
     lines = []
     path = tmp_path / 'tuned.json'
     store = tune_twin([method], 12, 1, path, lines.append)
