@@ -34,7 +34,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
+from t3mpc_ros.chaos.chaotic_path import PortraitParameters, PortraitPath
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.evaluation.confidence_intervals import mean

@@ -37,8 +37,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from t3mpc_ros.chaos.patrol_planner import PlanParameters
-from t3mpc_ros.chaos.portrait import PortraitParameters
+from t3mpc_ros.chaos.chaotic_path import PortraitParameters
+from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.evaluation.experiment import ResultTable, Run, print_report, run_experiment
 from t3mpc_ros.evaluation.patrol.localization_study import localization_errors
 from t3mpc_ros.evaluation.patrol.patrol_run import (

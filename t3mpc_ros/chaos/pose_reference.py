@@ -22,8 +22,8 @@ from typing import Protocol
 
 import numpy as np
 
-from t3mpc_ros.chaos.patrol_planner import PlannedPath, PlanParameters
-from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
+from t3mpc_ros.chaos.chaotic_path import PortraitParameters, PortraitPath
+from t3mpc_ros.chaos.path_replanning import PlannedPath, PlanParameters
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose

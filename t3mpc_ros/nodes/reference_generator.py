@@ -27,7 +27,7 @@ from sensor_msgs.msg import BatteryState
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from t3mpc_ros.chaos.patrol_planner import PlannedPath
+from t3mpc_ros.chaos.path_replanning import PlannedPath
 from t3mpc_ros.chaos.pose_reference import (
     GivenPathSource,
     PathClock,

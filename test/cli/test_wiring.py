@@ -168,7 +168,7 @@ PATROL = {
     'evaluation.patrol.path_tracking.tune_trackers': {},
     'evaluation.patrol.safety_study.compare_safety': SimpleNamespace(rows=[]),
     'evaluation.patrol.safety_study.safety_table': SimpleNamespace(markdown=str),
-    'evaluation.patrol.tracking_page.tuning_markdown': '',
+    'evaluation.patrol.tracker_page.tuning_markdown': '',
     'evaluation.patrol.localization_study.compare_localizations': SimpleNamespace(rows=[]),
     'evaluation.patrol.localization_study.markdown': '',
 }

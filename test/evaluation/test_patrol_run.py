@@ -16,8 +16,8 @@
 import numpy as np
 import pytest
 
-from t3mpc_ros.chaos.patrol_planner import PlanParameters
-from t3mpc_ros.chaos.portrait import PortraitParameters
+from t3mpc_ros.chaos.chaotic_path import PortraitParameters
+from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     PatrolScenario,

@@ -310,7 +310,7 @@ def test_a_goal_before_the_first_odometry_is_rejected(harness, logged):
 
 
 def test_a_low_battery_leads_to_the_charging_place(harness, logged, monkeypatch):
-    monkeypatch.setattr('t3mpc_ros.chaos.patrol_planner.BATTERY_TIME', 0.0)
+    monkeypatch.setattr('t3mpc_ros.chaos.path_replanning.BATTERY_TIME', 0.0)
     charging = {'plan__charging__min_voltage': 10.0, 'plan__charging__place': [0.9, -0.2]}
     reference = harness.add(
         ReferenceGeneratorNode, source='portrait', plan__enabled=True, **charging

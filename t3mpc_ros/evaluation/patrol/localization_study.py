@@ -26,7 +26,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from t3mpc_ros.chaos.portrait import PortraitParameters
+from t3mpc_ros.chaos.chaotic_path import PortraitParameters
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.patrol.patrol_run import (

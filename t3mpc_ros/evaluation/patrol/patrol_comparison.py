@@ -29,8 +29,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.chaos.patrol_planner import PlanParameters
-from t3mpc_ros.chaos.portrait import PortraitParameters
+from t3mpc_ros.chaos.chaotic_path import PortraitParameters
+from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at, visits

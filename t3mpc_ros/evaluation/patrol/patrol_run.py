@@ -29,8 +29,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.chaos.patrol_planner import PlannedPath, PlanParameters
-from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
+from t3mpc_ros.chaos.chaotic_path import PortraitParameters, PortraitPath
+from t3mpc_ros.chaos.path_replanning import PlannedPath, PlanParameters
 from t3mpc_ros.chaos.pose_reference import PathClock, WaitParameters
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.secret_random import SecretRandom

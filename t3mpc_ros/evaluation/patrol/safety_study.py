@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.chaos.portrait import PortraitParameters
+from t3mpc_ros.chaos.chaotic_path import PortraitParameters
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     START,

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from support.long_tests import few_of
 
-from t3mpc_ros.chaos.portrait import PortraitParameters, PortraitPath
+from t3mpc_ros.chaos.chaotic_path import PortraitParameters, PortraitPath
 from t3mpc_ros.chaos.pose_reference import PathReferenceParameters, PortraitSource
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.geometry.kinematics import WheelGeometry

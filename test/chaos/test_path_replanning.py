@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from support.long_tests import few_of
 
-from t3mpc_ros.chaos.patrol_planner import FAR_AWAY, PATIENCE, PlannedPath, PlanParameters
+from t3mpc_ros.chaos.path_replanning import FAR_AWAY, PATIENCE, PlannedPath, PlanParameters
 from t3mpc_ros.chaos.pose_reference import PathReferenceParameters
 from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.geometry.arena import Arena, OccupancyGrid
