@@ -82,7 +82,7 @@ FAR_AWAY, PATIENCE = 0.3, 5.0
 the robot is."""
 CELL = 0.15
 """Side of the cells whose last visit is remembered, m."""
-PLACES, APART = 3, 0.25
+PLACES, APART = 5, 0.25
 """Old places that are visited one after the other, and their least distance, m."""
 FRESH_COST = 3.0
 """Cost of floor that was just visited, by the length of a way to old places over it."""

@@ -55,9 +55,10 @@ KNOWN_SHARE = 0.7
 SEARCH_SIGMA = 0.06
 """Least standard deviation of a reading while it is not known, m: particles are farther apart than
 the readings are exact, and the nearest to the robot would be dropped."""
-NEAR_DISTANCE, NEAR_ANGLE = 0.15, 0.15
+NEAR_DISTANCE, NEAR_ANGLE = 0.15, 0.05
 """Standard deviations (m, rad) of half of the new particles from the last estimate: wheels slip
-more often than a robot is carried."""
+more often than a robot is carried, and a gyro then measures the turn. With more of the angle, some
+readings that are wrong alike turn the pose."""
 KEPT_SHARE = 0.5
 """Share of the heaviest cluster's weight with which the cluster of the last estimate is kept."""
 

@@ -13,6 +13,7 @@
 # limitations under the License.
 """Numbers of the localisation study, by records whose errors are known."""
 
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -96,6 +97,22 @@ def test_the_table_has_medians_and_counts():
     assert '1 of 2' in lines[-1]
     with pytest.raises(ValueError, match='duration must be at least 90 s'):
         LocalizationPlan(duration=60.0)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.parametrize('seed', [104, 110])
+def test_three_times_the_noise_does_not_lose_the_place(seed):
+    """New particles near the pose had any yaw: it was turned by 10 degrees, and up to 2 m off."""
+    case = replace(
+        CASES['noise x 3, 20 % of the readings lost'],
+        seed=seed,
+        duration=36.0,
+        known_world='room',
+    )
+    found = measured_localization((case, 'noise'))
+    assert found['largest'] < 0.25
+    assert found['lost'] == 0.0
 
 
 @pytest.mark.slow
