@@ -13,6 +13,8 @@
 # limitations under the License.
 """A robot in a room that the tests simulate: odometry with drift, eight ranges with noise."""
 
+import copy
+import functools
 import math
 import re
 from types import SimpleNamespace
@@ -117,6 +119,18 @@ def follow(localizer, drive, seconds, loss=0.0):
     return np.array(errors)
 
 
+def driven(seconds, drift=0.004):
+    """Return localizer and drive after a drive from a known start: copies of one drive."""
+    return copy.deepcopy(_driven(seconds, drift))
+
+
+@functools.cache
+def _driven(seconds, drift):
+    localizer, drive = make_localizer(), Drive(drift=drift)
+    follow(localizer, drive, seconds)
+    return localizer, drive
+
+
 def error(localizer, drive):
     pose, truth = localizer.result.pose, drive.truth
     away = math.hypot(pose.x - truth.x, pose.y - truth.y)
@@ -169,18 +183,17 @@ def test_an_unknown_start_is_found():
     follow(localizer, drive, 0.2)
     assert localizer.state is Localization.SEARCHING
     assert np.diag(localizer.result.covariance).max() > 0.3
-    follow(localizer, drive, 60.0)
+    follow(localizer, drive, 25.0)
     assert localizer.state is Localization.LOCALIZED
     assert error(localizer, drive)[0] < 0.05
 
 
 @pytest.mark.compiled
 def test_a_robot_that_is_carried_is_lost_and_found_again():
-    localizer, drive = make_localizer(), Drive()
-    follow(localizer, drive, 20.0)
+    localizer, drive = driven(20.0)
     drive.carry(2.5)
     states = set()
-    for _ in range(60):
+    for _ in range(25):
         follow(localizer, drive, 1.0)
         states.add(localizer.state)
     assert states - {Localization.LOCALIZED}
@@ -216,8 +229,7 @@ def test_odometry_that_jumps_moves_neither_particle_nor_pose(jump):
     A jump of 0.76 m and 33 degrees, below a metre, was taken for a motion: the robot was lost for
     five seconds, and the used pose 0.2 m off for half a minute.
     """
-    localizer, drive, correction = make_localizer(), Drive(), PoseCorrection()
-    follow(localizer, drive, 20.0)
+    (localizer, drive), correction = driven(20.0), PoseCorrection()
     correction.step(drive.stamp_ns, drive.odometry, localizer)
     at, before = localizer.filter.poses.copy(), drive.odometry
     used = pose_in(localizer.result.odometry_frame, before)
@@ -302,8 +314,7 @@ def test_readings_that_are_lost_cost_little():
 @pytest.mark.compiled
 def test_things_that_the_map_lacks_do_not_lead_it_away():
     """A person goes along at the right: two of the eight ranges are short."""
-    localizer, drive = make_localizer(), Drive()
-    follow(localizer, drive, 5.0)
+    localizer, drive = driven(5.0)
     worst = 0.0
     for _ in range(400):
         drive.step()
@@ -320,11 +331,10 @@ def test_things_that_the_map_lacks_do_not_lead_it_away():
 @pytest.mark.parametrize('missing', few_of(['boxes', 'circles']))
 def test_a_thing_that_is_gone_does_not_make_it_doubt_its_place(missing):
     """It was lost after 20 readings that passed where a box had been: it was no event yet."""
-    localizer, drive = make_localizer(), Drive()
-    follow(localizer, drive, 5.0)
+    localizer, drive = driven(5.0)
     drive.room = parse_world(re.sub(rf'^{missing}: .*$', '', TEXT, flags=re.MULTILINE), 'cell')
     errors = []
-    for _ in range(12):
+    for _ in range(6):
         errors.extend(follow(localizer, drive, 5.0))
         assert localizer.state is Localization.LOCALIZED
         assert localizer.agreement > 0.6
@@ -334,18 +344,19 @@ def test_a_thing_that_is_gone_does_not_make_it_doubt_its_place(missing):
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize(('sensor', 'wrong'), [(6, math.inf), (3, 0.3), (5, -math.inf)])
-def test_a_sensor_that_contradicts_the_map_is_not_used(sensor, wrong):
+@pytest.mark.parametrize(
+    ('sensor', 'wrong', 'seconds'), [(6, math.inf, 20.0), (3, 0.3, 20.0), (5, -math.inf, 60.0)]
+)
+def test_a_sensor_that_contradicts_the_map_is_not_used(sensor, wrong, seconds):
     """A patrol with a sensor that was blind was 12 to 18 mm off, with all of them 10."""
-    localizer, drive = make_localizer(), Drive()
-    follow(localizer, drive, 20.0)
+    localizer, drive = driven(20.0)
     assert localizer.doubtful == ()
     drive.ranges = lambda: np.where(sensor == EVERY, wrong, Drive.ranges(drive))
-    follow(localizer, drive, 60.0)
+    follow(localizer, drive, seconds)
     assert localizer.doubtful == (sensor,)
     assert localizer.state is Localization.LOCALIZED
     del drive.ranges
-    assert rms(follow(localizer, drive, 60.0))[0] < 0.03
+    assert rms(follow(localizer, drive, 20.0))[0] < 0.03
     assert localizer.doubtful == ()
 
 
@@ -430,7 +441,7 @@ def test_the_corrected_pose_jumps_where_the_robot_is_found():
     localizer, drive, correction = make_localizer(), Drive(), PoseCorrection()
     drive_corrected(localizer, drive, correction, 10.0)
     drive.carry(2.5)
-    changes, pose = drive_corrected(localizer, drive, correction, 60.0)
+    changes, pose = drive_corrected(localizer, drive, correction, 25.0)
     assert changes[:, 0].max() > 0.25
     assert math.hypot(pose.x - drive.truth.x, pose.y - drive.truth.y) < 0.06
 
@@ -518,13 +529,12 @@ def turned_too_far(localizer, drive, seconds):
 
 
 def yaw_errors(drift):
-    """Return mean errors of half a minute: after a drift of a minute, and a minute after it."""
-    localizer, drive = make_localizer(), Drive(drift=drift)
-    turned_too_far(localizer, drive, 60.0)
-    drifting = turned_too_far(localizer, drive, 30.0)
+    """Return mean errors of 20 s: after a drift of a minute, and 40 s after it."""
+    localizer, drive = driven(60.0, drift)
+    drifting = turned_too_far(localizer, drive, 20.0)
     drive.drift = 0.0
-    turned_too_far(localizer, drive, 60.0)
-    return np.array([drifting, turned_too_far(localizer, drive, 30.0)])
+    turned_too_far(localizer, drive, 40.0)
+    return np.array([drifting, turned_too_far(localizer, drive, 20.0)])
 
 
 @pytest.mark.compiled
@@ -540,8 +550,7 @@ def test_the_drift_of_a_gyro_is_measured_by_the_map():
 @pytest.mark.compiled
 def test_a_robot_at_rest_does_not_turn_with_its_gyro():
     """Its pose loop followed the odometry, which did not turn then, and the robot did."""
-    localizer, drive = make_localizer(), Drive(drift=0.009)
-    turned_too_far(localizer, drive, 90.0)
+    localizer, drive = driven(90.0, drift=0.009)
     yaw = drive.truth.yaw
     for _ in range(round(20.0 / PERIOD)):
         drive.stamp_ns += round(PERIOD * 1e9)
@@ -556,14 +565,15 @@ def test_a_robot_at_rest_does_not_turn_with_its_gyro():
 @pytest.mark.compiled
 @pytest.mark.parametrize('angle', [-0.3, 0.3])
 def test_a_slip_is_no_drift(angle):
-    after = []
-    for slip in (0.0, angle):
-        localizer, drive = make_localizer(), Drive(drift=0.0)
-        turned_too_far(localizer, drive, 60.0)
-        drive.odometry = moved_pose(drive.odometry, (0.0, 0.0, slip))
-        turned_too_far(localizer, drive, 10.0)
-        after.append(turned_too_far(localizer, drive, 20.0))
-    assert abs(after[1] - after[0]) < 0.003
+    assert abs(turned_after_slip(angle) - turned_after_slip(0.0)) < 0.003
+
+
+@functools.cache
+def turned_after_slip(angle):
+    localizer, drive = driven(60.0, drift=0.0)
+    drive.odometry = moved_pose(drive.odometry, (0.0, 0.0, angle))
+    turned_too_far(localizer, drive, 10.0)
+    return turned_too_far(localizer, drive, 10.0)
 
 
 @pytest.mark.compiled
@@ -581,8 +591,7 @@ def test_a_slip_is_no_reason_to_look_elsewhere():
 
 
 def test_an_estimate_that_jumps_must_fit_for_some_time():
-    localizer, drive = make_localizer(), Drive()
-    follow(localizer, drive, 5.0)
+    localizer, drive = driven(5.0)
     assert localizer.state is Localization.LOCALIZED
     localizer.filter.place(Pose(-0.9, 0.8, 1.0), 1e-4 * np.eye(3))  # as if readings fitted there
     follow(localizer, drive, 0.6)
