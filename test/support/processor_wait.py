@@ -13,6 +13,7 @@
 # limitations under the License.
 """How long this process and its descendants waited for a processor."""
 
+import contextlib
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -43,18 +44,20 @@ def thread_times(pids):
 
 def descendants(pid):
     """Return the processes that ``pid`` has started, and those that they have started."""
-    children = {}
-    for stat in PROC.glob('[0-9]*/stat'):
-        try:
-            parent = int(stat.read_text().rpartition(')')[2].split()[1])
-        except OSError:
-            continue
-        children.setdefault(parent, []).append(int(stat.parent.name))
     found, open_pids = [], [pid]
     while open_pids:
-        new = children.get(open_pids.pop(), [])
+        new = _children(open_pids.pop())
         found += new
         open_pids += new
+    return found
+
+
+def _children(pid):
+    """Return the processes that the threads of a process have started."""
+    found = []
+    for path in PROC.glob(f'{pid}/task/*/children'):
+        with contextlib.suppress(OSError):
+            found += map(int, path.read_text().split())
     return found
 
 
