@@ -130,7 +130,11 @@ def test_a_test_of_each_row_reaches_a_function_of_that_row():
 @cache
 def _imported(path):
     found = set()
-    for node in ast.walk(_tree(path)):
+    pending = [_tree(path)]
+    while pending:
+        node = pending.pop()
+        if not isinstance(node, ast.expr):  # which imports nothing
+            pending.extend(ast.iter_child_nodes(node))
         if isinstance(node, ast.ImportFrom):
             source = (node.module or '').replace('.', '/').replace('support/', 'test/support/')
             found |= {f'{source}.py', *(f'{source}/{name.name}.py' for name in node.names)}

@@ -15,6 +15,7 @@
 
 import ast
 from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -104,12 +105,19 @@ def _tree(path: Path) -> ast.Module:
 
 
 @cache
+def _nodes(path: Path) -> list[ast.AST]:
+    return [*ast.walk(_tree(path))]
+
+
+@cache
 def _imports(path: Path, *, lazy: bool = True) -> frozenset[str]:
     """Return the imported modules; without ``lazy`` only those imported at import time."""
     found = set()
     pending: list[ast.AST] = [_tree(path)]
     while pending:
         node = pending.pop()
+        if isinstance(node, ast.expr):
+            continue  # it imports nothing
         if not lazy and (
             isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) or _is_type_checking(node)
         ):
@@ -249,7 +257,7 @@ def test_no_private_name_of_a_library_is_used():
 
     Sees what is imported and what is read from it, not attributes of a library's objects.
     """
-    found = {path: _private_names(_tree(path)) for path in SOURCES}
+    found = {path: _private_names(_nodes(path)) for path in SOURCES}
     assert {path: names for path, names in found.items() if names} == {}
 
 
@@ -266,13 +274,13 @@ def test_no_private_name_of_a_library_is_used():
     ],
 )
 def test_private_names_of_libraries_are_found(line):
-    assert _private_names(ast.parse(line))
+    assert _private_names([*ast.walk(ast.parse(line))])
 
 
-def _private_names(tree: ast.AST) -> set[str]:
+def _private_names(nodes: Sequence[ast.AST]) -> set[str]:
     """Return the private names of libraries that are imported or read from what is imported."""
     names, imported = set(), {}
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import | ast.ImportFrom):
             module = f'{node.module}.' if isinstance(node, ast.ImportFrom) else ''
             for name in node.names:
@@ -280,7 +288,7 @@ def _private_names(tree: ast.AST) -> set[str]:
                 # Without a new name, import a.b binds a.
                 top = name.name if module or name.asname else name.name.split('.')[0]
                 imported[name.asname or top] = module + top
-    for node in ast.walk(tree):
+    for node in nodes:
         first, _, rest = ast.unparse(node).partition('.') if _is_dotted(node) else ('', '', '')
         if first in imported:
             names.add(f'{imported[first]}.{rest}')
@@ -335,7 +343,7 @@ def test_the_tests_that_ci_names_exist():
 
 def test_functions_have_at_most_12_parameters():
     for path in SOURCES:
-        for node in ast.walk(_tree(path)):
+        for node in _nodes(path):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 names = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
                 assert len(names) <= 12, f'{path}: {node.name} has {len(names)} parameters'
@@ -441,18 +449,21 @@ def test_no_file_carries_a_path_of_a_machine_or_a_registry_host():
     words = re.compile(
         r'/(work|root|home|farm|tmp)/[a-z]|https?://[^\s]*(pypi|pythonhosted|npmjs|crates)'
     )
-    for path in ROOT.rglob('*'):
-        hidden = any(
-            part.startswith('.') and part != '.ci' for part in path.relative_to(ROOT).parts
-        )
-        if (
-            hidden
-            or not path.is_file()
-            or path.suffix in ('.png', '.gif', '.pyc', '.mcap', '.npz')
-        ):
-            continue
-        if {'build', 'install', 'log', 'runs', 'node_modules'} & set(path.relative_to(ROOT).parts):
+    for path in _files(ROOT):
+        if path.suffix in ('.png', '.gif', '.pyc', '.mcap', '.npz'):
             continue
         if path == Path(__file__).resolve():
             continue
         assert not words.search(path.read_text(errors='replace')), path
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Yield the files in a folder, but those that are hidden or made by a build or a run."""
+    made = 'build', 'install', 'log', 'runs', 'node_modules'
+    for path in folder.iterdir():
+        if path.name in made or (path.name.startswith('.') and path.name != '.ci'):
+            continue
+        if path.is_dir():
+            yield from _files(path)
+        elif path.is_file():
+            yield path

@@ -14,6 +14,7 @@
 """What other readers see of a bag, and copies of bags with other messages."""
 
 from collections import Counter
+import functools
 import io
 
 from mcap.reader import make_reader
@@ -72,17 +73,28 @@ def copied_bag(bag, folder, change):
     ``change(topic, k, received_ns, published_ns)`` yields (topic, received_ns, published_ns) of
     every copy of message k of a topic: none where it is left out.
     """
-    counts = Counter()
+    counts, added = Counter(), set()
+    records, messages = _content(bag, bag.stat().st_mtime_ns)
+    with BagWriter(folder, metadata_records=records) as writer:
+        for original, kind, received_ns, published_ns, data in messages:
+            k, counts[original] = counts[original], counts[original] + 1
+            for topic, *times in change(original, k, received_ns, published_ns):
+                if topic not in added:
+                    writer.add_topic(topic, kind)
+                    added.add(topic)
+                writer.write(topic, *times, data)
+    return folder
+
+
+@functools.cache
+def _content(bag, modified_ns):
+    """Return metadata records and messages of a file, read once while it is not modified."""
     with bag.open('rb') as file:
         reader = make_reader(file)
         records = {item.name: dict(item.metadata) for item in reader.iter_metadata()}
         records.pop('rosbag2')
-        with BagWriter(folder, metadata_records=records) as writer:
-            for schema, channel, message in reader.iter_messages():
-                k, counts[channel.topic] = counts[channel.topic], counts[channel.topic] + 1
-                for topic, *times in change(
-                    channel.topic, k, message.log_time, message.publish_time
-                ):
-                    writer.add_topic(topic, schema.name)
-                    writer.write(topic, *times, message.data)
-    return folder
+        messages = [
+            (channel.topic, schema.name, item.log_time, item.publish_time, item.data)
+            for schema, channel, item in reader.iter_messages()
+        ]
+    return records, messages
