@@ -220,7 +220,7 @@ def test_old_places_are_visited_again():
     for distance in (0.0, 3.0):
         room = Room()
         room.seen[:] = True
-        rows = drive(planned(circle().__next__, revisit_distance=distance), room, 120.0)
+        rows = drive(planned(circle().__next__, revisit_distance=distance), room, 60.0)
         cells = np.floor(rows[:, :2] / 0.3).astype(int)
         shares.append(len({*map(tuple, cells.tolist())}) / (3.4 * 2.4 / 0.09))
     assert shares[0] < 0.12
@@ -283,7 +283,7 @@ def test_with_a_low_battery_it_is_charged_and_goes_on(seed):
         return volts[-1]
 
     path = planned(seed=seed, charging__place=CHARGER, charging__min_voltage=10.0)
-    rows = drive(path, room, 300.0, voltage=voltage)
+    rows = drive(path, room, 250.0, voltage=voltage)
     check_limits(rows)
     assert min(volts) > 9.0, 'it did not get there'
     changes = np.flatnonzero(np.diff(np.array(charged, dtype=int)))

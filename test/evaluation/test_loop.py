@@ -684,14 +684,16 @@ class Counting(BaselineController):
         self.steps = learnt['steps'].copy()
 
 
-def test_pretraining_carries_weights_from_run_to_run():
+def test_pretraining_carries_weights_from_run_to_run(monkeypatch):
+    assert drivers.PRETRAINING_DURATION == 40.0
+    monkeypatch.setattr(drivers, 'PRETRAINING_DURATION', 4.0)
     nominal_model = Scenario('torque', 'nominal', 101, noise=0.0).nominal_model()
     fresh = MethodSpec('count', Counting, ProportionalParameters())(nominal_model)
     pretrained = MethodSpec('count', Counting, ProportionalParameters(), pretrained=True)
     assert fresh.steps[0] == 0.0
     for _ in range(2):  # the second is the first's equal: nothing of a run is carried over
         controller = pretrained(nominal_model)
-        assert controller.steps[0] == len(PRETRAINING_SEEDS) * 4000
+        assert controller.steps[0] == len(PRETRAINING_SEEDS) * 400
         controller.step(None)
     plain = MethodSpec('P', Proportional, ProportionalParameters(), pretrained=True)
     assert plain(nominal_model).get_weights() == {}

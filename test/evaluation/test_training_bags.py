@@ -56,10 +56,8 @@ def lossy(tape, seed, seconds):
     return kept
 
 
-def recorded_bags(folder, seconds):
-    loops = {
-        seed: TrainingRun(seed, seconds, **{'predictive.dither': DITHER}) for seed in RECORDED
-    }
+def recorded_bags(folder, seconds, seeds=RECORDED):
+    loops = {seed: TrainingRun(seed, seconds, **{'predictive.dither': DITHER}) for seed in seeds}
     return [
         lossy(loop.tape, seed, seconds).write(folder / f'run{seed}' / 'bag')
         for seed, loop in loops.items()
@@ -67,8 +65,18 @@ def recorded_bags(folder, seconds):
 
 
 @pytest.fixture(scope='module')
-def bags(tmp_path_factory):
-    return recorded_bags(tmp_path_factory.mktemp('recorded'), SECONDS)
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp('recorded')
+
+
+@pytest.fixture(scope='module')
+def bag(folder):
+    return recorded_bags(folder, SECONDS, RECORDED[:1])[0]
+
+
+@pytest.fixture(scope='module')
+def bags(bag, folder):
+    return [bag, *recorded_bags(folder, SECONDS, RECORDED[1:])]
 
 
 @pytest.fixture(scope='module')
@@ -165,13 +173,13 @@ def test_the_model_file_is_loaded_and_says_where_it_is_from(
     assert str(tmp_path.parent) not in str(origin)
 
 
-def test_one_bag_is_cut_into_as_many_blocks_as_asked_for(bags, tmp_path, capsys):
+def test_one_bag_is_cut_into_as_many_blocks_as_asked_for(bag, tmp_path, capsys):
     path = tmp_path / 'model.npz'
-    assert program('train', bags[0], '--folds', '3', '--output', path) == 0
+    assert program('train', bag, '--folds', '3', '--output', path) == 0
     assert 'cross-validated in 3 folds: each block' in capsys.readouterr().out
     assert read_model_header(path)['origin']['cross_validation']['folds'] == 3
     with pytest.raises(ValueError, match='folds must be at least 2: got 1'):
-        program('train', bags[0], '--folds', '1', '--output', path)
+        program('train', bag, '--folds', '1', '--output', path)
 
 
 def test_mean_and_spread_leave_out_what_is_not_known():

@@ -107,7 +107,7 @@ def test_serial_line_recovers_from_noise_and_bursts(boards: Boards) -> None:
 # -- timing ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(('rate', 'cycles'), few_of([(100, 120), (50, 500), (100, 500)]))
+@pytest.mark.parametrize(('rate', 'cycles'), few_of([(100, 60), (50, 500), (100, 500)]))
 def test_round_trip_time_is_below_six_milliseconds(boards: Boards, rate: int, cycles: int) -> None:
     boards.start()
     times, states, clocks = [], [], []
