@@ -18,8 +18,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.stats import sem
-from scipy.stats import t as student_of_scipy
 from support.records import record_of
 
 from t3mpc_ros.control.actuation import VelocityActuation
@@ -627,6 +625,8 @@ def test_a_column_that_a_run_lacks_is_named():
 
 
 def test_quantiles_are_students():
+    from scipy.stats import t as student_of_scipy  # not by the processes that import this file
+
     for degrees in [*range(1, 60), 99, 100, 999, 1000, 20_001]:
         for confidence in (0.5, 0.95, 0.999):
             expected = student_of_scipy.ppf(0.5 + 0.5 * confidence, degrees)
@@ -640,6 +640,9 @@ def test_quantiles_are_students():
 
 
 def test_the_interval_of_a_mean_is_students():
+    from scipy.stats import sem
+    from scipy.stats import t as student_of_scipy
+
     for n in (2, 5, 20):
         values = np.random.default_rng(n).normal(5.0, 2.0, n)
         bounds = student_of_scipy.interval(0.95, n - 1, mean(values), sem(values))
