@@ -26,7 +26,7 @@ import numpy as np
 from support.bag_messages import START, TYPES, diagnostics, serialised_odometry, serialised_twist
 from support.robot_bags import write_with_records
 
-DURATION, RATE, LEAD = 20.0, 100.0, 0.4
+DURATION, LEAD = 20.0, 0.4
 RADIUS, SEPARATION = 0.035, 0.147
 ERROR = 0.01 * math.sqrt(2.0)
 """Amplitude of the error of the wheels, rad/s."""
@@ -79,18 +79,20 @@ class Story:
     second_robot: bool = False
     switches: tuple = ()
     """Times at which the reference switches, s."""
+    rate: float = 50.0
+    """Of the messages of a topic, Hz; that of the robot is 100, which a stall is seen by."""
     apart: int = 0
     """Time from a stamp of the reference to one of the odometry, ns."""
 
     def rows(self):
         """Return rows of receipt (s), topic and message."""
         rows, pose, place = [], np.zeros(3), np.zeros(3)
-        for k in range(round(DURATION * RATE)):
-            t = k / RATE
+        for k in range(round(DURATION * self.rate)):
+            t = k / self.rate
             wanted = self._reference(t)
             speed = self._motion(t)
-            pose = _moved(pose, speed)
-            place = _moved(place, wanted)
+            pose = _moved(pose, speed, 1.0 / self.rate)
+            place = _moved(place, wanted, 1.0 / self.rate)
             received = t + self.late(t)
             shown = pose + (self.moved(t), 0.0, 0.0)
             if self.detour and self.detour[0] <= t < self.detour[1]:
@@ -157,9 +159,9 @@ def _signals(mode):
     return TYPES['std_msgs/msg/Int32MultiArray'](layout, values)
 
 
-def _moved(pose, twist):
+def _moved(pose, twist, seconds):
     x, y, yaw = pose
-    v, w = twist[0] / RATE, twist[1] / RATE
+    v, w = seconds * twist[0], seconds * twist[1]
     return np.array([x + v * math.cos(yaw), y + v * math.sin(yaw), yaw + w])
 
 
@@ -220,7 +222,7 @@ STORIES = {
     'stalls': Story(
         r'The machine stalled 3 times, the longest (8[0-9]) ms at 1[12]\.\d s: errors after them '
         rf"are not the controller's; {SETTLED}(, without the 1 s after them .*)?\.", 'open',
-        late=stalled((6.0, 0.066), (12.0, 0.074), (15.0, 0.066)),
+        rate=100.0, late=stalled((6.0, 0.066), (12.0, 0.074), (15.0, 0.066)),
     ),
     'patrol': Story(
         r'Good run: within 50 mm of its path for 8\d % of the drive, path error 1\d\d\.\d mm '
