@@ -150,7 +150,7 @@ def test_the_model_file_is_loaded_and_says_where_it_is_from(
 ):
     path, asked = tmp_path / 'model.npz', []
     monkeypatch.setattr(
-        fit_bags, 'fit_bags', lambda folders, **how: asked.append((folders, how)) or model
+        bag_fit, 'fit_bags', lambda folders, **how: asked.append((folders, how)) or model
     )
     assert program('train', *bags, '--output', path) == 0
     assert asked == [(bags, {'keep_predictor': False, 'count': bag_fit.FOLDS})]
