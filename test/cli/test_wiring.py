@@ -155,7 +155,7 @@ COMPARE = {
 }
 PATROL = {
     f'evaluation.patrol.{name}_page.{function}': result
-    for name in ('patrol', 'tracking')
+    for name in ('patrol', 'tracker')
     for function, result in (('markdown', ''), ('record', {}), ('page', ''))
 } | {
     'evaluation.plotting.write_pictures': {},
