@@ -26,7 +26,7 @@ import numpy as np
 from numpy.exceptions import ComplexWarning
 from numpy.typing import ArrayLike, NDArray
 
-from t3mpc_ros.evaluation.api.error_messages import one_sentence
+from t3mpc_ros.evaluation.api.error_messages import described, one_sentence
 from t3mpc_ros.evaluation.baselines.baseline_controller import JUMP
 from t3mpc_ros.evaluation.record import RATE
 from t3mpc_ros.evaluation.scenario import SampledReference
@@ -180,9 +180,7 @@ def _row(function: Callable[[float], Any], time: float) -> Array:
     try:
         given = function(time)
     except Exception as error:
-        raise ScriptError(
-            f'reference raised {type(error).__name__} ({error}) at {time:g} s'
-        ) from None
+        raise ScriptError(f'reference raised {described(error)}, at {time:g} s') from None
     found = numbers(f'reference({time:g})', given, '(2,)')
     if found.shape != (2,):
         raise ScriptError(

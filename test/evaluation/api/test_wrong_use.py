@@ -131,6 +131,10 @@ WRONG = {
         lambda: t3.simulate(raises, **SHORT),
         r'raises raised ZeroDivisionError \(.*zero\) in raises\(\), test_wrong_use.py line \d+',
     ),
+    'a reference that raises': (
+        lambda: t3.simulate(reference=lambda time: 1.0 / 0.0, plant='servo', duration=4.0),
+        r'reference raised ZeroDivisionError \(.*zero\) in <lambda>\(\), test_wrong_use.py line \d+',
+    ),
     'an observation that is changed': (
         lambda: t3.simulate(changes_what_it_sees, **SHORT),
         r'read-only\) in .*, at 0.00 s; change a copy, such as observation.speeds.copy\(\)',
