@@ -24,7 +24,17 @@ import sys
 from typing import Any
 import webbrowser
 
-from t3mpc_ros.cli import compare, faults, paper, patrol, ros2_commands, sweep, train, tune, view
+from t3mpc_ros.cli import (
+    compare,
+    faults,
+    paper,
+    patrol,
+    sweep,
+    topic_param_call,
+    train,
+    tune,
+    view,
+)
 from t3mpc_ros.cli.argument_parser import ArgumentParser, reject_removed, run_command
 from t3mpc_ros.cli.shared_options import add_json, add_seeds, prepare_outputs, print_result
 from t3mpc_ros.missing_library import remedy
@@ -169,7 +179,7 @@ def _compile_robots() -> None:
     from t3mpc_ros.control.controller import StepperControllerParameters
     from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
     from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
-    from t3mpc_ros.control.speed_filter import SpeedFilterParameters, SpeedKalmanFilter
+    from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters, SpeedKalmanFilter
     from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
     from t3mpc_ros.geometry.kinematics import WheelGeometry
     from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters, make_robot
@@ -274,7 +284,7 @@ def _parser(
     add_json(exponents)
     exponents.set_defaults(run=_exponents)
 
-    for module in (paper, compare, sweep, patrol, tune, train, faults, view, ros2_commands):
+    for module in (paper, compare, sweep, patrol, tune, train, faults, view, topic_param_call):
         module.add_parser(commands)
     completing = commands.add_parser(
         'completion', help='print what bash or zsh completes: eval "$(t3mpc completion bash)"'

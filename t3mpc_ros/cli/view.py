@@ -90,7 +90,7 @@ def _commanded_page(
     run: 'LiveRun', node: 'ViewNode', options: argparse.Namespace
 ) -> 'Iterator[PageServer]':
     """Yield a page whose commands the node executes, but for those of the recorder."""
-    from t3mpc_ros.cli.view_recorder import RunRecorder
+    from t3mpc_ros.cli.live_page_recording import RunRecorder
     from t3mpc_ros.view.server import PageServer
 
     def command(name: str, arguments: Mapping[str, Any], asked: float) -> str:

@@ -35,7 +35,7 @@ import math
 
 import numpy as np
 
-from t3mpc_ros.control.speed_filter import SpeedFilterParameters, SpeedKalmanFilter
+from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters, SpeedKalmanFilter
 from t3mpc_ros.geometry.kinematics import WheelGeometry, body_speeds
 from t3mpc_ros.geometry.types import Array, BodyTwist
 from t3mpc_ros.kernels import TypedKernel, contiguous, kernel

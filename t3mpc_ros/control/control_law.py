@@ -21,7 +21,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from t3mpc_ros.control.jump_transition import JumpTransitionParameters
-from t3mpc_ros.control.speed_filter import SpeedFilterParameters
+from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.fuzzy.estimator import (
     AdaptationGains,
     AdaptationParameters,

@@ -49,7 +49,7 @@ from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
 from t3mpc_ros.control.jump_transition import CommandLimit, JumpTransition, MotorLimit
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
-from t3mpc_ros.control.speed_filter import SpeedFilterParameters
+from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import (
     DriveMonitor,
     InputWatchdog,

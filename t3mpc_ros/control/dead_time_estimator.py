@@ -44,7 +44,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.control.speed_filter import SpeedFilterParameters
+from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
 

@@ -224,7 +224,7 @@ VIEW = {
     'nodes.viewer.view_node': context(SimpleNamespace(spin=lambda stop: None, command=print)),
     'view.server.PageServer': context(SimpleNamespace(url='http://page')),
     'cli.bag_view.recorded_run': 'run',
-    'cli.view_recorder.RunRecorder': SimpleNamespace(close=lambda: None),
+    'cli.live_page_recording.RunRecorder': SimpleNamespace(close=lambda: None),
 }
 GRAPH = MagicMock()
 GRAPH.topics.return_value = {'/odom': ['nav_msgs/msg/Odometry']}
@@ -966,7 +966,7 @@ def test_what_arrives_is_printed_at_once(command, monkeypatch, tmp_path):
             seen.append(path.read_text())
 
     clock = SimpleNamespace(time=0.0)
-    monkeypatch.setattr('t3mpc_ros.cli.ros2_commands.time.monotonic', lambda: clock.time)
+    monkeypatch.setattr('t3mpc_ros.cli.topic_param_call.time.monotonic', lambda: clock.time)
     opened = MagicMock(messages=messages)
     monkeypatch.setattr('t3mpc_ros.nodes.graph_client.graph', lambda stop: nullcontext(opened))
     monkeypatch.setattr('t3mpc_ros.nodes.graph_client.message_text', lambda message, _: message)

@@ -25,7 +25,7 @@ from t3mpc_ros.control.actuation import (
     limit_scale,
     wheel_limits,
 )
-from t3mpc_ros.control.speed_filter import SpeedFilterParameters
+from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import BodyTwist, WheelSpeeds
 

@@ -32,7 +32,7 @@ from t3mpc_ros.bag.model_file import (
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.controller import Controller, ControllerParameters
-from t3mpc_ros.control.speed_filter import SpeedFilterParameters
+from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.proposed_method import ProposedParameters
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS
 from t3mpc_ros.evaluation.training.bag_fit import blocks, fit_bags

@@ -45,7 +45,7 @@ from t3mpc_ros.control.pose_controller import (
     PoseController,
     PoseLoopParameters,
 )
-from t3mpc_ros.control.speed_filter import SpeedFilterParameters, SpeedKalmanFilter
+from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters, SpeedKalmanFilter
 from t3mpc_ros.control.watchdog import ResponseMonitor, WatchdogParameters
 from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultInjection

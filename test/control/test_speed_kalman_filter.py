@@ -18,7 +18,7 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.control.speed_filter import (
+from t3mpc_ros.control.speed_kalman_filter import (
     SpeedFilterParameters,
     SpeedKalmanFilter,
     stationary_gain,

@@ -19,7 +19,7 @@ import pytest
 from support.page_data import read_all
 from support.waiting import wait_until
 
-from t3mpc_ros.cli.view_recorder import RunRecorder
+from t3mpc_ros.cli.live_page_recording import RunRecorder
 from t3mpc_ros.view.live_data import LiveData
 
 pytestmark = pytest.mark.slow
@@ -62,7 +62,7 @@ def recording(tmp_path, monkeypatch):
     for name, text in (('recorder', RECORDER), ('t3mpc', REPORT)):
         (tmp_path / name).write_text(text)
         (tmp_path / name).chmod(0o755)
-    for module in ('process_group', 'view_recorder'):
+    for module in ('process_group', 'live_page_recording'):
         monkeypatch.setattr(f't3mpc_ros.cli.{module}.executable', lambda name: tmp_path / name)
     made = Recording(tmp_path / 'runs')
     yield made
