@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> None:
             raise ValueError(f'robot must be servo for bags: got {options.robot}')
         run_bags(options)
         return
-    from t3mpc_ros.evaluation.training.simulation_fit import assess, fit_simulated_runs, origin
+    from t3mpc_ros.evaluation.training.simulated_run_fit import assess, fit_simulated_runs, origin
 
     if options.keep_predictor:
         raise ValueError('--keep-predictor is for bags')

@@ -184,8 +184,8 @@ MODEL = SimpleNamespace(
     text='', learnt={}, parameters=SimpleNamespace(to_dict=dict), origin={}, to_dict=dict
 )
 TRAIN = {
-    'evaluation.training.simulation_fit.fit_simulated_runs': ({}, MODEL),
-    'evaluation.training.simulation_fit.assess': '',
+    'evaluation.training.simulated_run_fit.fit_simulated_runs': ({}, MODEL),
+    'evaluation.training.simulated_run_fit.assess': '',
     'evaluation.training.bag_fit.fit_bags': MODEL,
     'bag.model_file.save_model': None,
 }

@@ -38,7 +38,7 @@ from t3mpc_ros.evaluation.training.fit import (
     skills,
     stretches,
 )
-from t3mpc_ros.evaluation.training.simulation_fit import training_data_of
+from t3mpc_ros.evaluation.training.simulated_run_fit import training_data_of
 from t3mpc_ros.evaluation.training.training_data import TrainingData
 
 pytestmark = pytest.mark.slow
