@@ -270,7 +270,7 @@ class DeadTimeEstimator:
         """
         estimate = self.estimate
         costs = estimate.accepted.costs
-        slope, curvature = 0.5 * (costs[2] - costs[0]), costs[2] - 2.0 * costs[1] + costs[0]
+        slope, curvature = parabola(costs, 1)
         _, least, _ = minimum(costs)
         if slope > curvature > 0.0:
             least = costs[1] - 0.5 * slope**2 / curvature
@@ -544,13 +544,19 @@ def preference(estimate: Any) -> float:
 
 
 @kernel
+def parabola(costs: Array, g: int) -> tuple[float, float]:
+    """Return first and second derivative per step of the parabola through g and its neighbours."""
+    slope = 0.5 * (costs[g + 1] - costs[g - 1])
+    return slope, costs[g + 1] - 2.0 * costs[g] + costs[g - 1]
+
+
+@kernel
 def cost_at(costs: Array, dead_time: float) -> float:
     """Return the cost at a dead time, s: of the parabola through the three nearest of the grid."""
     position = dead_time / GRID_STEP
     g = min(max(int(position + 0.5), 1), GRID_SIZE - 2)
     offset = position - g
-    slope = 0.5 * (costs[g + 1] - costs[g - 1])
-    curvature = costs[g + 1] - 2.0 * costs[g] + costs[g - 1]
+    slope, curvature = parabola(costs, g)
     return float(costs[g] + offset * (slope + 0.5 * curvature * offset))
 
 
@@ -655,8 +661,8 @@ def minimum(costs: Array) -> tuple[float, float, float]:
         if costs[g] < costs[best]:
             best = g
     g = min(max(best, 1), GRID_SIZE - 2)
-    slope = 0.5 * (costs[g + 1] - costs[g - 1])
-    curvature = max(costs[g + 1] - 2.0 * costs[g] + costs[g - 1], 1e-12)
+    slope, curvature = parabola(costs, g)
+    curvature = max(curvature, 1e-12)
     offset = min(max(-slope / curvature, -1.0), 1.0)
     least = costs[g] + offset * (slope + 0.5 * curvature * offset)
     return (g + offset) * GRID_STEP, least, curvature / GRID_STEP**2

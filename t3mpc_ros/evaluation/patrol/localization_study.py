@@ -57,16 +57,14 @@ TRIPLED = MappingProxyType(
     }
 )
 """Parameters of a twin with three times the noise of wheels, gyro and ranges."""
+_LOCALIZED = PatrolScenario(localization='filter')
+_TRIPLED = replace(_LOCALIZED, range_loss=0.2, robot=dict(TRIPLED))
 CASES: Mapping[str, PatrolScenario] = {
     'odometry alone': PatrolScenario(localization='odometry'),
-    'particle filter': PatrolScenario(localization='filter'),
-    'noise x 3, 20 % of the readings lost': PatrolScenario(
-        localization='filter', range_loss=0.2, robot=dict(TRIPLED)
-    ),
-    'carried by 1 m and 90 degrees': PatrolScenario(localization='filter', carried_at=CARRIED_AT),
-    'carried, noise x 3, 20 % lost': PatrolScenario(
-        localization='filter', range_loss=0.2, robot=dict(TRIPLED), carried_at=CARRIED_AT
-    ),
+    'particle filter': _LOCALIZED,
+    'noise x 3, 20 % of the readings lost': _TRIPLED,
+    'carried by 1 m and 90 degrees': replace(_LOCALIZED, carried_at=CARRIED_AT),
+    'carried, noise x 3, 20 % lost': replace(_TRIPLED, carried_at=CARRIED_AT),
 }
 """The cases by name."""
 
