@@ -124,7 +124,7 @@ class RoutePlanner:
         start = (away < 3.0) & np.isfinite(costs)
         dearest = float(costs[start].max(initial=0.0))
         # Times that grow with the distance: cheap places beyond dear ones were no way down.
-        np.copyto(times, away * (dearest if dearest >= CLOSE_COST else costs), where=start)
+        np.copyto(times, away * dearest, where=start)
         for _ in range(MAX_SWEEPS):
             if not sweep_times(times, costs):
                 break

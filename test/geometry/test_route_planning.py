@@ -17,6 +17,7 @@ import math
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 
 from t3mpc_ros.geometry.arena import OccupancyGrid
 from t3mpc_ros.geometry.path_timing import resample
@@ -156,6 +157,19 @@ def test_a_robot_too_near_to_an_obstacle_finds_a_way_from_it():
     assert (planner.wall_distance(route) >= DISTANCE - 0.07).all()
     assert (planner.wall_distance(route)[30:] >= DISTANCE - SIZE).all()
     assert planner.route((0.0, 1.0), begin) is None
+
+
+@pytest.mark.parametrize('seed', few_of([1, 2, 3]))
+def test_what_is_reached_has_a_route_whatever_the_floor_costs(seed):
+    """Around the begin, cheap places beyond dear ones were hollows out of which no way led."""
+    generator = np.random.default_rng(seed)
+    planner = planner_of(box(floor(2.0, 2.0), 0.3, 0.2, 0.1, 0.3))
+    for _ in range(5):
+        begin = tuple(generator.uniform(-0.7, -0.1, 2).tolist())
+        planner.spread(begin, lambda nodes: 3.0 * generator.integers(0, 2, len(nodes)))
+        places = planner.reached_places()
+        for place in places[generator.permutation(len(places))[:20]].tolist():
+            assert planner.route(tuple(place), begin) is not None
 
 
 def test_seen_floor_is_preferred_to_unseen():
