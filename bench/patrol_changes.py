@@ -271,14 +271,15 @@ def measured(job: tuple[Any, str]) -> Mapping[str, Any]:
 
 def planted_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the table of the planted changes, in Markdown."""
-    lines = ['| room | change | seed | found after, s | named | size, m: true, found | false |']
-    lines += ['|---' * 7 + '|']
+    head = '| room | change | seed | found after, s | named | size, m: true, found | false '
+    lines = [f'{head}| position rms, mm | lost, s |', '|---' * 9 + '|']
     for row in rows:
         found = f'{row["found"]:.1f}' if math.isfinite(row['found']) else 'not found'
         found = found if math.isfinite(row['sight']) else 'not in sight'
         size = f'{row["size"]:.2f}, {row["size_found"]:.2f}'
         named = 'yes' if row['named'] else 'no'
-        cells = row['room'], row['change'], row['seed'], found, named, size, row['false']
+        pose = f'{1e3 * row["position"]:.1f}', f'{row["lost"]:.0f}'
+        cells = row['room'], row['change'], row['seed'], found, named, size, row['false'], *pose
         lines.append('| ' + ' | '.join(map(str, cells)) + ' |')
     seen = [row for row in rows if math.isfinite(row['sight'])]
     soon = sum(row['found'] <= WANTED_TIME for row in seen)

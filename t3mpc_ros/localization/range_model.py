@@ -50,7 +50,7 @@ class RangeModelParameters(Parameters):
     """Weights and errors of the beam model."""
 
     z_hit: float = parameter(
-        0.85, 'weight of readings that hit what the map has', bounds=(1e-3, 1.0), source=NAMES
+        0.67, 'weight of readings that hit what the map has', bounds=(1e-3, 1.0), source=NAMES
     )
     z_short: float = parameter(
         0.05,
@@ -59,7 +59,10 @@ class RangeModelParameters(Parameters):
         source=NAMES,
     )
     z_max: float = parameter(
-        0.02, 'weight of readings without a hit', bounds=(1e-6, 1.0), source=NAMES
+        0.2,
+        'weight of readings without a hit, as of a thing that the map has and the room has not',
+        bounds=(1e-6, 1.0),
+        source=NAMES,
     )
     z_rand: float = parameter(0.08, 'weight of random readings', bounds=(1e-6, 1.0), source=NAMES)
     sigma_hit: float = parameter(
