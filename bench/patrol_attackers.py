@@ -14,7 +14,8 @@
 """Three attackers who predict where a patrol is in five seconds, and what the schedule tells.
 
 ``python bench/patrol_attackers.py``: the table of ``docs/patrol.md``, in Markdown: paths in
-an empty room, seeds 141 to 146, 18 min. Each attacker sees positions without error, predicts at
+an empty room, and the planned patrol of the simulated robot in ``room``, seeds 141 to 146, 18 min.
+``--planned``: the last one alone. Each attacker sees positions without error, predicts at
 each instant of the second half, and says how much he trusts the prediction:
 
 * *arc*: speed and turn rate go on; he trusts steady ones;
@@ -27,6 +28,7 @@ within the five seconds; the moments of which he is certain are those that the p
 dwell leave him.
 """
 
+import argparse
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 import math
@@ -35,12 +37,19 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.chaos.chaotic_path import PortraitParameters, PortraitPath
+from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.evaluation.confidence_intervals import mean
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at, visits
-from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
+from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, free_cells
+from t3mpc_ros.evaluation.patrol.patrol_run import (
+    LIMITS,
+    PatrolScenario,
+    portrait_points,
+    run_patrol,
+)
 from t3mpc_ros.evaluation.patrol.time_series_analysis import (
     delay_vectors,
     resampled,
@@ -49,6 +58,7 @@ from t3mpc_ros.evaluation.patrol.time_series_analysis import (
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming
 from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.simulation.world import load_world
 
 STEP, HORIZON = 0.25, 20
 """Interval of the observations, s, and how many of them are five seconds."""
@@ -62,12 +72,12 @@ DURATION = 1080.0
 SEEDS, OTHER_SEEDS = tuple(range(141, 147)), (301, 302)
 ARENA = PortraitParameters().arena
 
-Source = Callable[[int], Iterator[Array]]
-"""Returns the points of the path of a seed."""
+Patrol = Callable[[int], tuple[Array, float]]
+"""Returns of a seed the places every 0.25 s, m, shape (n, 2), and the coverage."""
 
 
-def portraits(switching: SwitchingParameters) -> Source:
-    """Return the source of portraits that are switched so."""
+def portraits(switching: SwitchingParameters) -> Patrol:
+    """Return patrols on portraits that are switched so."""
 
     def points(seed: int) -> Iterator[Array]:
         parameters = replace(PortraitParameters(), switching=switching)
@@ -75,20 +85,30 @@ def portraits(switching: SwitchingParameters) -> Source:
         while True:
             yield path.advance(1.0)
 
-    return points
+    return lambda seed: driven(points(seed))
 
 
-def random_walk(seed: int) -> Iterator[Array]:
-    """Yield the points of a random walk with legs of 1 m."""
+def random_walk(seed: int) -> tuple[Array, float]:
+    """Return a random walk with legs of 1 m."""
     left, bottom, right, top = ARENA
     area = Rectangle((left, bottom), (right, top))
     length = LIMITS.linear * DURATION + 10.0
-    yield BASELINE_PATHS['random walk'](area, length, np.random.default_rng((seed, 21)))
+    path = BASELINE_PATHS['random walk'](area, length, np.random.default_rng((seed, 21)))
+    return driven(iter([path]))
+
+
+def planned(seed: int) -> tuple[Array, float]:
+    """Return the patrol of the simulated robot that plans its path in the bundled room."""
+    scenario = PatrolScenario(seed, DURATION, world='room', plan=PlanParameters(enabled=True))
+    record = run_patrol(portrait_points(seed, PortraitParameters()), scenario)
+    x, y, _ = record['truth'][::10].T
+    return observed(record.time[::10], x, y, free_cells(PatrolPlan(), load_world('room')))
 
 
 DEFAULT = PortraitParameters().switching
 BEFORE = replace(DEFAULT, kind='random')
-PATHS: dict[str, tuple[Source, SwitchingParameters | None]] = {
+PLANNED = 'planned in `room`'
+PATHS: dict[str, tuple[Patrol, SwitchingParameters | None]] = {
     'dwell of 8 to 16 s': (portraits(BEFORE), BEFORE),
     **{
         f'memoryless, mean {dwell:g} s': (portraits(made), made)
@@ -96,6 +116,7 @@ PATHS: dict[str, tuple[Source, SwitchingParameters | None]] = {
         for made in [replace(DEFAULT, mean_dwell=dwell)]
     },
     'random walk': (random_walk, None),
+    PLANNED: (planned, None),
 }
 
 
@@ -106,9 +127,13 @@ def driven(points: Iterator[Array]) -> tuple[Array, float]:
     track = np.array(rows)[::10]
     time = 0.1 * np.arange(len(track))
     left, bottom, right, top = ARENA
-    grid = CoverageGrid((left, bottom), (right, top))
-    covered = coverage_at(visits(time, *track.T, grid), grid, time[-1:])
-    return resampled(time, *track.T, STEP), float(covered[0])
+    return observed(time, *track.T, CoverageGrid((left, bottom), (right, top)))
+
+
+def observed(time: Array, x: Array, y: Array, grid: CoverageGrid) -> tuple[Array, float]:
+    """Return places (m) every 0.25 s, and which share of the cells was entered."""
+    covered = coverage_at(visits(time, x, y, grid), grid, time[-1:] - time[0])
+    return resampled(time, x, y, STEP), float(covered[0])
 
 
 def inputs(track: Array) -> tuple[Array, Array]:
@@ -179,13 +204,13 @@ def attacked(track: Array, method: tuple[Array, Array]) -> list[Knowledge]:
     return [knowledge(each, followed[later]) for each in predictions]
 
 
-def library(source: Source) -> tuple[Array, Array]:
+def library(patrol: Patrol) -> tuple[Array, Array]:
     """Return what an attacker learns from the method: other seeds, and their mirror images."""
     pairs = []
     left, bottom, right, top = ARENA
     middle = 0.5 * np.array([left + right, bottom + top])
     for seed in OTHER_SEEDS:
-        track = driven(source(seed))[0]
+        track = patrol(seed)[0]
         for mirror in ([1.0, 1.0], [-1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]):
             pairs.append(inputs(middle + (track - middle) * mirror))
     known, followed = (np.vstack(each) for each in zip(*pairs, strict=True))
@@ -210,13 +235,18 @@ def schedule_knowledge(switching: SwitchingParameters) -> tuple[float, float]:
 
 def main() -> None:
     """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition('\n')[0])
+    parser.add_argument('--planned', action='store_true', help='the planned patrol alone')
+    options = parser.parse_args()
     print('| path | coverage, % | arc | watcher | method | state: right, certain, % |')
     print('|---|---|---|---|---|---|')
-    for name, (source, switching) in PATHS.items():
-        method = library(source)
+    for name, (patrol, switching) in PATHS.items():
+        if options.planned and name != PLANNED:
+            continue
+        method = library(patrol)
         rows, covered = [], []
         for seed in SEEDS:
-            track, share = driven(source(seed))
+            track, share = patrol(seed)
             rows.append(attacked(track, method))
             covered.append(share)
         cells = [f'{100 * mean(covered):.1f} (least {100 * min(covered):.1f})']
@@ -225,7 +255,7 @@ def main() -> None:
             cells.append(f'{values[0]:.2f} m; {100 * values[1]:.0f}, {100 * values[2]:.0f}')
         state = schedule_knowledge(switching) if switching else (math.nan, math.nan)
         known = ', '.join(f'{100 * value:.0f}' for value in state)
-        cells.append(known if switching else 'no switches')
+        cells.append(known if switching else '–')
         print(f'| {name} |', ' | '.join(cells), '|', flush=True)
 
 

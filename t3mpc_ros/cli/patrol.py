@@ -50,7 +50,7 @@ def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') 
         '--planned',
         action='store_true',
         help='as --robot twin, and the path goes around what the robot has seen; the robot rests '
-        'and looks before floor that it has not',
+        'and looks before floor that it has not; also with --safety',
     )
     add_seeds(parser, DEFAULT_SEEDS, 'path, robot and room')
     text = (
@@ -140,7 +140,9 @@ def _safety(options: argparse.Namespace) -> int:
 
     seconds = 60.0 * options.minutes
     with executor_of(options) as executor:
-        measured = compare_safety(options.seeds, seconds, executor, print_report)
+        measured = compare_safety(
+            options.seeds, seconds, executor, print_report, planned=options.planned
+        )
     print_result(options, safety_table(measured).markdown, lambda: measured.rows)
     return 0
 

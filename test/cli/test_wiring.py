@@ -408,6 +408,7 @@ TABLE = {
         {
             '--seeds 3-4': {'compare_safety.seeds': (3, 4)},
             '--minutes 2': {'compare_safety.duration': 120.0},
+            '--planned': {'compare_safety.planned': True},
             **workers('compare_safety.workers'),
         },
     ),

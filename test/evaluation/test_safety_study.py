@@ -102,9 +102,10 @@ def test_faults_of_sensors_change_what_arrives():
 
 
 @pytest.mark.slow
-def test_a_robot_whose_sensors_fail_rests_within_half_a_second():
+@pytest.mark.parametrize('planned', [False, True])
+def test_a_robot_whose_sensors_fail_rests_within_half_a_second(planned):
     """It drove 9.4 m after the last reading, with diagnostics that said OK."""
-    row = measured_safety((('sensors silent', 9.0), 11))
+    row = measured_safety((('sensors silent', 9.0, planned), 11))
     assert row['rest'] < 0.5
     assert row['after'] < 0.12
     assert row['driven'] > 0.1

@@ -27,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.chaos.chaotic_path import PortraitParameters
+from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     START,
@@ -264,8 +265,13 @@ def at_places(found: Sequence[Contact]) -> list[list[Contact]]:
     return places
 
 
-def safety_run(case: str, seed: int, duration: float) -> tuple[Record, World]:
-    """Return the record of a case, and its world with all that came."""
+def safety_run(
+    case: str, seed: int, duration: float, *, planned: bool = False
+) -> tuple[Record, World]:
+    """Return the record of a case, and its world with all that came.
+
+    planned : whether the path is planned on what the robot has seen
+    """
     kind = CASES[case]
     text = room_with_boxes(seed, ROOM, BOXES)
     if kind.unseen:
@@ -281,14 +287,18 @@ def safety_run(case: str, seed: int, duration: float) -> tuple[Record, World]:
 
     with world_file(text) as path:
         scenario = PatrolScenario(
-            seed, duration, world=path, faults=tuple(kind.faults(seed)) if kind.faults else ()
+            seed,
+            duration,
+            world=path,
+            faults=tuple(kind.faults(seed)) if kind.faults else (),
+            plan=PlanParameters(enabled=planned),
         )
         record = run_patrol(portrait_points(seed, PortraitParameters()), scenario, visitors=visit)
     world = parse_world(text, 'room')
     return record, replace(world, moving=tuple(came))
 
 
-def measured_safety(job: tuple[tuple[str, float], int]) -> Row:
+def measured_safety(job: tuple[tuple[str, float, bool], int]) -> Row:
     """Return the row of a case.
 
     ``contacts``, those to which the robot moved; ``contacts_seen``, those of them with what a beam
@@ -298,8 +308,8 @@ def measured_safety(job: tuple[tuple[str, float], int]) -> Row:
     stop that lasts to the end. Of a case with faults ``rest``, time from the fault to the last
     pulse of a motor (s), NaN without, and ``after``, distance driven after it (m).
     """
-    (case, duration), seed = job
-    record, world = safety_run(case, seed, duration)
+    (case, duration, planned), seed = job
+    record, world = safety_run(case, seed, duration, planned=planned)
     found = contacts(record, world)
     own = [each for each in found if each.speed > OWN_SPEED]
     places = at_places(own)
@@ -333,8 +343,10 @@ def compare_safety(
     duration: float,
     workers: int | Executor = 1,
     report: Report | None = None,
+    *,
+    planned: bool = False,
 ) -> ResultTable:
-    """Return one row a case and seed; arguments as of :func:`run_experiment`.
+    """Return one row a case and seed; arguments as of :func:`run_experiment`, :func:`safety_run`.
 
     ValueError: the runs end before the last sensors have failed.
     """
@@ -344,7 +356,7 @@ def compare_safety(
             f'sensors fail until {FAULTS_END:g} s: got {duration:g} s'
         )
     runs = [
-        Run(((case, duration), seed), {'controller': case, 'seed': seed})
+        Run(((case, duration, planned), seed), {'controller': case, 'seed': seed})
         for case in CASES
         for seed in seeds
     ]
