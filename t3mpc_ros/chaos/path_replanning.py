@@ -86,6 +86,13 @@ PLACES, APART = 5, 0.25
 """Old places that are visited one after the other, and their least distance, m."""
 FRESH_COST = 3.0
 """Cost of floor that was just visited, by the length of a way to old places over it."""
+LOOK_AGAIN = 60.0
+"""Time for which the path does not lead by the same contradiction of the map again, s."""
+VIEW_DISTANCE, VIEW_DEPTH = 0.8, 0.15
+"""Largest distance from which a contradiction is looked at, and by how much farther than from the
+nearest place, m."""
+VIEW_END = 0.3
+"""Last part of the line of sight, m: what the map has there is what is in doubt."""
 OLD_SHARE = 0.9
 """Age of the places that are revisited, as a share of the greatest age."""
 
@@ -187,6 +194,28 @@ class PathPlan:
         """Place that is to be visited, and was not yet, m."""
         self._leads_there = False
         """Whether a way to the goal is in the plan."""
+        self._contradiction: tuple[float, float] | None = None
+        """Where the map is contradicted, and which is to be looked at, m."""
+        self._last_view: tuple[float, float] | None = None
+        """The last place from which it is looked at, m; None without a way there in the plan."""
+        self._looks: list[tuple[float, float, float]] = []
+        """Contradictions of the last minute: x, y (m), and since when it leads by (s)."""
+
+    def lead_by(self, places: Array, fixed: int, time: float) -> None:
+        """Lead by the first place where the map is contradicted, unless it did so a minute ago.
+
+        places : m, shape (n, 2)
+        """
+        self._looks = [each for each in self._looks if time - each[2] < LOOK_AGAIN]
+        if self._contradiction in [each[:2] for each in self._looks]:
+            return  # one after the other
+        self._contradiction = self._last_view = None
+        for x, y in places.tolist():
+            if all(math.hypot(x - each[0], y - each[1]) > APART for each in self._looks):
+                self._looks.append((x, y, time))
+                self._contradiction = x, y
+                self.truncate(max(fixed, 1))
+                return
 
     def lead_to(self, goal: tuple[float, float], fixed: int) -> None:
         """Lead to a place (m) after the first ``fixed`` points, and then on along the path."""
@@ -198,7 +227,11 @@ class PathPlan:
         """The point that is nearest to the goal; None without a way there."""
         if self.goal is None or not self._leads_there:
             return None
-        return int(np.argmin(np.hypot(*(self.points - self.goal).T)))
+        return self._point_at(self.goal)
+
+    def _point_at(self, place: tuple[float, float]) -> int:
+        """Return the point that is nearest to a place (m)."""
+        return int(np.argmin(np.hypot(*(self.points - place).T)))
 
     def use_random_numbers(self, random: SecretRandom) -> None:
         """Draw where and when places are revisited from these numbers from now on."""
@@ -229,6 +262,8 @@ class PathPlan:
         """Remove the first points, which have been passed."""
         if (point := self.goal_point) is not None and point <= count:
             self.goal = None
+        if self._last_view is not None and self._point_at(self._last_view) <= count:
+            self._contradiction = self._last_view = None
         self.points, self._next = self.points[count:], self._next[count:]
         used = int(self._next[0]) - self._base
         self._path, self._base = self._path[used:], self._base + used
@@ -237,11 +272,13 @@ class PathPlan:
         """Keep the first points only; what followed is planned anew."""
         if (point := self.goal_point) is not None and point >= count:
             self._leads_there = False
+        if self._last_view is not None and self._point_at(self._last_view) >= count:
+            self._last_view = None
         self.points, self._next = self.points[:count], self._next[:count]
 
     def begin_at(self, pose: Pose) -> None:
         """Plan from a place on."""
-        self._leads_there = False
+        self._leads_there, self._last_view = False, None
         self.points, self._next = np.array([[pose.x, pose.y]]), self._next[:1]
 
     def extend(self, fixed: int, time: float) -> None:
@@ -256,6 +293,12 @@ class PathPlan:
                 self._leads_there = self._lead_over(goal, GOAL_MISS, begin, path, blocked, fixed)
                 if self._leads_there:
                     continue
+            if self._contradiction is not None and self._last_view is None:
+                places = self._views(self._contradiction, begin)
+                if places and self._lead_over(places, MISS, begin, path, blocked, fixed):
+                    self._last_view = places[-1]
+                    continue
+                self._contradiction = None
             if self._left <= 0.0:
                 self._left = self._draw_length()
                 places = self._old_places(begin, time)
@@ -328,11 +371,7 @@ class PathPlan:
 
         The first one is drawn, the others are the nearest to the one before.
         """
-        self._planner.spread(begin)
-        places = self._planner.reached_places()
-        inside = self._arena.contains(places)
-        inside &= self._planner.wall_distance(places) >= self._parameters.distance
-        places = places[inside]
+        places = self._places_from(begin)
         if not len(places):
             return []
         age = time - self._visited[tuple(self._cells(places))]
@@ -344,6 +383,33 @@ class PathPlan:
                 break
             chosen.append(places[int(np.argmin(np.hypot(*(places - chosen[-1]).T)))])
         return [(float(x), float(y)) for x, y in chosen]
+
+    def _places_from(self, begin: tuple[float, float]) -> Array:
+        """Return the places (m) that have a way from a place, shape (n, 2)."""
+        self._planner.spread(begin)
+        places = self._planner.reached_places()
+        inside = self._arena.contains(places)
+        inside &= self._planner.wall_distance(places) >= self._parameters.distance
+        return places[inside]
+
+    def _views(
+        self, thing: tuple[float, float], begin: tuple[float, float]
+    ) -> list[tuple[float, float]]:
+        """Return two places from which a thing (m) is seen, the nearer one first; or none."""
+        places = self._places_from(begin)
+        away = np.hypot(*(places - thing).T)
+        places, away = places[away < VIEW_DISTANCE], away[away < VIEW_DISTANCE]
+        share = np.linspace(0.0, 1.0, 16)[:, None] * np.clip(1.0 - VIEW_END / away, 0.0, 1.0)
+        sight = places + share[:, :, None] * (thing - places)
+        clear = self._planner.wall_distance(sight.reshape(-1, 2)).reshape(share.shape)
+        seen = (clear > 2.0 * SPACING).all(axis=0)
+        places, away = places[seen], away[seen]
+        if not len(places):
+            return []
+        places = places[away <= away.min() + VIEW_DEPTH]
+        first = places[int(np.argmin(self._planner.arrival(places)))]
+        second = places[int(np.argmax(np.hypot(*(places - first).T)))]
+        return [(float(x), float(y)) for x, y in (first, second)]
 
     def _lead_over(
         self,
@@ -526,6 +592,8 @@ class PlannedPath:
         """Points of the plan that lead over floor that has been seen."""
         self.charging = False
         """Whether the path leads to the charging place, or rests there."""
+        self._contradictions: Array = _NOWHERE
+        """Where the map is contradicted, m, shape (n, 2)."""
         self._battery_time = math.inf
         """Since when the voltage has called for a change, s."""
 
@@ -594,6 +662,7 @@ class PlannedPath:
         self._planner.update(self._with_unseeable(grid))
         self._go_on()
         self._leave_unsafe()
+        self.plan.lead_by(self._contradictions, self._fed, self._time)
         self.plan.extend(self._fed, self._time)
         goes_on = self._feed()
         if self._look is not None:
@@ -652,6 +721,10 @@ class PlannedPath:
         end = self._timing.cut()
         away = np.hypot(*(self.plan.points[: self._fed] - np.array(end.pose[:2])).T)
         self._fed = int(np.argmin(away)) + 1
+
+    def look_at(self, places: Array) -> None:
+        """Lead soon by places (m), shape (n, 2), where the map is contradicted: once a minute."""
+        self._contradictions = places
 
     def go_to(self, goal: tuple[float, float]) -> None:
         """Lead to a place (m) now, and then on along the path."""

@@ -151,6 +151,12 @@ class Place:
         """Logarithm of the ratio of the likelihoods, with and without the change."""
         return sum(self.cells.values())
 
+    @property
+    def centre(self) -> Array:
+        """Mean of the centres of its cells, m, shape (2,)."""
+        found: Array = CELL * (np.array(list(self.cells)).mean(axis=0) + 0.5)
+        return found
+
 
 Cell = tuple[int, int]
 
@@ -177,6 +183,13 @@ class ChangeDetector:
     def changes(self) -> tuple[Change, ...]:
         """The events, in the order in which they were found."""
         return tuple(self._changes)
+
+    @property
+    def suspected(self) -> Array:
+        """Where a reading contradicts the map, and there is no event yet, m, shape (n, 2)."""
+        places = (each for each in self._places if each.event is None)
+        centres = [each.centre for each in places if each.evidence >= LARGEST]
+        return np.array(centres).reshape(-1, 2)
 
     def forget(self) -> None:
         """Forget what is no event yet: the robot was not where it took itself to be."""

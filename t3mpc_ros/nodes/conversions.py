@@ -14,7 +14,7 @@
 """ROS messages: conversion to the types of the package, classes by name, frames, and age."""
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import importlib
 import math
@@ -23,6 +23,7 @@ import time
 from typing import Any
 
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Pose as PoseMessage
 from geometry_msgs.msg import (
     PoseStamped,
     Quaternion,
@@ -32,7 +33,7 @@ from geometry_msgs.msg import (
     TwistStamped,
 )
 from nav_msgs.msg import OccupancyGrid as OccupancyGridMessage
-from nav_msgs.msg import Odometry, Path
+from nav_msgs.msg import Odometry
 import numpy as np
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
@@ -261,9 +262,9 @@ def stamped_twist(twist: BodyTwist, stamp_ns: int, frame: str) -> TwistStamped:
     return TwistStamped(header=header(stamp_ns, frame), twist=twist_from_body(twist))
 
 
-def points_from_path(message: Path) -> Array:
-    """Return the points of a path, m, shape (n, 2)."""
-    places = [each.pose.position for each in message.poses]
+def points_from_poses(poses: Iterable[PoseMessage]) -> Array:
+    """Return the positions of poses, m, shape (n, 2)."""
+    places = [each.position for each in poses]
     return np.array([(each.x, each.y) for each in places], dtype=np.float64).reshape(-1, 2)
 
 

@@ -27,7 +27,7 @@ from sensor_msgs.msg import LaserScan, Range
 from std_srvs.srv import Empty
 from visualization_msgs.msg import Marker, MarkerArray
 
-from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, Pose, State
+from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, Array, Pose, State
 from t3mpc_ros.localization.change_detection import Change, ChangeKind
 from t3mpc_ros.localization.localizer import (
     Localization,
@@ -159,6 +159,8 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         self._cloud = self.create_publisher(PoseArray, 'particlecloud', qos.SCALARS)
         self._changes = self.create_publisher(DiagnosticArray, 'map_changes', qos.LATCHED)
         self._markers = self.create_publisher(MarkerArray, 'map_changes/markers', qos.LATCHED)
+        self._suspected = self.create_publisher(PoseArray, 'map_changes/suspected', qos.LATCHED)
+        self._shown_suspected = np.empty((0, 2))
         self._broadcaster = self._make_broadcaster() if parameters.tf_broadcast else None
         self._scan: MatchingSubscription | None = None
         self._ranges: list[MatchingSubscription] = []
@@ -335,16 +337,27 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
     def _publish_cloud(self) -> None:
         if self._localizer is None or not self._cloud.get_subscription_count():
             return
+        poses = self._localizer.filter.poses
+        self._cloud.publish(self._pose_array(poses))
+
+    def _pose_array(self, poses: Array) -> PoseArray:
+        """Return poses on the map, shape (n, 3), as a message."""
         message = PoseArray(header=conversions.header(self._odometry_ns, self._map_frame))
-        for x, y, yaw in self._localizer.filter.poses.tolist():
+        for x, y, yaw in poses.tolist():
             pose = geometry_msgs.msg.Pose(orientation=conversions.quaternion_from_yaw(yaw))
             pose.position.x, pose.position.y = x, y
             message.poses.append(pose)
-        self._cloud.publish(message)
+        return message
 
     def _publish_changes(self) -> None:
-        """Publish all changes if one of them is other than it was."""
-        changes = () if self._localizer is None else self._localizer.changes.changes
+        """Publish all changes, and what may be one, if one of them is other than it was."""
+        if self._localizer is None:
+            return
+        changes, suspected = self._localizer.changes.changes, self._localizer.changes.suspected
+        if not np.array_equal(suspected, self._shown_suspected):
+            self._shown_suspected = suspected
+            poses = np.column_stack([suspected, np.zeros(len(suspected))])
+            self._suspected.publish(self._pose_array(poses))
         if changes == self._shown_changes:
             return
         self._shown_changes = changes

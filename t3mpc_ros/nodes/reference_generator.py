@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import secrets
 from typing import Any, ClassVar
 
-from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from geometry_msgs.msg import PoseArray, PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 import numpy as np
 from rclpy.time import Time
@@ -194,6 +194,9 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 OccupancyGrid, 'keep_out/map', self._on_map, qos.LATCHED
             )
             self.create_matching_subscription(PoseStamped, 'goal_pose', self._on_goal, qos.COMMAND)
+            self.create_matching_subscription(
+                PoseArray, 'map_changes/suspected', self._on_suspected, qos.LATCHED
+            )
             if parameters.plan.charging.min_voltage > 0.0:
                 self.create_matching_subscription(
                     BatteryState, 'battery_state', self._on_battery, qos.SCALARS
@@ -238,7 +241,8 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         self._path_stamps.append(stamp)
         try:
             points = self._own_points(
-                message.header.frame_id, conversions.points_from_path(message)
+                message.header.frame_id,
+                conversions.points_from_poses([each.pose for each in message.poses]),
             )
         except PathError as error:
             self._reject('path', error)
@@ -295,6 +299,17 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             self._reject('goal_pose', error)
             return
         self._planned.go_to((x, y))
+
+    def _on_suspected(self, message: PoseArray, info: dict[str, Any]) -> None:
+        try:
+            places = self._own_points(
+                message.header.frame_id, conversions.points_from_poses(message.poses)
+            )
+        except PathError as error:
+            self._reject('map_changes/suspected', error)
+            return
+        if self._planned is not None:
+            self._planned.look_at(places)
 
     def _on_battery(self, message: BatteryState, info: dict[str, Any]) -> None:
         if self._planned is not None:

@@ -49,7 +49,14 @@ INTERFACES = {
     'reference_generator': NodeInterface(
         'reference_generator:ReferenceGeneratorNode',
         'Publishes the reference: chaotic signals, a chaotic path, or a given path or twist.',
-        subscribes=('odom', 'path', 'target_twist', 'keep_out/map', 'goal_pose'),
+        subscribes=(
+            'odom',
+            'path',
+            'target_twist',
+            'keep_out/map',
+            'goal_pose',
+            'map_changes/suspected',
+        ),
         publishes=('reference', 'reference/path', 'reference/signals', '/diagnostics'),
         services=('~/reseed', '~/pause'),
     ),
@@ -117,6 +124,7 @@ INTERFACES = {
             'particlecloud',
             'map_changes',
             'map_changes/markers',
+            'map_changes/suspected',
             '/tf',
             '/diagnostics',
         ),

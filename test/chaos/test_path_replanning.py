@@ -206,25 +206,80 @@ def test_what_is_placed_ahead_of_it_is_not_touched():
     assert length(rows) > 4.0  # something is in its way every 5 s
 
 
+def circle(radius):
+    """Yield the points of a circle through the start, which is driven for ever."""
+    angle = radius
+    while True:
+        angles = angle + np.arange(100) * 0.01 / radius
+        yield radius * np.column_stack([np.sin(angles), 1.0 - np.cos(angles)])
+        angle += 1.0 / radius
+
+
 def test_old_places_are_visited_again():
     """The given path is a small circle: what else is entered is due to the visits."""
-
-    def circle():
-        angle = 0.3
-        while True:
-            angles = angle + np.arange(100) * 0.01 / 0.3
-            yield 0.3 * np.column_stack([np.sin(angles), 1.0 - np.cos(angles)])
-            angle += 1.0 / 0.3
-
     shares = []
     for distance in (0.0, 3.0):
         room = Room()
         room.seen[:] = True
-        rows = drive(planned(circle().__next__, revisit_distance=distance), room, 60.0)
+        rows = drive(planned(circle(0.3).__next__, revisit_distance=distance), room, 60.0)
         cells = np.floor(rows[:, :2] / 0.3).astype(int)
         shares.append(len({*map(tuple, cells.tolist())}) / (3.4 * 2.4 / 0.09))
     assert shares[0] < 0.12
     assert shares[1] > 2.0 * shares[0]
+
+
+@pytest.mark.parametrize('thing', [(1.2, 0.8), (-1.4, -0.9), (1.1, 0.2)])
+def test_what_contradicts_the_map_is_looked_at_soon_and_once_a_minute(thing):
+    """A pillar that the map has is at the last place: it is passed where it can be seen."""
+
+    def visits(look, seconds):
+        room = Room()
+        room.seen[:] = True
+        room.occupied |= room.near(0.5, 0.4, 0.1)
+        path = planned(circle(0.3).__next__, revisit_distance=0.0)
+        rows = [drive(path, room, 5.0)]
+        if look:
+            path.look_at(np.array([thing]))
+        rows.append(drive(path, room, seconds))
+        check_limits(np.vstack(rows))
+        near = np.hypot(*(rows[1][:, :2] - thing).T) < 0.5
+        return near, np.flatnonzero(np.diff(near.astype(int)) == 1) * PERIOD
+
+    near, begins = visits(look=True, seconds=90.0)
+    assert begins[0] < 25.0
+    assert near.sum() * PERIOD > 2.0
+    soon = begins[begins < 55.0]
+    assert soon[-1] - soon[0] < 10.0  # it passes two places beside it, and then leaves
+    assert begins[-1] > 60.0
+    without, _ = visits(look=False, seconds=30.0)
+    assert near[: len(without)].sum() > without.sum() + 2.0 / PERIOD
+
+
+def test_a_contradiction_that_cannot_be_seen_does_not_hold_it_up():
+    """Behind a wall, beyond the arena, and several at once."""
+    room = Room()
+    room.seen[:] = True
+    room.occupied |= np.abs(room.x - 1.0) < 0.03
+    path = planned(circle(0.3).__next__, revisit_distance=0.0)
+    path.look_at(np.array([[1.6, 0.0], [9.0, 9.0], [-1.2, 0.6], [-1.2, -0.6]]))
+    rows = drive(path, room, 40.0)
+    check_limits(rows)
+    assert (rows[:, 0] < 1.0 - KEEP_OUT).all()
+    for y in (0.6, -0.6):
+        assert np.hypot(*(rows[:, :2] - (-1.2, y)).T).min() < 0.3
+
+
+def test_a_goal_is_led_to_before_what_contradicts_the_map():
+    room = Room()
+    room.seen[:] = True
+    path = planned(circle(0.3).__next__, revisit_distance=0.0)
+    path.go_to((1.4, 0.8))
+    path.look_at(np.array([[-1.4, -0.8]]))
+    rows = drive(path, room, 40.0)
+    goal, thing = (np.hypot(*(rows[:, :2] - each).T) for each in ((1.4, 0.8), (-1.4, -0.8)))
+    assert goal.min() < 0.15
+    assert thing.min() < 0.3
+    assert np.argmin(goal) < np.argmin(thing)
 
 
 def test_it_leads_to_a_goal_and_waits_for_a_way_to_one_without():

@@ -153,12 +153,26 @@ def test_a_robot_that_is_not_sure_of_its_place_finds_nothing():
     assert patrol.drive(world(KNOWN), 2.0 * ROUND, bias=(0.08, -0.08, 0.15)) != ()
 
 
-def test_what_is_no_event_yet_is_forgotten():
+def test_what_is_no_event_yet_is_suspected_and_forgotten():
     added = world(WALLS + BOX + 'circles: [{center: [-0.95, 0.75], radius: 0.1}]\n')
     patrol = Patrol(min_confidence=0.9999, min_views=100)
+    assert patrol.detector.suspected.shape == (0, 2)
     assert patrol.drive(added, ROUND) == ()
+    assert np.hypot(*(patrol.detector.suspected - (-0.95, 0.75)).T).min() < 0.15
     patrol.detector.forget()
     assert patrol.detector.changes == ()
+    assert patrol.detector.suspected.shape == (0, 2)
+
+
+def test_an_event_is_suspected_no_more():
+    added = world(KNOWN.replace(PILLAR, PILLAR[:-2] + ', {center: [-0.95, 0.75], radius: 0.1}]\n'))
+    patrol = Patrol()
+    early = patrol.drive(added, 0.25 * ROUND)
+    while not early:
+        before = patrol.detector.suspected
+        early = patrol.drive(added, PERIOD)
+    assert np.hypot(*(before - (early[0].x, early[0].y)).T).min() < 0.1
+    assert patrol.detector.suspected.shape == (0, 2)
 
 
 def test_equal_readings_give_equal_events():

@@ -136,10 +136,20 @@ def test_a_thing_that_the_map_lacks_is_published(harness):
     node = harness.add(LocalizerNode, world='room', **{**START, 'initial_pose__y': -1.0})
     changes = harness.subscribe(DiagnosticArray, 'map_changes', LATCHED)
     markers = harness.subscribe(MarkerArray, 'map_changes/markers', LATCHED)
+    suspected = harness.subscribe(PoseArray, 'map_changes/suspected', LATCHED)
     robot = Robot(harness)
-    for _ in range(14):
+    steps = 0
+    while not len(node._localizer.changes.suspected):
+        steps += 1
         robot.step(node, wall=1.75, period=0.3, side=0.41)
-    harness.spin_until(lambda: changes and markers)
+    harness.spin_until(lambda: suspected)
+    (place,) = suspected[0].poses
+    assert suspected[0].header.frame_id == 'map'
+    assert place.position.x == pytest.approx(1.75, abs=0.15)
+    assert place.position.y == pytest.approx(-1.0, abs=0.08)
+    for _ in range(steps, 14):
+        robot.step(node, wall=1.75, period=0.3, side=0.41)
+    harness.spin_until(lambda: changes and markers and not suspected[-1].poses)
     (status,) = changes[-1].status
     values = {each.key: each.value for each in status.values}
     assert changes[-1].header.frame_id == 'map'

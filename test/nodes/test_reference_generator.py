@@ -19,7 +19,8 @@ import sys
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped, TransformStamped, Twist
+from geometry_msgs.msg import Pose as Place
+from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 import numpy as np
 import pytest
@@ -378,20 +379,25 @@ def test_a_planned_path_waits_for_a_map_and_leads_to_a_goal(harness):
 
     harness.spin_until(drives)
     goals = harness.connected_publisher(PoseStamped, 'goal_pose')
-    goal = PoseStamped()
+    goal, thing = PoseStamped(), Place()
     goal.pose.position.x, goal.pose.position.y = 1.0, -1.45  # outside of the arena
+    suspected = harness.connected_publisher(PoseArray, 'map_changes/suspected', LATCHED)
+    thing.position.x, thing.position.y = 1.0, -0.3
     for frame in ('elsewhere', 'odom'):
         goal.header.frame_id = frame
         goals.publish(goal)
+        suspected.publish(PoseArray(header=goal.header, poses=[thing]))
+        harness.spin_until(lambda: diagnostic(reference, 'rejected_inputs') > count + 1)
 
     def leads_there():
         where()
         maps.publish(free)
         points = reference._source.planned.plan.points
-        near = np.hypot(*(points - [1.0, -1.45]).T).min() < 0.15
-        return near and diagnostic(reference, 'rejected_inputs') > count
+        return np.hypot(*(points - [1.0, -1.45]).T).min() < 0.15
 
     harness.spin_until(leads_there)
+    assert reference._source.planned.plan._contradiction == (1.0, -0.3)
+    assert diagnostic(reference, 'rejected_inputs') == count + 2
 
 
 @pytest.mark.parametrize('source', ['portrait', 'twist'])

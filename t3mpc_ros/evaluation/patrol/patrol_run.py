@@ -400,6 +400,8 @@ class PathDriver:
             return self._timing.advance_along(self._points)
         keep_out = self._controller.keep_out
         if keep_out is not None and self._k % MAP_PERIOD == 0:
+            if self.localizer is not None:
+                self._plan.look_at(self.localizer.changes.suspected)
             self._plan.set_map(keep_out.map.occupancy())
         reference = self._plan.advance(self._clock.rate)
         self._clock.add_reference(stamp_ns, reference[0])
