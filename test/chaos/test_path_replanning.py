@@ -229,7 +229,7 @@ def test_old_places_are_visited_again():
 
 
 @pytest.mark.parametrize('thing', [(1.2, 0.8), (-1.4, -0.9), (1.1, 0.2)])
-def test_what_contradicts_the_map_is_looked_at_soon_and_once_a_minute(thing):
+def test_what_contradicts_the_map_is_looked_at_once_a_minute(thing):
     """A pillar that the map has is at the last place: it is passed where it can be seen."""
 
     def visits(look, seconds):
@@ -255,7 +255,7 @@ def test_what_contradicts_the_map_is_looked_at_soon_and_once_a_minute(thing):
     assert near[: len(without)].sum() > without.sum() + 2.0 / PERIOD
 
 
-def test_a_contradiction_that_cannot_be_seen_does_not_hold_it_up():
+def test_what_cannot_be_looked_at_does_not_hold_it_up():
     """Behind a wall, beyond the arena, and several at once."""
     room = Room()
     room.seen[:] = True

@@ -145,7 +145,7 @@ def test_the_filter_knows_what_the_odometry_does_not():
 
 @pytest.mark.long
 @pytest.mark.parametrize(('room', 'seed'), [('room', 2205), ('office', 1215)])
-def test_a_thing_of_the_map_that_is_gone_does_not_make_it_lose_its_place(room, seed):
+def test_a_thing_that_is_gone_does_not_make_a_patrol_lost(room, seed):
     """Where nothing else was in sight, the pose moved until the missing thing fitted: 1.6 m."""
     sys.path.insert(0, str(BENCH))
     try:

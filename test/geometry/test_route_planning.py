@@ -160,7 +160,7 @@ def test_a_robot_too_near_to_an_obstacle_finds_a_way_from_it():
 
 
 @pytest.mark.parametrize('seed', few_of([1, 2, 3]))
-def test_what_is_reached_has_a_route_whatever_the_floor_costs(seed):
+def test_what_is_reached_has_a_route_whatever_floor_costs(seed):
     """Around the begin, cheap places beyond dear ones were hollows out of which no way led."""
     generator = np.random.default_rng(seed)
     planner = planner_of(box(floor(2.0, 2.0), 0.3, 0.2, 0.1, 0.3))
