@@ -30,8 +30,8 @@ sys.path[:0] = [str(ROOT)]
 
 from t3mpc_ros.cli.main import main as t3mpc  # noqa: E402
 
-SEEDS = '2001-2006'
-"""Seeds that are in no other table, of the comparisons on all robots."""
+SEEDS = {'torque': '2001-2006', 'servo': '2001-2006', 'twin': '7001-7006'}
+"""Seeds of the comparison on each robot, which are in no other table."""
 
 
 def parts(folder: Path, *, quick: bool) -> dict[Path, list[str]]:
@@ -39,9 +39,9 @@ def parts(folder: Path, *, quick: bool) -> dict[Path, list[str]]:
     few = ['--seeds', '2001-2001', '--duration', '6', '--cases', 'nominal'] if quick else []
     paper = ['--quick', '--seeds', '101-101', '--estimation-seeds', '1-1'] if quick else []
     found = {folder / 'paper' / 'runs.csv': ['paper', '--output', str(folder / 'paper'), *paper]}
-    for robot in ('torque', 'servo', 'twin'):
+    for robot, seeds in SEEDS.items():
         file = folder / f'{robot}.csv'
-        command = ['compare', '--robot', robot, '--seeds', SEEDS, '--csv', str(file)]
+        command = ['compare', '--robot', robot, '--seeds', seeds, '--csv', str(file)]
         found[file] = [*command, *few]
     return found
 
