@@ -125,12 +125,12 @@ def run(options: argparse.Namespace) -> int:
 
 def _tune_tracking(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.experiment import print_report
-    from t3mpc_ros.evaluation.patrol import tracker_page
+    from t3mpc_ros.evaluation.patrol import path_tracking_page
     from t3mpc_ros.evaluation.patrol.path_tracking import tune_trackers
 
     with executor_of(options) as executor:
         found = tune_trackers(executor, print_report)
-    print_result(options, lambda: tracker_page.tuning_markdown(found), lambda: found)
+    print_result(options, lambda: path_tracking_page.tuning_markdown(found), lambda: found)
     return 0
 
 
@@ -168,7 +168,7 @@ _Study = tuple[Any, Any, Callable[..., Any]]
 
 
 def _tracking(options: argparse.Namespace) -> _Study:
-    from t3mpc_ros.evaluation.patrol import tracker_page
+    from t3mpc_ros.evaluation.patrol import path_tracking_page
     from t3mpc_ros.evaluation.patrol.path_tracking import (
         TRACKED_PATHS,
         TrackingPlan,
@@ -178,7 +178,7 @@ def _tracking(options: argparse.Namespace) -> _Study:
 
     names = tuple(TRACKED_PATHS)
     paths = find_names('path', options.paths, names) or names
-    return tracker_page, TrackingPlan(paths=paths, seeds=options.seeds), compare_trackers
+    return path_tracking_page, TrackingPlan(paths=paths, seeds=options.seeds), compare_trackers
 
 
 def _patrols(options: argparse.Namespace) -> _Study:

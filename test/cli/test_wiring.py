@@ -155,7 +155,7 @@ COMPARE = {
 }
 PATROL = {
     f'evaluation.patrol.{name}_page.{function}': result
-    for name in ('patrol', 'tracker')
+    for name in ('patrol', 'path_tracking')
     for function, result in (('markdown', ''), ('record', {}), ('page', ''))
 } | {
     'evaluation.plotting.write_pictures': {},
@@ -168,7 +168,7 @@ PATROL = {
     'evaluation.patrol.path_tracking.tune_trackers': {},
     'evaluation.patrol.safety_study.compare_safety': SimpleNamespace(rows=[]),
     'evaluation.patrol.safety_study.safety_table': SimpleNamespace(markdown=str),
-    'evaluation.patrol.tracker_page.tuning_markdown': '',
+    'evaluation.patrol.path_tracking_page.tuning_markdown': '',
     'evaluation.patrol.localization_study.compare_localizations': SimpleNamespace(rows=[]),
     'evaluation.patrol.localization_study.markdown': '',
 }

@@ -41,7 +41,7 @@ from t3mpc_ros.evaluation.paper import paper_figures
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.paper_tables import Results
 from t3mpc_ros.evaluation.paper.study import STAGES, WITHOUT
-from t3mpc_ros.evaluation.patrol import patrol_figures, tracker_page
+from t3mpc_ros.evaluation.patrol import path_tracking_page, patrol_figures
 from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, visits
 from t3mpc_ros.evaluation.patrol.path_tracking import OURS as TRACKER
 from t3mpc_ros.evaluation.patrol.path_tracking import TRACKED_PATHS, TrackingPlan, TrackingStudy
@@ -659,7 +659,7 @@ def test_tracked_paths_have_the_drives_of_their_methods():
          for (path, method), track in tracks.items()]
     )  # fmt: skip
     study = TrackingStudy(TrackingPlan(paths, (1,), methods), table)
-    first, second, *empty = tracker_page.draw_tracks(study).axes
+    first, second, *empty = path_tracking_page.draw_tracks(study).axes
     for axis, path in zip((first, second), paths, strict=True):
         shown = lines(axis)
         assert shown.keys() == colours.keys()

@@ -24,7 +24,7 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.patrol import tracker_page
+from t3mpc_ros.evaluation.patrol import path_tracking_page
 from t3mpc_ros.evaluation.patrol.path_trackers import (
     FeedbackLinearisation,
     LinearisationParameters,
@@ -203,7 +203,9 @@ def test_the_verdict_is_that_of_paired_seeds(baseline, verdict):
         for seed, error in enumerate(errors)
     ]  # fmt: skip
     plan = TrackingPlan(('square',), (0, 1, 2), tuple(times))
-    text = tracker_page.path_table(TrackingStudy(plan, ResultTable(rows)), 'square').markdown()
+    text = path_tracking_page.path_table(
+        TrackingStudy(plan, ResultTable(rows)), 'square'
+    ).markdown()
     (row,) = (line for line in text.splitlines() if line.startswith('| pure pursuit'))
     assert row.endswith(f'| {verdict} |')
     assert 'arrived in 0 of 3' in row
