@@ -44,6 +44,8 @@ def nodes(launched):
     # A planned path does not leave the robot behind: it need not be slower than the way back.
     fast = {'motion.linear.x.max_velocity': 0.33, 'motion.wheel.max_velocity': 10.0}
     source = {'source': 'portrait', 'seed': 0, 'plan.enabled': True, **fast}
+    if localized:
+        source['frame_id'] = 'map'  # as odom then is: goals and what is suspected are of the map
     made = [
         launched.node('controller', known, defaults=path, remappings=place),
         launched.node('reference_generator', seed, defaults=source, remappings=place),

@@ -86,8 +86,9 @@ PLACES, APART = 5, 0.25
 """Old places that are visited one after the other, and their least distance, m."""
 FRESH_COST = 3.0
 """Cost of floor that was just visited, by the length of a way to old places over it."""
-LOOK_AGAIN = 60.0
-"""Time for which the path does not lead by the same contradiction of the map again, s."""
+LOOK_AGAIN, MOST_LOOKS = 60.0, 20
+"""Time for which the path does not lead by the same contradiction of the map again, s, and how
+many places are looked at in turn."""
 VIEW_DISTANCE, VIEW_DEPTH = 0.8, 0.15
 """Largest distance from which a contradiction is looked at, and by how much farther than from the
 nearest place, m."""
@@ -210,7 +211,7 @@ class PathPlan:
         if self._contradiction in [each[:2] for each in self._looks]:
             return  # one after the other
         self._contradiction = self._last_view = None
-        for x, y in places.tolist():
+        for x, y in places[:MOST_LOOKS].tolist():
             if all(math.hypot(x - each[0], y - each[1]) > APART for each in self._looks):
                 self._looks.append((x, y, time))
                 self._contradiction = x, y

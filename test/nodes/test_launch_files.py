@@ -121,6 +121,14 @@ def test_the_controller_knows_whether_the_gyro_is_calibrated(file):
         assert stated == (calibrated if robots else None)
 
 
+@pytest.mark.parametrize(('localizer', 'frame'), [('true', 'map'), ('false', 'odom')])
+def test_the_path_of_a_patrol_is_in_the_frame_of_its_odometry(localizer, frame):
+    """With a localizer odom is in frame map: goals in that frame were refused."""
+    nodes = launched('patrol.launch.py', localizer=localizer)
+    default = parameter_class('reference_generator')().frame_id
+    assert only(nodes, 'reference_generator').values.get('frame_id', default) == frame
+
+
 def test_a_patrol_of_another_robot_assumes_no_calibration():
     controller = only(launched('patrol.launch.py', robot='false'), 'controller')
     assert 'body.gyro_scale_tolerance' not in controller.all_values
