@@ -33,7 +33,10 @@ ROOT = Path(__file__).resolve().parents[2]
 
 CONDITIONAL = {
     'publishes': ('/clock', '/tf', '/keep_out/map'),
-    'subscribes': ('/range/*', '/path', '/target_twist', '/keep_out/map', '/goal_pose'),
+    'subscribes': (
+        *('/range/*', '/path', '/target_twist', '/keep_out/map', '/goal_pose'),
+        '/map_changes/suspected',
+    ),
     'services': ('/controller/save_map',),
 }
 """Topics that a node has only with some parameters or libraries."""
