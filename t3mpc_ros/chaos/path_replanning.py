@@ -398,7 +398,7 @@ class PathPlan:
     ) -> list[tuple[float, float]]:
         """Return two places from which a thing (m) is seen, the nearer one first; or none."""
         places = self._places_from(begin)
-        away = np.hypot(*(places - thing).T)
+        away = np.maximum(np.hypot(*(places - thing).T), 1e-9)
         places, away = places[away < VIEW_DISTANCE], away[away < VIEW_DISTANCE]
         share = np.linspace(0.0, 1.0, 16)[:, None] * np.clip(1.0 - VIEW_END / away, 0.0, 1.0)
         sight = places + share[:, :, None] * (thing - places)
