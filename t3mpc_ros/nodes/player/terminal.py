@@ -126,6 +126,7 @@ class ProgressLine:
 
     def __init__(self, stream: TextIO, begin_ns: int, end_ns: int) -> None:
         self._stream = stream
+        self._is_terminal = stream.isatty()
         self._begin_ns = begin_ns
         self._length = (end_ns - begin_ns) / NANOSECONDS
         self._shown = ''
@@ -133,7 +134,7 @@ class ProgressLine:
     def show(self, status: PlaybackStatus) -> None:
         """Write the status in place of the former one."""
         text = self._text(status)
-        if text != self._shown and self._stream.isatty():
+        if text != self._shown and self._is_terminal:
             self._stream.write(f'\r{text}\x1b[K')
             self._stream.flush()
             self._shown = text
