@@ -152,9 +152,9 @@ class Place:
         return sum(self.cells.values())
 
     @property
-    def centre(self) -> Array:
-        """Mean of the centres of its cells, m, shape (2,)."""
-        found: Array = CELL * (np.array(list(self.cells)).mean(axis=0) + 0.5)
+    def centres(self) -> Array:
+        """Of its cells, m, shape (n, 2)."""
+        found: Array = CELL * (np.array(list(self.cells)) + 0.5)
         return found
 
 
@@ -188,7 +188,7 @@ class ChangeDetector:
     def suspected(self) -> Array:
         """Where a reading contradicts the map, and there is no event yet, m, shape (n, 2)."""
         places = (each for each in self._places if each.event is None)
-        centres = [each.centre for each in places if each.evidence >= LARGEST]
+        centres = [each.centres.mean(axis=0) for each in places if each.evidence >= LARGEST]
         return np.array(centres).reshape(-1, 2)
 
     def forget(self) -> None:
@@ -345,7 +345,7 @@ class ChangeDetector:
             place.views += 1
             place.seen_from = pose
         confidence = 1.0 / (1.0 + math.exp(self.parameters.prior - place.evidence))
-        centres = CELL * (np.array(list(place.cells)) + 0.5)
+        centres = place.centres
         x, y = centres.mean(axis=0).tolist()
         if place.event is None:
             if (

@@ -208,7 +208,7 @@ def test_what_is_placed_ahead_of_it_is_not_touched():
 
 def circle(radius):
     """Yield the points of a circle through the start, which is driven for ever."""
-    angle = radius
+    angle = 0.3
     while True:
         angles = angle + np.arange(100) * 0.01 / radius
         yield radius * np.column_stack([np.sin(angles), 1.0 - np.cos(angles)])
@@ -235,7 +235,7 @@ def test_what_contradicts_the_map_is_looked_at_once_a_minute(thing):
     def visits(look, seconds):
         room = Room()
         room.seen[:] = True
-        room.occupied |= room.near(0.5, 0.4, 0.1)
+        room.occupied |= room.near(1.1, 0.2, 0.1)
         path = planned(circle(0.3).__next__, revisit_distance=0.0)
         rows = [drive(path, room, 5.0)]
         if look:
