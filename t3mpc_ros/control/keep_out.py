@@ -382,7 +382,8 @@ def add_ray(
             if column < 0 or row < 0 or column >= count or row >= count:
                 continue
             state = grid.cells[row, column]
-            grid.seen[row, column] = now
+            if state != OCCUPIED:
+                grid.seen[row, column] = now
             if state == UNKNOWN:
                 grid.cells[row, column] = FREE
             elif (
@@ -395,6 +396,7 @@ def add_ray(
                 grid.cleared[row, column] += 1
                 if grid.cleared[row, column] >= CLEARINGS:
                     grid.cells[row, column] = FREE
+                    grid.seen[row, column] = now
                     grid.cleared[row, column] = 0
     if hit < 0.0:
         return

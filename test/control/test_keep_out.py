@@ -380,6 +380,19 @@ def test_what_was_there_or_is_far_has_not_come(kind):
     assert floor.is_free(0.5 if kind != 'far' else 0.7, 0.2)
 
 
+def test_a_ray_over_an_old_edge_does_not_make_it_new():
+    """Rays that graze a box hid the floor beside it: robots on their path stopped to look."""
+    floor = Floor()
+    grid = floor.map.grid
+    row, column = (math.floor((each - grid.low) / grid.size) for each in (0.05, 0.55))
+    edge = slice(row - 1, row + 2), column
+    grid.cells[edge], grid.seen[edge] = OCCUPIED, 0.0
+    floor.hit(math.inf)
+    assert (grid.cells[edge] == OCCUPIED).all()
+    floor.hit(0.4, 0.1)
+    assert floor.is_free(0.5, 0.2)
+
+
 def test_a_robot_that_begins_knows_of_nothing_that_came():
     floor = Floor()
     floor.map.now = 1.0
