@@ -382,7 +382,7 @@ def add_ray(
             if column < 0 or row < 0 or column >= count or row >= count:
                 continue
             state = grid.cells[row, column]
-            if state != OCCUPIED:
+            if state != OCCUPIED or across == 0:  # beside its axis a ray may graze an edge
                 grid.seen[row, column] = now
             if state == UNKNOWN:
                 grid.cells[row, column] = FREE
