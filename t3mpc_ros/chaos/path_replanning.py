@@ -86,9 +86,9 @@ PLACES, APART = 5, 0.25
 """Old places that are visited one after the other, and their least distance, m."""
 FRESH_COST = 3.0
 """Cost of floor that was just visited, by the length of a way to old places over it."""
-LOOK_AGAIN, MOST_LOOKS = 60.0, 20
-"""Time for which the path does not lead by the same contradiction of the map again, s, and how
-many places are looked at in turn."""
+LOOK_AGAIN, MOST_LOOKS, CONTRADICTED = 60.0, 20, 100.0
+"""Time for which the path does not lead by the same contradiction of the map again, s, how many
+places are looked at in turn, and how long they count: who named them may have fallen silent, s."""
 VIEW_DISTANCE, VIEW_DEPTH = 0.8, 0.15
 """Largest distance from which a contradiction is looked at, and by how much farther than from the
 nearest place, m."""
@@ -595,6 +595,8 @@ class PlannedPath:
         """Whether the path leads to the charging place, or rests there."""
         self._contradictions: Array = _NOWHERE
         """Where the map is contradicted, m, shape (n, 2)."""
+        self._contradicted = 0.0
+        """When they were given, s."""
         self._battery_time = math.inf
         """Since when the voltage has called for a change, s."""
 
@@ -663,6 +665,8 @@ class PlannedPath:
         self._planner.update(self._with_unseeable(grid))
         self._go_on()
         self._leave_unsafe()
+        if self._time - self._contradicted > CONTRADICTED:
+            self._contradictions = _NOWHERE
         self.plan.lead_by(self._contradictions, self._fed, self._time)
         self.plan.extend(self._fed, self._time)
         goes_on = self._feed()
@@ -724,8 +728,11 @@ class PlannedPath:
         self._fed = int(np.argmin(away)) + 1
 
     def look_at(self, places: Array) -> None:
-        """Lead soon by places (m), shape (n, 2), where the map is contradicted: once a minute."""
-        self._contradictions = places
+        """Lead soon by places (m), shape (n, 2), where the map is contradicted: once a minute.
+
+        It does so for :data:`CONTRADICTED` s, unless others are given, or the same again.
+        """
+        self._contradictions, self._contradicted = places, self._time
 
     def go_to(self, goal: tuple[float, float]) -> None:
         """Lead to a place (m) now, and then on along the path."""

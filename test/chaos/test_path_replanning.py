@@ -255,6 +255,21 @@ def test_what_contradicts_the_map_is_looked_at_once_a_minute(thing):
     assert near[: len(without)].sum() > without.sum() + 2.0 / PERIOD
 
 
+@pytest.mark.parametrize('silent', [True, False])
+def test_what_is_named_no_more_is_looked_at_no_more(silent):
+    """Of a localizer that has fallen silent: it was looked at once a minute, for ever."""
+    room = Room()
+    room.seen[:] = True
+    path, thing = planned(circle(0.3).__next__, revisit_distance=0.0), (-1.4, -0.9)
+    path.look_at(np.array([thing]))
+    drive(path, room, 90.0)
+    if not silent:
+        path.look_at(np.array([thing]))
+    drive(path, room, 20.0)
+    near = np.hypot(*(drive(path, room, 70.0)[:, :2] - thing).T) < 0.5
+    assert near.any() == (not silent)
+
+
 def test_what_cannot_be_looked_at_does_not_hold_it_up():
     """Behind a wall, beyond the arena, where a view is, and several at once."""
     room = Room()
