@@ -396,7 +396,6 @@ def add_ray(
                 grid.cleared[row, column] += 1
                 if grid.cleared[row, column] >= CLEARINGS:
                     grid.cells[row, column] = FREE
-                    grid.seen[row, column] = now
                     grid.cleared[row, column] = 0
     if hit < 0.0:
         return
