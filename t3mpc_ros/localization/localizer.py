@@ -48,7 +48,7 @@ from t3mpc_ros.localization.range_model import (
     Beams,
     RangeModel,
     RangeModelParameters,
-    explained_readings,
+    explain_readings,
     joined,
 )
 from t3mpc_ros.parameters.table import Parameters, group, parameter
@@ -91,6 +91,9 @@ LARGEST_DRIFT, LARGEST_CHANGE = 0.02, 0.03
 gyro stays below; a slip turns the odometry faster."""
 AGREEMENT_DECAY = 0.05
 """Decay of the share of readings that fit, per telling reading."""
+ONE_THING, MOST_WITNESSES = 0.3, 6.0
+"""Distance (m) within which readings contradict the map at one place, and number of the last 20 or
+so that count of it: a robot that is not where it takes itself to be contradicts it at several."""
 DOUBTFUL_AGREEMENT, OTHERS_AGREEMENT = 0.3, 0.8
 """Share of the readings of a sensor that fit below which they are not used, and share of the
 median sensor from which on it is the sensor, not the place, that is wrong."""
@@ -201,6 +204,10 @@ class Localizer:
         """That share for each range sensor."""
         self._searching = not parameters.set_initial_pose
         """Whether random particles are added until the readings fit for some time."""
+        self._anywhere = self._searching
+        """Whether the robot may be anywhere: one place that contradicts the map is enough."""
+        self._witnesses = np.empty((0, 3))
+        """Places that contradict the map, x, y (m), and the number of readings that do."""
         self._frames: deque[tuple[int, Pose]] = deque()
         """Stamps and origins of the odometry of the last :data:`STEADY_TIME`."""
         self.share = 0.0
@@ -233,9 +240,10 @@ class Localizer:
         self._restart(searching=True)
 
     def _restart(self, *, searching: bool) -> None:
-        self._searching, self.share = searching, 0.0
+        self._searching, self._anywhere, self.share = searching, searching, 0.0
         self.agreement = self.parameters.lost_agreement if searching else 1.0
         self._fits[:] = 1.0
+        self._witnesses = self._witnesses[:0]
         self._pending.clear()
         self._updated = None  # the next odometry is an update without a motion
 
@@ -323,7 +331,7 @@ class Localizer:
         self._compare(known)
         for sensor, each in of_the_map.items():
             if sensor != SCAN:
-                self._fits[sensor] = self._followed(self._fits[sensor], each)
+                self._fits[sensor] = followed(self._fits[sensor], self._explain(each)[:, 0])
         if self.parameters.changes.enabled:
             self._detect(joined([each for name, each in taken.items() if name not in doubtful]))
         return found
@@ -402,21 +410,41 @@ class Localizer:
 
     def _compare(self, beams: Beams) -> None:
         """Update the share of readings that fit to the map at the estimate."""
-        self.agreement = self._followed(self.agreement, beams)
+        fits = [each[0] for each in self._explain(beams).tolist() if self._counts(*each)]
+        self.agreement = followed(self.agreement, np.array(fits))
         if self.agreement < self.parameters.lost_agreement:
-            self._searching = True
+            self._searching = self._anywhere = True
         elif self.agreement >= FOUND_AGREEMENT and self.share >= KNOWN_SHARE:
-            self._searching = False
+            self._searching = self._anywhere = False
 
-    def _followed(self, share: float, beams: Beams) -> float:
-        """Return a share of fitting readings after those of beams at the estimate."""
+    def _counts(self, fits: float, x: float, y: float) -> bool:
+        """Return whether a reading says something about the pose, not only about one place."""
+        self._witnesses[:, 2] *= 1.0 - AGREEMENT_DECAY
+        if fits > 0.0 or self._anywhere:
+            return True
+        away = np.hypot(self._witnesses[:, 0] - x, self._witnesses[:, 1] - y)
+        if not away.size or away.min() > ONE_THING:
+            known = self._witnesses[self._witnesses[:, 2] > 0.1]
+            self._witnesses = np.concatenate([known, [[x, y, 1.0]]])
+            return True
+        near = int(away.argmin())
+        counts = bool(self._witnesses[near, 2] < MOST_WITNESSES - 1.0)
+        self._witnesses[near, 2] += 1.0 if counts else 0.0
+        return counts
+
+    def _explain(self, beams: Beams) -> Array:
+        """Return which beams fit to the map at the estimate, and where, of those that tell."""
         assert self.result is not None
-        pose = np.array(self.result.pose)
-        telling, fitting = explained_readings(pose, self._field, beams, self._model)
-        if not telling:
-            return share
-        decay = 1.0 - (1.0 - AGREEMENT_DECAY) ** telling
-        return share + decay * (fitting / telling - share)
+        found = np.empty((beams.reading.size, 3))
+        explain_readings(np.array(self.result.pose), self._field, beams, self._model, found)
+        telling: Array = found[found[:, 0] != 0.0]
+        return telling
+
+
+def followed(share: float, fits: Array) -> float:
+    """Return a share of fitting readings after further ones: 1 of one that fits, else -1."""
+    decay = 1.0 - (1.0 - AGREEMENT_DECAY) ** fits.size
+    return share + decay * (float(np.mean(fits > 0.0)) - share) if fits.size else share
 
 
 class PoseCorrection:

@@ -208,35 +208,33 @@ def best_logarithm(beams: Beams, model: RangeModel) -> float:
 
 
 @kernel
-def explained_readings(
-    pose: Array, field: DistanceField, beams: Beams, model: RangeModel
-) -> tuple[int, int]:
-    """Return how many readings at a pose say something, and how many of those fit to the map.
+def explain_readings(
+    pose: Array, field: DistanceField, beams: Beams, model: RangeModel, found: Array
+) -> None:
+    """Write of each reading at a pose whether it fits to the map, and where.
 
     A reading without a hit says nothing where the map has nothing within the range.
 
     pose : x, y (m), yaw (rad), shape (3,)
+    found : shape (n, 3), overwritten: 1 if it fits, -1 if it contradicts the map, 0 if it says
+        nothing; x, y of the nearer of what the map has and what was read, m
     """
-    telling = fitting = 0
     cosine, sine = math.cos(pose[2]), math.sin(pose[2])
     for i in range(beams.reading.size):
         ahead, left = beams.origin[i, 0], beams.origin[i, 1]
         least, most = beams.limits[i, 0], beams.limits[i, 1]
-        expected = trace_ray(
-            field,
-            pose[0] + cosine * ahead - sine * left,
-            pose[1] + sine * ahead + cosine * left,
-            pose[2] + beams.origin[i, 2],
-            BEYOND * most,
-        )
+        x, y = pose[0] + cosine * ahead - sine * left, pose[1] + sine * ahead + cosine * left
+        direction = pose[2] + beams.origin[i, 2]
+        expected = trace_ray(field, x, y, direction, BEYOND * most)
         reading = beams.reading[i]
-        if reading >= most and expected >= most:
-            continue
-        telling += 1
-        hit = model.z_hit * hit_likelihood(reading, expected, least, most, model)
-        if hit > other_likelihood(reading, expected, least, most, model):
-            fitting += 1
-    return telling, fitting
+        away = max(min(expected, reading, most), least)
+        found[i, 1] = x + away * math.cos(direction)
+        found[i, 2] = y + away * math.sin(direction)
+        found[i, 0] = 0.0
+        if reading < most or expected < most:
+            hit = model.z_hit * hit_likelihood(reading, expected, least, most, model)
+            other = other_likelihood(reading, expected, least, most, model)
+            found[i, 0] = 1.0 if hit > other else -1.0
 
 
 def joined(parts: Sequence[Beams]) -> Beams:

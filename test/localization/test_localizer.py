@@ -344,6 +344,32 @@ def test_a_thing_that_is_gone_does_not_make_it_doubt_its_place(missing):
 
 
 @pytest.mark.compiled
+@pytest.mark.parametrize('gone, lost', [(1, False), (3, True)])
+def test_one_place_that_contradicts_the_map_loses_nobody(gone, lost):
+    """Beams meet nothing but pillars that are gone, while the robot turns about itself.
+
+    All readings that said something were of them, so it counted as lost after a turn.
+    """
+    angles = math.tau * np.arange(gone) / 3.0
+    pillars = [
+        f'{{center: [{0.5 * math.cos(a)}, {0.5 * math.sin(a)}], radius: 0.12}}' for a in angles
+    ]
+    text = 'walls: [{points: [[-3, -3], [3, -3], [3, 3], [-3, 3]], closed: true}]\n'
+    known = map_of_world(parse_world(f'{text}circles: [{", ".join(pillars)}]', 'pillars'))
+    parameters = LocalizerParameters.from_dict({'set_initial_pose': True})
+    localizer = Localizer(parameters, known, MOUNTS, (LEAST, MOST))
+    for k in range(1, 400):
+        for sensor in range(len(MOUNTS)):
+            localizer.add_range(sensor, math.inf)
+        localizer.add_odometry(round(k * PERIOD * 1e9), Pose(0.0, 0.0, wrap_angle(0.025 * k)))
+        if localizer.state is Localization.LOST:
+            break
+    assert (localizer.state is Localization.LOST) is lost
+    if not lost:
+        assert math.hypot(localizer.result.pose.x, localizer.result.pose.y) < 0.3
+
+
+@pytest.mark.compiled
 @pytest.mark.parametrize(
     ('sensor', 'wrong', 'seconds'), [(6, math.inf, 20.0), (3, 0.3, 20.0), (5, -math.inf, 60.0)]
 )
