@@ -222,14 +222,27 @@ class ChangeDetector:
                 changed |= self._seen(place, stamp_ns, pose)
         return changed
 
-    def explained(self, pose: Pose, covariance: Array, beams: Beams) -> NDArray[np.bool_]:
+    def withdraw(self, since_ns: int) -> None:
+        """End the events that were found since a stamp: the robot was not where it took itself."""
+        for place in list(self._places):
+            if place.event is not None and self._changes[place.event].found_ns >= since_ns:
+                self._remove(place)
+                self._changes[place.event] = self._changes[place.event]._replace(present=False)
+
+    def explained(
+        self, pose: Pose, covariance: Array, beams: Beams, before_ns: float = math.inf
+    ) -> NDArray[np.bool_]:
         """Return which beams contradict the map where it has changed: they do not tell the pose.
 
-        That is where an event is, and at the one place besides where a change is most likely, if
-        it is more likely than not: a robot that is not where it takes itself to be contradicts
-        the map at many places.
+        That is where an event is that was found before a stamp, and at the one place besides where
+        a change is most likely, if it is more likely than not: a robot that is not where it takes
+        itself to be contradicts the map at many places.
         """
-        likely = {each for each in self._places if each.event is not None}
+        likely = {
+            each
+            for each in self._places
+            if each.event is not None and self._changes[each.event].found_ns < before_ns
+        }
         others = (each for each in self._places if each.event is None)
         best = max(others, key=lambda place: place.evidence, default=None)
         if best is not None and best.evidence > self.parameters.prior:

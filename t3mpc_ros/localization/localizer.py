@@ -91,6 +91,8 @@ LARGEST_DRIFT, LARGEST_CHANGE = 0.02, 0.03
 gyro stays below; a slip turns the odometry faster."""
 AGREEMENT_DECAY = 0.05
 """Decay of the share of readings that fit, per telling reading."""
+DOUBT_TIME = 60.0
+"""Time after which a place that a search has found is not in doubt any more, s."""
 ONE_THING, MOST_WITNESSES = 0.3, 6.0
 """Distance (m) within which readings contradict the map at one place, and number of the last 20 or
 so that count of it: a robot that is not where it takes itself to be contradicts it at several."""
@@ -204,8 +206,10 @@ class Localizer:
         """That share for each range sensor."""
         self._searching = not parameters.set_initial_pose
         """Whether random particles are added until the readings fit for some time."""
-        self._anywhere = self._searching
-        """Whether the robot may be anywhere: one place that contradicts the map is enough."""
+        self._found_ns = math.inf if self._searching else -math.inf
+        """When the place was found by a search; inf: not yet, -inf: it was known at the start."""
+        self._sure_ns = 0
+        """When the readings last fitted at a place that was not in doubt."""
         self._witnesses = np.empty((0, 3))
         """Places that contradict the map, x, y (m), and the number of readings that do."""
         self._frames: deque[tuple[int, Pose]] = deque()
@@ -240,7 +244,8 @@ class Localizer:
         self._restart(searching=True)
 
     def _restart(self, *, searching: bool) -> None:
-        self._searching, self._anywhere, self.share = searching, searching, 0.0
+        self._searching, self.share = searching, 0.0
+        self._found_ns = math.inf if searching else -math.inf
         self.agreement = self.parameters.lost_agreement if searching else 1.0
         self._fits[:] = 1.0
         self._witnesses = self._witnesses[:0]
@@ -359,7 +364,8 @@ class Localizer:
         if self.result is None or not self.parameters.changes.enabled:
             return beams
         expected = pose_in(self.result.odometry_frame, odometry)
-        known = ~self.changes.explained(expected, self.result.covariance, beams)
+        before_ns = self._found_ns if self._in_doubt else math.inf
+        known = ~self.changes.explained(expected, self.result.covariance, beams, before_ns)
         return Beams(*(part[known] for part in beams))
 
     def _detect(self, beams: Beams) -> None:
@@ -413,14 +419,26 @@ class Localizer:
         fits = [each[0] for each in self._explain(beams).tolist() if self._counts(*each)]
         self.agreement = followed(self.agreement, np.array(fits))
         if self.agreement < self.parameters.lost_agreement:
-            self._searching = self._anywhere = True
+            self._searching, self._found_ns = True, math.inf
+            self.changes.withdraw(self._sure_ns)
         elif self.agreement >= FOUND_AGREEMENT and self.share >= KNOWN_SHARE:
-            self._searching = self._anywhere = False
+            self._searching, self._found_ns = False, min(self._found_ns, self._stamp_ns)
+            if not self._in_doubt:
+                self._sure_ns = self._stamp_ns
+
+    @property
+    def _in_doubt(self) -> bool:
+        """Whether the place is not known, or was found a short time ago: it may be a wrong one.
+
+        Then nothing that contradicts the map excuses a reading, nor several readings each other.
+        """
+        since_ns = self._stamp_ns - self._found_ns
+        return self._found_ns == math.inf or 0.0 <= since_ns < DOUBT_TIME * NANOSECONDS
 
     def _counts(self, fits: float, x: float, y: float) -> bool:
         """Return whether a reading says something about the pose, not only about one place."""
         self._witnesses[:, 2] *= 1.0 - AGREEMENT_DECAY
-        if fits > 0.0 or self._anywhere:
+        if fits > 0.0 or self._in_doubt:
             return True
         away = np.hypot(self._witnesses[:, 0] - x, self._witnesses[:, 1] - y)
         if not away.size or away.min() > ONE_THING:

@@ -130,6 +130,18 @@ def test_what_is_gone_is_missing_until_it_is_back():
     assert again.number == 1
 
 
+def test_events_since_a_stamp_are_withdrawn_and_found_again():
+    patrol = Patrol()
+    (found,) = patrol.drive(world(WALLS + PILLAR), 3.0 * ROUND)
+    patrol.detector.withdraw(found.found_ns + 1)
+    assert patrol.detector.changes == (found,)
+    patrol.detector.withdraw(found.found_ns)
+    assert patrol.detector.changes == (found._replace(present=False),)
+    (again,) = patrol.drive(world(WALLS + PILLAR), 3.0 * ROUND)
+    assert again.present
+    assert again.number == 1
+
+
 def test_what_appears_and_disappears_moves():
     def visited(time):
         phase = math.tau * min(time + 3.0, 9.0) / ROUND

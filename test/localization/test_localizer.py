@@ -387,6 +387,39 @@ def test_a_sensor_that_contradicts_the_map_is_not_used(sensor, wrong, seconds):
 
 
 @pytest.mark.compiled
+def test_no_change_excuses_readings_where_a_place_was_just_found():
+    """A robot that took its place for the mirrored one called every contradiction a change."""
+    lowest = {}
+    for scattered in (False, True):
+        localizer, drive = make_localizer(), Drive(drift=0.0)
+        if scattered:
+            localizer.scatter()
+        follow(localizer, drive, 30.0)
+        drive.room = parse_world(re.sub('boxes.*', '', TEXT), 'without the box')
+        lowest[scattered] = 1.0
+        for _ in range(40):
+            follow(localizer, drive, 1.0)
+            assert localizer.state is Localization.LOCALIZED
+            lowest[scattered] = min(lowest[scattered], localizer.agreement)
+        (gone,) = localizer.changes.changes
+        assert gone.present
+    assert lowest[True] < lowest[False] - 0.05
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize('way', few_of([4.4, 1.0, 1.4]))
+def test_what_a_carried_robot_finds_is_withdrawn(way):
+    """Until it knows that it is lost, the map seems to have changed: up to four false events."""
+    localizer, drive = driven(20.0)
+    drive.carry(way)
+    follow(localizer, drive, 30.0)
+    assert localizer.state is Localization.LOCALIZED
+    assert error(localizer, drive)[0] < 0.05
+    assert localizer.changes.changes
+    assert not any(each.present for each in localizer.changes.changes)
+
+
+@pytest.mark.compiled
 def test_a_scan_is_used_like_the_ranges():
     localizer, drive = make_localizer(sigma_hit_growth=0.0), Drive(seed=7)
     angles = np.linspace(-math.pi, math.pi, 24, endpoint=False)
