@@ -120,13 +120,16 @@ class Change(NamedTuple):
     """Stamp at which it became an event."""
     present: bool
     """Whether it is there, as far as is known."""
+    withdrawn: bool = False
+    """Whether it was never there: the robot was lost, as it turned out."""
 
     @property
     def text(self) -> str:
         """What, how large, where and how certain, in words."""
         gone = '' if self.present else ', gone'
+        state = ', withdrawn: the robot was lost' if self.withdrawn else gone
         return (
-            f'{self.kind.value}{gone}: {self.size:.2f} m at x {self.x:.2f} m, y {self.y:.2f} m, '
+            f'{self.kind.value}{state}: {self.size:.2f} m at x {self.x:.2f} m, y {self.y:.2f} m, '
             f'confidence {self.confidence:.2f}'
         )
 
@@ -227,7 +230,8 @@ class ChangeDetector:
         for place in list(self._places):
             if place.event is not None and self._changes[place.event].found_ns >= since_ns:
                 self._remove(place)
-                self._changes[place.event] = self._changes[place.event]._replace(present=False)
+                event = self._changes[place.event]
+                self._changes[place.event] = event._replace(present=False, withdrawn=True)
 
     def explained(
         self, pose: Pose, covariance: Array, beams: Beams, before_ns: float = math.inf
@@ -378,6 +382,7 @@ class ChangeDetector:
             confidence=max(confidence, event.confidence),
             last_ns=stamp_ns,
             present=True,
+            withdrawn=False,
         )
         return True
 

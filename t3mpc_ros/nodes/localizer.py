@@ -406,6 +406,7 @@ def change_status(change: Change) -> DiagnosticStatus:
     values = {
         'kind': change.kind.name.lower(),
         'present': change.present,
+        'withdrawn': change.withdrawn,
         'x_m': f'{change.x:.3f}',
         'y_m': f'{change.y:.3f}',
         'size_m': f'{change.size:.3f}',
@@ -423,7 +424,7 @@ def change_status(change: Change) -> DiagnosticStatus:
 
 
 def change_marker(change: Change, frame: str) -> Marker:
-    """Return a change as a cylinder at its place, stamped as first seen; pale: it is gone."""
+    """Return a change as a cylinder at its place, stamped as first seen; pale: it is not there."""
     marker = Marker(ns='map_changes', id=change.number, type=Marker.CYLINDER, text=change.text)
     marker.header = conversions.header(change.first_ns, frame)
     marker.pose.position.x, marker.pose.position.y = change.x, change.y

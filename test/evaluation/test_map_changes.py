@@ -22,12 +22,17 @@ from t3mpc_ros.evaluation.bag_report.report_page import write_report
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
 
 
-def change(second, number, *, kind='new', present=True, first=4.5, last=6.0):
-    values = {'x_m': 0.5, 'y_m': -0.25, 'size_m': 0.3, 'confidence': 0.97}
+def change(second, number, *, kind='new', first=4.5, last=6.0, **state):
+    values = {
+        'present': True,
+        **state,
+        'x_m': 0.5,
+        'y_m': -0.25,
+        'size_m': 0.3,
+        'confidence': 0.97,
+    }
     times = {'first_seen_s': first, 'found_s': first + 1.5, 'last_seen_s': last}
-    message = diagnostics(
-        round(second * 1e9), f'change {number}', kind=kind, present=present, **values, **times
-    )
+    message = diagnostics(round(second * 1e9), f'change {number}', kind=kind, **values, **times)
     return second, '/map_changes', message
 
 
@@ -37,12 +42,14 @@ def test_changes_are_as_last_published_when_they_were_found(tmp_path):
         change(6.0, 1),
         change(9.0, 1, kind='moving', present=False, last=8.0),
         change(10.0, 2, kind='missing', first=8.5, last=10.0),
+        change(10.5, 3, present=False, withdrawn=True),
         (11.0, '/map_changes', diagnostics(11 * 10**9, 'of another publisher', kind='new')),
     ]
     folder = write(tmp_path / 'bag', sorted(rows, key=lambda row: row[0]))
     with open_bag(folder) as recording:
-        walker, missing = load_run(recording).map_changes
-    assert (walker.kind, walker.present) == ('moving', False)
+        walker, missing, withdrawn = load_run(recording).map_changes
+    assert (walker.kind, walker.state) == ('moving', 'gone')
+    assert (missing.state, withdrawn.state) == ('there', 'withdrawn')
     assert (walker.x, walker.y, walker.size, walker.confidence) == (0.5, -0.25, 0.3, 0.97)
     assert (walker.found, walker.seen_before) == pytest.approx((6.0, 1.5), abs=0.05)
     assert walker.seen_for == pytest.approx(3.5)

@@ -136,9 +136,12 @@ def test_events_since_a_stamp_are_withdrawn_and_found_again():
     patrol.detector.withdraw(found.found_ns + 1)
     assert patrol.detector.changes == (found,)
     patrol.detector.withdraw(found.found_ns)
-    assert patrol.detector.changes == (found._replace(present=False),)
+    (withdrawn,) = patrol.detector.changes
+    assert withdrawn == found._replace(present=False, withdrawn=True)
+    assert 'withdrawn: the robot was lost' in withdrawn.text
     (again,) = patrol.drive(world(WALLS + PILLAR), 3.0 * ROUND)
     assert again.present
+    assert not again.withdrawn
     assert again.number == 1
 
 

@@ -153,7 +153,7 @@ def test_a_thing_that_the_map_lacks_is_published(harness):
     (status,) = changes[-1].status
     values = {each.key: each.value for each in status.values}
     assert changes[-1].header.frame_id == 'map'
-    assert (values['kind'], values['present']) == ('new', 'True')
+    assert [values[key] for key in ('kind', 'present', 'withdrawn')] == ['new', 'True', 'False']
     assert float(values['x_m']) == pytest.approx(1.75, abs=0.15)  # as far as the start is off
     assert float(values['y_m']) == pytest.approx(-1.0, abs=0.08)
     first, found, last = (

@@ -31,7 +31,8 @@ class RecordedChange(NamedTuple):
 
     name: str
     kind: str
-    present: bool
+    state: str
+    """there, gone or withdrawn"""
     x: float
     """m"""
     y: float
@@ -76,10 +77,11 @@ def _change(status: Any, found: float) -> RecordedChange:
     first, event, last = (
         float(values[f'{key}_s']) for key in ('first_seen', 'found', 'last_seen')
     )
+    gone = 'withdrawn' if values.get('withdrawn') == 'True' else 'gone'
     return RecordedChange(
         status.name,
         values['kind'],
-        values['present'] == 'True',
+        'there' if values['present'] == 'True' else gone,
         float(values['x_m']),
         float(values['y_m']),
         float(values['size_m']),
@@ -105,13 +107,14 @@ def map_change_blocks(changes: tuple[RecordedChange, ...]) -> Iterator[Block]:
             f'{each.confidence:.2f}',
             f'{each.seen_before:.1f} s',
             f'{each.seen_for:.1f} s',
-            'there' if each.present else 'gone',
+            each.state,
         ]
         for each in changes
     ]
     yield Table('', head, rows, text=4)
     yield Paragraph(
         'New: a thing that the map lacks; missing: one that is not where the map has it; moving: '
-        'it was seen, and then that it was gone. The place is the middle of what was seen of it.',
+        'it was seen, and then that it was gone. The place is the middle of what was seen of it. '
+        'Withdrawn: the robot was lost, and had not been where it took itself to be.',
         'quiet',
     )
