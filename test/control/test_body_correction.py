@@ -111,6 +111,7 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+@pytest.mark.compiled
 def test_wrong_radii_and_separation_are_learnt():
     body = Body(miscalibrated, noise=0.02)
     before = uncorrected(40.0, miscalibrated) - uncorrected(40.0)
@@ -129,6 +130,7 @@ def creeping(right, left):
     return half / (1.0 + 0.01 * abs(half) + 0.003 * abs(mean * half))
 
 
+@pytest.mark.compiled
 def test_creep_that_grows_with_speed_and_curvature_is_learnt():
     """Two gains alone can only learn its mean."""
     before = uncorrected(60.0, creeping) - uncorrected(60.0)
@@ -150,6 +152,7 @@ def test_creep_that_grows_with_speed_and_curvature_is_learnt():
     assert rms(after[3000:]) < 0.7 * best
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_a_robot_that_is_exact_is_left_alone():
     """Noise of the gyro must not turn a good robot into a worse one."""
@@ -160,6 +163,7 @@ def test_a_robot_that_is_exact_is_left_alone():
         np.testing.assert_array_equal(body.sent[-1], body.reference(body.k + 1))
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('scale', [0.97, 1.03])
 def test_the_scale_of_an_uncalibrated_gyro_is_not_the_robots(scale):
     """3 % of the data sheet once turned an exact robot by 3 %, without a word."""
@@ -170,6 +174,7 @@ def test_the_scale_of_an_uncalibrated_gyro_is_not_the_robots(scale):
     assert abs(body.correction.estimate[GYRO_SCALE] - (scale - 1.0)) < 0.006
 
 
+@pytest.mark.compiled
 def test_stated_deviations_share_what_cannot_be_told_apart():
     """The two are one quantity: the posterior mean divides it as the variances."""
     for wheel, gyro in ((0.01, 0.01), (0.02, 0.01), (0.01, 0.03)):
@@ -181,6 +186,7 @@ def test_stated_deviations_share_what_cannot_be_told_apart():
         assert abs(found[TURNING] / (found[TURNING] + found[GYRO_SCALE]) - share) < 0.12
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('bias', [0.05, -0.2, 1.5])
 def test_a_jump_of_the_bias_turns_no_robot(bias):
     """0.05 rad/s at 15 s once turned the robot by 1.5 rad in the minute after."""
@@ -194,6 +200,7 @@ def test_a_jump_of_the_bias_turns_no_robot(bias):
         assert abs(body.correction.gyro_bias - bias) < 0.01
 
 
+@pytest.mark.compiled
 def test_a_bias_and_wrong_wheels_are_told_apart():
     body = Body(miscalibrated, noise=0.01)
     body.run(20.0)

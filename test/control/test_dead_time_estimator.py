@@ -188,6 +188,7 @@ def test_the_estimate_is_invariant_to_the_scale_of_the_speeds():
     np.testing.assert_allclose(record_scaled, record, rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('speed', [0.0, 3.0])
 def test_constant_commands_identify_nothing(speed):
     command = np.full((at(60.0), 2), speed)
@@ -284,6 +285,7 @@ def test_a_reset_keeps_the_estimate_and_ends_the_disturbance():
     assert after == before
 
 
+@pytest.mark.compiled
 def test_speeds_at_the_stamp_need_the_other_model():
     """The mean over a period is half a period older than the speed at its end."""
     command = smooth_commands(40.0, 97)

@@ -209,6 +209,7 @@ class Room:
         return self.keep_out.ranges.faults()
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('sensor', few_of(range(8), step=3))
 def test_a_sensor_that_sees_nothing_is_found_by_what_others_saw(sensor):
     room = Room()
@@ -232,6 +233,7 @@ def test_things_that_leave_make_no_sensor_blind():
         assert room.run(0.5) == {}
 
 
+@pytest.mark.compiled
 def test_what_nobody_has_seen_makes_no_sensor_blind():
     """Walls of the world file may be missing, and what was touched is not seen."""
     square = 0.8 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])

@@ -170,6 +170,7 @@ def test_robot_stops_and_turns_at_a_cusp():
     assert path.linear[near].max() < 0.06
 
 
+@pytest.mark.compiled
 def test_growing_path_gives_the_same_motion():
     """Points may arrive while the robot drives: the motion is that of the known path."""
     whole = time_path(_eight(), MotionLimits(), GEOMETRY, PERIOD)

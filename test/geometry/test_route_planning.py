@@ -109,6 +109,7 @@ def test_a_route_leads_around_a_box_at_its_distance():
     assert (np.diff(times) > -2.0 * SIZE * (1.0 + NEAR_COST)).all()
 
 
+@pytest.mark.compiled
 def test_there_and_back_take_the_same_time():
     generator = np.random.default_rng(5)
     cells = floor()

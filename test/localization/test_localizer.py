@@ -163,6 +163,7 @@ def test_the_covariance_covers_the_error():
     assert np.mean(inside) >= 0.9  # 99.9 % of a normal distribution; readings repeat their errors
 
 
+@pytest.mark.compiled
 def test_the_frame_of_the_odometry_leads_to_the_pose():
     localizer, drive = make_localizer(), Drive()
     follow(localizer, drive, 10.0)
@@ -212,6 +213,7 @@ def test_without_recovery_a_carried_robot_stays_lost():
     assert localizer.state is Localization.LOST
 
 
+@pytest.mark.compiled
 def test_a_pose_that_is_given_is_taken():
     localizer, drive = make_localizer(set_initial_pose=False), Drive(start=on_ellipse(1.0))
     follow(localizer, drive, 1.0)
@@ -286,6 +288,7 @@ def test_readings_of_another_time_are_not_used(late):
         assert set(localizer._pending) == {0}
 
 
+@pytest.mark.compiled
 def test_bad_inputs_change_nothing():
     localizer, drive = make_localizer(), Drive()
     for sensor in EVERY.tolist():

@@ -46,6 +46,7 @@ def rays(places, count, seed):
     return zip(chosen.tolist(), generator.uniform(-math.pi, math.pi, count).tolist(), strict=True)
 
 
+@pytest.mark.compiled
 def test_rays_end_where_those_of_the_world_end(room, room_map):
     errors, missed = [], 0
     for (x, y), direction in rays(room_map.free_places(0.1), 2000, 1):

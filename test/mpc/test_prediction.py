@@ -73,6 +73,7 @@ def _past(generator, horizon=10):
     return history
 
 
+@pytest.mark.compiled
 def test_iterated_prediction_uses_its_own_outputs(taught):
     history = _past(np.random.default_rng(4))
     history.planned_moves[:] = np.linspace(-2.0, 2.0, 10)

@@ -147,6 +147,7 @@ def test_cd_steps_increase_the_exact_likelihood():
     assert figures[-1] > figures[0] + 0.5
 
 
+@pytest.mark.compiled
 def test_cd_epochs_reduce_the_reconstruction_error():
     machine = _machine()
     errors, moves = _excited(np.random.default_rng(0))
@@ -324,6 +325,7 @@ def test_simulated_run_is_reproducible_and_nominal_at_rest():
     )
 
 
+@pytest.mark.compiled
 def test_pretraining_predicts_an_unseen_run():
     machine, rls = _machine(), make_rls_state(12)
     generator = np.random.default_rng(12)

@@ -404,6 +404,7 @@ def test_blocked_wheel_is_flagged_within_300_ms(speed):
     assert error @ np.linalg.solve(odometry.covariance[:2, :2], error) < 9.0
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('rate', few_of([1.0, 0.1, 0.01]))
 def test_external_rotation_at_standstill_keeps_the_bias(rate):
     count = 20

@@ -149,6 +149,7 @@ def test_joint_of_collinear_walls_adds_no_force():
         assert force(x, y, three, bumper=DAMPED, speed=speed) == pytest.approx(plain, abs=1e-9)
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_force_is_continuous_at_joints_and_corners():
     """A force that jumps at a joint would shake a robot that slides along the wall."""
@@ -181,6 +182,7 @@ def test_polygon_approximates_a_circle_on_both_sides(sides):
             assert aslant <= 1.01 * math.tan(math.pi / sides) * abs(pushed @ out)
 
 
+@pytest.mark.compiled
 @pytest.mark.slow
 def test_undamped_force_is_conservative():
     generator = np.random.default_rng(3)

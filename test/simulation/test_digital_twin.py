@@ -88,6 +88,7 @@ def test_drive_kind_selects_the_robot_class():
         PaperRobot(parameters())
 
 
+@pytest.mark.compiled
 def test_twins_in_one_process_are_independent():
     """A sweep may step its robots in any order."""
     tables = [parameters(seed=seed, world='room', noise__variance=0.04) for seed in range(5)]
@@ -152,6 +153,7 @@ def test_counters_give_the_path_without_lost_steps_or_slip():
     assert math.remainder(last.truth.pose.yaw - last.odometry.pose.yaw, math.tau) < 2e-3
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize(
     ('cause', 'changes'),
     [

@@ -259,6 +259,7 @@ def test_equal_seeds_give_bit_equal_runs():
     assert [numbers(other.step(wander(tick))) for tick in range(300)] != runs[0]
 
 
+@pytest.mark.compiled
 def test_noise_affects_the_measurement_only():
     silent, noisy = robot(), robot(noise__variance=0.04)
     deviations = []
@@ -286,6 +287,7 @@ def trajectory(substep: float, **changes: object) -> np.ndarray:
     return np.array(rows)
 
 
+@pytest.mark.compiled
 def test_torque_drive_converges_with_order_four():
     runs = [trajectory(substep, drive__kind='torque') for substep in (0.002, 0.001, 0.0005)]
     coarse, fine = np.abs(runs[0] - runs[1]).max(), np.abs(runs[1] - runs[2]).max()
