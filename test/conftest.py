@@ -42,6 +42,8 @@ INCONCLUSIVE = 'inconclusive'
 """Outcome of a test, and title of the section of its report that holds the time-out."""
 INCONCLUSIVE_CODE = 6
 """Exit code of a run in which nothing failed and something was inconclusive; pytest has 0 to 5."""
+EMPTY_PART = pytest.StashKey[bool]()
+"""Whether the part of the tests that is asked for has none, though there are tests."""
 OUTCOMES = {'skipped': 'skipped', 'passed': 'passed', INCONCLUSIVE: INCONCLUSIVE} | dict.fromkeys(
     ('failed', 'error'), 'failed'
 )
@@ -125,7 +127,9 @@ def pytest_collection_modifyitems(config, items):
             raise pytest.UsageError(f'{item.nodeid}: its file must name its marks, mark.NAME')
     if config.option.part:
         number, count = config.option.part
-        _keep(config, items, items[number - 1 :: count])
+        kept = items[number - 1 :: count]
+        config.stash[EMPTY_PART] = bool(items and not kept)
+        _keep(config, items, kept)
     elif _is_default(config):
         times = {'slow', 'long'}
         _keep(config, items, [i for i in items if not times & {m.name for m in i.iter_markers()}])
@@ -198,6 +202,8 @@ def pytest_report_teststatus(report):
 def pytest_sessionfinish(session):
     """Write the outcomes; end with a code of its own if something is inconclusive."""
     config = session.config
+    if config.stash.get(EMPTY_PART, False):  # with fewer tests than parts, no mistake
+        session.exitstatus = pytest.ExitCode.OK
     if hasattr(config, 'workerinput'):
         return
     reports = config.pluginmanager.get_plugin('terminalreporter').stats

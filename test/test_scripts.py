@@ -345,12 +345,13 @@ def test_each_part_of_the_environment_is_installed_when_needed(checkout):
 def test_check_runs_what_is_asked_for(checkout, tmp_path):
     check = checkout.root / 'scripts' / 'check'
     (notes := tmp_path / 'temporary').mkdir()
+    long = ['long and not ros', 'long and ros']
     usual = ['not (ros or long)', 'ros and not (timed or long)', 'ros and timed and not long']
     for arguments, linted, selected in (
         ((), True, usual),
         (('--quick',), True, ['not (ros or slow or long)']),
-        (('--long',), False, ['long']),
-        (('--long', '3/7'), False, ['long --part 3/7']),
+        (('--long',), False, long),
+        (('--long', '3/7'), False, [f'{marks} --part 3/7' for marks in long]),
     ):
         done = checkout.run(*arguments, script=check, TMPDIR=notes)
         assert done.returncode == 0
@@ -369,7 +370,7 @@ def test_check_runs_what_is_asked_for(checkout, tmp_path):
     checkout.beside('failing').touch()
     done = checkout.run('--long', script=check)
     assert done.returncode == 1
-    assert re.search('^not installed, .* -m long$', done.stderr, re.MULTILINE)
+    assert re.search('^not installed, .* -m long and ros$', done.stderr, re.MULTILINE)
 
 
 def test_the_installer_is_uv_and_without_it_pip(checkout):
