@@ -33,6 +33,17 @@ ROOT = Path(__file__).resolve().parent
 DEFAULT = ('geometry', 'parameters', 'robot', 'fuzzy', 'test_launch_files.py')
 """What ``colcon test``, and pytest without arguments, runs; scripts/check runs all."""
 
+FIRST = (
+    'test_live_page.py',
+    'test_node_processes.py',
+    'test_live_stop.py',
+    'test_launch_files.py',
+    'test_readme.py',
+)
+"""Files that take long: at the end of a run, the other processors would wait for them.
+
+The last of them follows those that compute much: it repeats a demo that was too slow.
+"""
 MAX_WAIT = 0.3
 """Largest share of the time with work to do that processes of a test may wait for a processor."""
 WAIT = pytest.StashKey[processor_wait.ProcessorWait]()
@@ -119,12 +130,18 @@ def pytest_ignore_collect(collection_path, config):
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
-    """Keep a part of the tests; of the default set, those that take neither long nor slow."""
+    """Keep a part of the tests; of the default set, those that take neither long nor slow.
+
+    What comes first is not left to the order of the arguments: pytest removes a path that is
+    within another one.
+    """
     for item in items:
         certain, possible = _marks_in(item.path)
         marks = {mark.name for mark in item.iter_markers()} & {*MARKS}
         if not certain <= marks <= possible:
             raise pytest.UsageError(f'{item.nodeid}: its file must name its marks, mark.NAME')
+    ranks = {name: rank for rank, name in enumerate(FIRST)}
+    items.sort(key=lambda item: ranks.get(item.path.name, len(FIRST)))
     if config.option.part:
         number, count = config.option.part
         kept = items[number - 1 :: count]
