@@ -326,6 +326,13 @@ def test_no_relative_link_is_dead(page):
     assert not dead
 
 
+@pytest.mark.parametrize('page', PAGES, ids=lambda path: path.name)
+def test_every_table_has_rows(page):
+    """A table that was to be filled from a record lost its twenty rows, and nobody saw it."""
+    text = page.read_text(encoding='utf-8')
+    assert not re.findall(r'^\|(?: *:?-+:? *\|)+$(?!\n\|)', text, flags=re.MULTILINE)
+
+
 def _prose(page):
     """Return the text of a page without its code blocks."""
     return re.sub(r'^(```|~~~).*?^\1', '', page.read_text(), flags=re.DOTALL | re.MULTILINE)
