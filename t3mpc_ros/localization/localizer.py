@@ -96,6 +96,8 @@ DOUBT_TIME = 60.0
 ONE_THING, MOST_WITNESSES = 0.3, 6.0
 """Distance (m) within which readings contradict the map at one place, and number of the last 20 or
 so that count of it: a robot that is not where it takes itself to be contradicts it at several."""
+FADED = 0.1
+"""Number of readings below which a place is forgotten: one reading, 45 ago."""
 DOUBTFUL_AGREEMENT, OTHERS_AGREEMENT = 0.3, 0.8
 """Share of the readings of a sensor that fit below which they are not used, and share of the
 median sensor from which on it is the sensor, not the place, that is wrong."""
@@ -206,7 +208,7 @@ class Localizer:
         """That share for each range sensor."""
         self._searching = not parameters.set_initial_pose
         """Whether random particles are added until the readings fit for some time."""
-        self._found_ns = math.inf if self._searching else -math.inf
+        self._found_ns = math.inf
         """When the place was found by a search; inf: not yet, -inf: it was known at the start."""
         self._sure_ns = 0
         """When the readings last fitted at a place that was not in doubt."""
@@ -432,18 +434,17 @@ class Localizer:
 
         Then nothing that contradicts the map excuses a reading, nor several readings each other.
         """
-        since_ns = self._stamp_ns - self._found_ns
-        return self._found_ns == math.inf or 0.0 <= since_ns < DOUBT_TIME * NANOSECONDS
+        return self._stamp_ns - self._found_ns < DOUBT_TIME * NANOSECONDS
 
     def _counts(self, fits: float, x: float, y: float) -> bool:
-        """Return whether a reading says something about the pose, not only about one place."""
+        """Note a reading; return whether it tells the pose: of each place only so many do."""
         self._witnesses[:, 2] *= 1.0 - AGREEMENT_DECAY
         if fits > 0.0 or self._in_doubt:
             return True
         away = np.hypot(self._witnesses[:, 0] - x, self._witnesses[:, 1] - y)
         if not away.size or away.min() > ONE_THING:
-            known = self._witnesses[self._witnesses[:, 2] > 0.1]
-            self._witnesses = np.concatenate([known, [[x, y, 1.0]]])
+            lately = self._witnesses[self._witnesses[:, 2] > FADED]
+            self._witnesses = np.concatenate([lately, [[x, y, 1.0]]])
             return True
         near = int(away.argmin())
         counts = bool(self._witnesses[near, 2] < MOST_WITNESSES - 1.0)
