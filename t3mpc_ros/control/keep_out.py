@@ -93,7 +93,7 @@ SECTORS = 16
 SEARCH_RADIUS = 0.5
 """Distance from the centre up to which cells are considered, m."""
 CAUTIOUS_SPEED = 0.12
-"""Largest speed of a robot that sees less than usual, m/s."""
+"""Largest speed of a robot that sees less than usual, or where something has come, m/s."""
 TOUCHED_SIZE = 0.15
 """Half the width, and the depth, that a thing is taken to have which the robot has touched and
 cannot see, m."""
@@ -198,6 +198,8 @@ class FreeSpaceMap:
         """Forget everything but the known obstacles."""
         self.now = 0.0
         """Time since then, s."""
+        self.last_come = -math.inf
+        """Time of the last reading of a thing that had come, s; see :func:`has_come`."""
         self.grid.cells[:] = UNKNOWN
         self.grid.cleared[:] = 0
         self.grid.seen[:] = 0.0
@@ -293,7 +295,7 @@ class FreeSpaceMap:
         near = reading == -math.inf
         hit = 0.0 if near else min(reading, limit)
         error = parameters.error_floor + parameters.error_growth * hit * hit
-        self._add_ray(
+        come = self._add_ray(
             self.grid,
             self.now,
             pose.x + cosine * ahead - sine * aside,
@@ -303,6 +305,8 @@ class FreeSpaceMap:
             0.09 if near else (hit if reading < limit else -1.0),
             parameters.beam_half_width,
         )
+        if come:
+            self.last_come = self.now
 
 
 def _occupied_places(grid: OccupancyGrid) -> Array:
@@ -364,8 +368,10 @@ def add_ray(
     free: float,
     hit: float,
     half_width: float,
-) -> None:
+) -> bool:
     """Mark the cells along a ray as free up to ``free`` m, and the one at ``hit`` m as occupied.
+
+    Return whether what it met has come, see :func:`has_come`.
 
     hit : below zero if the ray met nothing
     """
@@ -398,18 +404,20 @@ def add_ray(
                     grid.cells[row, column] = FREE
                     grid.cleared[row, column] = 0
     if hit < 0.0:
-        return
+        return False
     column = int(math.floor((x + hit * cosine - low) / size))
     row = int(math.floor((y + hit * sine - low) / size))
     if not (0 <= column < count and 0 <= row < count) or grid.cells[row, column] == KNOWN:
-        return
+        return False
     # Nearer than the sensor measures: only if nothing is known to be there already.
     if hit < 0.1 and has_obstacle(grid.cells, row, column, 4):
-        return
-    if hit < NEW_WITHIN and has_come(grid, now - NEW_FOR, row, column, int(NEW_APART / size)):
+        return False
+    come = has_come(grid, now - NEW_FOR, row, column, int(NEW_APART / size))
+    if come and hit < NEW_WITHIN:
         forget_around(grid, now - JUST_SEEN, row, column, int(NEW_EXTENT / size))
     grid.cells[row, column] = OCCUPIED
     grid.cleared[row, column] = 0
+    return come
 
 
 @kernel
@@ -678,7 +686,8 @@ class KeepOut:
     def _reshaped(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist, or one that looks around."""
         self._update_nearest(pose, UNKNOWN)
-        self._cautious = self.ranges.lost or self._is_near_touched(pose)
+        has_come = self.map.now - self.map.last_come < NEW_FOR
+        self._cautious = has_come or self.ranges.lost or self._is_near_touched(pose)
         if self._targets:
             self.changed = True
             self.activity = Activity.LOOKING

@@ -22,10 +22,12 @@ from support.long_tests import few_of
 
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.keep_out import (
+    CAUTIOUS_SPEED,
     CLEARINGS,
     FREE,
     KNOWN,
     MEMORY,
+    NEW_FOR,
     OCCUPIED,
     UNKNOWN,
     Activity,
@@ -391,6 +393,28 @@ def test_a_ray_over_an_old_edge_does_not_make_it_new():
     assert (grid.cells[edge] == OCCUPIED).all()
     floor.hit(0.4, 0.1)
     assert floor.is_free(0.5, 0.2)
+
+
+@pytest.mark.parametrize('distance', [0.4, 0.65])
+def test_a_robot_drives_slowly_where_a_thing_has_come(distance):
+    """People who stepped in from between the beams were touched at 0.2 m/s: more may follow."""
+    floor = Floor()
+
+    def speed(seconds):
+        floor.map.now += seconds
+        floor.map.grid.seen[floor.map.grid.cells == FREE] = floor.map.now
+        return floor.keep_out.step(BodyTwist(-0.24, 0.0), ORIGIN, 0.0).linear
+
+    assert speed(0.0) == pytest.approx(-0.24)
+    floor.map.grid.seen[:] = floor.map.now - 0.5
+    floor.hit(distance)
+    assert speed(0.0) == speed(0.9 * NEW_FOR) == pytest.approx(-CAUTIOUS_SPEED)
+    floor.hit(distance)  # it has stood there for a while
+    assert speed(0.2 * NEW_FOR) == pytest.approx(-0.24)
+    floor.hit(distance - 0.2)
+    assert speed(0.0) == pytest.approx(-CAUTIOUS_SPEED)
+    floor.keep_out.reset()
+    assert floor.map.last_come == -math.inf
 
 
 def test_a_robot_that_begins_knows_of_nothing_that_came():
