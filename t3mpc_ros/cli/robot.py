@@ -31,18 +31,15 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
 from t3mpc_ros.radio.tool import (
-    channel_scan,
     eeprom_records,
     key_provisioning,
     link_test,
+    manoeuvre,
     procedure,
     robot_info,
-    robot_log,
-    robot_settings,
-    wheel_jog,
 )
+from t3mpc_ros.radio.tool.eeprom_records import SettingsFileError, StoredSettings
 from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, ProcedureError, Script
-from t3mpc_ros.radio.tool.robot_settings import SettingsFileError, StoredSettings
 from t3mpc_ros.stop_signal import StopSignal
 
 EXIT_OK, EXIT_POOR, EXIT_FAILED, EXIT_INTERRUPTED = 0, 1, 2, 130
@@ -130,23 +127,23 @@ def _setup(options: argparse.Namespace, stop: StopSignal) -> int:
     compared = _load_settings(options.diff) if options.diff is not None else None
     if options.save is not None:
         command_line.check_writable(options.save)
-    stored = _run_at_board(robot_settings.read_settings(), options, stop)
+    stored = _run_at_board(eeprom_records.read_settings(), options, stop)
     if loaded is not None or changes:
         base = loaded._asdict() if loaded is not None else {}
-        wanted = robot_settings.change_settings(stored, {**base, **changes}, os.urandom)
+        wanted = eeprom_records.change_settings(stored, {**base, **changes}, os.urandom)
         stored = _store_settings(stored, wanted, options, stop)
-    print(robot_settings.format_settings(stored))
+    print(eeprom_records.format_settings(stored))
     if options.save is not None:
         if not stored.valid:
             raise ProcedureError('there are no settings to save: give the microsteps, or --load')
-        options.save.write_text(robot_settings.settings_file(stored.content))
+        options.save.write_text(eeprom_records.settings_file(stored.content))
         print(
             f'{options.save}: radio_bridge --ros-args --params-file {options.save}, '
             f't3mpc robot ping --params-file {options.save}'
         )
     if compared is not None:
-        rows = robot_settings.differences(stored.content, compared)
-        print(robot_settings.format_differences(rows) or f'equal to {options.diff}')
+        rows = eeprom_records.differences(stored.content, compared)
+        print(eeprom_records.format_differences(rows) or f'equal to {options.diff}')
         if rows:
             return EXIT_POOR
     return EXIT_OK if stored.state == frames.SETTINGS_GOOD else EXIT_POOR
@@ -158,27 +155,27 @@ def _store_settings(
     options: argparse.Namespace,
     stop: StopSignal,
 ) -> StoredSettings:
-    rows = robot_settings.differences(stored.content, wanted)
+    rows = eeprom_records.differences(stored.content, wanted)
     if stored.state == frames.SETTINGS_GOOD and not rows:
         return stored
     if stored.valid:
-        print(robot_settings.format_differences(rows))
+        print(eeprom_records.format_differences(rows))
     else:
-        print(robot_settings.SETTINGS_TEXTS[stored.state])
+        print(eeprom_records.SETTINGS_TEXTS[stored.state])
     if not options.yes and not _ask('Write this to the robot?', stop):
         raise ProcedureError('nothing was written')
-    return _run_at_board(robot_settings.write_settings(wanted), options, stop)
+    return _run_at_board(eeprom_records.write_settings(wanted), options, stop)
 
 
 def _show_log(options: argparse.Namespace, stop: StopSignal) -> int:
-    entries = _run_at_board(robot_log.read_log(), options, stop)
-    print_result(options, lambda: robot_log.format_log(entries), lambda: entries)
+    entries = _run_at_board(robot_info.read_log(), options, stop)
+    print_result(options, lambda: robot_info.format_log(entries), lambda: entries)
     return EXIT_OK
 
 
 def _load_settings(path: Path) -> eeprom_records.RobotSettings:
     try:
-        return robot_settings.settings_of_file(read_yaml(path))
+        return eeprom_records.settings_of_file(read_yaml(path))
     except (YamlError, SettingsFileError) as error:
         raise ParameterError(f'{path} {error}') from error
 
@@ -205,12 +202,10 @@ def _scan(options: argparse.Namespace, stop: StopSignal) -> int:
             file = sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout
             print(f'\r{result}' if interactive else result, file=file, flush=True)
 
-    results = _run_at_dongle(
-        channel_scan.scan_channels(parameters, rates, progress), options, stop
-    )
+    results = _run_at_dongle(link_test.scan_channels(parameters, rates, progress), options, stop)
     if interactive:
         print('\r' + 24 * ' ' + '\r', end='', file=sys.stderr)
-    good, advice = channel_scan.recommend(results, parameters)
+    good, advice = link_test.recommend(results, parameters)
     print_result(options, lambda: advice, lambda: {'advice': advice, 'channels': results})
     return EXIT_OK if good else EXIT_POOR
 
@@ -234,7 +229,7 @@ def _jog(options: argparse.Namespace, stop: StopSignal) -> int:
     if not options.yes and not _ask(motion, stop):
         print('t3mpc robot: nothing was moved', file=sys.stderr)
         return EXIT_INTERRUPTED if stop() else EXIT_FAILED
-    task = wheel_jog.Jog(
+    task = manoeuvre.Jog(
         parameters,
         _key_option(options),
         os.urandom,
@@ -245,7 +240,7 @@ def _jog(options: argparse.Namespace, stop: StopSignal) -> int:
     )
     procedure.run_at_port(task, options.port, stop)
     if task.result is not None:
-        print(wheel_jog.format_result(task.result, options.wheel, options.revolutions))
+        print(manoeuvre.format_result(task.result, options.wheel, options.revolutions))
     if task.error:
         raise ProcedureError(task.error)
     return EXIT_OK
@@ -401,7 +396,7 @@ def program_parser() -> argparse.ArgumentParser:
 
     text = 'turn one wheel, with both wheels in the air'
     add = link_command('jog', _jog, text, True).add_argument
-    add('wheel', choices=(wheel_jog.LEFT, wheel_jog.RIGHT))
+    add('wheel', choices=(manoeuvre.LEFT, manoeuvre.RIGHT))
     add('revolutions', type=_revolutions, metavar='REVOLUTIONS', help='negative: backward')
     text = 'wheel speed, rad/s (default 2)'
     add('--speed', type=command_line.bounded_float(0.2, 10.0), default=2.0, help=text)
@@ -435,7 +430,7 @@ def _add_settings_commands(
     add('--port', required=True, help='USB port of the robot board')
     add(
         '--address',
-        type=_setting('address', robot_settings.parse_address),
+        type=_setting('address', eeprom_records.parse_address),
         metavar='HEX',
         help='10 hexadecimal digits; default: as stored, on a new board random',
     )

@@ -21,7 +21,7 @@ from typing import TypeVar
 
 from t3mpc_ros.evaluation import reporting
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.tool import link_test, procedure, wheel_jog
+from t3mpc_ros.radio.tool import link_test, manoeuvre, procedure
 from t3mpc_ros.radio.tool.bench_checklist import (
     DRIVEN,
     FAIL,
@@ -104,12 +104,12 @@ def _drive(
     interrupted: Callable[[], bool],
     add: Callable[[Sequence[Check]], None],
 ) -> None:
-    for question, wheel in zip(DRIVEN, (wheel_jog.LEFT, wheel_jog.RIGHT), strict=True):
+    for question, wheel in zip(DRIVEN, (manoeuvre.LEFT, manoeuvre.RIGHT), strict=True):
         ready = f'The {wheel} wheel will make one turn. Both wheels in the air, hands away?'
         if answer(ready) != 'yes':
             add([_skip(question, 'not confirmed')])
             continue
-        task = wheel_jog.Jog(parameters, key, os.urandom, wheel, 1.0, _SPEED, print)
+        task = manoeuvre.Jog(parameters, key, os.urandom, wheel, 1.0, _SPEED, print)
         procedure.run_at_port(task, options.port, interrupted)
         if task.error:
             add([Check(question.step, question.name, FAIL, 'did not turn', task.error)])

@@ -31,7 +31,7 @@ from t3mpc_ros.cli import robot_calibrate
 from t3mpc_ros.radio.protocol.authentication import key_check, read_key
 from t3mpc_ros.radio.serial_port import SerialPort
 from t3mpc_ros.radio.tool import procedure
-from t3mpc_ros.radio.tool.wheel_jog import Jog
+from t3mpc_ros.radio.tool.manoeuvre import Jog
 from t3mpc_ros.robot.calibration import Recording
 
 

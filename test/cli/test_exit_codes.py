@@ -31,10 +31,9 @@ from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup
 from t3mpc_ros.emulator.fault_injection import FaultError
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.tool.bench_checklist import FAIL, PASS, SKIPPED, Check
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
+from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, StoredSettings, settings_file
 from t3mpc_ros.radio.tool.link_test import BAD, GOOD, POOR, ReportRow
 from t3mpc_ros.radio.tool.procedure import ProcedureError
-from t3mpc_ros.radio.tool.robot_settings import StoredSettings, settings_file
 
 RUN = 'radio.tool.procedure.run_script'
 EMULATOR, RECOVER = 'emulator.emulator.Emulator', 'bag.recovery.recover_bag'
@@ -65,12 +64,12 @@ def checked(*verdicts):
 
 
 def answered(good):
-    return {RUN: 'result', 'radio.tool.channel_scan.recommend': (good, 'advice')}
+    return {RUN: 'result', 'radio.tool.link_test.recommend': (good, 'advice')}
 
 
 def jogged(error=''):
     task = SimpleNamespace(result=None, error=error)
-    return {'radio.tool.wheel_jog.Jog': task, 'radio.tool.procedure.run_at_port': None}
+    return {'radio.tool.manoeuvre.Jog': task, 'radio.tool.procedure.run_at_port': None}
 
 
 def recovered(ended, *damages):

@@ -20,8 +20,8 @@ from support.long_tests import few_of
 import yaml
 
 from t3mpc_ros.cli import robot as cli
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
-from t3mpc_ros.radio.tool.robot_settings import (
+from t3mpc_ros.radio.tool.eeprom_records import (
+    RobotSettings,
     SettingsFileError,
     parse_address,
     settings_file,

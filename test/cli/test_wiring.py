@@ -40,8 +40,7 @@ from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.nodes.registry import NODES, parameter_class
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import key_check
-from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
-from t3mpc_ros.radio.tool.robot_settings import StoredSettings, settings_file
+from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, StoredSettings, settings_file
 from t3mpc_ros.robot.calibration import Calibration
 
 pytestmark = pytest.mark.slow
@@ -259,20 +258,20 @@ ROBOT = {
     'radio.tool.link_test.run_link_test': 'result',
     'radio.tool.link_test.evaluate': [],
     'radio.tool.link_test.format_report': '',
-    'radio.tool.channel_scan.scan_channels': 'result',
-    'radio.tool.channel_scan.recommend': (True, ''),
+    'radio.tool.link_test.scan_channels': 'result',
+    'radio.tool.link_test.recommend': (True, ''),
     'radio.tool.robot_info.read_robot_info': 'result',
     'radio.tool.robot_info.format_robot_info': '',
-    'radio.tool.wheel_jog.Jog': SimpleNamespace(result=None, error=''),
+    'radio.tool.manoeuvre.Jog': SimpleNamespace(result=None, error=''),
     'radio.tool.key_provisioning.write_key': 'state',
     'radio.tool.key_provisioning.read_key_state': frames.KeyState(
         0, 0, frames.KEY_HELD, key_check(KEY)
     ),
     'radio.tool.key_provisioning.format_key_state': '',
-    'radio.tool.robot_log.read_log': 'log',
-    'radio.tool.robot_log.format_log': '',
-    'radio.tool.robot_settings.read_settings': None,
-    'radio.tool.robot_settings.write_settings': STORED,
+    'radio.tool.robot_info.read_log': 'log',
+    'radio.tool.robot_info.format_log': '',
+    'radio.tool.eeprom_records.read_settings': None,
+    'radio.tool.eeprom_records.write_settings': STORED,
     'cli.robot_calibrate.CalibrationWizard': lambda start, **_: SimpleNamespace(
         run=lambda: None, calibration=start
     ),

@@ -29,17 +29,16 @@ from t3mpc_ros.radio.protocol.codec import decode_from_dongle, encode
 from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Hello, StatusFlag
 from t3mpc_ros.radio.protocol.framing import FrameDecoder
 from t3mpc_ros.radio.tool import (
-    channel_scan,
+    eeprom_records,
     key_provisioning,
     link_test,
+    manoeuvre,
     robot_info,
-    robot_settings,
-    wheel_jog,
 )
-from t3mpc_ros.radio.tool.channel_scan import ChannelResult
 from t3mpc_ros.radio.tool.eeprom_records import SENSORS, RobotSettings
+from t3mpc_ros.radio.tool.link_test import ChannelResult
 from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, Procedure, ProcedureError
-from t3mpc_ros.radio.tool.robot_log import LogEntry, LogKind, format_log
+from t3mpc_ros.radio.tool.robot_info import LogEntry, LogKind, format_log
 
 KEY, OTHER = bytes(range(16)), bytes(range(1, 17))
 TURN = 3200
@@ -148,17 +147,17 @@ def test_a_silent_port_fails_with_a_remedy():
 
 
 def write(bench, seed=1, **changes):
-    stored = bench.at_robot(robot_settings.read_settings())
+    stored = bench.at_robot(eeprom_records.read_settings())
     entropy = random.Random(seed).randbytes
-    wanted = robot_settings.change_settings(stored, changes, entropy)
-    written = bench.at_robot(robot_settings.write_settings(wanted))
+    wanted = eeprom_records.change_settings(stored, changes, entropy)
+    written = bench.at_robot(eeprom_records.write_settings(wanted))
     assert written == (frames.SETTINGS_GOOD, wanted)
     return wanted
 
 
 def host_of(settings):
     """Return link parameters from the parameter file of a robot."""
-    content = yaml.safe_load(robot_settings.settings_file(settings))
+    content = yaml.safe_load(eeprom_records.settings_file(settings))
     # A node rejects what it does not know: settings of the board once ended radio_bridge.
     assert set(content['/**']['ros__parameters']) == {'link'}
     return LinkParameters.from_dict(content['/**']['ros__parameters']['link'])
@@ -169,20 +168,20 @@ def test_a_new_robot_gets_a_random_address_and_keeps_it():
     addresses = set()
     for seed in range(20):
         bench = ToolBench(erased=True)
-        assert bench.at_robot(robot_settings.read_settings()).state == frames.SETTINGS_MISSING
+        assert bench.at_robot(eeprom_records.read_settings()).state == frames.SETTINGS_MISSING
         settings = write(bench, seed)
         assert settings[1:] == RobotSettings()[1:]
         addresses.add(settings.address)
         changed = write(bench, seed + 100, channel=100, microsteps=8)
         assert changed == settings._replace(channel=100, microsteps=8)
-        assert bench.at_robot(robot_settings.read_settings()).content == changed
+        assert bench.at_robot(eeprom_records.read_settings()).content == changed
     assert len(addresses) == 20
 
 
 def test_drawn_addresses_are_receivable_and_no_numbers():
     source = random.Random(1)
     for _ in range(2000):
-        text = robot_settings.draw_address(source.randbytes).hex()
+        text = eeprom_records.draw_address(source.randbytes).hex()
         assert not {'00', '55', 'aa', 'ff'} & {text[at : at + 2] for at in range(0, 10, 2)}
         assert isinstance(yaml.safe_load(text), str)
         with pytest.raises(ValueError):
@@ -193,14 +192,14 @@ def test_settings_survive_a_restart_of_the_robot():
     bench = ToolBench(erased=True)
     settings = write(bench)
     bench.emulator.restart_robot()
-    assert bench.at_robot(robot_settings.read_settings()).content == settings
+    assert bench.at_robot(eeprom_records.read_settings()).content == settings
 
 
 def test_settings_are_never_sent_to_the_dongle():
     """The answer that identifies a dongle was dropped: it was taken for an old robot board."""
     bench = ToolBench()
-    writing = robot_settings.write_settings(RobotSettings())
-    for script in (robot_settings.read_settings(), writing):
+    writing = eeprom_records.write_settings(RobotSettings())
+    for script in (eeprom_records.read_settings(), writing):
         with pytest.raises(ProcedureError, match='this is the dongle'):
             bench.at_dongle(script, ROBOT_BOARD)
 
@@ -220,7 +219,7 @@ def test_a_settings_file_holds_every_setting():
     source = random.Random(4)
     for _ in range(50):
         settings = RobotSettings(
-            robot_settings.draw_address(source.randbytes),
+            eeprom_records.draw_address(source.randbytes),
             source.randint(0, 125),
             source.choice(frames.RATES),
             source.choice(frames.POWERS),
@@ -232,11 +231,11 @@ def test_a_settings_file_holds_every_setting():
             source.random() < 0.5,
             tuple(source.choices(SENSORS, k=8)),
         )
-        text = robot_settings.settings_file(settings)
-        assert robot_settings.settings_of_file(yaml.safe_load(text)) == settings
+        text = eeprom_records.settings_file(settings)
+        assert eeprom_records.settings_of_file(yaml.safe_load(text)) == settings
         assert host_of(settings).rate == settings.rate
         other = settings._replace(divider=settings.divider + 1, channel=settings.channel + 1)
-        rows = robot_settings.differences(settings, other)
+        rows = eeprom_records.differences(settings, other)
         assert [row.name for row in rows] == ['channel', 'divider']
 
 
@@ -254,10 +253,10 @@ def test_a_settings_file_holds_every_setting():
     ],
 )
 def test_a_wrong_settings_file_is_rejected_by_name(old, new, words):
-    text = robot_settings.settings_file(RobotSettings(bytes.fromhex('c25a33a6e1')))
+    text = eeprom_records.settings_file(RobotSettings(bytes.fromhex('c25a33a6e1')))
     assert old in text
-    with pytest.raises(robot_settings.SettingsFileError, match=words):
-        robot_settings.settings_of_file(yaml.safe_load(text.replace(old, new, 1)))
+    with pytest.raises(eeprom_records.SettingsFileError, match=words):
+        eeprom_records.settings_of_file(yaml.safe_load(text.replace(old, new, 1)))
 
 
 @pytest.mark.slow
@@ -265,13 +264,13 @@ def test_each_of_two_robots_follows_its_own_host_only():
     """Both receive every packet of the dongle; before they are set up, neither moves."""
     benches = [ToolBench(erased=True) for _ in range(2)]
     for bench in benches:
-        bench.jog(wheel_jog.LEFT, 0.2)
+        bench.jog(manoeuvre.LEFT, 0.2)
         assert bench.board.counters == (0, 0)
     hosts = [host_of(write(bench, seed)) for seed, bench in enumerate(benches)]
     for number, host in enumerate(hosts):
         before = [bench.board.counters for bench in benches]
         for bench in benches:
-            bench.jog(wheel_jog.LEFT, 0.2, link=host)
+            bench.jog(manoeuvre.LEFT, 0.2, link=host)
         moved = [bench.board.counters != old for bench, old in zip(benches, before, strict=True)]
         assert moved == [number == 0, number == 1]
 
@@ -350,25 +349,25 @@ def test_the_wrong_port_and_a_dead_chip_are_reported():
 def test_the_scan_finds_the_robot_and_restores_the_radio(channel, rate):
     bench = ToolBench(channel=channel, rate=rate)
     before, seen = bench.radio(), []
-    script = channel_scan.scan_channels(
+    script = link_test.scan_channels(
         LinkParameters(), ('250k', '1M', '2M'), lambda *report: seen.append(report)
     )
     (result,) = bench.at_dongle(script)
     assert (result.channel, result.rate) == (channel, rate)
     assert result.answered == result.packets == 20
     assert [report[:2] for report in seen] == [(number + 1, 378) for number in range(378)]
-    assert [text for _, _, text in seen if text] == [channel_scan.format_channel(result)]
+    assert [text for _, _, text in seen if text] == [link_test.format_channel(result)]
     assert bench.radio() == before
-    good, advice = channel_scan.recommend([result], LinkParameters())
+    good, advice = link_test.recommend([result], LinkParameters())
     assert not good
     assert f'link.channel to {channel} and' in advice
-    assert channel_scan.recommend([result], LinkParameters(channel=channel, rate=rate))[0]
+    assert link_test.recommend([result], LinkParameters(channel=channel, rate=rate))[0]
 
 
 @pytest.mark.parametrize(
     'script',
     [
-        lambda: channel_scan.scan_channels(LinkParameters(), ('2M',), lambda *report: None),
+        lambda: link_test.scan_channels(LinkParameters(), ('2M',), lambda *report: None),
         lambda: link_test.run_link_test(LinkParameters(channel=40), 50),
     ],
 )
@@ -407,9 +406,7 @@ def test_unplugging_the_dongle_ends_the_scan():
 
     bench.each = pull
     with pytest.raises(ProcedureError, match='not there'):
-        bench.at_dongle(
-            channel_scan.scan_channels(LinkParameters(), ('1M',), lambda *report: None)
-        )
+        bench.at_dongle(link_test.scan_channels(LinkParameters(), ('1M',), lambda *report: None))
 
 
 def test_each_entry_of_the_log_in_words():
@@ -422,7 +419,7 @@ def test_each_entry_of_the_log_in_words():
         (LogKind.IMU, 0): 'the inertial sensor does not answer',
         (LogKind.RADIO, 0): 'the radio chip does not answer',
         (LogKind.BATTERY, 8970): 'battery below its cut-off: 9.0 V',
-        (LogKind.RECORDS, 3): robot_settings.SETTINGS_TEXTS[3],
+        (LogKind.RECORDS, 3): eeprom_records.SETTINGS_TEXTS[3],
         (LogKind.RECORDS, 99): 'records in state 99',
         (LogKind.LOOP, 12345): 'longest pass of the main loop: 12.3 ms',
         (99, 7): 'unknown entry 99: 7',
@@ -436,25 +433,25 @@ def test_each_entry_of_the_log_in_words():
 def test_the_recommended_channel_is_the_best():
     answers = {5: 9, 6: 19, 7: 3}
     found = [ChannelResult(k, '1M', count, 20, 0.0) for k, count in answers.items()]
-    good, advice = channel_scan.recommend(found, LinkParameters())
+    good, advice = link_test.recommend(found, LinkParameters())
     assert not good
     assert advice == (
         'the robot is on another channel or rate than configured: set link.channel to 6 and '
         "link.rate to '1M', or build its firmware for 82 at 1M"
     )
     best = LinkParameters(channel=6)
-    assert channel_scan.recommend(found, best)[1].endswith('ping measures the link quality')
+    assert link_test.recommend(found, best)[1].endswith('ping measures the link quality')
     whole = [found[1]._replace(answered=20)]
-    assert channel_scan.recommend(whole, best) == (True, 'the robot answers as configured')
+    assert link_test.recommend(whole, best) == (True, 'the robot answers as configured')
 
 
 def test_a_scan_without_result_has_a_recommendation():
     bench = ToolBench()
     bench.emulator.inject('jam', math.inf)
     found = bench.at_dongle(
-        channel_scan.scan_channels(LinkParameters(), ('1M',), lambda *report: None)
+        link_test.scan_channels(LinkParameters(), ('1M',), lambda *report: None)
     )
-    good, advice = channel_scan.recommend(found, LinkParameters())
+    good, advice = link_test.recommend(found, LinkParameters())
     assert found == []
     assert not good
     assert 'robot switched on' in advice
@@ -505,7 +502,7 @@ def test_key_mismatch_is_reported(here, there, expected):
 
 @pytest.mark.parametrize(
     'key, wheel, revolutions',
-    [(b'', wheel_jog.LEFT, 1.0), (KEY, wheel_jog.LEFT, -0.3), (KEY, wheel_jog.RIGHT, 0.5)],
+    [(b'', manoeuvre.LEFT, 1.0), (KEY, manoeuvre.LEFT, -0.3), (KEY, manoeuvre.RIGHT, 0.5)],
 )
 def test_jog_turns_one_wheel_and_disables_the_drives(key, wheel, revolutions):
     bench = ToolBench(key)
@@ -515,19 +512,19 @@ def test_jog_turns_one_wheel_and_disables_the_drives(key, wheel, revolutions):
     assert result.target == revolutions * TURN
     assert abs(result.counted - result.target) <= 10
     assert result.other == 0
-    counters = dict(zip((wheel_jog.LEFT, wheel_jog.RIGHT), bench.board.counters, strict=True))
+    counters = dict(zip((manoeuvre.LEFT, manoeuvre.RIGHT), bench.board.counters, strict=True))
     assert counters.pop(wheel) == result.counted
     assert list(counters.values()) == [0]
     assert not bench.board.powered
     assert reported == []
-    text = wheel_jog.format_result(result, wheel, revolutions)
+    text = manoeuvre.format_result(result, wheel, revolutions)
     assert ('forward' in text) == (revolutions > 0)
 
 
 def test_jog_respects_speed_and_acceleration():
     bench, speeds = ToolBench(), []
     bench.each = lambda bench: speeds.append((bench.now_ns, bench.board.speeds[0] / 1e6))
-    task, _ = bench.jog(wheel_jog.LEFT, 1.0, speed=1.5)
+    task, _ = bench.jog(manoeuvre.LEFT, 1.0, speed=1.5)
     assert task.error == ''
     assert max(speed for _, speed in speeds) == pytest.approx(1.5, abs=0.001)
     for (before_ns, before), (after_ns, after) in zip(speeds, speeds[1:], strict=False):
@@ -536,11 +533,11 @@ def test_jog_respects_speed_and_acceleration():
 
 def test_an_interrupted_jog_stops_and_disables_the_drives():
     bench = ToolBench()
-    task = wheel_jog.Jog(
+    task = manoeuvre.Jog(
         LinkParameters(),
         b'',
         random.Random(1).randbytes,
-        wheel_jog.LEFT,
+        manoeuvre.LEFT,
         5.0,
         3.0,
         lambda text: None,
@@ -570,7 +567,7 @@ def test_a_blocked_jog_ends_with_the_reason(fault, expected):
             bench.emulator.inject(fault, 1000.0)
 
     bench.each = block
-    task, _ = bench.jog(wheel_jog.LEFT, 5.0)
+    task, _ = bench.jog(manoeuvre.LEFT, 5.0)
     assert expected in task.error
     bench.emulator.run_to(bench.now_ns + 1_000_000_000)
     assert bench.board.speeds == (0, 0)
@@ -579,7 +576,7 @@ def test_a_blocked_jog_ends_with_the_reason(fault, expected):
 def test_jog_reports_a_robot_that_does_not_answer():
     bench = ToolBench()
     bench.emulator.inject('jam', math.inf)
-    task, reported = bench.jog(wheel_jog.LEFT, 1.0)
+    task, reported = bench.jog(manoeuvre.LEFT, 1.0)
     assert 'does not answer' in task.error
     assert reported == [task.error]
     assert task.result is None
@@ -593,7 +590,7 @@ def test_unplugging_the_dongle_ends_the_jog_and_stops_the_robot():
             bench.emulator.inject('close_port', 1000.0)
 
     bench.each = pull
-    task, _ = bench.jog(wheel_jog.RIGHT, 5.0)
+    task, _ = bench.jog(manoeuvre.RIGHT, 5.0)
     assert 'not there' in task.error
     bench.emulator.run_to(bench.now_ns + 1_000_000_000)
     assert bench.board.speeds == (0, 0)

@@ -18,7 +18,7 @@ import random
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import Close, Open, Wait, Write
-from t3mpc_ros.radio.tool import wheel_jog
+from t3mpc_ros.radio.tool import manoeuvre
 from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, Procedure, ProcedureError
 
 START_NS = 5_000_000_000
@@ -99,7 +99,7 @@ class ToolBench:
 
     def jog(self, wheel, revolutions, key=b'', speed=2.0, link=None):
         reported = []
-        task = wheel_jog.Jog(
+        task = manoeuvre.Jog(
             link or LinkParameters(),
             key,
             random.Random(1).randbytes,

@@ -23,14 +23,25 @@ docs/radio.md has the layouts and units of the wire; this module has SI units.
     stored = run_script(write_calibration(found), '/dev/ttyACM0', interrupted, ROBOT_BOARD)
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import math
+import string
 import struct
 from typing import Any, Generic, NamedTuple, TypeVar
 
+from t3mpc_ros.parameters.table import number_hint
+from t3mpc_ros.parameters.yaml_checks import parameter_file, shortened
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.framing import crc16
-from t3mpc_ros.radio.tool import procedure
+from t3mpc_ros.radio.tool.procedure import (
+    OLD_FIRMWARE,
+    Pause,
+    ProcedureError,
+    Request,
+    Script,
+    request_reply,
+    wait_for_board,
+)
 from t3mpc_ros.robot.calibration import Calibration, DividerCorrection, Estimate, SharpCurve
 
 SENSORS = ('none', 'GP2Y0A21', 'GP2Y0A41')
@@ -98,7 +109,7 @@ class Stored(NamedTuple, Generic[Content]):
         try:
             return Stored(self.state, decode(self.content))
         except ValueError as error:
-            raise procedure.ProcedureError(
+            raise ProcedureError(
                 f'the robot holds a record that this host does not know ({error}): update the host'
             ) from error
 
@@ -280,17 +291,17 @@ def _encode_curve(name: str, curve: SharpCurve | None) -> bytes:
 # -- scripts --------------------------------------------------------------------------------------
 
 
-def read_calibration() -> procedure.Script[Calibration]:
+def read_calibration() -> Script[Calibration]:
     """Return the calibration of the robot, all None if it was never calibrated."""
     stored = yield from read_record(frames.CALIBRATION_RECORD)
     if stored.state == frames.SETTINGS_DAMAGED:
-        raise procedure.ProcedureError(
+        raise ProcedureError(
             'the calibration of the robot is damaged, so it accepts no session: write it again'
         )
     return stored.decoded(decode_calibration).content
 
 
-def write_calibration(calibration: Calibration) -> procedure.Script[Calibration]:
+def write_calibration(calibration: Calibration) -> Script[Calibration]:
     """Store a calibration in both copies; return what the robot now holds, rounded to its units.
 
     It replaces the old one completely: to change a value, write ``read_calibration()`` with it
@@ -301,9 +312,9 @@ def write_calibration(calibration: Calibration) -> procedure.Script[Calibration]
     return decode_calibration((yield from write_record(frames.CALIBRATION_RECORD, body)))
 
 
-def read_samples() -> procedure.Script[frames.Samples]:
+def read_samples() -> Script[frames.Samples]:
     """Return the newest raw samples of distance sensors, battery and inertial sensor."""
-    return (yield from procedure.request_reply(frames.Sense(0), frames.Samples))
+    return (yield from request_reply(frames.Sense(0), frames.Samples))
 
 
 def range_counts(samples: frames.Samples) -> tuple[int, ...]:
@@ -311,26 +322,26 @@ def range_counts(samples: frames.Samples) -> tuple[int, ...]:
     return struct.unpack('<8H', samples.ranges)
 
 
-def read_counts(samples: int) -> procedure.Script[list[tuple[int, ...]]]:
+def read_counts(samples: int) -> Script[list[tuple[int, ...]]]:
     """Return samples of the raw counts: eight distance sensors and, last, the battery."""
-    yield from procedure.wait_for_board()
+    yield from wait_for_board()
     counts = []
     for _ in range(samples):
         sample = yield from read_samples()
         counts.append((*range_counts(sample), sample.battery))
-        yield procedure.Pause(_SAMPLE_PERIOD)
+        yield Pause(_SAMPLE_PERIOD)
     return counts
 
 
-def read_record(record: int) -> procedure.Script[Stored[bytes]]:
+def read_record(record: int) -> Script[Stored[bytes]]:
     """Return a record, after the board has answered."""
-    yield from procedure.wait_for_board()
+    yield from wait_for_board()
     return (yield from _read_parts(record))
 
 
-def write_record(record: int, body: bytes) -> procedure.Script[bytes]:
+def write_record(record: int, body: bytes) -> Script[bytes]:
     """Stage and store a record; return its content. A lost answer is harmless: it is read back."""
-    yield from procedure.wait_for_board()
+    yield from wait_for_board()
     rc = frames.FAILED
     for _ in range(_MAX_ATTEMPTS):
         for part in range(-(-len(body) // frames.PART_SIZE)):
@@ -338,15 +349,15 @@ def write_record(record: int, body: bytes) -> procedure.Script[bytes]:
                 frames.PART_SIZE, b'\0'
             )
             yield from request_part(frames.Record(0, record, part, data))
-        response = yield procedure.Request(frames.Store(0, record, crc16(body)), _WRITE_TIMEOUT)
+        response = yield Request(frames.Store(0, record, crc16(body)), _WRITE_TIMEOUT)
         if isinstance(response.reply, frames.RecordPart):
             rc = response.reply.rc
             if rc in _REASONS:
-                raise procedure.ProcedureError(_REASONS[rc])
+                raise ProcedureError(_REASONS[rc])
         stored = yield from _read_parts(record)
         if stored.state == frames.SETTINGS_GOOD and stored.content == body:
             return body
-    raise procedure.ProcedureError('the robot does not confirm the record: is the cable good?')
+    raise ProcedureError('the robot does not confirm the record: is the cable good?')
 
 
 _REASONS = {
@@ -362,7 +373,7 @@ _REASONS = {
 }
 
 
-def _read_parts(record: int) -> procedure.Script[Stored[bytes]]:
+def _read_parts(record: int) -> Script[Stored[bytes]]:
     first = yield from request_part(frames.Record(0, record, 0))
     body = first.data
     for part in range(1, -(-first.size // frames.PART_SIZE)):
@@ -370,9 +381,182 @@ def _read_parts(record: int) -> procedure.Script[Stored[bytes]]:
     return Stored(first.state, body[: first.size])
 
 
-def request_part(request: frames.Record) -> procedure.Script[frames.RecordPart]:
+def request_part(request: frames.Record) -> Script[frames.RecordPart]:
     """Return the answer to a RECORD, or raise ProcedureError."""
-    reply = yield from procedure.request_reply(request, frames.RecordPart)
+    reply = yield from request_reply(request, frames.RecordPart)
     if reply.rc != frames.OK:
-        raise procedure.ProcedureError(procedure.OLD_FIRMWARE)
+        raise ProcedureError(OLD_FIRMWARE)
     return reply
+
+
+# -- settings: their changes, text and file -------------------------------------------------------
+
+
+SETTINGS_TEXTS = (
+    'settings stored in both copies',
+    'settings stored, one of their two copies is damaged: t3mpc robot setup writes both',
+    'no settings: the robot does not move until t3mpc robot setup --microsteps N stores them',
+    'settings damaged: the robot does not move until t3mpc robot setup',
+    'settings of an older firmware: the robot does not move until t3mpc robot setup',
+    'calibration damaged: the robot does not move until it is written again',
+)
+"""By state of the settings."""
+ADDRESS_SIZE = 5
+_CONFUSABLE = (0x00, 0x55, 0xAA, 0xFF)
+"""Bytes that the receiver takes for noise or a preamble (nRF24L01+ data sheet 1.0, 7.3.2)."""
+_LINK = ('address', 'channel', 'rate')
+"""Settings that are link parameters of the host too."""
+_KINDS = {int: 'a whole number', float: 'a number', bool: 'true or false', str: 'text in quotes'}
+_BOARD = '/robot_board'
+"""Name of no node: a node rejects parameters that it does not have."""
+
+
+class SettingsFileError(Exception):
+    """A file of settings cannot be read or written; the text contains the reason."""
+
+
+StoredSettings = Stored[RobotSettings]
+
+
+class Difference(NamedTuple):
+    """A setting with two values."""
+
+    name: str
+    old: object
+    new: object
+
+
+def draw_address(entropy: Callable[[int], bytes]) -> bytes:
+    """Return a random address; its text is no number, which ROS would not take for a string."""
+    while True:
+        address = entropy(ADDRESS_SIZE)
+        letters = set(address.hex()) & set('abcdf')
+        if letters and len(set(address)) > 1 and not set(address) & set(_CONFUSABLE):
+            return address
+
+
+def parse_address(text: object) -> bytes:
+    """Return an address written as 10 hexadecimal digits; SettingsFileError: it is none."""
+    if not isinstance(text, str):
+        raise SettingsFileError(
+            f'address must be text in quotes, 10 hexadecimal digits: got {shortened(text)}'
+        )
+    if len(text) != 2 * ADDRESS_SIZE or set(text.lower()) - set(string.hexdigits):
+        raise SettingsFileError(
+            f'address must be 10 hexadecimal digits, such as 54334d5043: got {shortened(text)}'
+        )
+    return bytes.fromhex(text)
+
+
+def read_settings() -> Script[StoredSettings]:
+    """Return the settings of the robot."""
+    stored = yield from read_record(frames.SETTINGS_RECORD)
+    return stored.decoded(decode_settings)
+
+
+def change_settings(
+    stored: StoredSettings, changes: Mapping[str, object], entropy: Callable[[int], bytes]
+) -> RobotSettings:
+    """Return the settings with changes, by field name.
+
+    A robot without settings gets a random address, so that two robots never obey one host by
+    accident.
+    """
+    settings = stored.content._replace(**changes)  # type: ignore[arg-type]
+    if not stored.valid and 'address' not in changes:
+        settings = settings._replace(address=draw_address(entropy))
+    check_settings(settings)
+    return settings
+
+
+def write_settings(settings: RobotSettings) -> Script[StoredSettings]:
+    """Store settings in both copies; return what the robot holds."""
+    body = yield from write_record(frames.SETTINGS_RECORD, encode_settings(settings))
+    return StoredSettings(frames.SETTINGS_GOOD, decode_settings(body))
+
+
+def differences(old: RobotSettings, new: RobotSettings) -> list[Difference]:
+    """Return the settings that differ; the sensors one by one."""
+    pairs = [(name, getattr(old, name), getattr(new, name)) for name in old._fields[:-1]]
+    pairs += [
+        (f'sensors[{number}]', before, after)
+        for number, (before, after) in enumerate(zip(old.sensors, new.sensors, strict=True))
+    ]
+    return [Difference(*pair) for pair in pairs if pair[1] != pair[2]]
+
+
+def format_differences(rows: list[Difference]) -> str:
+    """Return one line for each difference."""
+    return '\n'.join(f'{row.name}: {_text(row.old)} -> {_text(row.new)}' for row in rows)
+
+
+def format_settings(stored: StoredSettings) -> str:
+    """Return the settings as text."""
+    lines = [SETTINGS_TEXTS[stored.state]]
+    if not stored.valid:
+        return lines[0]
+    settings = stored.content
+    same = len(set(settings.sensors)) == 1
+    for name in settings._fields[:-1]:
+        lines.append(f'  {name:<15} {_text(getattr(settings, name))}')
+    sensors = settings.sensors[:1] if same else settings.sensors
+    lines.append(f'  {"sensors":<15} {"8 x " if same else ""}{", ".join(sensors)}')
+    return '\n'.join(lines)
+
+
+def settings_file(settings: RobotSettings) -> str:
+    """Return a ROS parameter file: the link parameters of the host, and all other settings."""
+    values: dict[str, object] = settings._asdict()
+    values |= {'address': settings.address.hex(), 'sensors': list(settings.sensors)}
+    link = {name: values.pop(name) for name in _LINK}
+    title = 'Settings of the robot, written by t3mpc robot setup.'
+    return parameter_file(title, {'/**': {'link': link}, _BOARD: values})
+
+
+def settings_of_file(content: object) -> RobotSettings:
+    """Return the settings of a file of :func:`settings_file`, parsed as YAML."""
+    values: dict[str, Any] = {'battery_wired': False}  # which older files lack
+    try:
+        link = content['/**']['ros__parameters']['link']  # type: ignore[index]
+        board = content[_BOARD]['ros__parameters']  # type: ignore[index]
+        values |= {**link, **board}
+        values['address'] = parse_address(values['address'])
+        if not isinstance(values['sensors'], list):
+            raise SettingsFileError(
+                f'sensors must be a list of {SENSOR_COUNT}: got {shortened(values["sensors"])}'
+            )
+        values['sensors'] = tuple(map(str, values['sensors']))
+    except SettingsFileError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise SettingsFileError(
+            f'must be a file of t3mpc robot setup --save, with link below /**, and {_BOARD}'
+        ) from error
+    unknown, missing = (
+        set(values) - {*RobotSettings._fields},
+        {*RobotSettings._fields} - set(values),
+    )
+    if unknown or missing:
+        names = ', '.join(sorted(unknown or missing))
+        raise SettingsFileError(f'{"has unknown" if unknown else "lacks the"} settings: {names}')
+    settings = RobotSettings(**values)
+    for name, kind in RobotSettings.__annotations__.items():
+        value = getattr(settings, name)
+        allowed = {float: (int, float)}.get(kind, (kind,))
+        if kind in (int, bool, float, str) and type(value) not in allowed:
+            raise SettingsFileError(
+                f'{name} must be {_KINDS[kind]}: got {shortened(value)}{number_hint(value)}'
+            )
+    try:
+        check_settings(settings)
+    except (TypeError, ValueError) as error:
+        raise SettingsFileError(str(error)) from error
+    return settings
+
+
+def _text(value: object) -> str:
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, bool):
+        return 'yes' if value else 'no'
+    return str(value)

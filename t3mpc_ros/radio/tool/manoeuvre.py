@@ -21,6 +21,7 @@ within the time to live of a command.
 from collections.abc import Callable
 from dataclasses import replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -333,3 +334,73 @@ class HandTurn(Manoeuvre):
     def _bias(self) -> float:
         """Return the mean rate of the rest before the turn, rad/s."""
         return float(np.mean([rate for *_, rate in self._samples[: self._motion[0] or 1]]))
+
+
+LEFT, RIGHT = 'left', 'right'
+
+
+class JogResult(NamedTuple):
+    """Microsteps counted by the board, forward positive."""
+
+    target: int
+    counted: int
+    other: int
+    """Of the other wheel, expected to be 0."""
+    seconds: float
+
+
+class Jog(Manoeuvre):
+    """Turns one wheel, LEFT or RIGHT, over the link; negative revolutions are backward."""
+
+    _ends_when_silent = False
+    _over_cable = True
+    _late_reason = 'the wheel does not reach its target: does the board count its steps?'
+
+    def __init__(
+        self,
+        parameters: LinkParameters,
+        key: bytes,
+        entropy: Callable[[int], bytes],
+        wheel: str,
+        revolutions: float,
+        speed: float,
+        report: Callable[[str], None],
+    ) -> None:
+        if wheel not in (LEFT, RIGHT):
+            raise ValueError(f'wheel must be {LEFT} or {RIGHT}: got {wheel}')
+        self._right = wheel == RIGHT
+        self._angle = math.tau * revolutions
+        angles = WheelAngles(self._angle, 0.0) if self._right else WheelAngles(0.0, self._angle)
+        super().__init__(parameters, key, entropy, angles, speed, report)
+
+    @property
+    def result(self) -> JogResult | None:
+        """Counts of the board so far."""
+        info, travelled = self.link.info, self.travelled
+        if info is None or travelled is None:
+            return None
+        steps = info.steps_per_rev * info.microsteps
+        way, other = travelled if self._right else reversed(travelled)
+        target, counted, idle = (
+            round(angle * steps / math.tau) for angle in (self._angle, way, other)
+        )
+        return JogResult(target, counted, idle, self.seconds)
+
+
+def format_result(result: JogResult, wheel: str, revolutions: float) -> str:
+    """Return the result as text, with the expected motion and remedies."""
+    way, top = ('forward', 'front') if revolutions > 0 else ('backward', 'back')
+    other = RIGHT if wheel == LEFT else LEFT
+    return '\n'.join(
+        (
+            f'{wheel}: {result.counted} microsteps counted, target {result.target}; '
+            f'{other}: {result.other}; {result.seconds:.1f} s',
+            f'Expected: {abs(revolutions):g} turns {way} of the {wheel} wheel (its top moves to '
+            f'the {top}), standstill of the {other} wheel. Otherwise:',
+            '  the other wheel turned: swap the cables of the two drivers',
+            f'  reverse direction: t3mpc robot setup --invert {wheel} (or both), over the USB of '
+            'the robot board, or swap the wires of one motor coil',
+            '  more or fewer turns: t3mpc robot setup --microsteps as the jumpers of the drivers',
+            '  humming or lost steps: more motor current, or a lower --speed',
+        )
+    )
