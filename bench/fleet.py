@@ -38,8 +38,7 @@ import time
 from typing import NamedTuple
 
 from bench.recorder_load import processor_time
-from t3mpc_ros.cli.private_graph import PrivateGraph
-from t3mpc_ros.cli.process_group import ProcessGroup
+from t3mpc_ros.cli.process_group import PrivateGraph, ProcessGroup
 
 NODES = ('sim_robot', 'reference_generator', 'controller', 'recorder')
 LAYOUTS = ('processes', 'composed', 'domains', 'server')

@@ -33,8 +33,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 
 from support.robot_page import FOCUS, LATCHED, RobotPage  # noqa: E402
 
-from t3mpc_ros.cli.private_graph import PrivateGraph  # noqa: E402
-from t3mpc_ros.cli.process_group import ProcessGroup  # noqa: E402
+from t3mpc_ros.cli.process_group import PrivateGraph, ProcessGroup  # noqa: E402
 
 TABS = (1, 2, 6, 7, 12)
 WATCH = """

@@ -36,8 +36,11 @@ sys.path[:0] = [str(ROOT), str(ROOT / 'test')]
 from support.browser import SIZES, Browser  # noqa: E402
 from support.recorded_stories import STORIES  # noqa: E402
 
-from t3mpc_ros.cli.private_graph import PrivateGraph  # noqa: E402
-from t3mpc_ros.cli.process_group import ProcessGroup, executable  # noqa: E402
+from t3mpc_ros.cli.process_group import (  # noqa: E402
+    PrivateGraph,
+    ProcessGroup,
+    executable,
+)
 from t3mpc_ros.cli.view import PAGE_AT  # noqa: E402
 from t3mpc_ros.evaluation.bag_report.report_page import write_report  # noqa: E402
 

@@ -33,8 +33,7 @@ import tempfile
 import time
 
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.cli.private_graph import PrivateGraph
-from t3mpc_ros.cli.process_group import ProcessGroup
+from t3mpc_ros.cli.process_group import PrivateGraph, ProcessGroup
 
 FIELDS = {
     'nav_msgs/msg/Odometry': 'pose.pose.position.x',

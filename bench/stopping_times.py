@@ -42,7 +42,7 @@ import rclpy
 from sensor_msgs.msg import JointState
 from support.waiting import Processes, WaitTimeoutError, wait_until
 
-from t3mpc_ros.cli.private_graph import PrivateGraph
+from t3mpc_ros.cli.process_group import PrivateGraph
 from t3mpc_ros.emulator.emulator import Emulator, EmulatorParameters
 from t3mpc_ros.emulator.pty_port import PtyPort, serve
 from t3mpc_ros.geometry.types import NANOSECONDS

@@ -33,8 +33,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT)]
 
 from bench.recorder_load import processor_time  # noqa: E402
-from t3mpc_ros.cli.private_graph import PrivateGraph  # noqa: E402
-from t3mpc_ros.cli.process_group import ProcessGroup  # noqa: E402
+from t3mpc_ros.cli.process_group import PrivateGraph, ProcessGroup  # noqa: E402
 from t3mpc_ros.cli.view import PAGE_AT  # noqa: E402
 
 NODES = ('sim_robot', 'reference_generator', 'controller')

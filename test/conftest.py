@@ -27,7 +27,7 @@ from support import processor_wait
 from support.missing_tools import list_missing, skip
 from support.waiting import TIMEOUTS, Processes
 
-from t3mpc_ros.cli.private_graph import PrivateGraph
+from t3mpc_ros.cli.process_group import PrivateGraph
 
 ROOT = Path(__file__).resolve().parent
 DEFAULT = ('geometry', 'parameters', 'robot', 'fuzzy', 'test_launch_files.py')

@@ -22,8 +22,15 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from t3mpc_ros.cli.argument_parser import ArgumentParser, RemovedOption, run_command
-from t3mpc_ros.cli.shared_options import add_json, add_topic_options, print_result, report_options
+from t3mpc_ros.cli.shared_options import (
+    ArgumentParser,
+    RemovedOption,
+    add_json,
+    add_topic_options,
+    print_result,
+    report_options,
+    run_command,
+)
 from t3mpc_ros.cli.train import add_bag_options, run_bags
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 

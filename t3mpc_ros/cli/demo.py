@@ -22,8 +22,12 @@ import time
 from typing import TYPE_CHECKING
 import webbrowser
 
-from t3mpc_ros.cli.private_graph import PrivateGraph
-from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup, StopRequestedError
+from t3mpc_ros.cli.process_group import (
+    PrivateGraph,
+    ProcessError,
+    ProcessGroup,
+    StopRequestedError,
+)
 from t3mpc_ros.cli.view import PAGE_AT
 from t3mpc_ros.nodes.registry import CALIBRATED_GYRO
 from t3mpc_ros.parameters.command_line import parse_assignments

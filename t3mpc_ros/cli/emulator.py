@@ -21,7 +21,7 @@ import os
 from pathlib import Path
 import sys
 
-from t3mpc_ros.cli.argument_parser import ArgumentParser
+from t3mpc_ros.cli.shared_options import ArgumentParser
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultError, parse_fault
 from t3mpc_ros.parameters.command_line import bounded_float, parse_assignments
 from t3mpc_ros.parameters.table import ParameterError

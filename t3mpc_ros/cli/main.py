@@ -35,8 +35,15 @@ from t3mpc_ros.cli import (
     tune,
     view,
 )
-from t3mpc_ros.cli.argument_parser import ArgumentParser, reject_removed, run_command
-from t3mpc_ros.cli.shared_options import add_json, add_seeds, prepare_outputs, print_result
+from t3mpc_ros.cli.shared_options import (
+    ArgumentParser,
+    add_json,
+    add_seeds,
+    prepare_outputs,
+    print_result,
+    reject_removed,
+    run_command,
+)
 from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.parameters.command_line import bounded_float
 

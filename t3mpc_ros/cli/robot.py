@@ -22,8 +22,14 @@ import sys
 from typing import Any, TypeVar
 
 from t3mpc_ros.cli import robot_calibrate
-from t3mpc_ros.cli.argument_parser import ArgumentParser, ask_line, check_two_ports
-from t3mpc_ros.cli.shared_options import STANDARD_OUTPUT, add_json, print_result
+from t3mpc_ros.cli.shared_options import (
+    STANDARD_OUTPUT,
+    ArgumentParser,
+    add_json,
+    ask_line,
+    check_two_ports,
+    print_result,
+)
 from t3mpc_ros.parameters import command_line
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.parameters.yaml_checks import YamlError, file_errors, read_yaml

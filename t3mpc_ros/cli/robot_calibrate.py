@@ -22,7 +22,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
-from t3mpc_ros.cli.argument_parser import ask_line, check_two_ports
+from t3mpc_ros.cli.shared_options import ask_line, check_two_ports
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_writable
 from t3mpc_ros.parameters.table import ParameterError

@@ -27,7 +27,7 @@ from t3mpc_ros.stop_signal import StopSignal
 
 if TYPE_CHECKING:
     from t3mpc_ros.nodes.viewer import ViewNode
-    from t3mpc_ros.view.run_status import LiveRun
+    from t3mpc_ros.view.live_data import LiveRun
     from t3mpc_ros.view.server import PageServer
 
 DEFAULT_PORT = 8765
@@ -57,7 +57,7 @@ def add_parser(commands: Any) -> None:
 
 def _view(options: argparse.Namespace) -> None:
     # Imported only when it is used: `t3mpc --help` stays fast.
-    from t3mpc_ros.view.run_status import LiveRun
+    from t3mpc_ros.view.live_data import LiveRun
     from t3mpc_ros.view.server import PageServer
 
     with StopSignal() as stop:

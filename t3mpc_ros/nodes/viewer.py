@@ -110,7 +110,7 @@ class CommandFailedError(RuntimeError):
 class ViewNode(Node):
     """Collects samples, facts and reports of the robot in a namespace, and executes commands.
 
-    ``sink``, a :class:`~t3mpc_ros.view.run_status.LiveRun`, gets them in the thread of
+    ``sink``, a :class:`~t3mpc_ros.view.live_data.LiveRun`, gets them in the thread of
     :meth:`spin`.
     """
 

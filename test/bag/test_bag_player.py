@@ -23,18 +23,16 @@ from rosbags.rosbag2.metadata import parse_qos
 from support.bag_messages import STORE, TYPES, serialised
 
 from t3mpc_ros.bag.mcap_file import SerializedMessage
-from t3mpc_ros.bag.merged_reader import (
-    MIN_LOOP_NS,
-    MergedReader,
-    ScheduledMessage,
-    alignment_offsets_ns,
-    transient_local_count,
-)
 from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.player import (
+    MIN_LOOP_NS,
+    MergedReader,
     PlaybackParameters,
     PlaybackTimeline,
     ReadAheadQueue,
+    ScheduledMessage,
+    alignment_offsets_ns,
+    transient_local_count,
     velocity_command_risk,
 )
 from t3mpc_ros.bag.qos import (

@@ -24,9 +24,8 @@ from support.object_state import differences
 from support.properties import PROPERTY, STATEFUL
 
 from t3mpc_ros.bag.mcap_file import Attachment, SerializedMessage
-from t3mpc_ros.bag.merged_reader import ScheduledMessage
 from t3mpc_ros.bag.message_definitions import MessageDefinitions
-from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline
+from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline, ScheduledMessage
 from t3mpc_ros.bag.recording.snapshot import CircularMessageCache
 from t3mpc_ros.bag.writer import BagWriter
 

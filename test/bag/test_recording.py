@@ -37,15 +37,13 @@ from t3mpc_ros.bag.player import PlaybackParameters
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.recording.snapshot import (
+    REPORT_TIMEOUT_NS,
     CircularMessageCache,
+    DiagnosticsMonitor,
+    SnapshotRateLimiter,
     SnapshotWriter,
     snapshot_folder_name,
     unused_folder,
-)
-from t3mpc_ros.bag.recording.snapshot_trigger import (
-    REPORT_TIMEOUT_NS,
-    DiagnosticsMonitor,
-    SnapshotRateLimiter,
 )
 from t3mpc_ros.bag.recording.writer_thread import WriterThread
 from t3mpc_ros.bag.topic_filter import TopicFilter, TopicFilterError

@@ -33,7 +33,7 @@ from support.waiting import communicate, run, wait_until
 
 from t3mpc_ros.cli import process_group
 from t3mpc_ros.cli.main import DEMO_EXIT_CODES, _new_run, main
-from t3mpc_ros.cli.private_graph import DOMAINS, NoDomainError, PrivateGraph, used_domains
+from t3mpc_ros.cli.process_group import DOMAINS, NoDomainError, PrivateGraph, used_domains
 
 pytestmark = pytest.mark.slow
 
@@ -388,7 +388,7 @@ def test_a_private_graph_is_not_in_the_domain_of_the_caller(monkeypatch):
         assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] != 'SUBNET'
         assert 'ROS_STATIC_PEERS' not in environment
         # Another process, of another checkout perhaps, gets none of them.
-        code = 'from t3mpc_ros.cli.private_graph import PrivateGraph; PrivateGraph()'
+        code = 'from t3mpc_ros.cli.process_group import PrivateGraph; PrivateGraph()'
         other = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
         assert 'NoDomainError' in other.stderr
         free = graphs[0]

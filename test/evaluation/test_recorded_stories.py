@@ -35,7 +35,7 @@ from support.recorded_stories import STORIES, TWIN, Story
 
 from t3mpc_ros.cli.bag_view import recorded_run
 from t3mpc_ros.cli.main import main as t3mpc
-from t3mpc_ros.evaluation.bag_report.causes import cause_of
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import cause_of
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
 
 LOSSES = {'losses': {'undiscovered': '25', 'undiscovered /imu/data_raw': '25'}}

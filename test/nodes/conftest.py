@@ -18,7 +18,7 @@ from types import SimpleNamespace
 import pytest
 from support.waiting import Processes
 
-from t3mpc_ros.cli.private_graph import PrivateGraph
+from t3mpc_ros.cli.process_group import PrivateGraph
 
 
 @pytest.fixture(scope='module')

@@ -37,8 +37,8 @@ from std_srvs.srv import Trigger
 from support.ros_graph import LATCHED, diagnostic, diagnostic_level, odometry, reason, twist
 from support.waiting import wait_until
 
-from t3mpc_ros.bag.merged_reader import MergedReader
 from t3mpc_ros.bag.message_definitions import BagError
+from t3mpc_ros.bag.player import MergedReader
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.writer import BagWriter

@@ -31,7 +31,7 @@ from t3mpc_ros.nodes.base_node import WARN
 from t3mpc_ros.nodes.remote_parameters import parameter_row
 from t3mpc_ros.nodes.sim_robot import SimRobotNode, SimRobotParameters
 from t3mpc_ros.nodes.viewer import REPLY_TIMEOUT, CommandFailedError, ViewNode
-from t3mpc_ros.view.run_status import LiveRun
+from t3mpc_ros.view.live_data import LiveRun
 
 pytestmark = pytest.mark.ros
 

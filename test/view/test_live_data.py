@@ -20,8 +20,19 @@ import numpy as np
 import pytest
 from support.page_data import read_all
 
-from t3mpc_ros.view.live_data import MAX_CHANGES, MAX_EVENTS, SPAN, Cursor, LiveData
-from t3mpc_ros.view.run_status import LOST, LOST_REMEDY, MAX_AGE, LiveRun, NodeReport, banner
+from t3mpc_ros.view.live_data import (
+    LOST,
+    LOST_REMEDY,
+    MAX_AGE,
+    MAX_CHANGES,
+    MAX_EVENTS,
+    SPAN,
+    Cursor,
+    LiveData,
+    LiveRun,
+    NodeReport,
+    banner,
+)
 
 
 def test_readers_of_any_pace_get_every_sample_once_and_in_order():

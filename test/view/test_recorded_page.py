@@ -26,8 +26,7 @@ from support.robot_bags import following_rows, write
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag_view import recorded_run
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
-from t3mpc_ros.view.live_data import LiveData
-from t3mpc_ros.view.run_status import LiveRun
+from t3mpc_ros.view.live_data import LiveData, LiveRun
 from t3mpc_ros.view.server import PageServer
 
 pytestmark = pytest.mark.slow

@@ -11,9 +11,9 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Diagnostics over time: warnings of every node, and metrics of a radio link."""
+"""Diagnostics over time: metrics of a radio link, warnings of every node, and their causes."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 import math
 from typing import Any, NamedTuple
@@ -207,3 +207,157 @@ def _numbers(status: Any) -> dict[str, float]:
             continue  # not a number or missing: unknown
         numbers[key] = value if math.isfinite(value) else math.nan
     return numbers
+
+
+# -- why a robot stands ---------------------------------------------------------------------------
+
+
+ROBOT, CONTROLLER, MACHINE = 0, 1, 2
+"""Sources of causes in the order of their report: the later ones often follow from the others."""
+_SOURCES = {
+    'sim_robot': ROBOT,
+    'radio_bridge': ROBOT,
+    'controller': CONTROLLER,
+    'reference_generator': MACHINE,
+    'recorder': MACHINE,
+    'player': MACHINE,
+}
+"""By node; every other node is one of the robot's."""
+REASON_WINDOW = 1.5
+"""Diagnostics come once a second: those of a stop are at most this far from its start, s."""
+REASON_LEAD = 0.5
+"""Diagnostics of a cause are at most this far before the stop, s, or still hold then."""
+
+
+class Cause(NamedTuple):
+    """Why a robot stands or is disturbed."""
+
+    name: str
+    """What happened, in a few words; empty if nothing is known."""
+    remedy: str = ''
+    """What a reader does about it, as a sentence; empty if there is nothing to do."""
+    text: str = ''
+    """What the nodes said."""
+    source: int = MACHINE
+
+    @property
+    def known(self) -> bool:
+        """Whether a node gave a reason."""
+        return bool(self.name)
+
+
+class Pattern(NamedTuple):
+    """A text of diagnostics and the cause that it stands for."""
+
+    text: str
+    """What the diagnostics contain."""
+    name: str
+    remedy: str
+    stops: bool = True
+    """Whether it stops the robot; else it is a condition under which it drives on."""
+
+
+SLIP = 'a wheel slips'
+"""Part of the reports of a robot whose gyro and steps disagree."""
+_CHARGE = 'Charge the battery.'
+OVERLOADED = 'The machine was overloaded'
+END_PROGRAMS = 'End other programs, or use a faster machine, and repeat the run.'
+PATTERNS = (
+    Pattern(
+        'emergency stop was released', 'Waiting after an e-stop', 'Command it again.',
+    ),
+    Pattern(
+        'emergency stop', 'E-stop',
+        'When the way is clear, release it with the service e_stop; the robot then waits for a '
+        'new command.',
+    ),
+    Pattern(
+        'gyro and steps disagree', 'Slip stop: a wheel slips, is blocked, or has lost steps',
+        'Free the wheels, then command no motion for 0.5 s.',
+    ),
+    Pattern('brown-out', 'Brown-out: the board restarted', _CHARGE),
+    Pattern('below its cut-off', 'Battery below its cut-off', _CHARGE),
+    Pattern(
+        'robot does not answer', 'The robot did not answer',
+        'See that it is on, in range and on the same channel.',
+    ),
+    Pattern(
+        'no command reached the robot', 'No command reached the robot',
+        'Move the dongle nearer to it, or change the channel.',
+    ),
+    Pattern(
+        'dongle', 'The dongle did not answer', 'See its cable and its port.',
+    ),
+    Pattern('the last command has expired', 'No command', 'See why the controller fell silent.'),
+    Pattern('no command', 'No command', 'See why the controller fell silent.'),
+    Pattern('disabled by request', 'Controller disabled', 'Enable it with ~/enable.'),
+    Pattern(
+        'reference is stale', 'Reference too old',
+        'See why the reference generator fell silent.',
+    ),
+    Pattern('no reference yet', 'No reference', 'Start a reference generator.'),
+    Pattern(
+        'odom is too old', 'Odometry too old',
+        'See the processor, the network and the clocks of the computers.',
+    ),
+    Pattern(
+        'odom is from the future', 'Odometry from the future', 'Set the clocks of the computers.',
+    ),
+    Pattern('no odometry', 'No odometry', 'See why the robot fell silent.'),
+    Pattern('odometry is not finite', 'Odometry is not finite', 'See the sensors of the robot.'),
+    Pattern('state is diverging', 'The state diverged', 'See the wheels and the parameters.'),
+    Pattern('odometry has restarted', 'Odometry restarted', 'See why the robot restarted.'),
+    Pattern(
+        'does not follow commands', 'The robot did not follow its commands',
+        'See its drives and its supply.',
+    ),
+    Pattern('battery is low', 'Battery low', _CHARGE, stops=False),
+    Pattern(
+        'inertial sensor does not answer', 'Inertial sensor silent', 'See its wiring.',
+        stops=False,
+    ),
+    Pattern(
+        SLIP, 'A wheel slipped', 'See the floor, the tyres and the load.',
+        stops=False,
+    ),
+    Pattern('processor overloaded', OVERLOADED, END_PROGRAMS, stops=False),
+    Pattern('real-time factor', OVERLOADED, END_PROGRAMS, stops=False),
+)  # fmt: skip
+"""Of two that a text contains the earlier one is meant."""
+
+
+def cause_of(event: DiagnosticEvent, *, stops: bool = True) -> Cause | None:
+    """Return the cause that a warning or error stands for.
+
+    With ``stops`` that of a standstill: an unknown warning is none, an unknown error is one.
+    """
+    _, level, node, text = event
+    found = next((each for each in PATTERNS if each.text in text and level != 'ok'), None)
+    source = _SOURCES.get(node.split(':')[0].rpartition('/')[2].strip(), ROBOT)
+    if found and found.name == OVERLOADED:
+        source = MACHINE
+    if found is not None and found.stops == stops:
+        return Cause(found.name, found.remedy, f'{node}: {text}', source)
+    if found is None and stops and level == 'error' and source != MACHINE:
+        first = text.split('; ')[0]  # what follows is about something else
+        return Cause(f'{node}: {first}', '', f'{node}: {text}', source)
+    return None
+
+
+def cause_between(changes: Sequence[DiagnosticEvent], start: float, end: float) -> Cause:
+    """Return the cause of a standstill from ``start`` to ``end``, s.
+
+    From what the nodes reported about its start, and from what still applied then.
+    """
+    until = max(math.nextafter(start, end), min(end, start + 10.0)) + REASON_WINDOW
+    near = [each for each in changes if start - REASON_LEAD <= each[0] <= until]
+    active: dict[str, DiagnosticEvent] = {}
+    for each in changes:
+        if each[0] < start - REASON_LEAD:
+            active[each[2]] = each
+    found = [cause for each in [*near, *active.values()] if (cause := cause_of(each))]
+    if not found:
+        texts = [f'{node}: {text}' for _, level, node, text in near if level != 'ok']
+        words = '; '.join(dict.fromkeys(texts[:2]))
+        return Cause('', text=words or 'the bag holds no diagnostics of that time')
+    return min(found, key=lambda each: each.source)  # of equal ones the first

@@ -21,7 +21,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.causes import SLIP, Cause, cause_between
 from t3mpc_ros.evaluation.bag_report.continuity import (
     MIN_GAP,
     POSE_JUMP,
@@ -29,6 +28,7 @@ from t3mpc_ros.evaluation.bag_report.continuity import (
     pose_jumps,
     several_robots,
 )
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import SLIP, Cause, cause_between
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, moves
 from t3mpc_ros.evaluation.record import spans_of
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH

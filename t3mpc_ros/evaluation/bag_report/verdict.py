@@ -25,7 +25,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.evaluation.bag_report.causes import END_PROGRAMS, OVERLOADED, Cause, cause_of
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import (
+    END_PROGRAMS,
+    OVERLOADED,
+    Cause,
+    cause_of,
+)
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents, driving
 from t3mpc_ros.evaluation.bag_report.run_data import Run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (

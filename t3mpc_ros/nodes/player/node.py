@@ -25,9 +25,8 @@ from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from t3mpc_ros.bag.merged_reader import MergedReader
 from t3mpc_ros.bag.message_definitions import BagError
-from t3mpc_ros.bag.player import PlaybackParameters, PlaybackTimeline, ReadAheadQueue
+from t3mpc_ros.bag.player import MergedReader, PlaybackParameters, PlaybackTimeline, ReadAheadQueue
 from t3mpc_ros.bag.qos import read_qos_overrides
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import qos

@@ -28,9 +28,8 @@ from rclpy.qos import (
     ReliabilityPolicy,
 )
 
-from t3mpc_ros.bag.merged_reader import MergedReader
 from t3mpc_ros.bag.message_definitions import BagError
-from t3mpc_ros.bag.player import VELOCITY_TYPES, velocity_command_risk
+from t3mpc_ros.bag.player import VELOCITY_TYPES, MergedReader, velocity_command_risk
 from t3mpc_ros.bag.qos import UNLIMITED, QosProfile, adapt_offer_to_recorded_offers
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import conversions

@@ -30,11 +30,12 @@ from std_srvs.srv import Trigger
 from t3mpc_ros.bag.mcap_file import LOSSES, Attachment, message_loss_record
 from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions, UnknownTypeError
 from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
-from t3mpc_ros.bag.recording.snapshot import CircularMessageCache, SnapshotWriter
-from t3mpc_ros.bag.recording.snapshot_trigger import (
+from t3mpc_ros.bag.recording.snapshot import (
+    CircularMessageCache,
     DiagnosticsMonitor,
     NodeFault,
     SnapshotRateLimiter,
+    SnapshotWriter,
 )
 from t3mpc_ros.bag.recording.writer_thread import WriterThread
 from t3mpc_ros.bag.topic_filter import TopicFilter
