@@ -424,17 +424,26 @@ def message_loss_record(
     return table
 
 
-def message_loss_notes(records: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """Return a sentence for each topic and cause in the loss record of a bag.
+def message_losses(records: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, int]]:
+    """Return the number of missing messages by cause and topic.
 
-    ``records`` are the metadata records of the bag, by name.
+    ``records`` are the metadata records of a bag, by name.
     """
-    notes = []
+    found: dict[str, dict[str, int]] = {cause: {} for cause in LOSS_CAUSES}
     for key, count in records.get(LOSSES, {}).items():
         cause, _, topic = key.partition(' ')
-        if topic and cause in LOSS_CAUSES:
-            notes.append(f'{count} messages of {topic} are missing: {LOSS_CAUSES[cause]}.')
-    return notes
+        if topic and cause in found and count.isdecimal():
+            found[cause][topic] = int(count)
+    return found
+
+
+def message_loss_notes(records: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Return a sentence for each topic and cause of :func:`message_losses`."""
+    return [
+        f'{count} messages of {topic} are missing: {LOSS_CAUSES[cause]}.'
+        for cause, topics in message_losses(records).items()
+        for topic, count in topics.items()
+    ]
 
 
 @contextmanager

@@ -24,7 +24,7 @@ from typing import Any
 import yaml
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.bag.qos import QosProfile, dump_yaml
+from t3mpc_ros.bag.qos import TRANSIENT_LOCAL, QosProfile, dump_yaml
 
 METADATA_FILE_NAME = 'metadata.yaml'
 METADATA_VERSION = 9
@@ -45,6 +45,11 @@ class TopicInformation:
     type_hash: str = ''
     message_count: int = 0
     serialization_format: str = 'cdr'
+
+    @property
+    def transient_local_count(self) -> int:
+        """Number of transient-local publishers."""
+        return sum(p.durability == TRANSIENT_LOCAL for p in self.offered_qos_profiles)
 
     def merged(self, other: 'TopicInformation') -> 'TopicInformation':
         """Return this topic with the messages, and the other profiles, of ``other``."""

@@ -29,7 +29,6 @@ from typing import Generic, NamedTuple, Self, TypeVar
 from t3mpc_ros.bag.mcap_file import RECEIVE_TIME, SerializedMessage
 from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.metadata import TopicInformation
-from t3mpc_ros.bag.qos import TRANSIENT_LOCAL
 from t3mpc_ros.bag.reader import BagFile, BagReader, merge_streams, merge_topics, open_bag
 from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilterError, parse_remappings
 from t3mpc_ros.geometry.types import NANOSECONDS
@@ -127,8 +126,7 @@ class MergedReader:
         """
         found: list[SerializedMessage] = []
         for name, topic in self.topics.items():
-            count = transient_local_count(topic)
-            if not count:
+            if not (count := topic.transient_local_count):
                 continue
             earlier = [
                 message._replace(topic=name, received_ns=message.received_ns + offset)
@@ -187,11 +185,6 @@ def _last_before(file: BagFile, topic: str, stamp_ns: int, count: int) -> list[S
         found = [*file.messages([topic], start_ns, stop_ns, skip_damaged=True), *found]
         stop_ns, lookback_ns = start_ns, 2 * lookback_ns
     return found[-count:]
-
-
-def transient_local_count(topic: TopicInformation) -> int:
-    """Return the number of transient-local publishers of a topic."""
-    return sum(each.durability == TRANSIENT_LOCAL for each in topic.offered_qos_profiles)
 
 
 def loop_duration_ns(begin_ns: int, end_ns: int) -> int:

@@ -20,6 +20,7 @@ runs, and that no other private graph of the machine reserves.
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+import json
 import os
 from pathlib import Path
 import random
@@ -121,7 +122,8 @@ class ProcessGroup:
         if given:
             command.append('--ros-args')
             for key, value in given.items():
-                command += ['-p', f'{key}:={yaml_value(value)}']
+                # JSON is YAML, which the parser of ROS reads.
+                command += ['-p', f'{key}:={json.dumps(value, ensure_ascii=False)}']
         with self.log(name).open('ab') as output:
             self._log_start[name] = output.tell()
             self._processes[name] = subprocess.Popen(
@@ -248,17 +250,6 @@ class ProcessGroup:
     def _tail(self, name: str) -> str:
         lines = self._fresh_output(name).splitlines()[-12:]
         return '\n'.join(f'  {line}' for line in lines)
-
-
-def yaml_value(value: object) -> str:
-    """Return a parameter value as ``-p name:=value`` takes it."""
-    if isinstance(value, bool):
-        return 'true' if value else 'false'
-    if isinstance(value, list | tuple):
-        return '[' + ', '.join(map(yaml_value, value)) + ']'
-    if isinstance(value, str):
-        return '"' + value.replace('\\', '\\\\').replace('"', '\\"') + '"'
-    return repr(value)
 
 
 # -- private graph --------------------------------------------------------------------------------

@@ -162,7 +162,7 @@ def calibrate(
     if path.exists():
         start, known = read_parameter_file(path)
         link = known | link
-    elif robot.has_usb:
+    elif options.robot_port:
         try:
             start = robot.stored()
         except Interrupted as interruption:

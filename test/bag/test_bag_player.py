@@ -32,7 +32,6 @@ from t3mpc_ros.bag.player import (
     ReadAheadQueue,
     ScheduledMessage,
     alignment_offsets_ns,
-    transient_local_count,
     velocity_command_risk,
 )
 from t3mpc_ros.bag.qos import (
@@ -152,7 +151,7 @@ def test_every_format_returns_every_byte_in_file_order(write, tape, tmp_path):
         '/b': 200,
         '/map': 4,
     }
-    assert transient_local_count(made.topics['/map']) == 1
+    assert made.topics['/map'].transient_local_count == 1
     assert made.topics['/a'].offered_qos_profiles[0].durability == 'volatile'
     assert made.topics['/a'].type_name == TEXT
 

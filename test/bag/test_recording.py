@@ -35,8 +35,8 @@ from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.player import PlaybackParameters
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
-from t3mpc_ros.bag.recording.snapshot import (
+from t3mpc_ros.bag.recording_parameters import RecordingParameters
+from t3mpc_ros.bag.snapshot import (
     REPORT_TIMEOUT_NS,
     CircularMessageCache,
     DiagnosticsMonitor,
@@ -45,7 +45,6 @@ from t3mpc_ros.bag.recording.snapshot import (
     snapshot_folder_name,
     unused_folder,
 )
-from t3mpc_ros.bag.recording.writer_thread import WriterThread
 from t3mpc_ros.bag.topic_filter import TopicFilter, TopicFilterError
 from t3mpc_ros.bag.writer import (
     AttachmentError,
@@ -54,6 +53,7 @@ from t3mpc_ros.bag.writer import (
     FolderError,
     read_attachment,
 )
+from t3mpc_ros.bag.writer_thread import WriterThread
 from t3mpc_ros.parameters.table import ParameterError
 
 SECOND = 1_000_000_000
@@ -482,7 +482,7 @@ def snapshots(tmp_path):
     thread = WriterThread(None, 0, lambda: 0)
     cache = CircularMessageCache(100 * SECOND, 10**6)
     made = SnapshotWriter(tmp_path, cache, MessageDefinitions(), thread)
-    made.add_topic(TopicInformation('/n', NUMBER), 0)
+    made.add_topic(TopicInformation('/n', NUMBER))
 
     def take(attachments=()):
         done, results = threading.Event(), []
@@ -499,7 +499,7 @@ def snapshots(tmp_path):
 
 
 def test_snapshot_is_a_bag_with_its_reason(snapshots):
-    snapshots.add_topic(TopicInformation('/quiet', NUMBER), 0)
+    snapshots.add_topic(TopicInformation('/quiet', NUMBER))
     snapshots.add([message('/n', i / 10) for i in range(450)] + [message('/unknown', 50)])
     folder, success, text = snapshots.take([(Attachment('a', 'text/plain', b'x'), START)])
     assert success
@@ -520,7 +520,7 @@ def test_a_topic_that_appears_meanwhile_is_not_in_the_snapshot(snapshots):
     snapshots.add([message('/n', i) for i in range(5)] + [message('/late', 5)])
 
     def attachments():
-        snapshots.add_topic(TopicInformation('/late', NUMBER), 0)
+        snapshots.add_topic(TopicInformation('/late', NUMBER))
         yield Attachment('a', 'text/plain', b'x'), START
 
     folder, success, _ = snapshots.take(attachments())

@@ -222,7 +222,7 @@ def test_the_likeliest_topic_is_chosen_and_the_others_are_listed(tmp_path, capsy
     assert 'taken from /wheels/odometry; there is also /gps/odom_map (--odom chooses).' in page
     assert 'taken from /base/cmd_vel; there is also /joy/velocity (--cmd-vel chooses).' in page
     run = run_of(folder, ReportOptions(odom='/gps/odom_map', cmd_vel='/joy/velocity'))
-    assert not any('taken from' in note for note in run.notes)
+    assert not any('taken from' in note for note in run.remarks)
     assert run.topics[ODOMETRY] == '/gps/odom_map'
     assert run.motions[ODOMETRY].time[-1] < 6.0
 

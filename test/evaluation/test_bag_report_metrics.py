@@ -457,9 +457,9 @@ def test_the_geometry_is_that_of_the_robot(tmp_path, metadata_records, expected,
     run = run_of(tmp_path, until(1.0, *SCALARS), metadata_records)
     assert run.geometry == expected
     if complaint:
-        assert any(complaint in note for note in run.notes)
+        assert any(complaint in note for note in run.oddities + run.remarks)
     assumed = '0.035 m radius and 0.147 m apart are assumed'
-    assert any(assumed in note for note in run.notes) == bool(complaint)
+    assert any(assumed in note for note in run.oddities + run.remarks) == bool(complaint)
 
 
 # -- the page -----------------------------------------------------------------------------------

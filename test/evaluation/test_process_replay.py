@@ -157,8 +157,8 @@ def test_a_report_without_scalars_has_those_of_the_journal(path, tmp_path):
             now['value'][near], was['value'], rtol=ELSEWHERE, atol=ELSEWHERE
         )
         assert len(now) >= 2 * len(was)
-    assert any('recomputed from its journal' in note for note in found.notes)
-    assert not any('approximate' in note for note in found.notes)
+    assert any('recomputed from its journal' in note for note in found.remarks)
+    assert not any('approximate' in note for note in found.remarks)
 
 
 def test_scalars_after_a_lost_input_are_called_approximate(bag, tmp_path):
@@ -168,7 +168,7 @@ def test_scalars_after_a_lost_input_are_called_approximate(bag, tmp_path):
         lambda topic, k: topic[1:] in SCALARS or (topic, k) == ('/odom', 300),
     )
     with open_bag(torn) as recording:
-        notes = load_run(recording).notes
+        notes = load_run(recording).remarks
     assert any(' s on they are approximate' in note for note in notes)
     gone = without(
         bag, tmp_path / 'gone', lambda topic, k: topic[1:] in SCALARS or topic == JOURNAL
@@ -176,7 +176,7 @@ def test_scalars_after_a_lost_input_are_called_approximate(bag, tmp_path):
     with open_bag(gone) as recording:
         run = load_run(recording)
     assert set(run.absent) >= SCALARS
-    assert not any('journal' in note for note in run.notes)
+    assert not any('journal' in note for note in run.remarks)
 
 
 def test_the_golden_runs_have_all_that_they_are_for(inputs, again):

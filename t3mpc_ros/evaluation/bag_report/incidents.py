@@ -372,16 +372,11 @@ def find_stalls(run: Run) -> list[Span]:
     if odometry is None or timing is None or not timing.period > 0.0 or run.other_clock:
         return []
     least = max(STALL_PERIODS * timing.period, MIN_STALL)
-    steps = np.diff(odometry)
-    rows = np.flatnonzero((steps > least) & (steps < MIN_GAP)).tolist()
-    found = [(float(odometry[k]), float(odometry[k + 1])) for k in rows]
+    found = _pauses(odometry, least)
     commands = run.receipts.get(COMMAND) if run.ours else None
     if commands is not None and commands.size > 2:
-        steps = np.diff(commands)
-        least = max(least, STALL_PERIODS * float(np.median(steps)))
-        rows = np.flatnonzero((steps > least) & (steps < MIN_GAP)).tolist()
-        pauses = [(float(commands[k]), float(commands[k + 1])) for k in rows]
-        found += [span for span in pauses if _received(odometry, *span)]
+        least = max(least, STALL_PERIODS * float(np.median(np.diff(commands))))
+        found += [span for span in _pauses(commands, least) if _received(odometry, *span)]
     going_on = [COMMAND, REFERENCE] if run.links or not run.ours else [COMMAND]
     others = [run.receipts[name] for name in going_on if name in run.receipts]
     found = [span for span in found if not any(_received(each, *span) for each in others)]
@@ -392,6 +387,13 @@ def find_stalls(run: Run) -> list[Span]:
         slow = (late - asked > least) & (late - asked < MIN_GAP)
         found += zip(asked[slow].tolist(), late[slow].tolist(), strict=True)
     return merged(found, -1e-6)
+
+
+def _pauses(times: Array, least: float) -> list[Span]:
+    """Return the spans between two times that are longer than ``least``, s, and no gaps."""
+    steps = np.diff(times)
+    rows = np.flatnonzero((steps > least) & (steps < MIN_GAP)).tolist()
+    return [(float(times[k]), float(times[k + 1])) for k in rows]
 
 
 def _received(times: Array, low: float, high: float) -> bool:

@@ -183,33 +183,32 @@ class ReportMetrics:
                 units = [unit.format(each.unit) for each in self.channels]
                 found.append((tracking_errors.format_pair(pair, units), f'{title}, {names}'))
         rows = [(title, unit, value(self)) for title, unit, value in RUN_NUMBERS]
+        return found + [
+            (f'{format_number(number)} {unit}'.rstrip(), title)
+            for title, unit, number in (*rows, *self._link_rows())
+            if math.isfinite(number)
+        ]
+
+    def to_dict(self) -> dict[str, object]:
+        """Return verdict and main numbers as plain data, unrounded; those of channels by name."""
+        rows = [(title, unit, value(self)) for title, unit, value in (*PATH_NUMBERS, *RUN_NUMBERS)]
         rows += [
+            (f'{title}, {each.name}', unit.format(each.unit), value(self, each.name))
+            for title, unit, value in CHANNEL_NUMBERS
+            for each in self.channels
+        ]
+        rows += self._link_rows()
+        numbers = {f'{title} ({unit})' if unit else title: number for title, unit, number in rows}
+        verdict = {'kind': self.verdict.kind, 'text': self.verdict.text()}
+        return {'report': str(self.report), 'verdict': verdict, 'numbers': numbers}
+
+    def _link_rows(self) -> list[tuple[str, str, float]]:
+        """Return what it is, unit and value of each number of each link."""
+        return [
             (f'{title}, {name}', unit, value(link))
             for name, link in self.links.items()
             for title, unit, value in LINK_NUMBERS
         ]
-        found += [
-            (f'{format_number(number)} {unit}'.rstrip(), title)
-            for title, unit, number in rows
-            if math.isfinite(number)
-        ]
-        return found
-
-    def to_dict(self) -> dict[str, object]:
-        """Return verdict and main numbers as plain data, unrounded; those of channels by name."""
-        rows = [*PATH_NUMBERS, *RUN_NUMBERS]
-        found: dict[str, object] = {
-            f'{title} ({unit})' if unit else title: value(self) for title, unit, value in rows
-        }
-        for title, unit, number in CHANNEL_NUMBERS:
-            for each in self.channels:
-                key = f'{title}, {each.name} ({unit.format(each.unit)})'
-                found[key] = number(self, each.name)
-        for name, link in self.links.items():
-            for title, unit, of_link in LINK_NUMBERS:
-                found[f'{title}, {name} ({unit})'] = of_link(link)
-        verdict = {'kind': self.verdict.kind, 'text': self.verdict.text()}
-        return {'report': str(self.report), 'verdict': verdict, 'numbers': found}
 
     def summary(self) -> str:
         """Return the main numbers in one line."""

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from t3mpc_ros.bag.mcap_file import LOSS_CAUSES, LOSSES, UNDISCOVERED
+from t3mpc_ros.bag.mcap_file import LOSS_CAUSES, UNDISCOVERED, message_losses
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.evaluation.bag_report import incidents
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED, LinkMetrics
@@ -181,22 +181,16 @@ def _losses(recording: BagReader, run: Run) -> tuple[list[str], list[str]]:
     unusual if it records every motion before the time that counts.
     """
     unusual, usual = [], []
-    record = recording.metadata_records.get(LOSSES, {})
     first, last = incidents.driving(run)
     counted = counted_from(first, last) if first < last else math.inf
     early = all(float(each.time[0]) <= counted for each in run.motions.values())
-    for cause, text in LOSS_CAUSES.items():
-        topics = {
-            key.partition(' ')[2]: int(count)
-            for key, count in record.items()
-            if key.startswith(f'{cause} ') and count.isdecimal()
-        }
+    for cause, topics in message_losses(recording.metadata_records).items():
         if topics:
             most = max(topics, key=lambda name: topics[name])
             also = (
                 f', of {len(topics)} topics, most of {most}' if len(topics) > 1 else f' of {most}'
             )
-            sentence = f'{sum(topics.values())} messages{also} are missing: {text}'
+            sentence = f'{sum(topics.values())} messages{also} are missing: {LOSS_CAUSES[cause]}'
             if cause == UNDISCOVERED and early:
                 usual.append(f'{sentence}, before the time that counts.')
             else:

@@ -60,8 +60,6 @@ _ODOMETRY_FIELDS = {
     'linear': 'twist.twist.linear.x',
     'angular': 'twist.twist.angular.z',
 }
-
-
 SIGNAL_NAMES = ('mode', 'signal of the right wheel', 'signal of the left wheel')
 """Numbers of the topic of signals."""
 _TWIST_FIELDS = {'linear': 'linear.x', 'angular': 'angular.z'}
@@ -180,18 +178,12 @@ class Run:
     """Name of the simulated world; empty if unknown."""
     follows_path: bool = False
     """Whether the controller follows the poses of the reference, not its speeds."""
-
     map_changes: tuple[RecordedChange, ...] = ()
     """What contradicts the map."""
     other_clock: bool = False
     """Whether the stamps are of another clock than the receive times, as with simulated time."""
     parameters: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     """Recorded parameters by node."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """All sentences on the bag."""
-        return self.oddities + self.remarks
 
     @property
     def measured(self) -> str:

@@ -14,7 +14,7 @@
 """``ros2 run t3mpc_ros recorder``: records topics as serialized messages into an MCAP bag.
 
 A timer takes the messages of the subscriptions (:mod:`~t3mpc_ros.nodes.recorder.subscriptions`),
-a thread compresses and writes them (:mod:`~t3mpc_ros.bag.recording.writer_thread`).
+a thread compresses and writes them (:mod:`~t3mpc_ros.bag.writer_thread`).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,23 +29,23 @@ from std_srvs.srv import Trigger
 
 from t3mpc_ros.bag.mcap_file import LOSSES, Attachment, message_loss_record
 from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions, UnknownTypeError
-from t3mpc_ros.bag.recording.recording_parameters import RecordingParameters
-from t3mpc_ros.bag.recording.snapshot import (
+from t3mpc_ros.bag.recording_parameters import RecordingParameters
+from t3mpc_ros.bag.snapshot import (
     CircularMessageCache,
     DiagnosticsMonitor,
     NodeFault,
     SnapshotRateLimiter,
     SnapshotWriter,
 )
-from t3mpc_ros.bag.recording.writer_thread import WriterThread
 from t3mpc_ros.bag.topic_filter import TopicFilter
 from t3mpc_ros.bag.writer import BagWriter, FolderError
+from t3mpc_ros.bag.writer_thread import WriterThread
 from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
 from t3mpc_ros.nodes.recorder.metadata import SEED_RECORD, RecordingMetadata
-from t3mpc_ros.nodes.recorder.subscriptions import TopicSubscriptions, offered_qos
+from t3mpc_ros.nodes.recorder.subscriptions import TopicSubscriptions, topic_information
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters
 
@@ -189,7 +189,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
             self._topics.exclude(topic, f'it is recorded as {recorded}, not {type_name}')
             return
         publishers = self.get_publishers_info_by_topic(topic)
-        metadata, latched = offered_qos(topic, type_name, publishers)
+        metadata = topic_information(topic, type_name, publishers)
         try:
             self._definitions.schema(type_name)
         except UnknownTypeError as error:
@@ -201,7 +201,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
             lambda writer: writer.add_topic(name, type_name, profiles, metadata.type_hash)
         )
         if self._snapshots:
-            self._snapshots.add_topic(metadata, latched)
+            self._snapshots.add_topic(metadata)
 
     def _submit(self, task: Callable[[BagWriter], object]) -> None:
         if self._recording:

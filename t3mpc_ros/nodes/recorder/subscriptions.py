@@ -41,7 +41,7 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from t3mpc_ros.bag.mcap_file import SerializedMessage
+from t3mpc_ros.bag.mcap_file import RECEIVE_TIME, SerializedMessage
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.topic_filter import TopicFilter
@@ -65,8 +65,6 @@ cannot be replayed, are received, too."""
 
 FULL_DISCOVERY = 10
 """Calls of :meth:`TopicSubscriptions.discover` after which all publishers are queried again."""
-
-_RECEIVE_TIME = attrgetter('received_ns')
 
 
 @dataclass
@@ -229,7 +227,7 @@ class TopicSubscriptions:
                 self._add_lost(topic, _replaced(held, first))
             self._count_undiscovered(topic, held, first)
             held.sequence, held.received = sequence, True
-        found.sort(key=_RECEIVE_TIME)
+        found.sort(key=RECEIVE_TIME)
         return found
 
     def count_lost(self) -> None:
@@ -264,16 +262,15 @@ def _replaced(held: RawSubscription, first: int | None) -> int:
     return max(0, first - held.sequence - 1)
 
 
-def offered_qos(
+def topic_information(
     topic: str, type_name: str, publishers: Sequence[TopicEndpointInfo]
-) -> tuple[TopicInformation, int]:
-    """Return the metadata of a topic for the bag, and its number of transient-local publishers."""
+) -> TopicInformation:
+    """Return the metadata of a topic for the bag."""
     profiles = tuple(
         QosProfile.from_object(info.qos_profile, attrgetter('nanoseconds')) for info in publishers
     )
     type_hash = str(publishers[-1].topic_type_hash) if publishers else ''
-    latched = sum(qos.is_transient_local(info.qos_profile) for info in publishers)
-    return TopicInformation(topic, type_name, profiles, type_hash), latched
+    return TopicInformation(topic, type_name, profiles, type_hash)
 
 
 def _lost_event(subscription: Subscription) -> Any:

@@ -93,8 +93,6 @@ class CalibrationRobot:
     report: Callable[[str], None]
 
     def __post_init__(self) -> None:
-        self.has_usb = bool(self.robot_port)
-        """Whether the USB port of the robot board is connected: raw counts."""
         self._link = self.parameters, self.key, self.entropy
 
     def rest(self, seconds: float) -> calibration.Recording:
@@ -204,7 +202,7 @@ class CalibrationWizard:
             self._show('')
         for line in summary(self.calibration):
             self._show(line)
-        if self._robot.has_usb:
+        if self._robot.robot_port:
             self._repeat(self._store)
         return self.calibration
 

@@ -210,9 +210,7 @@ class Manoeuvre:
         travelled = self.travelled
         if travelled is None:
             return self._largest
-        right_leads = abs(self._angles.right) == self._largest
-        target = self._angles.right if right_leads else self._angles.left
-        way = travelled.right if right_leads else travelled.left
+        target, way = max(zip(self._angles, travelled, strict=True), key=lambda pair: abs(pair[0]))
         return self._largest - math.copysign(1.0, target) * way
 
     def _command(self, remaining: float, now_ns: int) -> None:

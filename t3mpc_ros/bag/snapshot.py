@@ -31,8 +31,8 @@ from t3mpc_ros.bag.message_definitions import (
     UnknownTypeError,
 )
 from t3mpc_ros.bag.metadata import TopicInformation
-from t3mpc_ros.bag.recording.writer_thread import WriterThread
 from t3mpc_ros.bag.writer import BagWriter
+from t3mpc_ros.bag.writer_thread import WriterThread
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 SNAPSHOT_RECORD = 'snapshot'
@@ -116,11 +116,11 @@ class SnapshotWriter:
         self.problem = ''
         """Why the last snapshot failed; empty if it did not."""
 
-    def add_topic(self, topic: TopicInformation, latched: int) -> None:
-        """Add the metadata of a topic with ``latched`` transient-local publishers."""
+    def add_topic(self, topic: TopicInformation) -> None:
+        """Add the metadata of a topic."""
         self._topics[topic.name] = topic
-        if latched:
-            self._cache.keep_last(topic.name, latched)
+        if count := topic.transient_local_count:
+            self._cache.keep_last(topic.name, count)
 
     def add(self, messages: list[SerializedMessage]) -> None:
         """Add messages to the cache, in order of reception."""
