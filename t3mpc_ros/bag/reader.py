@@ -408,10 +408,8 @@ class TopicColumns:
     """Publish times, shape (n,); equal to ``received_ns`` if not recorded."""
     stamps_ns: Integers
     """Stamps of the headers, shape (n,); zeros for a type without a header."""
-    numbers: Array
-    """Floating-point numbers of the :class:`CdrLayout`, shape (n, number of columns)."""
-    integers: Integers
-    """Integers of a layout of integers, same shape; else empty."""
+    numbers: NDArray[Any]
+    """Those of the :class:`CdrLayout`, integers or not, shape (n, number of columns)."""
 
     def __len__(self) -> int:
         return int(self.received_ns.size)
@@ -444,10 +442,8 @@ class _Batches:
         self.convert()
         times = np.array(self.times, dtype=np.int64).reshape(-1, 2)
         stamps, numbers = (np.concatenate(each) for each in zip(*self.parts, strict=True))
-        none = np.zeros((len(times), 0))
-        floats, integers = (none, numbers) if self.layout.integer else (numbers, none.astype(int))
         received, published = np.ascontiguousarray(times.T)
-        return TopicColumns(received, published, stamps, floats, integers)
+        return TopicColumns(received, published, stamps, numbers)
 
 
 def read_columns(bag: BagReader, topics: Iterable[str]) -> dict[str, TopicColumns]:

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from t3mpc_ros.cli.shared_options import (
     ArgumentParser,
+    Commands,
     RemovedOption,
     add_json,
     add_topic_options,
@@ -69,8 +70,7 @@ def size_text(count: int) -> str:
 _MAX_LISTED_ENTRIES = 6  # longer tables are only counted
 
 
-def add_info_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``info`` to the commands of ``bag``."""
+def _add_info(commands: Commands) -> None:
     parser = commands.add_parser(
         'info',
         help='files, time, topics, parameters of a bag',
@@ -212,8 +212,7 @@ EXIT_USAGE = 2
 _MAX_LISTED_DAMAGES = 20  # further damaged spans are only counted
 
 
-def add_recover_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``recover`` to the commands of ``bag``."""
+def _add_recover(commands: Commands) -> None:
     parser = commands.add_parser(
         'recover',
         help='write what a damaged bag still holds into a new one',
@@ -337,8 +336,7 @@ class _RecoveryProgress:
             self._bar.close()
 
 
-def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``report`` to the commands of ``bag``."""
+def _add_report(commands: Commands) -> None:
     parser = commands.add_parser(
         'report',
         help='draw the report of a bag, or compare several',
@@ -355,11 +353,10 @@ def add_report_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
     text = 'what the robot was to follow: odometry or a twist'
     add('--reference', default='', metavar='TOPIC', help=text)
     add_json(parser, 'write verdict and numbers')
-    parser.set_defaults(run=run_report)
+    parser.set_defaults(run=_run_report)
 
 
-def run_report(options: argparse.Namespace) -> None:
-    """Write the report and print its summary."""
+def _run_report(options: argparse.Namespace) -> None:
     from t3mpc_ros.evaluation.bag_report.report_page import write_report
 
     wanted = report_options(options)
@@ -377,8 +374,7 @@ def run_report(options: argparse.Namespace) -> None:
     )
 
 
-def add_animate_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``animate`` to the commands of ``bag``."""
+def _add_animate(commands: Commands) -> None:
     parser = commands.add_parser(
         'animate',
         help='draw the animation of a bag as GIF',
@@ -399,11 +395,10 @@ def add_animate_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
     ):  # fmt: skip
         add(f'--{name}', type=kind, default=default, metavar=metavar, help=text)
     add('--namespace', help='of the robot, where the bag holds several')
-    parser.set_defaults(run=run_animate)
+    parser.set_defaults(run=_run_animate)
 
 
-def run_animate(options: argparse.Namespace) -> None:
-    """Write the animation."""
+def _run_animate(options: argparse.Namespace) -> None:
     from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions, animate_bag
     from t3mpc_ros.evaluation.topic_roles import ReportOptions
 
@@ -415,8 +410,7 @@ def run_animate(options: argparse.Namespace) -> None:
     print(f'{written}: {size_text(written.stat().st_size)}')
 
 
-def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``replay`` to the commands of ``bag``."""
+def _add_replay(commands: Commands) -> None:
     parser = commands.add_parser(
         'replay',
         help='compute a recorded run again',
@@ -431,7 +425,7 @@ def add_replay_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPar
     add('--method', action=RemovedOption, nargs='?', help=argparse.SUPPRESS)
     add_input_options(parser)
     add_json(parser, 'write speed and comparison')
-    parser.set_defaults(run=run_replay)
+    parser.set_defaults(run=_run_replay)
 
 
 def add_input_options(parser: argparse.ArgumentParser) -> None:
@@ -445,8 +439,7 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     add('--namespace', help='of the robot, where the bag holds several')
 
 
-def run_replay(options: argparse.Namespace) -> None:
-    """Replay the run; print the comparison and the speed."""
+def _run_replay(options: argparse.Namespace) -> None:
     from t3mpc_ros.bag.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
     from t3mpc_ros.evaluation.process_replay.controller_replay import (
@@ -497,8 +490,7 @@ SAME, DIFFERS = 0, 3
 """Exit codes; an error is 1, as for every command."""
 
 
-def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``compare`` to the commands of ``bag``."""
+def _add_compare(commands: Commands) -> None:
     parser = commands.add_parser(
         'compare',
         help='compare a recorded run with its replay, or with another bag',
@@ -521,10 +513,10 @@ def add_compare_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentPa
     add('--update-golden', action=RemovedOption, nargs='?', help=argparse.SUPPRESS)
     add_input_options(parser)
     add_json(parser, 'write the comparison')
-    parser.set_defaults(run=run_compare)
+    parser.set_defaults(run=_run_compare)
 
 
-def run_compare(options: argparse.Namespace) -> int:
+def _run_compare(options: argparse.Namespace) -> int:
     """Print the comparison; return 0 when all is within the tolerances, 3 otherwise."""
     from t3mpc_ros.bag.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
@@ -574,8 +566,7 @@ def _tolerances(options: argparse.Namespace) -> 'Tolerances':
     return Tolerances(**chosen, fields=own)
 
 
-def add_train_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
-    """Add ``train`` to the commands of ``bag``."""
+def _add_train(commands: Commands) -> None:
     parser = commands.add_parser(
         'train',
         help='learn a model file that the controller starts from',
@@ -604,13 +595,13 @@ def program_parser() -> argparse.ArgumentParser:
         prog='t3mpc bag', description='Bags without a ROS graph.'
     )
     commands = parser.add_subparsers(dest='command', required=True)
-    add_info_parser(commands)
-    add_recover_parser(commands)
-    add_report_parser(commands)
-    add_animate_parser(commands)
-    add_replay_parser(commands)
-    add_compare_parser(commands)
-    add_train_parser(commands)
+    _add_info(commands)
+    _add_recover(commands)
+    _add_report(commands)
+    _add_animate(commands)
+    _add_replay(commands)
+    _add_compare(commands)
+    _add_train(commands)
     return parser
 
 

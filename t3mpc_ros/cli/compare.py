@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 DEFAULT_SEEDS = '201-206'
 
 
-def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+def add_parser(commands: shared_options.Commands) -> None:
     """Add the subcommand ``compare``."""
     parser = commands.add_parser(
         'compare',

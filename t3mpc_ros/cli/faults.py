@@ -19,7 +19,7 @@ from pathlib import Path
 from t3mpc_ros.cli import shared_options
 
 
-def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+def add_parser(commands: shared_options.Commands) -> None:
     """Add the subcommand ``faults``."""
     parser = commands.add_parser(
         'faults', help='drive the digital twin under every named fault, and say what comes of it'

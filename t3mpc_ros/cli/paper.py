@@ -19,7 +19,7 @@ from pathlib import Path
 from t3mpc_ros.cli import shared_options
 
 
-def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+def add_parser(commands: shared_options.Commands) -> None:
     """Add the subcommand ``paper``."""
     parser = commands.add_parser(
         'paper', help='every figure and table of the paper, and the verdict on its claims'

@@ -20,6 +20,7 @@ import sys
 from typing import Any
 
 from t3mpc_ros.cli.shared_options import (
+    Commands,
     add_json,
     add_seeds,
     add_workers,
@@ -34,7 +35,7 @@ RUNS = '.runs.jsonl'
 """End of the name of the file with the finished runs of an interrupted study."""
 
 
-def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+def add_parser(commands: Commands) -> None:
     """Add the subcommand ``patrol``."""
     parser = commands.add_parser(
         'patrol', help='coverage and predictability of the chaotic patrol against other paths'

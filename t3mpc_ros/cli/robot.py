@@ -25,6 +25,7 @@ from t3mpc_ros.cli import robot_calibrate
 from t3mpc_ros.cli.shared_options import (
     STANDARD_OUTPUT,
     ArgumentParser,
+    Commands,
     add_json,
     ask_line,
     check_two_ports,
@@ -425,9 +426,7 @@ def program_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_settings_commands(
-    commands: 'argparse._SubParsersAction[argparse.ArgumentParser]',
-) -> None:
+def _add_settings_commands(commands: Commands) -> None:
     command = commands.add_parser(
         'setup', help='show, change, save, load the settings of the robot, over its own USB'
     )
@@ -466,7 +465,7 @@ def _add_settings_commands(
     add_json(command, 'also write the entries')
 
 
-def _add_key_commands(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+def _add_key_commands(commands: Commands) -> None:
     about = 'secret key of robot and host, transferred over the USB port of the robot board'
     actions = commands.add_parser('key', help=about).add_subparsers(
         required=True, metavar='ACTION'

@@ -21,7 +21,7 @@ import os
 from pathlib import Path
 import select
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from t3mpc_ros.evaluation.api.error_messages import sentence
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
@@ -31,6 +31,8 @@ from t3mpc_ros.version import VERSION
 if TYPE_CHECKING:
     from t3mpc_ros.evaluation.topic_roles import ReportOptions
 
+Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
+"""Subcommands of a parser."""
 ROBOTS = ('twin', 'servo', 'torque')
 FULL, NOMINAL = 'full', 'nominal'
 STANDARD_OUTPUT = Path('-')

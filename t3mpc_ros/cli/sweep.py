@@ -25,7 +25,7 @@ SOME_FAILED = 3
 """Exit code: the file was written, but some of its runs failed."""
 
 
-def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+def add_parser(commands: shared_options.Commands) -> None:
     """Add the subcommand ``sweep``."""
     parser = commands.add_parser(
         'sweep',

@@ -16,7 +16,7 @@
 import argparse
 from pathlib import Path
 
-from t3mpc_ros.cli.shared_options import add_seeds
+from t3mpc_ros.cli.shared_options import Commands, add_seeds
 
 DRIVES = {'servo': 'velocity', 'torque': 'torque'}
 OUTPUT = Path('model.npz')
@@ -24,7 +24,7 @@ SEEDS = '101-105'
 FOLDS = 5
 
 
-def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+def add_parser(commands: Commands) -> None:
     """Add the subcommand ``train``."""
     parser = commands.add_parser(
         'train',

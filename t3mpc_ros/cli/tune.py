@@ -36,7 +36,7 @@ TWIN_EVALUATIONS = 30
 OUTPUT = Path('runs') / 'tuned.json'
 
 
-def add_parser(commands: 'argparse._SubParsersAction[argparse.ArgumentParser]') -> None:
+def add_parser(commands: shared_options.Commands) -> None:
     """Add the subcommand ``tune``."""
     parser = commands.add_parser(
         'tune',

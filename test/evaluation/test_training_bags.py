@@ -13,7 +13,6 @@
 # limitations under the License.
 """``bag train``: recorded bags train as simulated runs do; the file says where it is from."""
 
-import argparse
 import hashlib
 
 import numpy as np
@@ -21,7 +20,7 @@ import pytest
 from support.training_runs import START, STEP, TrainingRun
 
 from t3mpc_ros.bag.model_file import load_model, read_model_header
-from t3mpc_ros.cli.bag import add_train_parser
+from t3mpc_ros.cli.bag import program_parser
 from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.loop import run
@@ -138,9 +137,7 @@ def test_every_bag_is_judged_by_the_others(model):
 
 
 def program(*arguments):
-    parser = argparse.ArgumentParser(prog='bag')
-    add_train_parser(parser.add_subparsers(required=True))
-    options = parser.parse_args([str(argument) for argument in arguments])
+    options = program_parser().parse_args([str(argument) for argument in arguments])
     return options.run(options) or 0
 
 

@@ -22,7 +22,7 @@ from support.ros_graph import ControllerHarness, diagnostic, odometry, reason
 from t3mpc_ros.bag.controller_journal import Event
 from t3mpc_ros.bag.model_file import save_model
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.recording_parameters import RecordingParameters
+from t3mpc_ros.bag.recording import RecordingParameters
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.process_replay.controller_replay import (

@@ -132,7 +132,8 @@ def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
     headline = PATH_HEADLINE if run.follows_path else HEADLINE
     first = [section for section in SECTIONS if section.draw.__name__ in headline]
     others = [section for section in SECTIONS if section.draw.__name__ not in headline]
-    blocks += _beside(run, figures, first) if run.follows_path else _sections(run, figures, first)
+    together = 'Path, and distance from it' if run.follows_path else ''
+    blocks += _sections(run, figures, first, together)
     blocks.append(Tiles(figures.numbers()))
     if remarks := [*_remarks(run), *usual]:
         blocks.append(Items([[each] for each in remarks], 'side'))
@@ -290,22 +291,15 @@ def _response(run: Run, figures: ReportMetrics) -> Iterator[Block]:
             yield table
 
 
-def _sections(run: Run, figures: ReportMetrics, sections: Sequence[Section]) -> Iterator[Block]:
-    """Yield the charts of some sections."""
-    for section in sections:
-        if charts := list(section.draw(run, figures)):
-            yield Heading(section.title)
+def _sections(
+    run: Run, figures: ReportMetrics, sections: Sequence[Section], title: str = ''
+) -> Iterator[Block]:
+    """Yield the charts of some sections, side by side below a common title if it is given."""
+    for group in [sections] if title else [[each] for each in sections]:
+        if charts := [chart for section in group for chart in section.draw(run, figures)]:
+            yield Heading(title or group[0].title)
             yield Group(charts, 'div', 'charts')
-            yield Paragraph(section.caption_of(run), 'quiet')
-
-
-def _beside(run: Run, figures: ReportMetrics, sections: Sequence[Section]) -> Iterator[Block]:
-    """Yield the charts of some sections side by side."""
-    charts = [chart for section in sections for chart in section.draw(run, figures)]
-    if charts:
-        yield Heading('Path, and distance from it')
-        yield Group(charts, 'div', 'charts')
-        yield from (Paragraph(section.caption_of(run), 'quiet') for section in sections)
+            yield from (Paragraph(section.caption_of(run), 'quiet') for section in group)
 
 
 def _timing(run: Run) -> list[Block]:

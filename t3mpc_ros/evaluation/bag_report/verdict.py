@@ -436,7 +436,7 @@ def _path_finding(share: float, distance: Array | None) -> tuple[_Finding | None
     return None, reached
 
 
-# -- known results --------------------------------------------------------------------------------
+# -- known result ---------------------------------------------------------------------------------
 
 MAX_RATIO = 3.0
 """A settled RMSE of more than so many times the known one is not that of a good run. Single seeds
@@ -449,26 +449,20 @@ class KnownResult(NamedTuple):
 
     robot: str
     """Its name in a sentence."""
-    parameters: Mapping[str, Mapping[str, str]]
-    """Recorded parameters by node that make the robot and the task."""
     settled: float
     """The larger one of both wheels, rad/s."""
-    source: str
 
 
-_SIGNALS = {'reference_generator': {'source': 'signals', 'output': 'wheels'}}
-KNOWN_RESULTS: tuple[KnownResult, ...] = (
-    KnownResult(
-        'digital twin',
-        {'sim_robot': {'drive.kind': 'stepper', 'world': ''}, **_SIGNALS},
-        0.012,
-        'README.md: 60 s of scripts/demo, noise variance 0.04 (rad/s)²',
-    ),
-)
-"""Of the parameters that are not named those of the twin must have their defaults, but for
-:data:`FREE`."""
+KNOWN_RESULT = KnownResult('digital twin', 0.012)
+"""README.md: 60 s of scripts/demo, noise variance 0.04 (rad/s)²."""
+KNOWN_PARAMETERS: Mapping[str, Mapping[str, str]] = {
+    'sim_robot': {'drive.kind': 'stepper', 'world': ''},
+    'reference_generator': {'source': 'signals', 'output': 'wheels'},
+}
+"""Its recorded parameters by node. Those of the twin that are not named must have their defaults,
+but for :data:`FREE`."""
 MAX_NOISE = 0.04
-"""Largest variance of the measured wheel speeds of the known results, (rad/s)²."""
+"""Largest variance of its measured wheel speeds, (rad/s)²."""
 FREE = ('seed', 'noise.variance', 'drive.kind', 'world')
 """Parameters of the twin that may differ from their defaults, or are named."""
 
@@ -490,14 +484,12 @@ def known_result(records: Mapping[str, Mapping[str, str]]) -> KnownResult | None
             return None
     except ValueError:
         return None
-    for known in KNOWN_RESULTS:
-        if all(
-            records.get(node, {}).get(name) == value
-            for node, values in known.parameters.items()
-            for name, value in values.items()
-        ):
-            return known
-    return None
+    same = all(
+        records.get(node, {}).get(name) == value
+        for node, values in KNOWN_PARAMETERS.items()
+        for name, value in values.items()
+    )
+    return KNOWN_RESULT if same else None
 
 
 def _recorded(value: object) -> str:

@@ -383,9 +383,9 @@ def _journal(column: TopicColumns) -> tuple[Integers, Integers, Integers]:
     """Return the rows of the journal, and when they were published and received."""
     # A previous session, latched by its publisher: in order of publication.
     order = np.argsort(column.published_ns, kind='stable')
-    rows = column.integers[order]
+    rows = column.numbers[order]
     order = order[np.concatenate([[True], np.diff(rows[:, 0]) != 0])]  # twice after a restart
-    return column.integers[order], column.published_ns[order], column.received_ns[order]
+    return column.numbers[order], column.published_ns[order], column.received_ns[order]
 
 
 def _recorded_outputs(
@@ -426,7 +426,7 @@ def with_initial_inputs(received: TopicColumns, initial: TopicColumns) -> TopicC
         name: np.insert(getattr(received, name), places, getattr(initial, name)[missing], axis=0)
         for name in ('received_ns', 'published_ns', 'stamps_ns', 'numbers')
     }
-    return TopicColumns(**merged, integers=received.integers)
+    return TopicColumns(**merged)
 
 
 def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> ConsumedMessages:

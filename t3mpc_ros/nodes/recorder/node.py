@@ -29,7 +29,7 @@ from std_srvs.srv import Trigger
 
 from t3mpc_ros.bag.mcap_file import LOSSES, Attachment, message_loss_record
 from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions, UnknownTypeError
-from t3mpc_ros.bag.recording_parameters import RecordingParameters
+from t3mpc_ros.bag.recording import SEED_RECORD, RecordingMetadata, RecordingParameters
 from t3mpc_ros.bag.snapshot import (
     CircularMessageCache,
     DiagnosticsMonitor,
@@ -44,7 +44,6 @@ from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
-from t3mpc_ros.nodes.recorder.metadata import SEED_RECORD, RecordingMetadata
 from t3mpc_ros.nodes.recorder.subscriptions import TopicSubscriptions, topic_information
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters
