@@ -91,7 +91,6 @@ SHARED_BASENAMES = {
     'emulator': 'the emulator, and the command that starts it',
     'fault_injection': 'faults injected into the twin, and into the emulated board',
     'localizer': 'the localizer, and the node that runs it',
-    'node': 'the node of a folder in nodes/',
     'qos': 'QoS profiles, in bags and of publishers and subscriptions',
 }
 MAX_CLOSURE = 42

@@ -74,15 +74,11 @@ def find_model(name: str) -> Path:
 
 def load_model(path: Path) -> dict[str, NDArray[np.float64]]:
     """Return the arrays of a model file; an unusable one raises :class:`ModelError`."""
-    return _read(path)[1]
+    return read_model(path)[1]
 
 
-def read_model_header(path: Path) -> dict[str, Any]:
-    """Return the header of a model file: format, version, parameters and origin."""
-    return _read(path)[0]
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
+def read_model(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[np.float64]]]:
+    """Return header (format, version, parameters and origin) and arrays of a model file."""
     try:
         # Of a file that it cannot read, numpy leaves the archive to the garbage collector.
         with path.open('rb') as file, np.load(file, allow_pickle=False) as content:

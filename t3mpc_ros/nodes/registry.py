@@ -94,7 +94,7 @@ INTERFACES = {
         services=_ROBOT_SERVICES,
     ),
     'recorder': NodeInterface(
-        'recorder.node:RecorderNode',
+        'recorder:RecorderNode',
         'Records topics into an MCAP bag that rosbag2 reads.',
         subscribes=('*', '/diagnostics'),
         publishes=('/diagnostics',),

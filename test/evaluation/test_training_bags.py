@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from support.training_runs import START, STEP, TrainingRun
 
-from t3mpc_ros.bag.model_file import load_model, read_model_header
+from t3mpc_ros.bag.model_file import load_model, read_model
 from t3mpc_ros.cli.bag import program_parser
 from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.evaluation.drivers import MethodSpec
@@ -158,7 +158,7 @@ def test_the_model_file_is_loaded_and_says_where_it_is_from(
     Controller(model.parameters).law.set_weights(loaded)
     for name, values in model.learnt.items():
         np.testing.assert_array_equal(loaded[name], values)
-    header = read_model_header(path)
+    header = read_model(path)[0]
     assert header['parameters']['predictive.dither'] == DITHER
     origin = header['origin']
     assert [bag['name'] for bag in origin['bags']] == [f'run{seed}/bag' for seed in RECORDED]
@@ -174,7 +174,7 @@ def test_one_bag_is_cut_into_as_many_blocks_as_asked_for(bag, tmp_path, capsys):
     path = tmp_path / 'model.npz'
     assert program('train', bag, '--folds', '3', '--output', path) == 0
     assert 'cross-validated in 3 folds: each block' in capsys.readouterr().out
-    assert read_model_header(path)['origin']['cross_validation']['folds'] == 3
+    assert read_model(path)[0]['origin']['cross_validation']['folds'] == 3
     with pytest.raises(ValueError, match='folds must be at least 2: got 1'):
         program('train', bag, '--folds', '1', '--output', path)
 

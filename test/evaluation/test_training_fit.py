@@ -26,7 +26,7 @@ from t3mpc_ros.bag.model_file import (
     ModelError,
     find_model,
     load_model,
-    read_model_header,
+    read_model,
     save_model,
 )
 from t3mpc_ros.cli.main import main
@@ -485,7 +485,7 @@ def test_training_on_the_command_line(tmp_path, capsys):
     loaded = load_model(path)
     # The model of the package is the one that the command makes, with its origin inside.
     packaged = find_model('servo')
-    header, made = read_model_header(packaged), read_model_header(path)
+    header, made = read_model(packaged)[0], read_model(path)[0]
     # Its parameters include former ones, at the values that they always have now.
     former = ProposedParameters.class_constants()
     made['parameters'] |= {k: v for k, v in former.items() if k in header['parameters']}

@@ -21,7 +21,7 @@ from t3mpc_ros.cli import bag as bag_cli
 from t3mpc_ros.cli.robot_calibrate import calibration_file
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
-from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.recorder import RecorderNode
 from t3mpc_ros.robot.calibration import Calibration, Estimate, SharpCurve
 
 pytestmark = pytest.mark.ros

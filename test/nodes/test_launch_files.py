@@ -28,7 +28,7 @@ from support.launch_files import arguments_of, nodes_of
 from support.waiting import wait_for_end, wait_for_text
 import yaml
 
-from t3mpc_ros.bag.model_file import find_model, load_model, read_model_header
+from t3mpc_ros.bag.model_file import find_model, load_model, read_model
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main as bag_main
 from t3mpc_ros.cli.process_group import installed_file
@@ -195,7 +195,7 @@ def test_the_file_of_the_paper_fits_its_plant_and_model():
     assert parameters.speed_filter.lag == plant.drive.lag
     assert parameters.speed_filter.dead_time == plant.drive.dead_time
     Controller(parameters).set_weights(load_model(find_model(parameters.model)))
-    used = read_model_header(find_model(parameters.model))['parameters']
+    used = read_model(find_model(parameters.model))[0]['parameters']
     assert parameters.law.gain == pytest.approx(used['law.gain'], rel=0.01)
 
 

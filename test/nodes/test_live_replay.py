@@ -33,7 +33,7 @@ from t3mpc_ros.evaluation.process_replay.controller_replay import (
 from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances, compare
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.controller import ControllerNode
-from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.recorder import RecorderNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 

@@ -49,7 +49,7 @@ from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.composed import ComposedNode
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.conversions import FrameParameters
-from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.recorder import RecorderNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
 from t3mpc_ros.nodes.registry import NODES, node_class
 from t3mpc_ros.nodes.sim_robot import SimRobotNode

@@ -46,7 +46,7 @@ from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.base_node import OK, WARN
 from t3mpc_ros.nodes.player.node import PlayerNode
 from t3mpc_ros.nodes.player.terminal import parse_keys
-from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.recorder import RecorderNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 from t3mpc_ros.parameters.table import ParameterError
 

@@ -31,7 +31,7 @@ from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.base_node import OK
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.node_main import make_executor
-from t3mpc_ros.nodes.recorder.node import RecorderNode
+from t3mpc_ros.nodes.recorder import RecorderNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 
 LATCHED = QoSProfile(

@@ -93,21 +93,21 @@ class CalibrationRobot:
     report: Callable[[str], None]
 
     def __post_init__(self) -> None:
-        self._link = self.parameters, self.key, self.entropy
+        self._link = self.parameters, self.key, self.entropy, self.report
 
     def rest(self, seconds: float) -> calibration.Recording:
         """Return a recording of the robot at rest."""
-        return self._record(Rest(*self._link, seconds, self.report))
+        return self._record(Rest(*self._link, (seconds, 0.0)))
 
     def drive(
         self, angles: WheelAngles, speed: float, rests: tuple[float, float]
     ) -> calibration.Recording:
         """Turn the wheels by angles (rad); return the recording with the rests around it."""
-        return self._record(Manoeuvre(*self._link, angles, speed, self.report, rests))
+        return self._record(Manoeuvre(*self._link, rests, angles, speed))
 
     def turn_by_hand(self, timeout: float, rests: tuple[float, float]) -> calibration.Recording:
         """Return the recording of a turn by hand between two rests."""
-        return self._record(HandTurn(*self._link, timeout, self.report, rests))
+        return self._record(HandTurn(*self._link, rests, timeout))
 
     def counts(self, samples: int) -> Sequence[tuple[int, ...]]:
         """Return raw counts: of the eight distance sensors and, last, of the battery."""

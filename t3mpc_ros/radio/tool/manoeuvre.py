@@ -58,6 +58,7 @@ _TURNING_RATE, _RESTING_RATE = 0.1, 0.03
 """A turn by hand begins above the one and ends below the other, rad/s."""
 _TURN_MARGIN = 0.3
 """Time before and after that belongs to the turn, s."""
+NO_MOTION = WheelAngles(0.0, 0.0)
 _IDLE_OFF = 0.1
 """Standstill after which the drivers are off for a turn by hand, s."""
 
@@ -76,10 +77,10 @@ class Manoeuvre:
         parameters: LinkParameters,
         key: bytes,
         entropy: Callable[[int], bytes],
-        angles: WheelAngles,
-        speed: float,
         report: Callable[[str], None],
         rests: tuple[float, float] = (0.0, SETTLING_TIME),
+        angles: WheelAngles = NO_MOTION,
+        speed: float = 1.0,
     ) -> None:
         robot = replace(parameters.robot, acceleration=_ACCELERATION, deceleration=_ACCELERATION)
         self.link = Link(replace(parameters, robot=robot), key, entropy)
@@ -262,18 +263,7 @@ class Manoeuvre:
 
 
 class Rest(Manoeuvre):
-    """Records a robot that its motors hold at rest."""
-
-    def __init__(
-        self,
-        parameters: LinkParameters,
-        key: bytes,
-        entropy: Callable[[int], bytes],
-        seconds: float,
-        report: Callable[[str], None],
-    ) -> None:
-        none = WheelAngles(0.0, 0.0)
-        super().__init__(parameters, key, entropy, none, 1.0, report, (seconds, 0.0))
+    """Records a robot that its motors hold at rest, for the first one of ``rests``."""
 
     _over_cable = True  # it does not move
 
@@ -295,13 +285,12 @@ class HandTurn(Manoeuvre):
         parameters: LinkParameters,
         key: bytes,
         entropy: Callable[[int], bytes],
-        timeout: float,
         report: Callable[[str], None],
         rests: tuple[float, float],
+        timeout: float,
     ) -> None:
         robot = replace(parameters.robot, idle_off=_IDLE_OFF)
-        none = WheelAngles(0.0, 0.0)
-        super().__init__(replace(parameters, robot=robot), key, entropy, none, 1.0, report, rests)
+        super().__init__(replace(parameters, robot=robot), key, entropy, report, rests)
         self._timeout = rests[0] + timeout
         self._turning = False
         self._resting_ns: int | None = None
@@ -369,7 +358,7 @@ class Jog(Manoeuvre):
         self._right = wheel == RIGHT
         self._angle = math.tau * revolutions
         angles = WheelAngles(self._angle, 0.0) if self._right else WheelAngles(0.0, self._angle)
-        super().__init__(parameters, key, entropy, angles, speed, report)
+        super().__init__(parameters, key, entropy, report, angles=angles, speed=speed)
 
     @property
     def result(self) -> JogResult | None:

@@ -13,7 +13,7 @@
 # limitations under the License.
 """``ros2 run t3mpc_ros recorder``: records topics as serialized messages into an MCAP bag.
 
-A timer takes the messages of the subscriptions (:mod:`~t3mpc_ros.nodes.recorder.subscriptions`),
+A timer takes the messages of the subscriptions (:mod:`~t3mpc_ros.nodes.raw_subscriptions`),
 a thread compresses and writes them (:mod:`~t3mpc_ros.bag.writer_thread`).
 """
 
@@ -44,7 +44,7 @@ from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
-from t3mpc_ros.nodes.recorder.subscriptions import TopicSubscriptions, topic_information
+from t3mpc_ros.nodes.raw_subscriptions import TopicSubscriptions, topic_information
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters
 
