@@ -104,7 +104,11 @@ def metrics_of(bag: Path) -> object:
     """Return the metrics of a report as plain data."""
     with open_bag(bag) as recording:
         run = load_run(recording)
-        return plain(compute_metrics(run, Path('report.html'), 0))
+        found = dict(vars(compute_metrics(run, Path('report.html'), 0)))
+    del found['run']
+    of_run = ('duration', 'measured', 'channels', 'absent')
+    found |= {name: getattr(run, name) for name in of_run}
+    return plain({**found, 'switches': run.switches.size})
 
 
 def plain(value: object) -> object:

@@ -383,7 +383,6 @@ class CdrLayout:
     head: tuple[int, ...] = ()
     """Expected 4-byte numbers before the strings."""
     integer: bool = False
-    """Whether the numbers are integers."""
 
 
 CDR_LAYOUTS: Mapping[str, CdrLayout] = {

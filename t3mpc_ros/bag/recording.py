@@ -197,7 +197,6 @@ class RecordingMetadata:
         self._start_ns = now_ns
         self._model_outputs: dict[str, Path] = {}
         self.records: dict[str, dict[str, str]] = {'provenance': provenance()}
-        """Metadata records by name."""
         self.attachments: dict[str, tuple[Attachment, int]] = {}
         """Attached files by name, with the time of reading."""
         for name in files:

@@ -18,7 +18,6 @@ Nodes report once per second. A shorter fault is not detected, but its messages 
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 import re
@@ -110,9 +109,7 @@ class SnapshotWriter:
         self._thread = thread
         self._topics: dict[str, TopicInformation] = {}
         self.busy = False
-        """Whether a snapshot is being written."""
         self.completed = 0
-        """Number of complete snapshots."""
         self.problem = ''
         """Why the last snapshot failed; empty if it did not."""
 
@@ -219,14 +216,6 @@ REPORT_TIMEOUT_NS = 5 * NANOSECONDS
 """Time without a report after which a node has failed; nodes report once per second."""
 
 
-@dataclass(frozen=True, slots=True)
-class NodeFault:
-    """Beginning of a fault of one node."""
-
-    node: str
-    reason: str
-
-
 class DiagnosticsMonitor:
     """Detects the beginning of faults of the monitored nodes, by their names in the diagnostics.
 
@@ -241,26 +230,26 @@ class DiagnosticsMonitor:
         self._healthy: dict[str, int] = {}
         """Time of the last report of each healthy node, steady nanoseconds."""
 
-    def update(self, name: str, level: int, text: str, now_ns: int) -> NodeFault | None:
-        """Return the fault that begins with this report, or None."""
+    def update(self, name: str, level: int, text: str, now_ns: int) -> str:
+        """Return node and text of the fault that begins with this report, else nothing."""
         if name not in self._names:
-            return None
+            return ''
         if level >= ERROR_LEVEL:
-            return NodeFault(name, text) if self._healthy.pop(name, None) is not None else None
+            return f'{name}: {text}' if self._healthy.pop(name, None) is not None else ''
         if text.startswith(WAITING_PREFIX):
             self._healthy.pop(name, None)  # the node was restarted
         else:
             self._healthy[name] = now_ns
-        return None
+        return ''
 
-    def check_timeouts(self, now_ns: int) -> list[NodeFault]:
+    def check_timeouts(self, now_ns: int) -> list[str]:
         """Return the faults of healthy nodes whose reports have timed out."""
         expired = [
             name for name, last in self._healthy.items() if now_ns - last > REPORT_TIMEOUT_NS
         ]
         for name in expired:
             del self._healthy[name]
-        return [NodeFault(name, 'diagnostics timed out') for name in expired]
+        return [f'{name}: diagnostics timed out' for name in expired]
 
 
 class SnapshotRateLimiter:

@@ -38,7 +38,7 @@ class TopicPatterns:
     def __init__(
         self, names: Iterable[str], regex: str, *, parameter: str, namespace: str = '/'
     ) -> None:
-        self._names = [_resolve(name, namespace) for name in dict.fromkeys(names)]
+        self._names = [resolve_name(name, namespace) for name in dict.fromkeys(names)]
         self._regex = compile_regex(parameter, regex)
 
     def __bool__(self) -> bool:
@@ -128,12 +128,12 @@ def parse_remappings(items: Sequence[str]) -> dict[str, str]:
             raise TopicFilterError(
                 f'play.topic_remapping_options must be a list of old:=new: got {item!r}'
             )
-        name = _resolve(old)
+        name = resolve_name(old)
         if name in result:
             raise TopicFilterError(
                 f'play.topic_remapping_options must have one rule per topic: got {name} again'
             )
-        result[name] = _resolve(new)
+        result[name] = resolve_name(new)
     return result
 
 
@@ -149,5 +149,6 @@ def compile_regex(parameter: str, text: str) -> re.Pattern[str] | None:
         ) from error
 
 
-def _resolve(name: str, namespace: str = '/') -> str:
+def resolve_name(name: str, namespace: str = '/') -> str:
+    """Return the full name of a topic or a node; one that begins with ``*`` stays as it is."""
     return name if name.startswith(('/', '*')) else f'{namespace.rstrip("/")}/{name}'

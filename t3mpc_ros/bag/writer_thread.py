@@ -49,7 +49,6 @@ class WriterThread:
         self.bytes = 0
         """Memory of the messages."""
         self.dropped: dict[str, int] = {}
-        """Number of dropped messages by topic."""
         self.failure = ''
         """Why writing has stopped; empty if it has not."""
         self.file_name = writer.path.name if writer else 'none'

@@ -128,11 +128,12 @@ def _info_text(bag: 'BagReader') -> str:
     from t3mpc_ros.bag.mcap_file import message_loss_notes
 
     info = _info(bag)
+    start = datetime.fromtimestamp(bag.start_ns // 10**9, UTC)
     size = size_text(sum(info['files'].values()))
     rows = [
         ('bag', info['path']),
         ('storage', f'{bag.storage}, {size} in {len(bag.files)} file(s)'),
-        ('start', _date(bag.start_ns) if bag.message_count else 'no message'),
+        ('start', f'{start:%Y-%m-%d %H:%M:%S} UTC' if bag.message_count else 'no message'),
         ('duration', f'{bag.duration:.3f} s'),
         ('messages', str(bag.message_count)),
     ]
@@ -195,12 +196,6 @@ def _calibrations(records: Mapping[str, Mapping[str, str]]) -> list[str]:
 
 
 _CALIBRATED = ('calibration.', 'odometry.gyro_scale', 'wheel_radius', 'wheel_separation')
-
-
-def _date(time_ns: int) -> str:
-    from t3mpc_ros.geometry.types import NANOSECONDS
-
-    return f'{datetime.fromtimestamp(time_ns // NANOSECONDS, UTC):%Y-%m-%d %H:%M:%S} UTC'
 
 
 EXIT_LOSS = 3

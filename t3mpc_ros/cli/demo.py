@@ -64,7 +64,6 @@ ROBOTS: Mapping[str, Mapping[str, Mapping[str, object]]] = {
 """Robots, and the parameters of each node for them: the digital twin, the paper's plant, and
 the twin on an emulated board behind a serial port and a radio."""
 VIEW = 'view'
-"""The live page."""
 FOLLOWS = 'tracking'
 """Log message of the controller when it follows the reference; discovery takes seconds."""
 DISCOVERY_TIMEOUT = 60.0

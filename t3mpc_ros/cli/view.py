@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from t3mpc_ros.view.server import PageServer
 
 DEFAULT_PORT = 8765
-"""TCP port of the page."""
 PAGE_AT = 'live page at '
 """Begin of the line that names the address of the page."""
 

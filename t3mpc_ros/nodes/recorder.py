@@ -33,11 +33,10 @@ from t3mpc_ros.bag.recording import SEED_RECORD, RecordingMetadata, RecordingPar
 from t3mpc_ros.bag.snapshot import (
     CircularMessageCache,
     DiagnosticsMonitor,
-    NodeFault,
     SnapshotRateLimiter,
     SnapshotWriter,
 )
-from t3mpc_ros.bag.topic_filter import TopicFilter
+from t3mpc_ros.bag.topic_filter import TopicFilter, resolve_name
 from t3mpc_ros.bag.writer import BagWriter, FolderError
 from t3mpc_ros.bag.writer_thread import WriterThread
 from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY
@@ -87,7 +86,11 @@ class RecorderNode(BaseNode[RecordingParameters]):
         self._received = 0
         self._dropped_ns: int | None = None
         self._failure = ''
-        self._monitor = DiagnosticsMonitor(map(self._diagnostic_name, parameters.monitored_nodes))
+        self._monitor = DiagnosticsMonitor(
+            # In the diagnostics, names of nodes have no slash in front.
+            resolve_name(node, self.get_namespace()).lstrip('/')
+            for node in parameters.monitored_nodes
+        )
         self._rate_limiter = SnapshotRateLimiter(
             round(parameters.snapshot_min_interval * NANOSECONDS), parameters.snapshot_max_count
         )
@@ -150,11 +153,6 @@ class RecorderNode(BaseNode[RecordingParameters]):
             types=self.parameters.topic_types,
             namespace=self.get_namespace(),
         )
-
-    def _diagnostic_name(self, node: str) -> str:
-        """Return the name of a node in the diagnostics."""
-        name = node if node.startswith('/') else f'{self.get_namespace().rstrip("/")}/{node}'
-        return name.lstrip('/')
 
     # -- messages: subscriptions to queue ---------------------------------------------------------
 
@@ -273,8 +271,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
         except BagError as error:
             return str(error), ''
 
-    def _on_fault(self, fault: NodeFault) -> None:
-        reason = f'{fault.node}: {fault.reason}'
+    def _on_fault(self, reason: str) -> None:
         if self._snapshots is None:
             return
         if problem := self._rate_limiter.acquire(self.steady_ns()):

@@ -26,7 +26,6 @@ Json = None | bool | int | float | str | Sequence['Json'] | Mapping[str, 'Json']
 SPAN = 600.0
 """Time for which the samples of a live run are kept, s."""
 MAX_EVENTS = 500
-"""Number of events that are kept."""
 STEP = 0.019
 """Least time between two samples that a page is shown, s: every second one at 100 Hz."""
 DISORDER = 0.5
@@ -186,7 +185,6 @@ Condition = Literal['normal', 'warning', 'stopped']
 LOST = 1.5
 """Time without odometry after which the connection counts as lost, s."""
 ROBOTS = ('sim_robot', 'radio_bridge')
-"""Nodes that are a robot."""
 ESTOP = 'emergency stop'
 """Begin of the reason of a robot whose e-stop is latched."""
 

@@ -113,7 +113,6 @@ class PageServer:
             ) from None  # fmt: skip
         self.port: int = self._server.server_address[1]
         self.url = f'http://{ADDRESS}:{self.port}/'
-        """Address of the page."""
         self._thread = Thread(target=self._server.serve_forever, args=(0.1,), daemon=True)
 
     def news(self, cursor: Cursor) -> str:

@@ -567,20 +567,19 @@ def test_one_fault_per_change_to_an_error():
         monitor.update('robot', level, 'e-stop', i * SECOND) for i, level in enumerate(levels)
     ]
     assert [i for i, fault in enumerate(found) if fault] == [2, 7]
-    assert found[2].node == 'robot'
-    assert found[2].reason == 'e-stop'
-    assert monitor.update('stranger', OK, '', 0) is None
-    assert monitor.update('stranger', ERROR, '', SECOND) is None
+    assert found[2] == 'robot: e-stop'
+    assert monitor.update('stranger', OK, '', 0) == ''
+    assert monitor.update('stranger', ERROR, '', SECOND) == ''
 
 
 def test_node_that_was_never_healthy_has_no_fault():
     """A controller reports "stopped" as a warning before its first odometry, then as an error."""
     monitor = DiagnosticsMonitor(['controller', 'radio_bridge'])
-    assert monitor.update('controller', WARN, 'stopped: waiting', 0) is None
-    assert monitor.update('controller', ERROR, 'stopped: no reference', 1) is None
-    assert monitor.update('radio_bridge', ERROR, 'handshake', 2) is None
+    assert monitor.update('controller', WARN, 'stopped: waiting', 0) == ''
+    assert monitor.update('controller', ERROR, 'stopped: no reference', 1) == ''
+    assert monitor.update('radio_bridge', ERROR, 'handshake', 2) == ''
     assert monitor.check_timeouts(100 * SECOND) == []
-    assert monitor.update('controller', OK, 'tracking', 3) is None
+    assert monitor.update('controller', OK, 'tracking', 3) == ''
     assert monitor.update('controller', ERROR, 'stopped: no reference', 4)
 
 
@@ -589,7 +588,7 @@ def test_report_timeout_is_one_fault():
     monitor.update('controller', OK, 'tracking', 0)
     assert monitor.check_timeouts(REPORT_TIMEOUT_NS) == []
     (fault,) = monitor.check_timeouts(REPORT_TIMEOUT_NS + 1)
-    assert (fault.node, fault.reason) == ('controller', 'diagnostics timed out')
+    assert fault == 'controller: diagnostics timed out'
     assert monitor.check_timeouts(10 * REPORT_TIMEOUT_NS) == []
     monitor.update('controller', OK, 'tracking', 11 * REPORT_TIMEOUT_NS)
     assert len(monitor.check_timeouts(13 * REPORT_TIMEOUT_NS)) == 1

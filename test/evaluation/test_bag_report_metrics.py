@@ -501,7 +501,7 @@ def test_absent_topics_leave_out_their_figures_and_are_named(tmp_path):
     figures = report_of(tmp_path, until(4.0, 'reference/signals', 'diagnostics', *SCALARS))
     own = {'tracking', 'error', 'control', 'portrait', 'path', 'timing'}
     assert set(sections_of(figures.report.read_text())) == {*own, 'response'}
-    assert 'controller/estimate/right' in figures.absent
+    assert 'controller/estimate/right' in figures.run.absent
     text = page_of(figures).text()
     assert 'Not in the bag, or without a message: reference/signals, controller/' in text
 
@@ -510,9 +510,9 @@ def test_absent_topics_leave_out_their_figures_and_are_named(tmp_path):
 def test_any_topic_may_be_empty(tmp_path, gone):
     figures = report_of(tmp_path, until(3.0, gone))
     page_of(figures)
-    assert figures.absent == (gone,)
+    assert figures.run.absent == (gone,)
     assert np.isfinite(figures.wheels['right'].overall.rmse) == (gone != REFERENCE)
-    assert figures.measured == (ODOMETRY if gone == TRUTH else TRUTH)
+    assert figures.run.measured == (ODOMETRY if gone == TRUTH else TRUTH)
     assert ('RMSE' in figures.summary()) == (gone != REFERENCE)
 
 

@@ -372,7 +372,7 @@ def test_an_odd_bag_is_named_first(name, tmp_path):
     for each in words:
         assert each in screen or each in remarks(figures)
     assert ('Unusual in this bag' in screen) == (name in NAMED), screen
-    errors = [figures.wheels[each.name].settled for each in figures.channels]
+    errors = [figures.wheels[each.name].settled for each in figures.run.channels]
     if measured:
         assert [each.rmse for each in errors] == pytest.approx([OFFSET] * 2, rel=1e-3)
     elif measured is False:
@@ -420,7 +420,7 @@ def test_a_damaged_bag_has_a_report_that_says_so(name, tmp_path):
     figures = write_report(tmp_path / 'bag' / file if file else tmp_path / 'bag', tmp_path)
     assert words in first_screen(figures)
     assert figures.verdict.sound == (name != 'truncated file')
-    errors = [figures.wheels[each.name].settled.rmse for each in figures.channels]
+    errors = [figures.wheels[each.name].settled.rmse for each in figures.run.channels]
     assert errors == pytest.approx([OFFSET] * 2, rel=1e-3)
 
 

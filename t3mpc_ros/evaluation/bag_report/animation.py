@@ -52,7 +52,6 @@ _FRESH = 0.15
 """Greatest age of a range reading that is drawn, s."""
 _RAY, _HIT = '#f59e0b', '#b45309'
 _NUMBER_OF_COLOURS = 64
-"""Colours of the file."""
 
 
 class AnimationOptions(NamedTuple):

@@ -67,7 +67,6 @@ class LinkHistory:
     """Metrics of one link over time."""
 
     name: str
-    """Name of the diagnostic status."""
     time: Array
     """Receive time, s."""
     values: Mapping[str, Array]

@@ -69,7 +69,6 @@ class Stop(NamedTuple):
     start: float
     end: float
     cause: Cause
-    """What the nodes reported about it."""
 
     @property
     def length(self) -> float:

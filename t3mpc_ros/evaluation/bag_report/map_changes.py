@@ -23,7 +23,6 @@ from t3mpc_ros.evaluation.reporting import Block, Heading, Paragraph, Table
 from t3mpc_ros.geometry.types import Array
 
 TOPIC = 'map_changes'
-"""Relative name of the topic."""
 
 
 class RecordedChange(NamedTuple):

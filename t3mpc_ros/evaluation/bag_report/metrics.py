@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation.bag_report import tracking_errors
 from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import LinkMetrics, link_metrics
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents, find_incidents
-from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series
+from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict, judge
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.drive_response import ResponseFit, fit_response
@@ -130,31 +130,22 @@ class ReportMetrics:
     """Summary metrics of a run; NaN where the bag holds no data."""
 
     report: Path
-    duration: float
+    run: Run
     messages: int
-    switches: int
-    measured: str
-    """Source of the errors: ``ground_truth/odom``, else ``odom``, else empty."""
     wheels: Mapping[str, ChannelMetrics]
     """Metrics of ``right`` and ``left``; without wheel geometry ``linear`` and ``angular``."""
-    channels: tuple[Channel, Channel]
-    """Names and units of the channels."""
     responses: Mapping[str, ResponseFit]
     """Fitted response of the robot to its commands, by channel, where it is identifiable."""
     links: Mapping[str, LinkMetrics]
-    """Quality of the radio links, by name."""
     latency: float
     """Median time (s) from the receipt of odometry to that of the command."""
     latency_99: float
     """Its 99th percentile (s)."""
     missing: Mapping[str, float]
     """Share of missing samples by relative topic name."""
-    absent: tuple[str, ...]
-    """Topics that are missing in the bag."""
     verdict: Verdict
     """What happened, and whether the numbers measure the controller."""
     incidents: Incidents
-    """What interrupted the run."""
     path_error: float = math.nan
     """Root mean square of the distance from the path of a reference that is one, m."""
     path_error_99: float = math.nan
@@ -175,12 +166,12 @@ class ReportMetrics:
             for title, unit, value in PATH_NUMBERS
             if math.isfinite(number := value(self))
         ]
-        names = ' / '.join(each.short for each in self.channels)
+        names = ' / '.join(each.short for each in self.run.channels)
         follows_path = self.verdict.on_path is not None
         for title, unit, value in CHANNEL_NUMBERS[len(SPEED_ERRORS) if follows_path else 0 :]:
-            pair = [value(self, each.name) for each in self.channels]
+            pair = [value(self, each.name) for each in self.run.channels]
             if any(map(math.isfinite, pair)):
-                units = [unit.format(each.unit) for each in self.channels]
+                units = [unit.format(each.unit) for each in self.run.channels]
                 found.append((tracking_errors.format_pair(pair, units), f'{title}, {names}'))
         rows = [(title, unit, value(self)) for title, unit, value in RUN_NUMBERS]
         return found + [
@@ -195,7 +186,7 @@ class ReportMetrics:
         rows += [
             (f'{title}, {each.name}', unit.format(each.unit), value(self, each.name))
             for title, unit, value in CHANNEL_NUMBERS
-            for each in self.channels
+            for each in self.run.channels
         ]
         rows += self._link_rows()
         numbers = {f'{title} ({unit})' if unit else title: number for title, unit, number in rows}
@@ -217,48 +208,46 @@ class ReportMetrics:
 
 
 PATH_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics], float]], ...] = (
-    ('path error, root mean square', 'mm', lambda run: 1e3 * run.path_error),
-    ('path error, 99 % below', 'mm', lambda run: 1e3 * run.path_error_99),
+    ('path error, root mean square', 'mm', lambda found: 1e3 * found.path_error),
+    ('path error, 99 % below', 'mm', lambda found: 1e3 * found.path_error_99),
     (
         f'of the drive within {1e3 * ON_PATH:g} mm of the path', '%',
-        lambda run: math.nan if run.verdict.on_path is None else 100.0 * run.verdict.on_path,
+        lambda found: math.nan if found.verdict.on_path is None else 100.0 * found.verdict.on_path,
     ),
 )  # fmt: skip
 """Main numbers of a robot that follows a path."""
 ChannelNumber = tuple[str, str, Callable[[ReportMetrics, str], float]]
 SPEED_ERRORS: tuple[ChannelNumber, ...] = (
-    ('RMSE while driven', '{}', lambda run, name: run.wheels[name].overall.rmse),
-    ('RMSE while driven and settled', '{}', lambda run, name: run.wheels[name].settled.rmse),
-    ('largest error', '{}', lambda run, name: run.wheels[name].overall.largest),
+    ('RMSE while driven', '{}', lambda found, name: found.wheels[name].overall.rmse),
+    ('RMSE while driven and settled', '{}', lambda found, name: found.wheels[name].settled.rmse),
+    ('largest error', '{}', lambda found, name: found.wheels[name].overall.largest),
 )
 """Main numbers of the error of each channel, which mean nothing where the reference is a path."""
 CHANNEL_NUMBERS: tuple[ChannelNumber, ...] = (
     *SPEED_ERRORS,
-    ('variation of the command per second', '{}', lambda run, name: run.wheels[name].chatter),
-    ('variation of the reference per second', '{}', lambda run, name: run.wheels[name].demand),
-    ('command to motion', 'ms', lambda run, name: 1e3 * run.delay(name)),
+    ('variation of the command per second', '{}', lambda found, name: found.wheels[name].chatter),
+    ('variation of the reference per second', '{}', lambda found, name: found.wheels[name].demand),
+    ('command to motion', 'ms', lambda found, name: 1e3 * found.delay(name)),
 )
 """Main numbers of each channel: what it is, unit with ``{}`` for that of the channel, value."""
 RUN_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics], float]], ...] = (
-    ('duration', 's', lambda run: run.duration),
-    ('messages', '', lambda run: run.messages),
-    ('switches', '', lambda run: run.switches),
+    ('duration', 's', lambda found: found.run.duration),
+    ('messages', '', lambda found: found.messages),
+    ('switches', '', lambda found: found.run.switches.size),
     (
         'stood although it was to move', 's',
-        lambda run: run.incidents.stopped if run.measured else math.nan,
+        lambda found: found.incidents.stopped if found.run.measured else math.nan,
     ),
-    ('odometry to command, median', 'ms', lambda run: 1e3 * run.latency),
-    ('odometry to command, 99 % below', 'ms', lambda run: 1e3 * run.latency_99),
-    ('odometry missing', '%', lambda run: 100.0 * run.missing.get(ODOMETRY, math.nan)),
+    ('odometry to command, median', 'ms', lambda found: 1e3 * found.latency),
+    ('odometry to command, 99 % below', 'ms', lambda found: 1e3 * found.latency_99),
+    ('odometry missing', '%', lambda found: 100.0 * found.missing.get(ODOMETRY, math.nan)),
 )  # fmt: skip
-"""Main numbers of a run."""
 LINK_NUMBERS: tuple[tuple[str, str, Callable[[LinkMetrics], float]], ...] = (
     ('cycles answered', '%', lambda link: 100.0 * link.answered),
     ('round trip, median', 'ms', lambda link: 1e3 * link.round_trip),
     ('round trip, worst 99 %', 'ms', lambda link: 1e3 * link.round_trip_99),
     ('oldest measurement', 's', lambda link: link.oldest),
 )
-"""Main numbers of a radio link."""
 
 
 def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
@@ -288,18 +277,14 @@ def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
     distance = tracking_errors.path_distance(run)
     return ReportMetrics(
         report=report,
-        duration=run.duration,
+        run=run,
         messages=messages,
-        switches=run.switches.size,
-        measured=run.measured,
         wheels=wheels,
-        channels=run.channels,
         responses=responses(run),
         links={link.name: link_metrics(link) for link in run.links},
         latency=float(np.percentile(delays, 50.0)),
         latency_99=float(np.percentile(delays, 99.0)),
         missing=missing,
-        absent=run.absent,
         verdict=verdict,
         incidents=incidents,
         path_error=math.nan if distance is None else rms(distance['value']),

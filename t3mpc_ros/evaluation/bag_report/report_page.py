@@ -65,13 +65,9 @@ from t3mpc_ros.evaluation.topic_roles import (
 )
 from t3mpc_ros.geometry.types import NANOSECONDS
 
-HEADLINE = ('tracking', 'error')
-PATH_HEADLINE = ('path', 'distance')
-"""Sections of the first screen, of a robot that follows speeds and of one that follows a path."""
-FIRST = ('tracking', 'error', 'path', 'distance')
-"""Sections before the events and tables."""
+SPEEDS, FLOOR, FURTHER = SECTIONS[:2], SECTIONS[2:4], SECTIONS[4:]
+"""Sections before the events and tables, that of what the robot follows first, and the others."""
 MAX_EVENTS = 300
-"""Events that a page lists."""
 
 
 def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> Table:
@@ -129,23 +125,20 @@ def _page(recording: BagReader, run: Run, figures: ReportMetrics) -> str:
     if oddities := [*run.oddities, *unusual]:
         blocks.append(Items([[each] for each in oddities], title='Unusual in this bag'))
     blocks.append(Contents())
-    headline = PATH_HEADLINE if run.follows_path else HEADLINE
-    first = [section for section in SECTIONS if section.draw.__name__ in headline]
-    others = [section for section in SECTIONS if section.draw.__name__ not in headline]
+    first, soon = (FLOOR, SPEEDS) if run.follows_path else (SPEEDS, FLOOR)
     together = 'Path, and distance from it' if run.follows_path else ''
     blocks += _sections(run, figures, first, together)
     blocks.append(Tiles(figures.numbers()))
     if remarks := [*_remarks(run), *usual]:
         blocks.append(Items([[each] for each in remarks], 'side'))
-    soon = [section for section in others if section.draw.__name__ in FIRST]
     blocks += _sections(run, figures, soon)
     events = _events(run, figures)
     quiet = Paragraph('No switch, no stop, no warning.', 'quiet')
     blocks += [Heading('Events'), Timeline(events) if events else quiet]
-    if (run.ours or figures.measured) and not run.follows_path:
+    if (run.ours or run.measured) and not run.follows_path:
         blocks += [Heading('Tracking error'), *_errors(run)]
     blocks += _response(run, figures)
-    blocks += _sections(run, figures, [each for each in others if each not in soon])
+    blocks += _sections(run, figures, FURTHER)
     blocks += map_change_blocks(run.map_changes)
     blocks += patrol_blocks(run)
     blocks += [Heading('Timing by topic'), *_timing(run), *_complaints(run)]

@@ -76,7 +76,6 @@ MAX_SAMPLES = 2000
 GROUP = 3
 """Blocks of a group of charts: heading, charts, and what their time is."""
 MAX_RUNS = len(report_charts.TERM_COLOURS)
-"""Runs that a page compares."""
 DISTANCE = Channel('distance', 'distance from the path', 'distance', 'm')
 """What is compared of two robots that follow poses."""
 BETTER, WORSE, INCONCLUSIVE = 'smaller error', 'larger error', 'inconclusive'

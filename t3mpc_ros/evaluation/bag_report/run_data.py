@@ -159,7 +159,6 @@ class Run:
     """Receive times by relative name, by the recorder's clock."""
     timing: Mapping[str, Timing]
     switches: Array
-    """Times of the switches of the reference."""
     lead: float
     """Median lead (s) of the reference stamps over their receive times."""
     complaints: tuple[diagnostic_history.DiagnosticEvent, ...]
@@ -167,7 +166,6 @@ class Run:
     changes: tuple[diagnostic_history.DiagnosticEvent, ...]
     """Likewise, each time that a node got worse."""
     links: tuple[diagnostic_history.LinkHistory, ...]
-    """Radio links in the diagnostics."""
     oddities: tuple[str, ...]
     """Sentences on what is unusual in the bag, and what was done about it."""
     remarks: tuple[str, ...]
@@ -179,7 +177,6 @@ class Run:
     follows_path: bool = False
     """Whether the controller follows the poses of the reference, not its speeds."""
     map_changes: tuple[RecordedChange, ...] = ()
-    """What contradicts the map."""
     other_clock: bool = False
     """Whether the stamps are of another clock than the receive times, as with simulated time."""
     parameters: Mapping[str, Mapping[str, str]] = field(default_factory=dict)

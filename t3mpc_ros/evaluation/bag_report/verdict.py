@@ -71,7 +71,6 @@ class Verdict:
     """What happened in a run, and whether its numbers measure the controller."""
 
     sentence: str
-    """What happened."""
     label: str
     """The same in a few words."""
     kind: Literal['good', 'open', 'bad']
@@ -102,8 +101,6 @@ class Verdict:
 
 
 class _Finding(NamedTuple):
-    """Something that happened."""
-
     text: str
     """A sentence without its full stop."""
     label: str = ''
@@ -473,8 +470,9 @@ def known_result(records: Mapping[str, Mapping[str, str]]) -> KnownResult | None
     ``records`` are the recorded parameters by node.
     """
     twin = records.get('sim_robot', {})
-    defaults = {
-        name: _recorded(value) for name, value in DigitalTwinParameters().to_dict().items()
+    defaults = {  # as a recorder writes them
+        name: str(list(value)) if isinstance(value, tuple) else str(value)
+        for name, value in DigitalTwinParameters().to_dict().items()
     }
     for name, value in twin.items():
         if name in defaults and name not in FREE and value != defaults[name]:
@@ -490,8 +488,3 @@ def known_result(records: Mapping[str, Mapping[str, str]]) -> KnownResult | None
         for name, value in values.items()
     )
     return KNOWN_RESULT if same else None
-
-
-def _recorded(value: object) -> str:
-    """Return a value as a recorder writes it."""
-    return str(list(value)) if isinstance(value, tuple) else str(value)

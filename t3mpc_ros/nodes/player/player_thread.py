@@ -118,7 +118,6 @@ class PlayerThread:
             )
 
     def _set_priority(self) -> None:
-        """Request the real-time priority for this thread."""
         try:
             # Process number 0 is the calling thread.
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(self._priority))

@@ -57,7 +57,6 @@ class Check(NamedTuple):
     value: str
     """What was measured or answered."""
     remedy: str = ''
-    """What to do after a failure."""
 
 
 class Question(NamedTuple):

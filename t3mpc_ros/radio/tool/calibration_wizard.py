@@ -190,7 +190,6 @@ class CalibrationWizard:
         self._options = options
         self._turns: list[tuple[float, calibration.GyroTurn]] = []
         self.calibration = start
-        """The values so far."""
 
     def run(self) -> calibration.Calibration:
         """Run the steps; return the calibration."""
@@ -260,7 +259,9 @@ class CalibrationWizard:
             )
             angles = WheelAngles(sign * angle, sign * angle)
             recording = self._robot.drive(angles, options.speed, (0.0, 1.0))
-            right, left = _travelled(recording)
+            right, left = (
+                float(angle[-1] - angle[0]) for angle in (recording.right, recording.left)
+            )
             self._see(
                 f'the wheels turned {math.degrees(right):.1f} (right) and '
                 f'{math.degrees(left):.1f} (left) degrees'
@@ -453,12 +454,6 @@ def summary(found: calibration.Calibration) -> list[str]:
     for name, curve in zip(RANGE_SENSORS, found.curves, strict=True):
         lines.append(f'  {name:<18}  {_curve(curve) if curve else "not calibrated"}')
     return lines
-
-
-def _travelled(recording: calibration.Recording) -> tuple[float, float]:
-    """Return the angles of both wheels, right first, rad."""
-    right, left = recording.right, recording.left
-    return float(right[-1] - right[0]), float(left[-1] - left[0])
 
 
 def _value(estimate: calibration.Estimate, factor: float, digits: int) -> str:

@@ -23,7 +23,6 @@ from t3mpc_ros.radio.protocol.frames import Key, KeyState
 from t3mpc_ros.radio.tool import procedure
 
 ERASE_KEY = bytes(KEY_SIZE)
-"""Key value that erases the stored key."""
 _WRITE_TIMEOUT = 1.0
 """s; 25 EEPROM cells of 3.4 ms, and the load of the radio"""
 _MAX_ATTEMPTS = 5

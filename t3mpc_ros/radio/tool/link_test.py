@@ -56,7 +56,6 @@ class LinkTestResult(NamedTuple):
     line_errors: int
     """Frames that reached the dongle damaged during the test."""
     state: frames.State | None
-    """Last STATE of the robot."""
 
 
 class ReportRow(NamedTuple):

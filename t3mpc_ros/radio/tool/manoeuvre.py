@@ -154,7 +154,6 @@ class Manoeuvre:
         return actions
 
     def _advance(self, now_ns: int) -> None:
-        """Advance the manoeuvre by one step."""
         link, telemetry = self.link, self.link.telemetry
         reason = link.reason(now_ns)
         if link.state is not LinkState.RUN or telemetry is None:
@@ -194,7 +193,6 @@ class Manoeuvre:
     _late_reason = 'the wheels do not reach their target: does the board count its steps?'
 
     def _move(self, telemetry: Telemetry, now_ns: int) -> None:
-        """Advance the motion by one step."""
         remaining = self._remaining()
         if remaining <= _FINAL_SPEED / 100.0:
             self._finish(telemetry.status.moving, now_ns)

@@ -109,7 +109,6 @@ class Board(NamedTuple):
 
     name: str
     decode: Callable[[bytes], ReplyFrame]
-    """Decodes its frames."""
 
 
 DONGLE = Board('the dongle', decode_from_dongle)
@@ -152,11 +151,8 @@ class Procedure(Generic[Value]):
         self._id = 0
         self._open = self._interrupted = False
         self.done = False
-        """Whether the procedure has ended."""
         self.error = ''
-        """Reason of a failure; empty on success."""
         self.result: Value | None = None
-        """Return value of the script."""
 
     def port_opened(self, now_ns: int) -> None:
         """Start the script."""
