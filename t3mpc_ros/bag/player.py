@@ -30,7 +30,7 @@ from t3mpc_ros.bag.mcap_file import RECEIVE_TIME, SerializedMessage
 from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.reader import BagFile, BagReader, merge_streams, merge_topics, open_bag
-from t3mpc_ros.bag.topic_filter import PlayTopicFilter, TopicFilterError, parse_remappings
+from t3mpc_ros.bag.topic_filter import PlayTopicFilter, parse_remappings
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
@@ -291,10 +291,7 @@ class PlaybackParameters(Parameters):
                 f'play.bag_offsets must have one number for each of the {len(self.uris)} bags: '
                 f'got {len(self.bag_offsets)}'
             )
-        try:
-            self.topic_filter()
-        except TopicFilterError as error:
-            raise ParameterError(str(error)) from error
+        self.topic_filter()
 
     def topic_filter(self) -> PlayTopicFilter:
         """Return the selection of topics and their remappings."""

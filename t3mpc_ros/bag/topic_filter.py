@@ -20,11 +20,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 import re
 
-from t3mpc_ros.bag.message_definitions import BagError
-
-
-class TopicFilterError(BagError):
-    """A regular expression or a remapping rule is invalid; the text names the parameter."""
+from t3mpc_ros.parameters.table import ParameterError
 
 
 class TopicPatterns:
@@ -125,12 +121,12 @@ def parse_remappings(items: Sequence[str]) -> dict[str, str]:
     for item in items:
         old, mark, new = (part.strip() for part in item.partition(':='))
         if not (old and mark and new):
-            raise TopicFilterError(
+            raise ParameterError(
                 f'play.topic_remapping_options must be a list of old:=new: got {item!r}'
             )
         name = resolve_name(old)
         if name in result:
-            raise TopicFilterError(
+            raise ParameterError(
                 f'play.topic_remapping_options must have one rule per topic: got {name} again'
             )
         result[name] = resolve_name(new)
@@ -144,7 +140,7 @@ def compile_regex(parameter: str, text: str) -> re.Pattern[str] | None:
     try:
         return re.compile(text)
     except re.error as error:
-        raise TopicFilterError(
+        raise ParameterError(
             f'{parameter} must be a regular expression: got {text!r} ({error})'
         ) from error
 

@@ -33,7 +33,7 @@ from t3mpc_ros.cli.shared_options import (
 )
 from t3mpc_ros.parameters import command_line
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.parameters.yaml_checks import YamlError, file_errors, read_yaml
+from t3mpc_ros.parameters.yaml_checks import file_errors, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
@@ -45,7 +45,7 @@ from t3mpc_ros.radio.tool import (
     procedure,
     robot_info,
 )
-from t3mpc_ros.radio.tool.eeprom_records import SettingsFileError, StoredSettings
+from t3mpc_ros.radio.tool.eeprom_records import StoredSettings
 from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, ProcedureError, Script
 from t3mpc_ros.stop_signal import StopSignal
 
@@ -181,10 +181,8 @@ def _show_log(options: argparse.Namespace, stop: StopSignal) -> int:
 
 
 def _load_settings(path: Path) -> eeprom_records.RobotSettings:
-    try:
+    with file_errors(path, ParameterError):
         return eeprom_records.settings_of_file(read_yaml(path))
-    except (YamlError, SettingsFileError) as error:
-        raise ParameterError(f'{path} {error}') from error
 
 
 def _ping(options: argparse.Namespace, stop: StopSignal) -> int:
@@ -343,7 +341,7 @@ def _setting(name: str, convert: Callable[[str], object]) -> Callable[[str], obj
         try:
             value = convert(text)
             eeprom_records.check_settings(eeprom_records.RobotSettings()._replace(**{name: value}))  # type: ignore[arg-type]
-        except (ValueError, SettingsFileError) as error:
+        except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from error
         return value
 

@@ -43,17 +43,9 @@ MAX_BODY = 4096
 """Largest command, bytes."""
 
 _TYPES = {'.html': 'text/html', '.js': 'text/javascript', '.css': 'text/css'}
-_SCRIPTS = (
-    'view.js',
-    'commands.js',
-    'parameters.js',
-    'pictures.js',
-    'signals.js',
-    'draw.js',
-    'events.js',
-    'share.js',
-)
-_PAGE = ('view.html', 'view.css', *_SCRIPTS, *PAGE_FILES)
+_OWN = files('t3mpc_ros.view') / 'page'
+_PAGE = {each.name for each in _OWN.iterdir() if each.name.endswith(tuple(_TYPES))} | {*PAGE_FILES}
+"""Files that are served."""
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'"
@@ -284,4 +276,4 @@ def _text_of(file: Path) -> str:
 def _file(name: str) -> str:
     if name in PAGE_FILES:
         return page_file(name)
-    return (files('t3mpc_ros.view') / 'page' / name).read_text(encoding='utf-8')
+    return (_OWN / name).read_text(encoding='utf-8')

@@ -20,9 +20,9 @@ from support.long_tests import few_of
 import yaml
 
 from t3mpc_ros.cli import robot as cli
+from t3mpc_ros.parameters.yaml_checks import YamlError
 from t3mpc_ros.radio.tool.eeprom_records import (
     RobotSettings,
-    SettingsFileError,
     parse_address,
     settings_file,
     settings_of_file,
@@ -151,7 +151,7 @@ def test_any_value_in_a_settings_file_is_accepted_or_named(name, value):
             group[name] = value
     try:
         settings_of_file(content)
-    except SettingsFileError as error:
+    except YamlError as error:
         shown = str(error)
     else:
         shown = f'{name} accepted: got '
@@ -163,10 +163,10 @@ def test_any_value_in_a_settings_file_is_accepted_or_named(name, value):
 
 def test_an_address_without_quotes_is_a_number():
     """54334d5043 is text, 1234567890 a number: its zeros in front would be lost."""
-    with pytest.raises(SettingsFileError, match='address must be text in quotes'):
+    with pytest.raises(YamlError, match='address must be text in quotes'):
         parse_address(1234567890)
     content = yaml.safe_load(settings_file(RobotSettings()).replace("'54334d5043'", '1234567890'))
-    with pytest.raises(SettingsFileError, match='address must be text in quotes'):
+    with pytest.raises(YamlError, match='address must be text in quotes'):
         settings_of_file(content)
 
 

@@ -22,6 +22,7 @@ import pytest
 from support.tool_bench import START_NS, ToolBench
 import yaml
 
+from t3mpc_ros.parameters.yaml_checks import YamlError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
@@ -255,7 +256,7 @@ def test_a_settings_file_holds_every_setting():
 def test_a_wrong_settings_file_is_rejected_by_name(old, new, words):
     text = eeprom_records.settings_file(RobotSettings(bytes.fromhex('c25a33a6e1')))
     assert old in text
-    with pytest.raises(eeprom_records.SettingsFileError, match=words):
+    with pytest.raises(YamlError, match=words):
         eeprom_records.settings_of_file(yaml.safe_load(text.replace(old, new, 1)))
 
 

@@ -30,7 +30,7 @@ import struct
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from t3mpc_ros.parameters.table import number_hint
-from t3mpc_ros.parameters.yaml_checks import parameter_file, shortened
+from t3mpc_ros.parameters.yaml_checks import YamlError, parameter_file, shortened
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.framing import crc16
 from t3mpc_ros.radio.tool.procedure import (
@@ -411,10 +411,6 @@ _BOARD = '/robot_board'
 """Name of no node: a node rejects parameters that it does not have."""
 
 
-class SettingsFileError(Exception):
-    """A file of settings cannot be read or written; the text contains the reason."""
-
-
 StoredSettings = Stored[RobotSettings]
 
 
@@ -436,13 +432,13 @@ def draw_address(entropy: Callable[[int], bytes]) -> bytes:
 
 
 def parse_address(text: object) -> bytes:
-    """Return an address written as 10 hexadecimal digits; SettingsFileError: it is none."""
+    """Return an address written as 10 hexadecimal digits; YamlError: it is none."""
     if not isinstance(text, str):
-        raise SettingsFileError(
+        raise YamlError(
             f'address must be text in quotes, 10 hexadecimal digits: got {shortened(text)}'
         )
     if len(text) != 2 * ADDRESS_SIZE or set(text.lower()) - set(string.hexdigits):
-        raise SettingsFileError(
+        raise YamlError(
             f'address must be 10 hexadecimal digits, such as 54334d5043: got {shortened(text)}'
         )
     return bytes.fromhex(text)
@@ -522,14 +518,14 @@ def settings_of_file(content: object) -> RobotSettings:
         values |= {**link, **board}
         values['address'] = parse_address(values['address'])
         if not isinstance(values['sensors'], list):
-            raise SettingsFileError(
+            raise YamlError(
                 f'sensors must be a list of {SENSOR_COUNT}: got {shortened(values["sensors"])}'
             )
         values['sensors'] = tuple(map(str, values['sensors']))
-    except SettingsFileError:
+    except YamlError:
         raise
     except (KeyError, TypeError, ValueError) as error:
-        raise SettingsFileError(
+        raise YamlError(
             f'must be a file of t3mpc robot setup --save, with link below /**, and {_BOARD}'
         ) from error
     unknown, missing = (
@@ -538,19 +534,19 @@ def settings_of_file(content: object) -> RobotSettings:
     )
     if unknown or missing:
         names = ', '.join(sorted(unknown or missing))
-        raise SettingsFileError(f'{"has unknown" if unknown else "lacks the"} settings: {names}')
+        raise YamlError(f'{"has unknown" if unknown else "lacks the"} settings: {names}')
     settings = RobotSettings(**values)
     for name, kind in RobotSettings.__annotations__.items():
         value = getattr(settings, name)
         allowed = {float: (int, float)}.get(kind, (kind,))
         if kind in (int, bool, float, str) and type(value) not in allowed:
-            raise SettingsFileError(
+            raise YamlError(
                 f'{name} must be {_KINDS[kind]}: got {shortened(value)}{number_hint(value)}'
             )
     try:
         check_settings(settings)
     except (TypeError, ValueError) as error:
-        raise SettingsFileError(str(error)) from error
+        raise YamlError(str(error)) from error
     return settings
 
 
