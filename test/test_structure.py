@@ -91,6 +91,7 @@ SHARED_BASENAMES = {
     'emulator': 'the emulator, and the command that starts it',
     'fault_injection': 'faults injected into the twin, and into the emulated board',
     'localizer': 'the localizer, and the node that runs it',
+    'player': 'the playback of bags, and the node that plays them',
     'qos': 'QoS profiles, in bags and of publishers and subscriptions',
 }
 MAX_CLOSURE = 42

@@ -101,7 +101,7 @@ INTERFACES = {
         services=('~/split_bagfile', '~/snapshot'),
     ),
     'player': NodeInterface(
-        'player.node:PlayerNode',
+        'player:PlayerNode',
         'Publishes the messages of bags at the recorded times; storage.uris names the bags.',
         publishes=('*', '/clock', '/diagnostics'),
         services=(

@@ -36,7 +36,7 @@ from t3mpc_ros.control.range_fault_detection import RangeFault
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist
 from t3mpc_ros.nodes.base_node import ERROR, NO_CLOCK, OK, WARN
-from t3mpc_ros.nodes.player.node import PlayerNode
+from t3mpc_ros.nodes.player import PlayerNode
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.nodes.registry import NODES, node_class, parameter_class
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch

@@ -44,8 +44,8 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.nodes.base_node import OK, WARN
-from t3mpc_ros.nodes.player.node import PlayerNode
-from t3mpc_ros.nodes.player.terminal import parse_keys
+from t3mpc_ros.nodes.player import PlayerNode
+from t3mpc_ros.nodes.player_terminal import parse_keys
 from t3mpc_ros.nodes.recorder import RecorderNode
 from t3mpc_ros.nodes.sim_robot import SimRobotNode
 from t3mpc_ros.parameters.table import ParameterError
@@ -471,7 +471,7 @@ def test_keys_pause_play_next_and_change_the_rate(terminal, tmp_path):
 
 
 FAULT = (
-    'from t3mpc_ros.nodes.player.node import PlayerNode as node; '
+    'from t3mpc_ros.nodes.player import PlayerNode as node; '
     'node._monitor = lambda self: 1 / (self._keyboard is None); '
 )
 
