@@ -149,9 +149,9 @@ def _setup(options: argparse.Namespace, stop: StopSignal) -> int:
             f't3mpc robot ping --params-file {options.save}'
         )
     if compared is not None:
-        rows = eeprom_records.differences(stored.content, compared)
-        print(eeprom_records.format_differences(rows) or f'equal to {options.diff}')
-        if rows:
+        changed = eeprom_records.differences(stored.content, compared)
+        print(changed or f'equal to {options.diff}')
+        if changed:
             return EXIT_POOR
     return EXIT_OK if stored.state == frames.SETTINGS_GOOD else EXIT_POOR
 
@@ -162,13 +162,10 @@ def _store_settings(
     options: argparse.Namespace,
     stop: StopSignal,
 ) -> StoredSettings:
-    rows = eeprom_records.differences(stored.content, wanted)
-    if stored.state == frames.SETTINGS_GOOD and not rows:
+    changed = eeprom_records.differences(stored.content, wanted)
+    if stored.state == frames.SETTINGS_GOOD and not changed:
         return stored
-    if stored.valid:
-        print(eeprom_records.format_differences(rows))
-    else:
-        print(eeprom_records.SETTINGS_TEXTS[stored.state])
+    print(changed if stored.valid else eeprom_records.SETTINGS_TEXTS[stored.state])
     if not options.yes and not _ask('Write this to the robot?', stop):
         raise ProcedureError('nothing was written')
     return _run_at_board(eeprom_records.write_settings(wanted), options, stop)

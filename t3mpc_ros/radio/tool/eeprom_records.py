@@ -414,14 +414,6 @@ _BOARD = '/robot_board'
 StoredSettings = Stored[RobotSettings]
 
 
-class Difference(NamedTuple):
-    """A setting with two values."""
-
-    name: str
-    old: object
-    new: object
-
-
 def draw_address(entropy: Callable[[int], bytes]) -> bytes:
     """Return a random address; its text is no number, which ROS would not take for a string."""
     while True:
@@ -471,19 +463,14 @@ def write_settings(settings: RobotSettings) -> Script[StoredSettings]:
     return StoredSettings(frames.SETTINGS_GOOD, decode_settings(body))
 
 
-def differences(old: RobotSettings, new: RobotSettings) -> list[Difference]:
-    """Return the settings that differ; the sensors one by one."""
+def differences(old: RobotSettings, new: RobotSettings) -> str:
+    """Return a line for each setting that differs; the sensors one by one."""
     pairs = [(name, getattr(old, name), getattr(new, name)) for name in old._fields[:-1]]
     pairs += [
         (f'sensors[{number}]', before, after)
         for number, (before, after) in enumerate(zip(old.sensors, new.sensors, strict=True))
     ]
-    return [Difference(*pair) for pair in pairs if pair[1] != pair[2]]
-
-
-def format_differences(rows: list[Difference]) -> str:
-    """Return one line for each difference."""
-    return '\n'.join(f'{row.name}: {_text(row.old)} -> {_text(row.new)}' for row in rows)
+    return '\n'.join(f'{name}: {_text(a)} -> {_text(b)}' for name, a, b in pairs if a != b)
 
 
 def format_settings(stored: StoredSettings) -> str:
