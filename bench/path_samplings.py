@@ -19,25 +19,27 @@ the shape without its sampling and all of the limits, and empty without it.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 import math
 
 import numpy as np
 
 from t3mpc_ros.evaluation.confidence_intervals import mean
 from t3mpc_ros.evaluation.patrol.path_trackers import (
-    FeedbackLinearisation,
-    LinearisationParameters,
+    SPACING,
     PathTracker,
     PurePursuitParameters,
     Pursuit,
     RegulatedParameters,
+    TwistLimiter,
 )
 from t3mpc_ros.evaluation.patrol.path_tracking import errors_of
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS, PatrolScenario, run_patrol
+from t3mpc_ros.evaluation.record import RATE
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_smoothing import SmoothedPath
-from t3mpc_ros.geometry.path_timing import polyline_length, resample, time_path
-from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.geometry.path_timing import check_points, polyline_length, resample, time_path
+from t3mpc_ros.geometry.types import Array, BodyTwist, Pose
 
 GEOMETRY = WheelGeometry()
 TOLERANCE = 0.02
@@ -98,6 +100,65 @@ SAMPLINGS: Mapping[str, tuple[Array, Array]] = {
     'steps of a grid, 50 mm': (diagonal(), staircase(0.05)),
 }
 """Shape, and the path given, m."""
+
+
+@dataclass(frozen=True)
+class LinearisationParameters:
+    """Parameters of feedback linearisation."""
+
+    ahead: float = 0.05
+    """d, m"""
+    gain: float = 3.0
+    """k, 1/s"""
+    speed: float = 0.25
+    """m/s"""
+    acceleration: float = 0.5
+    """m/s²"""
+
+
+class FeedbackLinearisation:
+    r"""A point ahead of the axle follows a path (m, shape (n, 2)) with a trapezoid of speed.
+
+    At the distance :math:`d` ahead it moves like a point mass (d'Andréa-Novel, Campion and Bastin,
+    Int. J. Robotics Research 14, 1995, doi 10.1177/027836499501400602): :math:`(v, \omega d)` is
+    its wanted velocity :math:`\dot p_r + k (p_r - p)` in the frame of the robot. Every command has
+    the limits of the controller.
+    """
+
+    def __init__(self, points: Array, parameters: LinearisationParameters) -> None:
+        check_points(points)
+        self._parameters, self._limiter = parameters, TwistLimiter()
+        # The axle is to reach the end: the path of the point goes on by its distance.
+        run = points[-1] - points[-2]
+        end = points[-1] + parameters.ahead * run / np.hypot(*run)
+        self._path = resample(np.vstack([points, end]), SPACING)
+        self._length = polyline_length(self._path)
+        self._along, self._speed = parameters.ahead, 0.0
+
+    def step(self, pose: Pose) -> BodyTwist:
+        """Return the commanded twist for a pose; called once per period."""
+        parameters = self._parameters
+        braking = math.sqrt(2.0 * parameters.acceleration * max(self._length - self._along, 0.0))
+        faster = self._speed + parameters.acceleration / RATE
+        self._speed = min(parameters.speed, braking, faster)
+        before = self._place()
+        self._along = min(self._along + self._speed / RATE, self._length)
+        after = self._place()
+        ahead = np.array([math.cos(pose.yaw), math.sin(pose.yaw)])
+        point = np.array(pose[:2]) + parameters.ahead * ahead
+        velocity = (after - before) * RATE + parameters.gain * (after - point)
+        left = float(velocity @ np.array([-ahead[1], ahead[0]]))
+        return self._limiter.limited(BodyTwist(float(velocity @ ahead), left / parameters.ahead))
+
+    def _place(self) -> Array:
+        """Return where the point is to be, m."""
+        index = self._along / self._length * (len(self._path) - 1)
+        first = min(int(index), len(self._path) - 2)
+        found: Array = self._path[first] + (index - first) * (
+            self._path[first + 1] - self._path[first]
+        )
+        return found
+
 
 TRACKERS = ('pure pursuit', 'regulated pure pursuit with rotation', 'feedback linearisation')
 

@@ -42,8 +42,8 @@ from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.evaluation.confidence_intervals import mean
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
-from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at, visits
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan, free_cells
+from t3mpc_ros.evaluation.patrol.patrol_metrics import CoverageGrid, coverage_at, visits
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     LIMITS,
     PatrolScenario,

@@ -41,8 +41,7 @@ from t3mpc_ros.evaluation.paper import paper_figures
 from t3mpc_ros.evaluation.paper.figure_runs import FigureRuns
 from t3mpc_ros.evaluation.paper.paper_tables import Results
 from t3mpc_ros.evaluation.paper.study import STAGES, WITHOUT
-from t3mpc_ros.evaluation.patrol import path_tracking_page, patrol_figures
-from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, visits
+from t3mpc_ros.evaluation.patrol import path_tracking_page, patrol_page
 from t3mpc_ros.evaluation.patrol.path_tracking import OURS as TRACKER
 from t3mpc_ros.evaluation.patrol.path_tracking import TRACKED_PATHS, TrackingPlan, TrackingStudy
 from t3mpc_ros.evaluation.patrol.patrol_comparison import (
@@ -50,6 +49,7 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     PatrolPlan,
     PatrolStudy,
 )
+from t3mpc_ros.evaluation.patrol.patrol_metrics import CoverageGrid, visits
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
 from t3mpc_ros.evaluation.process_replay import replay_comparison
 from t3mpc_ros.evaluation.process_replay.replay_comparison import (
@@ -527,7 +527,7 @@ PATROLS = PatrolStudy(
 
 
 def test_coverage_is_the_mean_in_per_cent_over_minutes():
-    (axis,) = patrol_figures.draw_coverage(PATROLS).axes
+    (axis,) = patrol_page.draw_coverage(PATROLS).axes
     shown = lines(axis)
     for name, last in ((OURS, 80.0), ('random walk', 50.0)):
         time, share = shown[name]
@@ -537,7 +537,7 @@ def test_coverage_is_the_mean_in_per_cent_over_minutes():
 
 
 def test_skills_have_their_intervals():
-    (axis,) = patrol_figures.draw_predictability(PATROLS).axes
+    (axis,) = patrol_page.draw_predictability(PATROLS).axes
     for name, container in zip(PATROLS.plan.paths, axis.containers, strict=True):
         assert container.get_label() == name
         values = [PATROLS.table.values(f'skill_{h:g}', controller=name) for h in HORIZONS]
@@ -601,7 +601,7 @@ DRAWN = PatrolStudy(
 
 def test_heat_maps_are_where_the_robot_was():
     """Between the walls and axes of the room: the picture of an array begins at the top."""
-    *axes, bar = patrol_figures.draw_heat_maps(DRAWN).axes
+    *axes, bar = patrol_page.draw_heat_maps(DRAWN).axes
     for axis, row, place in zip(axes, DRAWN.table, ((0.25, 0.25), (2.75, 0.75)), strict=True):
         assert title(axis) == row['controller']
         even = 4.0 / 31  # s in each of the cells that count
@@ -623,7 +623,7 @@ def test_heat_maps_are_where_the_robot_was():
 
 
 def test_patrols_are_drawn_with_their_hits_and_the_room():
-    for axis, row in zip(patrol_figures.draw_paths(DRAWN).axes, DRAWN.table, strict=True):
+    for axis, row in zip(patrol_page.draw_paths(DRAWN).axes, DRAWN.table, strict=True):
         assert title(axis) == row['controller']
         hits, path = axis.lines
         assert hits.get_xydata() == pytest.approx(np.array(row['hits']))

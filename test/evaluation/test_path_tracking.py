@@ -20,14 +20,13 @@ import numpy as np
 import pytest
 from support.records import record_of
 
+from bench.path_samplings import FeedbackLinearisation, LinearisationParameters
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.patrol import path_tracking_page
 from t3mpc_ros.evaluation.patrol.path_trackers import (
-    FeedbackLinearisation,
-    LinearisationParameters,
     PurePursuitParameters,
     Pursuit,
     RegulatedParameters,

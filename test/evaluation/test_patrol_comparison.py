@@ -26,7 +26,6 @@ from support.unrendered import unrendered  # noqa: F401 - a fixture
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.patrol import patrol_comparison, patrol_page
-from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid
 from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     CLEARANCE,
     OURS,
@@ -38,6 +37,7 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
     measured_patrol,
     patrol_track,
 )
+from t3mpc_ros.evaluation.patrol.patrol_metrics import CoverageGrid
 from t3mpc_ros.geometry.path_timing import MotionLimits
 from t3mpc_ros.simulation.world import clearance, load_world
 

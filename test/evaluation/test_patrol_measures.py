@@ -19,14 +19,14 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, LANES, Rectangle
-from t3mpc_ros.evaluation.patrol.coverage import (
+from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     CoverageGrid,
     coverage_at,
     evenness,
+    patrol_metrics,
     time_to_cover,
     visits,
 )
-from t3mpc_ros.evaluation.patrol.patrol_metrics import patrol_metrics
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, predictability
 from t3mpc_ros.evaluation.patrol.time_series_analysis import (
     delay_vectors,

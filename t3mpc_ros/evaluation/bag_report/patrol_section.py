@@ -21,8 +21,14 @@ import numpy as np
 from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.charts import Chart, Line
-from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at, visits
-from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES, SHORTEST, patrol_metrics
+from t3mpc_ros.evaluation.patrol.patrol_metrics import (
+    SHARES,
+    SHORTEST,
+    CoverageGrid,
+    coverage_at,
+    patrol_metrics,
+    visits,
+)
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
 from t3mpc_ros.evaluation.reporting import Block, Heading, Paragraph, Table
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH

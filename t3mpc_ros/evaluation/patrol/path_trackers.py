@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-r"""Pure pursuit, regulated pure pursuit and feedback linearisation: baselines of the pose loop.
+r"""Pure pursuit and regulated pure pursuit: baselines of the pose loop.
 
 Pure pursuit drives the arc through a point of the path at the distance :math:`L`, the lookahead,
 which is at :math:`y` to the left of the robot; the arc has the curvature :math:`2 y/L^2`
@@ -21,12 +21,6 @@ the arc is tighter than a radius :math:`r`, :math:`v' = v/(r |\kappa|)`. Before 
 down: plain pure pursuit as late as a deceleration allows, the regulated one in proportion to the
 distance, as its implementation in Nav2 does. Its regulation near obstacles has no effect here,
 where there are none. As there, it can turn on the spot towards a target far beside.
-
-Feedback linearisation moves a point at the distance :math:`d` ahead of the axle like a point mass
-(d'Andréa-Novel, Campion and Bastin, Int. J. Robotics Research 14, 1995, doi
-10.1177/027836499501400602): :math:`(v, \omega d)` is the wanted velocity of that point,
-:math:`\dot p_r + k (p_r - p)`, in the frame of the robot. :math:`p_r` goes along the path with a
-trapezoid of speed.
 """
 
 from dataclasses import dataclass
@@ -118,7 +112,7 @@ def pursuit_curvature(pose: Pose, target: tuple[float, float]) -> float:
     return 2.0 * left / max(x * x + y * y, 1e-12)
 
 
-class _Limiter:
+class TwistLimiter:
     """Commands within the limits of the controller."""
 
     def __init__(self) -> None:
@@ -135,61 +129,6 @@ class _Limiter:
         return twist_from_wheels(WheelSpeeds(*self._command.tolist()), self._geometry)
 
 
-@dataclass(frozen=True)
-class LinearisationParameters:
-    """Parameters of feedback linearisation."""
-
-    ahead: float = 0.05
-    """d, m"""
-    gain: float = 3.0
-    """k, 1/s"""
-    speed: float = 0.25
-    """m/s"""
-    acceleration: float = 0.5
-    """m/s²"""
-
-
-class FeedbackLinearisation:
-    """A point ahead of the axle follows a path (m, shape (n, 2)) with a trapezoid of speed.
-
-    Every command has the limits of the controller.
-    """
-
-    def __init__(self, points: Array, parameters: LinearisationParameters) -> None:
-        check_points(points)
-        self._parameters, self._limiter = parameters, _Limiter()
-        # The axle is to reach the end: the path of the point goes on by its distance.
-        run = points[-1] - points[-2]
-        end = points[-1] + parameters.ahead * run / np.hypot(*run)
-        self._path = resample(np.vstack([points, end]), SPACING)
-        self._length = polyline_length(self._path)
-        self._along, self._speed = parameters.ahead, 0.0
-
-    def step(self, pose: Pose) -> BodyTwist:
-        """Return the commanded twist for a pose; called once per period."""
-        parameters = self._parameters
-        braking = math.sqrt(2.0 * parameters.acceleration * max(self._length - self._along, 0.0))
-        faster = self._speed + parameters.acceleration / RATE
-        self._speed = min(parameters.speed, braking, faster)
-        before = self._place()
-        self._along = min(self._along + self._speed / RATE, self._length)
-        after = self._place()
-        ahead = np.array([math.cos(pose.yaw), math.sin(pose.yaw)])
-        point = np.array(pose[:2]) + parameters.ahead * ahead
-        velocity = (after - before) * RATE + parameters.gain * (after - point)
-        left = float(velocity @ np.array([-ahead[1], ahead[0]]))
-        return self._limiter.limited(BodyTwist(float(velocity @ ahead), left / parameters.ahead))
-
-    def _place(self) -> Array:
-        """Return where the point is to be, m."""
-        index = self._along / self._length * (len(self._path) - 1)
-        first = min(int(index), len(self._path) - 2)
-        found: Array = self._path[first] + (index - first) * (
-            self._path[first + 1] - self._path[first]
-        )
-        return found
-
-
 class Pursuit:
     """Pure pursuit of a path (m, shape (n, 2)), plain or regulated by the kind of its parameters.
 
@@ -201,7 +140,7 @@ class Pursuit:
     ) -> None:
         check_points(points)
         self._parameters = parameters
-        self._limiter = _Limiter()
+        self._limiter = TwistLimiter()
         path = resample(points, SPACING)
         self._spacing = polyline_length(path) / (len(path) - 1)
         self._goal = len(path) - 1

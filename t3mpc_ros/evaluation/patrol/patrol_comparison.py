@@ -33,8 +33,12 @@ from t3mpc_ros.chaos.chaotic_path import PortraitParameters
 from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
-from t3mpc_ros.evaluation.patrol.coverage import CoverageGrid, coverage_at, visits
-from t3mpc_ros.evaluation.patrol.patrol_metrics import patrol_metrics
+from t3mpc_ros.evaluation.patrol.patrol_metrics import (
+    CoverageGrid,
+    coverage_at,
+    patrol_metrics,
+    visits,
+)
 from t3mpc_ros.evaluation.patrol.patrol_run import (
     LIMITS,
     PatrolScenario,
@@ -280,12 +284,8 @@ def _twin_track(plan: PatrolPlan, record: Record, world: World) -> PatrolTrack:
 def range_hits(poses: Array, ranges: Array) -> Array:
     """Return where the rays of the range sensors ended, m, shape (k, 2).
 
-    Parameters
-    ----------
-    poses
-        x, y (m), yaw (rad), shape (n, 3).
-    ranges
-        Readings of the eight sensors, m, shape (n, 8); those that are not finite hit nothing.
+    ``poses`` are x, y (m) and yaw (rad), shape (n, 3), ``ranges`` the readings of the eight
+    sensors (m), shape (n, 8); those that are not finite hit nothing.
     """
     ends = ray_ends(poses, ranges, sensor_mounts(RangeSensorParameters())).reshape(-1, 2)
     found: Array = ends[np.isfinite(ends).all(axis=1)]

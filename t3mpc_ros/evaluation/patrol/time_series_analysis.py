@@ -40,10 +40,7 @@ def check_path(t: Array, x: Array, y: Array) -> None:
 def resampled(t: Array, x: Array, y: Array, step: float) -> Array:
     """Return the positions at intervals of ``step`` (s), linearly interpolated, shape (m, 2).
 
-    Raises
-    ------
-    ValueError
-        Not a path, see :func:`check_path`, or one shorter than a step.
+    ValueError: not a path, see :func:`check_path`, or one shorter than a step.
     """
     check_path(t, x, y)
     duration = float(t[-1] - t[0])
@@ -56,17 +53,8 @@ def resampled(t: Array, x: Array, y: Array, step: float) -> Array:
 def delay_vectors(series: Array, lags: Sequence[int]) -> Array:
     """Return one row (s[n - lag] for each lag) for each n that has them all.
 
-    Parameters
-    ----------
-    series
-        Shape (n, d).
-    lags
-        Samples into the past, in increasing order, the first one 0; row 0 is of n = lags[-1].
-
-    Returns
-    -------
-    Array
-        Shape (n - lags[-1], d * len(lags)).
+    ``series`` has the shape (n, d), the result (n - lags[-1], d * len(lags)). ``lags`` are samples
+    into the past, ascending from 0; row 0 is of n = lags[-1].
     """
     deepest = lags[-1]
     if not 0 <= deepest < len(series):
@@ -186,21 +174,9 @@ def divergence(points: Array, step: float, apart: int, horizon: int) -> float:
     Any data give a number. Noise has no exponent: there the number grows without bound as the
     samples become denser, and compares only with that of other paths of the same sampling.
 
-    Parameters
-    ----------
-    points
-        Delay vectors or states at uniform times, shape (n, d).
-    step
-        Time between two points, s.
-    apart
-        Neighbours are more than so many samples apart in time: about a mean period.
-    horizon
-        Samples for which neighbours are followed.
-
-    Raises
-    ------
-    ValueError
-        There are too few points, or no point has a neighbour.
+    ``points`` are delay vectors or states at times ``step`` (s) apart, shape (n, d); neighbours
+    are more than ``apart`` samples from each other in time, about a mean period, and are followed
+    for ``horizon`` samples. ValueError: there are too few points, or no point has a neighbour.
     """
     count = len(points) - horizon
     if horizon < 2 or count <= apart + 1:
