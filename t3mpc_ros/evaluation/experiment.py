@@ -122,6 +122,11 @@ class ResultTable(Sequence[Row]):
         return paired(list(one.values()), [other[key] for key in one])
 
 
+def recorded_run(job: Job) -> Record:
+    """Return the record of one run."""
+    return run(*job)
+
+
 def measured_run(job: Job, numbers: Callable[[Record], Mapping[str, Any]] = measure) -> Row:
     """Return the numbers of one run, by default its metrics."""
     return dict(numbers(run(*job)))

@@ -31,20 +31,18 @@ from support.records import record_of
 from t3mpc_ros.evaluation import experiment, open_loop_estimation
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL, methods
-from t3mpc_ros.evaluation.paper import figure_runs, study
 from t3mpc_ros.evaluation.paper import reproduce as reproduction
+from t3mpc_ros.evaluation.paper import study
 from t3mpc_ros.evaluation.paper.claims import ALONE, INTENDED, Claim, all_claims, markdown
-from t3mpc_ros.evaluation.paper.figure_runs import (
+from t3mpc_ros.evaluation.paper.paper_figures import (
     explained,
+    floor_path,
     follows_claim,
     largest_switch,
     switches_claim,
-    switches_of,
 )
-from t3mpc_ros.evaluation.paper.paper_figures import floor_path
-from t3mpc_ros.evaluation.paper.paper_page import EXHIBITS, counted
 from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables
-from t3mpc_ros.evaluation.paper.reproduce import RUNS, reproduce
+from t3mpc_ros.evaluation.paper.reproduce import EXHIBITS, RUNS, counted, reproduce
 from t3mpc_ros.evaluation.paper.study import (
     DRIVES,
     INTENDED_CASES,
@@ -58,6 +56,7 @@ from t3mpc_ros.evaluation.paper.study import (
     measure,
     study_runs,
 )
+from t3mpc_ros.evaluation.record import switch_times
 from t3mpc_ros.evaluation.reporting import finite
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry
@@ -457,7 +456,7 @@ def test_explained_share_is_one_if_perfect_zero_if_none():
 
 def test_switches_are_counted_and_only_a_whole_run_decides():
     run = record(60.0)
-    assert switches_of(run) == pytest.approx([12.0, 24.0, 36.0, 48.0])
+    assert switch_times(run.time, run['mode']) == pytest.approx([12.0, 24.0, 36.0, 48.0])
     assert switches_claim(run).held is True
     run['mode'][:] = 0
     assert switches_claim(run).held is False
@@ -492,7 +491,6 @@ def begun():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(experiment, 'run', run)
-        patch.setattr(figure_runs, 'run', run)
         yield found
 
 

@@ -325,14 +325,14 @@ def no_larger_than_pi(runs: ResultTable, drive: str) -> Finding:
 def smallest_growth(runs: ResultTable, drive: str) -> Finding:
     """Compare what the noise adds to RMSE with what it adds to that of any baseline, in rad/s."""
     full, others = growths(runs, drive)
-    added = {name: each.last - each.first for name, each in others.items()}
+    added = {name: each.ends[1] - each.ends[0] for name, each in others.items()}
     least = min(added, key=lambda name: added[name])
-    own = full.last - full.first
+    own = full.ends[1] - full.ends[0]
     return Finding(
         math.isfinite(own) and own <= added[least],
         f'{own:+.3f} rad/s against {added[least]:+.3f} of {least}, the least of {len(added)}',
         {'full': own, 'least_rival': least, 'least': added[least]},
-        [paired(each.beyond(0.0), full.beyond(0.0)) for each in others.values()],
+        [paired(each.last - each.first, full.last - full.first) for each in others.values()],
     )
 
 
@@ -348,7 +348,7 @@ def settled_share(runs: ResultTable, drive: str, limit: float) -> Finding:
 def grows_slightly(runs: ResultTable, drive: str) -> Finding:
     """Compare the growth of RMSE with noise with :data:`SLIGHTLY`."""
     full, _ = growths(runs, drive)
-    growth, margin = full.share, paired(np.zeros_like(full.ends[0]), full.beyond(SLIGHTLY))
+    growth, margin = full.share, full.below(SLIGHTLY)
     return Finding(growth <= SLIGHTLY, f'{100 * growth:+.0f} %', {'growth': growth}, [margin])
 
 
@@ -361,7 +361,7 @@ def others_grow(runs: ResultTable, drive: str) -> Finding:
         shares[low] > 0.5,
         f'from {100 * shares[low]:+.0f} % ({low}) to {100 * shares[high]:+.0f} % ({high})',
         shares,
-        [paired(each.beyond(0.5), np.zeros_like(each.ends[0])) for each in others.values()],
+        [each.above(0.5) for each in others.values()],
     )
 
 
@@ -432,24 +432,30 @@ def best_of(candidates: Mapping[str, Array]) -> str:
 
 
 class Growth(NamedTuple):
-    """RMSE of a method in the nominal case without noise and with the most."""
+    """RMSE of each seed in the nominal case without noise and with the most, rad/s."""
 
-    first: float
-    last: float
-    """Infinite for what diverges under noise."""
-    ends: tuple[Array, Array]
-    """Both of each seed."""
+    first: Array
+    last: Array
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Both means; the second one is infinite for what diverges under noise."""
+        last = mean(self.last)
+        return mean(self.first), last if math.isfinite(last) else math.inf
 
     @property
     def share(self) -> float:
-        """Growth relative to the RMSE without noise."""
-        return self.last / self.first - 1.0
-
-    def beyond(self, share: float) -> Array:
-        """Return the growth of each seed beyond a share of its start, rad/s."""
+        """What the noise adds, relative to the RMSE without it."""
         first, last = self.ends
-        growth: Array = last - (1.0 + share) * first
-        return growth
+        return last / first - 1.0
+
+    def above(self, share: float) -> Difference:
+        """Return by how much RMSE grows beyond a share of its start, rad/s."""
+        return paired(self.last, (1.0 + share) * self.first)
+
+    def below(self, share: float) -> Difference:
+        """Return by how much it stays below this."""
+        return paired((1.0 + share) * self.first, self.last)
 
 
 def growths(runs: ResultTable, drive: str) -> tuple[Growth, dict[str, Growth]]:
@@ -459,8 +465,7 @@ def growths(runs: ResultTable, drive: str) -> tuple[Growth, dict[str, Growth]]:
     for name, first in {**starts, FULL: by_seed(runs, FULL, drive, 0.0)}.items():
         last = by_seed(runs, name, drive, LOUDEST)
         if math.isfinite(mean(first)):
-            end = mean(last) if math.isfinite(mean(last)) else math.inf
-            found[name] = Growth(mean(first), end, (first, last))
+            found[name] = Growth(first, last)
     full = found.pop(FULL, None)
     if full is None or not found:
         raise NotMeasuredError
@@ -478,9 +483,8 @@ def half_of_others(estimated: ResultTable) -> Finding:
     """Compare type 3 at the paper's noise with half of the best of the others."""
     speeds = _speeds(estimated, study.PAPER_NOISE)
     ours, *others = KINDS
-    means = {kind: mean(values) for kind, values in speeds.items()}
-    best = min(others, key=lambda kind: means[kind])
-    own, other = means[ours], means[best]
+    best = best_of({kind: speeds[kind] for kind in others})
+    own, other = mean(speeds[ours]), mean(speeds[best])
     return Finding(
         own <= 0.5 * other,
         f'{own:.4f} rad/s against {other:.4f} of {best}: {own / other:.2f} of it',
@@ -493,17 +497,13 @@ def slight_growth(estimated: ResultTable) -> Finding:
     """Compare the growth with noise of each kind."""
     quiet, loud = (_speeds(estimated, noise) for noise in (0.0, LOUDEST))
     ours, *others = KINDS
-    ends = {kind: (quiet[kind], loud[kind]) for kind in KINDS}
-    grown = {kind: mean(last) / mean(first) - 1.0 for kind, (first, last) in ends.items()}
-    first, last = ends[ours]
+    grown = {kind: Growth(quiet[kind], loud[kind]) for kind in KINDS}
+    shares = {kind: each.share for kind, each in grown.items()}
     return Finding(
-        grown[ours] <= SLIGHTLY and all(grown[kind] > 0.5 for kind in others),
-        ', '.join(f'{kind} {100 * share:+.0f} %' for kind, share in grown.items()),
-        grown,
-        [
-            paired((1.0 + SLIGHTLY) * first, last),
-            *(paired(ends[kind][1], 1.5 * ends[kind][0]) for kind in others),
-        ],
+        shares[ours] <= SLIGHTLY and all(shares[kind] > 0.5 for kind in others),
+        ', '.join(f'{kind} {100 * share:+.0f} %' for kind, share in shares.items()),
+        shares,
+        [grown[ours].below(SLIGHTLY), *(grown[kind].above(0.5) for kind in others)],
     )
 
 

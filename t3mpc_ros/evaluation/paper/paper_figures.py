@@ -11,10 +11,13 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Figures 8 to 15 of the paper, and of the comparison: bars, growth with noise, ablation."""
+"""The single runs that the paper's figures show, the claims decided from them, and the figures."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
 import math
+import re
 from textwrap import wrap
 from typing import Any
 
@@ -22,25 +25,222 @@ from matplotlib.ticker import MaxNLocator
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.chaos.reference import ReferenceParameters
+from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation import plotting
+from t3mpc_ros.evaluation.cases import NOMINAL
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import rms
-from t3mpc_ros.evaluation.methods import FULL
-from t3mpc_ros.evaluation.paper import figure_runs
-from t3mpc_ros.evaluation.paper.paper_tables import Results, label
-from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, PARTS, SETTLING, STAGES, WITHOUT
-from t3mpc_ros.evaluation.record import START, Record
+from t3mpc_ros.evaluation.experiment import map_jobs, recorded_run
+from t3mpc_ros.evaluation.methods import FULL, methods
+from t3mpc_ros.evaluation.open_loop_estimation import (
+    KINDS,
+    NORMALISED_GAIN,
+    SETTLE,
+    estimate,
+    estimator,
+    simulate_open_loop,
+    torque_robot,
+)
+from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD, Claim
+from t3mpc_ros.evaluation.paper.paper_tables import Results, label, rank
+from t3mpc_ros.evaluation.paper.study import (
+    PAPER_NOISE,
+    PARTS,
+    SETTLING,
+    STAGES,
+    WITHOUT,
+    Extent,
+    study_scenario,
+)
+from t3mpc_ros.evaluation.record import START, Record, switch_times
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, Array, WheelSpeeds
 
+NO_PREVIEW = WITHOUT['preview']
+PORTRAITS = 6
+"""How many phase portraits are compared, the full controller's among them."""
+FOLLOWS = 0.10
+"""Settled RMSE over the reference's spread that counts as following under noise."""
+LONG_ENOUGH = 59.0
+"""Length of a run that the claims are about, s; a shorter one cannot refute them."""
+EXPLAINS = 0.5
+"""Share of the unknown acceleration's variance that an estimate must explain to follow it."""
+
+
+@dataclass(frozen=True, slots=True)
+class FigureRuns:
+    """One run of each kind, all with the same seed and the paper's noise."""
+
+    torque: Record
+    """The full controller in the paper's parameter."""
+    velocity: Record
+    """The full controller as the nodes close the loop."""
+    blind: Record
+    """The same without preview."""
+    portraits: Mapping[str, Record]
+    """Of several methods in the paper's parameter, the full controller first."""
+    pairs: tuple[tuple[int, int], ...]
+    """Signals, from 1, that drive right and left wheel in each mode."""
+    driven: Array
+    """True speeds of a robot without a controller (86) after it has settled, rad/s, shape
+    (n, 2)."""
+    estimated: Mapping[str, Array]
+    """Their estimates by each kind of fuzzy system."""
+
+    def claims(self) -> list[Claim]:
+        """Return the paper's claims on single runs, decided for these."""
+        return [decide(self.torque) for decide in (switches_claim, follows_claim, estimate_claim)]
+
+
+def simulate_figure_runs(extent: Extent, results: Results, workers: int | Executor) -> FigureRuns:
+    """Return the runs that are drawn, with the first held-out seed."""
+    seed = extent.seeds[0]
+    shown = portrait_methods(results)
+    wanted = [('torque', name) for name in shown]
+    wanted += [('velocity', FULL), ('velocity', NO_PREVIEW)]
+    jobs = [
+        (
+            study_scenario(drive, PAPER_NOISE, NOMINAL, seed, extent.duration),
+            methods(drive)[name],
+        )
+        for drive, name in wanted
+    ]
+    found = dict(zip(wanted, map_jobs(recorded_run, jobs, workers), strict=True))
+    alone = simulate_open_loop(torque_robot(PAPER_NOISE, seed), SETTLE + extent.duration, seed)
+    first = round(SETTLE / alone.period)
+    return FigureRuns(
+        torque=found['torque', FULL],
+        velocity=found['velocity', FULL],
+        blind=found['velocity', NO_PREVIEW],
+        portraits={name: found['torque', name] for name in shown},
+        pairs=ReferenceParameters().switching.pairs,
+        driven=alone.speeds[first:],
+        estimated={
+            kind: estimate(alone, estimator(kind, PAPER_NOISE, NORMALISED_GAIN))[0][first:]
+            for kind in KINDS
+        },
+    )
+
+
+def portrait_methods(results: Results) -> list[str]:
+    """Return the methods of the phase portraits: proposed, other fuzzy kinds, best baselines."""
+    rows = results.methods('torque')
+    kinds = re.compile(r'fuzzy|type.?[12]\b|\bi?t[12]\b', re.IGNORECASE)
+    fuzzy = [row['controller'] for row in rows if kinds.search(row['controller'])]
+    best = sorted((row for row in rows if row['baseline']), key=lambda row: rank(row['rmse_mean']))
+    return list(dict.fromkeys([FULL, *fuzzy, *(row['controller'] for row in best)]))[:PORTRAITS]
+
+
+def largest_switch(run: Record) -> int | None:
+    """Return the row of the switch with the largest jump, None when there is none.
+
+    Switches so near the end that nothing of what follows could be shown do not count, unless
+    there are no others.
+    """
+    rows = np.flatnonzero(np.diff(run['mode']) != 0) + 1
+    early = rows[run.time[rows] < run.time[-1] - 3.0]
+    rows = early if early.size else rows
+    if not rows.size:
+        return None
+    jumps = np.abs(run.reference[rows] - run.reference[rows - 1]).sum(axis=1)
+    return int(rows[int(np.argmax(jumps))])
+
+
+def estimated_unknown(run: Record) -> Array:
+    """Return g of (31) as the law used it, rad/s², shape (n, 2): its term in (66) is -g."""
+    found: Array = -run['terms'][:, TERM_NAMES.index('fuzzy')]
+    return found
+
+
+def true_unknown(run: Record) -> Array:
+    """Return chi' - u of (30), from the true speeds over each period, rad/s², shape (n - 1, 2)."""
+    period = (run.time[-1] - run.time[0]) / (run.time.size - 1)
+    found: Array = np.diff(run.speeds, axis=0) / period - run['acceleration'][:-1]
+    return found
+
+
+def explained(run: Record) -> tuple[float, float]:
+    """Return the share of the unknown acceleration that g explains, of right and left wheel.
+
+    1 - mean((unknown - g)²)/var(unknown) after the start: 1 is perfect, 0 no better than the
+    mean, negative worse than that.
+    """
+    counted = run.time[:-1] >= START
+    target = true_unknown(run)[counted]
+    miss = target - estimated_unknown(run)[:-1][counted]
+    shares = 1.0 - np.mean(miss**2, axis=0) / np.var(target, axis=0)
+    return float(shares[0]), float(shares[1])
+
+
+def switches_claim(run: Record) -> Claim:
+    """Decide whether the reference changes its signals as often as in the paper's run."""
+    count = switch_times(run.time, run['mode']).size
+    return Claim(
+        'four switches',
+        'paper',
+        'The reference changes its signals four times in a run, suddenly (60 s here)',
+        f'{count} switches in {run.time[-1]:.0f} s',
+        count == 4 if run.time[-1] > LONG_ENOUGH else None,
+        {'switches': count},
+    )
+
+
+def follows_claim(run: Record) -> Claim:
+    """Decide whether the outputs follow between switches, in the run that is drawn."""
+    settled = run.rmse(START, margins=SETTLING)
+    return _of_run(
+        run,
+        'outputs follow',
+        'The outputs track the switching references very well (here: settled RMSE at most '
+        f'{100 * FOLLOWS:.0f} % of the reference, torque drive, noise {PAPER_NOISE:g}, run shown)',
+        f'settled RMSE {settled:.3f} rad/s, {100 * settled / REFERENCE_SPREAD:.1f} %',
+        settled <= FOLLOWS * REFERENCE_SPREAD,
+        {'settled': settled},
+    )
+
+
+def estimate_claim(run: Record) -> Claim:
+    """Decide whether the fuzzy systems' estimates follow the true unknown acceleration."""
+    right, left = explained(run)
+    return _of_run(
+        run,
+        'estimates follow',
+        'The estimated signals follow their targets (here: they explain at least '
+        f'{100 * EXPLAINS:.0f} % of the variance on both wheels, run shown)',
+        f'{100 * right:.0f} % of the variance explained on the right, {100 * left:.0f} % left',
+        min(right, left) >= EXPLAINS,
+        {'right': right, 'left': left},
+    )
+
+
+def _of_run(
+    run: Record, name: str, text: str, found: str, held: bool, numbers: dict[str, object]
+) -> Claim:
+    """Return the claim with its verdict; a short run refutes nothing."""
+    sure = held or bool(run.time[-1] > LONG_ENOUGH)
+    return Claim(
+        name, 'paper', text, found, bool(held) if sure else None, numbers, inconclusive=not sure
+    )
+
+
+def broken_at_switches(run: Record, values: Sequence[Array] | Array) -> Array:
+    """Return ``values`` (n, 2) with a gap before each switch: a jump is no line in a portrait."""
+    rows = np.flatnonzero(np.diff(run['mode']) != 0) + 1
+    broken: Array = np.insert(np.asarray(values, dtype=np.float64), rows, np.nan, axis=0)
+    return broken
+
+
+# -- figures --------------------------------------------------------------------------------------
+
 REFERENCE_COLOUR, DRIVEN = plotting.COLOURS[REFERENCE], plotting.COLOURS[TRUTH]
 COMMAND, MEASURED = plotting.COLOURS['applied'], plotting.COLOURS[ODOMETRY]
 
 
-def path(showcase: figure_runs.FigureRuns) -> Any:
+def path(showcase: FigureRuns) -> Any:
     """Return the path on the floor of the simulated robot, the paper's Fig. 8."""
     run = showcase.velocity
     figure = plotting.new_figure(5.0)
@@ -74,7 +274,7 @@ def floor_path(speeds: Array, time: Array) -> Array:
     return places
 
 
-def path_in_words(showcase: figure_runs.FigureRuns) -> str:
+def path_in_words(showcase: FigureRuns) -> str:
     """Return how long the way was and where it ended."""
     run = showcase.velocity
     reference, driven = floor_path(run.reference, run.time), floor_path(run.speeds, run.time)
@@ -86,7 +286,7 @@ def path_in_words(showcase: figure_runs.FigureRuns) -> str:
     )
 
 
-def portrait_in_words(showcase: figure_runs.FigureRuns) -> str:
+def portrait_in_words(showcase: FigureRuns) -> str:
     """Return how closely the simulated robot's wheels followed."""
     run = showcase.velocity
     settled = run.rmse(margins=SETTLING)
@@ -98,7 +298,7 @@ def portrait(run: Record) -> Any:
     figure = plotting.new_figure(3.4)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     # The robot's way through a switch is part of its portrait, the reference's jump is not.
-    reference = figure_runs.broken_at_switches(run, run.reference)
+    reference = broken_at_switches(run, run.reference)
     for axis, values, colour, title in (
         (axes[0], reference, REFERENCE_COLOUR, 'reference'),
         (axes[1], run.speeds, DRIVEN, 'robot'),
@@ -109,7 +309,7 @@ def portrait(run: Record) -> Any:
     return figure
 
 
-def modes(showcase: figure_runs.FigureRuns) -> Any:
+def modes(showcase: FigureRuns) -> Any:
     """Return which chaotic signal drives which output, the paper's Fig. 10."""
     run = showcase.torque
     figure, axes = plotting.new_panels(2, 1.25)
@@ -129,7 +329,7 @@ def modes(showcase: figure_runs.FigureRuns) -> Any:
     return figure
 
 
-def outputs(showcase: figure_runs.FigureRuns) -> Any:
+def outputs(showcase: FigureRuns) -> Any:
     """Return both outputs with their references, whole run and one switch, the paper's Fig. 11."""
     run = showcase.torque
     dots = {'color': MEASURED, 'marker': '.', 'linestyle': '', 'ms': 2.5, 'label': 'measured'}
@@ -142,7 +342,7 @@ def outputs(showcase: figure_runs.FigureRuns) -> Any:
     return figure
 
 
-def control(showcase: figure_runs.FigureRuns) -> Any:
+def control(showcase: FigureRuns) -> Any:
     """Return the control signals with their total variation, the paper's Fig. 12."""
     run = showcase.torque
     effort = run['acceleration']
@@ -154,26 +354,26 @@ def control(showcase: figure_runs.FigureRuns) -> Any:
     return figure
 
 
-def estimates(showcase: figure_runs.FigureRuns) -> Any:
+def estimates(showcase: FigureRuns) -> Any:
     """Return the estimates g with their targets, the paper's Fig. 13."""
     run = showcase.torque
     target = {'color': plotting.COLOURS['target'], 'lw': 0.9, 'label': 'unknown, $\\dot\\chi - u$'}
     found = {'color': plotting.COLOURS['estimate'], 'lw': 1.3, 'label': 'estimate g'}
     columns = (
-        (figure_runs.true_unknown(run), target),
-        (figure_runs.estimated_unknown(run)[:-1], found),
+        (true_unknown(run), target),
+        (estimated_unknown(run)[:-1], found),
     )
     figure, axes = run_and_zoom(run, 'rad/s²', 2.0, 4.0, columns)
-    for axis, wheel, share in zip(axes[:, 0], WHEELS, figure_runs.explained(run), strict=True):
+    for axis, wheel, share in zip(axes[:, 0], WHEELS, explained(run), strict=True):
         axis.set_title(f'{wheel} wheel, {100 * share:.0f} % of the variance explained')
     plotting.legend_above(figure, axes[0][-1])
     return figure
 
 
-def preview(showcase: figure_runs.FigureRuns) -> Any:
+def preview(showcase: FigureRuns) -> Any:
     """Return both wheels about a switch, with preview and without."""
     run, blind = showcase.velocity, showcase.blind
-    middle = figure_runs.largest_switch(run)
+    middle = largest_switch(run)
     if middle is None:
         return None
     before, after = 0.3, 0.8
@@ -210,7 +410,7 @@ def run_and_zoom(
     ``before`` and ``after`` are times about the switch, s; samples are drawn there alone.
     """
     stretches = [np.arange(run.time.size)]
-    middle = figure_runs.largest_switch(run)
+    middle = largest_switch(run)
     if middle is not None:
         switch = run.time[middle]
         stretches.append(rows_between(run, switch - before, switch + after))
@@ -220,7 +420,7 @@ def run_and_zoom(
     for i, wheel in enumerate(WHEELS):
         axes[i, 0].set(title=f'{wheel} wheel', ylabel=unit)
         for k, (axis, rows) in enumerate(zip(axes[i], stretches, strict=True)):
-            plotting.mark_switches(axis, figure_runs.switches_of(run))
+            plotting.mark_switches(axis, switch_times(run.time, run['mode']))
             for values, style in (samples, *columns) if samples and k else columns:
                 shown = rows[rows < len(values)]
                 axis.plot(*thinned(run.time[shown], values[shown, i]), **style)
@@ -396,7 +596,7 @@ def parts(results: Results) -> Any:
     return figure
 
 
-def portraits(showcase: figure_runs.FigureRuns, results: Results) -> Any:
+def portraits(showcase: FigureRuns, results: Results) -> Any:
     """Return phase portraits of several methods in closed loop (Fig. 15)."""
     colours = colours_of(results)
     shown = showcase.portraits
@@ -408,7 +608,7 @@ def portraits(showcase: figure_runs.FigureRuns, results: Results) -> Any:
         axis.set_visible(False)
     for axis, (name, run) in zip(axes.flat, shown.items(), strict=False):
         counted = run.time >= START
-        reference = figure_runs.broken_at_switches(run, run.reference)
+        reference = broken_at_switches(run, run.reference)
         axis.plot(reference[:, 1], reference[:, 0], color=REFERENCE_COLOUR, linewidth=0.7)
         speeds = run.speeds[counted]
         axis.plot(speeds[:, 1], speeds[:, 0], color=colours[name], linewidth=0.8, alpha=0.9)
@@ -418,7 +618,7 @@ def portraits(showcase: figure_runs.FigureRuns, results: Results) -> Any:
     return figure
 
 
-def estimation_portraits(showcase: figure_runs.FigureRuns) -> Any:
+def estimation_portraits(showcase: FigureRuns) -> Any:
     """Return phase portraits of (86) by kind of fuzzy system, the paper's Fig. 15."""
     shown = showcase.estimated
     figure = plotting.new_figure(2.7)

@@ -31,22 +31,19 @@ _GROUP = ('controller', 'baseline', 'preview', *SITUATION)
 class Results:
     """Means and paired differences of the runs of a study.
 
-    Attributes
-    ----------
-    runs
-        One row a run: what it is, see :func:`.study_runs`, and its :data:`.NUMBERS`.
-    means
-        One row for each method and situation: means over the seeds with half their 95 % intervals,
-        the largest error of all seeds, and whether every number is finite; NaN where a run
-        diverged.
-    added, lost
-        What RMSE each stage adds to the one before, and each part left out to the full controller:
-        mean with half its 95 % interval of ``first`` less ``second`` on the same seeds.
+    ``runs`` has one row a run: what it is, see :func:`.study_runs`, and its :data:`.NUMBERS`;
+    ``means`` one for each method and situation: means over the seeds with half their 95 %
+    intervals, the largest error of all seeds, and whether every number is finite; NaN where a run
+    diverged. ``added`` and ``lost`` are what RMSE each stage adds to the one before, and each part
+    left out to the full controller: mean with half its 95 % interval of ``first`` less ``second``
+    on the same seeds.
     """
 
     def __init__(self, runs: ResultTable) -> None:
         self.runs = runs
         self.means = ResultTable([_mean_row(rows) for rows in runs.groups(*_GROUP).values()])
+        self.drives = self.means.unique('drive')
+        self.noises = sorted(self.means.unique('noise'))
         self.added = self._differences(list(zip(STAGES[1:], STAGES[:-1], strict=True)))
         self.lost = self._differences([(each, STAGES[-1]) for each in WITHOUT.values()])
 
@@ -54,16 +51,6 @@ class Results:
         """Return a row of the means, None when it was not measured."""
         rows = self.means.where(controller=controller, drive=drive, noise=noise, case=case)
         return rows[0] if rows else None
-
-    @property
-    def drives(self) -> tuple[str, ...]:
-        """The drives of the runs."""
-        return self.means.unique('drive')
-
-    @property
-    def noises(self) -> tuple[float, ...]:
-        """The noises of the runs, ascending."""
-        return tuple(sorted(self.means.unique('noise')))
 
     def cases(self, drive: str) -> tuple[str, ...]:
         """The cases of the runs with a drive."""
