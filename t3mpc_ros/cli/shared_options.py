@@ -170,7 +170,7 @@ def executor_of(options: argparse.Namespace) -> Iterator[Any]:
     if not options.scheduler:
         yield options.workers
         return
-    from t3mpc_ros.evaluation.api.dask_workers import cluster
+    from t3mpc_ros.evaluation.api.parameter_sweep import cluster
 
     with cluster(options.scheduler) as executor:
         yield executor

@@ -85,6 +85,7 @@ class ProposedController(BaselineController):
         self.estimate_dead_time = table.estimate_dead_time
         self.inertia_error = table.inertia_error
         self._loads = WheelLoads(nominal_model) if table.nominal_loads else None
+        self.known = (FRICTION,) if table.nominal_loads else ()
         self._begun = False
         self._steps = 0
         """Control periods since the first observation."""
@@ -93,11 +94,6 @@ class ProposedController(BaselineController):
         self._expected: Array = np.zeros(2)
         self.terms = self._tracker.law.terms
         """The law's terms of the last step, rows as in ``TERM_NAMES``, rad/s², shape (5, 2)."""
-
-    @property
-    def knowledge(self) -> list[str]:
-        """What it knows, see :attr:`BaselineController.knowledge`."""
-        return [*super().knowledge, *([FRICTION] if self._loads else [])]
 
     def get_weights(self) -> dict[str, Array]:
         """Return fuzzy coefficients and predictor weights, as a model file keeps them."""

@@ -108,7 +108,7 @@ def context(value):
     return lambda **_: nullcontext(value)
 
 
-SHARED = {'evaluation.api.dask_workers.cluster': context(5)}
+SHARED = {'evaluation.api.parameter_sweep.cluster': context(5)}
 CSV = 'time,right,left\n' + ''.join(f'{0.01 * k:.2f},1.0,2.0\n' for k in range(300))
 OWN_RATE = tuple([0.0, 0.0] for _ in range(6100))
 """Slope of that reference over a run and a second."""

@@ -13,8 +13,9 @@
 # limitations under the License.
 """Runs over parameters × seeds × cases × controllers: ``sweep`` and its result."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 import itertools
 import math
@@ -317,6 +318,24 @@ def numbers_or_error(job: Job) -> Row:
 
 def _numbers(record: Record) -> Row:
     return {**measure(record), ERROR: divergence(record)}
+
+
+@contextmanager
+def cluster(address: str, timeout: float = 10.0) -> Iterator[Executor]:
+    """Enter the executor of a Dask scheduler, tcp://HOST:PORT, that answers within some s."""
+    import distributed
+
+    try:
+        client = distributed.Client(address, timeout=timeout)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise ScriptError(
+            f'no Dask scheduler answers at {address}; start one with "dask scheduler" and '
+            f'workers with "dask worker ADDRESS": {error}'
+        ) from None
+    with client:
+        found = client.get_executor(pure=False)
+        assert isinstance(found, Executor)
+        yield found
 
 
 # -- file -----------------------------------------------------------------------------------------

@@ -367,12 +367,8 @@ class LawNoise:
 
 def gaussian_noise(variance: float) -> NoiseLaw:
     """Return the law of white noise with a variance in (rad/s)²."""
-    return NoiseLaw(_Gaussian(math.sqrt(variance)), variance)
+    return NoiseLaw(partial(_white_noise, math.sqrt(variance)), variance)
 
 
-@dataclass(frozen=True)
-class _Gaussian:
-    deviation: float
-
-    def __call__(self, generator: np.random.Generator, time: float, speeds: Array) -> Array:
-        return self.deviation * generator.standard_normal(2)
+def _white_noise(deviation: float, generator: np.random.Generator, *_: object) -> Array:
+    return deviation * generator.standard_normal(2)

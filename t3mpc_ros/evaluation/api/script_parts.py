@@ -22,7 +22,8 @@ from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 import hashlib
-import importlib.util
+from importlib.machinery import ModuleSpec
+from importlib.util import module_from_spec
 import inspect
 from pathlib import Path
 import sys
@@ -219,33 +220,32 @@ class FileController:
         It is known before it has run, as a dataclass in it needs, but to no other thread.
         """
         with _RUNNING_A_FILE:
-            return sys.modules.get(self.module) or self._run()
+            if self.module in sys.modules:
+                return sys.modules[self.module]
+            module = module_from_spec(ModuleSpec(self.module, None, origin=self.path))
+            sys.modules[self.module] = module
+            folder = str(Path(self.path).resolve().parent)
+            sys.path.insert(0, folder)  # as when the file is run as a program
+            try:
+                exec(compile(self.text, self.path, 'exec'), vars(module))
+            except Exception as error:
+                del sys.modules[self.module]
+                text = f'{self.path} cannot be run: {described(error, self.path)}'
+                raise ScriptError(text) from None
+            finally:
+                sys.path.remove(folder)
+            return module
 
-    def _run(self) -> ModuleType:
-        """Return the module after running the file."""
-        spec = importlib.util.spec_from_loader(self.module, None, origin=self.path)
-        assert spec is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[self.module] = module
-        folder = str(Path(self.path).resolve().parent)
-        sys.path.insert(0, folder)  # as when the file is run as a program
-        try:
-            exec(compile(self.text, self.path, 'exec'), vars(module))
-        except Exception as error:
-            del sys.modules[self.module]
-            raise ScriptError(
-                f'{self.path} cannot be run: {described(error, self.path)}'
-            ) from None
-        finally:
-            sys.path.remove(folder)
-        return module
+
+def _resolved(source: Any) -> Any:
+    return source.resolve() if isinstance(source, FileController) else source
 
 
 def checked_source(source: Any) -> Any:
     """Return a source that makes controllers, or raise :class:`ScriptError`."""
     if isinstance(source, str):
         source = FileController.load(source)
-    found = source.resolve() if isinstance(source, FileController) else source
+    found = _resolved(source)
     if isinstance(found, type):
         if not callable(getattr(found, 'step', None)):
             raise ScriptError(f'class {found.__name__} must have a method step(observation)')
@@ -267,23 +267,18 @@ class OwnMethod:
 
     def __call__(self, nominal_model: NominalModel) -> BaselineController:
         """Return a new controller for a run."""
-        source, settings = self.source, dict(self.settings)
-        if isinstance(source, FileController):
-            source = source.resolve()
+        source, settings = _resolved(self.source), dict(self.settings)
         if isinstance(source, type):
-            step, made = self._instance(source, settings, nominal_model)
+            made = self._instance(source, settings, nominal_model)
         elif callable(getattr(source, 'step', None)):
             made = deepcopy(source)
-            step = made.step
         else:
-            made, step = source, partial(source, **settings)
-        return OwnController(self.name, step, made, nominal_model)
+            return OwnController(self.name, partial(source, **settings), source, nominal_model)
+        return OwnController(self.name, made.step, made, nominal_model)
 
     def check_settings(self) -> None:
         """Raise :class:`ScriptError` for a setting that its class or function does not take."""
-        source, settings = self.source, dict(self.settings)
-        if isinstance(source, FileController):
-            source = source.resolve()
+        source, settings = _resolved(self.source), dict(self.settings)
         if not settings:
             return
         if isinstance(source, type) and issubclass(source, BaselineController):
@@ -312,22 +307,17 @@ class OwnMethod:
         """Return what it knows."""
         return OWN_KNOWLEDGE
 
-    def _instance(
-        self, kind: type, settings: dict[str, Any], nominal_model: NominalModel
-    ) -> tuple[Callable[[Observation], Any], Any]:
+    def _instance(self, kind: type, settings: Settings, nominal_model: NominalModel) -> Any:
         try:
             if issubclass(kind, BaselineController):
-                table = kind.parameters_type().with_values(settings)
-                made: Any = kind(table, nominal_model)
-            else:
-                if MODEL in inspect.signature(kind).parameters:
-                    settings = {MODEL: nominal_model, **settings}
-                made = kind(**settings)
+                return kind(kind.parameters_type().with_values(settings), nominal_model)
+            if MODEL in inspect.signature(kind).parameters:
+                settings = {MODEL: nominal_model, **settings}
+            return kind(**settings)
         except ScriptError:
             raise
         except Exception as error:
             raise ScriptError(f'{self.name} cannot be made: {described(error)}') from None
-        return made.step, made
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ takes effect, and the actuation converts u_k into the wheel speed command of the
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 from typing import Any, ClassVar
@@ -218,6 +218,8 @@ class BaselineController(ABC):
     """Whether it uses :attr:`Observation.future`."""
     measured: ClassVar[str] = 'wheel speeds'
     """What it measures, as text; empty for nothing."""
+    known: Sequence[str] = ()
+    """What else it knows, each in a few words."""
     estimate_dead_time: bool = False
     """Whether it estimates the dead time of a velocity drive; the configured one otherwise."""
     inertia_error: float = 1.0
@@ -243,7 +245,7 @@ class BaselineController(ABC):
             found.append('estimate of the dead time')
         if self.inertia_error != 1.0:
             found.append(f'inertia × {self.inertia_error:g}')
-        return found
+        return [*found, *self.known]
 
     @abstractmethod
     def step(self, observation: Observation) -> Array:

@@ -80,15 +80,11 @@ class FeedForward(BaselineController):
         whole, self._part = divmod(0.0 if self._torque else advance / self._period, 1.0)
         shaper = CommandShaper(table.command_shaper, self._period)
         self._shaper = shaper if shaper.lead_ns else None
+        self.known = ('frequencies of the rotors',) if self._shaper else ()
         ahead = int(whole) + round(shaper.lead_ns / NANOSECONDS / self._period)
         # Without a lag: the advance already contains that of the drive.
         self._plan = PlannedReference(table.jump_transition, nominal_model, 0.0, ahead)
         self._started = False
-
-    @property
-    def knowledge(self) -> list[str]:
-        """What it knows, see :attr:`BaselineController.knowledge`."""
-        return [*super().knowledge, *(['frequencies of the rotors'] if self._shaper else [])]
 
     def step(self, observation: Observation) -> Array:
         """Return u, rad/s², shape (2,)."""

@@ -357,6 +357,7 @@ class ComputedTorque(ProportionalIntegral):
     """
 
     parameters_type = ComputedTorqueParameters
+    known = (EXACT_INERTIA, FRICTION)
 
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
         super().__init__(parameters, nominal_model)
@@ -365,11 +366,6 @@ class ComputedTorque(ProportionalIntegral):
         self._felt, self._measured = self.parameters.belief, self.parameters.measured
         if nominal_model.drive == 'velocity':
             self._felt *= nominal_model.lag * nominal_model.share / nominal_model.period
-
-    @property
-    def knowledge(self) -> list[str]:
-        """What it knows, see :attr:`BaselineController.knowledge`."""
-        return [*super().knowledge, EXACT_INERTIA, FRICTION]
 
     def feedback(self, observation: Observation, feedforward: Array, error: Array) -> Array:
         """Return u, rad/s², shape (2,)."""

@@ -197,20 +197,15 @@ class PredictiveBaseline(BaselineController):
 
     def __init__(self, parameters: Parameters, nominal_model: NominalModel) -> None:
         super().__init__(parameters, nominal_model)
+        factor = self.parameters.model_error
+        self.known = (EXACT_INERTIA if factor == 1.0 else f'inertia × {factor:g}',)
+        if getattr(parameters, 'load_share', 1.0):
+            self.known += (FRICTION,)
         self._torque = nominal_model.drive == 'torque'
         slope_time = getattr(parameters, 'slope_time', math.inf)
         self._fade = math.exp(-nominal_model.period / slope_time)
         self._command: Array = np.zeros(2)
         """First command of the plan, or the u that the limits let through."""
-
-    @property
-    def knowledge(self) -> list[str]:
-        """What it knows, see :attr:`BaselineController.knowledge`."""
-        found, factor = super().knowledge, self.parameters.model_error
-        found.append(EXACT_INERTIA if factor == 1.0 else f'inertia × {factor:g}')
-        if getattr(self.parameters, 'load_share', 1.0):
-            found.append(FRICTION)
-        return found
 
     def step(self, observation: Observation) -> Array:
         """Return u, rad/s², shape (2,)."""
