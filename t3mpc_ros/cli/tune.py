@@ -94,7 +94,7 @@ def _tuned(
 
     output = options.output or OUTPUT
     if options.robot == TWIN:
-        from t3mpc_ros.evaluation.tuning.twin_tuning import tune_twin, twin_definitions
+        from t3mpc_ros.evaluation.tuning.tune_methods import tune_twin, twin_definitions
 
         return tune_twin(
             twin_definitions(methods),

@@ -174,7 +174,7 @@ PATROL = {
 TUNE = {
     'evaluation.methods.require_libraries': None,
     'evaluation.tuning.tune_methods.tune_methods': SimpleNamespace(table=text, to_dict=dict),
-    'evaluation.tuning.twin_tuning.tune_twin': SimpleNamespace(table=text, to_dict=dict),
+    'evaluation.tuning.tune_methods.tune_twin': SimpleNamespace(table=text, to_dict=dict),
     'evaluation.tuning.drive_identification.identify_bag': ('drive', 'paper'),
     'evaluation.tuning.drive_identification.drive_file': 'a: 1\n',
     'evaluation.tuning.drive_identification.drive_record': {},

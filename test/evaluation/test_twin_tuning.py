@@ -36,19 +36,19 @@ from t3mpc_ros.evaluation.methods import (
 )
 from t3mpc_ros.evaluation.record import OVERALL, VARIATION, measure, rolling_speeds
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, TUNING_SEEDS, Scenario
-from t3mpc_ros.evaluation.tuning import twin_tuning
-from t3mpc_ros.evaluation.tuning.tune_methods import ClosedLoopObjective
-from t3mpc_ros.evaluation.tuning.tuned_parameter_file import SMOOTHNESS, TunedParameters
-from t3mpc_ros.evaluation.tuning.twin_tuning import (
+from t3mpc_ros.evaluation.tuning import tune_methods as twin_tuning
+from t3mpc_ros.evaluation.tuning.tune_methods import (
     CASES,
     FULL_RANGES,
     TRAINING,
     TWIN,
     VALIDATION_SEEDS,
+    ClosedLoopObjective,
     tune_twin,
     twin_definitions,
     twin_objective,
 )
+from t3mpc_ros.evaluation.tuning.tuned_parameter_file import SMOOTHNESS, TunedParameters
 
 PI = 'PI + feed-forward'
 
