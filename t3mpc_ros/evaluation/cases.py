@@ -60,20 +60,17 @@ class LinkFaults:
 
     def __post_init__(self) -> None:
         try:
-            self._check()
+            for name in ('command_loss', 'odometry_loss', 'begin'):
+                check_number(getattr(self, name), name, 0.0, 1.0)
+            check_number(self.lasting, 'lasting', 0.0, math.inf, 's')
+            for name in ('command_delay', 'odometry_delay'):
+                pair = getattr(self, name)
+                given = list(pair) if isinstance(pair, tuple) else pair
+                least, most = check_list(given, name, 2, 2)
+                check_number(least, f'the least {name}', 0.0, MAX_DELAY, 's')
+                check_number(most, f'the largest {name}', least, MAX_DELAY, 's')
         except EntryError as error:
             raise ScriptError(str(error)) from None
-
-    def _check(self) -> None:
-        for name in ('command_loss', 'odometry_loss', 'begin'):
-            check_number(getattr(self, name), name, 0.0, 1.0)
-        check_number(self.lasting, 'lasting', 0.0, math.inf, 's')
-        for name in ('command_delay', 'odometry_delay'):
-            pair = getattr(self, name)
-            given = list(pair) if isinstance(pair, tuple) else pair
-            least, most = check_list(given, name, 2, 2)
-            check_number(least, f'the least {name}', 0.0, MAX_DELAY, 's')
-            check_number(most, f'the largest {name}', least, MAX_DELAY, 's')
         for name, least in (('swapped', 0), ('repeated', 1), ('kept', 1)):
             count = getattr(self, f'odometry_{name}')
             if isinstance(count, bool) or not isinstance(count, int) or count < least:

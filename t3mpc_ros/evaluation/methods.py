@@ -66,33 +66,26 @@ TWIN_ADVANCE = 0.0104
 """Lead of feed-forward over the dead time on the twin, s: T/(1 - exp(-T/lag)), by which the law of
 the controller is ahead when its feedback cancels the measured speed."""
 
+_NO_FUZZY, _NO_COMPENSATOR = {'use_fuzzy': False}, {'law.compensator': False}
+_NO_MPC, _NO_PREVIEW = {'predictive.enabled': False}, {'jump_transition.preview': False}
 STAGES: Mapping[str, Mapping[str, object]] = {
-    'feedback': {
-        'use_fuzzy': False,
-        'law.compensator': False,
-        'predictive.enabled': False,
-        'jump_transition.preview': False,
-    },
-    '+NT3FS': {
-        'law.compensator': False,
-        'predictive.enabled': False,
-        'jump_transition.preview': False,
-    },
-    '+compensator': {'predictive.enabled': False, 'jump_transition.preview': False},
-    '+MPC': {'jump_transition.preview': False},
+    'feedback': _NO_FUZZY | _NO_COMPENSATOR | _NO_MPC | _NO_PREVIEW,
+    '+NT3FS': _NO_COMPENSATOR | _NO_MPC | _NO_PREVIEW,
+    '+compensator': _NO_MPC | _NO_PREVIEW,
+    '+MPC': _NO_PREVIEW,
     FULL: {},
 }
 """Stages of the controller, as changes of the full one; the last stage adds preview."""
 
 WITHOUT: Mapping[str, Mapping[str, object]] = {
-    'full without NT3FS': {'use_fuzzy': False},
-    'full without compensator': {'law.compensator': False},
-    'full without MPC': {'predictive.enabled': False},
+    'full without NT3FS': _NO_FUZZY,
+    'full without compensator': _NO_COMPENSATOR,
+    'full without MPC': _NO_MPC,
     'full without MPC, equal bound': {
-        'predictive.enabled': False,
+        **_NO_MPC,
         'law.error_bound': ProposedParameters().compensated_bound,
     },
-    'full without preview': {'jump_transition.preview': False},
+    'full without preview': _NO_PREVIEW,
     'full with random predictor': {'random_predictor': True, 'predictive.learning': False},
 }
 """The full controller with one part left out. Without v_p the bound (80) of the compensator is
@@ -107,7 +100,7 @@ TWIN_PARTS: Mapping[str, Mapping[str, object]] = {
         'command_shaper.turning_frequency': 0.0,
     },
     'full without dead-time estimate': {'estimate_dead_time': False},
-    'full without preview': {'jump_transition.preview': False},
+    'full without preview': _NO_PREVIEW,
     "full, the paper's composition": {'composition': 'paper'},
 }
 """The node's controller on the twin with one part left out, and with NT3FS, compensator and v_p on
@@ -131,11 +124,11 @@ differs from the nominal robot, a wrong inertia has a basis of its own (E24), an
 term, which brings no improvement beside them, is off. Chosen on seeds 2001 to 2003."""
 TORQUE_PARTS: Mapping[str, Mapping[str, object]] = {
     'full with MPC': {'predictive.enabled': True},
-    'full without NT3FS': {'use_fuzzy': False},
-    'full without compensator': {'law.compensator': False},
+    'full without NT3FS': _NO_FUZZY,
+    'full without compensator': _NO_COMPENSATOR,
     'full without inertia term': {'inertia.gamma': 0.0},
     'full without nominal loads': {'nominal_loads': False},
-    'full without preview': {'jump_transition.preview': False},
+    'full without preview': _NO_PREVIEW,
 }
 """That controller with one part more or less."""
 
@@ -277,10 +270,9 @@ def methods(drive: str, store: TunedParameters | None = None) -> dict[str, Metho
             continue
         found[each.name] = MethodSpec(each.name, each.controller_type, parameters, True)
     for name in ('linear MPC preview', NMPC):
-        if name in found:
-            wrong, exact = found[name], f'{name}{EXACT_MODEL}'
-            parameters = wrong.parameters.with_values({'model_error': 1.0})
-            found[exact] = MethodSpec(exact, wrong.controller_type, parameters, True)
+        wrong, exact = found[name], f'{name}{EXACT_MODEL}'
+        parameters = wrong.parameters.with_values({'model_error': 1.0})
+        found[exact] = replace(wrong, name=exact, parameters=parameters)
     return found
 
 

@@ -30,6 +30,7 @@ from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Sce
 from t3mpc_ros.evaluation.training import bag_fit
 from t3mpc_ros.evaluation.training.bag_fit import fit_bags, mean_and_spread, spread_text
 from t3mpc_ros.evaluation.training.fit import (
+    TrainingData,
     explained,
     fit_coefficients,
     fit_predictor,
@@ -38,7 +39,6 @@ from t3mpc_ros.evaluation.training.fit import (
     stretches,
 )
 from t3mpc_ros.evaluation.training.simulated_run_fit import training_data_of
-from t3mpc_ros.evaluation.training.training_data import TrainingData
 
 pytestmark = pytest.mark.slow
 

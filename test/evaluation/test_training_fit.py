@@ -37,19 +37,17 @@ from t3mpc_ros.evaluation.proposed_method import ProposedParameters
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS
 from t3mpc_ros.evaluation.training.bag_fit import blocks, fit_bags
 from t3mpc_ros.evaluation.training.fit import (
+    TrainingData,
+    TrainingError,
     estimate_move_effect,
     explained,
     feedback_slope,
     fit_coefficients,
     fit_predictor,
+    load_training_data,
     periods,
     skills,
     stretches,
-)
-from t3mpc_ros.evaluation.training.training_data import (
-    TrainingData,
-    TrainingError,
-    load_training_data,
 )
 from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
 from t3mpc_ros.mpc.boltzmann_machine import (

@@ -112,11 +112,8 @@ def _read(path: Path, topic: str) -> dict[str, Array]:
     # A field that is not in every message is an array of varying length.
     names: Collection[str] = rows[0] if rows else ()
     kept = [name for name in names if all(name in row for row in rows)]
-    return {name: _column([row[name] for row in rows]) for name in kept}
-
-
-def _column(values: list[Any]) -> Array:
-    return read_only(np.array(values, dtype=object if isinstance(values[0], str) else None))
+    kinds = {name: object if isinstance(rows[0][name], str) else None for name in kept}
+    return {name: read_only(np.array([row[name] for row in rows], kinds[name])) for name in kept}
 
 
 def _flatten(value: Any, name: str, row: dict[str, Any]) -> None:

@@ -42,7 +42,7 @@ from t3mpc_ros.evaluation.experiment import (
     print_report,
     run_experiment,
 )
-from t3mpc_ros.evaluation.record import SETTLED, Metric, Record, measure
+from t3mpc_ros.evaluation.record import SETTLED, Metric, measure
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, columns_of
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.run_digest import digest
@@ -295,14 +295,13 @@ def _combinations(parameters: Mapping[str, Sequence[Any]]) -> list[Row]:
         if isinstance(values, str) or not hasattr(values, '__iter__'):
             raise ScriptError(f'{name} must be a list of values: got {values!r}')
     # NumPy's numbers are no parameter values, and no JSON.
-    lists = [[_plain(value) for value in values] for values in parameters.values()]
+    lists = [
+        [value.item() if isinstance(value, np.generic) else value for value in values]
+        for values in parameters.values()
+    ]
     if not all(lists):
         raise ScriptError('each parameter must have one or more values')
     return [dict(zip(parameters, each, strict=True)) for each in itertools.product(*lists)]
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def numbers_or_error(job: Job) -> Row:
@@ -311,13 +310,9 @@ def numbers_or_error(job: Job) -> Row:
     Errors that say nothing about the run itself, such as a missing library, are raised.
     """
     try:
-        return measured_run(job, _numbers)
+        return measured_run(job, lambda record: {**measure(record), ERROR: divergence(record)})
     except (ValueError, ArithmeticError) as error:
         return {ERROR: sentence(error)}
-
-
-def _numbers(record: Record) -> Row:
-    return {**measure(record), ERROR: divergence(record)}
 
 
 @contextmanager

@@ -81,18 +81,16 @@ class Results:
 
 
 def _mean_row(runs: Sequence[Row]) -> Row:
-    rmse, settled, chatter, largest, finite = (
-        [run[name] for run in runs]
-        for name in ('rmse', 'settled', 'chatter', 'largest_error', 'finite')
-    )
+    rows = columns_of(runs)
+    finite = all(rows['finite'])
     return {name: runs[0][name] for name in _GROUP} | {
-        'rmse_mean': mean(rmse),
-        'rmse_ci95': interval(rmse),
-        'settled_mean': mean(settled),
-        'settled_ci95': interval(settled),
-        'chatter_mean': mean(chatter),
-        'largest_error': max(largest) if all(finite) else math.nan,
-        'finite': all(finite),
+        'rmse_mean': mean(rows['rmse']),
+        'rmse_ci95': interval(rows['rmse']),
+        'settled_mean': mean(rows['settled']),
+        'settled_ci95': interval(rows['settled']),
+        'chatter_mean': mean(rows['chatter']),
+        'largest_error': max(rows['largest_error']) if finite else math.nan,
+        'finite': finite,
         'seeds': len(runs),
         'duration': runs[0]['duration'],
     }

@@ -149,25 +149,25 @@ def lost_time(position: Array) -> float:
 
 def markdown(plan: LocalizationPlan, table: ResultTable) -> str:
     """Return the medians, with the largest of all seeds in brackets, as a table in Markdown."""
+
+    def cell(name: str, column: str, scale: float, digits: int) -> str:
+        values = [scale * value for value in table.values(column, controller=name)]
+        return f'{np.median(values):.{digits}f} ({max(values):.{digits}f})'
+
     rows = []
     for name in plan.cases:
-        found = table.where(controller=name)
-
-        def cell(column: str, scale: float, digits: int, found: Sequence[Row] = found) -> str:
-            values = [scale * float(row[column]) for row in found]
-            return f'{np.median(values):.{digits}f} ({max(values):.{digits}f})'
-
-        again = [row for row in found if row['found'] <= FOUND_WITHIN]
+        times = table.values('found', controller=name)
+        again = sum(time <= FOUND_WITHIN for time in times)
         carried = math.isfinite(CASES[name].carried_at)
         rows.append(
             (
                 name,
-                cell('position', 1e3, 1),
-                cell('yaw', 180.0 / math.pi, 2),
-                cell('largest', 1e3, 0),
-                '' if carried else cell('lost', 1.0, 0),
-                f'{len(again)} of {len(found)}' if carried else '',
-                cell('deceived', 1.0, 1),
+                cell(name, 'position', 1e3, 1),
+                cell(name, 'yaw', 180.0 / math.pi, 2),
+                cell(name, 'largest', 1e3, 0),
+                '' if carried else cell(name, 'lost', 1.0, 0),
+                f'{again} of {len(times)}' if carried else '',
+                cell(name, 'deceived', 1.0, 1),
             )
         )
     head = (

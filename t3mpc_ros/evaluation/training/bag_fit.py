@@ -29,18 +29,16 @@ from t3mpc_ros.evaluation.proposed_method import random_output_weights
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.topic_roles import bag_display_name
 from t3mpc_ros.evaluation.training.fit import (
-    explained,
-    fit_coefficients,
-    fit_predictor,
-    periods,
-    skills,
-    stretches,
-)
-from t3mpc_ros.evaluation.training.training_data import (
     TrainingData,
     TrainingError,
     check_compatible,
+    explained,
+    fit_coefficients,
+    fit_predictor,
     load_training_data,
+    periods,
+    skills,
+    stretches,
 )
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.mpc.predictive_controller import PredictiveController

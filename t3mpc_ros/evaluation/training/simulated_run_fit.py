@@ -36,8 +36,7 @@ from t3mpc_ros.evaluation.scenario import (
     held_out,
 )
 from t3mpc_ros.evaluation.training.bag_fit import MIDDLE, NEXT_STEP, pair
-from t3mpc_ros.evaluation.training.fit import periods, skills, stretches
-from t3mpc_ros.evaluation.training.training_data import TrainingData
+from t3mpc_ros.evaluation.training.fit import TrainingData, periods, skills, stretches
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.mpc.predictive_controller import PredictiveController
 

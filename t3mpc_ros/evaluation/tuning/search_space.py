@@ -123,27 +123,17 @@ class SearchSpace:
 
 @dataclass(frozen=True)
 class MethodDefinition:
-    """One line of the table of methods.
-
-    Parameters
-    ----------
-    name
-        As it stands in tables and figures, for example ``'linear MPC'``.
-    start
-        For each drive, or the twin, the method is meant for, the parameters its maker would
-        choose: tuning begins there, and never ends worse.
-    ranges
-        What is tuned, in either drive. All else stays as in ``start``.
-    table
-        The table of the controller of the node, whose method this is then; by default the
-        parameters are those of ``controller_type``.
-    """
+    """One line of the table of methods."""
 
     name: str
+    """As it stands in tables and figures, for example ``'linear MPC'``."""
     controller_type: type[BaselineController]
     start: Mapping[str, Parameters]
+    """By drive, or the twin, the parameters that its maker would choose: tuning begins there."""
     ranges: tuple[SearchRange, ...]
+    """What is tuned, in either drive. All else stays as in ``start``."""
     table: type[Parameters] | None = None
+    """Table of the controller of the node, whose method this is then."""
 
     def __post_init__(self) -> None:
         for drive, parameters in self.start.items():
@@ -169,10 +159,3 @@ class MethodDefinition:
     def short(self) -> str:
         """The name for command lines and files."""
         return short_name(self.name)
-
-
-def check_names(methods: Sequence[MethodDefinition]) -> None:
-    """Raise :class:`ValueError` when two methods could be taken for each other."""
-    names = [method.short for method in methods]
-    if len({*names}) < len(names):
-        raise ValueError(f'methods must have different names: got {", ".join(names)}')

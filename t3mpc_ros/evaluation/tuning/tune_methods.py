@@ -43,7 +43,6 @@ from t3mpc_ros.evaluation.tuning.search_space import (
     MethodDefinition,
     SearchRange,
     Values,
-    check_names,
 )
 from t3mpc_ros.evaluation.tuning.tuned_parameter_file import (
     SMOOTHNESS,
@@ -162,7 +161,9 @@ def tune_methods(
     other methods tuned in the same drive with another budget. RuntimeError: for some method no
     parameters gave a finite objective; all others are kept.
     """
-    check_names(methods)
+    names = [method.short for method in methods]
+    if len({*names}) < len(names):
+        raise ValueError(f'methods must have different names: got {", ".join(names)}')
     for drive in drives:
         if not any(drive in method.start for method in methods):
             raise ValueError(f'no method to be tuned is meant for drive {drive!r}')

@@ -17,11 +17,11 @@ The file holds all parameters of a method, not only the tuned ones: it shows wha
 when a default changes later.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 import json
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.reporting import Table, strict_json
@@ -117,6 +117,20 @@ class TunedEntry:
     version: str
     """Of this package, when it was found."""
 
+    @classmethod
+    def from_dict(
+        cls,
+        values: Mapping[str, object],
+        tuned: Sequence[str],
+        budget: Mapping[str, object],
+        **others: Any,
+    ) -> Self:
+        """Return an entry of the file; JSON has lists in place of tuples."""
+        made = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+        if missing := {*tuned} - {*made}:
+            raise StoreError(f'{", ".join(sorted(missing))} was tuned, but has no value')
+        return cls(made, tuple(tuned), budget=TuningBudget.from_dict(budget), **others)
+
 
 class TunedParameters(dict[tuple[str, str], TunedEntry]):
     """Tuned parameters by (method, drive); those for the digital twin have drive ``twin``."""
@@ -130,7 +144,7 @@ class TunedParameters(dict[tuple[str, str], TunedEntry]):
                 raise StoreError(f'format must be {_FORMAT}: got {content["format"]!r}')
             return cls(
                 {
-                    (method, drive): _entry(**found)
+                    (method, drive): TunedEntry.from_dict(**found)
                     for method, drives in content['methods'].items()
                     for drive, found in drives.items()
                 }
@@ -187,19 +201,3 @@ class TunedParameters(dict[tuple[str, str], TunedEntry]):
             numbers = f'{entry.objective:.4f}', str(len(entry.tuned))
             rows.append((method, drive, first, *numbers, str(entry.budget.evaluations)))
         return Table('', (*head, 'evaluations'), rows).markdown()
-
-
-def _entry(
-    values: Mapping[str, object],
-    tuned: list[str],
-    objective: float,
-    start_objective: float | None,
-    budget: Mapping[str, object],
-    version: str,
-) -> TunedEntry:
-    """Return an entry of the file; JSON has lists in place of tuples."""
-    made = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
-    given = TuningBudget.from_dict(budget)
-    if missing := {*tuned} - {*made}:
-        raise StoreError(f'{", ".join(sorted(missing))} was tuned, but has no value')
-    return TunedEntry(made, tuple(tuned), objective, start_objective, given, version)
