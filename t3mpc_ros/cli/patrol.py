@@ -175,20 +175,17 @@ def _tracking(options: argparse.Namespace) -> _Study:
         TrackingPlan,
         compare_trackers,
     )
-    from t3mpc_ros.parameters.table import find_names
 
-    names = tuple(TRACKED_PATHS)
-    paths = find_names('path', options.paths, names) or names
-    return path_tracking_page, TrackingPlan(paths=paths, seeds=options.seeds), compare_trackers
+    plan = TrackingPlan(paths=options.paths or tuple(TRACKED_PATHS), seeds=options.seeds)
+    return path_tracking_page, plan, compare_trackers
 
 
 def _patrols(options: argparse.Namespace) -> _Study:
     from t3mpc_ros.evaluation.patrol import patrol_page
     from t3mpc_ros.evaluation.patrol.patrol_comparison import PATHS, PatrolPlan, compare_patrols
-    from t3mpc_ros.parameters.table import find_names
 
     plan = PatrolPlan(
-        paths=find_names('path', options.paths, PATHS) or PATHS,
+        paths=options.paths or PATHS,
         seeds=options.seeds,
         duration=60.0 * options.minutes,
         robot='twin' if options.planned else options.robot,

@@ -172,22 +172,18 @@ def verdicts(differences: Mapping[Key, Difference | None], seeds: int) -> dict[K
     }
 
 
-def case_differences(
+def case_judgement(
     plan: ComparisonPlan, results: ResultTable, case: str
-) -> dict[tuple[str, record.Metric], Difference | None]:
-    """Return the differences that a case is judged by, of every method and metric."""
-    return {
-        (method, metric): difference(plan, results, case, method, metric)
+) -> dict[tuple[str, record.Metric], tuple[Difference, str]]:
+    """Return by method and metric the differences that a case is judged by, with verdicts."""
+    found = {
+        (method, metric): each
         for method in plan.methods
         for metric in judged_metrics(case)
+        if (each := difference(plan, results, case, method, metric)) is not None
     }
-
-
-def case_verdicts(
-    plan: ComparisonPlan, results: ResultTable, case: str
-) -> dict[tuple[str, record.Metric], str]:
-    """Return the verdicts of the table of a case."""
-    return verdicts(case_differences(plan, results, case), len(plan.seeds))
+    judged = verdicts(found, len(plan.seeds))
+    return {key: (each, judged[key]) for key, each in found.items()}
 
 
 def judged_metrics(case: str) -> tuple[record.Metric, ...]:
@@ -283,20 +279,18 @@ def case_table(plan: ComparisonPlan, results: ResultTable, case: str) -> Table:
         for metric in judged:
             head += [f'{metric.heading} − {plan.against}', 'verdict']
     head.append('knows')
-    differences = case_differences(plan, results, case)
-    judgement = verdicts(differences, len(plan.seeds))
+    judgement = case_judgement(plan, results, case)
     rows = []
     for method in plan.methods:
         cells = [method]
         for metric in metrics:
             cells.append(_cell(results.values(metric.name, case=case, controller=method), metric))
         for metric in judged if compared else ():
-            found = differences[method, metric]
-            if found is None:
-                cells += [EMPTY_CELL, EMPTY_CELL]
+            if (method, metric) in judgement:
+                found, verdict = judgement[method, metric]
+                cells += [format_interval(*found, '+', metric.digits), verdict]
             else:
-                text = format_interval(found.mean, found.half, '+', metric.digits)
-                cells += [text, judgement[method, metric]]
+                cells += [EMPTY_CELL, EMPTY_CELL]
         cells.append(known_by(plan, method, case))
         rows.append(tuple(cells))
     title = f'{case}: {CASES[case].text}'

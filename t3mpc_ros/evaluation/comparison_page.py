@@ -28,8 +28,8 @@ from t3mpc_ros.evaluation.comparison import (
     WORSE,
     ComparisonPlan,
     StepTimes,
+    case_judgement,
     case_table,
-    case_verdicts,
     description,
     difference,
     first_verdicts,
@@ -38,7 +38,7 @@ from t3mpc_ros.evaluation.comparison import (
     known_by,
     summary_table,
 )
-from t3mpc_ros.evaluation.confidence_intervals import Difference, format_interval, interval, mean
+from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.evaluation.drivers import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.plotting import drawing, file_of, new_figure, scale_by_size
@@ -142,7 +142,7 @@ def _method_record(
 ) -> dict[str, Any]:
     runs = results.where(case=case, controller=method)
     names = [metric.name for metric in METRICS if metric.name in runs[0]]
-    judgement = case_verdicts(plan, results, case)
+    judgement = case_judgement(plan, results, case)
     differences = {}
     for metric in METRICS:
         found = difference(plan, results, case, method, metric)
@@ -151,7 +151,7 @@ def _method_record(
                 'mean': found.mean,
                 'half_interval': found.half,
                 'p': found.p_value(len(plan.seeds)),
-                'verdict': judgement.get((method, metric), ''),
+                'verdict': judgement[method, metric][1] if (method, metric) in judgement else '',
             }
     return {
         'mean': {name: mean([run[name] for run in runs]) for name in names},
@@ -163,10 +163,11 @@ def _method_record(
 def _draw_differences(plan: ComparisonPlan, results: ResultTable, case: str) -> Any:
     """Return a figure of the paired differences of the first judged metric, or None."""
     metric = judged_metrics(case)[0]
-    rows: Sequence[tuple[str, Difference]] = [
-        (method, found)
-        for method in plan.methods
-        if (found := difference(plan, results, case, method, metric)) and math.isfinite(found.mean)
+    judgement = case_judgement(plan, results, case)
+    rows = [
+        (method, *found)
+        for (method, judged), found in judgement.items()
+        if judged is metric and math.isfinite(found[0].mean)
     ]
     if not rows:
         return None
@@ -174,15 +175,13 @@ def _draw_differences(plan: ComparisonPlan, results: ResultTable, case: str) -> 
     axis = figure.subplots()
     places = np.arange(len(rows))[::-1]
     colours = {BETTER: '#15803d', WORSE: '#be123c', INCONCLUSIVE: '#6b7280'}
-    judgement = case_verdicts(plan, results, case)
     ends: list[float] = []
-    for place, (method, found) in zip(places, rows, strict=True):
+    for place, (_, found, verdict) in zip(places, rows, strict=True):
         half = found.half if math.isfinite(found.half) else 0.0
         ends += [found.mean - half, found.mean + half]
-        colour = colours[judgement[method, metric]]
-        axis.errorbar(found.mean, place, xerr=half, fmt='o', color=colour, markersize=4)
+        axis.errorbar(found.mean, place, xerr=half, fmt='o', color=colours[verdict], markersize=4)
     axis.axvline(0.0, color='#1f2937', linewidth=0.8)
-    axis.set_yticks(places, [name for name, _ in rows])
+    axis.set_yticks(places, [name for name, *_ in rows])
     scale_by_size(axis, 'x', ends, near=0.01)
     axis.set_xlabel(f'{metric.heading} / ({metric.unit})')
     return figure

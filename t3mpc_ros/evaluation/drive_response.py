@@ -319,8 +319,7 @@ def respond(data: WheelData, dead_time: float, lag: float) -> Array:
         return speeds
     before, covered_before = at(time - dead_time - window)
     # Of chi' = (c - chi)/lag: the integral of chi is that of c less the change of chi.
-    mean: Array = (covered - covered_before - lag * (speeds - before)) / window
-    return mean
+    return (covered - covered_before - lag * (speeds - before)) / window
 
 
 def fit_wheels(data: WheelData, delay: float) -> WheelFit:

@@ -92,52 +92,41 @@ class NodeDriver:
         return RobotCommand(wheels_from_twist(twist, self._geometry), status.stamp_ns)
 
 
-class ObservedReference(NamedTuple):
-    """Reference as a method observes it in each period.
+class ObservedReference:
+    """Reference of a run of ``steps`` periods as a method observes it in each of them.
 
-    With preview of ``rows`` periods these are rows of the reference after the dead time, and go on
-    beyond the run. Without, r is extrapolated over the dead time by the slope it has now: a switch
-    is seen when it happens, and not before.
+    With preview of ``rows`` periods these are rows of the reference after the dead time (s), and
+    go on beyond the run. Without, r is extrapolated over the dead time by the slope it has now: a
+    switch is seen when it happens, and not before.
     """
 
-    speeds: Array
-    """r, rad/s, shape (n, 2)."""
-    slope: Array
-    """Its change in a period, rad/s, shape (n, 2)."""
-    rows: int
-    """Rows that preview gives; 0 without preview."""
-    late: int
-    """Configured dead time, in periods."""
-    latest: int
-    """Largest dead time for which it is known, in periods."""
+    def __init__(
+        self, sampled: SampledReference, steps: int, rows: int, dead_time: float, *, preview: bool
+    ) -> None:
+        self.late = round(dead_time * RATE)
+        """Configured dead time, in periods."""
+        self.latest = sampled.time.size - steps - rows
+        """Largest dead time for which the reference is known, in periods."""
+        if not math.isclose(dead_time * RATE, self.late, abs_tol=1e-6):
+            raise ValueError(
+                f'dead time must be whole periods of {1.0 / RATE:g} s: got {dead_time} s'
+            )
+        if self.late > self.latest:
+            raise ValueError(
+                f'dead time must be at most {self.latest / RATE:g} s, as far as the reference '
+                f'reaches: got {dead_time} s'
+            )
+        # Compiled functions take an array that cannot be written to for another type.
+        self._speeds, self._slope = sampled.speeds.copy(), sampled.rate / RATE
+        self._rows = rows if preview else 0
 
     def at(self, k: int, late: int) -> tuple[Array, Array, Array | None]:
         """Return r ``late`` periods after period ``k``, one period later, and the preview."""
-        if self.rows:
-            row = k + late
-            return self.speeds[row], self.speeds[row + 1], self.speeds[row : row + self.rows]
-        now = self.speeds[k] + late * self.slope[k]
-        return now, self.speeds[k] + (late + 1) * self.slope[k], None
-
-
-def observed_reference(
-    sampled: SampledReference, steps: int, rows: int, dead_time: float, *, preview: bool
-) -> ObservedReference:
-    """Return what a method observes of a reference over a run of ``steps`` periods.
-
-    The arrays can be written to, because compiled functions take one that cannot for another type.
-    """
-    late = round(dead_time * RATE)
-    if not math.isclose(dead_time * RATE, late, abs_tol=1e-6):
-        raise ValueError(f'dead time must be whole periods of {1.0 / RATE:g} s: got {dead_time} s')
-    if steps + late + rows > sampled.time.size:
-        raise ValueError(
-            f'dead time must be at most {(sampled.time.size - steps - rows) / RATE:g} s, '
-            f'as far as the reference reaches: got {dead_time} s'
-        )
-    latest = sampled.time.size - steps - rows
-    rate = sampled.rate / RATE
-    return ObservedReference(sampled.speeds.copy(), rate, rows if preview else 0, late, latest)
+        if self._rows:
+            row, speeds = k + late, self._speeds
+            return speeds[row], speeds[row + 1], speeds[row : row + self._rows]
+        now = self._speeds[k] + late * self._slope[k]
+        return now, self._speeds[k] + (late + 1) * self._slope[k], None
 
 
 DEAD_TIME_HYSTERESIS = 0.75
@@ -262,7 +251,7 @@ class MethodDriver:
 
     def _new_controller(self, measured: Array) -> BaselineController:
         controller, seam = self._method(self._model), self._actuation
-        self._reference = observed_reference(
+        self._reference = ObservedReference(
             self._scenario.reference(),
             self._scenario.steps,
             self._scenario.kind.preview_rows(seam.dead_time),

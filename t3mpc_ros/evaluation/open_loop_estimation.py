@@ -179,21 +179,18 @@ def compare(
         for variance in variances:
             for seed in seeds:
                 run = simulate_open_loop(torque_robot(variance, seed), duration, seed)
+                first = round(SETTLE / run.period)
                 for kind in (*KINDS, NO_FUZZY_SYSTEM):
-                    fields = {'kind': kind, 'noise_variance': variance, 'seed': seed}
-                    rows.append(fields | _errors(run, kind, variance, normalised_gain))
+                    none = kind == NO_FUZZY_SYSTEM
+                    fuzzy = None if none else estimator(kind, variance, normalised_gain)
+                    speeds, unknown = estimate(run, fuzzy)
+                    errors = {
+                        'speed': rms((speeds - run.speeds)[first:]),
+                        'unknown': rms((unknown[:-1] - run.target)[first:]),
+                    }
+                    rows.append({'kind': kind, 'noise_variance': variance, 'seed': seed, **errors})
                 bar.update()
     return ResultTable(rows)
-
-
-def _errors(run: OpenLoopRun, kind: str, variance: float, gain: float) -> dict[str, float]:
-    fuzzy = None if kind == NO_FUZZY_SYSTEM else estimator(kind, variance, gain)
-    speeds, unknown = estimate(run, fuzzy)
-    first = round(SETTLE / run.period)
-    return {
-        'speed': rms((speeds - run.speeds)[first:]),
-        'unknown': rms((unknown[:-1] - run.target)[first:]),
-    }
 
 
 def records(results: ResultTable) -> list[dict[str, object]]:

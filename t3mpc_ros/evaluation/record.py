@@ -158,8 +158,7 @@ class Record:
         """
         if self.drive == 'torque':
             return self['acceleration']
-        changes: Array = np.diff(self['sent'], axis=0, prepend=0.0) / (1.0 / RATE)
-        return changes
+        return np.diff(self['sent'], axis=0, prepend=0.0) / (1.0 / RATE)
 
     @property
     def finite(self) -> bool:
@@ -174,8 +173,7 @@ class Record:
 
     def flag(self, name: str) -> NDArray[np.bool_]:
         """Return one status flag of the robot, a name of :data:`STATUS_FLAGS`, shape (n,)."""
-        flags: NDArray[np.bool_] = self['flags'][:, STATUS_FLAGS.index(name)].astype(np.bool_)
-        return flags
+        return self['flags'][:, STATUS_FLAGS.index(name)].astype(np.bool_)
 
     def rows(self, begin: float, end: float) -> slice:
         """Return the rows from ``begin`` up to, and without, ``end`` (s)."""

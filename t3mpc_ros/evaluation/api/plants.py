@@ -159,8 +159,7 @@ class OdePlant:
         second = self._slope(t + 0.5 * h, x + 0.5 * h * first, u)
         third = self._slope(t + 0.5 * h, x + 0.5 * h * second, u)
         fourth = self._slope(t + h, x + h * third, u)
-        found: Array = x + h / 6.0 * (first + 2.0 * (second + third) + fourth)
-        return found
+        return x + h / 6.0 * (first + 2.0 * (second + third) + fourth)
 
     def _slope(self, time: float, state: Array, u: Array) -> Array:
         found = _called(time, 'right_hand_side', self.right_hand_side, time, state, u)

@@ -110,12 +110,11 @@ def _natural_spline(knots: Array, values: Array, at: Array) -> Array:
     second = np.linalg.solve(matrix, right)
     k = np.clip(np.searchsorted(knots, at, side='right') - 1, 0, count - 2)
     h, before, behind = step[k], at - knots[k], knots[k + 1] - at
-    found: Array = (
+    return (
         (second[k] * behind**3 + second[k + 1] * before**3) / (6.0 * h)
         + (values[k] / h - second[k] * h / 6.0) * behind
         + (values[k + 1] / h - second[k + 1] * h / 6.0) * before
     )
-    return found
 
 
 def sampled(source: Any, duration: float, geometry: WheelGeometry) -> SampledReference:
@@ -170,10 +169,7 @@ def _held(speeds: Array, rows: int) -> Array:
             'reference must have the shape (n, 2), n >= 2: right and left wheel speed in rad/s, '
             f'{RATE:g} rows a second: got {speeds.shape}'
         )
-    found = np.empty((rows, 2))
-    given = min(rows, len(speeds))
-    found[:given], found[given:] = speeds[:given], speeds[given - 1]
-    return found
+    return speeds[np.minimum(np.arange(rows), len(speeds) - 1)]
 
 
 def _row(function: Callable[[float], Any], time: float) -> Array:

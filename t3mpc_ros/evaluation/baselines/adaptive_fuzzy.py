@@ -29,8 +29,8 @@ from t3mpc_ros.parameters.table import Parameters, parameter
 
 
 @dataclass(frozen=True)
-class AdaptiveParameters(FeedbackParameters):
-    """What both adaptive fuzzy controllers have; the sets cover -10 to 10 rad/s."""
+class AdaptiveType1Parameters(FeedbackParameters):
+    """Gains and sets of the type-1 controller; the sets cover -10 to 10 rad/s."""
 
     gain: float = parameter(30.0, 'feedback K on the error', '1/s', (0.5, 100.0))
     normalised_gain: float = parameter(
@@ -76,12 +76,7 @@ class AdaptiveParameters(FeedbackParameters):
 
 
 @dataclass(frozen=True)
-class AdaptiveType1Parameters(AdaptiveParameters):
-    """Gains and sets of the type-1 controller."""
-
-
-@dataclass(frozen=True)
-class AdaptiveIntervalType2Parameters(AdaptiveParameters):
+class AdaptiveIntervalType2Parameters(AdaptiveType1Parameters):
     """Gains and sets of the interval type-2 controller."""
 
     footprint_of_uncertainty: float = parameter(
@@ -105,7 +100,7 @@ def _unit_gamma(fuzzy: FuzzyParameters) -> float:
     return gamma_for(fuzzy, 1.0)
 
 
-class _Adaptive(FeedbackBaseline[AdaptiveParameters]):
+class _Adaptive(FeedbackBaseline[AdaptiveType1Parameters]):
     r"""The law both share: u = r' + v(h) - g(chi|alpha) - K e - bound tanh(e/epsilon).
 
     The coefficients learn by alpha' = gamma Phi e from the error that their own estimate has

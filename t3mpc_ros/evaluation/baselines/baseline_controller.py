@@ -82,8 +82,7 @@ class NominalModel:
 
         Only for the velocity drive: command = speeds + T u / (1 - exp(-T/lag)).
         """
-        u: Array = (command - speeds) * (self.share / self.period)
-        return u
+        return (command - speeds) * (self.share / self.period)
 
 
 EXACT_INERTIA, FRICTION = 'exact inertia', 'nominal friction'

@@ -152,8 +152,7 @@ def largest_switch(run: Record) -> int | None:
 
 def estimated_unknown(run: Record) -> Array:
     """Return g of (31) as the law used it, rad/s², shape (n, 2): its term in (66) is -g."""
-    found: Array = -run['terms'][:, TERM_NAMES.index('fuzzy')]
-    return found
+    return -run['terms'][:, TERM_NAMES.index('fuzzy')]
 
 
 def true_unknown(run: Record) -> Array:
@@ -230,8 +229,7 @@ def _of_run(
 def broken_at_switches(run: Record, values: Sequence[Array] | Array) -> Array:
     """Return ``values`` (n, 2) with a gap before each switch: a jump is no line in a portrait."""
     rows = np.flatnonzero(np.diff(run['mode']) != 0) + 1
-    broken: Array = np.insert(np.asarray(values, dtype=np.float64), rows, np.nan, axis=0)
-    return broken
+    return np.insert(np.asarray(values, dtype=np.float64), rows, np.nan, axis=0)
 
 
 # -- figures --------------------------------------------------------------------------------------

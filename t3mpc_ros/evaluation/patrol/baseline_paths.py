@@ -230,5 +230,4 @@ def _mirrored(points: Array, area: Rectangle) -> Array:
             pieces.append(start + np.array(shares)[:, None] * (end - start))
         pieces.append(end[None, :])
     folded = np.abs(np.mod(np.vstack(pieces) + 1.0, 2.0) - 1.0)
-    path: Array = low + size * folded
-    return path
+    return low + size * folded

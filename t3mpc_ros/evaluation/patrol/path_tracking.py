@@ -57,6 +57,7 @@ from t3mpc_ros.geometry.path_timing import (
     time_path,
 )
 from t3mpc_ros.geometry.types import ORIGIN, Array
+from t3mpc_ros.parameters.table import find_names
 
 RECORDED_PATH = Path(__file__).with_name('recorded_path.csv')
 """Odometry of a robot that followed switching chaotic wheel speeds, thinned to 10 mm."""
@@ -141,8 +142,7 @@ def figure_of_eight() -> Array:
     angle = np.linspace(0.0, math.tau, 721)
     points = 0.6 * np.column_stack([np.sin(angle), np.sin(angle) * np.cos(angle)])
     turn = math.sqrt(0.5) * np.array([[1.0, -1.0], [1.0, 1.0]])
-    turned: Array = points @ turn
-    return turned
+    return points @ turn
 
 
 def recorded_path() -> Array:
@@ -176,12 +176,9 @@ class TrackingPlan:
     methods: Sequence[str] = tuple(METHODS)
 
     def __post_init__(self) -> None:
-        for name in self.paths:
-            if name not in TRACKED_PATHS:
-                raise ValueError(f'path must be one of {", ".join(TRACKED_PATHS)}: got {name}')
-        for name in self.methods:
-            if name not in METHODS:
-                raise ValueError(f'method must be one of {", ".join(METHODS)}: got {name}')
+        for kind, known in (('path', TRACKED_PATHS), ('method', METHODS)):
+            names = find_names(kind, getattr(self, f'{kind}s'), known)
+            object.__setattr__(self, f'{kind}s', names)
         if not self.paths or not self.seeds or not self.methods:
             raise ValueError('at least one path, one seed and one method must be given')
 

@@ -57,6 +57,7 @@ from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming
 from t3mpc_ros.geometry.types import ORIGIN, Array
+from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.robot.description import ray_ends, sensor_mounts
 from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
 from t3mpc_ros.simulation.world import World, parse_world
@@ -92,11 +93,8 @@ class PatrolPlan:
     0.25 m outside."""
 
     def __post_init__(self) -> None:
-        for name in self.paths:
-            if name not in PATHS:
-                raise ValueError(f'path must be one of {", ".join(PATHS)}: got {name}')
-        if self.robot not in ROBOTS:
-            raise ValueError(f'robot must be one of {", ".join(ROBOTS)}: got {self.robot}')
+        object.__setattr__(self, 'paths', find_names('path', self.paths, PATHS))
+        object.__setattr__(self, 'robot', *find_names('robot', [self.robot], ROBOTS))
         if not self.paths or not self.seeds:
             raise ValueError('at least one path and one seed must be given')
         if not self.duration >= 1.0:
@@ -288,5 +286,4 @@ def range_hits(poses: Array, ranges: Array) -> Array:
     sensors (m), shape (n, 8); those that are not finite hit nothing.
     """
     ends = ray_ends(poses, ranges, sensor_mounts(RangeSensorParameters())).reshape(-1, 2)
-    found: Array = ends[np.isfinite(ends).all(axis=1)]
-    return found
+    return ends[np.isfinite(ends).all(axis=1)]

@@ -133,8 +133,7 @@ def visits(t: Array, x: Array, y: Array, grid: CoverageGrid) -> Visits:
 def coverage_at(found: Visits, grid: CoverageGrid, times: Array) -> Array:
     """Return the share of free cells entered up to each time (s since the start), shape (n,)."""
     order = np.sort(found.first[grid.free])
-    shares: Array = np.searchsorted(order, times, side='right') / order.size
-    return shares
+    return np.searchsorted(order, times, side='right') / order.size
 
 
 def time_to_cover(found: Visits, grid: CoverageGrid, share: float) -> float:

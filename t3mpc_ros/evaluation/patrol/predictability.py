@@ -148,8 +148,7 @@ def _persistence(path: Array, half: int, origins: Rows, steps: Rows) -> Array:
 
 def _constant_velocity(path: Array, half: int, origins: Rows, steps: Rows) -> Array:
     moved = path[origins] - path[origins - 1]
-    found: Array = path[None, origins] + steps[:, None, None] * moved[None]
-    return found
+    return path[None, origins] + steps[:, None, None] * moved[None]
 
 
 def _constant_turn(path: Array, half: int, origins: Rows, steps: Rows) -> Array:

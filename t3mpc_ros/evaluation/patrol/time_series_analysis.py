@@ -111,8 +111,7 @@ def ordinal_shares(series: Array, order: int) -> Array:
     for k in range(order):
         smaller = (ranks[k + 1 :] < ranks[k]).sum(axis=0)
         number += smaller * math.factorial(order - 1 - k)
-    count: Array = np.bincount(number, minlength=math.factorial(order)) / number.size
-    return count
+    return np.bincount(number, minlength=math.factorial(order)) / number.size
 
 
 def permutation_entropy(series: Array, order: int = 4) -> float:
