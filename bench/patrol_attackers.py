@@ -50,7 +50,7 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     portrait_points,
     run_patrol,
 )
-from t3mpc_ros.evaluation.patrol.time_series_analysis import (
+from t3mpc_ros.evaluation.patrol.predictability import (
     delay_vectors,
     resampled,
     square_distances,

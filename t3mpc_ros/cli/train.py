@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> None:
             raise ValueError(f'robot must be servo for bags: got {options.robot}')
         run_bags(options)
         return
-    from t3mpc_ros.evaluation.training.simulated_run_fit import assess, fit_simulated_runs, origin
+    from t3mpc_ros.evaluation.training.trained_models import assess, fit_simulated_runs, origin
 
     if options.keep_predictor:
         raise ValueError('--keep-predictor is for bags')
@@ -81,7 +81,7 @@ def run_bags(options: argparse.Namespace) -> None:
     Raises as :func:`run`.
     """
     from t3mpc_ros.bag.model_file import save_model
-    from t3mpc_ros.evaluation.training.bag_fit import fit_bags
+    from t3mpc_ros.evaluation.training.trained_models import fit_bags
 
     model = fit_bags(options.bags, keep_predictor=options.keep_predictor, count=options.folds)
     print(model.text)

@@ -265,7 +265,8 @@ def html_page(title: str, blocks: Sequence[Block]) -> str:
     """Return a page that loads nothing from anywhere."""
     every = list(_all_blocks(blocks))
     headings = [each for each in every if isinstance(each, Heading)]
-    anchors = {id(each): f'{_slug(each.text)}-{i}' for i, each in enumerate(headings, 1)}
+    slugs = [re.sub(r'[^a-z0-9]+', '-', each.text.lower()).strip('-') for each in headings]
+    anchors = {id(each): f'{slugs[i]}-{i + 1}' for i, each in enumerate(headings)}
     found = PageData()
     content: dict[str, dict[str, object]] = {'charts': {}, 'planes': {}}
     for i, each in enumerate(every, 1):
@@ -297,10 +298,6 @@ def _all_blocks(blocks: Sequence[Block]) -> Iterator[Block]:
         yield block
         if isinstance(block, Details | Group):
             yield from _all_blocks(block.blocks)
-
-
-def _slug(text: str) -> str:
-    return re.sub(r'[^a-z0-9]+', '-', text.lower()).strip('-')
 
 
 @cache

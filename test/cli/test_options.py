@@ -39,7 +39,7 @@ from t3mpc_ros.evaluation.paper.study import chosen_extent
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan
 from t3mpc_ros.evaluation.process_replay import replay_comparison
 from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances
-from t3mpc_ros.evaluation.training.bag_fit import fit_bags
+from t3mpc_ros.evaluation.training.trained_models import fit_bags
 from t3mpc_ros.radio.tool.calibration_wizard import WizardOptions
 from t3mpc_ros.robot.calibration import MARKS
 from t3mpc_ros.version import VERSION

@@ -183,9 +183,9 @@ MODEL = SimpleNamespace(
     text='', learnt={}, parameters=SimpleNamespace(to_dict=dict), origin={}, to_dict=dict
 )
 TRAIN = {
-    'evaluation.training.simulated_run_fit.fit_simulated_runs': ({}, MODEL),
-    'evaluation.training.simulated_run_fit.assess': '',
-    'evaluation.training.bag_fit.fit_bags': MODEL,
+    'evaluation.training.trained_models.fit_simulated_runs': ({}, MODEL),
+    'evaluation.training.trained_models.assess': '',
+    'evaluation.training.trained_models.fit_bags': MODEL,
     'bag.model_file.save_model': None,
 }
 OF_BAGS = {

@@ -27,12 +27,13 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     time_to_cover,
     visits,
 )
-from t3mpc_ros.evaluation.patrol.predictability import HORIZONS, predictability
-from t3mpc_ros.evaluation.patrol.time_series_analysis import (
+from t3mpc_ros.evaluation.patrol.predictability import (
+    HORIZONS,
     delay_vectors,
     divergence,
     ordinal_shares,
     permutation_entropy,
+    predictability,
     spectral_entropy,
 )
 

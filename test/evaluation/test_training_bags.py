@@ -27,8 +27,7 @@ from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
-from t3mpc_ros.evaluation.training import bag_fit
-from t3mpc_ros.evaluation.training.bag_fit import fit_bags, mean_and_spread, spread_text
+from t3mpc_ros.evaluation.training import trained_models
 from t3mpc_ros.evaluation.training.fit import (
     TrainingData,
     explained,
@@ -38,7 +37,12 @@ from t3mpc_ros.evaluation.training.fit import (
     skills,
     stretches,
 )
-from t3mpc_ros.evaluation.training.simulated_run_fit import training_data_of
+from t3mpc_ros.evaluation.training.trained_models import (
+    fit_bags,
+    mean_and_spread,
+    spread_text,
+    training_data_of,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -147,10 +151,10 @@ def test_the_model_file_is_loaded_and_says_where_it_is_from(
 ):
     path, asked = tmp_path / 'model.npz', []
     monkeypatch.setattr(
-        bag_fit, 'fit_bags', lambda folders, **how: asked.append((folders, how)) or model
+        trained_models, 'fit_bags', lambda folders, **how: asked.append((folders, how)) or model
     )
     assert program('train', *bags, '--output', path) == 0
-    assert asked == [(bags, {'keep_predictor': False, 'count': bag_fit.FOLDS})]
+    assert asked == [(bags, {'keep_predictor': False, 'count': trained_models.FOLDS})]
     said = capsys.readouterr().out
     assert model.text in said
     assert f'saved {path}' in said

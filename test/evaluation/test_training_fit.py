@@ -35,7 +35,6 @@ from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.proposed_method import ProposedParameters
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS
-from t3mpc_ros.evaluation.training.bag_fit import blocks, fit_bags
 from t3mpc_ros.evaluation.training.fit import (
     TrainingData,
     TrainingError,
@@ -49,6 +48,7 @@ from t3mpc_ros.evaluation.training.fit import (
     skills,
     stretches,
 )
+from t3mpc_ros.evaluation.training.trained_models import blocks, fit_bags
 from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
 from t3mpc_ros.mpc.boltzmann_machine import (
     LayerSizes,

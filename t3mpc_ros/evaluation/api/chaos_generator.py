@@ -134,7 +134,7 @@ def chaos(
         raise ScriptError(f'dt must be above 0 s and at most the span: got {dt!r}')
     if every is not None and (isinstance(every, bool) or not isinstance(every, int) or every < 1):
         raise ScriptError(f'every must be a whole number, at least 1: got {every!r}')
-    if not (isinstance(rtol, float) and MIN_RTOL <= rtol <= 1.0):
+    if not (isinstance(rtol, int | float) and MIN_RTOL <= rtol <= 1.0):
         raise ScriptError(f'rtol must be from {MIN_RTOL:g} to 1: got {rtol!r}')
     if system is None:
         orders = numbers('alpha', alpha, '() or (4,)')

@@ -52,10 +52,10 @@ from t3mpc_ros.evaluation.paper.study import (
     STAGES,
     WITHOUT,
     Extent,
-    study_scenario,
 )
 from t3mpc_ros.evaluation.record import START, Record, switch_times
 from t3mpc_ros.evaluation.result_file import Row
+from t3mpc_ros.evaluation.scenario import PLANT_OF, Scenario
 from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, Array, WheelSpeeds
@@ -104,7 +104,7 @@ def simulate_figure_runs(extent: Extent, results: Results, workers: int | Execut
     wanted += [('velocity', FULL), ('velocity', NO_PREVIEW)]
     jobs = [
         (
-            study_scenario(drive, PAPER_NOISE, NOMINAL, seed, extent.duration),
+            Scenario(PLANT_OF[drive], NOMINAL, seed, extent.duration, PAPER_NOISE),
             methods(drive)[name],
         )
         for drive, name in wanted

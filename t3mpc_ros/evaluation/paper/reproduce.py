@@ -360,7 +360,7 @@ _KINDS = {
 def page(title: str, origin: str, material: ExhibitData, pictures: Mapping[str, bytes]) -> str:
     """Return the page as HTML that loads nothing from anywhere.
 
-    ``origin`` says where the numbers come from; pictures (PNG) are by the stem of their exhibit.
+    ``origin`` says where the numbers come from; pictures are by the stem of their exhibit.
     """
     headline, *others = (
         _exhibit(each, material, pictures)

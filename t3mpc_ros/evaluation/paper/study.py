@@ -113,7 +113,7 @@ def study_runs(extent: Extent) -> list[Run]:
     found = []
     for seed in extent.seeds:
         for method, drive, noise, case in situations:
-            scenario = study_scenario(drive, noise, case, seed, extent.duration)
+            scenario = Scenario(PLANT_OF[drive], case, seed, extent.duration, noise)
             fields = {
                 'controller': method.name,
                 'baseline': method.baseline,
@@ -127,11 +127,6 @@ def study_runs(extent: Extent) -> list[Run]:
             key = digest(scenario, made[drive, method.name])
             found.append(Run((scenario, method), fields, key))
     return found
-
-
-def study_scenario(drive: str, noise: float, case: str, seed: int, duration: float) -> Scenario:
-    """Return a run on the paper's plant."""
-    return Scenario(PLANT_OF[drive], case, seed, duration, noise)
 
 
 def _situations(extent: Extent) -> Iterator[tuple[MethodSpec, str, float, str]]:

@@ -90,11 +90,6 @@ class TrackingMethod:
     pursuit: PurePursuitParameters | RegulatedParameters | None = None
     """A baseline in place of our controller."""
 
-    @property
-    def spare_time(self) -> float:
-        """Time for a path as a multiple of that of its reference."""
-        return SLOW_SPARE_TIME if isinstance(self.pursuit, RegulatedParameters) else SPARE_TIME
-
 
 TUNED_GAINS: Mapping[str, object] = {'pose.gain_across': 240.0, 'pose.gain_yaw': 8.0}
 """The best of :func:`tune_trackers`, as the lookaheads of the baselines below."""
@@ -245,11 +240,12 @@ def drive(job: tuple[TrackingJob, TrackingMethod]) -> Record:
         'wheel_separation_multiplier': 1.0 + float(separation),
     }
     least = float(time_path(points, LIMITS, WheelGeometry(), 1.0 / RATE, ORIGIN).time[-1])
+    spare = SLOW_SPARE_TIME if isinstance(method.pursuit, RegulatedParameters) else SPARE_TIME
     tracker = None if method.pursuit is None else Pursuit(points, method.pursuit)
     with world_file(slippery_floor(points, generator)) as world:
         scenario = PatrolScenario(
             seed=seed,
-            duration=math.ceil(method.spare_time * least) + 2.0,
+            duration=math.ceil(spare * least) + 2.0,
             world=world,
             keep_out=False,
             robot=robot,

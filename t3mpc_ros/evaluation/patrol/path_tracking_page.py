@@ -139,7 +139,7 @@ def markdown(study: TrackingStudy) -> str:
 
 
 def page(study: TrackingStudy, drawn: Mapping[str, bytes]) -> str:
-    """Return the page as self-contained HTML, with the picture (PNG) by its stem."""
+    """Return the page as self-contained HTML, with the pictures by their stems."""
     blocks: list[Block] = [Contents(), Paragraph(description(study.plan))]
     if 'tracks' in drawn:
         blocks.append(Picture(PICTURES[0].title, drawn['tracks'], PICTURES[0].title))

@@ -20,13 +20,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.patrol.predictability import predictability
-from t3mpc_ros.evaluation.patrol.time_series_analysis import (
+from t3mpc_ros.evaluation.patrol.predictability import (
     check_path,
     delay_vectors,
     divergence,
     normalised_entropy,
     permutation_entropy,
+    predictability,
     resampled,
     spectral_entropy,
 )

@@ -115,6 +115,7 @@ WRONG = {
     ),
     'list for a name': (lambda: t3.fuzzy(['x']), r"inputs must be names, each once: got \['x'\]"),
     'tolerance of the generator': (lambda: t3.chaos(rtol=0.0), 'rtol must be from 1e-06 to 1'),
+    'whole tolerance of the generator': (lambda: t3.chaos(rtol=2), 'rtol must be from 1e-06 to 1'),
     'list for array': (
         lambda: t3.simulate(returns_list, **SHORT),
         r'returns_list must return a numpy array of shape \(2,\), .* got \[1.0, 2.0\] at 0.00 s',

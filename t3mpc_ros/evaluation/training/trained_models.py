@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Model fitted to recorded bags, of a simulated robot or a real one, and its cross-validation."""
+"""Models fitted to bags, and to the training runs of the simulation, with their skill."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -23,10 +23,29 @@ import warnings
 import numpy as np
 
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.control.control_law import Nt3fsMpcController, Nt3fsMpcParameters
+from t3mpc_ros.control.control_law import TERM_NAMES, Nt3fsMpcController, Nt3fsMpcParameters
 from t3mpc_ros.control.controller import ControllerParameters
-from t3mpc_ros.evaluation.proposed_method import random_output_weights
+from t3mpc_ros.evaluation.cases import NOMINAL
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean, rms
+from t3mpc_ros.evaluation.drivers import MethodSpec, pretrain
+from t3mpc_ros.evaluation.experiment import Job, Run, print_report, run_experiment
+from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.methods import FULL, methods
+from t3mpc_ros.evaluation.proposed_method import (
+    ProposedController,
+    ProposedParameters,
+    random_output_weights,
+)
+from t3mpc_ros.evaluation.record import RATE, Record
 from t3mpc_ros.evaluation.reporting import Table
+from t3mpc_ros.evaluation.scenario import (
+    PLANT_OF,
+    PRETRAINING_DURATION,
+    PRETRAINING_NOISE,
+    PRETRAINING_SEEDS,
+    Scenario,
+    held_out,
+)
 from t3mpc_ros.evaluation.topic_roles import bag_display_name
 from t3mpc_ros.evaluation.training.fit import (
     TrainingData,
@@ -44,7 +63,7 @@ from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.mpc.predictive_controller import PredictiveController
 from t3mpc_ros.parameters.provenance import provenance
 
-FITTED, NOMINAL, RANDOM = 'fitted', 'nominal loop', 'random'
+FITTED, LOOP, RANDOM = 'fitted', 'nominal loop', 'random'
 """Compared predictors: fitted to the other folds, nominal only, and with random output
 weights of the same size. Skill 0 is no prediction."""
 NEXT_STEP, MIDDLE = 'next step', 'middle of the horizon'
@@ -89,15 +108,15 @@ def cross_validate(
     predictive = parameters.predictive
     span = predictive.decimation / parameters.rate
     found = []
-    for name, held_out in runs.items():
+    for name, left_out in runs.items():
         others = TrainingData.joined([run for other, run in runs.items() if other != name])
-        judged = len(held_out) / parameters.rate
+        judged = len(left_out) / parameters.rate
         ratings: dict[str, Array] = {}
         try:
             coefficients = fit_coefficients(parameters, others)
             if not keep_predictor:
                 fit = fit_predictor(parameters, *periods(others, predictive, parameters.rate))
-                parts = stretches(*periods(held_out, predictive, parameters.rate))
+                parts = stretches(*periods(left_out, predictive, parameters.rate))
                 judged = sum(part[0][0].size for part in parts) * span
                 nominal = PredictiveController(
                     predictive, 1.0 / parameters.rate, parameters.law.gain
@@ -106,13 +125,13 @@ def cross_validate(
                     title: skills(predictive, span, weights, parts)
                     for title, weights in (
                         (FITTED, fit.weights),
-                        (NOMINAL, nominal),
+                        (LOOP, nominal),
                         (RANDOM, random_output_weights(fit.weights, predictive.seed)),
                     )
                 }
         except TrainingError as error:
             raise TrainingError(f'without {name} to learn from: {error}') from error
-        found.append(Fold(name, judged, ratings, explained(parameters, coefficients, held_out)))
+        found.append(Fold(name, judged, ratings, explained(parameters, coefficients, left_out)))
     if not keep_predictor and not any(fold.judged for fold in found):
         raise TrainingError('there must be a stretch without a gap to evaluate: there is none')
     return found
@@ -245,7 +264,7 @@ def _warnings(folds: Sequence[Fold]) -> list[str]:
     found = []
     if folds[0].skills:
         fitted, nominal = (
-            mean_and_spread([fold.skills[name] for fold in folds])[0] for name in (FITTED, NOMINAL)
+            mean_and_spread([fold.skills[name] for fold in folds])[0] for name in (FITTED, LOOP)
         )
         if (fitted <= 0.0).any():
             found.append(
@@ -290,3 +309,105 @@ def origin_of(folder: Path) -> dict[str, object]:
         made_by = dict(recording.metadata_records.get('provenance', {}))
         start, duration = recording.start_ns, recording.duration
     return {'files': files, 'start_ns': start, 'duration_s': duration, 'made_by': made_by}
+
+
+# -- simulated runs -------------------------------------------------------------------------------
+
+WITHOUT, WITH = 'without model', 'with model'
+EARLY = 10.0
+"""Length of the initial phase, in which a model matters most, s."""
+
+
+def fit_simulated_runs(drive: str) -> tuple[Mapping[str, Array], ProposedParameters]:
+    """Return the model of the training runs, and the parameters of our full controller."""
+    parameters = methods(drive)[FULL].parameters
+    assert isinstance(parameters, ProposedParameters)
+    return pretrain(ProposedController, parameters, drive), parameters
+
+
+def origin(drive: str) -> Mapping[str, object]:
+    """Return the origin of the model fitted to the training runs, for the model file."""
+    return {
+        'command': f't3mpc train --robot {"servo" if drive == "velocity" else drive}',
+        'drive': drive,
+        'seeds': list(PRETRAINING_SEEDS),
+        'duration': PRETRAINING_DURATION,
+        'noise_variance': PRETRAINING_NOISE,
+    }
+
+
+def assess(drive: str, seeds: Sequence[int], *, progress: bool = False) -> str:
+    """Return a report on the model: runs on held-out seeds with it and without."""
+    _, parameters = fit_simulated_runs(drive)
+    specs = {
+        name: MethodSpec(FULL, ProposedController, parameters, pretrained=name == WITH)
+        for name in (WITHOUT, WITH)
+    }
+    scenarios = [
+        Scenario(PLANT_OF[drive], NOMINAL, seed, PRETRAINING_DURATION, PRETRAINING_NOISE)
+        for seed in held_out(seeds)
+    ]
+    table = run_experiment(
+        [
+            Run((scenario, spec), {'model': name, 'seed': scenario.seed})
+            for scenario in scenarios
+            for name, spec in specs.items()
+        ],
+        measured_phases,
+        report=print_report if progress else None,
+    )
+    phases = 'early', 'late'
+    rows = []
+    for name in specs:
+        numbers = [table.values(phase, model=name) for phase in phases]
+        rows.append([name, *(f'{mean(each):.4f} ± {interval(each):.4f}' for each in numbers)])
+    gains = [table.difference(phase, {'model': WITH}, {'model': WITHOUT}) for phase in phases]
+    rows.append(['difference', *(f'{each.mean:+.4f} ± {each.half:.4f}' for each in gains if each)])
+    what = f'RMSE (rad/s), seeds {seeds[0]} to {seeds[-1]}, mean ± 95 %'
+    return '\n\n'.join(
+        [
+            f'Trained on runs of {PRETRAINING_DURATION:g} s with seeds '
+            f'{", ".join(map(str, PRETRAINING_SEEDS))}: drive {drive}, noise '
+            f'{PRETRAINING_NOISE:g} (rad/s)².',
+            _skill_table(drive, run(scenarios[0], specs[WITHOUT])).markdown(),
+            Table('', (what, f'first {EARLY:g} s', 'from 3 s on'), rows).markdown(),
+        ]
+    )
+
+
+def measured_phases(job: Job) -> dict[str, float]:
+    """Return the tracking RMSE over both wheels in the initial phase and after 3 s, rad/s."""
+    record = run(*job)
+    return {'early': rms(record.error[record.time < EARLY]), 'late': record.rmse()}
+
+
+def _skill_table(drive: str, record: Record) -> Table:
+    """Return the skills of both wheels before and after the fit, on the last quarter of a run."""
+    weights, parameters = fit_simulated_runs(drive)
+    predictive, prefix = parameters.predictive, 'predictive.'
+    term = PredictiveController(predictive, 1.0 / RATE, parameters.law.gain)
+    after = {key.removeprefix(prefix): each for key, each in weights.items() if prefix in key}
+    errors, moves = periods(training_data_of(record, parameters), predictive, RATE)
+    cut = 3 * len(errors) // 4
+    last_quarter = stretches(errors[cut:], moves[cut:])
+    rows = [
+        [name, *map(pair, skills(predictive, term.span, each, last_quarter))]
+        for name, each in (('before', term.get_weights()), ('after', after))
+    ]
+    return Table(
+        '', ('skill on the last quarter of the first run (right/left)', NEXT_STEP, MIDDLE), rows
+    )
+
+
+def training_data_of(record: Record, parameters: ProposedParameters) -> TrainingData:
+    """Return a simulated run in the form of training data from a bag."""
+    begins = np.zeros(record.time.size, dtype=np.bool_)
+    begins[0] = True
+    return TrainingData(
+        errors=-record['terms'][:, TERM_NAMES.index('feedback')] / parameters.law.gain,
+        moves=record['terms'][:, TERM_NAMES.index('predictive')],
+        speeds=record['estimated'],
+        unexplained=record['unexplained'],
+        limited=record['limited'].astype(np.bool_),
+        begins=begins,
+    )
