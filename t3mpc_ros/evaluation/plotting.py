@@ -26,6 +26,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
+from t3mpc_ros.evaluation.charts import thinned
+from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import World
@@ -213,3 +215,70 @@ def legend_above(figure: Any, *axes: Any, columns: int = 5) -> None:
             entries.setdefault(label, handle)
     columns = min(columns, len(entries))
     figure.legend(entries.values(), entries.keys(), loc='outside upper center', ncols=columns)
+
+
+# -- results of scripts ---------------------------------------------------------------------------
+
+
+def run_figure(name: str, columns: Mapping[str, Array]) -> Any:
+    """Return speeds and error of each wheel over time."""
+    figure, axes = new_panels(3, 1.5)
+    time = columns['time']
+    for axis, side in zip(axes, ('right', 'left'), strict=False):
+        speed, reference = columns[f'speed_{side}'], columns[f'reference_{side}']
+        axis.plot(*thinned(time, reference), color=COLOURS[REFERENCE], lw=1.0, label='reference')
+        axis.plot(*thinned(time, speed), color=COLOURS[TRUTH], lw=1.0, label=name)
+        axis.set_ylabel('rad/s')
+        axis.set_title(f'{side} wheel')
+        error = speed - reference
+        strength = 1.0 if side == 'right' else 0.45
+        label = f'{side} wheel'
+        axes[2].plot(
+            *thinned(time, error),
+            color=COLOURS['error'],
+            lw=0.8,
+            alpha=strength,
+            label=label,
+        )
+    axes[2].set_title('error')
+    axes[2].set_ylabel('rad/s')
+    name_time(axes)
+    add_legend(axes[0])
+    add_legend(axes[2])
+    return figure
+
+
+def lines_figure(time: Array, lines: Mapping[str, Array]) -> Any:
+    """Return one panel for each quantity over time."""
+    figure, axes = new_panels(len(lines), 1.1)
+    for axis, (name, values) in zip(axes, lines.items(), strict=True):
+        axis.plot(*thinned(time, values), color=COLOURS['value'], lw=0.9)
+        axis.set_title(name)
+    name_time(axes)
+    return figure
+
+
+def plane_figure(x: Array, y: Array, names: Sequence[str]) -> Any:
+    """Return one line in the plane."""
+    figure = new_figure(4.2)
+    axis = figure.subplots()
+    axis.plot(x, y, color=COLOURS['value'], lw=0.5)
+    axis.set_xlabel(names[0])
+    axis.set_ylabel(names[1])
+    return figure
+
+
+def sweep_figure(lines: Mapping[str, Mapping[float, list[float]]], name: str, label: str) -> Any:
+    """Return means with 95 % intervals over the values of a parameter, a line for each name."""
+    figure = new_figure(3.2)
+    axis = figure.subplots()
+    for line, values in lines.items():
+        ordered = sorted(values)
+        means = [mean(values[value]) for value in ordered]
+        halves = [interval(values[value]) for value in ordered]
+        shown = [half if math.isfinite(half) else 0.0 for half in halves]
+        axis.errorbar(ordered, means, yerr=shown, marker='o', markersize=3, capsize=2, label=line)
+    axis.set_xlabel(name)
+    axis.set_ylabel(label)
+    add_legend(axis)
+    return figure

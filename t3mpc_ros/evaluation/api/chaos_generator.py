@@ -28,7 +28,7 @@ from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
 from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.references import numbers
-from t3mpc_ros.evaluation.api.result_tables import writable
+from t3mpc_ros.evaluation.api.result_tables import drawn, writable
 from t3mpc_ros.evaluation.reporting import write_columns
 from t3mpc_ros.geometry.types import Array, read_only
 from t3mpc_ros.script_error import ScriptError
@@ -63,15 +63,11 @@ class ChaosSolution:
 
         Each state over time, or with ``plane`` the second state over the first.
         """
-        from t3mpc_ros.evaluation.api.figures import drawn, lines_figure, plane_figure
-
         names = [f'y{i + 1}' for i in range(self.system.size)]
         if plane and len(names) > 1:
-            return drawn(
-                lambda: plane_figure(self.y[:, 0], self.y[:, 1], (names[0], names[1])), path
-            )
+            return drawn(lambda figures: figures.plane_figure(*self.y.T[:2], names[:2]), path)
         lines = {name: self.y[:, i] for i, name in enumerate(names)}
-        return drawn(lambda: lines_figure(self.t, lines), path)
+        return drawn(lambda figures: figures.lines_figure(self.t, lines), path)
 
     @one_sentence
     def to_csv(self, path: str | os.PathLike[str]) -> Path:

@@ -23,7 +23,7 @@ from typing import Any
 from t3mpc_ros.evaluation import comparison
 from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, writable
+from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, drawn, writable
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import Difference
@@ -81,11 +81,10 @@ class Comparison(ShownAsTables):
 
         By default that of the first case; written to ``path``, a .png, .pdf or .svg, if given.
         """
-        from t3mpc_ros.evaluation.api.figures import drawn
         from t3mpc_ros.evaluation.comparison_page import draw_seeds
 
         (chosen,) = find_names('case', [case or self.plan.cases[0]], self.plan.cases)
-        return drawn(lambda: draw_seeds(self.plan, self.results, chosen), path)
+        return drawn(lambda _: draw_seeds(self.plan, self.results, chosen), path)
 
     @one_sentence
     def values(self, controller: Any, metric: str = SETTLED.name, case: str = '') -> list[float]:

@@ -116,8 +116,6 @@ class Sweep(result_tables.ShownAsTables):
         Means over all else, with 95 % intervals; written to ``path``, a .png, .pdf or .svg, if one
         is given.
         """
-        from t3mpc_ros.evaluation.api.figures import drawn, sweep_figure
-
         (name,) = find_names('parameter', [parameter], self.parameters)
         wanted = find_metric(metric)
         lines: dict[str, dict[Any, list[float]]] = {}
@@ -125,7 +123,7 @@ class Sweep(result_tables.ShownAsTables):
             numbers = [row.get(wanted.name, math.nan) for row in rows]
             lines.setdefault(str(line), {})[value] = numbers
         label = f'{wanted.heading} / ({wanted.unit})'
-        return drawn(lambda: sweep_figure(lines, name, label), path)
+        return result_tables.drawn(lambda figures: figures.sweep_figure(lines, name, label), path)
 
 
 def has_failed(row: Row) -> bool:

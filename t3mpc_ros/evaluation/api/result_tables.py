@@ -14,7 +14,7 @@
 """How the results of a script are shown: in a terminal, a notebook, a paper, and as files."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 import os
@@ -144,6 +144,20 @@ def write_parquet(
     pyarrow.parquet.write_table(table, part)
     part.replace(target)
     return target
+
+
+def drawn(draw: Callable[[Any], Any], path: str | os.PathLike[str] | None) -> Any:
+    """Return what ``draw`` makes by the module of the figures, written to ``path`` if given."""
+    import matplotlib
+
+    from t3mpc_ros.evaluation import plotting  # it loads matplotlib, which a run does without
+
+    with matplotlib.rc_context(plotting.STYLE):
+        figure = draw(plotting)
+    if path is not None:
+        target = writable(path, *(f'.{kind}' for kind in plotting.DATES))
+        target.write_bytes(plotting.file_of(figure, target.suffix.removeprefix('.')))
+    return figure
 
 
 def writable(path: str | os.PathLike[str], *suffixes: str) -> Path:

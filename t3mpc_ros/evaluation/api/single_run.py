@@ -22,7 +22,7 @@ import numpy as np
 
 from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
-from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables
+from t3mpc_ros.evaluation.api.result_tables import Columns, ShownAsTables, drawn
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, own_scenario
 from t3mpc_ros.evaluation.cases import NOMINAL, LinkFaults
 from t3mpc_ros.evaluation.confidence_intervals import rms
@@ -116,9 +116,7 @@ class RunResult(ShownAsTables):
 
         It is written to ``path``, a .png, .pdf or .svg, if one is given.
         """
-        from t3mpc_ros.evaluation.api.figures import drawn, run_figure
-
-        return drawn(lambda: run_figure(self.controller, self.columns), path)
+        return drawn(lambda figures: figures.run_figure(self.controller, self.columns), path)
 
 
 @one_sentence
