@@ -344,6 +344,16 @@ class BaseNode(Node, Generic[P]):
     def on_shutdown(self) -> None:
         """Stop the robot, publish final messages, close files."""
 
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set all parameters or none; unlike that of rclpy, the reason names an unknown one."""
+        for each in parameter_list:
+            if not self.has_parameter(each.name):
+                known = [spec.name for spec in self.parameter_class.specs()]
+                reason = f'{self.get_name()} has no parameter {each.name}'
+                reason += nearest_hint(each.name, known)
+                return SetParametersResult(successful=False, reason=reason)
+        return super().set_parameters_atomically(parameter_list)
+
     def _validate(self, requested: list[Parameter]) -> SetParametersResult:
         try:
             self._with_changes(requested)

@@ -18,6 +18,7 @@ import math
 from pathlib import Path
 
 import pytest
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from support.ros_graph import record
 import yaml
@@ -119,6 +120,20 @@ def test_only_dynamic_parameters_can_be_set(name, harness):
             assert not response.successful, row.name
             assert row.name in response.reason
         assert node.get_parameter(row.name).value == held.value
+
+
+def test_an_unknown_parameter_is_named_with_the_nearest_one(harness):
+    harness.add(SimRobotNode)
+    wrong = Parameter('wheel.max_acelleration', value=5.0).to_parameter_msg()
+    for service in (SetParameters, SetParametersAtomically):
+        name = 'set_parameters' + ('_atomically' if service is SetParametersAtomically else '')
+        response = harness.call(service, f'/sim_robot/{name}', parameters=[wrong])
+        result = response.result if service is SetParametersAtomically else response.results[0]
+        assert not result.successful
+        assert result.reason == (
+            'sim_robot has no parameter wheel.max_acelleration; '
+            'did you mean wheel.max_acceleration?'
+        )
 
 
 def test_inconsistent_parameters_are_rejected_with_the_reason(harness):
