@@ -256,6 +256,9 @@ class ParticleFilter:
         if not total > 0.0:  # the particles with weight are the ones that became impossible
             weights = np.exp(logarithms - logarithms.max())
             total = float(weights.sum())
+        if not math.isfinite(total):  # a likelihood was no number
+            self.scatter()
+            return
         self.weights = weights / total
         lost = 0.0
         if self.parameters.recovery_alpha_slow > 0.0:

@@ -237,6 +237,34 @@ def explain_readings(
             found[i, 0] = 1.0 if hit > other else -1.0
 
 
+def beams_of_scan(
+    reading: Array, first: float, increment: float, limits: tuple[float, float], count: int
+) -> Beams:
+    """Return at most ``count`` beams, evenly spaced, in the frame of a laser; NaN is left out.
+
+    reading : m, shape (n,); first, increment : of their directions, rad
+    limits : smallest and largest distance, m
+
+    ValueError: no scan has such directions or limits; with them no particle has a likelihood.
+    """
+    least, most = limits
+    turns = math.isfinite(increment) and (increment != 0.0 or reading.size < 2)
+    positive, ascending = 0.0 <= least < math.inf, least < most < math.inf
+    for name, value, possible, wanted in (
+        ('angle_min', first, math.isfinite(first), 'finite'),
+        ('angle_increment', increment, turns, 'finite and not 0'),
+        ('range_min or laser_min_range', least, positive, 'finite and at least 0 m'),
+        ('range_max or laser_max_range', most, ascending, f'finite and above {least:g} m'),
+    ):
+        if not possible:
+            raise ValueError(f'{name} must be {wanted}: got {value:g}')
+    chosen = np.unique(np.linspace(0, max(reading.size - 1, 0), count).astype(np.int64))
+    chosen = chosen[~np.isnan(reading[chosen])] if reading.size else chosen[:0]
+    rays = np.zeros((chosen.size, 3))
+    rays[:, 2] = first + increment * chosen
+    return Beams(rays, reading[chosen], np.tile([least, most], (chosen.size, 1)))
+
+
 def joined(parts: Sequence[Beams]) -> Beams:
     """Return the beams of several sensors."""
     nothing = Beams(np.empty((0, 3)), np.empty(0), np.empty((0, 2)))

@@ -32,6 +32,7 @@ from t3mpc_ros.localization.range_model import (
     Beams,
     RangeModel,
     RangeModelParameters,
+    beams_of_scan,
     hit_likelihood,
     other_likelihood,
 )
@@ -109,6 +110,15 @@ def test_resampling_keeps_the_mean_and_shrinks_the_number():
     assert x == pytest.approx(1.5, abs=0.03)
 
 
+def test_without_a_likelihood_particles_are_scattered():
+    found = make_filter()
+    found.place(ORIGIN, np.zeros((3, 3)))
+    found.correct(Beams(np.zeros((1, 3)), np.array([math.inf]), np.full((1, 2), math.nan)))
+    assert len(found.poses) == 5000
+    assert found.weights.sum() == pytest.approx(1.0)
+    assert np.isfinite(found.poses).all()
+
+
 def test_the_estimate_is_the_heaviest_cluster_and_not_the_mean():
     found = make_filter()
     left, right = np.tile([-1.0, 0.0, 3.1], (40, 1)), np.tile([1.0, 0.5, 0.0], (60, 1))
@@ -158,3 +168,32 @@ def test_parameters_that_contradict_are_rejected(change, reason):
 def test_weights_above_one_are_rejected():
     with pytest.raises(ParameterError, match='sum to at most 1'):
         RangeModelParameters.from_dict({'z_rand': 0.5})
+
+
+def test_beams_of_a_scan_are_evenly_spaced_without_nan():
+    reading = np.array([0.1, math.nan, 0.3, 0.4, math.inf])
+    beams = beams_of_scan(reading, -1.0, 0.5, (0.05, 3.0), 5)
+    assert beams.origin[:, 2] == pytest.approx([-1.0, 0.0, 0.5, 1.0])
+    assert beams.reading.tolist() == [0.1, 0.3, 0.4, math.inf]
+    assert beams.limits.tolist() == [[0.05, 3.0]] * 4
+    assert beams_of_scan(reading, -1.0, 0.5, (0.05, 3.0), 3).origin[:, 2].tolist() == [-1.0, 0, 1]
+    assert beams_of_scan(reading[:1], 0.0, 0.0, (0.05, 3.0), 60).reading.tolist() == [0.1]
+    assert beams_of_scan(reading[:0], 0.0, 0.0, (0.05, 3.0), 60).reading.tolist() == []
+
+
+@pytest.mark.parametrize(
+    ('first', 'increment', 'limits', 'reason'),
+    [
+        (math.nan, 0.1, (0.1, 3.0), 'angle_min must be finite: got nan'),
+        (0.0, math.nan, (0.1, 3.0), 'angle_increment must be finite and not 0: got nan'),
+        (0.0, 0.0, (0.1, 3.0), 'angle_increment must be finite and not 0: got 0'),
+        (0.0, 0.1, (math.nan, 3.0), 'range_min .* must be finite and at least 0 m: got nan'),
+        (0.0, 0.1, (-0.1, 3.0), 'range_min .* must be finite and at least 0 m: got -0.1'),
+        (0.0, 0.1, (0.1, math.nan), 'range_max .* must be finite and above 0.1 m: got nan'),
+        (0.0, 0.1, (0.1, math.inf), 'range_max .* must be finite and above 0.1 m: got inf'),
+        (0.0, 0.1, (0.1, 0.1), 'range_max .* must be finite and above 0.1 m: got 0.1'),
+    ],
+)
+def test_a_scan_that_is_impossible_is_rejected(first, increment, limits, reason):
+    with pytest.raises(ValueError, match=reason):
+        beams_of_scan(np.array([0.5, 0.6]), first, increment, limits, 60)
