@@ -56,6 +56,11 @@ from t3mpc_ros.parameters.table import Parameters, group, parameter
 DISORDER = 0.2
 """Age up to which odometry was overtaken, and readings belong to it, s: the time-outs of the
 controller."""
+LONGEST_SILENCE = 2.5
+"""Time without a reading from which on the pose is by odometry alone, s: a scanner of 1 Hz may
+lose one scan."""
+LARGEST_VARIANCES = 25.0, 25.0, 10.0
+"""Largest variances of x, y (m²), yaw (rad²) of a pose that is given: it says nothing beyond."""
 SCAN = -1
 """Number of a scan among the sensors."""
 LONGEST_UPDATE = 60.0
@@ -171,7 +176,7 @@ class LocalizedPose(NamedTuple):
     stamp_ns: int
     pose: Pose
     covariance: Array
-    """Of x, y (m), yaw (rad), shape (3, 3); of all particles unless the place is known."""
+    """Of x, y (m), yaw (rad), shape (3, 3); of all particles unless readings tell the place."""
     odometry_frame: Pose
     """Origin of the odometry on the map."""
 
@@ -228,6 +233,8 @@ class Localizer:
         """Of the odometry's yaw, rad/s: a gyro measures its bias only at rest."""
         self._turned = 0.0
         """Turn by it since the last update, rad."""
+        self.silence = 0.0
+        """Time by the odometry since the last reading that was used, s."""
         self._pending: dict[int, tuple[Pose, Beams]] = {}
         """Beams since the last update by sensor, each with the odometry at its instant."""
         if parameters.set_initial_pose:
@@ -274,28 +281,39 @@ class Localizer:
             return ()  # a scan alone has no sensors to compare
         return tuple(np.flatnonzero(self._fits < DOUBTFUL_AGREEMENT).tolist())
 
-    def add_range(self, sensor: int, reading: float, stamp_ns: int | None = None) -> None:
-        """Add a reading (m, REP 117) taken where the last odometry was.
+    @property
+    def silent(self) -> bool:
+        """Whether the pose is by odometry alone: no reading was used for some time."""
+        return self.silence > LONGEST_SILENCE
+
+    def add_range(self, sensor: int, reading: float, stamp_ns: int | None = None) -> str:
+        """Add a reading (m, REP 117) taken where the last odometry was; return why not, or ''.
 
         NaN and a finite distance below zero change nothing, nor does a stamp of another time.
         """
-        if not (reading >= 0.0 or reading == -math.inf) or self._is_late(stamp_ns):
-            return
+        if not (reading >= 0.0 or reading == -math.inf):
+            return f'it is no distance: {reading:g}'
         mount = self._mounts[sensor : sensor + 1]
-        self._add(sensor, Beams(mount, np.array([reading]), np.array([self._limits])))
+        return self._add(
+            sensor, Beams(mount, np.array([reading]), np.array([self._limits])), stamp_ns
+        )
 
-    def add_scan(self, beams: Beams, stamp_ns: int | None = None) -> None:
-        """Add a scan taken where the last odometry was; it replaces one that was not used yet."""
-        if not self._is_late(stamp_ns):
-            self._add(SCAN, beams)
+    def add_scan(self, beams: Beams, stamp_ns: int | None = None) -> str:
+        """Add a scan taken where the last odometry was; return why not, or ''.
 
-    def _is_late(self, stamp_ns: int | None) -> bool:
-        """Whether a reading was taken elsewhere than where the last odometry was."""
-        return stamp_ns is not None and abs(stamp_ns - self._stamp_ns) > DISORDER * NANOSECONDS
+        It replaces one that was not used yet.
+        """
+        return self._add(SCAN, beams, stamp_ns) if beams.reading.size else 'it has no reading'
 
-    def _add(self, sensor: int, beams: Beams) -> None:
-        if self._odometry is not None:
-            self._pending[sensor] = self._odometry, beams
+    def _add(self, sensor: int, beams: Beams, stamp_ns: int | None) -> str:
+        if self._odometry is None:
+            return ''  # not rejected: the first ones come before any odometry
+        lead = 0.0 if stamp_ns is None else (stamp_ns - self._stamp_ns) / NANOSECONDS
+        if abs(lead) > DISORDER:  # taken elsewhere than where the last odometry was
+            return f'it is stamped {abs(lead):.1f} s {"after" if lead > 0.0 else "before"} odom'
+        self._pending[sensor] = self._odometry, beams
+        self.silence = 0.0
+        return ''
 
     def add_odometry(self, stamp_ns: int, pose: Pose) -> bool:
         """Add a pose of the odometry; return whether there is a new :attr:`result`.
@@ -320,10 +338,12 @@ class Localizer:
                 stamp_ns=stamp_ns, pose=pose_in(frame, pose), odometry_frame=frame
             )
             return True
+        since = 0.0 if last is None else min((stamp_ns - last_ns) / NANOSECONDS, DISORDER)
+        self.silence += since
         if self._updated is None:
             return self._publish(pose)
         parameters = self.parameters
-        self._turn(pose, min((stamp_ns - last_ns) / NANOSECONDS, DISORDER))
+        self._turn(pose, since)
         turned = pose._replace(yaw=pose.yaw + self._turned)
         if not has_moved(self._updated, turned, parameters.update_min_d, parameters.update_min_a):
             return False
@@ -410,7 +430,7 @@ class Localizer:
         self._updated, self._updated_ns = odometry, self._stamp_ns
         self.share = estimate.share
         covariance = estimate.covariance + np.diag(np.square(SYSTEMATIC))
-        if estimate.share < KNOWN_SHARE:
+        if estimate.share < KNOWN_SHARE or self.silent:
             covariance = self.filter.spread(estimate.pose)
         frame = frame_between(estimate.pose, odometry)
         self.result = LocalizedPose(self._stamp_ns, estimate.pose, covariance, frame)

@@ -44,7 +44,7 @@ from t3mpc_ros.localization.occupancy_map import (
     map_of_grid,
     map_of_world,
 )
-from t3mpc_ros.localization.range_model import NAMES, Beams
+from t3mpc_ros.localization.range_model import NAMES, Beams, beams_of_scan
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import NO_CLOCK, OK, WARN, BaseNode, MatchingSubscription
 from t3mpc_ros.nodes.conversions import FrameParameters
@@ -145,6 +145,8 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         self._localizer: Localizer | None = None
         self._map_problem = 'no map yet: set world or yaml_filename, or publish map'
         self._rejected = 0
+        self._rejection = ''
+        """Why the last reading was rejected; '' of one that was used."""
         self._updates = 0
         self._shown_changes: tuple[Change, ...] = ()
         self._odometry_ns = 0
@@ -250,30 +252,39 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         for sensor, subscription in enumerate(self._ranges):
             for message in subscription.take_waiting():
                 if localizer is not None:
-                    localizer.add_range(sensor, message.range, _stamp_ns(message))
+                    self._count(localizer.add_range(sensor, message.range, _stamp_ns(message)))
         if self._scan is not None:
             for message in self._scan.take_waiting()[-1:]:
                 if localizer is not None:
-                    localizer.add_scan(self._beams(message), _stamp_ns(message))
+                    self._add_scan(localizer, message)
+
+    def _add_scan(self, localizer: Localizer, message: LaserScan) -> None:
+        try:
+            beams = self._beams(message)
+        except ValueError as error:
+            self._count(str(error))
+            self.get_logger().warning(f'scan is rejected: {error}', throttle_duration_sec=1.0)
+            return
+        self._count(localizer.add_scan(beams, _stamp_ns(message)))
+
+    def _count(self, problem: str) -> None:
+        self._rejected += 1 if problem else 0
+        self._rejection = problem
 
     def _beams(self, message: LaserScan) -> Beams:
-        """Return evenly spaced beams of a scan in the frame of the robot; NaN is left out."""
+        """Return beams of a scan in the frame of the robot, or raise ValueError."""
         parameters = self.parameters
-        reading = np.array(message.ranges, dtype=np.float64)
-        chosen = np.unique(
-            np.linspace(0, max(reading.size - 1, 0), parameters.max_beams).astype(np.int64)
-        )
-        chosen = chosen[~np.isnan(reading[chosen])] if reading.size else chosen[:0]
         least, most = parameters.laser_min_range, parameters.laser_max_range
-        least = message.range_min if least < 0.0 else least
-        most = message.range_max if most < 0.0 else most
-        rays = np.zeros((chosen.size, 3))
-        rays[:, 2] = message.angle_min + message.angle_increment * chosen
-        return Beams(
-            transformed(Pose(*parameters.laser_pose), rays),
-            reading[chosen],
-            np.tile([least, most], (chosen.size, 1)),
+        limits = (
+            message.range_min if least < 0.0 else least,
+            message.range_max if most < 0.0 else most,
         )
+        reading = np.array(message.ranges, dtype=np.float64)
+        beams = beams_of_scan(
+            reading, message.angle_min, message.angle_increment, limits, parameters.max_beams
+        )
+        mount = Pose(*parameters.laser_pose)
+        return beams._replace(origin=transformed(mount, beams.origin))
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped, info: dict[str, Any]) -> None:
         pose, problem = message.pose.pose, ''
@@ -380,20 +391,28 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
             'particles': len(localizer.filter.poses),
             'share': localizer.share,
             'agreement': localizer.agreement,
+            'silence_s': localizer.silence,
         }
         if changes := localizer.changes.changes:
             values |= {'map_changes': len(changes), 'newest_map_change': changes[-1].text}
         if localizer.result is not None:
             x, y, yaw = np.sqrt(np.diag(localizer.result.covariance)).tolist()
             values |= {'x_std_m': x, 'y_std_m': y, 'yaw_std_rad': yaw}
-        state = localizer.state
-        if state is not Localization.LOCALIZED:
-            return WARN, state.value, values
-        if doubtful := ', '.join(map(str, localizer.doubtful)):
+        state, texts = localizer.state, [localizer.state.value]
+        known = state is Localization.LOCALIZED
+        if localizer.silent:
+            topic = self.parameters.scan_topic or 'range/*'
+            reason = f' ({self._rejection})' if self._rejection else ''
+            texts.append(
+                f'no reading of {topic} is used{reason}: the pose is by odometry alone; check '
+                'that the sensors publish there, with stamps of the clock of odom'
+            )
+        elif known and (doubtful := ', '.join(map(str, localizer.doubtful))):
             values['doubtful_sensors'] = doubtful
-            text = f'range sensor {doubtful} contradicts the map and is not used: look at it'
-            return WARN, f'{state.value}; {text}', values
-        return OK, state.value, values
+            texts.append(
+                f'range sensor {doubtful} contradicts the map and is not used: look at it'
+            )
+        return OK if known and len(texts) == 1 else WARN, '; '.join(texts), values
 
 
 def _stamp_ns(message: Range | LaserScan) -> int | None:

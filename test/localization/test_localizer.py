@@ -28,6 +28,7 @@ from t3mpc_ros.geometry.kinematics import advance_pose
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State, wrap_angle
 from t3mpc_ros.localization.change_detection import ChangeKind
 from t3mpc_ros.localization.localizer import (
+    LONGEST_SILENCE,
     Localization,
     Localizer,
     LocalizerParameters,
@@ -280,11 +281,12 @@ def test_readings_of_another_time_are_not_used(late):
     """Half a second late, they were taken where the robot no longer is."""
     localizer = make_localizer()
     localizer.add_odometry(10**9, Pose(0.0, 0.0, 0.0))
-    localizer.add_range(0, 0.3, 10**9 + late)
+    reason = localizer.add_range(0, 0.3, 10**9 + late)
+    assert reason == f'it is stamped 0.5 s {"before" if late < 0 else "after"} odom'
     assert localizer._pending == {}
     for stamp_ns in (None, 10**9, 10**9 - 100_000_000):
         localizer._pending.clear()
-        localizer.add_range(0, 0.3, stamp_ns)
+        assert not localizer.add_range(0, 0.3, stamp_ns)
         assert set(localizer._pending) == {0}
 
 
@@ -306,6 +308,40 @@ def test_silent_sensors_leave_odometry_and_growing_covariance():
     before = np.trace(localizer.result.covariance[:2, :2])
     follow(localizer, drive, 20.0, loss=1.0)
     assert np.trace(localizer.result.covariance[:2, :2]) > 2.0 * before
+
+
+def test_odometry_alone_leaves_the_spread_of_all_particles():
+    """That of the particles within 0.3 m of each other is smaller, and does not grow."""
+    localizer = make_localizer()
+    localizer.set_pose(ORIGIN, np.diag([0.18**2, 0.18**2, 1e-4]))
+    for k in range(4):
+        localizer.silence = LONGEST_SILENCE
+        localizer.add_odometry(10**8 * k, Pose(0.05 * k, 0.0, 0.0))
+    assert localizer.share < 0.9
+    assert np.diag(localizer.result.covariance)[:2] == pytest.approx(0.18**2, rel=0.2)
+
+
+@pytest.mark.parametrize('reading', [0.4, math.inf, -math.inf])
+def test_a_pose_by_odometry_alone_is_noticed_and_ends(reading):
+    localizer, stamp_ns = make_localizer(), 0
+
+    def stand(seconds, period, late_ns=0):
+        nonlocal stamp_ns
+        for k in range(round(seconds / PERIOD)):
+            if k % round(period / PERIOD) == 0:
+                localizer.add_range(0, reading, stamp_ns - late_ns)
+            stamp_ns += round(PERIOD * 1e9)
+            localizer.add_odometry(stamp_ns, ORIGIN)
+            yield localizer.silent
+
+    assert not any(stand(5.0, PERIOD))
+    assert not any(stand(5.0, 1.0)), 'a slow scanner'
+    assert [*stand(2.0 * LONGEST_SILENCE, PERIOD, late_ns=300_000_000)][-1]
+    assert not any(stand(1.0, PERIOD))
+    assert not any(stand(1.0, 0.5, late_ns=300_000_000))
+    stamp_ns += 10_000_000_000
+    localizer.add_odometry(stamp_ns, ORIGIN)
+    assert not localizer.silent, 'there was no odometry meanwhile'
 
 
 @pytest.mark.compiled
@@ -438,6 +474,13 @@ def test_a_scan_is_used_like_the_ranges():
     away, turned = rms(np.array(errors)[20:])
     assert away < 0.015
     assert turned < math.radians(1.0)
+
+
+def test_a_scan_without_any_reading_is_none():
+    localizer = make_localizer()
+    localizer.add_odometry(0, ORIGIN)
+    nothing = Beams(np.empty((0, 3)), np.empty(0), np.empty((0, 2)))
+    assert localizer.add_scan(nothing) == 'it has no reading'
 
 
 def test_a_robot_without_range_sensors_has_no_doubtful_one():

@@ -21,13 +21,16 @@ from nav_msgs.msg import OccupancyGrid, Odometry
 import numpy as np
 import pytest
 from sensor_msgs.msg import LaserScan, Range
+from std_msgs.msg import Header
 from std_srvs.srv import Empty
-from support.ros_graph import LATCHED, diagnostic, odometry, reason
+from support.ros_graph import LATCHED, diagnostic, diagnostic_level, odometry, reason
 from visualization_msgs.msg import MarkerArray
 
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
 from t3mpc_ros.localization.localizer import Localization
 from t3mpc_ros.localization.occupancy_map import MapError
+from t3mpc_ros.nodes import conversions
+from t3mpc_ros.nodes.base_node import WARN
 from t3mpc_ros.nodes.localizer import LocalizerNode
 from t3mpc_ros.parameters.table import ParameterError
 
@@ -56,22 +59,27 @@ class Robot:
         for name in RANGE_SENSORS:
             self.publishers[name] = harness.connected_publisher(Range, f'range/{name}')
 
-    def step(self, node, travel=0.03, wall=2.0, period=0.1, side=math.inf):
+    def step(self, node, travel=0.03, wall=2.0, period=0.1, side=math.inf, **readings):
         """Publish ranges, then the odometry after some more travel; wait until it is used.
 
         wall : x of what the sensors see ahead, m; period : since the last step, s; side : reading
-        of the sensors on the right, m
+        of the sensors on the right, m; readings : other fields of their messages
         """
         distance = wall - (1.0 + AHEAD + self.travel) - (0.0 if self.scan else 0.1)
         if self.scan:
-            message = LaserScan(angle_min=-0.2, angle_increment=0.2, range_min=0.05, range_max=3.0)
+            message = LaserScan(angle_min=-0.2, angle_increment=0.2, range_min=0.05)
+            message.range_max = 3.0
             message.ranges = [distance / math.cos(0.2), distance, distance / math.cos(0.2)]
+            for name, value in readings.items():
+                setattr(message, name, value)
             self.publishers['scan'].publish(message)
         else:
             for name in RANGE_SENSORS:
                 ahead = name.startswith('front') and distance < 0.8
                 other = side if name.startswith('right') else math.inf
-                self.publishers[name].publish(Range(range=distance if ahead else other))
+                self.publishers[name].publish(
+                    Range(range=distance if ahead else other, **readings)
+                )
         self.travel += travel
         self.stamp_ns += round(period * NANOSECONDS)
         message = odometry(self.stamp_ns)
@@ -106,7 +114,45 @@ def test_the_pose_is_that_of_the_readings(harness, scan):
     assert reason(node) == Localization.LOCALIZED.value
 
 
-def test_a_pose_is_given_and_one_in_another_frame_is_ignored(harness):
+@pytest.mark.parametrize('scan', ['', 'scan'])
+def test_readings_that_are_not_used_are_named(harness, scan):
+    node = harness.add(LocalizerNode, world='room', scan_topic=scan, **START)
+    robot = Robot(harness, scan)
+    robot.step(node)
+    for _ in range(30):
+        stamp = conversions.time_from_ns(robot.stamp_ns + NANOSECONDS)
+        robot.step(node, travel=0.0, header=Header(stamp=stamp))
+    assert diagnostic_level(node) == WARN
+    assert f'no reading of {scan or "range/*"} is used (it is stamped ' in reason(node)
+    assert 's after odom): the pose is by odometry alone' in reason(node)
+    assert diagnostic(node, 'rejected_inputs') > 10
+    for _ in range(3):
+        robot.step(node, travel=0.0)
+    assert reason(node) == Localization.LOCALIZED.value
+
+
+def test_an_impossible_scan_is_rejected_with_its_field(harness, logged):
+    node = harness.add(LocalizerNode, world='room', scan_topic='scan', **START)
+    robot = Robot(harness, 'scan')
+    for _ in range(5):
+        robot.step(node, range_max=math.nan)
+    assert diagnostic(node, 'rejected_inputs') > 0
+    text = 'range_max or laser_max_range must be finite and above 0.05 m: got nan'
+    assert logged(f'scan is rejected: {text}')
+    for _ in range(20):
+        robot.step(node)
+    assert reason(node) == Localization.LOCALIZED.value
+
+
+def given_pose(frame='map', x=-0.5, variance=1e-4, w=1.0):
+    message = PoseWithCovarianceStamped()
+    message.header.frame_id = frame
+    message.pose.pose.position.x, message.pose.pose.orientation.w = x, w
+    message.pose.covariance[0] = variance
+    return message
+
+
+def test_a_pose_is_given_and_an_impossible_one_is_ignored(harness, logged):
     node = harness.add(LocalizerNode, world='room', **START)
     given = harness.connected_publisher(PoseWithCovarianceStamped, 'initialpose')
     robot = Robot(harness)
