@@ -168,6 +168,10 @@ class Localization(enum.Enum):
     SEARCHING = 'searching: the readings fit to several places, or not for long enough'
     LOCALIZED = 'the place is known'
     LOST = 'lost: the readings do not fit to the map'
+    OFF_MAP = (
+        'lost: the pose is off the map; give another one by initialpose, or call '
+        'reinitialize_global_localization'
+    )
 
 
 class LocalizedPose(NamedTuple):
@@ -199,9 +203,8 @@ class Localizer:
         self._mounts, self._limits = mounts, limits
         self._model = RangeModel.of(parameters.ranges, parameters.robot_radius)
         self._field = known.field
-        self.filter = ParticleFilter(
-            parameters, known.field, known.free_places(parameters.robot_radius), self._model
-        )
+        self._places = known.free_places(parameters.robot_radius)
+        self.filter = ParticleFilter(parameters, known.field, self._places, self._model)
         """The particles."""
         self.changes = ChangeDetector(parameters.changes, known.field, self._model)
         """What contradicts the map."""
@@ -242,6 +245,30 @@ class Localizer:
             variances = initial.covariance_x, initial.covariance_y, initial.covariance_yaw
             self.set_pose(Pose(initial.x, initial.y, initial.yaw), np.diag(variances))
 
+    def pose_problem(self, pose: Pose, covariance: Array) -> str:
+        """Return why the robot cannot be at a pose as for :meth:`set_pose`, '' if it can."""
+        if not (all(map(math.isfinite, pose)) and np.isfinite(covariance).all()):
+            return 'it is not finite'
+        variances = np.diag(covariance)
+        if (variances > LARGEST_VARIANCES).any():
+            most, got = LARGEST_VARIANCES, variances
+            return (
+                f'its variances must be at most {most[0]:g} m² and {most[2]:g} rad²: got '
+                f'{got[0]:g}, {got[1]:g} and {got[2]:g}; reinitialize_global_localization searches'
+            )
+        if np.linalg.eigvalsh(covariance).min() < -1e-9:
+            return 'its covariance is not positive semi-definite'
+        deviation = math.sqrt(max(np.linalg.eigvalsh(covariance[:2, :2]).max(), 0.0))
+        x, y = self._places.T
+        away = float(np.hypot(x - pose.x, y - pose.y).min())
+        if away <= max(3.0 * deviation, self.parameters.robot_radius, self._field.step):
+            return ''
+        return (
+            f'it is {away:.3g} m from the free floor of the map, more than 3 standard deviations; '
+            f'that is within x {x.min():.2f} to {x.max():.2f} m, y {y.min():.2f} to '
+            f'{y.max():.2f} m: got x {pose.x:g} m, y {pose.y:g} m, deviation {deviation:g} m'
+        )
+
     def set_pose(self, pose: Pose, covariance: Array) -> None:
         """Begin at a pose with a covariance of x, y (m), yaw (rad), shape (3, 3)."""
         self.filter.place(pose, covariance)
@@ -271,8 +298,10 @@ class Localizer:
         if self._searching:
             return Localization.SEARCHING
         largest = float(np.diag(self.result.covariance).max())
-        known = math.sqrt(largest) <= self.parameters.localized_deviation
-        return Localization.LOCALIZED if known else Localization.SEARCHING
+        if math.sqrt(largest) > self.parameters.localized_deviation:
+            return Localization.SEARCHING
+        on_map = self._field.contains(self.result.pose.x, self.result.pose.y)
+        return Localization.LOCALIZED if on_map else Localization.OFF_MAP
 
     @property
     def doubtful(self) -> tuple[int, ...]:

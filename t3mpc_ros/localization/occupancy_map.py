@@ -55,6 +55,12 @@ class DistanceField(NamedTuple):
     step: float
     """Distance of neighbouring nodes, m."""
 
+    def contains(self, x: float, y: float) -> bool:
+        """Return whether a point (m) is on the grid."""
+        rows, columns = self.distance.shape
+        width, height = self.step * (columns - 1), self.step * (rows - 1)
+        return bool(self.x <= x < self.x + width and self.y <= y < self.y + height)
+
 
 class LocalizationMap:
     """What the localisation knows of the surroundings.

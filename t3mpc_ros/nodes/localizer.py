@@ -59,6 +59,10 @@ CLOUD_PERIOD = 0.5
 """Time between two clouds of particles, s."""
 CHANGES_PERIOD = 0.5
 """Least time between two messages of the changes, s."""
+KEPT = Localization.LOCALIZED, Localization.OFF_MAP
+"""States whose pose is kept on another map: one that grows has the place that was off it."""
+LEAST_NORM = 0.5
+"""Norm of a quaternion below which it is no rotation: a message with zeros has no yaw."""
 MARKER_HEIGHT = 0.3
 """m"""
 COLOURS = {
@@ -212,6 +216,8 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         """Begin on another map: from the last pose, where it was known."""
         before = self._localizer
         try:
+            if problem := self._frame_problem(message.header.frame_id):
+                raise MapError(problem)
             grid = conversions.grid_from_occupancy(message)
             self._use_map(map_of_grid(grid.cells, grid.resolution, (grid.x, grid.y, 0.0)))
         except ValueError as error:  # a MapError among them
@@ -220,7 +226,7 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
             self.get_logger().warning(f'map is rejected: {error}')
             return
         assert self._localizer is not None
-        if before is not None and before.state is Localization.LOCALIZED:
+        if before is not None and before.state in KEPT:
             assert before.result is not None
             self._localizer.set_pose(before.result.pose, before.result.covariance)
 
@@ -287,27 +293,26 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         return beams._replace(origin=transformed(mount, beams.origin))
 
     def _on_initial_pose(self, message: PoseWithCovarianceStamped, info: dict[str, Any]) -> None:
-        pose, problem = message.pose.pose, ''
-        yaw = conversions.yaw_from_quaternion(
-            pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w
-        )
-        place = Pose(pose.position.x, pose.position.y, yaw)
+        pose, turn = message.pose.pose.position, message.pose.pose.orientation
+        rotation = turn.x, turn.y, turn.z, turn.w
+        place = Pose(pose.x, pose.y, conversions.yaw_from_quaternion(*rotation))
         rows = np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6)
         covariance = rows[np.ix_((0, 1, 5), (0, 1, 5))]
-        frame = message.header.frame_id
-        if self._localizer is None:
-            problem = self._map_problem
-        elif frame not in ('', self._map_frame):
-            problem = f'its frame must be {self._map_frame}: got {frame}'
-        elif not (all(map(math.isfinite, place)) and np.isfinite(covariance).all()):
-            problem = 'it is not finite'
-        elif np.linalg.eigvalsh(0.5 * (covariance + covariance.T)).min() < -1e-9:
-            problem = 'its covariance is not positive semi-definite'
+        covariance = 0.5 * (covariance + covariance.T)
+        problem = self._map_problem or self._frame_problem(message.header.frame_id)
+        if not problem and math.hypot(*rotation) < LEAST_NORM:
+            problem = f'the norm of its quaternion must be 1: got {math.hypot(*rotation):g}'
+        if not problem and self._localizer is not None:
+            problem = self._localizer.pose_problem(place, covariance)
         if self._localizer is None or problem:
             self._rejected += 1
             self.get_logger().warning(f'initialpose is ignored: {problem}')
             return
-        self._localizer.set_pose(place, 0.5 * (covariance + covariance.T))
+        self._localizer.set_pose(place, covariance)
+
+    def _frame_problem(self, frame: str) -> str:
+        own = self._map_frame
+        return '' if frame.lstrip('/') in ('', own) else f'its frame must be {own}: got {frame}'
 
     def _reinitialize_global_localization(
         self, request: Empty.Request, response: Empty.Response

@@ -224,6 +224,48 @@ def test_a_pose_that_is_given_is_taken():
     assert localizer.state is Localization.LOCALIZED
 
 
+@pytest.mark.parametrize(
+    ('x', 'deviation', 'reason'),
+    [
+        (1.19, 0.0, ''),  # closer to the wall than the map says that it can be
+        (1.5, 0.11, ''),
+        (1.5, 0.09, 'm from the free floor of the map, more than 3 standard deviations'),
+        (100.0, 0.1, 'x -1.19 to 1.19 m, y -0.89 to 0.89 m: got x 100 m, y 0.6 m'),
+        (1e300, 0.1, 'got x 1e'),
+        (math.nan, 0.1, 'not finite'),
+        (0.9, math.inf, 'not finite'),
+        (0.9, 6.0, 'variances must be at most 25 m² and 10 rad²: got 36, 36 and 36'),
+    ],
+)
+def test_a_pose_where_the_robot_cannot_be_is_named(x, deviation, reason):
+    problem = make_localizer().pose_problem(Pose(x, 0.6, 0.0), np.diag([deviation**2] * 3))
+    assert re.search(reason, problem)
+    assert bool(problem) == bool(reason)
+
+
+def test_a_place_off_the_map_is_not_known():
+    localizer = make_localizer()
+    localizer.set_pose(Pose(100.0, 100.0, 0.0), np.eye(3) * 1e-4)
+    localizer.add_odometry(0, ORIGIN)
+    assert localizer.state is Localization.OFF_MAP
+    localizer.set_pose(on_ellipse(0.0), np.eye(3) * 1e-4)
+    localizer.add_odometry(1, ORIGIN)
+    assert localizer.state is Localization.LOCALIZED
+
+
+@pytest.mark.compiled
+def test_readings_without_a_likelihood_do_not_lose_it_for_ever():
+    localizer, drive = driven(5.0)
+    broken = Beams(np.zeros((1, 3)), np.array([0.5]), np.full((1, 2), math.nan))
+    localizer.add_scan(broken)
+    while not localizer.add_odometry(drive.stamp_ns, drive.odometry):
+        drive.step()
+    assert localizer.state is not Localization.LOCALIZED
+    follow(localizer, drive, 25.0)
+    assert localizer.state is Localization.LOCALIZED
+    assert error(localizer, drive)[0] < 0.05
+
+
 @pytest.mark.compiled
 @pytest.mark.parametrize('jump', ['far', 'in yaw', 'near', 'stamp'])
 def test_odometry_that_jumps_moves_neither_particle_nor_pose(jump):

@@ -157,25 +157,22 @@ def test_a_pose_is_given_and_an_impossible_one_is_ignored(harness, logged):
     given = harness.connected_publisher(PoseWithCovarianceStamped, 'initialpose')
     robot = Robot(harness)
     robot.step(node)
-    message = PoseWithCovarianceStamped()
-    message.pose.pose.orientation.w = 1.0
-    message.pose.pose.position.x = -0.5
-    message.header.frame_id = 'odom'
-    given.publish(message)
-    harness.spin_until(lambda: diagnostic(node, 'rejected_inputs') == 1)
-    message.pose.pose.position.x = math.nan
-    message.header.frame_id = 'map'
-    given.publish(message)
-    harness.spin_until(lambda: diagnostic(node, 'rejected_inputs') == 2)
-    message.pose.pose.position.x = -0.5
-    message.pose.covariance[0] = -1.0
-    given.publish(message)
-    harness.spin_until(lambda: diagnostic(node, 'rejected_inputs') == 3)
+    rejected = {
+        'its frame must be map: got odom': {'frame': 'odom'},
+        'it is not finite': {'x': math.nan},
+        'its covariance is not positive semi-definite': {'variance': -1.0},
+        'it is 98.1 m from the free floor of the map': {'x': 100.0},
+        'the norm of its quaternion must be 1: got 0': {'w': 0.0},
+    }
+    for change in rejected.values():
+        given.publish(given_pose(**change))
+    harness.spin_until(lambda: diagnostic(node, 'rejected_inputs') == len(rejected))
+    for reason_of_it in rejected:
+        assert logged(f'initialpose is ignored: {reason_of_it}')
     assert node._localizer.result.pose.x == pytest.approx(1.0, abs=0.05)
-    message.pose.covariance[0] = 1e-4
-    given.publish(message)
+    given.publish(given_pose())
     harness.spin_until(lambda: abs(np.mean(node._localizer.filter.poses[:, 0]) + 0.5) < 0.01)
-    assert diagnostic(node, 'rejected_inputs') == 3
+    assert diagnostic(node, 'rejected_inputs') == len(rejected)
 
 
 def test_a_thing_that_the_map_lacks_is_published(harness):
@@ -239,7 +236,7 @@ def grid_message(width=60, height=40):
 
 
 def test_a_map_of_a_topic_is_used_and_a_broken_one_is_not(harness):
-    node = harness.add(LocalizerNode, **START)
+    node = harness.add(LocalizerNode, **{**START, 'initial_pose__y': 1.0})
     assert 'no map yet' in reason(node)
     robot = Robot(harness)
     maps = harness.connected_publisher(OccupancyGrid, 'map', LATCHED)
@@ -247,6 +244,10 @@ def test_a_map_of_a_topic_is_used_and_a_broken_one_is_not(harness):
     del broken.data[5:]
     maps.publish(broken)
     harness.spin_until(lambda: 'width x height' in reason(node))
+    foreign = grid_message()
+    foreign.header.frame_id = 'odom'
+    maps.publish(foreign)
+    harness.spin_until(lambda: 'its frame must be map: got odom' in reason(node))
     maps.publish(grid_message())
     harness.spin_until(lambda: node._localizer is not None)
     robot.step(node)
