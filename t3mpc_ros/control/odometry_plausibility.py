@@ -20,9 +20,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.control.watchdog import JUMP
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, State, wrap_angle
+from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, State, has_jumped
 
 MAX_DELAY, MAX_LEAD = 0.3, 0.05
 """Offset of odometry stamps from the node's clock beyond which the clocks differ, s."""
@@ -279,7 +278,7 @@ class InputMonitor:
         elapsed = self.gaps.update(odometry.stamp_ns)
         self._add_offset((now_ns - odometry.stamp_ns) / NANOSECONDS)
         if elapsed is not None and self._last is not None:
-            self.jumps += _jumped(self._last, odometry, elapsed)
+            self.jumps += has_jumped(self._last, odometry)
         self._last = odometry
         self._follows = False
         if command is None or elapsed is None:
@@ -417,13 +416,3 @@ def _common(linear: Gain, angular: Gain) -> Gain | None:
 
 def _text(gain: Gain) -> str:
     return f'{gain.value:.3f} (standard deviation {gain.deviation:.2g}) times the command'
-
-
-def _jumped(last: State, new: State, elapsed: float) -> bool:
-    """Whether the pose has changed by more than the motion explains."""
-    speeds = [max(abs(last.twist[i]), abs(new.twist[i])) for i in (0, 1)]
-    moved = math.hypot(new.pose.x - last.pose.x, new.pose.y - last.pose.y)
-    turned = abs(wrap_angle(new.pose.yaw - last.pose.yaw))
-    return bool(
-        moved > JUMP[0] + 2.0 * elapsed * speeds[0] or turned > JUMP[1] + 2.0 * elapsed * speeds[1]
-    )

@@ -20,6 +20,7 @@ import math
 from typing import ClassVar
 
 from t3mpc_ros.geometry.types import (
+    JUMP,
     NANOSECONDS,
     ORIGIN,
     BodyTwist,
@@ -224,8 +225,6 @@ TWIST_TOLERANCE, TWIST_CERTAIN = 0.05, 4.0
 """Deviation of the factor between twist and pose that counts, and its standard deviations."""
 SIDEWAYS = 0.2
 """Share of the way by which a pose may go aside: the cosine of such an angle is tolerable."""
-JUMP = 0.1, 0.3
-"""Change of the pose beyond the motion that is a jump, m and rad."""
 
 
 def motion_between(last: Pose, new: Pose) -> tuple[float, float, float]:

@@ -111,6 +111,18 @@ def has_moved(start: Pose | None, pose: Pose, distance: float, angle: float) -> 
     )
 
 
+JUMP = 0.1, 0.3
+"""Change of a pose beyond the motion that is a jump, m and rad."""
+
+
+def has_jumped(last: State, new: State) -> bool:
+    """Return whether the pose has changed by more than twice the motion between two messages."""
+    elapsed = max(new.stamp_ns - last.stamp_ns, 0) / NANOSECONDS
+    linear, angular = (max(abs(last.twist[i]), abs(new.twist[i])) for i in (0, 1))
+    distance, angle = JUMP[0] + 2.0 * elapsed * linear, JUMP[1] + 2.0 * elapsed * angular
+    return has_moved(last.pose, new.pose, distance, angle)
+
+
 def wrap_angle(angle: float) -> float:
     """Return ``angle`` (rad) wrapped into (-pi, pi]."""
     wrapped = math.remainder(angle, math.tau)

@@ -16,6 +16,8 @@
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
+import math
 import secrets
 from typing import Any, ClassVar
 
@@ -51,6 +53,7 @@ from t3mpc_ros.geometry.types import (
     BodyTwist,
     Pose,
     State,
+    has_jumped,
 )
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import (
@@ -68,6 +71,15 @@ PATH_PERIOD = 0.1
 """Time between the poses of ``reference/path``, s."""
 SEED_BITS = 128
 """Length of a secret seed."""
+FRAMES_THAT_JUMP = 'map', 'earth'
+"""Frames in which a pose may jump, as when a localisation finds the robot elsewhere (REP 105)."""
+AFTER_JUMP = {
+    'portrait': 'another path begins where the robot is',
+    'twist': 'the reference goes on where the robot is',
+    'topic': 'its path has ended: send it again, in the new odom',
+    'file': 'its path has ended: start reference_generator again to drive it',
+}
+"""What the sources do when the odometry is set."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +140,11 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         # A patrol is to cover its room: a portrait that waited would leave out much of it.
         # A planned one waits: what stands in its way is on the map, and it goes around it.
         on_the_way = parameters.source != 'portrait' or parameters.plan.enabled
-        self._path_clock = PathClock(parameters.wait, on_the_way=on_the_way)
+        self._make_path_clock = partial(PathClock, parameters.wait, on_the_way=on_the_way)
+        self._path_clock = self._make_path_clock()
+        self._last: State | None = None
+        """Last message of odom."""
+        self._jumps, self._restated, self._ended = 0, True, ''
         self._rejected = 0
         self._mapped = not parameters.plan.enabled
         """Whether the path needs no map, or has one."""
@@ -153,6 +169,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         )
         self._path.header.frame_id = frame
         """Path driven so far, in the frame of the reference."""
+        self._may_jump = parameters.frame_id.rpartition('/')[2] in FRAMES_THAT_JUMP
         self._serialized = conversions.SerializedOdometry(frame, child)
         self._reference_publisher = self.create_publisher(Odometry, 'reference', qos.STREAM)
         self._path_publisher = self.create_publisher(Path, 'reference/path', qos.LATCHED)
@@ -220,9 +237,33 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             if self._source is None:
                 self._source = self._make_source(state.pose)
                 self._pose = state.pose
+            elif self._last and not self._may_jump and has_jumped(self._last, state):
+                self._begin_again(state.pose, math.dist(self._last.pose[:2], state.pose[:2]))
+            self._last = state
             self._path_clock.observe(state.stamp_ns, state.pose)
             if self._planned is not None:
                 self._planned.observe(state.pose)
+
+    def _begin_again(self, pose: Pose, distance: float) -> None:
+        """Begin at rest at a pose that the odometry was set to, some distance (m) away.
+
+        The robot has not moved: one that rests is to rest, and a path in the frame of before leads
+        elsewhere now.
+        """
+        source = self.parameters.source
+        text = f'odom has jumped by {distance:.2f} m: {AFTER_JUMP[source]}'
+        if isinstance(self._source, GivenPathSource) and self._source.under_way:
+            self._ended = text
+        self.get_logger().warning(text, throttle_duration_sec=5.0)
+        self._jumps += 1
+        self._points = None
+        if source == 'portrait':
+            self._next_seed()
+            self._mapped = not self.parameters.plan.enabled
+        self._source, self._pose = self._make_source(pose), pose
+        self._path_clock = self._make_path_clock()
+        self._path.poses.clear()
+        self._restated = False
 
     def _make_transform_buffer(self) -> Any:
         """Return the transforms known to tf2, None without tf2_ros."""
@@ -247,6 +288,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         except PathError as error:
             self._reject('path', error)
             return
+        self._ended = ''
         if not isinstance(self._source, GivenPathSource):
             self._points = points  # the robot has not reported where it is
         elif self.parameters.path_mode == 'append':
@@ -336,6 +378,9 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             if self._source is None:
                 return
         for stamp_ns in self._scheduler.due(self.now_ns()):
+            if not self._restated:  # in place of what was published ahead, which leads elsewhere
+                self._restated = True
+                self._publish(stamp_ns)
             self._publish(stamp_ns + self._lead_ns)
 
     def _publish(self, stamp_ns: int) -> None:
@@ -399,6 +444,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             return WARN, NO_CLOCK, values
         if self.parameters.source != 'signals':
             values['rejected_inputs'] = self._rejected
+            values['odometry_jumps'] = self._jumps
             values['path_rate'] = self._path_clock.rate
             if isinstance(self._source, GivenPathSource):
                 values['path_under_way'] = self._source.under_way
@@ -406,6 +452,8 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 return WARN, 'no odom yet: the path begins where the robot is', values
             if not self._mapped:
                 return WARN, 'no keep_out/map yet: the controller publishes it', values
+            if self._ended:
+                return WARN, self._ended, values
         if self._scheduler.newly_skipped():
             return WARN, 'processor overloaded: samples were skipped', values
         if self._planned is not None and self._planned.charging:

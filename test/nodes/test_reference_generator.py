@@ -19,8 +19,8 @@ import sys
 from types import SimpleNamespace
 
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Point, PoseArray, PoseStamped, TransformStamped, Twist
 from geometry_msgs.msg import Pose as Place
-from geometry_msgs.msg import PoseArray, PoseStamped, TransformStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
 import numpy as np
 import pytest
@@ -213,6 +213,62 @@ def test_a_path_replaces_the_one_before_and_an_empty_one_stops(harness):
     assert places[-1] < 1.3
     limit = drive.node.parameters.motion.linear_acceleration * 0.01
     assert _largest_change(drive.received) <= limit * (1 + 1e-9)
+
+
+class _SetOdometry(_PathDrive):
+    """A robot that does not move, at the end of a path of 1 m or on it, whose odom is set to 0."""
+
+    def __init__(self, harness, *, at_rest, **parameters):
+        super().__init__(harness, **parameters)
+        planner = harness.connected_publisher(Path, 'path')
+        self.until(bool)
+        planner.publish(_path([(0.5, -0.2), (1.5, -0.2)]))
+        self.until(lambda m: m.pose.pose.position.x > 1.0)
+        if at_rest:
+            self.until(lambda m: speed(m) == 0.0)
+        self.before = self.received[-1]
+        self.message = odometry(stamp(self.before))
+        count = len(self.received) + 60
+
+        def done():
+            self._places.publish(self.message)
+            return len(self.received) > count
+
+        harness.spin_until(done)
+        first = next(
+            k for k, each in enumerate(self.received) if each.pose.pose.position == Point()
+        )
+        self.after = self.received[first:]
+
+
+@pytest.mark.parametrize('at_rest', [True, False])
+def test_a_robot_whose_odom_is_set_rests(harness, logged, at_rest):
+    """It drove to where its path had been: a metre further with each reset at rest."""
+    drive = _SetOdometry(harness, at_rest=at_rest)
+    assert {(speed(each), each.pose.pose.position.x) for each in drive.after} == {(0.0, 0.0)}
+    # What was published ahead is replaced, too.
+    first, second = (stamp(each) for each in drive.after[:2])
+    assert first <= stamp(drive.before)
+    assert second - first == pytest.approx(4e8)
+    assert logged('odom has jumped by')
+    assert diagnostic(drive.node, 'odometry_jumps') == 1
+    assert ('its path has ended' in reason(drive.node)) == (not at_rest)
+    harness.connected_publisher(Path, 'path').publish(_path([(0.0, 0.0), (1.0, 0.0)]))
+    drive.until(lambda m: m.pose.pose.position.x > 0.5)
+    assert 'its path has ended' not in reason(drive.node)
+
+
+def test_a_pose_may_jump_in_a_map(harness):
+    """A localisation that finds the robot elsewhere leaves the path where it is."""
+    drive = _PathDrive(harness, frame_id='map')
+    planner = harness.connected_publisher(Path, 'path')
+    drive.until(bool)
+    planner.publish(_path([(0.5, -0.2), (1.5, -0.2)], 'map'))
+    drive.until(lambda m: m.pose.pose.position.x > 1.0)
+    drive._places.publish(odometry(stamp(drive.received[-1])))
+    drive.until(lambda m: speed(m) == 0.0)
+    assert drive.received[-1].pose.pose.position.x == pytest.approx(1.5, abs=1e-6)
+    assert diagnostic(drive.node, 'odometry_jumps') == 0
 
 
 def test_a_path_in_another_frame_needs_a_transform(harness, logged, monkeypatch):
