@@ -371,7 +371,9 @@ class Controller:
         self._step_ns = 0
         """Instant of the last step, with odometry or without."""
         self._reach = ReachMonitor()
-        self.drive_monitor = DriveMonitor(feels=self.keep_out is not None)
+        self.drive_monitor = DriveMonitor(
+            feels=self.keep_out is not None, follows_pose=self.parameters.pose.enabled
+        )
         """Pauses of the commands."""
         self.odometry_twist = OdometryTwist()
         """Whether the odometry has a twist."""
@@ -480,6 +482,7 @@ class Controller:
         self._begin()
         if self.keep_out is not None:
             self.keep_out.reset()
+            self.keep_out.ranges.reset()
 
     def add_range(self, sensor: int, reading: float, stamp_ns: int | None = None) -> bool:
         """Add a range reading (m, REP 117) of a sensor, taken at the pose of the last odometry.
@@ -538,6 +541,7 @@ class Controller:
             self._clear_reference()
             if self.keep_out is not None:
                 self.keep_out.reset()
+                self.keep_out.ranges.reset()
         elif self.keep_out is not None and last is not None and self._is_elsewhere(odometry):
             self.keep_out.reset()  # what it has marked was marked at another place
             self.drive_monitor.contact_monitor.restart(None)

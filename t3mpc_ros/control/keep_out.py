@@ -568,9 +568,8 @@ class KeepOut:
         self.reset()
 
     def reset(self) -> None:
-        """Begin at a new place: the robot looks around first."""
+        """Begin at a new place: the robot looks around first. The sensors are what they were."""
         self.map.clear()
-        self.ranges.reset()
         self.activity = Activity.FREE
         """What it does."""
         self.changed = False

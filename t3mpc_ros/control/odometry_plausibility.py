@@ -33,7 +33,9 @@ RATE_TOLERANCE = 0.2
 GAP = 1.7
 """Interval from which a message is missing, in periods: with a jitter of 30 % none reaches it."""
 RECENT = 10.0
-"""Time for which gaps are reported, s."""
+"""Time for which gaps and jumps are reported, s."""
+MANY_JUMPS = 3
+"""Jumps of the pose in that time from which they are: a localisation makes one now and then."""
 MANY_MISSING = 0.02
 """Share of missing messages that is reported."""
 LATE = 0.1
@@ -256,6 +258,10 @@ class InputMonitor:
         """Messages that took much longer than the others."""
         self.jumps = 0
         """Changes of the pose that no motion explains."""
+        self._jumps_ns: deque[int] = deque(maxlen=1000)
+        """Stamps of those in the last 10 s."""
+        self._jump = 0.0
+        """Distance of the last one, m."""
         self._last: State | None = None
         self._standing = 0.0
         self._follows = False
@@ -278,7 +284,7 @@ class InputMonitor:
         elapsed = self.gaps.update(odometry.stamp_ns)
         self._add_offset((now_ns - odometry.stamp_ns) / NANOSECONDS)
         if elapsed is not None and self._last is not None:
-            self.jumps += has_jumped(self._last, odometry)
+            self._add_jump(self._last, odometry)
         self._last = odometry
         self._follows = False
         if command is None or elapsed is None:
@@ -294,6 +300,14 @@ class InputMonitor:
             return
         for response, given, found in zip(self._responses, command, odometry.twist, strict=True):
             response.update(elapsed, given, found)
+
+    def _add_jump(self, last: State, new: State) -> None:
+        if has_jumped(last, new):
+            self.jumps += 1
+            self._jumps_ns.append(new.stamp_ns)
+            self._jump = math.hypot(new.pose.x - last.pose.x, new.pose.y - last.pose.y)
+        while self._jumps_ns and new.stamp_ns - self._jumps_ns[0] > RECENT * NANOSECONDS:
+            self._jumps_ns.popleft()
 
     def _interrupt(self) -> None:
         for response in self._responses:
@@ -348,6 +362,12 @@ class InputMonitor:
             found.append(f'odom has {rate:.3g} Hz, but rate is {self._rate:g} Hz')
         if gaps := self.gaps.warning(tolerated_gap):
             found.append(gaps)
+        if len(self._jumps_ns) >= MANY_JUMPS:
+            found.append(
+                f'the pose in odom has jumped {len(self._jumps_ns)} times in the last {RECENT:g} '
+                f's, the last time by {self._jump:.3g} m: look for a second publisher, other '
+                'units than metres, a localisation that alternates between two places'
+            )
         opposite = [self._is_opposite(axis) for axis in (0, 1)]
         for axis, name in enumerate(NAMES):
             if opposite[axis]:

@@ -455,6 +455,9 @@ ON_THE_SPOT, DRIVING = 0.015, 0.05
 TIGHT = 0.1
 """Radius of a curve (m) below which the robot turns rather than drives: the correction of a pose
 may be a fifth of the way of a point beside it, and most of that of its centre."""
+FROZEN_MOTION = 0.08, 0.6
+"""Motion by the twist (m, rad) during which a pose that is equal to the last bit is frozen; a
+camera of 5 Hz repeats the pose of a robot for less."""
 RECOVERY_TIME = 5.0
 """Time of driving as commanded after which earlier pauses do not count, s."""
 
@@ -550,9 +553,12 @@ class DriveMonitor:
     released, its board may start. One that moves and then stops again gets three pauses.
     """
 
-    def __init__(self, *, feels: bool = False) -> None:
-        """``feels``: also pause them where the change of the pose says that the robot is held."""
-        self._feels = feels
+    def __init__(self, *, feels: bool = False, follows_pose: bool = False) -> None:
+        """``feels``: also pause them where the change of the pose says that the robot is held.
+
+        ``follows_pose``: also where the pose is frozen, by which the robot is led.
+        """
+        self._feels, self._follows_pose = feels, follows_pose
         self.contact_monitor = ContactMonitor()
         """Where something holds the robot."""
         self.reset()
@@ -563,6 +569,8 @@ class DriveMonitor:
         """Pauses since the robot drove as commanded."""
         self.contact = False
         """Whether this pause began because something held the robot."""
+        self._frozen = False
+        """Whether it began because the pose was frozen."""
         self._trials = 0
         self._stopped = False
         """Whether a pause began because something held the robot, or it stopped by itself."""
@@ -577,7 +585,10 @@ class DriveMonitor:
         self._well = self._astray = 0.0
         self._power, self._product = [0.0, 0.0], [0.0, 0.0]
         self._time = 0.0
-        self.contact = False
+        self.contact = self._frozen = False
+        self._pose: Pose | None = None
+        self._unchanged = 0.0
+        """Share of FROZEN_MOTION since the pose last changed."""
         self.contact_monitor.restart(None)
         self._restart(None)
 
@@ -604,7 +615,11 @@ class DriveMonitor:
                 return Reason.PAUSED
             self.begin()
             return Reason.TRACKING
+        unchanged = self._unchanged_share(odometry, elapsed)
         held = self._feels and self.contact_monitor.is_in_contact(odometry, command, elapsed)
+        if self._follows_pose and unchanged > (0.5 if held else 1.0):
+            self._frozen = True
+            return self._begin_pause()
         # A robot that stops by itself, after a slip, drives on after a pause; what holds it will
         # hold it again.
         by_itself = self.contact_monitor.wheels_stood and not self._stopped
@@ -632,6 +647,11 @@ class DriveMonitor:
                 'something that the range sensors do not see holds the robot: free it, move what '
                 'is in its way or keep it out by keep_out.world, then call ~/enable'
             )
+        if self._frozen:
+            return (
+                'the pose in odom stays the same while its twist moves: look at the localisation '
+                f'or camera that gives it{", then call ~/enable" if self._ended else ""}'
+            )
         if self._ended:
             return 'free the wheels, look at the diagnostics of the robot, then call ~/enable'
         if self.contact:
@@ -643,6 +663,15 @@ class DriveMonitor:
                 'of odom'
             )
         return ''
+
+    def _unchanged_share(self, odometry: State, elapsed: float) -> float:
+        """Return the motion by the twist since the pose last changed; 1: the pose is frozen."""
+        if odometry.pose != self._pose:
+            self._pose, self._unchanged = odometry.pose, 0.0
+        else:
+            shares = (abs(v) / most for v, most in zip(odometry.twist, FROZEN_MOTION, strict=True))
+            self._unchanged += elapsed * max(shares)
+        return self._unchanged
 
     def _stands(self, odometry: State, command: BodyTwist, elapsed: float) -> bool:
         """Whether the robot has not moved for longer than its commands allow."""

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from support.long_tests import few_of
 
-from t3mpc_ros.control.odometry_plausibility import Gaps, InputMonitor
+from t3mpc_ros.control.odometry_plausibility import MANY_JUMPS, RECENT, Gaps, InputMonitor
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
 
@@ -240,6 +240,20 @@ def test_jumps_late_messages_and_restarts_are_counted():
     drive._last -= 3000
     drive.run(1.0)
     assert drive.monitor.gaps.restarts == 1
+
+
+def test_a_pose_that_jumps_again_and_again_is_named():
+    """A pose in mm, or of two localisations, was counted and never named."""
+    drive = Drive()
+    for jumps in range(1, 5):
+        drive.run(1.0)
+        drive.pose[0] += 0.5
+        assert ('has jumped' in ' '.join(drive.run(0.1))) == (jumps >= MANY_JUMPS)
+    assert (
+        f'has jumped 4 times in the last {RECENT:g} s, the last time by 0.499' in drive.run(0.1)[0]
+    )
+    assert drive.run(RECENT) == []
+    assert drive.monitor.jumps == 4
 
 
 def test_simulated_time_may_run_ahead_of_the_messages():

@@ -294,6 +294,18 @@ def test_all_silent_brakes_stops_and_goes_on_by_itself():
 
 
 @pytest.mark.compiled
+def test_a_pose_that_jumps_is_no_fault_of_the_sensors():
+    """A pose in mm stopped the robot because of "all range sensors silent"."""
+    robot = KeptOut()
+    begin = robot.run_until_fast()
+    for sign in (1.0, -1.0, 1.0):
+        robot.pose = robot.pose._replace(x=robot.pose.x + sign)
+        robot.run(0.3)
+    assert Reason.TOO_FEW_RANGES not in robot.reasons[begin:]
+    assert 'silent' not in ' '.join(robot.controller.problems())
+
+
+@pytest.mark.compiled
 @pytest.mark.parametrize('lost', few_of(range(8), step=3))
 def test_with_one_sensor_lost_the_robot_drives_slowly(lost):
     robot = KeptOut()

@@ -27,6 +27,7 @@ from support.properties import PROPERTY, STATEFUL
 from t3mpc_ros.control.watchdog import (
     ASTRAY_TIME,
     EVIDENCE_WEIGHT,
+    FROZEN_MOTION,
     PAUSE,
     RECOVERY_TIME,
     STANDING_TIME,
@@ -792,6 +793,35 @@ def test_wheels_that_turn_under_a_pose_that_stands_are_a_contact(speed):
     assert _feel(lambda t: ((0.0, 0.0, 0.3), command, command), 30.0, feels=False)[1] == (
         3000 * [Reason.TRACKING]
     )
+
+
+@pytest.mark.parametrize('twist', [(0.25, 0.0), (0.0, 3.0), (-0.1, 0.5)])
+@pytest.mark.parametrize('feels', [False, True])
+def test_a_frozen_pose_pauses_and_ends(twist, feels):
+    """Towards a pose that stayed where it was the robot turned on the spot, without end."""
+    monitor, reasons = DriveMonitor(feels=feels, follows_pose=True), []
+    command, moved = BodyTwist(*twist), [0.0, 0.0]
+    for k in range(1000):
+        measured = command if not reasons or reasons[-1].moves else STANDSTILL
+        moved = [sum_ + 0.01 * abs(each) for sum_, each in zip(moved, measured, strict=True)]
+        state = State(k * PERIOD, Pose(1.0, 0.0, 0.3), measured)
+        reasons.append(monitor.decide(state, measured, 0.01, following=True))
+        if not reasons[-1].moves:
+            assert 'the pose in odom stays the same' in monitor.problem()
+    assert reasons[-1] is Reason.STOPPED_AGAIN
+    assert 'call ~/enable' in monitor.problem()
+    assert monitor.contact is False
+    again = TRIALS + 1.2
+    assert moved[0] < again * FROZEN_MOTION[0] or moved[1] < again * FROZEN_MOTION[1]
+
+
+@pytest.mark.parametrize('rate', [5.0, 30.0])
+def test_a_pose_of_a_slow_camera_is_not_frozen(rate):
+    monitor, command = DriveMonitor(follows_pose=True), BodyTwist(0.35, 0.0)
+    for k in range(1000):
+        x = 0.35 * math.floor(0.01 * k * rate) / rate
+        state = State(k * PERIOD, Pose(x, 0.0, 0.0), command)
+        assert monitor.decide(state, command, 0.01, following=True) is Reason.TRACKING
 
 
 def test_a_robot_turned_or_pushed_aside_touches_something():
