@@ -16,7 +16,7 @@
 import enum
 import math
 
-from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, Array, Pose, wrap_angle
+from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, RANGE_SENSORS, Array, Pose, wrap_angle
 
 LOOKS_ALONG = 0.7
 """Cosine of the direction of a sensor from which on it looks along the motion of the robot."""
@@ -30,7 +30,12 @@ noise of 10 mV changes a reading beyond 0.25 m even of a robot that stands, but 
 a robot that drives along a wall: that moves no face along its beam."""
 MISSES, MISSES_APART = 4, 0.3
 """Number of surfaces, so far (m) from the one before, that a sensor has not seen and the map has,
-without having seen anything in between: it sees nothing at all. One may be old."""
+without having seen anything in between: it sees nothing at all. One may be old. The same number,
+so far from each other, of those that any sensor has missed while none has seen anything: none
+does."""
+NOTHING_SEEN = 3.0
+"""Way (m) without a reading of anything after which it is in doubt whether any sensor sees:
+without their supply Sharp sensors read "nothing in range"."""
 BRAKES = 0.4
 """Share of the time-out after which the robot brakes."""
 LEAP = 0.1
@@ -45,7 +50,7 @@ class RangeFault(enum.Enum):
     REPEATED = 'repeated: no newer stamps'
     IMPOSSIBLE = 'impossible: not a number, negative or beyond its range'
     FROZEN = 'frozen: one distance while the robot moves'
-    BLIND = 'blind: nothing in range where others have seen something'
+    BLIND = 'blind: nothing in range where something was seen before'
 
 
 class SensorRecord:
@@ -134,6 +139,10 @@ class RangeMonitor:
         self._sensors = [SensorRecord(mount) for mount in self._mounts]
         self._now_ns: int | None = None
         self._pose: Pose | None = None
+        self._missed: list[tuple[float, float]] = []
+        """Surfaces that were missed since any sensor saw something, m."""
+        self._way, self._way_from = 0.0, ORIGIN
+        """Way since then (m), in steps beyond the noise of a pose, and the end of the last one."""
 
     def accept(self, sensor: int, reading: float, stamp_ns: int | None) -> bool:
         """Return whether a reading (m, REP 117) is to be used.
@@ -155,11 +164,16 @@ class RangeMonitor:
             record.cause = RangeFault.IMPOSSIBLE
             return False
         record.add(reading)
+        if reading != math.inf:
+            self._missed.clear()
+            self._way = 0.0
         return True
 
     def miss(self, sensor: int, surface: tuple[float, float]) -> None:
         """Note that a sensor reads "nothing in range" where the map has a surface (m)."""
         self._sensors[sensor].miss(surface)
+        if all(math.dist(surface, each) > MISSES_APART for each in self._missed):
+            self._missed.append(surface)
 
     def sees(self, sensor: int) -> bool:
         """Return whether "nothing in range" of a sensor says that nothing is there."""
@@ -174,13 +188,18 @@ class RangeMonitor:
             forward, left = cosine * x + sine * y, cosine * y - sine * x
             for record in self._sensors:
                 record.move(forward, left, wrap_angle(pose.yaw - last.yaw))
+        step = math.dist(pose[:2], self._way_from[:2])
+        if step > LEAP:
+            self._way, self._way_from = self._way + min(step, 2.0 * LEAP), pose
         for record in self._sensors:
             record.update(now_ns, self._timeout)
+            if len(self._missed) >= MISSES and record.fault is None:
+                record.fault = RangeFault.BLIND
 
     @property
     def lost(self) -> bool:
-        """Whether any sensor cannot be relied on."""
-        return any(record.fault for record in self._sensors)
+        """Whether any sensor cannot be relied on, or all are in doubt."""
+        return self._way > NOTHING_SEEN or any(record.fault for record in self._sensors)
 
     def is_blind(self, *, astern: bool) -> bool:
         """Return whether too few sensors are left to drive ahead or astern."""
@@ -204,6 +223,11 @@ class RangeMonitor:
     def problem(self) -> str:
         """Return which sensors are lost, and why; '' if all work."""
         found = self.faults()
+        if not found and self._way > NOTHING_SEEN:
+            return (
+                f'no range sensor has seen anything for {self._way:.0f} m, the robot drives '
+                'slowly: look at their supply and cables, unless nothing is near'
+            )
         if not found:
             return ''
         if len(found) == len(self._sensors) and len(set(found.values())) == 1:

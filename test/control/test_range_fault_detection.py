@@ -27,7 +27,11 @@ from t3mpc_ros.control.keep_out import (
     KeepOut,
     KeepOutParameters,
 )
-from t3mpc_ros.control.range_fault_detection import RangeFault, RangeMonitor
+from t3mpc_ros.control.range_fault_detection import (
+    NOTHING_SEEN,
+    RangeFault,
+    RangeMonitor,
+)
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import advance_pose
@@ -222,6 +226,37 @@ def test_a_sensor_that_sees_nothing_is_found_by_what_others_saw(sensor):
         np.count_nonzero(cells == OCCUPIED)
     )  # its rays clear nothing
     assert room.run(20.0) == {}  # it sees again
+
+
+@pytest.mark.compiled
+def test_sensors_that_all_see_nothing_are_named():
+    """Without their supply they read so: the robot drove at full speed into what it had seen."""
+    room = Room()
+    assert room.run(20.0) == {}
+    found = room.run(20.0, blind=range(8))
+    assert found == dict.fromkeys(RANGE_SENSORS, RangeFault.BLIND)
+    assert 'all range sensors blind' in room.keep_out.ranges.problem()
+    assert room.keep_out.ranges.is_blind(astern=False)
+    assert room.run(20.0) == {}  # they see again
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.003])
+def test_a_robot_that_sees_nothing_for_long_is_slow_and_says_so(noise):
+    """In the open it may be right; one that stands has not driven, whatever its pose's noise."""
+    monitor, generator = _monitor(), np.random.default_rng(3)
+    for k in range(4000):
+        x = 0.003 * max(k - 2000, 0) + noise * generator.standard_normal()
+        for sensor in range(8):
+            monitor.accept(sensor, math.inf, k * PERIOD_NS)
+        monitor.update(k * PERIOD_NS, Pose(x, noise * generator.standard_normal(), 0.0))
+        far = 0.003 * (k - 2000) > NOTHING_SEEN
+        if abs(0.003 * (k - 2000) - NOTHING_SEEN) > 0.2:
+            assert monitor.lost == far
+            assert ('no range sensor has seen anything for' in monitor.problem()) == far
+    monitor.accept(3, 0.5, 4000 * PERIOD_NS)
+    monitor.update(4000 * PERIOD_NS, Pose(x, 0.0, 0.0))
+    assert not monitor.lost
+    assert monitor.faults() == {}
 
 
 def test_things_that_leave_make_no_sensor_blind():
