@@ -74,7 +74,9 @@ _RCLPY_PARAMETERS = ('use_sim_time', 'start_type_description_service', 'qos_over
 """Parameters (or their first name part) that rclpy declares for every node."""
 
 
-def _with_info(callback: Callable[[Any, dict[str, Any]], None]) -> Callable[..., None]:
+def _with_info(
+    callback: Callable[[Any, dict[str, Any]], None], sequence: qos.PublicationSequence
+) -> Callable[..., None]:
     """Return a callback that gets a message and its information, whichever executor calls it.
 
     The events executor of rclpy 7.1 passes both as one tuple, the others as two arguments.
@@ -82,6 +84,7 @@ def _with_info(callback: Callable[[Any, dict[str, Any]], None]) -> Callable[...,
 
     def called(*received: Any) -> None:
         message, info = received if len(received) == 2 else received[0]
+        sequence.add(info['publication_sequence_number'])
         callback(message, info)
 
     # rclpy passes the information to callbacks of two arguments.
@@ -112,7 +115,8 @@ class MatchingSubscription:
         raw: bool = False,
     ) -> None:
         self._node = node
-        called = _with_info(callback) if callback else qos.unused_callback
+        self.sequence = qos.PublicationSequence()
+        called = _with_info(callback, self.sequence) if callback else qos.unused_callback
         self._arguments = message, topic, called
         self._group = None if callback else qos.PolledCallbackGroup()
         self._raw = raw
@@ -148,7 +152,10 @@ class MatchingSubscription:
         The executor takes one message of a subscription per cycle: a queue that has filled while
         it was busy would otherwise stay full, and every message would wait as long.
         """
-        return [message for message, _ in qos.take_with_info(self.subscription)]
+        taken = qos.take_with_info(self.subscription)
+        for _, info in taken:
+            self.sequence.add(info['publication_sequence_number'])
+        return [message for message, _ in taken]
 
 
 class BaseNode(Node, Generic[P]):
@@ -161,6 +168,8 @@ class BaseNode(Node, Generic[P]):
     parameter_class: ClassVar[type[Parameters]] = Parameters
     configuration_errors: ClassVar[tuple[type[Exception], ...]] = ()
     """Errors of :meth:`make` that name what the user has to change, beside ParameterError."""
+    single_publisher_topics: ClassVar[tuple[str, ...]] = ('cmd_vel',)
+    """Topics whose publishers the diagnostics name if there are several."""
 
     @classmethod
     def make(cls, **options: Any) -> 'list[BaseNode[Any]]':
@@ -189,7 +198,6 @@ class BaseNode(Node, Generic[P]):
         # Steady time: diagnostics continue while the simulated clock is paused.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_steady_timer(DIAGNOSTICS_PERIOD, self._publish_diagnostics)
-        self._command_publishers = qos.CommandPublishers()
         self._matching: list[MatchingSubscription] = []
         self.create_steady_timer(ADAPT_PERIOD, self._adapt_subscriptions)
         self._unused_overrides: list[str] | None = None
@@ -401,14 +409,25 @@ class BaseNode(Node, Generic[P]):
                 self.get_logger().warning(f'{name} has no effect: this node has no such endpoint')
         found = [
             *self.start_warnings,
+            *self._publishers_problems(),
             *self.warnings(),
-            self._command_publishers.problem(self, self.steady_ns()),
             qos.qos_problem(self, (each.subscription for each in self._matching), 'subscription'),
             qos.qos_problem(self, islice(self._public_publishers(), 20), 'publisher'),
         ]
         if self.get_clock().ros_time_is_active and not self.clock_started():
             found.append(f'use_sim_time is set: {NO_CLOCK}')
         return [text for text in found if text]
+
+    def _publishers_problems(self) -> Iterator[str]:
+        """Yield which topics have several publishers: their messages contradict each other."""
+        several = {
+            each.subscription.topic_name: each.sequence.has_several_publishers()
+            for each in self._matching
+        }
+        used = {each.topic_name for each in (*self.subscriptions, *self.publishers)}
+        for topic in map(self.resolve_topic_name, self.single_publisher_topics):
+            if topic in used or topic in several:
+                yield qos.publishers_problem(self, topic, alive=several.get(topic, False))
 
     def _public_publishers(self) -> Iterator[Publisher]:
         """Return the publishers of topics that other nodes use."""

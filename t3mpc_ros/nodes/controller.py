@@ -130,6 +130,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
 
     parameter_class = ControllerNodeParameters
     configuration_errors = (ModelError,)
+    single_publisher_topics = ('cmd_vel', 'reference', 'odom')
 
     def __init__(self, **options: Any) -> None:
         super().__init__('controller', **options)

@@ -34,7 +34,6 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes import conversions
 from t3mpc_ros.parameters.table import ParameterError
 
@@ -195,37 +194,39 @@ LEASE = 20.0
 """Time after which a node that was killed leaves the graph, s: the default of Fast DDS."""
 
 
-class CommandPublishers:
-    """The publishers of ``cmd_vel`` of a graph, and since when each is known."""
+class PublicationSequence:
+    """Decides from the sequence numbers of a topic whether several publishers are alive.
+
+    Each publisher counts its own messages, and rclpy does not identify the publisher of a message.
+    The number falls once when a publisher is replaced, and again and again while two publish.
+    """
 
     def __init__(self) -> None:
-        self._since_ns: dict[bytes, int] = {}
+        self._last = 0
+        self._falls = 0
 
-    def problem(self, node: Node, now_ns: int) -> str:
-        """Return the publishers if several compete for the robot, or nothing.
+    def add(self, number: int | None) -> None:
+        """Add the sequence number of a message; None where the middleware has none."""
+        if number is not None:
+            self._falls += number <= self._last
+            self._last = number
 
-        now_ns : steady time
-        """
-        topic = node.resolve_topic_name('cmd_vel')
-        own = {each.topic_name for each in (*node.subscriptions, *node.publishers)}
-        if topic not in own:
-            return ''
-        found = {
-            bytes(info.endpoint_gid): info for info in node.get_publishers_info_by_topic(topic)
-        }
-        self._since_ns = {gid: self._since_ns.get(gid, now_ns) for gid in found}
-        names = sorted(map(node_of, found.values()))
-        if len(names) < 2:
-            return ''
-        if len(set(names)) == 1:
-            known = (now_ns - max(self._since_ns.values())) / NANOSECONDS
-            if known < LEASE:
-                return (
-                    f'{topic}: a {names[0]} that has ended without notice is still listed, for '
-                    f'at most {LEASE:g} s'
-                )
-            return f'{topic} has {len(names)} publishers of the same name: {names[0]}'
-        return f'{topic} has {len(names)} publishers: {", ".join(names)}'
+    def has_several_publishers(self) -> bool:
+        """Return whether several published since the last call."""
+        falls, self._falls = self._falls, 0
+        return falls > 1
+
+
+def publishers_problem(node: Node, topic: str, *, alive: bool) -> str:
+    """Return the publishers of a topic if there are several, or nothing.
+
+    alive : whether several are known to publish
+    """
+    names = sorted(map(node_of, node.get_publishers_info_by_topic(topic)))
+    if len(names) < 2:
+        return ''
+    text = f'{topic} has {len(names)} publishers: {", ".join(names)}; stop all but one'
+    return text if alive else f'{text}; one that was killed leaves this list within {LEASE:g} s'
 
 
 def qos_problem(node: Node, endpoints: Iterable[Any], kind: Kind) -> str:
