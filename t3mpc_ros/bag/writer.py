@@ -16,11 +16,13 @@
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 import errno
+import fcntl
 import mimetypes
 import os
 from pathlib import Path
 import re
 from typing import Self
+import weakref
 
 from mcap.writer import CompressionType, Writer
 
@@ -55,6 +57,10 @@ class AttachmentError(BagError):
 
 class FolderError(BagError):
     """The folder or a file in it cannot be created."""
+
+
+class FolderInUseError(FolderError):
+    """Another writer writes the bag."""
 
 
 class DiskError(BagError):
@@ -99,8 +105,9 @@ class BagWriter:
     A chunk is compressed and written at ``chunk_bytes``, or when its oldest message is
     ``chunk_ns`` old, by receive time or between two calls of :meth:`tick`: a killed recorder
     loses at most the current chunk. The next file begins at ``max_file_bytes`` or
-    ``max_file_ns``, 0 = never. What cannot be created raises :class:`FolderError`; a failed write
-    raises :class:`DiskError`, once, from any method.
+    ``max_file_ns``, 0 = never. What cannot be created raises :class:`FolderError`, a bag that
+    another writer of any process has not closed :class:`FolderInUseError`; a failed write raises
+    :class:`DiskError`, once, from any method.
     """
 
     path: Path
@@ -136,6 +143,7 @@ class BagWriter:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             sync_folder(self.folder.parent)
+            self._unlock = weakref.finalize(self, os.close, _lock_folder(self.folder))
             existing, self.incomplete_files = collect_metadata(self.folder)
             write_metadata(self.folder, existing)
         except OSError as error:
@@ -308,12 +316,12 @@ class BagWriter:
     def split(self) -> Path:
         """Complete the current file, begin the next one and return its path."""
         if self._is_open():
-            self.close()
-            self._closed = False
+            self._complete()
             try:
                 self._open_file()
             except FolderError:
                 self._closed = True
+                self._unlock()
                 raise
         return self.path
 
@@ -321,8 +329,11 @@ class BagWriter:
         """Complete the file and add it to ``metadata.yaml``; idempotent."""
         if not self._closed:
             self._closed = True
-            if not self._failed:
-                self._complete()
+            try:
+                if not self._failed:
+                    self._complete()
+            finally:
+                self._unlock()
 
     def _complete(self) -> None:
         try:
@@ -377,6 +388,22 @@ class BagWriter:
         self._output.abandon()
         rest = 't3mpc bag recover keeps the messages until here'
         return DiskError(self.path, error.strerror or str(error), rest)
+
+
+def _lock_folder(folder: Path) -> int:
+    """Return a descriptor that holds the lock of a folder until it is closed, or its process ends.
+
+    Without a lock where the file system has none: no file is overwritten in any case.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if isinstance(error, BlockingIOError):
+            os.close(descriptor)
+            reason = 'another recorder writes this bag: set storage.uri'
+            raise FolderInUseError(f'cannot record into {folder}: {reason}') from error
+    return descriptor
 
 
 def _folder_error(folder: Path, error: OSError) -> FolderError:

@@ -168,6 +168,8 @@ class BaseNode(Node, Generic[P]):
     parameter_class: ClassVar[type[Parameters]] = Parameters
     configuration_errors: ClassVar[tuple[type[Exception], ...]] = ()
     """Errors of :meth:`make` that name what the user has to change, beside ParameterError."""
+    conflict_errors: ClassVar[tuple[type[Exception], ...]] = ()
+    """Those of them that another process causes: the exit code is 1, not 2."""
     single_publisher_topics: ClassVar[tuple[str, ...]] = ('cmd_vel',)
     """Topics whose publishers the diagnostics name if there are several."""
 

@@ -62,7 +62,8 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
 
     0 after SIGINT, SIGTERM or SIGHUP, with the robot stopped, after a node has requested the
     exit, and for ``--help`` and ``--version``; 2 for an unusable parameter, parameter file or
-    command line, with one line on standard error that names it and the reason.
+    command line, with one line on standard error that names it and the reason; 1, with such a
+    line, for a conflict with another process.
     """
     import rclpy
     from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -105,7 +106,8 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
         if not stop():
             _spin(nodes, stop)
     except configuration_errors as error:
-        return _usage_error(name, str(error))
+        code = 1 if isinstance(error, kind.conflict_errors) else USAGE_ERROR
+        return _usage_error(name, str(error), code)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     finally:
@@ -149,9 +151,9 @@ def _spin(nodes: Sequence['BaseNode'], stop: StopSignal) -> None:
         executor.shutdown()
 
 
-def _usage_error(name: str, problem: str) -> int:
+def _usage_error(name: str, problem: str, code: int = USAGE_ERROR) -> int:
     print(f'{name}: {problem}', file=sys.stderr, flush=True)
-    return USAGE_ERROR
+    return code
 
 
 @contextmanager

@@ -37,7 +37,7 @@ from t3mpc_ros.bag.snapshot import (
     SnapshotWriter,
 )
 from t3mpc_ros.bag.topic_filter import TopicFilter, resolve_name
-from t3mpc_ros.bag.writer import BagWriter, FolderError
+from t3mpc_ros.bag.writer import BagWriter, FolderError, FolderInUseError
 from t3mpc_ros.bag.writer_thread import WriterThread
 from t3mpc_ros.chaos.seed_fingerprint import FINGERPRINT_KEY
 from t3mpc_ros.geometry.types import NANOSECONDS
@@ -62,6 +62,7 @@ class RecorderNode(BaseNode[RecordingParameters]):
 
     parameter_class = RecordingParameters
     configuration_errors = (BagError,)
+    conflict_errors = (FolderInUseError,)
 
     def __init__(self, **options: Any) -> None:
         super().__init__('recorder', **options)

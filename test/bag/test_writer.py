@@ -14,8 +14,11 @@
 """Bags written, continued, interrupted, and read by three independent libraries."""
 
 import errno
+import fcntl
 import io
 import os
+import subprocess
+import sys
 from types import SimpleNamespace
 
 from mcap.reader import NonSeekingReader, make_reader
@@ -39,7 +42,7 @@ from t3mpc_ros.bag.message_definitions import (
 )
 from t3mpc_ros.bag.qos import QosProfile, profiles_from_yaml
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
-from t3mpc_ros.bag.writer import BagWriter, DiskError, FolderError
+from t3mpc_ros.bag.writer import BagWriter, DiskError, FolderError, FolderInUseError
 
 STEP = 10_000_000
 ODOM, TWIST, NUMBER = 'nav_msgs/msg/Odometry', 'geometry_msgs/msg/Twist', 'std_msgs/msg/Float64'
@@ -272,6 +275,40 @@ def test_a_killed_recorder_leaves_a_folder_that_can_be_read(folder):
     killed.flush()
     killed._output.abandon()
     assert read_with_rosbags(folder) == one  # and the second is never completed
+
+
+def test_a_bag_has_one_writer_at_a_time(folder):
+    """Two recorders reported *recording*, and the bag held each message twice."""
+    first = BagWriter(folder, metadata_records={})
+    first.split()
+    with pytest.raises(FolderInUseError, match='another recorder writes this bag'):
+        BagWriter(folder, metadata_records={})
+    written = fill(first, 20)
+    first.close()
+    with BagWriter(folder, metadata_records={}) as second:
+        written += fill(second, 20, START + 10**10)
+    assert read_with_rosbags(folder) == written
+
+
+def test_a_killed_writer_does_not_keep_its_bag(folder):
+    code = (
+        'import os, sys; from t3mpc_ros.bag.writer import BagWriter; '
+        'bag = BagWriter(sys.argv[1], metadata_records={}); os.kill(os.getpid(), 9)'
+    )
+    process = subprocess.run([sys.executable, '-c', code, folder], check=False)
+    assert process.returncode == -9
+    with BagWriter(folder, metadata_records={}) as bag:
+        assert bag.incomplete_files == ('run_0.mcap',)
+
+
+def test_a_file_system_without_locks_is_used(folder, monkeypatch):
+    def refuse(descriptor, operation):
+        raise OSError(errno.ENOLCK, 'No locks available')
+
+    monkeypatch.setattr(fcntl, 'flock', refuse)
+    with BagWriter(folder, metadata_records={}) as bag:
+        written = fill(bag, 20)
+    assert read_with_rosbags(folder) == written
 
 
 def test_a_bag_without_messages_is_readable(folder):

@@ -208,8 +208,8 @@ def test_each_yaml_reaches_its_node_with_and_without_a_namespace(name, harness, 
     changed = tmp_path / 'changed.yaml'
     changed.write_text(yaml.safe_dump(content))
     files = ['--params-file', str(installed), '--params-file', str(changed)]
-    given = {'storage.uri': str(tmp_path / 'bag')} if name == 'recorder' else {}
     for namespace in ('/', '/robot_1'):
+        given = {'storage.uri': f'{tmp_path}/{namespace}/bag'} if name == 'recorder' else {}
         node = harness.add(node_class(name), files, namespace=namespace, **given)
         assert node.get_parameter(parameter).value == value
 

@@ -196,6 +196,20 @@ def test_messages_before_a_signal_are_in_the_bag(number, processes, publisher, t
     assert numbers(tmp_path / 'bag') == list(range(900))
 
 
+def test_a_second_recorder_of_a_bag_ends_with_the_reason(processes, tmp_path):
+    start(processes, tmp_path / 'bag')
+    second = Processes(tmp_path / 'second', os.environ)
+    with pytest.raises(ProcessError, match='ended with code 1'):
+        start(second, tmp_path / 'bag')
+    (line,) = second.log('recorder').read_text().splitlines()
+    assert line.startswith('recorder: cannot record into')
+    assert line.endswith('another recorder writes this bag: set storage.uri')
+    processes.kill('recorder')
+    third = Processes(tmp_path / 'third', os.environ)
+    start(third, tmp_path / 'bag')
+    assert third.stop('recorder') == 0
+
+
 def test_a_write_error_stops_recording_and_keeps_chunks(processes, publisher, tmp_path):
     start(processes, tmp_path / 'bag', **{'storage.chunk_duration': 0.05})
     publisher.wait_for_recorder()
