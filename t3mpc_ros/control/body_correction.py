@@ -403,10 +403,11 @@ class BodyCorrection:
             found.append(float(np.quantile(known, WATCHED_QUANTILE)) if enough else 0.0)
         share, rough = found
         if share > UNEXPLAINED:
+            follows = 'only partly follows' if share < 1.0 else 'does not follow'
             return (
-                f'{share:.0%} of the squared changes of the commands is not in the yaw of odom: '
-                'commands or odometry are lost or late, or the dead time has changed; check the '
-                'link and the processors'
+                f'the yaw rate of odom {follows} the changes of the commands: commands or '
+                'odometry are lost or late, or the dead time has changed; check the link and the '
+                'processors'
             )
         if rough > ROUGH:
             return (

@@ -423,3 +423,16 @@ def test_lost_commands_and_a_rough_yaw_rate_are_named():
         assert words in each.correction.response_problem()
         each.correction.restart()
         assert each.correction.response_problem() == ''
+
+
+@pytest.mark.parametrize(
+    'share, words', [(0.2, ''), (0.5, 'only partly follows'), (25.89, 'does not follow')]
+)
+def test_what_the_turn_leaves_of_the_commands_is_in_words(share, words):
+    """It was "2589% of the squared changes of the commands"."""
+    body = Body(exact)
+    body.correction._state.watched[:, 0] = share
+    problem = body.correction.response_problem()
+    assert problem.startswith(words and f'the yaw rate of odom {words} the changes')
+    assert bool(problem) == bool(words)
+    assert '%' not in problem
