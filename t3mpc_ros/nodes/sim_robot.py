@@ -260,7 +260,9 @@ class SimRobotNode(RobotNode[SimRobotParameters]):
         if self._real_time_factor.value is not None:
             values['real_time_factor'] = self._real_time_factor.value
         if state is None:
-            return ERROR, NO_CLOCK, values
+            if not self.clock_started():
+                return ERROR, NO_CLOCK, values
+            return WARN, 'starting', values
         values |= state_values(state, twin)
         if state.status.estop:
             return ERROR, state.reason, values

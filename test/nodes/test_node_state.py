@@ -335,8 +335,15 @@ def robot_conditions(state):
 
 
 def test_levels_of_the_simulated_robot(start):
+    for clock, simulated, expected in (
+        (False, False, (WARN, 'starting')),
+        (True, False, (WARN, 'starting')),
+        (True, True, (WARN, 'starting')),
+        (False, True, (ERROR, NO_CLOCK)),
+    ):
+        node = start('sim_robot', publish_clock=clock, use_sim_time=simulated)
+        assert report(node) == expected
     node = start('sim_robot')
-    assert report(node) == (ERROR, NO_CLOCK)
     for found, level in robot_conditions(node._robot.advance(10**7)):
         node._state = found
         assert diagnostic_level(node) == level, found
