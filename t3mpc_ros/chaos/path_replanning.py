@@ -599,6 +599,8 @@ class PlannedPath:
         """When they were given, s."""
         self._battery_time = math.inf
         """Since when the voltage has called for a change, s."""
+        self._voltage_time = 0.0
+        """When the last voltage was observed, s."""
 
     def advance(self, rate: float = 1.0) -> tuple[Pose, BodyTwist]:
         """Return pose and twist of the next period, for a rate of the path's time."""
@@ -634,21 +636,32 @@ class PlannedPath:
             if self.charging:
                 self.plan.goal = self._charging_place
 
-    def observe_battery(self, voltage: float) -> None:
+    def observe_battery(self, voltage: float) -> bool:
         """Lead to the charging place with a low battery, and on from there with a full one.
 
-        voltage : V, NaN if it is not measured; one that lasts for 5 s counts
+        Return whether the voltage is one: what is not finite or not above 0 V changes nothing.
+
+        voltage : V; one that lasts for 5 s counts
         """
+        if not 0.0 < voltage < math.inf:
+            return False
+        self._voltage_time = self._time
         parameters = self._parameters.charging
         enough = voltage >= parameters.full_voltage
         if not (enough if self.charging else voltage < parameters.min_voltage):
             self._battery_time = math.inf
-            return
+            return True
         self._battery_time = min(self._battery_time, self._time)
         if self._time - self._battery_time >= BATTERY_TIME:
             self.charging, self._battery_time = not self.charging, math.inf
             if self.charging:
                 self.go_to(self._charging_place)
+        return True
+
+    @property
+    def battery_silence(self) -> float:
+        """Time without a voltage, s."""
+        return self._time - self._voltage_time
 
     @property
     def _charging_place(self) -> tuple[float, float]:

@@ -69,6 +69,8 @@ from t3mpc_ros.parameters.table import ParameterError, group, parameter
 
 PATH_PERIOD = 0.1
 """Time between the poses of ``reference/path``, s."""
+BATTERY_TIMEOUT = 30.0
+"""Time without a voltage of the battery that is reported, s: some robots send one every 10 s."""
 SEED_BITS = 128
 """Length of a secret seed."""
 FRAMES_THAT_JUMP = 'map', 'earth'
@@ -354,8 +356,8 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             self._planned.look_at(places)
 
     def _on_battery(self, message: BatteryState, info: dict[str, Any]) -> None:
-        if self._planned is not None:
-            self._planned.observe_battery(message.voltage)
+        if self._planned is not None and not self._planned.observe_battery(message.voltage):
+            self._rejected += 1
 
     def _on_twist(self, message: Twist | TwistStamped, info: dict[str, Any]) -> None:
         twist = message.twist if isinstance(message, TwistStamped) else message
@@ -462,6 +464,19 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         if self._path_clock.rate == 0.0:
             return OK, 'waiting for the robot', values
         return OK, 'paused' if self._paused else 'running', values
+
+    def warnings(self) -> list[str]:
+        """Return that nothing tells whether the battery is to be charged, if so."""
+        planned, charging = self._planned, self.parameters.plan.charging
+        if planned is None or charging.min_voltage == 0.0:
+            return []
+        if (silence := planned.battery_silence) < BATTERY_TIMEOUT:
+            return []
+        effect = 'does not leave' if planned.charging else 'does not go to'
+        return [
+            f'no voltage in battery_state for {silence:.0f} s: the robot {effect} the charging '
+            'place'
+        ]
 
     def on_shutdown(self) -> None:
         """Wait until all subscribers have the last sample."""

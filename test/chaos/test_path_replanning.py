@@ -362,6 +362,23 @@ def test_with_a_low_battery_it_is_charged_and_goes_on(seed):
     assert room.distances(room.occupied, rows).min() > KEEP_OUT - SIZE
 
 
+@pytest.mark.parametrize('voltage', [math.nan, math.inf, -math.inf, 0.0, -5.0])
+def test_what_is_no_voltage_changes_nothing(voltage):
+    """0 V, of a driver that measures none, led to the charger, and inf on from there."""
+    room = Room()
+    room.seen[:] = True
+    path = planned(charging__place=CHARGER, charging__min_voltage=10.0)
+    drive(path, room, 7.0, voltage=lambda pose: voltage)
+    assert not path.observe_battery(voltage)
+    assert not path.charging
+    assert path.battery_silence == pytest.approx(7.0)
+    drive(path, room, 7.0, voltage=lambda pose: 9.0)
+    assert path.charging
+    assert path.battery_silence == pytest.approx(1.0)
+    drive(path, room, 7.0, voltage=lambda pose: voltage)
+    assert path.charging
+
+
 def test_only_a_voltage_that_lasts_calls_for_the_charger():
     room = Room()
     room.seen[:] = True

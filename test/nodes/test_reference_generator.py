@@ -397,6 +397,15 @@ def test_a_low_battery_leads_to_the_charging_place(harness, logged, monkeypatch)
     at = received[-1].pose.pose.position
     assert np.hypot(at.x - 0.9, at.y + 0.2) < 0.05
     assert logged('goal_pose is ignored: the battery is charged first')
+    volts = 0.0
+    count = reference._rejected
+    harness.spin_until(lambda: says('at the charging place') and reference._rejected > count + 1)
+    assert reference.warnings() == []
+    reference._planned._time += 40.0
+    assert reference.warnings() == [
+        f'no voltage in battery_state for {reference._planned.battery_silence:.0f} s: the robot '
+        'does not leave the charging place'
+    ]
     volts = 12.5
     harness.spin_until(lambda: says('running') and speed(received[-1]) > 0.1)
 
