@@ -288,6 +288,16 @@ def test_a_fast_robot_with_rare_messages_does_not_jump(speed):
     assert continuity_notes('/odom', time, time, places, np.full(20, speed)) == []
 
 
+@pytest.mark.parametrize(('moved', 'count'), [(0.05, 0), (0.5, 1)])
+def test_a_jump_at_rest_is_found(moved, count):
+    """An odometry that was set to the origin had to jump by more than a metre."""
+    time = 0.02 * np.arange(100)
+    places = np.stack([moved * (time > 1.0), np.zeros(100)], axis=1)
+    assert len(continuity_notes('/odom', time, time, places, np.zeros(100))) == count
+    # A robot that rests before and after a gap may have driven in it.
+    assert continuity_notes('/odom', time[::50], time[::50], places[::50], np.zeros(2)) == []
+
+
 # -- way, stops ----------------------------------------------------------------------
 
 

@@ -26,6 +26,9 @@ GAP_PERIODS = 20.0
 """Least gap, in median intervals of the messages."""
 POSE_JUMP = 1.0
 """Least displacement between two messages, m, beyond that by the speed, which is a jump."""
+REST_JUMP, REST_SPEED, REST_INTERVAL = 0.1, 0.01, 0.25
+"""The same of a robot at rest, m: with less than this speed, m/s, at both ends of a time without a
+message of at most the last one, s."""
 SPEED_MARGIN = 3.0
 """Displacement that counts as explained by the speed, in multiples of speed times interval."""
 MIXED_STEP = 0.05
@@ -70,12 +73,15 @@ def within_gaps(time: Array, series: Array) -> NDArray[np.bool_]:
 def pose_jumps(stamps: Array, positions: Array, speeds: Array, least: float) -> Integers:
     """Return the rows whose position is farther from that before than the speed explains.
 
-    By more than ``least`` metres; stamps (s), positions (m, shape (n, 2)), forward speeds (m/s).
+    By more than ``least`` metres, or :data:`REST_JUMP` at rest if that is less; stamps (s),
+    positions (m, shape (n, 2)), forward speeds (m/s).
     """
     away = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     fastest = np.maximum(np.abs(speeds[1:]), np.abs(speeds[:-1]))
-    explained = SPEED_MARGIN * fastest * np.abs(np.diff(stamps))
-    return np.flatnonzero(away > least + explained) + 1
+    intervals = np.abs(np.diff(stamps))
+    rests = (fastest < REST_SPEED) & (intervals <= REST_INTERVAL)
+    allowed = np.where(rests, min(least, REST_JUMP), least)
+    return np.flatnonzero(away > allowed + SPEED_MARGIN * fastest * intervals) + 1
 
 
 def continuity_notes(

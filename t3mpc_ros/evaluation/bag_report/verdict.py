@@ -15,7 +15,7 @@
 
 One sentence, the same in the terminal, on the page and in the report. What happened comes first,
 in this order: a recording that cannot be trusted, nothing to judge, a stop, a blocked wheel, a
-gap, a condition of the robot, a machine too slow, a jump, an error that is too large.
+gap, a condition of the robot, a jump, a machine too slow, an error that is too large.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -141,12 +141,16 @@ def judge(
     if missing > MAX_MISSING:
         text = f'{100.0 * missing:.1f} % of {ODOMETRY} is missing'
         loss.append(_Finding(text, 'Data missing', spoils=True))
-    findings += [*slow, *loss, *_jumps(incidents)]
+    findings += [*_jumps(incidents), *slow, *loss]
     late = _late(run, latency_99)
     distance, on_path = path_distance(run), None
     if run.follows_path:
         on_path = share_on_path(run)
-        error, reached = _path_finding(on_path, None if distance is None else distance['value'])
+        error, reached = _path_finding(
+            on_path,
+            None if distance is None else distance['value'],
+            detours=run.parameters.get('controller', {}).get('keep_out.enabled') == 'True',
+        )
     else:
         error, reached = _error_finding(run, counted, last - counted_from(first, last))
     if error is not None:
@@ -415,8 +419,13 @@ def share_on_path(run: Run) -> float:
     return 0.0 if distance is None else float(np.mean(distance['value'] <= ON_PATH))
 
 
-def _path_finding(share: float, distance: Array | None) -> tuple[_Finding | None, str]:
-    """Return what speaks against the path of a patrol, if anything, and how well it was driven."""
+def _path_finding(
+    share: float, distance: Array | None, *, detours: bool
+) -> tuple[_Finding | None, str]:
+    """Return what speaks against the path of a patrol, if anything, and how well it was driven.
+
+    detours : whether the robot makes detours
+    """
     within = f'within {1e3 * ON_PATH:g} mm of its path for'
     if distance is None:
         text = 'the robot did not follow its path: the bag holds no positions of both'
@@ -426,7 +435,9 @@ def _path_finding(share: float, distance: Array | None) -> tuple[_Finding | None
     if share < MIN_ON_PATH:
         text = f'the robot did not follow its path: {within} only {percent}, {error}'
         return _Finding(text, 'Did not follow its path', spoils=True), error
-    rest = '' if share > 0.995 else '; the rest were detours around obstacles and the ways back'
+    rest = '; the rest were detours around obstacles and the ways back'
+    if share > 0.995 or not detours:
+        rest = ''
     reached = f'{within} {percent}, {error}{rest}'
     if share < MOSTLY:
         return _Finding(f'mostly off its path: {reached}', 'Mostly off its path'), reached
