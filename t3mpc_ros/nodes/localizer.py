@@ -216,7 +216,11 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         """Begin on another map: from the last pose, where it was known."""
         before = self._localizer
         try:
-            if problem := self._frame_problem(message.header.frame_id):
+            frame = message.header.frame_id
+            # Robots of a fleet may share a map, in the frame without their prefixes.
+            if frame != self.parameters.global_frame_id and (
+                problem := self._frame_problem(frame)
+            ):
                 raise MapError(problem)
             grid = conversions.grid_from_occupancy(message)
             self._use_map(map_of_grid(grid.cells, grid.resolution, (grid.x, grid.y, 0.0)))

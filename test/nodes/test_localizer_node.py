@@ -260,6 +260,16 @@ def test_a_map_of_a_topic_is_used_and_a_broken_one_is_not(harness):
     assert node._localizer.state is Localization.LOCALIZED
 
 
+@pytest.mark.parametrize('frame', ['map', 'east/map'])
+def test_robots_with_namespaces_may_share_a_map(harness, frame):
+    node = harness.add(LocalizerNode, namespace='east', **START)
+    shared = grid_message()
+    shared.header.frame_id = frame
+    harness.connected_publisher(OccupancyGrid, 'east/map', LATCHED).publish(shared)
+    harness.spin_until(lambda: node._localizer is not None)
+    assert node._map_frame == 'east/map'
+
+
 def test_wrong_maps_end_the_node(harness, tmp_path):
     with pytest.raises(ParameterError, match='yaml_filename must be empty'):
         harness.add(LocalizerNode, world='room', yaml_filename='map.yaml')
