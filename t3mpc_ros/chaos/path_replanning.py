@@ -193,8 +193,8 @@ class PathPlan:
         self._left = math.inf
         self.goal: tuple[float, float] | None = None
         """Place that is to be visited, and was not yet, m."""
-        self._leads_there = False
-        """Whether a way to the goal is in the plan."""
+        self._leads_there: bool | None = None
+        """Whether a way to the goal is in the plan; None before it was looked for."""
         self._contradiction: tuple[float, float] | None = None
         """Where the map is contradicted, and which is to be looked at, m."""
         self._last_view: tuple[float, float] | None = None
@@ -221,7 +221,7 @@ class PathPlan:
     def lead_to(self, goal: tuple[float, float], fixed: int) -> None:
         """Lead to a place (m) after the first ``fixed`` points, and then on along the path."""
         self.truncate(max(fixed, 1))
-        self.goal, self._leads_there = goal, False
+        self.goal, self._leads_there = goal, None
 
     @property
     def goal_point(self) -> int | None:
@@ -229,6 +229,11 @@ class PathPlan:
         if self.goal is None or not self._leads_there:
             return None
         return self._point_at(self.goal)
+
+    @property
+    def unreachable_goal(self) -> tuple[float, float] | None:
+        """The goal (m) if no way to it is known; it is looked for again as the path goes on."""
+        return self.goal if self._leads_there is False else None
 
     def _point_at(self, place: tuple[float, float]) -> int:
         """Return the point that is nearest to a place (m)."""
@@ -272,14 +277,14 @@ class PathPlan:
     def truncate(self, count: int) -> None:
         """Keep the first points only; what followed is planned anew."""
         if (point := self.goal_point) is not None and point >= count:
-            self._leads_there = False
+            self._leads_there = None
         if self._last_view is not None and self._point_at(self._last_view) >= count:
             self._last_view = None
         self.points, self._next = self.points[:count], self._next[:count]
 
     def begin_at(self, pose: Pose) -> None:
         """Plan from a place on."""
-        self._leads_there, self._last_view = False, None
+        self._leads_there, self._last_view = None, None
         self.points, self._next = np.array([[pose.x, pose.y]]), self._next[:1]
 
     def extend(self, fixed: int, time: float) -> None:

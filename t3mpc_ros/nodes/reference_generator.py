@@ -466,17 +466,24 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         return OK, 'paused' if self._paused else 'running', values
 
     def warnings(self) -> list[str]:
-        """Return that nothing tells whether the battery is to be charged, if so."""
+        """Return that no way to a goal is known, and that nothing tells whether to charge."""
         planned, charging = self._planned, self.parameters.plan.charging
-        if planned is None or charging.min_voltage == 0.0:
+        if planned is None:
             return []
-        if (silence := planned.battery_silence) < BATTERY_TIMEOUT:
-            return []
-        effect = 'does not leave' if planned.charging else 'does not go to'
-        return [
-            f'no voltage in battery_state for {silence:.0f} s: the robot {effect} the charging '
-            'place'
-        ]
+        found = []
+        if goal := planned.plan.unreachable_goal:
+            name = 'charging place' if planned.charging else 'goal'
+            found.append(
+                f'no way to the {name} at ({goal[0]:.2f}, {goal[1]:.2f}) m is known: it is '
+                'outside of the map or behind what is in it; the robot drives on and looks again'
+            )
+        if charging.min_voltage and (silence := planned.battery_silence) >= BATTERY_TIMEOUT:
+            effect = 'does not leave' if planned.charging else 'does not go to'
+            found.append(
+                f'no voltage in battery_state for {silence:.0f} s: the robot {effect} the '
+                'charging place'
+            )
+        return found
 
     def on_shutdown(self) -> None:
         """Wait until all subscribers have the last sample."""

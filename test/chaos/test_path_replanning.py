@@ -310,11 +310,12 @@ def test_it_leads_to_a_goal_and_waits_for_a_way_to_one_without():
         path.go_to(goal)
         rows = drive(path, room, 20.0)
         check_limits(rows)
-        assert path.plan.goal is None
+        assert path.plan.goal is path.plan.unreachable_goal is None
         assert np.hypot(*(rows[:, :2] - goal).T).min() < 0.15
     path.go_to((-1.0, -0.6))
+    assert path.plan.unreachable_goal is None  # nobody has looked for a way
     drive(path, room, 10.0)
-    assert path.plan.goal is not None
+    assert path.plan.goal == path.plan.unreachable_goal == (-1.0, -0.6)
     room.occupied &= ~ring
     rows = drive(path, room, 40.0)
     assert np.hypot(*(rows[:, :2] - (-1.0, -0.6)).T).min() < 0.15

@@ -463,6 +463,14 @@ def test_a_planned_path_waits_for_a_map_and_leads_to_a_goal(harness):
     harness.spin_until(leads_there)
     assert reference._source.planned.plan._contradiction == (1.0, -0.3)
     assert diagnostic(reference, 'rejected_inputs') == count + 2
+    goal.pose.position.x = 50.0
+    goals.publish(goal)
+
+    def is_named():
+        where()
+        return 'no way to the goal at (50.00, -1.45) m is known' in reason(reference)
+
+    harness.spin_until(is_named)
 
 
 @pytest.mark.parametrize('source', ['portrait', 'twist'])
