@@ -468,7 +468,8 @@ def test_a_planned_path_waits_for_a_map_and_leads_to_a_goal(harness):
 
     def is_named():
         where()
-        return 'no way to the goal at (50.00, -1.45) m is known' in reason(reference)
+        maps.publish(free)
+        return 'no way to the goal at (50.00, -1.45) m is known' in ' '.join(reference.warnings())
 
     harness.spin_until(is_named)
 
