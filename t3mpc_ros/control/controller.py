@@ -543,7 +543,7 @@ class Controller:
                 self.keep_out.reset()
                 self.keep_out.ranges.reset()
         elif self.keep_out is not None and last is not None and self._is_elsewhere(odometry):
-            self.keep_out.reset()  # what it has marked was marked at another place
+            self.keep_out.reset(looks=False)  # what it has marked was marked at another place
             self.drive_monitor.contact_monitor.restart(None)
         plan_ns, reason = self._sample_plan(odometry)
         if reason.moves and restarted:

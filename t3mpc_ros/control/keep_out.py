@@ -567,8 +567,12 @@ class KeepOut:
         self._find_nearest = TypedKernel(find_nearest)
         self.reset()
 
-    def reset(self) -> None:
-        """Begin at a new place: the robot looks around first. The sensors are what they were."""
+    def reset(self, *, looks: bool = True) -> None:
+        """Begin at a new place. The sensors are what they were.
+
+        ``looks``: the robot looks around first; else when it is to move
+        """
+        self._looks, self._has_looked = looks, False
         self.map.clear()
         self.activity = Activity.FREE
         """What it does."""
@@ -615,10 +619,12 @@ class KeepOut:
         elapsed : time since the last step, s
         """
         if not self._standing_room:
-            # The robot stands where it stands; and it looks around once.
+            # The robot stands where it stands.
             self._standing_room = True
             room = self.parameters.distance + self.parameters.ahead + 0.06
             self.map.mark_free(pose.x, pose.y, room)
+        if not self._has_looked and (self._looks or wanted != STANDSTILL):
+            self._has_looked = True
             self._look_around(pose, math.pi)
         self.map.now += elapsed
         self.map.mark_free(pose.x, pose.y, STANDING_ROOM)

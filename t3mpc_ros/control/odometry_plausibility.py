@@ -21,7 +21,14 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, State, has_jumped
+from t3mpc_ros.geometry.types import (
+    NANOSECONDS,
+    Array,
+    BodyTwist,
+    State,
+    has_jumped,
+    wrap_angle,
+)
 
 MAX_DELAY, MAX_LEAD = 0.3, 0.05
 """Offset of odometry stamps from the node's clock beyond which the clocks differ, s."""
@@ -260,8 +267,8 @@ class InputMonitor:
         """Changes of the pose that no motion explains."""
         self._jumps_ns: deque[int] = deque(maxlen=1000)
         """Stamps of those in the last 10 s."""
-        self._jump = 0.0
-        """Distance of the last one, m."""
+        self._jump = 0.0, 0.0
+        """Distance (m) and turn (rad) of the last one."""
         self._last: State | None = None
         self._standing = 0.0
         self._follows = False
@@ -305,7 +312,10 @@ class InputMonitor:
         if has_jumped(last, new):
             self.jumps += 1
             self._jumps_ns.append(new.stamp_ns)
-            self._jump = math.hypot(new.pose.x - last.pose.x, new.pose.y - last.pose.y)
+            self._jump = (
+                math.dist(last.pose[:2], new.pose[:2]),
+                abs(wrap_angle(new.pose.yaw - last.pose.yaw)),
+            )
         while self._jumps_ns and new.stamp_ns - self._jumps_ns[0] > RECENT * NANOSECONDS:
             self._jumps_ns.popleft()
 
@@ -365,8 +375,9 @@ class InputMonitor:
         if len(self._jumps_ns) >= MANY_JUMPS:
             found.append(
                 f'the pose in odom has jumped {len(self._jumps_ns)} times in the last {RECENT:g} '
-                f's, the last time by {self._jump:.3g} m: look for a second publisher, other '
-                'units than metres, a localisation that alternates between two places'
+                f's, the last time by {self._jump[0]:.2f} m and {self._jump[1]:.2f} rad: look for '
+                'a second publisher, other units than metres and radians, a localisation that '
+                'alternates between two places'
             )
         opposite = [self._is_opposite(axis) for axis in (0, 1)]
         for axis, name in enumerate(NAMES):

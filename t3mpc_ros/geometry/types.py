@@ -115,10 +115,18 @@ JUMP = 0.1, 0.3
 """Change of a pose beyond the motion that is a jump, m and rad."""
 
 
+UNKNOWN_TWIST, UNKNOWN_TIME = BodyTwist(0.5, 4.5), 0.25
+"""Speeds that a robot may have, and the time (s) for which it may, whose twist is zero: some
+odometry has none."""
+
+
 def has_jumped(last: State, new: State) -> bool:
     """Return whether the pose has changed by more than twice the motion between two messages."""
     elapsed = max(new.stamp_ns - last.stamp_ns, 0) / NANOSECONDS
-    linear, angular = (max(abs(last.twist[i]), abs(new.twist[i])) for i in (0, 1))
+    twists = last.twist, new.twist
+    if twists == (STANDSTILL, STANDSTILL):
+        twists, elapsed = (UNKNOWN_TWIST, UNKNOWN_TWIST), min(elapsed, UNKNOWN_TIME)
+    linear, angular = (max(abs(twists[0][i]), abs(twists[1][i])) for i in (0, 1))
     distance, angle = JUMP[0] + 2.0 * elapsed * linear, JUMP[1] + 2.0 * elapsed * angular
     return has_moved(last.pose, new.pose, distance, angle)
 

@@ -54,6 +54,7 @@ from t3mpc_ros.geometry.types import (
     Pose,
     State,
     has_jumped,
+    wrap_angle,
 )
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import (
@@ -240,20 +241,21 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 self._source = self._make_source(state.pose)
                 self._pose = state.pose
             elif self._last and not self._may_jump and has_jumped(self._last, state):
-                self._begin_again(state.pose, math.dist(self._last.pose[:2], state.pose[:2]))
+                self._begin_again(self._last.pose, state.pose)
             self._last = state
             self._path_clock.observe(state.stamp_ns, state.pose)
             if self._planned is not None:
                 self._planned.observe(state.pose)
 
-    def _begin_again(self, pose: Pose, distance: float) -> None:
-        """Begin at rest at a pose that the odometry was set to, some distance (m) away.
+    def _begin_again(self, last: Pose, pose: Pose) -> None:
+        """Begin at rest at a pose that the odometry was set to, from the last one.
 
         The robot has not moved: one that rests is to rest, and a path in the frame of before leads
         elsewhere now.
         """
         source = self.parameters.source
-        text = f'odom has jumped by {distance:.2f} m: {AFTER_JUMP[source]}'
+        distance, angle = math.dist(last[:2], pose[:2]), abs(wrap_angle(pose.yaw - last.yaw))
+        text = f'odom has jumped by {distance:.2f} m and {angle:.2f} rad: {AFTER_JUMP[source]}'
         if isinstance(self._source, GivenPathSource) and self._source.under_way:
             self._ended = text
         self.get_logger().warning(text, throttle_duration_sec=5.0)
@@ -432,7 +434,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
 
     def _pause(self, on: bool) -> tuple[str, str]:
         self._paused = on
-        return '', 'reference paused' if on else 'reference resumed'
+        return '', 'reference paused' if on else self._ended or 'reference resumed'
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return the state of the reference; a warning if samples were skipped since the last."""

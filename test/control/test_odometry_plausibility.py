@@ -22,7 +22,15 @@ from support.long_tests import few_of
 
 from t3mpc_ros.control.odometry_plausibility import MANY_JUMPS, RECENT, Gaps, InputMonitor
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import NANOSECONDS, BodyTwist, Pose, State
+from t3mpc_ros.geometry.types import (
+    NANOSECONDS,
+    ORIGIN,
+    STANDSTILL,
+    BodyTwist,
+    Pose,
+    State,
+    has_jumped,
+)
 
 GEOMETRY = WheelGeometry(wheel_radius=0.05, wheel_separation=0.3)
 
@@ -249,11 +257,24 @@ def test_a_pose_that_jumps_again_and_again_is_named():
         drive.run(1.0)
         drive.pose[0] += 0.5
         assert ('has jumped' in ' '.join(drive.run(0.1))) == (jumps >= MANY_JUMPS)
-    assert (
-        f'has jumped 4 times in the last {RECENT:g} s, the last time by 0.499' in drive.run(0.1)[0]
-    )
+    (text,) = drive.run(0.1)
+    assert f'4 times in the last {RECENT:g} s, the last time by 0.50 m and 0.00 rad' in text
     assert drive.run(RECENT) == []
     assert drive.monitor.jumps == 4
+
+
+@pytest.mark.parametrize('period', [0.01, 0.1, 0.2])
+def test_without_a_twist_a_turn_on_the_spot_is_no_jump(period):
+    """A robot of 5 Hz gave up its path as it turned: its pose had "jumped by 0.00 m"."""
+
+    def jumps(pose, seconds=period):
+        new = State(round(seconds * NANOSECONDS), pose, STANDSTILL)
+        return has_jumped(State(0, ORIGIN, STANDSTILL), new)
+
+    assert not jumps(Pose(0.35 * period, 0.0, 4.0 * period))
+    assert jumps(Pose(0.4, 0.0, 0.0))
+    assert jumps(Pose(0.0, 0.0, 2.6))
+    assert jumps(Pose(0.4, 0.0, 0.0), seconds=30.0)  # a driver that was started again
 
 
 def test_simulated_time_may_run_ahead_of_the_messages():
