@@ -118,6 +118,17 @@ def test_what_a_recorder_misses_at_its_start_is_usual(late, tmp_path):
 
 
 @pytest.mark.slow
+def test_the_page_says_that_the_odometry_was_set(tmp_path):
+    """Ground truth stayed in the old frame: a robot on its path was a metre off it."""
+    figures = write_report(STORIES['odometry set'].write(tmp_path / 'bag'))
+    page = figures.report.read_text(encoding='utf-8')
+    assert 'odom was set at 12.0 s: from there on the path is in its new frame.' in page
+    # That of the section on coverage, too, which takes fewer samples.
+    (error,) = re.findall(r'path error, root mean square</td><td>([\d.]+) mm', page)
+    assert float(error) == pytest.approx(1e3 * figures.path_error, abs=0.06)
+
+
+@pytest.mark.slow
 def test_errors_after_stalls_are_told_apart(tmp_path):
     """Nine times the error of a quiet machine, all of it after the stalls, was a good run."""
     calm = STORIES['stalls']

@@ -70,6 +70,8 @@ class Story:
     """Which messages are recorded."""
     moved: Callable = lambda t: 0.0
     """By how much the position is shifted, m."""
+    set_at: float = math.inf
+    """Time at which odometry and path begin anew where the robot is, ground truth does not, s."""
     path: bool = False
     """Whether the reference is a path with poses."""
     detour: tuple = ()
@@ -86,7 +88,7 @@ class Story:
 
     def rows(self):
         """Return rows of receipt (s), topic and message."""
-        rows, pose, place = [], np.zeros(3), np.zeros(3)
+        rows, pose, place, origin = [], np.zeros(3), np.zeros(3), None
         for k in range(round(DURATION * self.rate)):
             t = k / self.rate
             wanted = self._reference(t)
@@ -99,12 +101,15 @@ class Story:
                 shown = shown + (0.0, 0.3, 0.0)
             stamp = START + round(t * 1e9)
             measured = stamp + self.apart
-            target = place if self.path else (0.0, 0.0, 0.0)
+            if origin is None and t >= self.set_at:
+                origin = place = pose
+            target = _seen_from(origin, place) if self.path else (0.0, 0.0, 0.0)
             ahead = serialised_odometry(stamp, wanted, target)
             motion = serialised_odometry(measured, speed, shown)
+            odometry = serialised_odometry(measured, speed, _seen_from(origin, shown))
             rows += [
                 (max(received - LEAD, 0.0), '/reference', ahead),
-                (received + 2e-4, '/odom', motion),
+                (received + 2e-4, '/odom', odometry),
                 (received + 3e-4, '/ground_truth/odom', motion),
                 (received + 1e-3, '/cmd_vel', serialised_twist(self._command(t))),
             ]
@@ -163,6 +168,15 @@ def _moved(pose, twist, seconds):
     x, y, yaw = pose
     v, w = seconds * twist[0], seconds * twist[1]
     return np.array([x + v * math.cos(yaw), y + v * math.sin(yaw), yaw + w])
+
+
+def _seen_from(origin, pose):
+    """Return a pose in the frame of another one; as it is without one."""
+    if origin is None:
+        return pose
+    x, y, yaw = pose - origin
+    c, s = math.cos(origin[2]), math.sin(origin[2])
+    return np.array([c * x + s * y, c * y - s * x, yaw])
 
 
 def stalled(*stalls):
@@ -233,6 +247,16 @@ STORIES = {
         r'Good run: within 50 mm of its path for 8\d % of the drive, path error 1\d\d\.\d mm '
         r'\(RMS\)\.', 'good',
         records={**TWIN, 'controller': {'pose.enabled': 'True'}}, path=True, detour=(8.0, 11.0),
+    ),
+    'odometry set': Story(
+        r'The position of odom jumps by 1\.\d+ m at 12\.0 s; within 50 mm of its path for 100 % '
+        r'of the drive, path error \d\.\d mm \(RMS\)\.', 'open',
+        records=PATROL, path=True, set_at=12.0,
+    ),
+    'localizer wrong': Story(
+        r'The position of odom jumps by 1\.\d+ m at 12\.0 s; within 50 mm of its path for 6\d % '
+        r'of the drive, path error \d+\.\d mm \(RMS\); .*', 'open',
+        records={**PATROL, 'localizer': {}}, path=True, set_at=12.0,
     ),
     'other robot': Story(
         r'The robot drove 3\.[56]\d m in 20\.0 s; the bag holds no reference, so tracking cannot '

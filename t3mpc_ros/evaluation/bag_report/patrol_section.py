@@ -20,6 +20,7 @@ import numpy as np
 
 from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
+from t3mpc_ros.evaluation.bag_report.tracking_errors import on_reference_frame
 from t3mpc_ros.evaluation.charts import Chart, Line
 from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     SHARES,
@@ -70,6 +71,9 @@ def patrol_blocks(run: Run) -> Iterator[Block]:
             [np.interp(time, reference.time, reference[axis]) for axis in 'xy']
         )
         wanted[~inside] = math.nan
+        laid = on_reference_frame(run)
+        if laid is not None:  # as far from the robot as it is in its own frame
+            wanted += np.column_stack([x - laid['x'][rarely], y - laid['y'][rarely]])
     torn = bool(gaps(motion.time))
     found = patrol_metrics(time, x, y, grid, wanted, whole=not torn)
     entered = f'{100.0 * found["coverage"]:.1f} %'

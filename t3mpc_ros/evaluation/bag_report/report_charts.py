@@ -36,6 +36,7 @@ from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
 from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     driven,
+    odometry_sets,
     path_distance,
     settled,
     tracking_error,
@@ -122,6 +123,12 @@ def distance(run: Run, metrics: ReportMetrics) -> Shown:
         f'{format_number(1e3 * metrics.path_error_99)} mm; the largest distance is '
         f'{format_number(1e3 * float(series["value"][row]))} mm at {series.time[row]:.1f} s.'
     )
+    if sets := odometry_sets(run):
+        more = f' and {len(sets) - 5} more' if len(sets) > 5 else ''
+        times = ', '.join(f'{time:.1f}' for time in sets[:5])
+        seen += (
+            f' {ODOMETRY} was set at {times} s{more}: from there on the path is in its new frame.'
+        )
     lines = [line('distance', 'c1', series, scale=1e3)]
     yield Chart('Distance from the path', 'mm', lines, seen)
 

@@ -21,13 +21,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.evaluation.bag_report.continuity import within_gaps
-from t3mpc_ros.evaluation.bag_report.incidents import BRAKING, Span, driving, find_stops
+from t3mpc_ros.evaluation.bag_report.incidents import (
+    BRAKING,
+    Span,
+    driving,
+    find_jumps,
+    find_stops,
+)
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.record import ROBOT_WINDOW, counted_from, counted_rows
 from t3mpc_ros.evaluation.reporting import format_number
-from t3mpc_ros.evaluation.topic_roles import REFERENCE
+from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
+
+SETTING = 0.5
+"""Time before and after the odometry is set in which no distance from the path counts, s."""
 
 
 @dataclass(frozen=True)
@@ -129,22 +138,76 @@ def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, Error
     }
 
 
+def odometry_sets(run: Run) -> list[float]:
+    """Return when the odometry was set, s: it jumps, and the ground truth of the robot does not.
+
+    None with the localizer of this package: its odometry is the pose on the map, as ground truth
+    is, so that a jump of it is an error of the pose, or the end of one.
+    """
+    truth, odometry = run.motions.get(TRUTH), run.motions.get(ODOMETRY)
+    if truth is None or odometry is None or 'localizer' in run.parameters:
+        return []
+    found = []
+    for jump in find_jumps(run):
+        if jump.name != ODOMETRY or not truth.time[0] < jump.time < truth.time[-1]:
+            continue
+        row = int(np.searchsorted(odometry.time, jump.time))
+        step = [np.diff(np.interp(odometry.time[row - 1 : row + 1], truth.time, truth[axis]))
+                for axis in 'xy']  # fmt: skip
+        if np.hypot(*step) < 0.5 * jump.distance:
+            found.append(jump.time)
+    return found
+
+
+def on_reference_frame(run: Run) -> Series | None:
+    """Return the measured motion with positions in the frame of the odometry and the reference.
+
+    From each time on at which the odometry was set, ground truth is laid on it anew. Positions are
+    NaN about that time, while the reference may still be, or is interpolated, in the old frame.
+    """
+    motion, reference = run.motions.get(run.measured), run.motions.get(REFERENCE)
+    sets = odometry_sets(run)
+    if motion is None or reference is None or not sets:
+        return motion
+    odometry = run.motions[ODOMETRY]
+    x, y, yaw = (motion[name].copy() for name in ('x', 'y', 'yaw'))
+    unknown = np.zeros(len(motion), dtype=np.bool_)
+    for time in sets:
+        row, first = np.searchsorted(odometry.time, time), np.searchsorted(motion.time, time)
+        turn = odometry['yaw'][row] - yaw[first]
+        c, s = np.cos(turn), np.sin(turn)
+        dx, dy = x[first:] - x[first], y[first:] - y[first]
+        x[first:] = odometry['x'][row] + c * dx - s * dy
+        y[first:] = odometry['y'][row] + s * dx + c * dy
+        yaw[first:] += turn
+        old, new = reference.time < time, reference.time >= time + run.lead
+        start = min(time - SETTING, np.max(reference.time[old], initial=-math.inf))
+        end = max(time + run.lead + SETTING, np.min(reference.time[new], initial=math.inf))
+        unknown |= (motion.time > start) & (motion.time < end)
+    x[unknown] = y[unknown] = math.nan
+    return Series(motion.time, {**motion.values, 'x': x, 'y': y, 'yaw': yaw})
+
+
 def path_distance(run: Run) -> Series | None:
     """Return how far the robot is from the place of its reference at the same time, m.
 
-    From the first to the last command to move. None for a robot that follows no path, or without
-    the positions of either.
+    From the first to the last command to move, in the frame of the reference. None for a robot
+    that follows no path, or without the positions of either.
     """
-    motion, reference = run.motions.get(run.measured), run.motions.get(REFERENCE)
-    if not run.follows_path or motion is None or reference is None or 'x' not in reference.values:
+    reference = run.motions.get(REFERENCE)
+    if not run.follows_path or reference is None or 'x' not in reference.values:
+        return None
+    motion = on_reference_frame(run)
+    if motion is None:
         return None
     motion = motion.between(*driving(run)).between(
         float(reference.time[0]), float(reference.time[-1])
     )
-    away = [
-        motion[axis] - np.interp(motion.time, reference.time, reference[axis]) for axis in 'xy'
-    ]
-    return Series(motion.time, {'value': np.hypot(*away)}) if len(motion) else None
+    away = np.hypot(
+        *(motion[axis] - np.interp(motion.time, reference.time, reference[axis]) for axis in 'xy')
+    )
+    known = np.isfinite(away)
+    return Series(motion.time[known], {'value': away[known]}) if known.any() else None
 
 
 def settled_rmse(
