@@ -406,8 +406,8 @@ class BodyCorrection:
             follows = 'only partly follows' if share < 1.0 else 'does not follow'
             return (
                 f'the yaw rate of odom {follows} the changes of the commands: commands or '
-                'odometry are lost or late, or the dead time has changed; check the link and the '
-                'processors'
+                'odometry are lost or late, the dead time has changed, or the yaw of odom is '
+                'noisy; check the link, the processors, and what gives the yaw'
             )
         if rough > ROUGH:
             return (
@@ -611,14 +611,21 @@ def clear_block(state: BodyState) -> None:
 
 @kernel
 def watch_block(state: BodyState) -> None:
-    """Add what the block says of the response: unexplained share, and roughness if it is calm."""
+    """Add what the block says of the response: unexplained share, and roughness if it is calm.
+
+    The share says nothing where the changes are below the roughness, as of a pose with noise.
+    """
     memory, watched = state.memory[0], state.watched
+    least = math.inf
     for j in range(watched.shape[0] - 1, 0, -1):
         watched[j, 0], watched[j, 1] = watched[j - 1, 0], watched[j - 1, 1]
+        if watched[j, 1] < least:
+            least = watched[j, 1]
+    noise = least**2 if least < math.inf else 0.0
     steps = memory.steps
     variance = memory.rest_square / steps - (memory.rest_sum / steps) ** 2
     change = memory.change_square / steps
-    watched[0, 0] = variance / change if change > EXCITED else math.nan
+    watched[0, 0] = variance / change if change > max(EXCITED, noise) else math.nan
     calm = memory.largest_change < CALM_CHANGE and memory.slowest > CALM_SPEED
     watched[0, 1] = math.sqrt(max(variance, 0.0)) if calm and memory.rings == 0 else math.nan
     rings = RINGING_BLOCKS if memory.largest_change >= CALM_CHANGE else memory.rings - 1

@@ -425,6 +425,15 @@ def test_lost_commands_and_a_rough_yaw_rate_are_named():
         assert each.correction.response_problem() == ''
 
 
+def test_noise_above_the_changes_is_no_lost_command():
+    """With the yaw of a camera a good drive was "the yaw rate does not follow the changes"."""
+    body = Body(exact, noise=0.5)
+    body.run(6.0)
+    body.correction._state.watched[:, 0] = math.nan
+    body.run(6.0)
+    assert 'are lost or late' not in body.correction.response_problem()
+
+
 @pytest.mark.parametrize(
     'share, words', [(0.2, ''), (0.5, 'only partly follows'), (25.89, 'does not follow')]
 )
