@@ -482,7 +482,6 @@ class Controller:
         self._begin()
         if self.keep_out is not None:
             self.keep_out.reset()
-            self.keep_out.ranges.reset()
 
     def add_range(self, sensor: int, reading: float, stamp_ns: int | None = None) -> bool:
         """Add a range reading (m, REP 117) of a sensor, taken at the pose of the last odometry.
@@ -541,9 +540,8 @@ class Controller:
             self._clear_reference()
             if self.keep_out is not None:
                 self.keep_out.reset()
-                self.keep_out.ranges.reset()
         elif self.keep_out is not None and last is not None and self._is_elsewhere(odometry):
-            self.keep_out.reset(looks=False)  # what it has marked was marked at another place
+            self.keep_out.relocate()  # what it has marked was marked at another place
             self.drive_monitor.contact_monitor.restart(None)
         plan_ns, reason = self._sample_plan(odometry)
         if reason.moves and restarted:

@@ -567,11 +567,16 @@ class KeepOut:
         self._find_nearest = TypedKernel(find_nearest)
         self.reset()
 
-    def reset(self, *, looks: bool = True) -> None:
-        """Begin at a new place. The sensors are what they were.
+    def reset(self) -> None:
+        """Begin as new: the robot looks around first."""
+        self.ranges.reset()
+        self._begin(looks=True)
 
-        ``looks``: the robot looks around first; else when it is to move
-        """
+    def relocate(self) -> None:
+        """Begin at a new place with the same sensors; the robot looks around before it moves."""
+        self._begin(looks=False)
+
+    def _begin(self, *, looks: bool) -> None:
         self._looks, self._has_looked = looks, False
         self.map.clear()
         self.activity = Activity.FREE
@@ -691,8 +696,8 @@ class KeepOut:
     def _reshaped(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist, or one that looks around."""
         self._update_nearest(pose, UNKNOWN)
-        has_come = self.map.now - self.map.last_come < NEW_FOR
-        self._cautious = has_come or self.ranges.lost or self._is_near_touched(pose)
+        visited = self.map.now - self.map.last_come < NEW_FOR
+        self._cautious = visited or self.ranges.lost or self._is_near_touched(pose)
         if self._targets:
             self.changed = True
             self.activity = Activity.LOOKING

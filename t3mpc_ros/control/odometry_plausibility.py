@@ -26,8 +26,8 @@ from t3mpc_ros.geometry.types import (
     Array,
     BodyTwist,
     State,
+    difference,
     has_jumped,
-    wrap_angle,
 )
 
 MAX_DELAY, MAX_LEAD = 0.3, 0.05
@@ -312,10 +312,7 @@ class InputMonitor:
         if has_jumped(last, new):
             self.jumps += 1
             self._jumps_ns.append(new.stamp_ns)
-            self._jump = (
-                math.dist(last.pose[:2], new.pose[:2]),
-                abs(wrap_angle(new.pose.yaw - last.pose.yaw)),
-            )
+            self._jump = difference(last.pose, new.pose)
         while self._jumps_ns and new.stamp_ns - self._jumps_ns[0] > RECENT * NANOSECONDS:
             self._jumps_ns.popleft()
 

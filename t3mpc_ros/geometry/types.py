@@ -103,6 +103,11 @@ def check_pose(pose: Pose) -> None:
         raise ValueError(f'pose must be finite: got {pose}')
 
 
+def difference(one: Pose, other: Pose) -> tuple[float, float]:
+    """Return the distance (m) and the angle (rad) between two poses."""
+    return math.dist(one[:2], other[:2]), abs(wrap_angle(other.yaw - one.yaw))
+
+
 def has_moved(start: Pose | None, pose: Pose, distance: float, angle: float) -> bool:
     """Return whether a pose is farther than a distance (m) or an angle (rad) from the start."""
     return start is None or (

@@ -17,7 +17,6 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-import math
 import secrets
 from typing import Any, ClassVar
 
@@ -53,8 +52,8 @@ from t3mpc_ros.geometry.types import (
     BodyTwist,
     Pose,
     State,
+    difference,
     has_jumped,
-    wrap_angle,
 )
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import (
@@ -147,7 +146,12 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         self._path_clock = self._make_path_clock()
         self._last: State | None = None
         """Last message of odom."""
-        self._jumps, self._restated, self._ended = 0, True, ''
+        self._jumps = 0
+        """How often it was set."""
+        self._restated = True
+        """Whether the reference of the present was published since."""
+        self._ended = ''
+        """How that ended a path that was under way."""
         self._rejected = 0
         self._mapped = not parameters.plan.enabled
         """Whether the path needs no map, or has one."""
@@ -254,7 +258,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         elsewhere now.
         """
         source = self.parameters.source
-        distance, angle = math.dist(last[:2], pose[:2]), abs(wrap_angle(pose.yaw - last.yaw))
+        distance, angle = difference(last, pose)
         text = f'odom has jumped by {distance:.2f} m and {angle:.2f} rad: {AFTER_JUMP[source]}'
         if isinstance(self._source, GivenPathSource) and self._source.under_way:
             self._ended = text

@@ -312,7 +312,7 @@ def test_it_begins_with_the_obstacles_of_a_saved_map():
 def test_a_robot_that_rests_at_a_new_place_may_rest(looks):
     """After reset_odometry a paused robot turned by a full circle."""
     keep_out = _seen()
-    keep_out.reset(looks=looks)
+    (keep_out.reset if looks else keep_out.relocate)()
     turns = [keep_out.step(STANDSTILL, ORIGIN, PERIOD).angular for _ in range(50)]
     assert any(turns) == looks
     assert keep_out.activity is (Activity.LOOKING if looks else Activity.FREE)
