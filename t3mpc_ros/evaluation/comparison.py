@@ -34,13 +34,7 @@ from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experi
 from t3mpc_ros.evaluation.loop import ComparedMethod, Driver, Method, run
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, MODEL_ERROR
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
-from t3mpc_ros.evaluation.scenario import (
-    HELD_OUT_SEEDS,
-    LEAD,
-    PRETRAINING_SEEDS,
-    TUNING_SEEDS,
-    Scenario,
-)
+from t3mpc_ros.evaluation.scenario import LEAD, PRETRAINING_SEEDS, TUNING_SEEDS, Scenario
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
 
 QUICK_SEEDS = tuple(range(201, 207))
@@ -155,19 +149,14 @@ def difference(
 def verdicts(differences: Mapping[Key, Difference | None], seeds: int) -> dict[Key, str]:
     """Return the verdict on every paired difference of a table, with Holm's correction.
 
-    Each is the mean over as many ``seeds``. A run that diverged is worse; without a difference
-    there is no verdict.
+    Each is the mean over as many ``seeds``. Whose run diverged is worse than the other, and if
+    both have one it is open; without a difference there is no verdict.
     """
     found = {key: each for key, each in differences.items() if each is not None}
     certain = holm({key: each.p_value(seeds) for key, each in found.items()}, LEVEL)
+    certain |= {key for key, each in found.items() if math.isinf(each.mean)}
     return {
-        key: WORSE
-        if math.isnan(each.mean)
-        else INCONCLUSIVE
-        if key not in certain
-        else BETTER
-        if each.mean < 0.0
-        else WORSE
+        key: INCONCLUSIVE if key not in certain else BETTER if each.mean < 0.0 else WORSE
         for key, each in found.items()
     }
 
@@ -337,12 +326,13 @@ def knowledge_table(plan: ComparisonPlan) -> Table:
 def description(plan: ComparisonPlan) -> str:
     """Return in one paragraph what was run and how it is counted."""
     seeds = ', '.join(map(str, plan.seeds))
-    used = {*TUNING_SEEDS, *PRETRAINING_SEEDS, *HELD_OUT_SEEDS} & {*plan.seeds}
-    outside = '' if used else ' (none is used for tuning or in another table)'
+    known = {*TUNING_SEEDS, *PRETRAINING_SEEDS}
+    used = ', '.join(str(seed) for seed in plan.seeds if seed in known)
+    told = f' (methods of the package were tuned or trained on {used})' if used else ''
     text = (
         f'{plan.scenario.text}, {plan.scenario.duration:g} s, '
         f'noise variance {plan.scenario.noise:g} (rad/s)², '
-        f'seeds {seeds}{outside}. '
+        f'seeds {seeds}{told}. '
         'True wheel speeds against the reference; mean ± half the 95 % interval over the seeds. '
     )
     kind = plan.scenario.kind

@@ -228,20 +228,24 @@ def draw_seeds(plan: ComparisonPlan, results: ResultTable, case: str) -> Any:
     """Return a figure of the first judged metric of every seed and method, or None."""
     metric = judged_metrics(case)[0]
     rows = {
-        method: [each for each in values if math.isfinite(each)]
+        method: values
         for method in plan.methods
         if (values := results.values(metric.name, case=case, controller=method))
     }
-    rows = {method: values for method, values in rows.items() if values}
-    if not rows:
+    finite = [each for values in rows.values() for each in values if math.isfinite(each)]
+    if not finite:
         return None
     figure = new_figure(0.9 + 0.2 * len(rows))
     axis = figure.subplots()
     places = np.arange(len(rows))[::-1]
-    for place, values in zip(places, rows.values(), strict=True):
+    names = []
+    for place, (method, values) in zip(places, rows.items(), strict=True):
+        diverged = sum(map(math.isnan, values))
+        names.append(f'{method} ({diverged} diverged)' if diverged else method)
         axis.plot(values, np.full(len(values), place), '|', color='#0284c7', markersize=8)
-        axis.plot(mean(values), place, 'o', color='#1f2937', markersize=4)
-    axis.set_yticks(places, list(rows))
-    scale_by_size(axis, 'x', [each for values in rows.values() for each in values])
+        if not diverged:  # a mean of the others would praise it
+            axis.plot(mean(values), place, 'o', color='#1f2937', markersize=4)
+    axis.set_yticks(places, names)
+    scale_by_size(axis, 'x', finite)
     axis.set_xlabel(f'{metric.heading} / ({metric.unit})')
     return figure

@@ -76,12 +76,15 @@ def interval(values: Values, confidence: float = 0.95) -> float:
 def paired(a: Values, b: Values, confidence: float = 0.95) -> Difference:
     """Return how much larger ``a`` is than ``b``, value by value.
 
-    What both have from a seed, an easy reference say, drops out of the difference.
+    What both have from a seed, an easy reference say, drops out of the difference. NaN, of a run
+    that diverged, is larger than every number; where both diverged, the difference is NaN.
     """
     if len(a) != len(b):
         raise ValueError(f'paired values must be equally many: got {len(a)} and {len(b)}')
-    differences = [x - y for x, y in zip(a, b, strict=True)]
-    return Difference(mean(differences), interval(differences, confidence))
+    first, second = (np.where(np.isnan(each), np.inf, each) for each in (a, b))
+    with np.errstate(invalid='ignore'):
+        differences = first - second
+        return Difference(mean(differences), interval(differences, confidence))
 
 
 def holm(p_values: Mapping[Key, float], level: float = 0.05) -> set[Key]:

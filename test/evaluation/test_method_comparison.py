@@ -41,12 +41,13 @@ from t3mpc_ros.evaluation.comparison import (
     WORSE,
     ComparisonPlan,
     case_table,
+    description,
     difference,
     judged_metrics,
     run_plan,
     verdicts,
 )
-from t3mpc_ros.evaluation.comparison_page import record
+from t3mpc_ros.evaluation.comparison_page import draw_seeds, record
 from t3mpc_ros.evaluation.drivers import MethodDriver, MethodSpec, NodeDriver
 from t3mpc_ros.evaluation.experiment import ResultTable, measured_run
 from t3mpc_ros.evaluation.loop import reports_of, run, run_loop
@@ -311,6 +312,17 @@ def test_the_quick_seeds_are_in_no_other_table():
     assert not set(QUICK_SEEDS) & {*TUNING_SEEDS, *PRETRAINING_SEEDS, *HELD_OUT_SEEDS}
 
 
+def test_seeds_on_which_methods_were_tuned_are_named():
+    """Of 2001 it said that no table has it, of 1 to 12 it said nothing."""
+
+    def seeds_of(*seeds):
+        return re.search(r'seeds (.*?)\. True', description(plan_of('servo', PI, seeds=seeds)))[1]
+
+    told = '(methods of the package were tuned or trained on 9, 12)'
+    assert seeds_of(9, 2001, 12) == f'9, 2001, 12 {told}'
+    assert seeds_of(2001, 101) == '2001, 101'
+
+
 @pytest.mark.parametrize('robot', ROBOTS)
 def test_every_robot_has_feed_forward_and_the_full_controller(robot):
     assert default_methods(robot)[:2] == (FULL, FEED_FORWARD)
@@ -362,6 +374,8 @@ def test_differences_are_paired_with_their_verdict():
     assert judged([0.9, 1.91, 2.9], [1.0, 2.0, 3.0]) == BETTER
     assert judged([0.9, 2.1, 3.0], [1.0, 2.0, 3.0]) == INCONCLUSIVE
     assert judged([math.nan, 2.0, 3.0], [1.0, 2.0, 3.0]) == WORSE
+    assert judged([1.0, 2.0, 3.0], [1.0, math.nan, 3.0]) == BETTER, 'was worse'
+    assert judged([math.nan, 2.0, 3.0], [1.0, math.nan, 3.0]) == INCONCLUSIVE
     assert judged([0.5], [1.0]) == INCONCLUSIVE
     assert found([1.0], [1.0], FEED_FORWARD) is None
 
@@ -476,3 +490,20 @@ def test_a_cell_says_how_many_of_its_runs_diverged():
     row = {'controller': 'feed-forward', 'case': NOMINAL}
     results = ResultTable([{**row, 'settled': value} for value in (0.1, math.nan)])
     assert '| 1 of 2 diverged |' in case_table(plan, results, NOMINAL).markdown()
+
+
+def test_a_figure_has_no_mean_of_the_seeds_that_did_not_diverge():
+    """The mean of those alone praised a method that often diverges."""
+    plan = plan_of('servo', FEED_FORWARD, PI, seeds=(1, 2))
+    results = ResultTable(
+        [
+            {'controller': name, 'case': NOMINAL, 'seed': seed, 'settled': value}
+            for name, values in ((FEED_FORWARD, (0.1, math.nan)), (PI, (0.2, 0.3)))
+            for seed, value in enumerate(values)
+        ]
+    )
+    (axis,) = draw_seeds(plan, results, NOMINAL).axes
+    names = [text.get_text() for text in axis.get_yticklabels()]
+    assert names == [f'{FEED_FORWARD} (1 diverged)', PI]
+    means = [line.get_xdata().tolist() for line in axis.lines if line.get_marker() == 'o']
+    assert means == [[pytest.approx(0.25)]]
