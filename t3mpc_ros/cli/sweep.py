@@ -62,6 +62,11 @@ def run(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.api.comparison_runs import find_metric
     from t3mpc_ros.evaluation.api.parameter_sweep import has_failed, sweep
 
+    names = [name for name, _ in options.set]
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(
+            f'--set must name each parameter once, with all of its values: got {repeated[0]} again'
+        )
     shared_options.prepare_outputs(options, options.output)
     metric = find_metric(options.metric).name
     with shared_options.executor_of(options) as executor:

@@ -186,11 +186,7 @@ def make_plan(
     for method in methods:
         check_method(method, scenario, chosen)
     names = [method.name for method in methods]
-    if repeated := sorted({name for name in names if names.count(name) > 1}):
-        raise ScriptError(
-            f'controllers must have different names, see Controller(name=…): got {repeated[0]} '
-            'more than once'
-        )
+    check_names(names)
     return comparison.ComparisonPlan(
         scenario,
         chosen,
@@ -198,6 +194,15 @@ def make_plan(
         checked_seeds(seeds),
         next(iter(names), ''),
     )
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Raise :class:`ScriptError` if two controllers have one name: a table would mix them."""
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise ScriptError(
+            f'controllers must have different names, see Controller(name=…): got {repeated[0]} '
+            'more than once'
+        )
 
 
 def chosen_cases(cases: str | Sequence[str], scenario: Scenario) -> tuple[str, ...]:

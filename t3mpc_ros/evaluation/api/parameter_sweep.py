@@ -26,7 +26,12 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.evaluation.api import result_tables
-from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds, chosen_cases, find_metric
+from t3mpc_ros.evaluation.api.comparison_runs import (
+    check_names,
+    checked_seeds,
+    chosen_cases,
+    find_metric,
+)
 from t3mpc_ros.evaluation.api.error_messages import one_sentence, sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
@@ -42,7 +47,7 @@ from t3mpc_ros.evaluation.experiment import (
     print_report,
     run_experiment,
 )
-from t3mpc_ros.evaluation.record import SETTLED, Metric, measure
+from t3mpc_ros.evaluation.record import METRICS, SETTLED, Metric, measure
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, columns_of
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.run_digest import digest
@@ -57,6 +62,12 @@ ROBOT = 'robot.'
 OF_SETTING = ('noise', 'duration')
 RUN, ERROR = 'run', 'error'
 """Columns: digest of all that determines a run, and why it has no numbers; '' with them."""
+COLUMNS = {
+    *('controller', 'robot', 'reference', 'case', 'seed', RUN, ERROR),
+    *provenance(),
+    *(metric.name for metric in METRICS),
+}
+"""Columns that no parameter may have; that of noise or duration is the swept one."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -227,6 +238,7 @@ def make_runs(
     combinations = [(values, _scenario(setting, values)) for values in _combinations(parameters)]
     chosen = chosen_cases(cases, combinations[0][1])
     prepared, given = [], as_controllers(controllers)
+    check_names([controller.name for controller in given])
     for controller in given:
         for values, scenario in combinations:
             own = {k: v for k, v in values.items() if not (k in OF_SETTING or k.startswith(ROBOT))}
@@ -290,6 +302,12 @@ def _combinations(parameters: Mapping[str, Sequence[Any]]) -> list[Row]:
     if not isinstance(parameters, Mapping):
         raise ScriptError(f'parameters must map names to lists of values: got {parameters!r}')
     for name, values in parameters.items():
+        if not isinstance(name, str):
+            raise ScriptError(f'parameters must map names to lists of values: got {name!r}')
+        if name in COLUMNS:
+            raise ScriptError(
+                f'{name} is a column of every sweep: give the argument of the class another name'
+            )
         if isinstance(values, str) or not hasattr(values, '__iter__'):
             raise ScriptError(f'{name} must be a list of values: got {values!r}')
     # NumPy's numbers are no parameter values, and no JSON.
@@ -299,6 +317,15 @@ def _combinations(parameters: Mapping[str, Sequence[Any]]) -> list[Row]:
     ]
     if not all(lists):
         raise ScriptError('each parameter must have one or more values')
+    for name, values in zip(parameters, lists, strict=True):
+        try:
+            repeated = len({*values}) < len(values)
+        except TypeError:
+            raise ScriptError(
+                f'values of {name} must be numbers, truth values or texts: got {values!r}'
+            ) from None
+        if repeated:  # the table would count the seeds of one cell twice
+            raise ScriptError(f'values must differ: got {values!r} of {name}')
     return [dict(zip(parameters, each, strict=True)) for each in itertools.product(*lists)]
 
 
@@ -354,6 +381,8 @@ def _run_to_file(
         report(f'{path} holds {len(runs) - len(wanted)} of {len(runs)} runs')
     if not wanted:
         return [{**run.fields, **stored[run.key]} for run in runs]
+    fields = [run.fields for run in wanted]
+    result_tables.arrow_table(columns_of([*fields, *stored.values()]))  # an error before the runs
     journal = ResultFile(path.with_name(f'{path.name}.runs.jsonl'))
     journal.remove({key for key, row in journal.read().items() if has_failed(row)})
     made = run_experiment(wanted, numbers_or_error, workers, store=journal.path, report=report)

@@ -132,11 +132,10 @@ def write_parquet(
     path: str | os.PathLike[str], columns: Columns, details: Mapping[str, str] | None = None
 ) -> Path:
     """Write columns as one Parquet file, with version, commit and ``details`` in its metadata."""
-    import pyarrow
     import pyarrow.parquet
 
     target = writable(path)
-    table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
+    table = arrow_table(columns)
     texts = {**provenance(), **(details or {})}
     table = table.replace_schema_metadata({name: str(text) for name, text in texts.items()})
     # A reader of an interrupted write finds the old file or none, never half of one.
@@ -144,6 +143,22 @@ def write_parquet(
     pyarrow.parquet.write_table(table, part)
     part.replace(target)
     return target
+
+
+def arrow_table(columns: Columns) -> Any:
+    """Return columns as a table of Arrow; ScriptError names the one that Parquet cannot hold."""
+    import pyarrow
+
+    arrays = {}
+    for name, values in columns.items():
+        try:
+            arrays[name] = pyarrow.array(values)
+        except pyarrow.ArrowException as error:
+            raise ScriptError(
+                f'values of {name} must be of one kind, numbers or texts, in a Parquet file: '
+                f'{error}'
+            ) from None
+    return pyarrow.table(arrays)
 
 
 def drawn(draw: Callable[[Any], Any], path: str | os.PathLike[str] | None) -> Any:

@@ -317,11 +317,21 @@ def test_the_key_of_a_run_ignores_files_named_like_a_case(tmp_path, monkeypatch)
         ((Proportional, {'gain': 3.0}), 'gain must be a list of values: got 3.0'),
         ((Proportional, {'gain': []}), 'each parameter must have one or more values'),
         ((Proportional, {'gain': [1.0, 1.0]}), 'values must differ'),
+        ((Proportional, {'gain': [20, 20.0]}), 'values must differ: got .20, 20.0. of gain'),
+        ((Proportional, {'gain': [[1.0, 2.0]]}), 'gain must be numbers, truth values or texts'),
+        ((Proportional, {'seed': [1, 2]}), 'seed is a column of every sweep'),
+        ((Proportional, {'settled': [1, 2]}), 'settled is a column of every sweep'),
+        ((Proportional, {1: [1.0]}), 'parameters must map names to lists of values: got 1'),
+        (
+            ([t3.Controller(Proportional, name='a'), t3.Controller(Made, name='a')], {}),
+            'must have different names',
+        ),
         (('full', {'law.gian': [1.0]}), 'did you mean law.gain'),
         ((Proportional, {'robot.frction_factor': [1.0]}), 'did you mean friction_factor'),
     ],
 )
 def test_wrong_use_of_a_sweep_is_a_sentence(arguments, text):
+    """Runs of two such cells were one cell, with twice the seeds and too narrow an interval."""
     with pytest.raises(t3.ScriptError, match=text):
         t3.sweep(*arguments, executor=1, seeds=[1], **SHORT)
 
@@ -342,6 +352,27 @@ def test_a_file_of_another_kind_is_left_alone(tmp_path, monkeypatch):
     with pytest.raises(t3.ScriptError, match='is no file of a sweep'):
         t3.sweep(Proportional, GAINS, executor=1, output=path, **SHORT)
     assert path.read_bytes() == content
+
+
+def test_values_that_no_file_holds_are_refused_before_the_runs(tmp_path, counted):
+    """``--set gain=5,,6`` made every run, and then wrote no file."""
+    pytest.importorskip('pyarrow')
+    with pytest.raises(t3.ScriptError, match='values of gain must be of one kind'):
+        t3.sweep(
+            Proportional,
+            {'gain': [5.0, '']},
+            executor=1,
+            output=tmp_path / 'a.parquet',
+            seeds=[1],
+            **SHORT,
+        )
+    assert not counted
+
+
+def test_a_parameter_that_is_set_twice_is_refused(capsys):
+    """Of ``--set gain=20 --set gain=10`` only the last one was swept, without a word."""
+    assert main(['sweep', '--set', 'law.gain=20', '--set', 'law.gain=10']) == 1
+    assert '--set must name each parameter once' in capsys.readouterr().err
 
 
 @pytest.mark.slow
