@@ -24,7 +24,7 @@ import sys
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from t3mpc_ros.evaluation.api.error_messages import sentence
-from t3mpc_ros.parameters.command_line import bounded_float, bounded_int
+from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_writable
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.version import VERSION
 
@@ -137,10 +137,11 @@ def add_outputs(parser: argparse.ArgumentParser, json: str = 'also write the num
 
 
 def prepare_outputs(options: argparse.Namespace, *further: Path | None) -> None:
-    """Make the folders of the files: one that cannot be made is an error before the runs."""
+    """Make the folders of the files: one that cannot be written is an error before the runs."""
     for path in (options.json, getattr(options, 'html', None), *further):
-        if path:
+        if path and path != STANDARD_OUTPUT:
             path.parent.mkdir(parents=True, exist_ok=True)
+            check_writable(path)
 
 
 def add_topic_options(parser: argparse._ActionsContainer) -> None:

@@ -31,6 +31,7 @@ from support.waiting import run
 from t3mpc_ros.cli import tune
 from t3mpc_ros.cli.demo import DemoOptions
 from t3mpc_ros.cli.main import main
+from t3mpc_ros.evaluation import comparison
 from t3mpc_ros.evaluation.api.comparison_runs import compare
 from t3mpc_ros.evaluation.api.parameter_sweep import sweep
 from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions
@@ -227,3 +228,22 @@ def test_the_help_without_environment_is_that_of_the_parser():
         for option in options(commands()['demo']).values()
     }
     assert {*re.findall(r'--\w+', text.partition('Runs all')[0])} == {name for name, _ in rows}
+
+
+@pytest.mark.parametrize('option', ['--json', '--html', '--csv'])
+def test_a_folder_as_a_file_is_refused_before_the_runs(option, tmp_path, capsys, monkeypatch):
+    """An hour of runs ended with *Is a directory*."""
+    monkeypatch.setattr(comparison, 'run_plan', lambda *_: pytest.fail('runs were begun'))
+    words = [
+        'compare',
+        '--robot',
+        'servo',
+        '--seeds',
+        '201-202',
+        '--duration',
+        '2',
+        '--methods',
+        'full',
+    ]
+    assert main([*words, option, str(tmp_path)]) == 1
+    assert f'{tmp_path} cannot be written' in capsys.readouterr().err
