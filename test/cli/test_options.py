@@ -234,16 +234,6 @@ def test_the_help_without_environment_is_that_of_the_parser():
 def test_a_folder_as_a_file_is_refused_before_the_runs(option, tmp_path, capsys, monkeypatch):
     """An hour of runs ended with *Is a directory*."""
     monkeypatch.setattr(comparison, 'run_plan', lambda *_: pytest.fail('runs were begun'))
-    words = [
-        'compare',
-        '--robot',
-        'servo',
-        '--seeds',
-        '201-202',
-        '--duration',
-        '2',
-        '--methods',
-        'full',
-    ]
+    words = ['compare', '--robot', 'servo', '--seeds', '201-202', '--methods', 'full']
     assert main([*words, option, str(tmp_path)]) == 1
     assert f'{tmp_path} cannot be written' in capsys.readouterr().err

@@ -140,8 +140,10 @@ def chaos(
             raise ScriptError(f'alpha must be above 0 and at most 1: got {alpha!r}')
         chosen = hyperchaotic_system(orders=tuple(np.broadcast_to(orders, 4).tolist()))
         start = np.array(ReferenceParameters().initial)
-    else:
+    elif isinstance(system, QuadraticSystem):
         chosen, start = system, np.ones(system.size)
+    else:
+        raise ScriptError(f'system must be a QuadraticSystem: got {system!r}')
     initial = start if y0 is None else numbers('y0', y0, f'({chosen.size},)')
     if initial.shape != (chosen.size,):
         raise ScriptError(f'y0 must have the shape ({chosen.size},): got {initial.shape}')

@@ -20,6 +20,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from t3mpc_ros.evaluation import comparison
 from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
@@ -213,7 +215,7 @@ def chosen_cases(cases: str | Sequence[str], scenario: Scenario) -> tuple[str, .
 def checked_seeds(seeds: Any) -> tuple[int, ...]:
     """Return seeds as a tuple, or raise :class:`ScriptError`."""
     try:
-        found = tuple(seeds)
+        found = tuple(int(s) if isinstance(s, np.integer) else s for s in seeds)
     except TypeError:
         raise ScriptError(
             f'seeds must be a list of them, such as [1] or range(1, 6): got {seeds!r}'

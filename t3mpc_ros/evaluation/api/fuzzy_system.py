@@ -14,6 +14,7 @@
 """The fuzzy system alone: ``fuzzy``."""
 
 from collections.abc import Mapping, Sequence
+import math
 from typing import Any
 
 import numpy as np
@@ -104,6 +105,8 @@ class FuzzySystem:
         ridge
             Weight of the squared coefficients, which determines those that no sample does.
         """
+        if not (isinstance(ridge, int | float) and 0.0 <= ridge < math.inf):
+            raise ScriptError(f'ridge must be at least 0: got {ridge!r}')
         points = self._points(inputs)
         wanted = numbers('outputs', outputs, '(n,)')
         if wanted.shape != (len(points),):

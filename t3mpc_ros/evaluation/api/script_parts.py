@@ -105,6 +105,8 @@ class Controller:
         return own
 
     def _packaged(self, robot: str, wanted: str) -> ComparedMethod:
+        if wanted.endswith('.py'):
+            raise ScriptError(f'{wanted} must be followed by what to take of it: {wanted}:NAME')
         known = methods_for(robot)
         (found,) = find_names('controller', [wanted], known)
         require_libraries([found])
@@ -133,7 +135,7 @@ def loaded(spec: str) -> Any:
     functions are sent, no other process finds them.
     """
     if FILE_SEPARATOR not in spec:
-        raise ScriptError(f'must be FILE.py:NAME: got {spec}')
+        raise ScriptError(f'robot must be twin, servo, torque or FILE.py:NAME: got {spec}')
     source = FileController.load(spec)
     found = source.resolve()
     if not is_dataclass(found) or isinstance(found, type):

@@ -28,6 +28,7 @@ import t3mpc_ros as t3
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation import run_digest
 from t3mpc_ros.evaluation.api import parameter_sweep
+from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds
 from t3mpc_ros.evaluation.api.parameter_sweep import make_runs
 from t3mpc_ros.evaluation.cases import LinkFaults
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
@@ -367,6 +368,11 @@ def test_values_that_no_file_holds_are_refused_before_the_runs(tmp_path, counted
             **SHORT,
         )
     assert not counted
+
+
+def test_seeds_may_be_integers_of_numpy():
+    """``np.arange`` was refused: *whole numbers of at least 0: got np.int64(1)*."""
+    assert checked_seeds(np.arange(1, 3)) == (1, 2)
 
 
 def test_a_parameter_that_is_set_twice_is_refused(capsys):

@@ -93,6 +93,15 @@ WRONG = {
         lambda: t3.compare('feed-forward', seeds=5, **SHORT),
         r'seeds must be a list of them, such as \[1\] or range\(1, 6\): got 5',
     ),
+    'a file without a name in it': (
+        lambda: t3.simulate('mine.py', **SHORT),
+        'mine.py must be followed by what to take of it: mine.py:NAME',
+    ),
+    'no system': (lambda: t3.chaos(system=3), 'system must be a QuadraticSystem: got 3'),
+    'no weight': (
+        lambda: t3.fuzzy('x').fit([[0.0]], [1.0], ridge=float('nan')),
+        'ridge must be at least 0: got nan',
+    ),
     'folder of a file': (
         lambda: t3.simulate(plant='servo', duration=4.0).to_csv('/nowhere/at/all.csv'),
         'all.csv cannot be written: give a file in a folder that exists',
