@@ -52,16 +52,22 @@ class Robots:
         self._lagged = np.zeros((2, count))
 
     def move(self, right, left, dt):
-        """Move by these wheel travels (m) in ``dt``."""
-        run = 0.5 * (right + left) + np.zeros_like(self.bias)
-        turn = (right - left) / TRACK + np.zeros_like(self.bias)
-        chord, direction = run * np.sinc(0.5 * turn / math.pi), self.pose[2] + 0.5 * turn
-        self.pose += chord * np.cos(direction), chord * np.sin(direction), turn
-        self.rate = turn / dt
+        """Move by these wheel travels (m) in ``dt``; several rows: each in ``dt``, in turn."""
+        run = np.atleast_2d(0.5 * (right + left) + np.zeros_like(self.bias))
+        turn = np.atleast_2d((right - left) / TRACK + np.zeros_like(self.bias))
+        yaw = self.pose[2] + np.cumsum(turn, axis=0)
+        chord, direction = run * np.sinc(0.5 * turn / math.pi), yaw - 0.5 * turn
+        self.pose[0] += np.sum(chord * np.cos(direction), axis=0)
+        self.pose[1] += np.sum(chord * np.sin(direction), axis=0)
+        self.pose[2] = yaw[-1]
+        # The filter is 1/(1 + p s)², exactly, with a constant rate in each dt.
+        rates, left_over = turn / dt, np.arange(len(turn))[::-1]
+        self.rate = rates[-1]
         decay, share = math.exp(-dt / self._pole), dt / self._pole
-        first, second = self._lagged - self.rate
-        self._lagged[0] = self.rate + first * decay
-        self._lagged[1] = self.rate + (second + first * share) * decay
+        weight = (1.0 - decay) * (1.0 + left_over * share) - decay * share
+        weights = decay**left_over * (np.full(len(turn), 1.0 - decay), weight)
+        first, second = self._lagged * decay ** len(turn)
+        self._lagged = weights @ rates + (first, second + len(turn) * share * first)
 
     def walk_bias(self, dt, drift=PARAMETERS.gyro_bias_drift):
         self.bias += drift * math.sqrt(dt) * self.generator.standard_normal(self.bias.size)
@@ -96,8 +102,7 @@ class Robots:
         paths = RADIUS * 1e-3 * (speeds * grip)[1:]
         for index, (right, left) in enumerate(counts):
             first = index * round(period * 1e3)
-            for path in paths[first : first + round(period * 1e3)]:
-                self.move(*path, 1e-3)
+            self.move(*paths[first : first + round(period * 1e3)].swapaxes(0, 1), 1e-3)
             for odometry, *angle, sample in zip(odometries, right, left, self.gyro(), strict=True):
                 odometry.update(*angle, sample, period)
             yield (index + 1) * period
