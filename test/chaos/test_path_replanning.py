@@ -13,6 +13,7 @@
 # limitations under the License.
 """A path on a map: around obstacles, not over unseen floor, and on to places that are old."""
 
+import functools
 import math
 
 import numpy as np
@@ -228,30 +229,34 @@ def test_old_places_are_visited_again():
     assert shares[1] > 2.0 * shares[0]
 
 
+@functools.cache
+def drive_by(thing, seconds):
+    """Return places from 5 s on, when a robot that drives in a circle is to look at something."""
+    room = Room()
+    room.seen[:] = True
+    room.occupied |= room.near(1.1, 0.2, 0.1)
+    path = planned(circle(0.3).__next__, revisit_distance=0.0)
+    rows = [drive(path, room, 5.0)]
+    if thing:
+        path.look_at(np.array([thing]))
+    rows.append(drive(path, room, seconds))
+    check_limits(np.vstack(rows))
+    return rows[1][:, :2]
+
+
 @pytest.mark.parametrize('thing', [(1.2, 0.8), (-1.4, -0.9), (1.1, 0.2)])
 def test_what_contradicts_the_map_is_looked_at_once_a_minute(thing):
     """A pillar that the map has is at the last place: it is passed where it can be seen."""
-
-    def visits(look, seconds):
-        room = Room()
-        room.seen[:] = True
-        room.occupied |= room.near(1.1, 0.2, 0.1)
-        path = planned(circle(0.3).__next__, revisit_distance=0.0)
-        rows = [drive(path, room, 5.0)]
-        if look:
-            path.look_at(np.array([thing]))
-        rows.append(drive(path, room, seconds))
-        check_limits(np.vstack(rows))
-        near = np.hypot(*(rows[1][:, :2] - thing).T) < 0.5
-        return near, np.flatnonzero(np.diff(near.astype(int)) == 1) * PERIOD
-
-    near, begins = visits(look=True, seconds=90.0)
+    near, without = (
+        np.hypot(*(places - thing).T) < 0.5
+        for places in (drive_by(thing, 90.0), drive_by(None, 30.0))
+    )
+    begins = np.flatnonzero(np.diff(near.astype(int)) == 1) * PERIOD
     assert begins[0] < 25.0
     assert near.sum() * PERIOD > 2.0
     soon = begins[begins < 55.0]
     assert soon[-1] - soon[0] < 10.0  # it passes two places beside it, and then leaves
     assert begins[-1] > 60.0
-    without, _ = visits(look=False, seconds=30.0)
     assert near[: len(without)].sum() > without.sum() + 2.0 / PERIOD
 
 
