@@ -81,11 +81,7 @@ class _Copy:
     """Copy of an array, equal to another one if every bit is."""
 
     def __init__(self, array: np.ndarray) -> None:
-        self._kind, self._bytes, self._array = (
-            (array.dtype, array.shape),
-            array.tobytes(),
-            array.copy(),
-        )
+        self._kind, self._bytes = (array.dtype, array.shape), array.tobytes()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Copy) and (self._kind, self._bytes) == (
@@ -97,15 +93,17 @@ class _Copy:
 
     def unlike(self, other: object) -> list[str]:
         """Return the rows in which two copies differ, or '' for the whole."""
-        if not isinstance(other, _Copy) or self._kind != other._kind or not self._array.ndim:
+        kind, shape = self._kind
+        if not isinstance(other, _Copy) or self._kind != other._kind or not shape:
             return ['']
-        pairs = np.ndenumerate(self._array)
-        found = [
-            ''.join(f'[{k}]' for k in index)
-            for (index, a), b in zip(pairs, other._array.flat, strict=True)
-            if a.tobytes() != b.tobytes()
-        ]
-        return found if len(found) <= SINGLY else ['']
+        mine, its = (
+            np.frombuffer(each._bytes, np.uint8).reshape(*shape, kind.itemsize)
+            for each in (self, other)
+        )
+        found = np.argwhere((mine != its).any(axis=-1)).tolist()
+        if len(found) > SINGLY:
+            return ['']
+        return [''.join(f'[{k}]' for k in index) for index in found]
 
 
 def _parts(thing: Any) -> Iterator[tuple[str, Any]]:
