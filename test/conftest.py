@@ -37,6 +37,10 @@ FIRST = (
     'test_live_page.py',
     'test_node_processes.py',
     'test_live_stop.py',
+    'test_install.py',
+    'test_viewer.py',
+    'test_reference_generator.py',
+    'test_scripts.py',
     'test_launch_files.py',
     'test_readme.py',
 )
