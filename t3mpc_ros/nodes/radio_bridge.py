@@ -125,8 +125,9 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
         try:
             received, reported = b'', ''
             while True:
-                step_ns = self.steady_ns()
                 with self._lock:
+                    # Within the lock: a command of the other thread is not later than this time.
+                    step_ns = self.steady_ns()
                     actions = self._robot.step(step_ns, received)
                     states = self._robot.take_states()
                     done = self._robot.link.state is LinkState.DONE
@@ -211,8 +212,8 @@ class RadioBridgeNode(RobotNode[RadioBridgeParameters]):
 
     def produce_diagnostics(self) -> tuple[bytes, str, Mapping[str, object]]:
         """Return whether the robot follows commands, the reason if not, and the link quality."""
-        now_ns = self.steady_ns()
         with self._lock:
+            now_ns = self.steady_ns()
             state, link = self._robot.advance(now_ns), self._robot.link
             quality = self._robot.quality(now_ns)
             restart, unknown = self._robot.restart(now_ns), self._robot.unknown_travel

@@ -32,6 +32,8 @@ from support.ros_graph import CommandSource, diagnostic, reason, twist
 from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.nodes.radio_bridge import RadioBridgeNode
 from t3mpc_ros.radio.protocol.authentication import KeyFileError
+from t3mpc_ros.robot.command_limiter import CLOCK_JUMPED_BACK
+from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
 
 pytestmark = pytest.mark.ros
 
@@ -166,3 +168,28 @@ def test_commands_are_signed_with_the_key(harness, tmp_path):
         harness.spin_until(lambda: max(plug.robot.speeds) > 2.0, 'the robot drives')
         harness.spin_until(lambda: reason(node) == 'following commands', 'status OK')
         assert diagnostic(node, 'authenticated') is True
+
+
+def test_command_between_two_steps_is_no_clock_that_jumps_back(harness, plug, monkeypatch):
+    """A step had the time before its lock: a command that came first stopped the robot."""
+    node, _, _ = driving(harness, plug)
+    reasons = []
+    monkeypatch.setattr(node, '_log_reason', reasons.append)
+
+    class Contested:
+        """A lock for which each holder has waited for a command of another thread."""
+
+        lock = node._lock
+
+        def __enter__(self):
+            self.lock.acquire()
+            standstill = RobotCommand(ZERO_WHEEL_SPEEDS, node.steady_ns())
+            node._robot.apply(standstill, standstill.stamp_ns)
+
+        def __exit__(self, *error):
+            self.lock.release()
+
+    monkeypatch.setattr(node, '_lock', Contested())
+    reasons += [node.produce_diagnostics()[1] for _ in range(3)]
+    harness.spin_until(lambda: len(reasons) > 10, 'steps of the radio')
+    assert not any(CLOCK_JUMPED_BACK in each for each in reasons)
