@@ -23,6 +23,7 @@ from t3mpc_ros.geometry.types import (
     JUMP,
     NANOSECONDS,
     ORIGIN,
+    UNKNOWN_TWIST,
     BodyTwist,
     Pose,
     State,
@@ -297,6 +298,12 @@ class TwistFactor:
         return factor, math.sqrt(rest / poses)
 
 
+def _was_set(last: State, new: State) -> bool:
+    """Return whether a robot whose twist is zero cannot have driven from one pose to the other."""
+    elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
+    return has_moved(last.pose, new.pose, *(2.0 * elapsed * speed for speed in UNKNOWN_TWIST))
+
+
 class OdometryTwist:
     """The twist of the odometry, or what the change of its pose says where it cannot be right.
 
@@ -345,7 +352,7 @@ class OdometryTwist:
                 return odometry
             linear, angular = odometry.twist
             return odometry._replace(twist=BodyTwist(linear / factor, angular / factor))
-        if self._anchor is None:
+        if self._anchor is None or last is None or restart or _was_set(last, odometry):
             self._anchor = pose
         self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
         if restart or last is None or not self.missing:

@@ -354,6 +354,26 @@ def test_a_message_that_is_not_finite_keeps_the_twist_missing():
     assert found[7:20] + found[21:] == pytest.approx([0.2] * 22)
 
 
+@pytest.mark.parametrize('place', [Pose(0.02, 0.0, 0.0), Pose(0.5, 0.2, 0.0), Pose(0.0, 0.0, 2.9)])
+def test_a_pose_that_is_set_at_rest_is_no_twist_that_is_missing(place):
+    """After ``reset_odometry`` 'odom has no twist' was said, and 'state is diverging'."""
+    twist = OdometryTwist()
+    poses = [place] * 5 + [Pose(0.0, 0.0, 0.0)] * 5
+    for k, pose in enumerate(poses):
+        state = State(k * 10 * MS, pose, STANDSTILL)
+        assert twist.measured(state, restart=k == 0) == state
+    assert not twist.problem()
+
+
+def test_a_pose_that_is_set_in_a_gap_is_no_missing_twist():
+    twist = OdometryTwist()
+    for k in range(10):
+        twist.measured(
+            State(k * 20 * MS, Pose(0.5 * (k < 5), 0.0, 0.0), STANDSTILL), restart=k == 5
+        )
+    assert not twist.missing
+
+
 # -- a twist that does not fit to the pose --------------------------------------------------------
 
 
