@@ -30,6 +30,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, Array, Pose, State
 from t3mpc_ros.localization.change_detection import Change, ChangeKind
 from t3mpc_ros.localization.localizer import (
+    LONGEST_SILENCE,
     Localization,
     Localizer,
     LocalizerParameters,
@@ -154,6 +155,7 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         self._updates = 0
         self._shown_changes: tuple[Change, ...] = ()
         self._odometry_ns = 0
+        self._odometry_used_ns = self.steady_ns()
         self._map_frame = parameters.frames.prefixed(parameters.global_frame_id, namespace)
         self._odometry_frame = parameters.frames.prefixed(parameters.odom_frame_id, namespace)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, 'pose', qos.LATCHED)
@@ -243,6 +245,8 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
             # Readings belong to the pose before this one, during which they arrived.
             self._take_readings()
             self._odometry_ns = state.stamp_ns
+            if state.is_finite():
+                self._odometry_used_ns = self.steady_ns()
             self._publish_filtered(state)  # first: a controller waits for it
             if self._localizer.add_odometry(state.stamp_ns, state.pose):
                 self._updates += 1
@@ -409,7 +413,13 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
             values |= {'x_std_m': x, 'y_std_m': y, 'yaw_std_rad': yaw}
         state, texts = localizer.state, [localizer.state.value]
         known = state is Localization.LOCALIZED
-        if localizer.silent:
+        silence = (self.steady_ns() - self._odometry_used_ns) / NANOSECONDS
+        if silence > LONGEST_SILENCE:
+            texts.append(
+                f'no odometry that is finite on {self.resolve_topic_name("odom")} '
+                f'for {silence:.0f} s: the pose is an old one; check its publisher'
+            )
+        elif localizer.silent:
             topic = self.parameters.scan_topic or 'range/*'
             reason = f' ({self._rejection})' if self._rejection else ''
             texts.append(

@@ -131,6 +131,23 @@ def test_readings_that_are_not_used_are_named(harness, scan):
     assert reason(node) == Localization.LOCALIZED.value
 
 
+def test_odometry_that_ends_or_is_not_finite_is_named(harness, monkeypatch):
+    """The robot drove on, and 'the place is known' was said of where it had been."""
+    node = harness.add(LocalizerNode, world='room', **START)
+    robot = Robot(harness)
+    robot.step(node)
+    begin_ns, later = node.steady_ns(), 2.0
+    monkeypatch.setattr(node, 'steady_ns', lambda: begin_ns + round(later * NANOSECONDS))
+    assert reason(node) == Localization.LOCALIZED.value
+    later = 5.0
+    robot.step(node, travel=math.nan)
+    assert diagnostic_level(node) == WARN
+    assert 'no odometry that is finite on /odom for 5 s' in reason(node)
+    robot.travel = 0.03
+    robot.step(node)
+    assert reason(node) == Localization.LOCALIZED.value
+
+
 def test_an_impossible_scan_is_rejected_with_its_field(harness, logged):
     node = harness.add(LocalizerNode, world='room', scan_topic='scan', **START)
     robot = Robot(harness, 'scan')
