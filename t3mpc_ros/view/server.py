@@ -31,7 +31,7 @@ import json
 import math
 from pathlib import Path
 import secrets
-from threading import Thread
+from threading import Lock, Thread
 from typing import Any, Self
 from urllib.parse import parse_qs, urlsplit
 
@@ -96,6 +96,7 @@ class PageServer:
         self.token = secrets.token_urlsafe(24)
         self._texts: tuple[Cursor, dict[Cursor, str]] = Cursor(), {}
         """Newest change, and what was sent since then, by the cursor of the page."""
+        self._encoding = Lock()
         try:
             self._server = _Server((ADDRESS, port), self)
         except OSError as error:
@@ -111,16 +112,18 @@ class PageServer:
         """Return what has changed since the cursor in JSON, without the final bracket.
 
         Pages that ask between the same two changes get one text: most of the cost is its encoding.
+        One thread encodes at a time: many would leave no time to the thread that executes a stop.
         """
-        newest, texts = self._texts
-        if newest != (present := self.data.newest()):
-            newest, texts = self._texts = present, {}
-        if (text := texts.get(cursor)) is None:
-            changes, end = self.data.read(cursor)
-            changes['id'] = f'{self.token[:8]}-{end.change}-{end.fact}'
-            text = json.dumps(changes, separators=(',', ':'), allow_nan=False)[:-1]
-            texts[cursor] = text
-        return text
+        with self._encoding:
+            newest, texts = self._texts
+            if newest != (present := self.data.newest()):
+                newest, texts = self._texts = present, {}
+            if (text := texts.get(cursor)) is None:
+                changes, end = self.data.read(cursor)
+                changes['id'] = f'{self.token[:8]}-{end.change}-{end.fact}'
+                text = json.dumps(changes, separators=(',', ':'), allow_nan=False)[:-1]
+                texts[cursor] = text
+            return text
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -225,7 +228,7 @@ class _Handler(BaseHTTPRequestHandler):
         origin = self.headers.get('Origin', f'http://{self.headers["Host"]}')
         if origin != f'http://{self.headers["Host"]}':
             raise RefusedError(HTTPStatus.FORBIDDEN, f'commands from {origin} are refused')
-        if not hmac.compare_digest(self.headers.get('X-Token', ''), page.token):
+        if not hmac.compare_digest(self.headers.get('X-Token', '').encode(), page.token.encode()):
             raise RefusedError(
                 HTTPStatus.FORBIDDEN, 'the token is not that of this start: load the page again'
             )

@@ -19,11 +19,12 @@ import json
 import math
 import re
 import socket
+import threading
 import time
 
 import pytest
 
-from t3mpc_ros.view.live_data import LiveData
+from t3mpc_ros.view.live_data import Cursor, LiveData
 from t3mpc_ros.view.server import ADDRESS, MAX_BODY, PageServer
 
 
@@ -105,6 +106,7 @@ def test_a_command_of_the_page_is_executed(page):
         ({'origin': 'null'}, 403, 'commands from null'),
         ({'x_token': ''}, 403, 'load the page again'),
         ({'x_token': 'x' * 32}, 403, 'load the page again'),
+        ({'x_token': 'é'}, 403, 'load the page again'),
         ({'content_length': str(MAX_BODY + 1)}, 413, f'at most {MAX_BODY} bytes'),
         ({'content_length': '-1'}, 413, 'at most'),
     ],
@@ -183,6 +185,26 @@ def test_pages_that_share_answers_get_every_change_once(page):
         ask(reader)
         assert reader['events'] == [str(k) for k in range(0, 12, 2)]
         assert reader['facts'][-1] == 11
+
+
+def test_pages_that_load_at_once_are_encoded_one_by_one(page, monkeypatch):
+    """Ten pages that were loaded again and again kept a stop from being executed for 3 s."""
+    data, at_once = page.server.data, []
+    read, guard = data.read, threading.Semaphore(1)
+
+    def contested(cursor):
+        at_once.append(not guard.acquire(blocking=False))
+        time.sleep(0.01)  # another thread may begin
+        guard.release()
+        return read(cursor)
+
+    monkeypatch.setattr(data, 'read', contested)
+    loads = [threading.Thread(target=page.server.news, args=(Cursor(k),)) for k in range(5)]
+    for each in loads:
+        each.start()
+    for each in loads:
+        each.join()
+    assert at_once == [False] * 5
 
 
 def test_an_answer_without_news_comes_at_once_with_the_time(page):
