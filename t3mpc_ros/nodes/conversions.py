@@ -130,6 +130,36 @@ def frame_from_serialized(data: bytes) -> str:
     return data[16 : 15 + length].decode(errors='replace')
 
 
+def points_from_path(data: bytes) -> Array:
+    """Return the positions in a serialized path, m, shape (n, 2); struct.error if it is truncated.
+
+    To construct the message takes seconds for a long path, in which the node does nothing else.
+    """
+    order = '<' if data[1] & 1 else '>'
+    (length,) = struct.unpack_from(f'{order}I', data, 12)
+    start = 16 + length + -length % 4
+    (count,) = struct.unpack_from(f'{order}I', data, start)
+    start += 4
+    points: list[tuple[float, float]] = []
+    while len(points) < count:
+        (length,) = struct.unpack_from(f'{order}I', data, start + 8)
+        place = start + 12 + length
+        place += (4 - place) % 8
+        points.append(struct.unpack_from(f'{order}2d40x', data, place))
+        start, rest = place + 56, count - len(points)
+        if len(points) == 1 and rest:
+            # From the second pose on, poses are equally long if the names of their frames are.
+            size = 12 + length + (4 - length) % 8 + 56
+            if len(data) >= start + rest * size:
+                lengths = np.ndarray(rest, f'{order}u4', data, start + 8, size)
+                if (lengths == length).all():
+                    places = np.ndarray(
+                        (rest, 2), f'{order}f8', data, start + size - 56, (size, 8)
+                    )
+                    return np.vstack([points, places]).astype(np.float64)
+    return np.array(points, dtype=np.float64).reshape(-1, 2)
+
+
 def twist_from_serialized(data: bytes) -> BodyTwist:
     """Return :func:`body_twist` of a serialized Twist; struct.error if it is truncated."""
     order = '<' if data[1] & 1 else '>'

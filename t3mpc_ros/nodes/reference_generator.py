@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 import secrets
+import struct
 from typing import Any, ClassVar
 
 from geometry_msgs.msg import PoseArray, PoseStamped, Twist, TwistStamped
@@ -208,9 +209,9 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         if parameters.source == 'topic':
             # A volatile subscription receives from every publisher, but not what a latched one has
             # published before; only a transient-local one does, and only from those.
-            self.create_matching_subscription(Path, 'path', self._on_path, qos.LATEST)
+            self.create_matching_subscription(Path, 'path', self._on_path, qos.LATEST, raw=True)
             if qos.overriding_options(self, 'path', 'subscription') is None:
-                MatchingSubscription(self, Path, 'path', self._on_path, qos.LATCHED)
+                MatchingSubscription(self, Path, 'path', self._on_path, qos.LATCHED, raw=True)
             self._path_stamps: deque[int] = deque(maxlen=8)
             self._transforms = self._make_transform_buffer()
         elif parameters.plan.enabled:
@@ -283,17 +284,16 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         self._transform_listener = tf2_ros.TransformListener(buffer, self)
         return buffer
 
-    def _on_path(self, message: Path, info: dict[str, Any]) -> None:
+    def _on_path(self, message: bytes, info: dict[str, Any]) -> None:
         stamp = int(info['source_timestamp'])
         if stamp and stamp in self._path_stamps:
             return  # both subscriptions receive it
         self._path_stamps.append(stamp)
         try:
             points = self._own_points(
-                message.header.frame_id,
-                conversions.points_from_poses([each.pose for each in message.poses]),
+                conversions.frame_from_serialized(message), conversions.points_from_path(message)
             )
-        except PathError as error:
+        except (PathError, struct.error) as error:
             self._reject('path', error)
             return
         self._ended = ''
@@ -304,7 +304,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         else:
             self._source.replace(points)
 
-    def _reject(self, topic: str, error: ValueError) -> None:
+    def _reject(self, topic: str, error: Exception) -> None:
         self._rejected += 1
         self.get_logger().warning(f'{topic} is ignored: {error}')
 

@@ -15,9 +15,10 @@
 
 import math
 import struct
+import time
 
-from geometry_msgs.msg import Quaternion, Twist, TwistStamped
-from nav_msgs.msg import Odometry
+from geometry_msgs.msg import PoseStamped, Quaternion, Twist, TwistStamped
+from nav_msgs.msg import Odometry, Path
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
@@ -103,6 +104,45 @@ def test_odometry_is_written_and_read_whatever_its_frames(frame, child):
         assert back.pose == pytest.approx(motion.pose, abs=1e-14)
     with pytest.raises(struct.error):
         conversions.state_from_odometry(serialize_message(message)[:-350])
+
+
+def path_message(places, frame, frames):
+    """Return a path whose poses have the frames in turn."""
+    message = Path()
+    message.header.frame_id = frame
+    for k, (x, y) in enumerate(places):
+        pose = PoseStamped()
+        pose.header.frame_id = frames[k % len(frames)]
+        pose.pose.position.x, pose.pose.position.y = x, y
+        message.poses.append(pose)
+    return message
+
+
+@pytest.mark.parametrize('length', range(9))
+@pytest.mark.parametrize('frames', [('',), ('odom',), ('odom', 'map'), ('a', '', 'base_link')])
+def test_points_of_a_path_are_read_whatever_its_frames(length, frames):
+    for count in (0, 1, 2, 7):
+        places = [(0.1 * k, -0.3 * k) for k in range(count)]
+        data = serialize_message(path_message(places, 'f' * length, frames))
+        assert conversions.points_from_path(data).tolist() == [list(each) for each in places]
+        with pytest.raises(struct.error):
+            conversions.points_from_path(data[: 60 * count + 10])
+
+
+def test_a_long_path_leaves_the_node_its_time():
+    """200 000 points took 8 s, in which no reference was published."""
+    one, two = (
+        serialize_message(path_message([(1.0, 2.0)] * count, 'odom', ('odom',)))
+        for count in (1, 2)
+    )
+    count = 200_000
+    data = bytearray(one + count * two[len(one) :])
+    data[len(one) - 84 : len(one) - 80] = struct.pack('<I', count)
+    begin = time.thread_time()
+    points = conversions.points_from_path(bytes(data))
+    assert time.thread_time() - begin < 0.2
+    assert points.shape == (count, 2)
+    assert (points == (1.0, 2.0)).all()
 
 
 def test_big_endian_odometry_is_read():
