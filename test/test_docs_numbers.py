@@ -49,6 +49,10 @@ def _runs():
         return list(csv.DictReader(file))
 
 
+BY_PROCESSOR = '1b0643c', 'c63e1f4', '7f990c2'
+"""Commits of rows that were made when the exponentials of NumPy made the reference of a seed."""
+
+
 @cache
 def _values(robot, case, controller, metric):
     """Return a metric of the runs of the file, in the order of their seeds."""
@@ -196,7 +200,10 @@ def test_the_sentences_of_the_results_are_those_of_the_runs():
 @pytest.mark.long
 def test_runs_of_the_file_made_anew_have_its_digits():
     """Eight of them, drawn; the file is as long as an hour of runs."""
-    chosen = random.Random(33).sample(_runs(), 8)
+    rows = [row for row in _runs() if row['commit'] not in BY_PROCESSOR]
+    if not rows:
+        pytest.skip('all rows were made when the reference of a seed depended on the processor')
+    chosen = random.Random(33).sample(rows, min(8, len(rows)))
     for row in chosen:
         scenario = Scenario(
             row['robot'],

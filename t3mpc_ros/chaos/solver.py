@@ -45,7 +45,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.chaos.sum_of_exponentials import fit_sum_of_exponentials
+from t3mpc_ros.chaos.sum_of_exponentials import exp, expm1, fit_sum_of_exponentials
 from t3mpc_ros.chaos.system import QuadraticSystem, Terms, right_hand_side
 from t3mpc_ros.kernels import kernel
 
@@ -63,8 +63,8 @@ def mode_weights(
     """
     small = decay < 0.5
     a = np.where(small, 1.0, decay)
-    older = (-np.expm1(-a) - a * np.exp(-a)) / a**2
-    newer = (a + np.expm1(-a)) / a**2
+    older = (-expm1(-a) - a * exp(-a)) / a**2
+    newer = (a + expm1(-a)) / a**2
     a = np.where(small, decay, 0.0)
     older_series = np.zeros_like(a)
     newer_series = np.zeros_like(a)
@@ -167,7 +167,7 @@ class FractionalSolver:
             used = each.rates.size
             older, newer = mode_weights(each.rates * step)
             self._rates[state, :used] = each.rates
-            self._decays[state, :used] = np.exp(-each.rates * step)
+            self._decays[state, :used] = exp(-each.rates * step)
             self._older[state, :used] = each.weights * step * older
             self._newer[state, :used] = each.weights * step * newer
             self._local[:, state] = (

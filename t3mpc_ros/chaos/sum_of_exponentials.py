@@ -46,6 +46,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+exp, expm1 = (np.vectorize(each, otypes=[np.float64]) for each in (math.exp, math.expm1))
+"""Of the C library. Those of NumPy differ in the last bit between kinds of processors, and within
+seconds one bit makes another reference of a seed."""
+
 
 @dataclass(frozen=True)
 class SumOfExponentials:
@@ -123,8 +127,8 @@ def _sample_kernel(
     # Geometric series over x[0] - w, x[0] - 2w, ... of the weights and of weight times rate.
     weight = scale * math.exp(beta * x[0]) / math.expm1(beta * spacing)
     moment = scale * math.exp((1.0 + beta) * x[0]) / math.expm1((1.0 + beta) * spacing)
-    rates = np.concatenate(([moment / weight], np.exp(x)))
-    weights = np.concatenate(([weight], scale * np.exp(beta * x)))
+    rates = np.concatenate(([moment / weight], exp(x)))
+    weights = np.concatenate(([weight], scale * exp(beta * x)))
     return SumOfExponentials(
         rates, weights, _measure_error(order, shortest, horizon, rates, weights)
     )
