@@ -657,16 +657,21 @@ def learn_block(constants: BodyConstants, state: BodyState) -> None:
     time = memory.block_time
     for j in range(GYRO_SCALE):
         row[j] = state.sums[j] / time
-    row[GYRO_SCALE], row[BIAS] = memory.achieved_sum / time, 1.0
-    row[DELAY] = memory.rise / time
-    error = row[GYRO_SCALE] - row[TURNING]
+    row[BIAS], row[DELAY] = 1.0, memory.rise / time
+    achieved, turn = memory.achieved_sum / time, row[TURNING]
+    for j in range(ROWS):
+        if j != GYRO_SCALE:
+            turn += row[j] * state.estimate[j]
+    # w_a as E20 predicts it: the noise of the measured one would be taken for its scale.
+    row[GYRO_SCALE] = turn / (1.0 - state.estimate[GYRO_SCALE])
+    error = achieved - row[TURNING]
     for j in (GYRO_SCALE, BIAS, DELAY):
         error -= row[j] * state.estimate[j]
     residual = error
     for j in range(GYRO_SCALE):
         residual -= row[j] * state.estimate[j]
     share = time / SKILL_TIME
-    memory.raw_power += share * ((row[GYRO_SCALE] - row[TURNING]) ** 2 - memory.raw_power)
+    memory.raw_power += share * ((achieved - row[TURNING]) ** 2 - memory.raw_power)
     memory.command_power += share * (memory.square_sum / time - memory.command_power)
     if memory.spoilt:
         update_authority(memory)
