@@ -352,9 +352,14 @@ class OdometryTwist:
                 return odometry
             linear, angular = odometry.twist
             return odometry._replace(twist=BodyTwist(linear / factor, angular / factor))
-        if self._anchor is None or last is None or restart or _was_set(last, odometry):
+        if last is None or restart or self._anchor is None:
             self._anchor = pose
-        self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
+        elif _was_set(last, odometry):
+            self._anchor = (
+                None  # that of the next message: this one may be the only one so far off
+            )
+        if self._anchor is not None:
+            self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
         if restart or last is None or not self.missing:
             return odometry
         elapsed = (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS

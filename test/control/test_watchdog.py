@@ -365,6 +365,13 @@ def test_a_pose_that_is_set_at_rest_is_no_twist_that_is_missing(place):
     assert not twist.problem()
 
 
+def test_one_pose_that_is_far_off_is_no_missing_twist():
+    twist = OdometryTwist()
+    for k, x in enumerate([0.0] * 5 + [0.0105] + [0.001] * 5):
+        twist.measured(State(k * 10 * MS, Pose(x, 0.0, 0.0), STANDSTILL), restart=k == 0)
+    assert not twist.missing
+
+
 def test_a_pose_that_is_set_in_a_gap_is_no_missing_twist():
     twist = OdometryTwist()
     for k in range(10):

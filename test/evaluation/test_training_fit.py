@@ -491,8 +491,7 @@ def test_training_on_the_command_line(tmp_path, capsys):
     defaults = ProposedParameters().to_dict()
     newer = made['parameters'].keys() - header['parameters']
     header['parameters'] |= {name: defaults[name] for name in newer}
-    # It was made by an earlier version.
-    assert (header.pop('version'), made.pop('version')) == ('0.1.0', VERSION)
+    assert (header.pop('version'), made.pop('version')) == ('0.2.0', VERSION)
     assert header == made
     assert set(load_model(packaged)) == set(loaded)
     for name, values in load_model(packaged).items():
