@@ -224,6 +224,9 @@ TWIST_MEMORY = 1.0 - 1.0 / 60.0
 """Forgetting factor of a comparison: 30 s."""
 TWIST_TOLERANCE, TWIST_CERTAIN = 0.05, 4.0
 """Deviation of the factor between twist and pose that counts, and its standard deviations."""
+TOGETHER = 0.9
+"""Squared correlation of twist and change of the pose from which there is one factor: a pose that
+was set by less than a jump, while the robot was slow, leaves 0.55."""
 SIDEWAYS = 0.2
 """Share of the way by which a pose may go aside: the cosine of such an angle is tolerable."""
 
@@ -286,6 +289,8 @@ class TwistFactor:
         least = max(TWIST_TOLERANCE, TWIST_CERTAIN * spread)
         # After the yaw was set, the robot goes aside by its pose, and its way ahead is shorter.
         apart |= self._aside > SIDEWAYS**2 * self._sums[0][0]
+        poses, products, twists = self._sums[0]
+        apart |= products**2 < TOGETHER * poses * twists
         self.value = linear if abs(linear - 1.0) > least and linear > 0.0 and not apart else 1.0
 
     def _fit(self, axis: int) -> tuple[float, float]:

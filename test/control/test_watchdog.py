@@ -460,6 +460,18 @@ def test_a_jump_of_the_pose_is_no_factor():
     assert not twist.replaced
 
 
+@pytest.mark.parametrize('step', [-0.09, 0.05, 0.09])
+@pytest.mark.parametrize('speed', [0.01, 0.03])
+def test_a_slow_robot_whose_pose_is_set_has_no_factor(speed, step):
+    """Its speed was taken for up to thirteen times what it was, in the state *tracking*."""
+    _, used = twists_of(
+        lambda time: (speed, 0.0),
+        seconds=60.0,
+        moved=lambda k, pose: Pose(pose.x + step * (k >= 600), pose.y, pose.yaw),
+    )
+    assert (used[:, 0] == speed).all()
+
+
 @pytest.mark.parametrize('drive', list(DRIVES))
 @pytest.mark.parametrize('angle', [-0.5, 0.3, 1.5])
 def test_a_yaw_that_was_set_is_no_factor(drive, angle):
