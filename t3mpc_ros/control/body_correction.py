@@ -662,14 +662,12 @@ def learn_block(constants: BodyConstants, state: BodyState) -> None:
     for j in range(ROWS):
         if j != GYRO_SCALE:
             turn += row[j] * state.estimate[j]
-    # w_a as E20 predicts it: the noise of the measured one would be taken for its scale.
-    row[GYRO_SCALE] = turn / (1.0 - state.estimate[GYRO_SCALE])
-    error = achieved - row[TURNING]
-    for j in (GYRO_SCALE, BIAS, DELAY):
-        error -= row[j] * state.estimate[j]
-    residual = error
+    residual = achieved - state.estimate[GYRO_SCALE] * achieved - turn
+    # As E20 predicts it, not w_a: the noise of that would be taken for its scale.
+    row[GYRO_SCALE] = turn
+    error = residual
     for j in range(GYRO_SCALE):
-        residual -= row[j] * state.estimate[j]
+        error += row[j] * state.estimate[j]
     share = time / SKILL_TIME
     memory.raw_power += share * ((achieved - row[TURNING]) ** 2 - memory.raw_power)
     memory.command_power += share * (memory.square_sum / time - memory.command_power)

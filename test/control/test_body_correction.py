@@ -441,6 +441,16 @@ def test_noise_of_the_yaw_is_no_scale_of_the_gyro(noise):
     assert 'scale of the gyro' not in body.correction.problem()
 
 
+@pytest.mark.parametrize('scale', [-1.0, 0.0, 0.5, 1.5, 2.0, 5.0])
+def test_no_scale_of_a_gyro_leaves_the_bounds(scale):
+    """With the largest tolerance and a scale of 2 the bias once was 1e12 rad/s."""
+    body = Body(exact, gyro_scale_tolerance=0.5)
+    body.scale = scale
+    for _ in range(60):
+        body.run(2.0)
+        assert np.abs(body.correction.estimate).max() < 2.0
+
+
 @pytest.mark.parametrize('noise, step', [(0.5, 0.0), (5.0, 0.1)])
 def test_noise_above_the_changes_is_no_lost_command(noise, step):
     """With the yaw of a camera a good drive was "the yaw rate does not follow the changes".
