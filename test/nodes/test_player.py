@@ -413,8 +413,10 @@ class Terminal:
         wait_until(condition, lambda: f'it shows {self.text!r}', step=self._read)
 
     def _read(self):
-        if select.select([self.master], [], [], 0.05)[0]:
+        ready = select.select([self.master], [], [], 0.05)[0]
+        if ready:
             self.text += os.read(self.master, 4096).decode()
+        return bool(ready)
 
     def press(self, keys):
         os.write(self.master, keys)
@@ -424,6 +426,8 @@ class Terminal:
 
     def wait(self):
         self._wait_until(lambda: self.process.poll() is not None)
+        while self._read():  # what it wrote between the last look and its end
+            pass
         return self.process.returncode
 
     def close(self):
