@@ -372,7 +372,7 @@ class InputMonitor:
         if len(self._jumps_ns) >= MANY_JUMPS:
             found.append(
                 f'the pose in odom has jumped {len(self._jumps_ns)} times in the last {RECENT:g} '
-                f's, the last time by {self._jump[0]:.2f} m and {self._jump[1]:.2f} rad: look for '
+                f's, the last time by {self._jump[0]:.4g} m and {self._jump[1]:.3g} rad: look for '
                 'a second publisher, other units than metres and radians, a localisation that '
                 'alternates between two places'
             )

@@ -94,7 +94,12 @@ def quaternion_from_yaw(yaw: float) -> Quaternion:
 
 
 def yaw_from_quaternion(x: float, y: float, z: float, w: float) -> float:
-    """Return the yaw (rad) of a rotation with any roll and pitch; NaN if not finite."""
+    """Return the yaw (rad) of a rotation with any roll and pitch; NaN if not finite, or of zeros.
+
+    Zeros are no rotation: a driver that leaves them knows no yaw.
+    """
+    if not (x or y or z or w):
+        return math.nan
     # Products, not powers, which raise OverflowError.
     sine = 2.0 * (w * z + x * y)
     cosine = 1.0 - 2.0 * (y * y + z * z)

@@ -72,6 +72,8 @@ PATH_PERIOD = 0.1
 """Time between the poses of ``reference/path``, s."""
 BATTERY_TIMEOUT = 30.0
 """Time without a voltage of the battery that is reported, s: some robots send one every 10 s."""
+REFUSAL_SHOWN_NS = 30 * NANOSECONDS
+"""Time for which the diagnostics say why an input was refused, unless one is taken before."""
 SEED_BITS = 128
 """Length of a secret seed."""
 FRAMES_THAT_JUMP = 'map', 'earth'
@@ -154,6 +156,8 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         self._ended = ''
         """How that ended a path that was under way."""
         self._rejected = 0
+        self._refused: dict[str, tuple[int, str]] = {}
+        """When (ns) the last message of an input was refused, and why, by topic."""
         self._mapped = not parameters.plan.enabled
         """Whether the path needs no map, or has one."""
         if parameters.source == 'signals':
@@ -163,7 +167,11 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             self._sample: ReferenceSample | None = None
             self._ramp = PauseRamp(parameters.motion, parameters.geometry, 1.0 / parameters.rate)
         else:
-            self._make_source(ORIGIN).advance()
+            source = self._make_source(ORIGIN)
+            if isinstance(source, GivenPathSource) and not source.under_way:
+                # Load what a path needs here: the first one held up the reference for a second.
+                source.append(np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.3]]))
+            source.advance()
             self._subscribe()
         self._scheduler = SampleScheduler(parameters.rate, slack=0.2 / parameters.rate)
         self._lead_ns = round(parameters.lead * NANOSECONDS)
@@ -260,7 +268,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         """
         source = self.parameters.source
         distance, angle = difference(last, pose)
-        text = f'odom has jumped by {distance:.2f} m and {angle:.2f} rad: {AFTER_JUMP[source]}'
+        text = f'odom has jumped by {distance:.4g} m and {angle:.3g} rad: {AFTER_JUMP[source]}'
         if isinstance(self._source, GivenPathSource) and self._source.under_way:
             self._ended = text
         self.get_logger().warning(text, throttle_duration_sec=5.0)
@@ -297,6 +305,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             self._reject('path', error)
             return
         self._ended = ''
+        self._refused.pop('path', None)
         if not isinstance(self._source, GivenPathSource):
             self._points = points  # the robot has not reported where it is
         elif self.parameters.path_mode == 'append':
@@ -306,6 +315,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
 
     def _reject(self, topic: str, error: Exception) -> None:
         self._rejected += 1
+        self._refused[topic] = self.steady_ns(), f'the last {topic} is ignored: {error}'
         self.get_logger().warning(f'{topic} is ignored: {error}')
 
     def _own_points(self, frame: str, points: Array) -> Array:
@@ -335,6 +345,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             return
         if self._planned is not None:
             self._mapped = True
+            self._refused.pop('keep_out/map', None)
             self._planned.set_map(grid)
 
     def _on_goal(self, message: PoseStamped, info: dict[str, Any]) -> None:
@@ -348,6 +359,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         except PathError as error:
             self._reject('goal_pose', error)
             return
+        self._refused.pop('goal_pose', None)
         self._planned.go_to((x, y))
 
     def _on_suspected(self, message: PoseArray, info: dict[str, Any]) -> None:
@@ -358,6 +370,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         except PathError as error:
             self._reject('map_changes/suspected', error)
             return
+        self._refused.pop('map_changes/suspected', None)
         if self._planned is not None:
             self._planned.look_at(places)
 
@@ -472,11 +485,12 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         return OK, 'paused' if self._paused else 'running', values
 
     def warnings(self) -> list[str]:
-        """Return that no way to a goal is known, and that nothing tells whether to charge."""
+        """Return what was refused last, goals without a way, and a battery that is not known."""
         planned, charging = self._planned, self.parameters.plan.charging
+        since_ns = self.steady_ns() - REFUSAL_SHOWN_NS
+        found = [text for at_ns, text in self._refused.values() if at_ns > since_ns]
         if planned is None:
-            return []
-        found = []
+            return found
         if goal := planned.plan.unreachable_goal:
             name = 'charging place' if planned.charging else 'goal'
             found.append(

@@ -37,6 +37,12 @@ TYPE_PATIENCE = 2.0
 BATTERY_RATE = 1.0
 """Rate of ``battery_state``, Hz."""
 
+UNCONFIRMED = (
+    'not confirmed by the robot: {}. The stop is latched in the node and sent until the robot '
+    'answers; cut the power if its wheels turn'
+)
+"""Answer to an emergency stop that does not reach the robot now."""
+
 P = TypeVar('P', bound=RobotTopicParameters)
 
 
@@ -159,8 +165,8 @@ class RobotNode(BaseNode[P]):
         with self._lock:
             if not on:
                 return self._robot.release_estop(self.robot_ns()), 'emergency stop released'
-            self._robot.latch_estop('requested by service e_stop', self.robot_ns())
-        return '', 'emergency stop latched'
+            silence = self._robot.latch_estop('requested by service e_stop', self.robot_ns())
+        return UNCONFIRMED.format(silence) if silence else '', 'emergency stop latched'
 
     def _log_reason(self, reason: str) -> None:
         if reason != self._logged_reason:

@@ -27,7 +27,7 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parame
 from t3mpc_ros.radio.link.link import Link
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState, PortAction
-from t3mpc_ros.radio.link.standstill_reasons import ANSWERS_AGAIN, restarted
+from t3mpc_ros.radio.link.standstill_reasons import ANSWERS_AGAIN, ROBOT_SILENT, restarted
 from t3mpc_ros.radio.link.statistics import LinkQuality
 from t3mpc_ros.radio.link.telemetry import Telemetry
 from t3mpc_ros.robot import interface
@@ -157,8 +157,9 @@ class RadioRobot(interface.RobotInterface):
 
     def reason(self, now_ns: int) -> str:
         """Return why the robot does not follow commands; empty when it does."""
-        if self.link.state is not LinkState.RUN:
-            return self.link.reason(now_ns)
+        # First what is between host and robot: a stop of the host may not have arrived.
+        if not self._answers(now_ns):
+            return self.link.reason(now_ns) or ROBOT_SILENT
         return self._limiter.reason or self.link.reason(now_ns)
 
     def restart(self, now_ns: int) -> str:
@@ -203,10 +204,12 @@ class RadioRobot(interface.RobotInterface):
         )
         return ''
 
-    def latch_estop(self, reason: str, now_ns: int) -> None:
-        """Latch the emergency stop of host and robot."""
+    def latch_estop(self, reason: str, now_ns: int) -> str:
+        """Latch the emergency stop of host and robot; return why the robot does not get it."""
+        why = '' if self._answers(now_ns) else self.reason(now_ns)
         self._limiter.latch(reason, now_ns)
         self.link.latch_estop(reason)
+        return why
 
     def release_estop(self, now_ns: int) -> str:
         """Release the emergency stop of host and robot."""
@@ -214,6 +217,9 @@ class RadioRobot(interface.RobotInterface):
         return robot_error if host_error else ''
 
     # -- internal ---------------------------------------------------------------------------------
+
+    def _answers(self, now_ns: int) -> bool:
+        return self.link.state is LinkState.RUN and not self.link.is_silent(now_ns)
 
     def _send_command(self, now_ns: int) -> None:
         """Pass the limited command to the link, once per cycle."""

@@ -135,8 +135,11 @@ class RobotInterface(Protocol):
     def reset_odometry(self, now_ns: int) -> str:
         """Set the odometry pose to the origin; rejected while the robot moves."""
 
-    def latch_estop(self, reason: str, now_ns: int) -> None:
-        """Stop until the emergency stop is released."""
+    def latch_estop(self, reason: str, now_ns: int) -> str:
+        """Stop until the emergency stop is released.
+
+        Return why a robot has not got it yet; it is sent to it again until it has.
+        """
 
     def release_estop(self, now_ns: int) -> str:
         """Release the emergency stop; the robot then waits for a new command."""

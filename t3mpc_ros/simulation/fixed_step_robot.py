@@ -104,9 +104,10 @@ class FixedStepRobot(RobotInterface, ABC, Generic[S]):
         self._refresh_state()
         return ''
 
-    def latch_estop(self, reason: str, now_ns: int) -> None:
-        """Stop until :meth:`release_estop`."""
+    def latch_estop(self, reason: str, now_ns: int) -> str:
+        """Stop until :meth:`release_estop`; the robot has it at once."""
         self._limiter.latch(reason, self._run_to(now_ns))
+        return ''
 
     def release_estop(self, now_ns: int) -> str:
         """Release the emergency stop; the robot then waits for a new command."""

@@ -188,6 +188,14 @@ def test_yaw_survives_the_conversion_to_a_quaternion():
             assert abs(wrap_angle(yaw_of(same) - yaw)) < (1e-13 if abs(yaw) > 4.0 else 4e-15)
 
 
+def test_a_quaternion_of_zeros_is_no_yaw():
+    """A driver that left it so was taken to look along x for ever."""
+    message = message_of(State(0, Pose(1.0, 2.0, 0.5), BodyTwist(0.1, 0.0)))
+    message.pose.pose.orientation = Quaternion(x=0.0, y=0.0, z=0.0, w=0.0)
+    assert math.isnan(from_odometry(message).pose.yaw)
+    assert not from_odometry(message).is_finite()
+
+
 def test_roll_and_pitch_do_not_change_the_yaw():
     generator = np.random.default_rng(6)
     for _ in range(100):

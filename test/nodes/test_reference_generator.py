@@ -295,6 +295,9 @@ def test_a_path_in_another_frame_needs_a_transform(harness, logged, monkeypatch)
         planner.publish(message)
         harness.spin_until(lambda count=count: diagnostic(drive.node, 'rejected_inputs') == count)
         assert any(text in line for line in logged('path is ignored'))
+        (warning,) = drive.node.warnings()  # it was in the log only
+        assert warning.startswith('the last path is ignored')
+        assert text in warning
     assert speed(drive.received[-1]) == 0.0
     # The map is turned by a quarter, its origin is at (1, -1): (0.8, 0.5) is at (0.5, -0.2).
     transform = TransformStamped().transform
@@ -306,6 +309,7 @@ def test_a_path_in_another_frame_needs_a_transform(harness, logged, monkeypatch)
     drive.until(lambda m: speed(m) == 0.0)
     place = drive.received[-1].pose.pose.position
     assert (place.x, place.y) == pytest.approx((0.8, -0.2), abs=1e-6)
+    assert drive.node.warnings() == []
 
 
 def _drive(harness, topic, message, until, **parameters):
@@ -400,6 +404,10 @@ def test_a_low_battery_leads_to_the_charging_place(harness, logged, monkeypatch)
     volts = 0.0
     count = reference._rejected
     harness.spin_until(lambda: says('at the charging place') and reference._rejected > count + 1)
+    assert [text.partition(':')[0] for text in reference.warnings()] == [
+        'the last goal_pose is ignored'
+    ]
+    monkeypatch.setattr('t3mpc_ros.nodes.reference_generator.REFUSAL_SHOWN_NS', 0)
     assert reference.warnings() == []
     reference._planned._time += 40.0
     assert reference.warnings() == [

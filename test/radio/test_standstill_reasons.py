@@ -339,3 +339,26 @@ def test_a_dongle_with_another_protocol_is_reported():
     )
     bench.run(1.0)
     assert bench.link.reason(bench.now_ns) == 'the dongle must speak protocol 2: it speaks 3'
+
+
+@pytest.mark.parametrize(
+    'silent, why',
+    [
+        (('silence', 1.0), reasons.DONGLE_TIMEOUT),
+        (('close_port', 1.0), 'dongle is not there'),
+        (('jam', 1.0), 'the robot does not answer'),
+    ],
+)
+def test_a_stop_that_does_not_reach_the_robot_is_said(silent, why):
+    """The answer was that the stop is latched, while the dongle was silent."""
+    bench = RobotBench()
+    driving(bench)
+    bench.inject(*silent)
+    bench.run(0.6)
+    for _ in range(2):
+        assert why in bench.robot.latch_estop('asked for', bench.now_ns)
+    assert why in bench.robot.reason(bench.now_ns), 'no word that it has stopped'
+    assert not bench.link.telemetry.status.estop
+    bench.run(4.0)
+    assert bench.link.telemetry.status.estop, 'it is sent as soon as the robot answers'
+    assert bench.robot.latch_estop('asked for', bench.now_ns) == ''

@@ -303,7 +303,11 @@ PATTERNS = (
         'odom is from the future', 'Odometry from the future', 'Set the clocks of the computers.',
     ),
     Pattern('no odometry', 'No odometry', 'See why the robot fell silent.'),
-    Pattern('odometry is not finite', 'Odometry is not finite', 'See the sensors of the robot.'),
+    Pattern(
+        'odometry is not finite',
+        'Odometry is not finite',
+        'A number in odom is NaN or infinite, or its quaternion is all zeros.',
+    ),
     Pattern('state is diverging', 'The state diverged', 'See the wheels and the parameters.'),
     Pattern('odometry has restarted', 'Odometry restarted', 'See why the robot restarted.'),
     Pattern(
