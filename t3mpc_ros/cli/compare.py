@@ -76,7 +76,6 @@ def run(options: argparse.Namespace) -> None:
     from t3mpc_ros.evaluation.reporting import columns_of, write_columns
 
     plan = _plan(options)
-    shared_options.prepare_outputs(options, options.csv)
     with shared_options.executor_of(options) as executor:
         results = run_plan(plan, executor, print_report)
     times = step_times(plan, time.perf_counter_ns)

@@ -148,15 +148,18 @@ def parse_settings(
     """Return parameters by node and name from texts like ``controller.law.gain=90``."""
     from t3mpc_ros.nodes.registry import parameter_class  # takes a second
 
-    found: dict[str, Mapping[str, object]] = {}
+    assignments: dict[str, list[str]] = {}
     for text in texts:
         name, _, assignment = text.partition('.')
         if name not in options.nodes:
             raise ParameterError(
                 f'--set must begin with one of {", ".join(options.nodes)} and a dot: got {text!r}'
             )
+        assignments.setdefault(name, []).append(assignment)
+    found: dict[str, Mapping[str, object]] = {}
+    for name, each in assignments.items():
         table = parameter_class(name)
-        found[name] = {**found.get(name, {}), **parse_assignments(table, [assignment])}
+        found[name] = parse_assignments(table, each)
         table.from_dict({**options.parameters()[name], **found[name]})
     return found
 

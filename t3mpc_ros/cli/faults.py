@@ -52,7 +52,6 @@ def run(options: argparse.Namespace) -> int:
         for fault_run in FAULT_RUNS
         if not options.names or fault_run.fault in options.names
     ]
-    shared_options.prepare_outputs(options)
     with shared_options.executor_of(options) as executor:
         rows = study_faults(fault_runs, executor, print_report)
     shared_options.print_result(options, lambda: fault_page.console_text(rows), lambda: list(rows))

@@ -39,7 +39,6 @@ from t3mpc_ros.cli.shared_options import (
     ArgumentParser,
     add_json,
     add_seeds,
-    prepare_outputs,
     print_result,
     reject_removed,
     run_command,
@@ -132,7 +131,6 @@ def _estimation(options: argparse.Namespace) -> None:
     from t3mpc_ros.evaluation.open_loop_estimation import compare, records
     from t3mpc_ros.evaluation.paper.paper_tables import estimation
 
-    prepare_outputs(options)
     results = compare(
         seeds=options.seeds, duration=options.duration, normalised_gain=options.gain, progress=True
     )
@@ -147,7 +145,6 @@ def _exponents(options: argparse.Namespace) -> None:
     from t3mpc_ros.chaos.system import hyperchaotic_system
     from t3mpc_ros.evaluation.lyapunov_exponents import lyapunov_exponents
 
-    prepare_outputs(options)
     values = lyapunov_exponents(hyperchaotic_system(orders=(1.0,) * 4), duration=options.duration)
     text = ', '.join(f'{value:.3f}' for value in values)
     print_result(

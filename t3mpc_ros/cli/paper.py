@@ -50,7 +50,6 @@ def run(options: argparse.Namespace) -> None:
     from t3mpc_ros.evaluation.methods import NMPC, require_libraries
     from t3mpc_ros.evaluation.paper.reproduce import reproduce
 
-    shared_options.prepare_outputs(options)
     require_libraries([NMPC])
     output = options.output or Path('runs') / ('paper-quick' if options.quick else 'paper')
     with shared_options.executor_of(options) as executor:

@@ -29,6 +29,7 @@ from t3mpc_ros.cli.shared_options import (
     add_json,
     ask_line,
     check_two_ports,
+    prepare_outputs,
     print_result,
 )
 from t3mpc_ros.parameters import command_line
@@ -63,6 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = program_parser().parse_args(arguments)
     with StopSignal() as stop:
         try:
+            prepare_outputs(options)
             return int(options.run(options, stop))
         except (ProcedureError, KeyFileError, ParameterError) as error:
             if stop():

@@ -15,7 +15,7 @@
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields
 import os
 from pathlib import Path
@@ -136,11 +136,12 @@ def add_outputs(parser: argparse.ArgumentParser, json: str = 'also write the num
     parser.add_argument('--html', type=Path, help='write one page to this file')
 
 
-def prepare_outputs(options: argparse.Namespace, *further: Path | None) -> None:
-    """Make the folders of the files: one that cannot be written is an error before the runs."""
-    for path in (options.json, getattr(options, 'html', None), *further):
+def prepare_outputs(options: argparse.Namespace) -> None:
+    """Make the folders of the files: one that cannot be written is an error before the work."""
+    for path in (getattr(options, name, None) for name in ('json', 'html', 'csv')):
         if path and path != STANDARD_OUTPUT:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            with suppress(OSError):  # the check says so
+                path.parent.mkdir(parents=True, exist_ok=True)
             check_writable(path)
 
 
@@ -255,6 +256,7 @@ def run_command(parser: argparse.ArgumentParser, arguments: Sequence[str] | None
     """
     options = parser.parse_args(arguments)
     try:
+        prepare_outputs(options)
         return int(options.run(options) or 0)
     except (OSError, RuntimeError, ValueError) as error:
         print(f'error: {sentence(error)}', file=sys.stderr)

@@ -17,6 +17,7 @@ import argparse
 from pathlib import Path
 
 from t3mpc_ros.cli.shared_options import Commands, add_seeds
+from t3mpc_ros.parameters.command_line import bounded_int, check_writable
 
 DRIVES = {'servo': 'velocity', 'torque': 'torque'}
 OUTPUT = Path('model.npz')
@@ -52,13 +53,14 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
         'blocks into which one bag alone is cut to be cross-validated; of several bags '
         f'each is a fold (default {FOLDS})'
     )
-    add('--folds', type=int, default=FOLDS, help=text)
+    add('--folds', type=bounded_int(2, 1000), default=FOLDS, help=text)
 
 
 def run(options: argparse.Namespace) -> None:
     """Write the model and print its skill."""
     from t3mpc_ros.bag.model_file import save_model
 
+    check_writable(options.output)
     if options.bags:
         if options.robot != 'servo':
             raise ValueError(f'robot must be servo for bags: got {options.robot}')
@@ -83,6 +85,7 @@ def run_bags(options: argparse.Namespace) -> None:
     from t3mpc_ros.bag.model_file import save_model
     from t3mpc_ros.evaluation.training.trained_models import fit_bags
 
+    check_writable(options.output)
     model = fit_bags(options.bags, keep_predictor=options.keep_predictor, count=options.folds)
     print(model.text)
     save_model(options.output, model.learnt, model.parameters.to_dict(), model.origin)

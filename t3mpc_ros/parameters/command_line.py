@@ -43,6 +43,8 @@ def parse_assignments(table: type[Parameters], texts: Iterable[str]) -> dict[str
         name, sign, value = text.partition('=')
         if not sign or not name:
             raise ParameterError(f'--set must be NAME=VALUE: got {text!r}')
+        if name in values:
+            raise ParameterError(f'--set must name each parameter once: got {name} again')
         values[name] = value if name in text_parameters else parsed_value(value)
     return values
 

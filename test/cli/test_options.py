@@ -237,3 +237,13 @@ def test_a_folder_as_a_file_is_refused_before_the_runs(option, tmp_path, capsys,
     words = ['compare', '--robot', 'servo', '--seeds', '201-202', '--methods', 'full']
     assert main([*words, option, str(tmp_path)]) == 1
     assert f'{tmp_path} cannot be written' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    'command',
+    ['bag report x', 'bag info x', 'bag replay x', 'bag compare x y', 'estimation', 'paper'],
+)
+def test_a_result_that_cannot_be_written_is_refused_first(command, tmp_path, capsys):
+    """The report of a bag was read and drawn first."""
+    assert main([*command.split(), '--json', str(tmp_path)]) == 1
+    assert f'{tmp_path} cannot be written' in capsys.readouterr().err

@@ -220,6 +220,8 @@ def test_assignments_are_parsed_by_the_type_of_the_parameter():
     }
     with pytest.raises(ParameterError, match="NAME=VALUE: got 'channel'"):
         parse_assignments(LinkParameters, ['channel'])
+    with pytest.raises(ParameterError, match='name each parameter once: got channel again'):
+        parse_assignments(LinkParameters, ['channel=3', 'rate=250k', 'channel=4'])
     with pytest.raises(ParameterError, match='nothing_such'):
         LinkParameters.from_dict(parse_assignments(LinkParameters, ['nothing_such=1']))
 

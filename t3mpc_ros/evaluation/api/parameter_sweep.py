@@ -129,6 +129,9 @@ class Sweep(result_tables.ShownAsTables):
         """
         (name,) = find_names('parameter', [parameter], self.parameters)
         wanted = find_metric(metric)
+        if not any(wanted.name in row for row in self.rows):
+            known = sorted(set().union(*self.rows) & {each.name for each in METRICS})
+            raise ScriptError(f'metric must be one of {", ".join(known)}: got {wanted.name}')
         lines: dict[str, dict[Any, list[float]]] = {}
         for (line, value), rows in ResultTable(self.rows).groups('controller', name).items():
             numbers = [row.get(wanted.name, math.nan) for row in rows]

@@ -177,7 +177,10 @@ def drawn(draw: Callable[[Any], Any], path: str | os.PathLike[str] | None) -> An
 
 def writable(path: str | os.PathLike[str], *suffixes: str) -> Path:
     """Return the path of a file; ValueError if it cannot be written, or has another suffix."""
-    target = Path(path).expanduser()
+    try:
+        target = Path(path).expanduser()
+    except TypeError:
+        raise ScriptError(f'path must be a text or a Path: got {path!r}') from None
     if suffixes and target.suffix not in suffixes:
         raise ScriptError(f'path must end in {", ".join(suffixes)}: got {target}')
     check_writable(target)

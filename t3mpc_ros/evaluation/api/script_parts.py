@@ -26,10 +26,12 @@ from importlib.machinery import ModuleSpec
 from importlib.util import module_from_spec
 import inspect
 from pathlib import Path
+import pickle
 import sys
 from threading import RLock
 from types import ModuleType
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -58,6 +60,8 @@ OWN_KNOWLEDGE = 'Observation of each step; NominalModel by an argument model'
 """What a controller of one's own knows."""
 MODEL = 'model'
 """Name of the argument of a class that gets the :class:`NominalModel`."""
+_CLASS_DATA: WeakKeyDictionary[type, dict[str, tuple[object, bytes]]] = WeakKeyDictionary()
+"""Objects that the classes of controllers hold, and what was in them when a run began."""
 _RUNNING_A_FILE = RLock()
 """A worker of a cluster has several threads, which begin with the same file."""
 
@@ -310,6 +314,7 @@ class OwnMethod:
         return OWN_KNOWLEDGE
 
     def _instance(self, kind: type, settings: Settings, nominal_model: NominalModel) -> Any:
+        _check_class_data(kind)
         try:
             if issubclass(kind, BaselineController):
                 return kind(kind.parameters_type().with_values(settings), nominal_model)
@@ -320,6 +325,29 @@ class OwnMethod:
             raise
         except Exception as error:
             raise ScriptError(f'{self.name} cannot be made: {described(error)}') from None
+
+
+def _check_class_data(kind: type) -> None:
+    """Raise ScriptError if a run before has changed an object that all of a class share.
+
+    The result of a run would depend on those before it in its process. Another object in its place
+    is one that the script has set.
+    """
+    known = _CLASS_DATA.setdefault(kind, {})
+    for name, value in vars(kind).items():
+        if name.startswith('__') or hasattr(type(value), '__get__'):
+            continue
+        try:
+            content = pickle.dumps(value)
+        except (pickle.PicklingError, AttributeError, TypeError):
+            continue
+        before, content_before = known.setdefault(name, (value, content))
+        if before is value and content != content_before:
+            raise ScriptError(
+                f'{kind.__name__}.{name} was changed by a run before, and would change the next '
+                f'one: set self.{name} in __init__'
+            )
+        known[name] = value, content
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,8 @@ def test_a_row_holds_all_that_was_run():
     assert same['overall'] == one.rows()[0]['overall']
     assert found.table().count('\n') == 1 + 2 * 2 * 2 * 2
     assert found.plot('gain').axes
+    with pytest.raises(t3.ScriptError, match='metric must be one of .*settled.*: got drift'):
+        found.plot('gain', 'drift')  # it drew an empty figure
 
 
 def test_a_run_that_fails_is_a_row_with_its_reason():
@@ -345,6 +347,7 @@ def test_a_file_of_another_kind_is_left_alone(tmp_path, monkeypatch):
     for name, text in (
         ('x.csv', 'must end in .parquet: got x.csv'),
         ('folder.parquet', 'cannot be written'),
+        (3, 'path must be a text or a Path: got 3'),
     ):
         with pytest.raises(t3.ScriptError, match=text):
             t3.sweep(Proportional, GAINS, executor=1, output=name, **SHORT)

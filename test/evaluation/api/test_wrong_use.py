@@ -315,3 +315,23 @@ def test_a_script_without_a_guard_gets_a_sentence(tmp_path, line):
     assert done.returncode == 1
     assert "begin its work with: if __name__ == '__main__':" in done.stderr.splitlines()[-1]
     assert line or done.stdout.split() == ['begun']
+
+
+class Shared:
+    """Forgets that its class keeps the list."""
+
+    errors = []
+    gain = 20.0
+
+    def step(self, observation):
+        self.errors.append(observation.reference[0])
+        return self.gain * (observation.reference - observation.speeds)
+
+
+def test_what_one_run_leaves_in_a_class_is_named():
+    """The second run began with what the first had left: equal arguments, other results."""
+    t3.simulate(Shared, plant='servo', duration=0.05)
+    Shared.errors, Shared.gain = [], 30.0  # what the script itself sets is its own matter
+    t3.simulate(Shared, plant='servo', duration=0.05)
+    with pytest.raises(t3.ScriptError, match=r'Shared.errors was changed by a run before'):
+        t3.simulate(Shared, plant='servo', duration=0.05)
