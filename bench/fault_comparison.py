@@ -178,6 +178,12 @@ FAULTS: Mapping[str, Fault] = {
     'twist of the odometry + 10 %': Fault(
         send=with_twist(lambda twist: BodyTwist(1.1 * twist.linear, 1.1 * twist.angular))
     ),
+    'twist of the odometry in mm/s': Fault(
+        send=with_twist(lambda twist: BodyTwist(1000.0 * twist.linear, twist.angular))
+    ),
+    'twist of the odometry in degrees/s': Fault(
+        send=with_twist(lambda twist: BodyTwist(twist.linear, math.degrees(twist.angular)))
+    ),
     'yaw rate of the odometry reversed': Fault(
         send=with_twist(lambda twist: BodyTwist(twist.linear, -twist.angular))
     ),

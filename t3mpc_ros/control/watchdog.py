@@ -227,6 +227,13 @@ TWIST_TOLERANCE, TWIST_CERTAIN = 0.05, 4.0
 TOGETHER = 0.9
 """Squared correlation of twist and change of the pose from which there is one factor: a pose that
 was set by less than a jump, while the robot was slow, leaves 0.55."""
+FAR, FAR_BEYOND, FAR_UNCHANGED = 5.0, (1.0, 5.0), 4.0
+"""A twist (m/s, rad/s) contradicts the change of the pose from this multiple of it and this excess
+on: 0.001 m/s in millimetres, 0.1 rad/s in degrees are found, wheels that slip are not. Where the
+pose stays the same, the excess is so many times larger."""
+UNITS_COUNT, UNITS_MOST, UNITS_MOTION = 10, 100, (0.02, 0.15)
+"""Messages that contradict, more than others, from which the units are wrong; the most that
+count; and the velocities by the pose (m/s, rad/s) of a message that counts as another one."""
 SIDEWAYS = 0.2
 """Share of the way by which a pose may go aside: the cosine of such an angle is tolerable."""
 
@@ -309,6 +316,40 @@ def _was_set(last: State, new: State) -> bool:
     return has_moved(last.pose, new.pose, *(2.0 * elapsed * speed for speed in UNKNOWN_TWIST))
 
 
+class TwistUnits:
+    """Whether the twist of the odometry is far beyond the change of its pose, in either velocity.
+
+    So it is in degrees or millimetres per second. A robot at rest agrees with any unit: such a
+    twist is found while the robot moves, however little, before it is taken to diverge.
+    """
+
+    def __init__(self) -> None:
+        self.wrong = False
+        self.example = ''
+        """Twist and change of the pose in a message in which they contradict each other."""
+        self._count = 0
+
+    def update(self, last: State, new: State) -> None:
+        """Compare the twist of a message with the change of the pose since the last one."""
+        # That of a camera which is slower than the wheels stays the same for a while.
+        times = FAR_UNCHANGED if new.pose == last.pose else 1.0
+        elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
+        ahead, _, turn = motion_between(last.pose, new.pose)
+        by_pose = ahead / elapsed, turn / elapsed
+        if any(
+            abs(twist) > FAR * abs(rate) + times * beyond
+            for twist, rate, beyond in zip(new.twist, by_pose, FAR_BEYOND, strict=True)
+        ):
+            self._count = min(self._count + 1, UNITS_MOST)
+            self.example = (
+                f'{new.twist.linear:.3g} m/s and {new.twist.angular:.3g} rad/s, where its pose '
+                f'says {by_pose[0]:.3g} and {by_pose[1]:.3g}'
+            )
+        elif any(abs(rate) > least for rate, least in zip(by_pose, UNITS_MOTION, strict=True)):
+            self._count = max(self._count - 1, 0)
+        self.wrong = self._count >= UNITS_COUNT or (self.wrong and self._count > 0)
+
+
 class OdometryTwist:
     """The twist of the odometry, or what the change of its pose says where it cannot be right.
 
@@ -321,6 +362,7 @@ class OdometryTwist:
         self.known = False
         """Whether it ever had one."""
         self._factor = TwistFactor()
+        self._units = TwistUnits()
         self._anchor: Pose | None = None
         """Pose of the first message with a twist of zero since the last other one."""
         self._last: State | None = None
@@ -328,12 +370,18 @@ class OdometryTwist:
     @property
     def replaced(self) -> bool:
         """Whether the twist that is used is not the one that was received."""
-        return self.missing or self._factor.value != 1.0
+        return self.missing or self._units.wrong or self._factor.value != 1.0
 
     def problem(self) -> str:
         """Return what is wrong with the twist, and the remedy; '' if nothing is."""
         if self.missing:
             return 'odom has no twist: its poses are differentiated; publish the twist'
+        if self._units.wrong:
+            return (
+                f'the twist in odom cannot be in m/s and rad/s: {self._units.example}; its poses '
+                'are differentiated: correct the units in the driver of the robot, or see why its '
+                'wheels spin'
+            )
         if self._factor.value == 1.0:
             return ''
         return (
@@ -351,9 +399,12 @@ class OdometryTwist:
             if last is None or restart or odometry.stamp_ns <= last.stamp_ns:
                 self._factor.interrupt()
             else:
+                self._units.update(last, odometry)
                 self._factor.update(last, odometry)
+                if self._units.wrong:
+                    return _differentiated(last, odometry)
             factor = self._factor.value
-            if factor == 1.0:
+            if factor == 1.0 or self._units.wrong:
                 return odometry
             linear, angular = odometry.twist
             return odometry._replace(twist=BodyTwist(linear / factor, angular / factor))
@@ -365,11 +416,16 @@ class OdometryTwist:
             )
         if self._anchor is not None:
             self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
-        if restart or last is None or not self.missing:
+        if restart or last is None or not (self.missing or self._units.wrong):
             return odometry
-        elapsed = (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
-        ahead, _, turn = motion_between(last.pose, pose)
-        return odometry._replace(twist=BodyTwist(ahead / elapsed, turn / elapsed))
+        return _differentiated(last, odometry)
+
+
+def _differentiated(last: State, new: State) -> State:
+    """Return a state whose twist is the change of its pose."""
+    elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
+    ahead, _, turn = motion_between(last.pose, new.pose)
+    return new._replace(twist=BodyTwist(ahead / elapsed, turn / elapsed))
 
 
 EVIDENCE_WEIGHT = 20

@@ -484,10 +484,42 @@ def test_a_yaw_that_was_set_is_no_factor(drive, angle):
     assert not twist.replaced
 
 
-def test_a_twist_beyond_all_reason_is_no_factor():
-    """The watchdog stops the robot by its speed; neither pose nor twist can be trusted."""
-    twist, _ = twists_of(winding, factors=(100.0, 100.0))
+@pytest.mark.parametrize('factors', [(1000.0, 1.0), (1.0, 57.3), (1000.0, 57.3), (100.0, 100.0)])
+@pytest.mark.parametrize('drive', ['winding', 'to and fro'])
+def test_a_twist_in_other_units_is_replaced_by_the_pose(drive, factors):
+    """The robot jerked: *diverging* and *tracking* took turns, and nothing told why."""
+    if drive == 'to and fro' and factors[0] == 1.0:
+        return  # it does not turn
+    twist, used = twists_of(DRIVES[drive], factors=factors, noise=0.005)
+    assert 'cannot be in m/s and rad/s' in twist.problem()
+    true = np.array([DRIVES[drive](0.01 * k) for k in range(len(used))])
+    assert np.abs(used[300:] - true[300:]).max() < 0.03
+
+
+@pytest.mark.parametrize('rate', [1, 4, 20])
+def test_a_fast_robot_with_a_slow_camera_has_its_own_twist(rate):
+    """The pose is that of the last picture; in the next one it has moved far."""
+    held = []
+
+    def seen(k, pose):
+        if k % rate == 0:
+            held[:] = [pose]
+        return held[0]
+
+    twist, used = twists_of(lambda time: (2.0, 3.0 * math.sin(time)), moved=seen, noise=0.05)
     assert not twist.replaced
+    assert np.abs(used[:, 0] - 2.0).max() < 0.3
+
+
+def test_units_that_are_corrected_are_believed_again():
+    parts, x, found = OdometryTwist(), 0.0, []
+    for k in range(2000):
+        x += 0.002 if k else 0.0
+        factor = 1000.0 if k < 500 else 1.0
+        state = State(k * 10 * MS, Pose(x, 0.0, 0.0), BodyTwist(0.2 * factor, 0.0))
+        found.append(parts.measured(state, restart=k == 0).twist.linear)
+    assert found[12:] == pytest.approx([0.2] * len(found[12:]))
+    assert not parts.replaced
 
 
 def test_a_twist_that_is_repaired_is_used_again():

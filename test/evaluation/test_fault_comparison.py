@@ -40,6 +40,7 @@ def test_each_fault_fits_the_robot_and_the_controller():
         ('no twist in the odometry', 'odom has no twist', 2001),
         ('twist reversed', 'opposite sign', 2001),
         ('twist of the odometry + 10 %', 'times the change of its pose', 2001),
+        ('twist of the odometry in mm/s', 'cannot be in m/s and rad/s', 2001),
         ('rate set to 50, odometry has 100 Hz', 'odom has 100 Hz, but rate is 50 Hz', 2001),
         ('shaper for another robot', 'the robot oscillates in yaw with', 2005),
         ('lag 20 ms assumed, none', 'too early for a speed_filter.lag of 0.02 s', 2003),
