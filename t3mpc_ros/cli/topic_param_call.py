@@ -89,10 +89,16 @@ def _with_graph(
     """Return a command that runs in the graph."""
 
     def run_in_graph(options: argparse.Namespace) -> int | None:
-        from t3mpc_ros.nodes.graph_client import graph  # takes a second
+        from rclpy.exceptions import NameValidationException  # takes a second
+
+        from t3mpc_ros.nodes.graph_client import graph
 
         with StopSignal() as stop, graph(stop) as opened:
-            return run(opened, options)
+            try:
+                return run(opened, options)
+            except NameValidationException as error:
+                # The name and a mark below it are lines of their own.
+                raise ValueError(' '.join(str(error).split()).rstrip('^ ')) from None
 
     return run_in_graph
 
@@ -136,7 +142,7 @@ def _list_parameters(graph: 'Graph', options: argparse.Namespace) -> None:
 
 
 def _set_parameter(graph: 'Graph', options: argparse.Namespace) -> int:
-    value = yaml.safe_load(options.value)
+    value = _yaml(options.value)
     if problem := graph.set_parameter(options.node, options.name, value):
         print(f'Setting parameter failed: {problem}', file=sys.stderr)
         return 1
@@ -144,13 +150,25 @@ def _set_parameter(graph: 'Graph', options: argparse.Namespace) -> int:
     return 0
 
 
-def _call(graph: 'Graph', options: argparse.Namespace) -> None:
+def _yaml(text: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ValueError(
+            f'value must be YAML, like 0.3, [1.0, 2.0] or {{data: true}}: got {text}'
+        ) from None
+
+
+def _call(graph: 'Graph', options: argparse.Namespace) -> int:
+    """Print the answer of a service; return 1 if it says that it has not succeeded."""
     from t3mpc_ros.nodes.graph_client import message_text
 
-    values = yaml.safe_load(options.values)
+    values = _yaml(options.values)
     if not isinstance(values, dict):
         raise ValueError(f'the fields must be a YAML mapping, like {{data: true}}: got {values!r}')
-    print(message_text(graph.call_by_name(options.service, values)), end='')
+    answer = graph.call_by_name(options.service, values)
+    print(message_text(answer), end='')
+    return 0 if getattr(answer, 'success', True) else 1
 
 
 def _stop(graph: 'Graph', options: argparse.Namespace) -> int:

@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 import math
+import os
 import time
 from typing import Any
 
@@ -31,8 +32,11 @@ from rcl_interfaces.srv import (
     ListParameters,
     SetParameters,
 )
+from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
+from rclpy.task import Future
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_srvs.srv import SetBool
 import yaml
@@ -48,13 +52,16 @@ from t3mpc_ros.nodes.remote_parameters import (
     type_text,
 )
 
-LISTING = 1.5
-"""Time in which nodes are discovered before they are listed, s."""
+QUIET = 3.5
+"""Time without a change of the graph after which a list of it is as good as complete, s: a lost
+message of discovery is repeated after 3 s."""
 DISCOVERY = 6.0
-"""Longest wait for something that is asked for by name, s."""
+"""Longest wait for that, and for something that is asked for by name, s."""
 REPLY = 5.0
 """Longest wait for the answer of a service, s."""
 E_STOP = 'e_stop'
+UNKNOWN = 'NODE_NAME_UNKNOWN'
+"""In the name of a node that is not known yet."""
 
 _WORDS = {'bool': 'Boolean', 'int': 'Integer', 'float': 'Double', 'str': 'String'}
 """Words of ``ros2 param`` for the types of parameters."""
@@ -73,12 +80,38 @@ class Graph:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
 
-    def discover(self, found: Callable[[], bool] | None = None) -> None:
-        """Wait until ``found`` returns True; without it, until a list is as good as complete."""
-        if found is None:
-            self._spin_until(lambda: False, LISTING)
-        else:
-            self._spin_until(found, DISCOVERY)
+    def discover(self, meanwhile: Callable[[], None] = lambda: None) -> None:
+        """Wait until there are nodes, and nothing was discovered for :data:`QUIET`.
+
+        After a fixed time some were missing, or all. ``meanwhile`` is called again and again.
+        """
+        begin = since = time.monotonic()
+        known = self._contents()
+
+        def settled() -> bool:
+            nonlocal known, since
+            meanwhile()
+            now, contents = time.monotonic(), self._contents()
+            if contents != known:
+                known, since = contents, now
+            return now - (since if self._others() else begin + DISCOVERY - QUIET) >= QUIET
+
+        self._spin_until(settled, DISCOVERY + QUIET)
+
+    def _contents(self) -> object:
+        """Return what is known of the graph."""
+        node, ends = self._node, []
+        for name, _ in node.get_topic_names_and_types():
+            ends.append((name, node.count_publishers(name), node.count_subscribers(name)))
+        return self._others(), [*self.services()], ends
+
+    def _others(self) -> set[str]:
+        """Return the full names of the other nodes."""
+        names = {
+            qos.full_name(where, name)
+            for name, where in self._node.get_node_names_and_namespaces()
+        }
+        return names - {self._node.get_fully_qualified_name()}
 
     def close(self) -> None:
         """End the executor."""
@@ -96,28 +129,41 @@ class Graph:
     # -- topics -----------------------------------------------------------------------------------
 
     def topics(self) -> Mapping[str, Sequence[str]]:
-        """Return the types of each topic, without those of this node alone."""
-        self.discover()
+        """Return the types of each topic, without those of this node alone.
+
+        GraphError if there is no other node.
+        """
+        self.nodes()
         own = {'/rosout', '/parameter_events'}
         found = dict(self._node.get_topic_names_and_types())
         return {
             name: kinds
             for name, kinds in sorted(found.items())
-            if name not in own or self._node.count_publishers(name) > 0
+            if name not in own or self._node.count_publishers(name) > 1
         }
+
+    def _resolved(self, topic: str) -> str:
+        """Return the full name of a topic; NameValidationException if it cannot be one."""
+        node = self._node
+        expand_topic_name(topic, node.get_name(), node.get_namespace())
+        return node.resolve_topic_name(topic)
 
     def topic_text(self, topic: str) -> str:
         """Return types, publishers and subscriptions of a topic, a node a line, with their QoS.
 
         GraphError if neither is there.
         """
-        name = self._node.resolve_topic_name(topic)
+        name = self._resolved(topic)
         node = self._node
-        self.discover(lambda: node.count_publishers(name) + node.count_subscribers(name) > 0)
-        ends = {
-            'publishers': node.get_publishers_info_by_topic(name),
-            'subscriptions': node.get_subscriptions_info_by_topic(name),
-        }
+        self.discover()
+        ends: dict[str, Sequence[TopicEndpointInfo]] = {}
+
+        def named() -> bool:
+            ends['publishers'] = node.get_publishers_info_by_topic(name)
+            ends['subscriptions'] = node.get_subscriptions_info_by_topic(name)
+            return not any(UNKNOWN in each.node_name for found in ends.values() for each in found)
+
+        self._spin_until(named, DISCOVERY)  # the name of a node follows what it publishes
         kinds = sorted({info.topic_type for found in ends.values() for info in found})
         if not kinds:
             raise GraphError(f'nothing publishes or receives {name} (t3mpc topic list)')
@@ -133,8 +179,8 @@ class Graph:
         The request matches the offers of the publishers. GraphError if nothing publishes the
         topic, or its type is not installed or not unique.
         """
-        name = self._node.resolve_topic_name(topic)
-        self.discover(lambda: self._node.count_publishers(name) > 0)
+        name = self._resolved(topic)
+        self._spin_until(lambda: self._node.count_publishers(name) > 0, DISCOVERY)
         offers = self._node.get_publishers_info_by_topic(name)
         kinds = sorted({info.topic_type for info in offers})
         if len(kinds) != 1:
@@ -161,13 +207,15 @@ class Graph:
     # -- parameters -------------------------------------------------------------------------------
 
     def nodes(self) -> Sequence[str]:
-        """Return the full names of the other nodes."""
+        """Return the full names of the other nodes; GraphError if there is none."""
         self.discover()
-        names = {
-            qos.full_name(where, name)
-            for name, where in self._node.get_node_names_and_namespaces()
-        }
-        return sorted(names - {self._node.get_fully_qualified_name()})
+        if not self._others():
+            domain = os.environ.get('ROS_DOMAIN_ID', '0')
+            raise GraphError(
+                f'no node was discovered within {DISCOVERY:g} s: is ROS_DOMAIN_ID, {domain} here, '
+                'that of the nodes, and is the network up?'
+            )
+        return sorted(self._others())
 
     def parameter_names(self, node: str) -> Sequence[str]:
         """Return the names of the parameters of a node, sorted."""
@@ -235,7 +283,7 @@ class Graph:
         GraphError also if its type is not installed, or a field does not fit.
         """
         full = self._node.resolve_service_name(name)
-        self.discover(lambda: full in self.services())
+        self._spin_until(lambda: full in self.services(), DISCOVERY)
         kinds = self.services().get(full)
         if not kinds:
             raise GraphError(f'no node offers the service {full}')
@@ -255,21 +303,31 @@ class Graph:
         return self.call(full, kind, request)
 
     def stop_robots(self) -> Mapping[str, str]:
-        """Latch the e-stop of every robot in reach; return the problem of each, or nothing."""
-        self.discover(lambda: bool(self._e_stops()))
-        self.discover()  # the others
-        clients = {name: self._node.create_client(SetBool, name) for name in self._e_stops()}
-        self._spin_until(
-            lambda: all(client.service_is_ready() for client in clients.values()), LISTING
-        )
-        # All at once: a robot that does not answer holds up no other one.
-        sent = {
-            name: client.call_async(SetBool.Request(data=True)) for name, client in clients.items()
-        }
-        self._spin_until(lambda: all(future.done() for future in sent.values()), REPLY)
+        """Latch the e-stop of every robot in reach; return the problem of each, or nothing.
+
+        Each is asked as soon as it is discovered.
+        """
+        clients: dict[str, Client] = {}
+        sent: dict[str, Future] = {}
+
+        def ask() -> None:
+            for name in self._e_stops():
+                if name not in clients:
+                    clients[name] = self._node.create_client(SetBool, name)
+            for name, client in clients.items():
+                if name not in sent and client.service_is_ready():
+                    sent[name] = client.call_async(SetBool.Request(data=True))
+
+        self.discover(ask)
+
+        def answered() -> bool:
+            ask()
+            return sent.keys() == clients.keys() and all(each.done() for each in sent.values())
+
+        self._spin_until(answered, REPLY)
         problems = {}
-        for name, future in sent.items():
-            answer = future.result() if future.done() else None
+        for name, client in clients.items():
+            answer = sent[name].result() if name in sent and sent[name].done() else None
             problems[name] = (
                 f'no answer within {REPLY:g} s'
                 if answer is None
@@ -277,7 +335,6 @@ class Graph:
                 if answer.success
                 else answer.message
             )
-        for client in clients.values():
             self._node.destroy_client(client)
         return problems
 
@@ -312,6 +369,8 @@ def plain(message: Any) -> Any:
         return {name: plain(getattr(message, name)) for name in names}
     if isinstance(message, bytes):
         return int.from_bytes(message, 'little')
+    if isinstance(message, np.generic):  # of an array, a covariance say
+        return message.item()
     if isinstance(message, bool | int | float | str):
         return message
     return [plain(each) for each in message]

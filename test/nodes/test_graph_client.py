@@ -43,7 +43,8 @@ class Asked:
 
 
 @pytest.fixture
-def asked(harness):
+def asked(harness, monkeypatch):
+    monkeypatch.setattr(graph_client, 'QUIET', 0.5)
     node = Node('asking')
     with closing(Graph(node)) as graph:
         yield Asked(harness, graph)
@@ -61,6 +62,8 @@ def test_topics_have_types_and_messages(asked, harness, nothing_comes):
     harness.add(SimRobotNode)
     assert asked('topics')['/odom'] == ['nav_msgs/msg/Odometry']
     first, second = asked.messages('odom', 2)
+    # The numbers of its covariances are those of an array, which YAML refused.
+    assert len(yaml.safe_load(message_text(first))['pose']['covariance']) == 36
     assert yaml.safe_load(message_text(first, 'header.frame_id')) == 'odom'
     assert second.header.stamp != first.header.stamp
     lines = asked('topic_text', 'odom').splitlines()
@@ -122,7 +125,7 @@ def test_services_are_called_with_the_type_of_the_graph(asked, harness, nothing_
 
 @pytest.mark.ros
 def test_stop_stops_every_robot_whatever_its_namespace(asked, harness, monkeypatch):
-    monkeypatch.setattr(graph_client, 'LISTING', 0.3)
+    monkeypatch.setattr(graph_client, 'DISCOVERY', 0.5)
     assert asked('stop_robots') == {}
     robots = [harness.add(SimRobotNode, namespace=name) for name in (None, 'east', 'far/west')]
 
@@ -157,3 +160,37 @@ def test_the_rate_is_that_of_the_arrivals():
     assert rate_text(times) == (
         'average rate: 100.000\n\tmin: 0.009s max: 0.011s std dev: 0.00100s window: 11'
     )
+
+
+@pytest.mark.ros
+def test_a_robot_that_is_discovered_late_is_stopped(asked, harness, monkeypatch):
+    """One of three was not asked, and not named: the list was made 1.5 s after the first."""
+    monkeypatch.setattr(graph_client, 'QUIET', 0.8)
+    monkeypatch.setattr(graph_client, 'REPLY', 0.2)
+    first, late, e_stops = harness.add(SimRobotNode, namespace='first'), [], asked._graph._e_stops
+
+    def with_late_ones():
+        stopped = first._robot._limiter.estop
+        if stopped and len(late) < 2:  # it is asked before others are there
+            name = f'late_{len(late)}'
+            late.append(Node(name, namespace=name))
+            late[-1].create_service(SetBool, 'e_stop', lambda request, response: response)
+        return e_stops()
+
+    monkeypatch.setattr(asked._graph, '_e_stops', with_late_ones)
+    problems = asked('stop_robots')
+    assert sorted(problems) == ['/first/e_stop', '/late_0/e_stop', '/late_1/e_stop']
+    assert problems['/first/e_stop'] == ''
+    assert all('no answer' in problems[f'/late_{k}/e_stop'] for k in (0, 1))
+    for node in late:
+        node.destroy_node()
+
+
+@pytest.mark.ros
+def test_a_graph_without_nodes_is_no_empty_list(monkeypatch):
+    """``topic list`` printed one topic of its own, with exit code 0."""
+    monkeypatch.setattr(graph_client, 'DISCOVERY', 0.3)
+    with graph_client.graph() as graph:
+        for method in (graph.topics, graph.nodes):
+            with pytest.raises(GraphError, match='no node was discovered within 0.3 s: is ROS_DO'):
+                method()
