@@ -394,6 +394,8 @@ class Controller:
     def problems(self) -> list[str]:
         """Return what does not fit in odometry and response, each with its remedy."""
         found = [self.drive_monitor.problem()]
+        if self.status.reason is Reason.DIVERGING:
+            found.append(self._watchdog.divergence())
         if self.keep_out is not None and self._last_stamp_ns is not None:
             found.append(self.keep_out.ranges.problem())
         found.append(self.odometry_twist.problem())

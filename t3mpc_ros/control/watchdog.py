@@ -149,6 +149,8 @@ class InputWatchdog:
         self._reference_ns: int | None = None
         self._reference_pending = False
         self._hold_until_ns: int | None = None
+        self._diverged = 0.0, 0.0
+        """Wheel speed and error of the last state that was diverging, rad/s."""
 
     def reference_received(self) -> None:
         """Register a valid reference; its age counts from the next odometry stamp."""
@@ -202,10 +204,21 @@ class InputWatchdog:
             return Reason.NO_REFERENCE
         if speed > self._parameters.speed_bound or error > self._parameters.error_bound:
             self._hold_until_ns = stamp_ns + round(self._parameters.hold_time * NANOSECONDS)
+            self._diverged = speed, error
         if self._hold_until_ns is not None and stamp_ns <= self._hold_until_ns:
             return Reason.DIVERGING
         self._hold_until_ns = None
         return Reason.TRACKING
+
+    def divergence(self) -> str:
+        """Return what a diverging state was beyond, and what to look at."""
+        parameters, (speed, error) = self._parameters, self._diverged
+        return (
+            f'wheel speed {speed:.3g} rad/s (watchdog.speed_bound {parameters.speed_bound:g}), '
+            f'{error:.3g} rad/s off the reference (watchdog.error_bound '
+            f'{parameters.error_bound:g}): look at the twist in odom and its units, and at '
+            'wheel_radius'
+        )
 
     def odometry_timed_out(self, last_received_ns: int | None, now_ns: int) -> bool:
         """Whether the odometry is older than the time-out; both times are from one clock."""

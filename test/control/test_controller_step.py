@@ -154,6 +154,8 @@ def test_a_reason_to_stop_stops_the_robot_until_it_has_passed(speed, enabled, re
     status = loop.step(make_state(loop.now, speed, 0.0))
     assert status.reason is reason
     assert loop.twist == BodyTwist(0.0, 0.0)
+    found = ' '.join(loop.controller.problems())  # neither value nor bound was said
+    assert ('85.7 rad/s (watchdog.speed_bound 40)' in found) == (reason is Reason.DIVERGING)
     loop.controller.enable(True)
     statuses = loop.run(60)
     assert statuses[-1].reason is Reason.TRACKING
