@@ -13,7 +13,7 @@
 # limitations under the License.
 """The process of an executable: start of ROS, spin, shutdown, exit code."""
 
-from collections.abc import Callable, Iterator, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
 import os
 from pathlib import Path
@@ -37,6 +37,8 @@ N = TypeVar('N', bound='Node')
 
 USAGE_ERROR = 2
 """Exit code for an unusable parameter, parameter file or command line."""
+MAX_DOMAIN = 232
+"""Largest domain: the ports of DDS end there."""
 
 
 def main(name: str, stop: StopSignal) -> NoReturn:
@@ -72,7 +74,8 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
 
     from t3mpc_ros.parameters.table import ParameterError
 
-    if problem := arguments.parameter_file_problem(argv):  # rcl would read them, too
+    # Both before rcl, which would name neither value nor bound.
+    if problem := domain_problem(os.environ) or arguments.parameter_file_problem(argv):
         return _usage_error(name, problem)
     try:
         words = remove_ros_args(list(argv))[1:]
@@ -177,8 +180,18 @@ def init_ros(words: Sequence[str]) -> None:
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
+    if problem := domain_problem(os.environ):
+        raise ValueError(problem)
     provide_log_directory(os.environ)
     rclpy.init(args=list(words), signal_handler_options=SignalHandlerOptions.NO)
+
+
+def domain_problem(environment: Mapping[str, str]) -> str:
+    """Return what is wrong with ``ROS_DOMAIN_ID``; '' if nothing is."""
+    text = environment.get('ROS_DOMAIN_ID', '')
+    if not text or (text.isdecimal() and int(text) <= MAX_DOMAIN):
+        return ''
+    return f'ROS_DOMAIN_ID must be a whole number from 0 to {MAX_DOMAIN}: got {text}'
 
 
 def provide_log_directory(environment: MutableMapping[str, str]) -> None:

@@ -22,7 +22,7 @@ import pytest
 
 import t3mpc_ros
 from t3mpc_ros.nodes.arguments import Origin, parameter_origins, unmatched_files
-from t3mpc_ros.nodes.node_main import provide_log_directory
+from t3mpc_ros.nodes.node_main import domain_problem, provide_log_directory
 from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
 
 
@@ -214,3 +214,11 @@ def test_ros_starts_without_a_home_folder(tmp_path):
         done = subprocess.run(words, env=environment | {'HOME': home}, capture_output=True)
         assert done.returncode == 0, done.stderr
     assert (tmp_path / '.ros' / 'log').is_dir()
+
+
+@pytest.mark.parametrize('text', ['233', '-1', '1.5', 'abc'])
+def test_a_domain_that_cannot_be_is_named(text):
+    """Some were accepted, others ended in the words of a port number or of a source file."""
+    assert domain_problem({'ROS_DOMAIN_ID': text}).endswith(f'from 0 to 232: got {text}')
+    assert all(not domain_problem({'ROS_DOMAIN_ID': each}) for each in ('', '0', '232'))
+    assert not domain_problem({})
