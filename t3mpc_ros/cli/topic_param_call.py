@@ -89,16 +89,10 @@ def _with_graph(
     """Return a command that runs in the graph."""
 
     def run_in_graph(options: argparse.Namespace) -> int | None:
-        from rclpy.exceptions import NameValidationException  # takes a second
-
-        from t3mpc_ros.nodes.graph_client import graph
+        from t3mpc_ros.nodes.graph_client import graph  # takes a second
 
         with StopSignal() as stop, graph(stop) as opened:
-            try:
-                return run(opened, options)
-            except NameValidationException as error:
-                # The name and a mark below it are lines of their own.
-                raise ValueError(' '.join(str(error).split()).rstrip('^ ')) from None
+            return run(opened, options)
 
     return run_in_graph
 

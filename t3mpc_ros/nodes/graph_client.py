@@ -33,6 +33,7 @@ from rcl_interfaces.srv import (
     SetParameters,
 )
 from rclpy.client import Client
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
@@ -348,10 +349,16 @@ class Graph:
 
 @contextmanager
 def graph(stop: Callable[[], bool] = lambda: False) -> Iterator[Graph]:
-    """Return a graph in a context of its own, which ends with the ``with`` block."""
+    """Return a graph in a context of its own, which ends with the ``with`` block.
+
+    GraphError in place of the text of several lines on a name that cannot be.
+    """
     options = {'start_parameter_services': False, 'enable_rosout': False}
     with own_context(lambda: Node('t3mpc', **options)) as node, closing(Graph(node, stop)) as made:
-        yield made
+        try:
+            yield made
+        except NameValidationException as error:
+            raise GraphError(' '.join(str(error).split()).rstrip('^ ')) from None
 
 
 def _end_text(info: TopicEndpointInfo) -> str:

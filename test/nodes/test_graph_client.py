@@ -194,3 +194,14 @@ def test_a_graph_without_nodes_is_no_empty_list(monkeypatch):
         for method in (graph.topics, graph.nodes):
             with pytest.raises(GraphError, match='no node was discovered within 0.3 s: is ROS_DO'):
                 method()
+
+
+@pytest.mark.ros
+def test_a_name_that_cannot_be_is_one_sentence():
+    """A traceback, or the line of a source file of rcl, was shown."""
+    for ask in ('parameter_names', 'topic_text'):
+        with (
+            pytest.raises(GraphError, match="^Invalid .*: 'a b.*'$"),
+            graph_client.graph() as graph,
+        ):
+            getattr(graph, ask)('a b')
