@@ -35,10 +35,10 @@ from rcl_interfaces.srv import (
 from rclpy.client import Client
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.task import Future
 from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.validate_topic_name import validate_topic_name
 from std_srvs.srv import SetBool
 import yaml
 
@@ -145,9 +145,8 @@ class Graph:
 
     def _resolved(self, topic: str) -> str:
         """Return the full name of a topic; NameValidationException if it cannot be one."""
-        node = self._node
-        expand_topic_name(topic, node.get_name(), node.get_namespace())
-        return node.resolve_topic_name(topic)
+        validate_topic_name(topic)
+        return self._node.resolve_topic_name(topic)
 
     def topic_text(self, topic: str) -> str:
         """Return types, publishers and subscriptions of a topic, a node a line, with their QoS.
