@@ -20,28 +20,42 @@ import os
 from pathlib import Path
 from typing import BinaryIO
 
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Errors of a full disk, a quota, and a limit of the size of files: they do not name a file."""
+
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a new file that replaces ``path`` at the end; after an error ``path`` is unchanged."""
-    temporary = path.with_name(f'.{path.name}.{os.getpid()}')
+    """Open a new file that replaces ``path`` at the end; after an error ``path`` is unchanged.
+
+    What cannot be replaced is written itself: a device, a pipe, a file in a read-only folder.
+    """
+    replaces = not path.exists() or (path.is_file() and os.access(path.resolve().parent, os.W_OK))
+    target = path.resolve() if replaces else path  # a link remains one
+    temporary = target.with_name(f'.{target.name}.{os.getpid()}') if replaces else target
     try:
         with temporary.open('wb') as file:
             yield file
             file.flush()
-            os.fsync(file.fileno())  # without it, a power failure may leave an empty file
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+            if replaces:
+                os.fsync(file.fileno())  # without it, a power failure may leave an empty file
+        if replaces:
+            temporary.replace(target)
+    except BaseException as error:
+        if replaces:
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno in NO_ROOM:
+            error.filename = str(path)
         raise
-    sync_folder(path.parent)
+    if replaces:
+        sync_folder(target.parent)
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Replace the text of a file, in a folder that is created if missing."""
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Replace the content of a file, in a folder that is created if missing."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as file:
-        file.write(text.encode())
+        file.write(content.encode() if isinstance(content, str) else content)
 
 
 def sync_folder(folder: Path) -> None:

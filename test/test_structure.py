@@ -63,7 +63,7 @@ PACKAGES = {
     | {'script_error'},
     'nodes': CORE | {'radio', 'localization', 'stop_signal', 'missing_library'},
     'cli': CORE
-    | {'radio', 'stop_signal', 'parent_process', 'missing_library'}
+    | {'radio', 'atomic_file', 'stop_signal', 'parent_process', 'missing_library'}
     | {'emulator', 'evaluation', 'nodes', 'view'},
     'page': set(),
     'view': {'page'},

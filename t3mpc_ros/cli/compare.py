@@ -18,6 +18,7 @@ from pathlib import Path
 import time
 from typing import TYPE_CHECKING
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.cli import shared_options
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ def run(options: argparse.Namespace) -> None:
         lambda: comparison_page.record(plan, results, times),
     )
     if options.html:
-        options.html.write_text(comparison_page.page(plan, results, times), encoding='utf-8')
+        write_atomically(options.html, comparison_page.page(plan, results, times))
     if options.csv:
         write_columns(writable(options.csv), columns_of(Comparison(plan, results).rows()))
 

@@ -16,6 +16,7 @@
 import argparse
 from pathlib import Path
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.cli import shared_options
 
 
@@ -58,5 +59,5 @@ def run(options: argparse.Namespace) -> int:
     if options.output:
         fault_page.update_page(options.output, rows)
     if options.html:
-        options.html.write_text(fault_page.page(rows), encoding='utf-8')
+        write_atomically(options.html, fault_page.page(rows))
     return 1 if any(row['verdict'] == 'unbounded' for row in rows) else 0

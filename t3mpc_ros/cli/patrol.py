@@ -19,6 +19,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.cli.shared_options import (
     Commands,
     add_json,
@@ -115,10 +116,9 @@ def run(options: argparse.Namespace) -> int:
     record = page.record(study)
     print_result(options, lambda: page.markdown(study), lambda: record)
     drawn = write_pictures({each.stem: each.draw for each in page.PICTURES}, study, figures)
-    numbers = strict_json(record)
-    (options.output / f'{name}.json').write_text(numbers, encoding='utf-8')
+    write_atomically(options.output / f'{name}.json', strict_json(record))
     written = options.output / f'{name}.html'
-    written.write_text(page.page(study, drawn), encoding='utf-8')
+    write_atomically(written, page.page(study, drawn))
     ResultFile(runs).remove(study.table.keys)
     print(f'written to {written}', file=sys.stderr)
     return 0

@@ -23,6 +23,7 @@ import select
 import sys
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.api.error_messages import sentence
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_writable
 from t3mpc_ros.parameters.table import ParameterError
@@ -127,7 +128,7 @@ def print_result(
         return
     print(text())
     if options.json:
-        options.json.write_text(strict_json(record()), encoding='utf-8')
+        write_atomically(options.json, strict_json(record()))
 
 
 def add_outputs(parser: argparse.ArgumentParser, json: str = 'also write the numbers') -> None:

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.cli import shared_options
 from t3mpc_ros.parameters.command_line import bounded_int
 
@@ -139,5 +140,4 @@ def _identify(options: argparse.Namespace) -> None:
     text = drive_file(*found, bag_display_name(bag))
     shared_options.print_result(options, lambda: text.rstrip('\n'), lambda: drive_record(*found))
     if options.output:
-        options.output.parent.mkdir(parents=True, exist_ok=True)
-        options.output.write_text(text, encoding='utf-8')
+        write_atomically(options.output, text)

@@ -26,6 +26,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.charts import thinned
 from t3mpc_ros.evaluation.confidence_intervals import interval, mean
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
@@ -116,7 +117,7 @@ def write_pictures(
     for stem, draw in drawings.items():
         if (figure := drawing(draw, subject)) is not None:
             found[stem] = file_of(figure, 'svg')
-            (folder / f'{stem}.png').write_bytes(file_of(figure, 'png'))
+            write_atomically(folder / f'{stem}.png', file_of(figure, 'png'))
     return found
 
 

@@ -21,6 +21,7 @@ from functools import cache
 import html
 from importlib import import_module
 from importlib.util import find_spec
+import io
 import json
 import math
 from pathlib import Path
@@ -31,6 +32,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.charts import Chart, PageData, Plane, Timeline
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.page.assets import page_file
@@ -345,7 +347,7 @@ def replace_section(page: Path, begin: str, end: str, section: str) -> None:
     _, ended, tail = rest.partition(end)
     if not begun or not ended or begin in rest or end in tail:
         raise ValueError(f'{page} must hold the lines {begin} and {end} once, in this order')
-    page.write_text(head + begin + section + end + tail, encoding='utf-8')
+    write_atomically(page, head + begin + section + end + tail)
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Any]]:
@@ -358,13 +360,12 @@ def write_columns(
     path: Path, columns: Mapping[str, Sequence[object] | NDArray[np.generic]]
 ) -> None:
     """Write columns as CSV with one line of names, numbers with all their digits."""
-    with path.open('w', newline='', encoding='utf-8') as stream:
-        writer = csv.writer(stream, lineterminator='\n')
-        writer.writerow(columns)
-        values = [
-            each.tolist() if isinstance(each, np.ndarray) else each for each in columns.values()
-        ]
-        writer.writerows(zip(*values, strict=True))
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator='\n')
+    writer.writerow(columns)
+    values = [each.tolist() if isinstance(each, np.ndarray) else each for each in columns.values()]
+    writer.writerows(zip(*values, strict=True))
+    write_atomically(path, stream.getvalue())
 
 
 def strict_json(content: object) -> str:

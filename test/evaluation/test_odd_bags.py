@@ -19,6 +19,8 @@ cannot be measured.
 
 from html import unescape
 import re
+import resource
+import sys
 
 import numpy as np
 import pytest
@@ -435,3 +437,37 @@ def test_what_cannot_be_read_is_an_error_that_says_why(content, words, tmp_path,
     assert t3mpc(['bag', 'report', str(file), '--output', str(tmp_path / 'out')]) == 1
     assert words in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
+
+
+def test_a_full_disk_names_the_file_and_the_remedy(tmp_path, capsys):
+    """It was *[Errno 28] No space left on device*: neither which file nor what to do."""
+    bag = write(tmp_path / 'bag', only('/odom')[:50])
+    assert t3mpc(['bag', 'info', str(bag), '--json', '/dev/full']) == 1
+    words = 'error: /dev/full cannot be written: No space left on device; free space there'
+    assert words in capsys.readouterr().err
+
+
+def test_a_report_that_cannot_be_written_keeps_the_last_one(tmp_path, capsys, monkeypatch):
+    """A limit of the size of files left a part of the new report in place of the good one."""
+    bag = write(tmp_path / 'bag', only('/odom')[:50])
+    good = write_report(bag).report.read_text(encoding='utf-8')
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    monkeypatch.setattr(sys, 'dont_write_bytecode', True)  # nothing else is cut off
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, before[1]))
+    try:
+        assert t3mpc(['bag', 'report', str(bag)]) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert f'{tmp_path}/report.html cannot be written: File too large' in capsys.readouterr().err
+    assert (tmp_path / 'report.html').read_text(encoding='utf-8') == good
+    assert {each.name for each in tmp_path.iterdir()} == {'bag', 'report.html'}
+
+
+def test_a_link_to_a_file_of_numbers_remains_a_link(tmp_path, capsys):
+    """A file that replaces another one would have replaced the link to it."""
+    bag = write(tmp_path / 'bag', only('/odom')[:50])
+    (tmp_path / 'numbers.json').write_text('')
+    (tmp_path / 'link').symlink_to('numbers.json')
+    assert t3mpc(['bag', 'info', str(bag), '--json', str(tmp_path / 'link')]) == 0
+    assert (tmp_path / 'link').is_symlink()
+    assert 'message_count' in (tmp_path / 'numbers.json').read_text()

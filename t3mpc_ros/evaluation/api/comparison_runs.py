@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation import comparison
 from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
@@ -128,7 +129,7 @@ class Comparison(ShownAsTables):
         from t3mpc_ros.evaluation.comparison_page import page
 
         target = writable(path, '.html')
-        target.write_text(page(self.plan, self.results), encoding='utf-8')
+        write_atomically(target, page(self.plan, self.results))
         return target
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 import traceback
 from typing import ParamSpec, TypeVar
 
+from t3mpc_ros.atomic_file import NO_ROOM
 from t3mpc_ros.missing_library import remedy
 from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.script_error import ScriptError
@@ -54,6 +55,11 @@ def sentence(error: BaseException) -> str:
         return LOST_PROCESS
     if isinstance(cause, ScriptError):
         return str(cause)
+    if isinstance(error, OSError) and error.errno in NO_ROOM:
+        return (
+            f'{error.filename or "the output"} cannot be written: {error.strerror}; free space '
+            'there, raise the quota or the limit of file sizes, or write to another disk'
+        )
     return str(error) or repr(error)
 
 

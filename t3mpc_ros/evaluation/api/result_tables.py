@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation.api.error_messages import one_sentence
 from t3mpc_ros.evaluation.reporting import Table, write_columns
 from t3mpc_ros.parameters.command_line import check_writable
@@ -171,7 +172,7 @@ def drawn(draw: Callable[[Any], Any], path: str | os.PathLike[str] | None) -> An
         figure = draw(plotting)
     if path is not None:
         target = writable(path, *(f'.{kind}' for kind in plotting.DATES))
-        target.write_bytes(plotting.file_of(figure, target.suffix.removeprefix('.')))
+        write_atomically(target, plotting.file_of(figure, target.suffix.removeprefix('.')))
     return figure
 
 

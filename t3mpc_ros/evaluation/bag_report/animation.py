@@ -31,6 +31,7 @@ from matplotlib.patches import Circle
 import numpy as np
 from PIL import Image
 
+from t3mpc_ros.atomic_file import atomic_file
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.evaluation.bag_report.metrics import path_of
 from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
@@ -134,15 +135,17 @@ def animate_bag(
             for frame in _frames(run, times, ranges, world, options.width, bar.update)
         ]
     # With ``optimize`` a frame holds only the pixels that change.
-    few[0].save(
-        output,
-        save_all=True,
-        append_images=few[1:],
-        duration=round(1000.0 / options.rate),
-        loop=0,
-        optimize=True,
-        disposal=1,
-    )
+    with atomic_file(output) as file:
+        few[0].save(
+            file,
+            'GIF',
+            save_all=True,
+            append_images=few[1:],
+            duration=round(1000.0 / options.rate),
+            loop=0,
+            optimize=True,
+            disposal=1,
+        )
     return output
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag.mcap_file import LOSS_CAUSES, UNDISCOVERED, message_losses
 from t3mpc_ros.bag.reader import BagReader, open_bag
 from t3mpc_ros.evaluation.bag_report import incidents
@@ -111,8 +112,7 @@ def write_report(
         run = load_run(recording, wanted)
         figures = compute_metrics(run, output / 'report.html', recording.message_count)
         page = _page(recording, run, figures)
-        output.mkdir(parents=True, exist_ok=True)
-        figures.report.write_text(page, encoding='utf-8')
+        write_atomically(figures.report, page)
     return figures
 
 

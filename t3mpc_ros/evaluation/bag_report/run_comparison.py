@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.evaluation.bag_report import report_charts
 from t3mpc_ros.evaluation.bag_report.incidents import driving
@@ -236,9 +237,8 @@ def write_comparison(
     charts = list(_charts(runs))
     blocks += [Contents(), *charts[:GROUP], Heading('Numbers'), _metrics_table(runs)]
     blocks += [*charts[GROUP:], *_parameters(runs)]
-    output.mkdir(parents=True, exist_ok=True)
     title = f'Comparison of {len(runs)} runs'
-    path.write_text(html_page(title, blocks), encoding='utf-8')
+    write_atomically(path, html_page(title, blocks))
     lines = [f'{each.label}: {each.metrics.verdict.text()}' for each in runs]
     lines += [f'{each.subject}: {each.headline}: {"; ".join(each.reasons)}' for each in verdicts]
     record = {

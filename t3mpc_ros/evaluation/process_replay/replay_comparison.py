@@ -24,6 +24,7 @@ from matplotlib.colors import ListedColormap
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation import plotting
 from t3mpc_ros.evaluation.plotting import COLOURS
 from t3mpc_ros.evaluation.process_replay.controller_replay import (
@@ -309,7 +310,7 @@ def write_divergence_figure(outcome: Comparison, path: Path) -> None:
     """Write a PNG of the first divergence of the replay from the recording."""
     figure = plotting.drawing(_draw, outcome)
     if figure is not None:
-        path.write_bytes(plotting.file_of(figure, 'png'))
+        write_atomically(path, plotting.file_of(figure, 'png'))
 
 
 def _draw(outcome: Comparison) -> Any:
