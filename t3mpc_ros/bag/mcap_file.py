@@ -264,7 +264,8 @@ class McapFile:
         names = {
             each.id: each.topic for each in channels if topics is None or each.topic in topics
         }
-        with self.path.open('rb') as file, read_errors(str(self.path)):
+        remedy = f'; `t3mpc bag recover {self.path}` writes what it still holds to a new bag'
+        with self.path.open('rb') as file, read_errors(str(self.path), remedy=remedy):
             statistics: Any = self._summary.statistics
             if not statistics.chunk_count == len(self._summary.chunk_indexes) > 0:
                 # Not every message is in a chunk with an index.
@@ -447,14 +448,17 @@ def message_loss_notes(records: Mapping[str, Mapping[str, str]]) -> list[str]:
 
 
 @contextmanager
-def read_errors(what: str, error_type: Callable[[str], BagError] = BagError) -> Iterator[None]:
-    """Convert the errors of the libraries for damaged files to a :class:`BagError`."""
+def read_errors(
+    what: str, error_type: Callable[[str], BagError] = BagError, remedy: str = ''
+) -> Iterator[None]:
+    """Convert the errors of the libraries to a :class:`BagError`, with the remedy for damage."""
     try:
         yield
     except BagError:
         raise
     except Exception as error:  # parsers and decompressors raise anything on damaged bytes
         text = str(error) or type(error).__name__
+        text += '' if isinstance(error, OSError) else remedy
         raise error_type(f'{what} cannot be read: {text}') from error
 
 

@@ -151,16 +151,23 @@ class BagReader:
         if topic not in self.topics:
             available = ', '.join(self.topics) or 'no topic'
             raise UnknownTopicError(f'{topic} is not in {self.folder}, which contains {available}')
-        for message in self.serialized_messages([topic]):
-            yield (message.received_ns - self.start_ns) / NANOSECONDS, self.decode(message)
+        for number, message in enumerate(self.serialized_messages([topic]), 1):
+            received = (message.received_ns - self.start_ns) / NANOSECONDS
+            yield received, self.decode(message, number)
 
-    def decode(self, message: mcap_file.SerializedMessage) -> Any:
-        """Return a message of this bag as an object."""
+    def decode(self, message: mcap_file.SerializedMessage, number: int) -> Any:
+        """Return a message of this bag as an object; its number in the topic is for the error."""
         type_name = self.topics[message.topic].type_name
-        with mcap_file.read_errors(message.topic, DataError):
-            if type_name not in self._decoders:
+        if type_name not in self._decoders:
+            with mcap_file.read_errors(message.topic, DataError):
                 self._decoders[type_name] = self._make_decoder(type_name)
+        try:
             return self._decoders[type_name](message.data, type_name)
+        except Exception as error:  # the library raises anything on damaged bytes
+            raise DataError(
+                f'message {number} of {message.topic} in {self.folder} does not have the layout '
+                f'of {type_name}: correct its publisher, or choose another topic'
+            ) from error
 
     def _make_decoder(self, type_name: str) -> Callable[[bytes, str], Any]:
         """Return the function that decodes messages of a type by its definition in the bag."""

@@ -27,7 +27,7 @@ import pytest
 from rosbags.convert import convert
 from rosbags.typesys import Stores, get_typestore
 from support.bag_messages import START, STORE, TYPES, diagnostics, odometry_message, twist_message
-from support.robot_bags import following_rows, write
+from support.robot_bags import following_rows, write, write_with_records
 
 from t3mpc_ros.cli.main import main as t3mpc
 from t3mpc_ros.evaluation.bag_report.report_page import write_report
@@ -437,6 +437,16 @@ def test_what_cannot_be_read_is_an_error_that_says_why(content, words, tmp_path,
     assert t3mpc(['bag', 'report', str(file), '--output', str(tmp_path / 'out')]) == 1
     assert words in capsys.readouterr().err
     assert not (tmp_path / 'out').exists()
+
+
+def test_a_damaged_chunk_names_the_command_that_recovers(tmp_path, capsys):
+    """*A chunk cannot be decompressed* had no remedy, where a truncated file has one."""
+    (file,) = write_with_records(tmp_path / 'bag', only('/odom'), {}).glob('*.mcap')
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    file.write_bytes(content)
+    assert t3mpc(['bag', 'report', str(file)]) == 1
+    assert f'`t3mpc bag recover {file}` writes what it still' in capsys.readouterr().err
 
 
 def test_a_full_disk_names_the_file_and_the_remedy(tmp_path, capsys):

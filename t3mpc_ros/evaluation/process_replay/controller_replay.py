@@ -256,8 +256,8 @@ def _revisions(recording: BagReader, topic: str) -> list[Revision]:
     if topic not in recording.topics:
         return []
     messages = [
-        (each.received_ns, recording.decode(each))
-        for each in recording.serialized_messages([topic])
+        (each.received_ns, recording.decode(each, number))
+        for number, each in enumerate(recording.serialized_messages([topic]), 1)
     ]
     try:
         return [(when, *parameters_from_json(message.data)) for when, message in messages]
