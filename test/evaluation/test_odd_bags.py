@@ -18,6 +18,7 @@ cannot be measured.
 """
 
 from html import unescape
+import json
 import re
 import resource
 import sys
@@ -152,14 +153,14 @@ ODD_BAGS = {
     ),
     'two robots far apart': (
         lambda: by_time(ROWS, second_robot((5.0, 0.0, 0.0))),
-        'Several robots publish /odom: nothing measured from it is valid',
-        ('Several robots: the position of /odom alternates between places',),
+        'The position of /odom jumps between its messages: several robots publish it, or',
+        ('or its pose disagrees with its twist; nothing measured from it is valid',),
         None,
     ),
     'two robots from one place': (
         lambda: by_time(ROWS, second_robot()),
-        'Several robots publish /odom: nothing measured from it is valid',
-        ('Several robots: the position of /odom alternates between places',),
+        'The position of /odom jumps between its messages: several robots publish it, or',
+        ('or its pose disagrees with its twist; nothing measured from it is valid',),
         None,
     ),
     'two namespaces': (
@@ -380,6 +381,53 @@ def test_an_odd_bag_is_named_first(name, tmp_path):
     elif measured is False:
         assert [each.count for each in errors] == [0, 0]
         assert 'RMSE' not in figures.summary()
+
+
+def scaled(linear, angular):
+    def change(i, t, message):
+        message.twist.twist.linear.x *= linear
+        message.twist.twist.angular.z *= angular
+
+    return change
+
+
+def turned(**values):
+    def change(i, t, message):
+        for name, value in values.items():
+            setattr(message.pose.pose.orientation, name, value)
+
+    return change
+
+
+def in_millimetres(i, t, message):
+    message.pose.pose.position.x *= 1e3
+    message.pose.pose.position.y *= 1e3
+
+
+UNITS = 'The twist of /odom cannot be in m/s and rad/s'
+JUMPS = 'The position of /odom jumps between its messages: several robots publish it, or its pose'
+IMPOSSIBLE = {
+    # change of the odometry, words of the verdict, whether anything measured is valid
+    'stamps': (lambda i, t, m: restamped(m, -t - START / 1e9), 'of /odom are constant', True),
+    'zeros': (turned(z=0.0, w=0.0), '799 of 799 quaternions of /odom are zero', True),
+    'nan': (turned(x=np.nan), '799 messages of /odom hold a number that is not finite', True),
+    'degrees': (scaled(1.0, 180.0 / np.pi), UNITS, False),
+    'millimetres': (scaled(1e3, 1.0), UNITS, False),
+    'pose in millimetres': (in_millimetres, JUMPS, False),
+}
+
+
+@pytest.mark.parametrize('name', IMPOSSIBLE)
+def test_the_verdict_names_an_impossible_odometry(name, tmp_path, capsys):
+    """It was a good run, or one of *several robots*, not valid, which *drove 1.07 m*."""
+    change, words, valid = IMPOSSIBLE[name]
+    rows = [row for row in changed('/odom', change) if row[1] != '/reference' or valid]
+    bag = write(tmp_path / 'bag', rows)
+    assert t3mpc(['bag', 'report', str(bag), '--json', '-']) == 0
+    verdict = json.loads(capsys.readouterr().out)['verdict']
+    assert words in verdict['text']
+    assert words in text_of((tmp_path / 'report.html').read_text(encoding='utf-8'))
+    assert valid or (verdict['kind'] == 'bad' and 'drove' not in verdict['text'])
 
 
 def truncated(folder):

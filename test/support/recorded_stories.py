@@ -277,7 +277,8 @@ STORIES = {
         r'be judged\.', 'open', names={'/reference': ''},
     ),
     'two robots': Story(
-        r'Several robots publish /odom: nothing measured from it is valid; .*', 'bad',
+        r'The position of /odom jumps between its messages: several robots publish it, or its '
+        r'pose disagrees with its twist; nothing measured from it is valid\.', 'bad',
         second_robot=True, names={'/ground_truth/odom': ''},
     ),
     'poor': Story(

@@ -13,10 +13,13 @@
 # limitations under the License.
 """Whether the messages of a topic are one motion: gaps, jumps, several robots."""
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.control.watchdog import FAR_BEYOND, TwistUnits
+from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, Pose, State
 
 Integers = NDArray[np.int64]
 
@@ -103,13 +106,7 @@ def continuity_notes(
         f'The position of {topic} jumps by {away[k - 1]:.4g} m at {received[k]:.1f} s.'
         for k in pose_jumps(stamps, positions, speeds, POSE_JUMP).tolist()
     ]
-    notes += shortened(jumps, 'jumps of the position')
-    if several_robots(stamps, positions, speeds):
-        notes.append(
-            f'Several robots: the position of {topic} alternates between places, so several '
-            'robots publish it, or it is noise; nothing measured from it is valid.'
-        )
-    return notes
+    return notes + shortened(jumps, 'jumps of the position')
 
 
 def shortened(notes: list[str], what: str) -> list[str]:
@@ -119,7 +116,26 @@ def shortened(notes: list[str], what: str) -> list[str]:
     return notes
 
 
-def several_robots(stamps: Array, positions: Array, speeds: Array) -> bool:
-    """Return whether the position jumps so often that a topic holds several robots."""
+def jumps_often(stamps: Array, positions: Array, speeds: Array) -> bool:
+    """Return whether the position jumps as if a topic held several robots."""
     jumps = pose_jumps(stamps, positions, speeds, MIXED_STEP).size
     return jumps > max(MIN_JUMPS, MIXED_SHARE * stamps.size)
+
+
+def other_units(stamps: Array, poses: Array, twists: Array) -> str:
+    """Return a twist that shows that those of an odometry are in other units; '' if none does.
+
+    Stamps (s) in the order of the bag, poses (x, y in m, yaw in rad) and twists, shape (n, ...).
+    """
+    units = TwistUnits()
+    if not np.any(np.abs(twists) > FAR_BEYOND):  # no message can contradict its pose
+        return ''
+    rows = zip(np.round(stamps * NANOSECONDS).tolist(), poses.tolist(), twists.tolist(),
+               strict=True)  # fmt: skip
+    states = (State(int(stamp), Pose(*pose), BodyTwist(*twist)) for stamp, pose, twist in rows)
+    for last, new in pairwise(states):
+        if new.stamp_ns > last.stamp_ns:
+            units.update(last, new)
+        if units.wrong:
+            return units.example
+    return ''

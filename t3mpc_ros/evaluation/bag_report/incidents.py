@@ -26,7 +26,6 @@ from t3mpc_ros.evaluation.bag_report.continuity import (
     POSE_JUMP,
     gaps,
     pose_jumps,
-    several_robots,
 )
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import SLIP, Cause, cause_between
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, moves
@@ -402,16 +401,14 @@ def _received(times: Array, low: float, high: float) -> bool:
 
 
 def find_jumps(run: Run) -> tuple[Jump, ...]:
-    """Return where the position of a robot jumps, unless several robots publish it."""
+    """Return where the position of a robot jumps, but for one that cannot be trusted."""
     found = []
     for name in (ODOMETRY, TRUTH):
         motion = run.motions.get(name)
-        if motion is None or 'x' not in motion.values:
+        if motion is None or 'x' not in motion.values or name in run.untrusted:
             continue
         places = np.stack([motion['x'], motion['y']], axis=1)
         given = motion.time, places, motion['linear']
-        if several_robots(*given):
-            continue
         away = np.linalg.norm(np.diff(places, axis=0), axis=1)
         found += [
             Jump(float(motion.time[k]), name, float(away[k - 1]))

@@ -31,7 +31,12 @@ from t3mpc_ros.bag.reader import (
 )
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report import diagnostic_history
-from t3mpc_ros.evaluation.bag_report.continuity import continuity_notes, gaps, several_robots
+from t3mpc_ros.evaluation.bag_report.continuity import (
+    continuity_notes,
+    gaps,
+    jumps_often,
+    other_units,
+)
 from t3mpc_ros.evaluation.bag_report.map_changes import RecordedChange, read_map_changes
 from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
 from t3mpc_ros.evaluation.topic_roles import (
@@ -55,6 +60,8 @@ from t3mpc_ros.parameters.table import ParameterError
 _ODOMETRY_FIELDS = {
     'x': 'pose.pose.position.x',
     'y': 'pose.pose.position.y',
+    'about x': 'pose.pose.orientation.x',
+    'about y': 'pose.pose.orientation.y',
     'z': 'pose.pose.orientation.z',
     'w': 'pose.pose.orientation.w',
     'linear': 'twist.twist.linear.x',
@@ -67,6 +74,8 @@ SWITCH_WINDOW = 0.25
 """Largest time from a change of the signals to the step of the reference, s."""
 JUMP = 10.0
 """Jump (s) of the stamps against the receive times that indicates a changed clock."""
+MOST = 0.98
+"""Share of finite messages above which a verdict does not mention the others."""
 
 
 class Channel(NamedTuple):
@@ -170,8 +179,12 @@ class Run:
     """Sentences on what is unusual in the bag, and what was done about it."""
     remarks: tuple[str, ...]
     """Sentences on where the data come from."""
-    damage: tuple[str, ...] = ()
-    """Oddities because of which the numbers cannot be trusted, in short."""
+    doubts: tuple[str, ...] = ()
+    """Those of the oddities that concern the numbers of the messages."""
+    damage: Mapping[str, str] = field(default_factory=dict)
+    """Oddities because of which the numbers cannot be trusted, in short, and their remedies."""
+    untrusted: tuple[str, ...] = ()
+    """Relative names of topics of which nothing that is measured is valid."""
     world: str = ''
     """Name of the simulated world; empty if unknown."""
     follows_path: bool = False
@@ -198,11 +211,14 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     records = recording.metadata_records
     geometry = _geometry(records, wanted, choice.ours, notes)
     columns = _columns(recording, topics.values())
-    raw = {}
+    raw, doubts, untrusted = {}, list[str](), []
     for name, topic in topics.items():
-        raw[name], mixed = _read(recording, name, topic, columns.get(topic), oddities)
-        if mixed:
-            damage.append(f'several robots publish {topic}: nothing measured from it is valid')
+        raw[name], found = _read(recording, name, topic, columns.get(topic), oddities, doubts)
+        if found:
+            damage |= found
+            untrusted.append(name)
+            oddities += [f'{text}.' for text in found]
+    oddities += doubts
     raw = {name: table for name, table in raw.items() if table['stamp'].size}
     clock = _Clock(raw, oddities)
     scalars = _recomputed_scalars(recording, choice, notes)
@@ -244,7 +260,9 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         links=diagnostics.links,
         oddities=tuple(dict.fromkeys(oddities)),
         remarks=tuple(notes),
-        damage=tuple(damage),
+        doubts=tuple(doubts),
+        damage=damage,
+        untrusted=tuple(untrusted),
         world=records.get('sim_robot', {}).get('world', ''),
         map_changes=read_map_changes(recording, choice.namespaces[0], clock.local),
         other_clock=clock.other,
@@ -253,16 +271,19 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     )
 
 
-def _oddities_of_bag(recording: BagReader, choice: TopicChoice) -> tuple[list[str], list[str]]:
-    """Return sentences on the bag as a whole, and damage in short."""
-    found, damage = [], []
+def _oddities_of_bag(
+    recording: BagReader, choice: TopicChoice
+) -> tuple[list[str], dict[str, str]]:
+    """Return sentences on the bag as a whole, and damage in short with its remedy."""
+    found, damage = [], {}
     if recording.incomplete_files:
         listed = ', '.join(recording.incomplete_files)
         found.append(
             f'Truncated or unfinished files, not read: {listed} (t3mpc bag recover writes their '
             'messages to a new bag).'
         )
-        damage.append('files of the bag are truncated or unfinished, and were not read')
+        text = 'files of the bag are truncated or unfinished, and were not read'
+        damage[text] = '`t3mpc bag recover` writes their messages to a new bag.'
     if recording.storage == 'ROS 1':
         found.append('This is a bag of ROS 1: it holds no quality of service.')
     if len(choice.namespaces) > 1:
@@ -383,9 +404,14 @@ def _columns(recording: BagReader, topics: Iterable[str]) -> Mapping[str, TopicC
 
 
 def _read(
-    recording: BagReader, name: str, topic: str, column: TopicColumns | None, notes: list[str]
-) -> tuple[dict[str, Array], bool]:
-    """Return the arrays of one topic, and whether it mixed several robots.
+    recording: BagReader,
+    name: str,
+    topic: str,
+    column: TopicColumns | None,
+    notes: list[str],
+    doubts: list[str],
+) -> tuple[dict[str, Array], dict[str, str]]:
+    """Return the arrays of one topic, and why nothing of it is valid, if so, with the remedy.
 
     Rows that are not finite are left out.
     """
@@ -403,31 +429,50 @@ def _read(
         stamps = column.stamps_ns if CDR_LAYOUTS[kind].stamped else column.received_ns
         instants = {'received': column.received_ns, 'stamp': stamps}
         table = {key: (each - recording.start_ns) / NANOSECONDS for key, each in instants.items()}
-        numbers = column.numbers.T
-        if fields is _ODOMETRY_FIELDS:  # without the orientation about the other axes
-            numbers = np.delete(numbers, (2, 3), axis=0)
-        table |= dict(zip(fields, numbers, strict=True))
+        table |= dict(zip(fields, column.numbers.T, strict=True))
     sound = np.all([np.isfinite(values) for values in table.values()], axis=0)
     if not sound.all():
-        notes.append(f'{np.count_nonzero(~sound)} messages of {topic} hold a number that is not '
-                     'finite; they are excluded.')  # fmt: skip
+        text = f'{np.count_nonzero(~sound)} messages of {topic} hold a number that is not finite'
+        (notes if np.mean(sound) > MOST else doubts).append(f'{text}; they are excluded.')
     table = {key: values[sound] for key, values in table.items()}
-    mixed = False
+    damage = {}
     if fields is _ODOMETRY_FIELDS:
         times = table['received'], table['stamp']
         places = np.stack([table['x'], table['y']], axis=1)
         notes += continuity_notes(topic, *times, places, table['linear'])
-        mixed = several_robots(table['stamp'], places, table['linear'])
-        _mend_stamps(table, topic, notes)
-    return table, mixed
+        often = jumps_often(table['stamp'], places, table['linear'])
+        _mend_stamps(table, topic, notes, doubts)
+        turned = [table.pop(key) for key in ('about x', 'about y')] + [table['z'], table['w']]
+        blind = np.count_nonzero(~np.any(turned, axis=0))
+        if often:
+            text = (
+                f'The position of {topic} jumps between its messages: several robots publish it, '
+                'or its pose disagrees with its twist; nothing measured from it is valid'
+            )
+            damage[text] = 'Give each robot a namespace, or correct the units in its driver.'
+        elif name != REFERENCE and blind:
+            doubts.append(
+                f'{blind} of {places.shape[0]} quaternions of {topic} are zero: its direction is '
+                'not known there.'
+            )
+        elif name != REFERENCE:
+            poses = np.column_stack([places, 2.0 * np.arctan2(table['z'], table['w'])])
+            twists = np.column_stack([table['linear'], table['angular']])
+            if example := other_units(table['stamp'], poses, twists):
+                text = (
+                    f'The twist of {topic} cannot be in m/s and rad/s: {example}; nothing '
+                    'measured from it is valid'
+                )
+                damage[text] = 'Correct the units in its driver, or see why wheels spin.'
+    return table, damage
 
 
-def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str]) -> None:
+def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str], doubts: list[str]) -> None:
     """Replace stamps that are unusable by receive times."""
     received, stamps = table['received'], table['stamp']
     if stamps.size > 2 and np.unique(stamps).size < 0.5 * np.unique(received).size:
         table['stamp'] = received
-        notes.append(
+        doubts.append(
             f'The stamps of {topic} are constant; its messages were placed by receive time.'
         )
         return

@@ -120,21 +120,20 @@ def judge(
     ``counted`` is the time in which errors count, s; ``missing`` the share of odometry,
     ``latency_99`` the 99th percentile from odometry to command, s; NaN if unknown.
     """
-    recovery = '`t3mpc bag recover` writes their messages to a new bag.'
-    findings = [
-        _Finding(text, remedy=recovery if 'truncated' in text else '', spoils=True)
-        for text in run.damage
-    ]
+    findings = [_Finding(text, '', remedy, spoils=True) for text, remedy in run.damage.items()]
     damaged = bool(findings)
-    if lacking := _lacking(run):
+    lacking = _lacking(run)
+    if run.measured in run.untrusted:
+        return _verdict(run, findings, '', judged=not lacking, damaged=True)
+    if lacking:
         said = _Finding(_without(run, lacking), 'Data missing: tracking cannot be judged')
         if run.measured:
             findings += _interruptions(run, incidents)
-        return _verdict([*findings, said], said.text, judged=False, damaged=damaged)
+        return _verdict(run, [*findings, said], said.text, judged=False, damaged=damaged)
     first, last = driving(run)
     if not first < last:
         findings.append(_never_driven(run))
-        return _verdict(findings, 'every command was zero', damaged=damaged)
+        return _verdict(run, findings, 'every command was zero', damaged=damaged)
     findings += _interruptions(run, incidents)
     slow = [*_slow_machine(run, incidents)]
     loss = []
@@ -155,12 +154,14 @@ def judge(
         error, reached = _error_finding(run, counted, last - counted_from(first, last))
     if error is not None:
         findings.append(error)
+    slowly = bool(slow or late)
     return _verdict(
-        findings, reached, slow=bool(slow or late), damaged=damaged, on_path=on_path, detail=late
+        run, findings, reached, slow=slowly, damaged=damaged, on_path=on_path, detail=late
     )
 
 
 def _verdict(
+    run: Run,
     findings: Sequence[_Finding],
     reached: str,
     *,
@@ -177,7 +178,7 @@ def _verdict(
         f'Good run: {reached}{stood}.',
         'Good run',
         'good',
-        details=(detail,) if detail else (),
+        details=(*run.doubts, *([detail] if detail else [])),
         sound=judged and not spoilt,
         judged=judged,
         slow=slow,
