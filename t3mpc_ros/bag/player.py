@@ -38,6 +38,8 @@ _FIRST_LOOKBACK_NS = NANOSECONDS
 """First time range of a backward search; each further range is twice as long."""
 MIN_LOOP_NS = 10_000_000
 """Minimum duration of a loop, for bags whose messages all have the same stamp."""
+LONGEST = 1e10
+"""Largest time in a bag or between bags, s: 300 years."""
 
 
 class ScheduledMessage(NamedTuple):
@@ -72,6 +74,7 @@ class MergedReader:
             (file, offset) for bag, offset in zip(bags, offsets, strict=True) for file in bag.files
         ]
         some = [(file, offset) for file, offset in self._files if file.message_count]
+        self.empty = not some
         self.start_ns = min((file.start_ns + offset for file, offset in some), default=0)
         self.end_ns = max((file.end_ns + offset for file, offset in some), default=0)
         selected = [
@@ -218,7 +221,10 @@ class PlaybackParameters(Parameters):
     )
     align_bags: bool = parameter(False, 'shift every bag to the start time of the first one')
     bag_offsets: tuple[float, ...] = parameter(
-        (), 'time offset of each bag, after the alignment; empty = none', 's'
+        (),
+        'time offset of each bag, after the alignment; empty = none',
+        's',
+        (-LONGEST, LONGEST),
     )
     rate: float = parameter(
         1.0, 'playback rate: seconds of the bag per second', bounds=(0.01, 100.0), dynamic=True
@@ -229,16 +235,16 @@ class PlaybackParameters(Parameters):
         'start of the playback, after the first message; transient-local messages from before it '
         'are published first',
         's',
-        (0.0, None),
+        (0.0, LONGEST),
     )
     playback_duration: float = parameter(
-        0.0, 'duration of the playback in bag time; 0 = to the end', 's', (0.0, None)
+        0.0, 'duration of the playback in bag time; 0 = to the end', 's', (0.0, LONGEST)
     )
     playback_until: float = parameter(
         0.0,
         'end of the playback, after the first message; 0 = the end of the bag',
         's',
-        (0.0, None),
+        (0.0, LONGEST),
     )
     topics: tuple[str, ...] = parameter(
         (),
@@ -269,7 +275,7 @@ class PlaybackParameters(Parameters):
         False, 'start paused: wait for ~/resume, ~/play_next or the space bar'
     )
     seek_time: float = parameter(
-        0.0, 'target of ~/seek, after the first message', 's', (0.0, None), dynamic=True
+        0.0, 'target of ~/seek, after the first message', 's', (0.0, LONGEST), dynamic=True
     )
     play_next_count: int = parameter(
         1, 'number of messages that ~/play_next plays', bounds=(1, 1_000_000), dynamic=True
@@ -309,6 +315,9 @@ class PlaybackParameters(Parameters):
         try:
             for path in self.uris:
                 bags.append(open_bag(path))
+                files = {file.path.resolve() for bag in bags for file in bag.files}
+                if len(files) < sum(len(bag.files) for bag in bags):
+                    raise ParameterError(f'storage.uris must name each bag once: got {path} twice')
             offsets_ns = [round(offset * NANOSECONDS) for offset in self.bag_offsets]
             offsets_ns = offsets_ns or [0] * len(bags)
             if self.align_bags and bags:

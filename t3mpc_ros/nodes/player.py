@@ -260,6 +260,8 @@ class PlayerNode(BaseNode[PlayerParameters]):
 
     def _why_nothing(self) -> str:
         topics = self._topic_publishers
+        if self._reader is not None and self._reader.empty:
+            return 'the bags hold no message: record them anew'
         if self._damaged:
             return f'all {self._damaged} messages are in damaged chunks'
         if excluded := {**topics.unusable, **topics.blocked}:

@@ -316,6 +316,27 @@ def test_parameters_that_cannot_be_played_are_rejected(given, words):
         PlaybackParameters.from_dict({'storage.uris': ['bag'], **given})
 
 
+@pytest.mark.parametrize(
+    'name', ['start_offset', 'playback_duration', 'playback_until', 'seek_time', 'bag_offsets']
+)
+def test_a_time_beyond_any_bag_is_refused(name):
+    """1e300 s ended with the traceback of an OverflowError."""
+    many, value = name == 'bag_offsets', 1e300
+    words = rf'play\.{name} must be from (0|-1e\+10) to 1e\+10 s: got 1e\+300'
+    with pytest.raises(ParameterError, match=words):
+        PlaybackParameters.from_dict(
+            {'storage.uris': ['bag'], f'play.{name}': [value] if many else value}
+        )
+
+
+def test_one_bag_twice_is_refused(tmp_path):
+    """Each message was played twice."""
+    folder = write_mcap(tmp_path / 'bag', ticks())
+    (file,) = folder.glob('*.mcap')
+    with pytest.raises(ParameterError, match=f'must name each bag once: got {file} twice'):
+        PlaybackParameters(uris=(str(folder), str(file))).open_reader()
+
+
 def test_a_rate_must_be_positive(bag):
     for rate in (0.0, -1.0, float('nan'), float('inf')):
         with pytest.raises(ValueError, match='rate must be a positive number'):

@@ -364,6 +364,15 @@ def test_a_bag_that_plays_nothing_is_an_error(kept, given, words, harness, logge
     assert [words in line for line in logged('nothing was played')] == [True] * bool(words)
 
 
+def test_an_empty_bag_is_named_as_such(harness, logged, tmp_path):
+    """It said that /cmd_vel may drive a robot, which was not why nothing was played."""
+    with BagWriter(tmp_path / 'bag', metadata_records={}) as bag:
+        bag.add_topic('/cmd_vel', 'geometry_msgs/msg/Twist')
+    player = play(harness, tmp_path / 'bag', play__subscriber_timeout=0.0)
+    harness.spin_until(lambda: player.exit_requested)
+    assert len(logged('nothing was played: the bags hold no message')) == 1
+
+
 @pytest.mark.parametrize(
     'given, error, words',
     [
