@@ -18,6 +18,7 @@ import re
 
 import numpy as np
 import pytest
+from support.checkout import ROOT
 from support.training_runs import GEOMETRY, TrainingRun
 
 from t3mpc_ros.bag import model_file
@@ -360,7 +361,11 @@ def of_another_controller(tape):
         (before(0.5, '/reference'), False, 'not in the bag: reference'),
         (before(0.5, '/odom'), False, 'not in the bag: odom'),
         (before(0.5, '/controller/journal'), False, 'no journal of the controller'),
-        (before(12.0), False, r'without block 1 to learn from: .* 10 s of motion: got 7\.\d s'),
+        (
+            before(12.0),
+            False,
+            r'without block 1 .* 10 s of motion: got 7\.\d s; record .* another bag',
+        ),
         (before(3.0), True, r'at least 10 s of motion: got 2\.\d s'),
         (of_another_controller, False, 'of 1500 commands come out of the replay'),
     ],
@@ -386,6 +391,14 @@ def test_bags_that_do_not_belong_together_are_refused(calm, tmp_path):
         fit_bags([])
     with pytest.raises(BagError, match='there is no bag'):
         fit_bags([tmp_path / 'nowhere'])
+
+
+def test_a_bag_whose_parameters_changed_is_named_once():
+    """It was *changes.mcap and changes.mcap must have the same parameters*."""
+    golden = ROOT / 'test' / 'golden' / 'changes.mcap'
+    words = f'{golden} must have the same parameters throughout; during the run changed law.gain'
+    with pytest.raises(TrainingError, match=f'^{words}'):
+        fit_bags([golden])
 
 
 # -- the pieces it rests on ---------------------------------------------------------------------

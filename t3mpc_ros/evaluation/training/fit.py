@@ -161,9 +161,11 @@ def check_compatible(
     names = [spec.name for spec in Nt3fsMpcParameters.specs() if spec.name not in FREE]
     names += [spec.name for spec in WheelGeometry.specs()]
     if differing := [name for name in names if mine[name] != its[name]]:
+        what = f'{path} and {other_path} must have the same parameters; they differ in '
+        if path == other_path:
+            what = f'{path} must have the same parameters throughout; during the run changed '
         raise TrainingError(
-            f'{path} and {other_path} must have the same parameters; they differ in '
-            + ', '.join(f'{name} ({mine[name]}, {its[name]})' for name in differing)
+            what + ', '.join(f'{name} ({mine[name]}, {its[name]})' for name in differing)
         )
 
 

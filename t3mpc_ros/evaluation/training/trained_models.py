@@ -130,7 +130,9 @@ def cross_validate(
                     )
                 }
         except TrainingError as error:
-            raise TrainingError(f'without {name} to learn from: {error}') from error
+            raise TrainingError(
+                f'without {name} to learn from: {error}; record for longer, or give another bag'
+            ) from error
         found.append(Fold(name, judged, ratings, explained(parameters, coefficients, left_out)))
     if not keep_predictor and not any(fold.judged for fold in found):
         raise TrainingError('there must be a stretch without a gap to evaluate: there is none')
