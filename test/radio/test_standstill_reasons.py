@@ -137,13 +137,13 @@ def the_radio_chip_is_dead(bench):
     bench.run(1.0)
 
 
-@cause('the robot does not answer: is it on, in range, on channel 82, at this address?')
+@cause('the robot does not answer: is it on, in range, on channel 82, at address 54334d5043?')
 def the_robot_is_off(bench):
     bench.inject('robot_reset', math.inf)
     bench.run(1.0)
 
 
-@cause('the robot does not answer: is it on, in range, on channel 82, at this address?')
+@cause('the robot does not answer: is it on, in range, on channel 82, at address 54334d5043?')
 def the_air_is_jammed(bench):
     driving(bench)
     bench.inject('jam')

@@ -397,7 +397,7 @@ class Link:
         """Text for a robot that does not answer."""
         if self.over_cable:
             return reasons.ROBOT_SILENT
-        return reasons.robot_absent(self._parameters.channel)
+        return reasons.robot_absent(self._parameters.address, self._parameters.channel)
 
     @property
     def _no_reply(self) -> str:

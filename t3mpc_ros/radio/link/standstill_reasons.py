@@ -145,6 +145,9 @@ def host_suspended(seconds: float) -> str:
     return f'this program was not executed for {seconds:.1f} s: was it suspended?'
 
 
-def robot_absent(channel: int) -> str:
-    """Return the text for a robot that does not answer on a radio channel."""
-    return f'the robot does not answer: is it on, in range, on channel {channel}, at this address?'
+def robot_absent(address: str, channel: int) -> str:
+    """Return the text for a robot that does not answer by radio."""
+    return (
+        f'the robot does not answer: is it on, in range, on channel {channel}, at address '
+        f'{address}?'
+    )

@@ -128,6 +128,7 @@ def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[ReportR
     """Return the report: each measurement with a verdict and a remedy."""
     requests, pings, cycles = result.requests, result.pings, result.cycles
     lost = 1.0 - len(cycles) / requests
+    absent = reasons.robot_absent(parameters.address, parameters.channel)
     rows = [
         ReportRow(
             'dongle answers over USB',
@@ -149,7 +150,7 @@ def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[ReportR
             'robot answers by radio',
             f'{len(cycles)} of {requests}',
             _verdict(lost <= LOSS_LIMIT / 5, lost <= LOSS_LIMIT),
-            ('' if cycles else _SEARCH.format(reasons.robot_absent(parameters.channel)))
+            ('' if cycles else _SEARCH.format(absent))
             + 'more than 0.2 m between the radios, antennas upright and free; 10 uF and 100 nF at '
             'both radio chips; another channel (t3mpc robot scan lists them); --set power=…; '
             '--set rate=250k with nRF24L01+ chips at both ends',

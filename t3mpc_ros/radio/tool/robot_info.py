@@ -87,11 +87,11 @@ def _request_info(parameters: LinkParameters) -> procedure.Script[frames.Info]:
             if answer.protocol != frames.VERSION:
                 raise procedure.ProcedureError(reasons.robot_version(answer.protocol))
             return answer
-    raise procedure.ProcedureError(reasons.robot_absent(parameters.channel))
+    raise procedure.ProcedureError(reasons.robot_absent(parameters.address, parameters.channel))
 
 
 def _start_session(parameters: LinkParameters, session: Session) -> procedure.Script[frames.Info]:
-    problem = reasons.robot_absent(parameters.channel)
+    problem = reasons.robot_absent(parameters.address, parameters.channel)
     for number in range(_MAX_ATTEMPTS):
         # An artificial clock, strictly increasing: no command is sent in this session.
         hello = session.hello(1000 * number)
