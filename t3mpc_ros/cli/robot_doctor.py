@@ -26,6 +26,7 @@ from t3mpc_ros.radio.tool.bench_checklist import (
     DRIVEN,
     FAIL,
     PASS,
+    POOR,
     QUESTIONS,
     SKIPPED,
     Check,
@@ -40,7 +41,7 @@ from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, Board, Procedure
 Value = TypeVar('Value')
 Answer = Callable[[str], str]
 """Asks a question; returns ``yes``, ``no`` or ``skip``."""
-_MARKS = {PASS: 'yes', FAIL: 'no', SKIPPED: 'open'}
+_MARKS = {PASS: 'yes', POOR: 'open', FAIL: 'no', SKIPPED: 'open'}
 _SPEED = 2.0
 """rad/s, of the wheels in the air"""
 
@@ -90,10 +91,10 @@ def run_doctor(
 
 
 def format_check(check: Check) -> str:
-    """Return a line of the output, with the remedy after a failure."""
+    """Return a line of the output, with the remedy of what is not good."""
     step = f'{check.step:>2}' if check.step else '  '
     text = f'{step}  {check.verdict:<7}  {check.name}: {check.value}'
-    return f'{text}\n             try: {check.remedy}' if check.verdict == FAIL else text
+    return f'{text}\n             try: {check.remedy}' if check.verdict in (POOR, FAIL) else text
 
 
 def _drive(
@@ -130,10 +131,10 @@ def _judge(question: Question, answer: str) -> Check:
 def _write(checks: Sequence[Check], path: Path) -> None:
     counts = {verdict: sum(c.verdict == verdict for c in checks) for verdict in _MARKS}
     failed = [f'{check.name}: {check.remedy}' for check in checks if check.verdict == FAIL]
-    kind = 'bad' if failed else 'open' if counts[SKIPPED] else 'good'
+    kind = 'bad' if failed else 'open' if counts[POOR] or counts[SKIPPED] else 'good'
     headline = {
         'bad': f'{counts[FAIL]} of {len(checks)} checks failed',
-        'open': f'nothing failed; {counts[SKIPPED]} checks were skipped',
+        'open': f'nothing failed; poor: {counts[POOR]}, skipped: {counts[SKIPPED]}',
         'good': 'all checks passed',
     }[kind]
     rows: list[list[str | reporting.Mark]] = [
@@ -142,7 +143,7 @@ def _write(checks: Sequence[Check], path: Path) -> None:
             reporting.Mark(check.verdict, _MARKS[check.verdict]),
             str(check.step or ''),
             check.value,
-            check.remedy if check.verdict == FAIL else '',
+            check.remedy if check.verdict in (POOR, FAIL) else '',
         ]
         for check in checks
     ]
@@ -153,7 +154,16 @@ def _write(checks: Sequence[Check], path: Path) -> None:
             '', ['check', 'verdict', 'step', 'found', 'remedy'], rows, text=5, wrap=True
         ),
     ]
-    path.write_text(reporting.html_page('Bench checklist of the robot', blocks), encoding='utf-8')
+    print(headline, flush=True)
     data = path.with_suffix('.json')
-    data.write_text(reporting.strict_json([check._asdict() for check in checks]), encoding='utf-8')
-    print(f'{path}, {data}: {headline}')
+    page = reporting.html_page('Bench checklist of the robot', blocks)
+    numbers = reporting.strict_json([check._asdict() for check in checks])
+    for file, text in ((path, page), (data, numbers)):
+        try:
+            file.write_text(text, encoding='utf-8')
+        except OSError as error:
+            raise ProcedureError(
+                f'{file} cannot be written ({error.strerror}): keep the checklist above, and give '
+                '--report a file on a disk with free space'
+            ) from error
+    print(f'{path}, {data}: saved')

@@ -15,6 +15,7 @@
 
 import argparse
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,16 +25,19 @@ from t3mpc_ros.cli import robot_doctor as cli
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import Pong, Samples
-from t3mpc_ros.radio.tool import procedure
+from t3mpc_ros.radio.tool import link_test, procedure
 from t3mpc_ros.radio.tool.bench_checklist import (
     FAIL,
     PASS,
+    POOR,
     SKIPPED,
     BoardFindings,
     check_board,
     check_builds,
+    check_link,
 )
 from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, Stored
+from t3mpc_ros.radio.tool.procedure import ProcedureError
 from t3mpc_ros.radio.tool.robot_info import LogEntry, LogKind
 from t3mpc_ros.robot.calibration import Calibration, DividerCorrection
 
@@ -129,6 +133,18 @@ def test_builds_of_both_boards_are_compared():
     assert check_builds(None, PONG).verdict == SKIPPED
 
 
+def test_a_poor_line_does_not_pass(monkeypatch):
+    """It said *pass*, and in the same line *poor, try: …*."""
+    rows = [link_test.ReportRow('cable', '3', link_test.POOR, 'another cable')]
+    monkeypatch.setattr(link_test, 'evaluate', lambda *given: rows)
+    (check,) = check_link(None, PARAMETERS)
+    assert check.verdict == POOR
+    shown = cli.format_check(check)
+    assert 'poor     cable: 3\n' in shown
+    assert 'try: another cable' in shown
+    assert 'pass' not in shown
+
+
 @pytest.mark.parametrize('drive', [False, True])
 @pytest.mark.slow
 def test_the_checklist_on_the_emulated_robot(drive, tmp_path, monkeypatch, capsys):
@@ -163,7 +179,7 @@ def test_the_checklist_on_the_emulated_robot(drive, tmp_path, monkeypatch, capsy
     assert [row['name'] for row in saved] == list(verdicts)
     page = (tmp_path / 'r.html').read_text()
     assert all(name in page for name in ('round trip to the robot', 'noise of the rate'))
-    assert 'checks were skipped' in capsys.readouterr().out
+    assert 'nothing failed; poor: 0, skipped: ' in capsys.readouterr().out
 
 
 def test_a_silent_robot_board_does_not_end_the_examination(tmp_path, monkeypatch):
@@ -182,3 +198,20 @@ def test_a_silent_robot_board_does_not_end_the_examination(tmp_path, monkeypatch
     checks = cli.run_doctor(options, PARAMETERS, b'', lambda question: 'skip', lambda: False)
     assert [check.name for check in checks if check.verdict == FAIL] == ['USB of the robot']
     assert any(check.name == 'robot answers by radio' for check in checks)
+
+
+def test_a_full_disk_does_not_cost_the_checklist(monkeypatch, capsys):
+    """It ended with a traceback, and said neither the file nor what to do."""
+    monkeypatch.setattr(procedure, 'run_script', lambda *given: _no_answer())
+    options = argparse.Namespace(
+        port='dongle', robot_port='robot', count=10, drive=False, report=Path('/dev/full')
+    )
+    with pytest.raises(ProcedureError, match='/dev/full cannot be written .No space.*--report'):
+        cli.run_doctor(options, PARAMETERS, b'', lambda question: 'yes', lambda: False)
+    shown = capsys.readouterr().out
+    assert 'pass     emergency stop: yes' in shown
+    assert '2 of 12 checks failed' in shown
+
+
+def _no_answer():
+    raise ProcedureError('silent')

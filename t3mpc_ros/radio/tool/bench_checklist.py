@@ -34,7 +34,7 @@ from t3mpc_ros.robot.calibration import (
 )
 from t3mpc_ros.robot.sensor_conversions import GRAVITY, ImuParameters
 
-PASS, FAIL, SKIPPED = 'pass', 'fail', 'skipped'
+PASS, POOR, FAIL, SKIPPED = 'pass', 'poor', 'fail', 'skipped'
 SAMPLE_COUNT = 200
 _SAMPLE_PERIOD = 0.01
 """s; two seconds in all"""
@@ -53,7 +53,7 @@ class Check(NamedTuple):
     """Row of the checklist in docs/robot.md; 0: not in it."""
     name: str
     verdict: str
-    """PASS, FAIL or SKIPPED."""
+    """PASS, POOR (usable, with a remedy), FAIL or SKIPPED."""
     value: str
     """What was measured or answered."""
     remedy: str = ''
@@ -157,13 +157,12 @@ def examine_board() -> Script[BoardFindings]:
 
 
 def check_link(result: link_test.LinkTestResult, parameters: LinkParameters) -> list[Check]:
-    """Return the rows of the link test; a poor row passes, with its remedy."""
-    checks = []
-    for row in link_test.evaluate(result, parameters):
-        poor = f'; poor, try: {row.remedy}' if row.verdict == link_test.POOR else ''
-        verdict = FAIL if row.verdict == link_test.BAD else PASS
-        checks.append(Check(2, row.name, verdict, row.value + poor, row.remedy))
-    return checks
+    """Return the rows of the link test."""
+    verdicts = {link_test.GOOD: PASS, link_test.POOR: POOR, link_test.BAD: FAIL}
+    return [
+        Check(2, row.name, verdicts[row.verdict], row.value, row.remedy)
+        for row in link_test.evaluate(result, parameters)
+    ]
 
 
 def check_builds(dongle: Pong | None, robot: Pong | None) -> Check:
