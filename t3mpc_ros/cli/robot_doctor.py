@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from t3mpc_ros.evaluation import reporting
+from t3mpc_ros.parameters.command_line import write_text
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool import link_test, manoeuvre, procedure
 from t3mpc_ros.radio.tool.bench_checklist import (
@@ -158,12 +159,6 @@ def _write(checks: Sequence[Check], path: Path) -> None:
     data = path.with_suffix('.json')
     page = reporting.html_page('Bench checklist of the robot', blocks)
     numbers = reporting.strict_json([check._asdict() for check in checks])
-    for file, text in ((path, page), (data, numbers)):
-        try:
-            file.write_text(text, encoding='utf-8')
-        except OSError as error:
-            raise ProcedureError(
-                f'{file} cannot be written ({error.strerror}): keep the checklist above, and give '
-                '--report a file on a disk with free space'
-            ) from error
+    write_text(path, page)
+    write_text(data, numbers)
     print(f'{path}, {data}: saved')

@@ -22,6 +22,7 @@ import pytest
 from support.tool_bench import ToolBench
 
 from t3mpc_ros.cli import robot_doctor as cli
+from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import Pong, Samples
@@ -206,7 +207,7 @@ def test_a_full_disk_does_not_cost_the_checklist(monkeypatch, capsys):
     options = argparse.Namespace(
         port='dongle', robot_port='robot', count=10, drive=False, report=Path('/dev/full')
     )
-    with pytest.raises(ProcedureError, match='/dev/full cannot be written .No space.*--report'):
+    with pytest.raises(ParameterError, match='/dev/full cannot be written .No space'):
         cli.run_doctor(options, PARAMETERS, b'', lambda question: 'yes', lambda: False)
     shown = capsys.readouterr().out
     assert 'pass     emergency stop: yes' in shown
