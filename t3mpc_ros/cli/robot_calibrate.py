@@ -24,7 +24,12 @@ from typing import Any
 
 from t3mpc_ros.cli.shared_options import ask_line, check_two_ports
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_writable
+from t3mpc_ros.parameters.command_line import (
+    bounded_float,
+    bounded_int,
+    check_writable,
+    write_text,
+)
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.parameters.yaml_checks import file_errors, parameter_file, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
@@ -37,6 +42,7 @@ from t3mpc_ros.radio.tool.calibration_wizard import (
     WizardOptions,
     available_steps,
 )
+from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
 from t3mpc_ros.radio.tool.procedure import ProcedureError
 from t3mpc_ros.robot.calibration import (
     MARKS,
@@ -116,6 +122,8 @@ def read_parameter_file(path: Path) -> tuple[Calibration, dict[str, object]]:
             f'{path} must be a parameter file of t3mpc robot calibrate, with calibration below '
             '/**/radio_bridge'
         ) from error
+    except ParameterError as error:
+        raise ParameterError(f'{path}: {error}') from error
     known: dict[str, Any] = parameters.to_dict()
     estimates = {
         field: Estimate(known[value], known[uncertainty])
@@ -131,7 +139,8 @@ def read_parameter_file(path: Path) -> tuple[Calibration, dict[str, object]]:
             SharpCurve(*each) if each[-1] > 0.0 else None for each in zip(*ranges, strict=True)
         ),
     )
-    return found, _changed(parameters.link)
+    link = parameters.link
+    return found, {'address': link.address} | _changed(link)
 
 
 def _changed(link: LinkParameters) -> dict[str, object]:
@@ -159,14 +168,18 @@ def calibrate(
         options.port, options.robot_port, parameters, key, os.urandom, stop, _report
     )
     start, link = Calibration(), _changed(parameters)
-    if path.exists():
-        start, known = read_parameter_file(path)
-        link = known | link
-    elif options.robot_port:
-        try:
+    try:
+        own = _link_of(robot.settings()) if options.robot_port else parameters
+        _check_address('the link parameters are', link, own)
+        saved: dict[str, object] = {}
+        if path.exists():
+            start, saved = read_parameter_file(path)
+            _check_address(f'{path} is', saved, own)
+        elif options.robot_port:
             start = robot.stored()
-        except Interrupted as interruption:
-            raise ProcedureError('interrupted') from interruption
+    except Interrupted as interruption:
+        raise ProcedureError('interrupted') from interruption
+    link = {'address': own.address} | saved | _changed(own) | link
     wizard = CalibrationWizard(robot, _asker(stop), _show, _wizard_options(options), start)
     code = _EXIT_OK
     try:
@@ -177,9 +190,26 @@ def calibrate(
         code = _EXIT_INTERRUPTED
     if wizard.calibration != start:
         today = datetime.date.today().isoformat()
-        path.write_text(calibration_file(wizard.calibration, today, link))
+        write_text(path, calibration_file(wizard.calibration, today, link))
         _show(f'{path}: saved; ros2 launch t3mpc_ros robot.launch.py params_file:={path}')
     return code
+
+
+def _link_of(settings: RobotSettings) -> LinkParameters:
+    """Return the link parameters of the host that fit the settings of a robot."""
+    return LinkParameters(
+        address=settings.address.hex(), channel=settings.channel, rate=settings.rate
+    )
+
+
+def _check_address(subject: str, link: Mapping[str, object], robot: LinkParameters) -> None:
+    """Raise ProcedureError if link parameters name the address of another robot."""
+    address = str(link.get('address', robot.address))
+    if address.lower() != robot.address.lower():
+        raise ProcedureError(
+            f'{subject} of the robot at address {address}, and this robot has {robot.address}: '
+            'give --params-file and --save of this robot, or connect the other one'
+        )
 
 
 def _check_steps(steps: Sequence[str], available: Sequence[str]) -> None:

@@ -276,7 +276,9 @@ ROBOT = {
         run=lambda: None, calibration=start
     ),
     'cli.robot_calibrate.read_parameter_file': (Calibration(), {}),
-    'cli.robot_calibrate.CalibrationRobot': SimpleNamespace(stored=Calibration),
+    'cli.robot_calibrate.CalibrationRobot': SimpleNamespace(
+        stored=Calibration, settings=RobotSettings
+    ),
     'cli.robot_doctor.run_doctor': [],
 }
 

@@ -18,6 +18,7 @@ from pathlib import Path
 import re
 import shlex
 import sys
+from types import SimpleNamespace
 
 import pytest
 from support.calibration_bench import CalibrationBench, Person
@@ -82,7 +83,6 @@ def test_a_whole_run_finds_the_errors_of_the_twin(person, monkeypatch, tmp_path)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(cli, '_asker', lambda stop: person.ask)
     monkeypatch.setattr(cli, '_show', person.show)
-    monkeypatch.setattr(cli, '_today', lambda: '2026-11-22')
     monkeypatch.setattr(sys.stdin, 'isatty', lambda: True)
     person.answers = {f'{side}: put the board': ['skip'] for side in ('left', 'rear', 'right')}
     for line in _transcript()[0]:
@@ -252,6 +252,27 @@ def test_the_parameter_file_holds_the_calibration(found, tmp_path):
             assert parameters['wheel_radius'] == 0.0356
 
 
+ANOTHER = '12345e6789'
+"""Address of a robot that is not connected."""
+ROBOT_PORT = '--robot-port /dev/ttyACM0'
+
+
+@pytest.mark.parametrize('words', ['', ROBOT_PORT, f'{ROBOT_PORT} --set address={ANOTHER}'])
+def test_another_robot_gets_no_calibration(words, person, monkeypatch, tmp_path, capsys):
+    """The values of a file were stored in whichever robot was connected."""
+    path = tmp_path / 'calibration.yaml'
+    if ANOTHER not in words:
+        path.write_text(cli.calibration_file(WHOLE, '2026-11-22', {'address': ANOTHER}))
+    monkeypatch.setattr(sys, 'stdin', SimpleNamespace(isatty=lambda: True))
+    monkeypatch.setattr(cli, '_asker', lambda stop: lambda question: 'skip')
+    before = person.bench.at_robot(eeprom_records.read_calibration())
+    words = f'calibrate --port /dev/t3mpc_dongle --save {path} {words}'
+    assert robot_cli.main(words.split()) == 2
+    error = capsys.readouterr().err
+    assert f'of the robot at address {ANOTHER}, and this robot has 54334d5043: give' in error
+    assert person.bench.at_robot(eeprom_records.read_calibration()) == before
+
+
 @pytest.mark.parametrize(
     'text, words',
     [
@@ -259,7 +280,7 @@ def test_the_parameter_file_holds_the_calibration(found, tmp_path):
         ('/**:\n  ros__parameters: {}\n', 'must be a parameter file'),
         (
             '/**/radio_bridge:\n  ros__parameters: {wheel_radius: 3.5}\n',
-            'wheel_radius must be from 0.005 to 1 m: got 3.5',
+            'other.yaml: wheel_radius must be from 0.005 to 1 m: got 3.5',
         ),
     ],
 )

@@ -113,12 +113,12 @@ class CalibrationRobot:
         """Return raw counts: of the eight distance sensors and, last, of the battery."""
         return self._at_board(eeprom_records.read_counts(samples))
 
-    def divider(self) -> float:
-        """Return the nominal divider of the battery, as in the settings of the robot."""
+    def settings(self) -> eeprom_records.RobotSettings:
+        """Return the settings of the robot."""
         stored = self._at_board(eeprom_records.read_settings())
         if not stored.valid:
             raise ProcedureError('the robot has no valid settings: t3mpc robot setup')
-        return stored.content.divider
+        return stored.content
 
     def store(self, found: calibration.Calibration) -> None:
         """Store a calibration in the robot, in place of the one that it has."""
@@ -360,7 +360,7 @@ class CalibrationWizard:
 
     def measure_battery(self) -> None:
         """Measure the divider of the battery."""
-        marks, divider = self._options.marks, self._robot.divider()
+        marks, divider = self._options.marks, self._robot.settings().divider
         self._do(
             'Connect a meter to the battery, or a bench supply in its place. Measure a full and '
             'an empty battery, at least 1 V apart.'
