@@ -58,6 +58,8 @@ _MAX_GAP = 0.1
 """s, in a turn: at 50 samples a second, four in a row are lost."""
 _MIN_DISTANCE, _MIN_TURNS, _MIN_RANGES, _MIN_VOLTAGES = 0.5, 2.0, 4, 2
 _MIN_RANGE_RATIO, _MIN_VOLTAGE_SPAN = 2.0, 1.0
+_MAX_DIFFERENCE, _MAX_UNCERTAINTY = 0.02, 0.01
+"""Relative, of repeated runs and of their mean; marks of 1 mm, 2 m apart, leave 0.0005."""
 MAX_SHARP_COUNT, MIN_SHARP_COUNT = 983, 12
 """Counts of a Sharp sensor whose wire is not loose: 4.8 V and 0.06 V."""
 
@@ -192,6 +194,42 @@ class RangeReading(NamedTuple):
     counts: tuple[int, ...]
 
 
+# -- plausibility ---------------------------------------------------------------------------------
+
+
+def plausible(nominal: float) -> tuple[float, float]:
+    """Return the least and the largest plausible value, by the nominal one."""
+    return 0.8 * nominal, 1.2 * nominal
+
+
+def check_within(
+    name: str, value: float, bounds: tuple[float, float], unit: str, remedy: str
+) -> None:
+    """Raise CalibrationError for a value outside its bounds."""
+    low, high = bounds
+    if not low <= value <= high:
+        raise CalibrationError(
+            f'{name} must be from {low:.4g} to {high:.4g}{unit}: got {value:.4g}; {remedy}'
+        )
+
+
+def _certain(name: str, found: Estimate, of_runs: Array) -> Estimate:
+    """Return an estimate; CalibrationError if its runs differ, or leave it uncertain."""
+    if np.ptp(of_runs) > _MAX_DIFFERENCE * abs(found.value):
+        raise CalibrationError(
+            f'{name} must be the same in all runs within {100.0 * _MAX_DIFFERENCE:g} %: got '
+            f'{" and ".join(f"{each:.4g}" for each in of_runs)}; a mark was misread, or the '
+            'wheels slip: measure again'
+        )
+    if not found.uncertainty <= _MAX_UNCERTAINTY * found.value:
+        raise CalibrationError(
+            f'standard uncertainty of {name} must be at most {100.0 * _MAX_UNCERTAINTY:g} %: got '
+            f'{100.0 * found.uncertainty / found.value:.2g} %; measure again, a longer way or '
+            'more turns, and finer marks'
+        )
+    return found
+
+
 # -- wheels ---------------------------------------------------------------------------------------
 
 
@@ -208,7 +246,7 @@ def estimate_wheel_radius(runs: Sequence[StraightRun], marks: MarkUncertainty = 
     if not runs:
         raise CalibrationError('runs must be at least 1: got 0; drive between two marks')
     for run in runs:
-        _check_straight_run(run)
+        check_straight_run(run)
     distances = np.array([run.distance for run in runs])
     angles = np.array([0.5 * abs(run.right + run.left) for run in runs])
     radius = float(angles @ distances / (angles @ angles))
@@ -216,10 +254,12 @@ def estimate_wheel_radius(runs: Sequence[StraightRun], marks: MarkUncertainty = 
     variance = 2.0 * marks.distance**2 + (radius * STEP_ANGLE) ** 2
     tape = np.max((3e-4 + 2e-4 * distances) / distances) / math.sqrt(3.0)
     spread = _slope(angles, distances, variance).uncertainty
-    return Estimate(radius, math.hypot(spread, radius * tape))
+    found = Estimate(radius, math.hypot(spread, radius * tape))
+    return _certain('the wheel radius (m)', found, distances / angles)
 
 
-def _check_straight_run(run: StraightRun) -> None:
+def check_straight_run(run: StraightRun) -> None:
+    """Raise CalibrationError for a run that is too short, or not straight."""
     if not run.distance >= _MIN_DISTANCE:
         raise CalibrationError(
             f'distance between the marks must be at least {_MIN_DISTANCE} m: got '
@@ -262,7 +302,8 @@ def estimate_track(
     variance = 2.0 * (ratio * marks.angle) ** 2 + 4.0 * STEP_ANGLE**2
     relative = _slope(yaws, angles, variance).uncertainty / ratio
     track = radius.value * ratio
-    return Estimate(track, track * math.hypot(relative, radius.uncertainty / radius.value))
+    found = Estimate(track, track * math.hypot(relative, radius.uncertainty / radius.value))
+    return _certain('the track (m)', found, radius.value * angles / yaws)
 
 
 # -- gyro -----------------------------------------------------------------------------------------
@@ -338,12 +379,9 @@ def estimate_gyro_scale(
     rotations = np.array([turn.rotation for _, turn in turns])
     variances = 2.0 * marks.angle**2 + np.array([turn.uncertainty**2 for _, turn in turns])
     scale = _slope(rotations, yaws, variances)
-    if not 0.8 <= scale.value <= 1.2:
-        raise CalibrationError(
-            f'the scale of the gyro must be from 0.8 to 1.2: got {scale.value:.3f}; '
-            'count the turns, left is positive'
-        )
-    return scale
+    name, remedy = 'the scale of the gyro', 'count the turns, left is positive'
+    check_within(name, scale.value, plausible(1.0), '', remedy)
+    return _certain(name, scale, yaws / rotations)
 
 
 def whole_turns(turn: GyroTurn, beyond: float) -> int:
@@ -425,20 +463,33 @@ def estimate_divider(
         )
     nominal = np.array([reading.nominal for reading in readings])
     meter = np.array([reading.meter for reading in readings])
-    apart = float(np.ptp(nominal))
-    if not apart >= _MIN_VOLTAGE_SPAN:
-        raise CalibrationError(
-            f'the voltages must be at least {_MIN_VOLTAGE_SPAN:g} V apart: got {apart:.2f}; '
-            'measure a full and an empty battery, or use a bench supply'
-        )
+    check_voltages(readings)
     step = REFERENCE_VOLTAGE / CONVERTER_COUNTS * divider
     variance = marks.voltage**2 + step**2 / 12.0
     design = np.column_stack((nominal, np.ones_like(nominal)))
     solution, covariance = _least_squares(design, meter, variance)
     slope, offset = solution.tolist()
+    check_within('gain of the battery voltage', slope, plausible(1.0), '', 'measure both again')
     ends = np.array([[voltage, 1.0] for voltage in span])
     worst = max(float(end @ covariance @ end) for end in ends)
     return DividerCorrection(slope - 1.0, offset, math.sqrt(worst))
+
+
+def check_voltages(readings: Sequence[VoltageReading]) -> None:
+    """Raise CalibrationError if meter and robot disagree, or the readings are alike."""
+    for meter, nominal in readings:
+        remedy = (
+            f'the robot measured {nominal:.2f} V: read the meter again, or correct the divider '
+            '(t3mpc robot setup --divider) and its wire at A8'
+        )
+        check_within('voltage of the meter', meter, plausible(nominal), ' V', remedy)
+    measured = [reading.nominal for reading in readings]
+    if len(measured) > 1 and not max(measured) - min(measured) >= _MIN_VOLTAGE_SPAN:
+        raise CalibrationError(
+            f'the voltages must be at least {_MIN_VOLTAGE_SPAN:g} V apart: got '
+            f'{" and ".join(f"{each:.2f}" for each in measured)} V, measured by the robot; measure '
+            'a full and an empty battery, or use a bench supply'
+        )
 
 
 def estimate_sharp_curve(
@@ -514,16 +565,21 @@ def _check_ranges(readings: Sequence[RangeReading]) -> None:
             f'{nearest:g} and {farthest:g} m'
         )
     for reading in readings:
-        if len(reading.counts) < 2:
+        check_range_reading(reading)
+
+
+def check_range_reading(reading: RangeReading) -> None:
+    """Raise CalibrationError for a sensor that does not measure."""
+    if len(reading.counts) < 2:
+        raise CalibrationError(
+            f'samples at {reading.distance:g} m must be at least 2: got {len(reading.counts)}'
+        )
+    for count in (min(reading.counts), max(reading.counts)):
+        if not MIN_SHARP_COUNT <= count <= MAX_SHARP_COUNT:
             raise CalibrationError(
-                f'samples at {reading.distance:g} m must be at least 2: got {len(reading.counts)}'
+                f'counts must be from {MIN_SHARP_COUNT} to {MAX_SHARP_COUNT}: got {count} '
+                f'at {reading.distance:g} m, saturated; check the wires of the sensor'
             )
-        for count in (min(reading.counts), max(reading.counts)):
-            if not MIN_SHARP_COUNT <= count <= MAX_SHARP_COUNT:
-                raise CalibrationError(
-                    f'counts must be from {MIN_SHARP_COUNT} to {MAX_SHARP_COUNT}: got {count} '
-                    f'at {reading.distance:g} m, saturated; check the wires of the sensor'
-                )
 
 
 def _curve_gradients(curve: Array, distances: Array) -> Array:

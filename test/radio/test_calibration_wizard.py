@@ -26,6 +26,7 @@ import yaml
 
 from t3mpc_ros.cli import robot as robot_cli
 from t3mpc_ros.cli import robot_calibrate as cli
+from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.nodes.registry import parameter_class
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
@@ -171,15 +172,67 @@ def _after(bench, seconds):
 
 
 @pytest.mark.slow
-def test_a_mark_distance_of_zero_is_refused_and_repeated(person):
-    person.answers = {'Between both marks': ['0', '0.5 m'], 'Enter to repeat': ['']}
+def test_a_misread_distance_is_asked_for_again(person):
+    """A typo cost the drive, and twice the way in both runs gave a wheel of 70 mm."""
+    person.answers = {'Between both marks': ['-2', '1', '0.5 m', '0.59'], 'Enter to repeat': ['']}
     found = wizard(person, 'radius', distance=0.5, speed=8.0).run()
-    assert 'at least 0.5 m: got 0' in person.transcript
-    assert "must be a number, or skip: got '0.5 m'" in person.transcript
+    shown = person.transcript
+    for answer in ('-2', '1'):
+        assert f'must be from 0.448 to 0.6719 m: got {answer}; the wheels drove 0.56 m' in shown
+    assert "must be a number, or skip: got '0.5 m'" in shown
+    # The other way is measured well: which one is wrong, only another drive can tell.
+    assert 'the wheel radius (m) must be the same in all runs within 2 %: got 0.03688 and' in shown
+    assert shown.count('Move now?') == 4
     assert found.wheel_radius.value == pytest.approx(RADIUS, rel=0.01)
 
 
-# Repeated after a refusal: test_a_mark_distance_of_zero_is_refused_and_repeated.
+def test_a_misread_distance_of_the_board_is_asked_for_again(person):
+    """-0.1 and 1e9 m were refused after all six placements, with another reason."""
+    person.answers = {'front: put': ['-0.1', '1e9'], 'Store these values': ['no']}
+    person.answers |= {f'{side}: put': ['skip'] for side in ('left', 'rear', 'right')}
+    found = wizard(person, 'ranges', robot_port='ttyACM0').run()
+    for answer in ('-0.1', '1e+09'):
+        assert f'board must be from 0.05 to 0.2 m: got {answer}; measure' in person.transcript
+    assert person.transcript.count('front: put the board') == 2 + 6
+    assert found.curves[0] is not None
+
+
+def test_a_loose_wire_is_named_at_the_first_placement(person):
+    """It was, after all six."""
+    person.plant._distances[:] = 1e-3
+    person.answers = {'front: put': ['', 'skip'], 'Store these values': ['no']}
+    person.answers |= {f'{side}: put': ['skip'] for side in ('left', 'rear', 'right')}
+    wizard(person, 'ranges', robot_port='ttyACM0').run()
+    assert 'front_left: counts must be from 12 to 983: got' in person.transcript
+
+
+def test_a_misread_voltage_is_asked_for_again(person):
+    """12.5 V, then 120 V, gave *must be at least 1 V apart: got 0.00*; -12 V was accepted."""
+    person.answers = {'meter, first': ['120', '-12'], 'meter, second': ['12.5']}
+    person.answers |= {'Store these values': ['no']}
+    found = wizard(person, 'battery', robot_port='ttyACM0').run()
+    for answer in ('120', '-12'):
+        assert re.search(
+            rf'meter must be from \S+ to \S+ V: got {answer}; the robot measured 1\S+ V',
+            person.transcript,
+        )
+    assert re.search(r'1 V apart: got 1\S+ and 1\S+ V, measured by the robot', person.transcript)
+    assert abs(found.divider.gain) < 0.1
+    assert 'Enter to repeat' not in person.transcript
+
+
+@pytest.mark.slow
+def test_a_track_far_from_the_nominal_one_is_refused(person):
+    """Any was accepted: of turns that were miscounted, or by a wrong wheel radius."""
+    person.answers = {'Enter to repeat': ['skip']}
+    start = Calibration(wheel_radius=Estimate(RADIUS, 1e-5))
+    geometry = WheelGeometry(0.035, 0.3)
+    found = wizard(person, 'track', start=start, speed=8.0, turns=2, geometry=geometry).run()
+    assert 'the track must be from 0.24 to 0.36 m: got 0.15' in person.transcript
+    assert found == start
+
+
+# Repeated after a refusal: test_a_misread_distance_is_asked_for_again.
 @pytest.mark.long
 @pytest.mark.slow
 def test_turns_that_are_refused_count_for_nothing(person, monkeypatch):

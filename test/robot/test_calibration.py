@@ -307,6 +307,24 @@ REFUSALS = {
         lambda: calibration.estimate_wheel_radius([StraightRun(2.0, 57.0, 50.0)]),
         r'agree within 2 %: got 57.000 and 50.000 rad; drive straight',
     ),
+    'ways that differ': (
+        lambda: calibration.estimate_wheel_radius(
+            [StraightRun(2.04, 57.0, 57.0), StraightRun(1.04, -57.0, -57.0)]
+        ),
+        r'in all runs within 2 %: got 0.03579 and 0.01825; a mark was misread.*measure again',
+    ),
+    'coarse marks': (
+        lambda: calibration.estimate_wheel_radius(
+            [StraightRun(2.0, 57.0, 57.0)], MarkUncertainty(distance=0.1)
+        ),
+        r'standard uncertainty of the wheel radius .* at most 1 %: got 7.1 %; measure again',
+    ),
+    'turns that differ': (
+        lambda: calibration.estimate_track(
+            [(10.0 * math.tau, TURN), (11.0 * math.tau, TURN)], Estimate(RADIUS, 1e-5)
+        ),
+        r'the track \(m\) must be the same in all runs within 2 %: got 0.1471 and 0.1337',
+    ),
     'one turn': (
         lambda: calibration.estimate_gyro_scale([(math.tau, TURN)]),
         r'at least 2 whole turns: got 1.00; ten are better',
@@ -321,7 +339,7 @@ REFUSALS = {
     ),
     'turns miscounted': (
         lambda: calibration.estimate_gyro_scale([(7.0 * math.tau, TURN)]),
-        r'from 0.8 to 1.2: got 0.700; count the turns',
+        r'from 0.8 to 1.2: got 0.7; count the turns',
     ),
     'saturated': (
         lambda: calibration.measure_turn(with_rates({400: 8.72})),
@@ -363,7 +381,19 @@ REFUSALS = {
         lambda: calibration.estimate_divider(
             [VoltageReading(12.0, 11.9), VoltageReading(11.5, 11.4)]
         ),
-        r'at least 1 V apart: got 0.50',
+        r'at least 1 V apart: got 11.90 and 11.40 V, measured by the robot',
+    ),
+    'another battery at the meter': (
+        lambda: calibration.estimate_divider(
+            [VoltageReading(120.0, 11.9), VoltageReading(9.5, 9.4)]
+        ),
+        r'from 9.52 to 14.28 V: got 120; the robot measured 11.90 V: read the meter again',
+    ),
+    'meters that contradict': (
+        lambda: calibration.estimate_divider(
+            [VoltageReading(10.0, 12.0), VoltageReading(10.5, 10.0)]
+        ),
+        r'gain of the battery voltage must be from 0.8 to 1.2: got -0.25; measure both again',
     ),
     'three distances': (
         lambda: calibration.estimate_sharp_curve(exact_readings((0.1, 0.2, 0.4))),

@@ -19,7 +19,8 @@ repeated; a step that is left out keeps the values of the calibration at the sta
 the robot without a yes to the question before it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 import math
@@ -266,12 +267,22 @@ class CalibrationWizard:
                 f'the wheels turned {math.degrees(right):.1f} (right) and '
                 f'{math.degrees(left):.1f} (left) degrees'
             )
+            driven = 0.5 * abs(right + left) * radius
+            check = partial(
+                calibration.check_within,
+                'distance between the marks',
+                bounds=calibration.plausible(driven),
+                unit=' m',
+                remedy=f'the wheels drove {driven:.2f} m by their nominal radius: measure in m, '
+                'or give --wheel-radius of other wheels',
+            )
             distance = self._number(
-                'Mark where it touches the floor now. Between both marks, in m: '
+                'Mark where it touches the floor now. Between both marks, in m: ', check
             )
             runs.append(calibration.StraightRun(distance, right, left))
             # Refused now, not after the way back.
-            found = calibration.estimate_wheel_radius(runs, options.marks)
+            calibration.check_straight_run(runs[-1])
+        found = calibration.estimate_wheel_radius(runs, options.marks)
         self._keep(wheel_radius=found)
         self._result(f'wheel radius {_millimetres(found)} mm, nominal {1e3 * radius:.2f}')
 
@@ -298,6 +309,13 @@ class CalibrationWizard:
             recording = self._robot.drive(WheelAngles(angle, -angle), options.speed, _RESTS)
             measured.append(self._read_turn(recording))
         track = calibration.estimate_track(measured, radius, options.marks)
+        calibration.check_within(
+            'the track',
+            track.value,
+            calibration.plausible(geometry.wheel_separation),
+            ' m',
+            'count the turns, repeat the step radius, or give --wheel-separation of other wheels',
+        )
         self._turns += measured
         scale = calibration.estimate_gyro_scale(self._turns, options.marks)
         self._keep(track=track, gyro_scale=scale)
@@ -334,26 +352,35 @@ class CalibrationWizard:
 
     def _measure_side(self, side: str, first: int) -> None:
         readings: tuple[list[calibration.RangeReading], list[calibration.RangeReading]] = ([], [])
-        for nominal in self._options.distances:
-            distance = self._number(
-                f'{side}: put the board at {nominal:g} m. Enter, or its distance in m: ', nominal
-            )
+        names = RANGE_SENSORS[first : first + 2]
+
+        def measure(nominal: float, distance: float) -> None:
+            bounds, remedy = (0.5 * nominal, 2.0 * nominal), 'measure in m, from the sensors'
+            calibration.check_within('distance of the board', distance, bounds, ' m', remedy)
             counts = self._robot.counts(_SAMPLES)
-            for number in (0, 1):
-                of_sensor = tuple(each[first + number] for each in counts)
-                readings[number].append(calibration.RangeReading(distance, of_sensor))
-            seen = (
-                f'{RANGE_SENSORS[first + number]} {np.mean(readings[number][-1].counts):.1f}'
+            new = [
+                calibration.RangeReading(distance, tuple(each[first + number] for each in counts))
                 for number in (0, 1)
+            ]
+            pairs = zip(names, new, strict=True)
+            seen = ', '.join(f'{name} {np.mean(each.counts):.1f}' for name, each in pairs)
+            self._see(f'mean counts: {seen}')
+            for number, name in enumerate(names):
+                with _naming(name):
+                    calibration.check_range_reading(new[number])
+            for number in (0, 1):
+                readings[number].append(new[number])
+
+        for nominal in self._options.distances:
+            self._number(
+                f'{side}: put the board at {nominal:g} m. Enter, or its distance in m: ',
+                partial(measure, nominal),
+                nominal,
             )
-            self._see(f'mean counts: {", ".join(seen)}')
         curves = list(self.calibration.curves)
-        for number in (0, 1):
-            name = RANGE_SENSORS[first + number]
-            try:
+        for number, name in enumerate(names):
+            with _naming(name):
                 curve = calibration.estimate_sharp_curve(readings[number], self._options.marks)
-            except calibration.CalibrationError as error:
-                raise calibration.CalibrationError(f'{name}: {error}') from error
             curves[first + number] = curve
             self._result(f'{name} {_curve(curve)}')
         self._keep(curves=tuple(curves))
@@ -365,13 +392,18 @@ class CalibrationWizard:
             'Connect a meter to the battery, or a bench supply in its place. Measure a full and '
             'an empty battery, at least 1 V apart.'
         )
-        readings = []
-        for which in ('first', 'second'):
-            meter = self._number(f'Voltage of the meter, {which}, in V: ')
+        readings: list[calibration.VoltageReading] = []
+
+        def measure(meter: float) -> None:
             counts = float(np.mean([each[-1] for each in self._robot.counts(_SAMPLES)]))
             nominal = calibration.nominal_battery_voltage(counts, divider)
             self._see(f'mean count {counts:.1f}: {nominal:.3f} V without correction')
-            readings.append(calibration.VoltageReading(meter, nominal))
+            new = calibration.VoltageReading(meter, nominal)
+            calibration.check_voltages([*readings, new])
+            readings.append(new)
+
+        for which in ('first', 'second'):
+            self._number(f'Voltage of the meter, {which}, in V: ', measure)
         found = calibration.estimate_divider(readings, divider, marks)
         self._keep(divider=found)
         self._result(
@@ -388,26 +420,42 @@ class CalibrationWizard:
         self._see(
             f'the gyro counted {turn.rotation / math.tau:+.3f} turns, at up to {fastest:.0f} deg/s'
         )
+        check = partial(
+            calibration.check_within,
+            'angle',
+            bounds=(-180.0, 180.0),
+            unit=' degrees',
+            remedy='measure the shorter way',
+        )
         beyond = math.radians(
-            self._number('Degrees from the mark to the robot, left positive: ', 0.0)
+            self._number('Degrees from the mark to the robot, left positive: ', check, 0.0)
         )
         return calibration.whole_turns(turn, beyond) * math.tau + beyond, turn
 
-    def _number(self, question: str, default: float | None = None) -> float:
-        """Return a number, asking until it is one; raise Skipped for ``skip``."""
+    def _number(
+        self, question: str, use: Callable[[float], None], default: float | None = None
+    ) -> float:
+        """Return a number, asking until ``use`` accepts it; raise Skipped for ``skip``.
+
+        ``use`` raises CalibrationError for what another answer would correct.
+        """
         while True:
             text = self._answer(f'  {question}').replace(',', '.')
             if text == _SKIP:
                 raise Skipped
-            if not text and default is not None:
-                return default
             try:
-                value = float(text)
+                value = default if not text and default is not None else float(text)
             except ValueError:
                 value = math.nan
-            if math.isfinite(value):
+            if not math.isfinite(value):
+                self._show(f'  Refused: the answer must be a number, or {_SKIP}: got {text!r}')
+                continue
+            try:
+                use(value)
+            except calibration.CalibrationError as error:
+                self._show(f'  Refused: {error}')
+            else:
                 return value
-            self._show(f'  Refused: the answer must be a number, or {_SKIP}: got {text!r}')
 
     def _confirm(self, motion: str) -> None:
         """Return after a yes; anything else leaves the step out."""
@@ -432,6 +480,15 @@ class CalibrationWizard:
 
     def _keep(self, **values: object) -> None:
         self.calibration = self.calibration._replace(**values)  # type: ignore[arg-type]
+
+
+@contextmanager
+def _naming(sensor: str) -> Iterator[None]:
+    """Raise the errors of a calibration with the name of the sensor in front."""
+    try:
+        yield
+    except calibration.CalibrationError as error:
+        raise calibration.CalibrationError(f'{sensor}: {error}') from error
 
 
 _FULL_SCALE = math.degrees(calibration.GYRO_FULL_SCALE)
