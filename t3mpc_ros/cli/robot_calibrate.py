@@ -208,7 +208,8 @@ def _check_address(subject: str, link: Mapping[str, object], robot: LinkParamete
     if address.lower() != robot.address.lower():
         raise ProcedureError(
             f'{subject} of the robot at address {address}, and this robot has {robot.address}: '
-            'give --params-file and --save of this robot, or connect the other one'
+            'give --params-file and --save of this robot (where only link.address is wrong or '
+            'missing, correct it), or connect the other one'
         )
 
 

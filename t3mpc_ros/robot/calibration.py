@@ -487,8 +487,8 @@ def check_voltages(readings: Sequence[VoltageReading]) -> None:
     if len(measured) > 1 and not max(measured) - min(measured) >= _MIN_VOLTAGE_SPAN:
         raise CalibrationError(
             f'the voltages must be at least {_MIN_VOLTAGE_SPAN:g} V apart: got '
-            f'{" and ".join(f"{each:.2f}" for each in measured)} V, measured by the robot; measure '
-            'a full and an empty battery, or use a bench supply'
+            f'{" and ".join(f"{each:.2f}" for each in measured)} V, measured by the robot; '
+            'measure a full and an empty battery, or use a bench supply'
         )
 
 
