@@ -21,6 +21,7 @@ from pathlib import Path
 import sys
 from typing import Any, TypeVar
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.cli import robot_calibrate
 from t3mpc_ros.cli.shared_options import (
     STANDARD_OUTPUT,
@@ -32,6 +33,7 @@ from t3mpc_ros.cli.shared_options import (
     prepare_outputs,
     print_result,
 )
+from t3mpc_ros.evaluation.api.error_messages import sentence
 from t3mpc_ros.parameters import command_line
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.parameters.yaml_checks import file_errors, read_yaml
@@ -73,6 +75,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 print(f't3mpc robot: interrupted{reason}', file=sys.stderr)
                 return EXIT_INTERRUPTED
             print(f't3mpc robot: {error}', file=sys.stderr)
+            return EXIT_FAILED
+        except OSError as error:  # what only writing a file shows, a full disk say
+            print(f't3mpc robot: {sentence(error)}', file=sys.stderr)
             return EXIT_FAILED
 
 
@@ -145,7 +150,7 @@ def _setup(options: argparse.Namespace, stop: StopSignal) -> int:
     if options.save is not None:
         if not stored.valid:
             raise ProcedureError('there are no settings to save: give the microsteps, or --load')
-        options.save.write_text(eeprom_records.settings_file(stored.content))
+        write_atomically(options.save, eeprom_records.settings_file(stored.content))
         print(
             f'{options.save}: radio_bridge --ros-args --params-file {options.save}, '
             f't3mpc robot ping --params-file {options.save}'

@@ -22,13 +22,13 @@ from pathlib import Path
 import sys
 from typing import Any
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.cli.shared_options import ask_line, check_two_ports
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.parameters.command_line import (
     bounded_float,
     bounded_int,
     check_writable,
-    write_text,
 )
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.parameters.yaml_checks import file_errors, parameter_file, read_yaml
@@ -190,7 +190,7 @@ def calibrate(
         code = _EXIT_INTERRUPTED
     if wizard.calibration != start:
         today = datetime.date.today().isoformat()
-        write_text(path, calibration_file(wizard.calibration, today, link))
+        write_atomically(path, calibration_file(wizard.calibration, today, link))
         _show(f'{path}: saved; ros2 launch t3mpc_ros robot.launch.py params_file:={path}')
     return code
 

@@ -19,8 +19,8 @@ import os
 from pathlib import Path
 from typing import TypeVar
 
+from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.evaluation import reporting
-from t3mpc_ros.parameters.command_line import write_text
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool import link_test, manoeuvre, procedure
 from t3mpc_ros.radio.tool.bench_checklist import (
@@ -159,6 +159,6 @@ def _write(checks: Sequence[Check], path: Path) -> None:
     data = path.with_suffix('.json')
     page = reporting.html_page('Bench checklist of the robot', blocks)
     numbers = reporting.strict_json([check._asdict() for check in checks])
-    write_text(path, page)
-    write_text(data, numbers)
+    write_atomically(path, page)
+    write_atomically(data, numbers)
     print(f'{path}, {data}: saved')

@@ -85,14 +85,3 @@ def check_writable(path: Path) -> None:
     target = path if path.exists() else path.parent
     if path.is_dir() or not path.parent.is_dir() or not os.access(target, os.W_OK):
         raise ParameterError(f'{path} cannot be written: give a file in a folder that exists')
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file; ParameterError for what only writing shows, a full disk say."""
-    try:
-        path.write_text(text, encoding='utf-8')
-    except OSError as error:
-        raise ParameterError(
-            f'{path} cannot be written ({error.strerror}): keep what is printed above, and give '
-            'a file on a disk with free space'
-        ) from error

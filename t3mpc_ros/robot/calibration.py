@@ -58,6 +58,8 @@ _MAX_GAP = 0.1
 """s, in a turn: at 50 samples a second, four in a row are lost."""
 _MIN_DISTANCE, _MIN_TURNS, _MIN_RANGES, _MIN_VOLTAGES = 0.5, 2.0, 4, 2
 _MIN_RANGE_RATIO, _MIN_VOLTAGE_SPAN = 2.0, 1.0
+PLAUSIBLE = 0.8, 1.2
+"""Least and largest plausible value, in multiples of the nominal one."""
 _MAX_DIFFERENCE, _MAX_UNCERTAINTY = 0.02, 0.01
 """Relative, of repeated runs and of their mean; marks of 1 mm, 2 m apart, leave 0.0005."""
 MAX_SHARP_COUNT, MIN_SHARP_COUNT = 983, 12
@@ -199,7 +201,7 @@ class RangeReading(NamedTuple):
 
 def plausible(nominal: float) -> tuple[float, float]:
     """Return the least and the largest plausible value, by the nominal one."""
-    return 0.8 * nominal, 1.2 * nominal
+    return PLAUSIBLE[0] * nominal, PLAUSIBLE[1] * nominal
 
 
 def check_within(

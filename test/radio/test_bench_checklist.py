@@ -22,7 +22,7 @@ import pytest
 from support.tool_bench import ToolBench
 
 from t3mpc_ros.cli import robot_doctor as cli
-from t3mpc_ros.parameters.table import ParameterError
+from t3mpc_ros.evaluation.api.error_messages import sentence
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import Pong, Samples
@@ -207,8 +207,9 @@ def test_a_full_disk_does_not_cost_the_checklist(monkeypatch, capsys):
     options = argparse.Namespace(
         port='dongle', robot_port='robot', count=10, drive=False, report=Path('/dev/full')
     )
-    with pytest.raises(ParameterError, match='/dev/full cannot be written .No space'):
+    with pytest.raises(OSError, match='No space') as caught:
         cli.run_doctor(options, PARAMETERS, b'', lambda question: 'yes', lambda: False)
+    assert sentence(caught.value).startswith('/dev/full cannot be written: No space')
     shown = capsys.readouterr().out
     assert 'pass     emergency stop: yes' in shown
     assert '2 of 12 checks failed' in shown
