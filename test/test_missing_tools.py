@@ -81,7 +81,6 @@ def test_what_is_missing_is_listed_once_with_its_remedy(tmp_path):
 OTHERS = {
     ('test_scripts.py', 'skipif'): 'not started by scripts/check',
     ('test_scripts.py', 'which'): 'what the scripts themselves need',
-    ('test_docs_numbers.py', 'skip'): 'rows that one kind of processor makes',
     ('support/missing_tools.py', 'skip'): 'the way',
     ('support/missing_tools.py', 'skipif'): 'the way',
     ('support/missing_tools.py', 'which'): 'the way',
