@@ -34,6 +34,8 @@ MAX_DELAY, MAX_LEAD = 0.3, 0.05
 """Offset of odometry stamps from the node's clock beyond which the clocks differ, s."""
 MAX_SIMULATED_OFFSET = 5.0
 """The same with simulated time, which may pass many times faster than messages travel, s."""
+NO_STAMP = 1e8
+"""Offset of a stamp that is no time of today, s: three years."""
 RATE_TOLERANCE = 0.2
 """Relative difference between measured and set rate that is reported."""
 
@@ -360,9 +362,11 @@ class InputMonitor:
         )
         if not -early <= offset <= late:
             side = 'behind' if offset > 0.0 else 'ahead of'
+            remedy = 'synchronise the clocks, or set use_sim_time alike'
+            if offset > NO_STAMP:
+                remedy = 'its driver sets no header.stamp, or use_sim_time differs'
             found.append(
-                f'odom is stamped {abs(offset):.3g} s {side} the clock of this node: synchronise '
-                'the clocks, or set use_sim_time alike'
+                f'odom is stamped {abs(offset):.3g} s {side} the clock of this node: {remedy}'
             )
         rate = self.gaps.rate
         if rate and abs(rate / self._rate - 1.0) > RATE_TOLERANCE:

@@ -159,6 +159,7 @@ def test_a_geometry_wrong_by_5_percent_is_named_within_a_minute(robot, gains, va
     [
         ({'offset': 1.0}, 'odom is stamped 1 s behind the clock'),
         ({'offset': -1.0}, 'odom is stamped 1 s ahead of the clock'),
+        ({'offset': 1.8e9}, 'its driver sets no header.stamp'),
         ({'real_rate': 50.0}, 'odom has 50 Hz, but rate is 100 Hz'),
         ({'gains': (0.5, 1.0)}, 'the linear velocity in odom is 0.50'),
         ({'gains': (1.0, 2.0)}, 'the angular velocity in odom is 2.0'),
