@@ -435,7 +435,7 @@ ZERO = {**FOLLOWING, COMMAND: Series(TIME, {k: 0.0 * v for k, v in COMMANDED.ite
          'bad', False),
         ({'motions': ZERO, 'changes': (ESTOP,)}, {},
          r'The robot was never driven \(E-stop\): every command was zero\.', 'bad', False),
-        ({'damage': ('torn',)}, {}, rf'Torn; {RMSE}\.', 'bad', False),
+        ({'damage': {'torn': ''}}, {}, rf'Torn; {RMSE}\.', 'bad', False),
         (
             {'complaints': ((1.0, 'warning', 'a', 'processor overloaded'),)}, {},
             r'The machine was overloaded from 1\.0 s on \(a: processor overloaded\): errors since '

@@ -179,8 +179,9 @@ def test_one_bag_is_cut_into_as_many_blocks_as_asked_for(bag, tmp_path, capsys):
     assert program('train', bag, '--folds', '3', '--output', path) == 0
     assert 'cross-validated in 3 folds: each block' in capsys.readouterr().out
     assert read_model(path)[0]['origin']['cross_validation']['folds'] == 3
-    with pytest.raises(ValueError, match='folds must be at least 2: got 1'):
+    with pytest.raises(SystemExit):
         program('train', bag, '--folds', '1', '--output', path)
+    assert 'must be from 2 to 1000: got 1' in capsys.readouterr().err
 
 
 def test_mean_and_spread_leave_out_what_is_not_known():
