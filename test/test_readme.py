@@ -431,7 +431,7 @@ def _prepare_bags(command, output):
     """Make the bags with other names that a command expects, from that of the demo."""
     for name in ('run1', 'run2', 'turtlebot_bag'):
         if name in command and not (output / name).exists():
-            (output / name).symlink_to(output / 'run' / 'bag')
+            shutil.copytree(output / 'run' / 'bag', output / name)  # one bag twice is refused
     if command in (OWN, SWEEP):
         (output / 'my_controller.py').write_text(_own_controller())
     if 'broken.mcap' in command:
