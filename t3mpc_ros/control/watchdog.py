@@ -23,6 +23,7 @@ from t3mpc_ros.geometry.types import (
     JUMP,
     NANOSECONDS,
     ORIGIN,
+    STANDSTILL,
     UNKNOWN_TWIST,
     BodyTwist,
     Pose,
@@ -407,31 +408,32 @@ class OdometryTwist:
         if not odometry.is_finite():
             return odometry
         pose, last, self._last = odometry.pose, self._last, odometry
+        if last is None or restart or odometry.stamp_ns <= last.stamp_ns:
+            last = None
         if odometry.twist != (0.0, 0.0):
             self.missing, self._anchor, self.known = False, None, True
-            if last is None or restart or odometry.stamp_ns <= last.stamp_ns:
+            if last is None:
                 self._factor.interrupt()
             else:
                 self._units.update(last, odometry)
                 self._factor.update(last, odometry)
-                if self._units.wrong:
-                    return _differentiated(last, odometry)
-            factor = self._factor.value
-            if factor == 1.0 or self._units.wrong:
-                return odometry
-            linear, angular = odometry.twist
-            return odometry._replace(twist=BodyTwist(linear / factor, angular / factor))
-        if last is None or restart or self._anchor is None:
-            self._anchor = pose
-        elif _was_set(last, odometry):
-            self._anchor = (
-                None  # that of the next message: this one may be the only one so far off
-            )
-        if self._anchor is not None:
-            self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
-        if restart or last is None or not (self.missing or self._units.wrong):
+        else:
+            if last is None or self._anchor is None:
+                self._anchor = pose
+            elif _was_set(last, odometry):
+                # That of the next message: this one may be the only one so far off.
+                self._anchor = None
+            if self._anchor is not None:
+                self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
+        if self.missing or self._units.wrong:
+            if last is None:  # across a restart the pose says nothing of the speed
+                return odometry._replace(twist=STANDSTILL)
+            return _differentiated(last, odometry)
+        factor = self._factor.value
+        if factor == 1.0:
             return odometry
-        return _differentiated(last, odometry)
+        linear, angular = odometry.twist
+        return odometry._replace(twist=BodyTwist(linear / factor, angular / factor))
 
 
 def _differentiated(last: State, new: State) -> State:

@@ -511,6 +511,17 @@ def test_a_fast_robot_with_a_slow_camera_has_its_own_twist(rate):
     assert np.abs(used[:, 0] - 2.0).max() < 0.3
 
 
+def test_a_twist_in_other_units_is_not_used_after_a_gap():
+    """The first message after each gap had its twist of 200 m/s: the robot stopped for 0.5 s."""
+    parts, x, found = OdometryTwist(), 0.0, []
+    for k in range(100):
+        x += 0.002
+        state = State(k * 10 * MS, Pose(x, 0.0, 0.0), BodyTwist(200.0, 0.0))
+        found.append(parts.measured(state, restart=k in (0, 50)).twist.linear)
+    assert found[50] == 0.0
+    assert found[51:] == pytest.approx([0.2] * 49)
+
+
 def test_units_that_are_corrected_are_believed_again():
     parts, x, found = OdometryTwist(), 0.0, []
     for k in range(2000):
