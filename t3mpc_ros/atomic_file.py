@@ -30,25 +30,32 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
 
     What cannot be replaced is written itself: a device, a pipe, a file in a read-only folder.
     """
-    replaces = not path.exists() or (path.is_file() and os.access(path.resolve().parent, os.W_OK))
-    target = path.resolve() if replaces else path  # a link remains one
-    temporary = target.with_name(f'.{target.name}.{os.getpid()}') if replaces else target
+    try:
+        if path.exists() and not (path.is_file() and os.access(path.resolve().parent, os.W_OK)):
+            with path.open('wb') as file:
+                yield file
+        else:
+            with _replacement(path.resolve()) as file:  # a link remains one
+                yield file
+    except OSError as error:
+        if error.errno in NO_ROOM:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
+def _replacement(path: Path) -> Iterator[BinaryIO]:
+    temporary = path.with_name(f'.{path.name}.{os.getpid()}')
     try:
         with temporary.open('wb') as file:
             yield file
             file.flush()
-            if replaces:
-                os.fsync(file.fileno())  # without it, a power failure may leave an empty file
-        if replaces:
-            temporary.replace(target)
-    except BaseException as error:
-        if replaces:
-            temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.errno in NO_ROOM:
-            error.filename = str(path)
+            os.fsync(file.fileno())  # without it, a power failure may leave an empty file
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
         raise
-    if replaces:
-        sync_folder(target.parent)
+    sync_folder(path.parent)
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:

@@ -25,11 +25,7 @@ from typing import Any
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.cli.shared_options import ask_line, check_two_ports
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.parameters.command_line import (
-    bounded_float,
-    bounded_int,
-    check_writable,
-)
+from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_writable
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.parameters.yaml_checks import file_errors, parameter_file, read_yaml
 from t3mpc_ros.radio.link.link_parameters import LinkParameters

@@ -141,9 +141,14 @@ def prepare_outputs(options: argparse.Namespace) -> None:
     """Make the folders of the files: one that cannot be written is an error before the work."""
     for path in (getattr(options, name, None) for name in ('json', 'html', 'csv')):
         if path and path != STANDARD_OUTPUT:
-            with suppress(OSError):  # the check says so
-                path.parent.mkdir(parents=True, exist_ok=True)
-            check_writable(path)
+            prepare_file(path)
+
+
+def prepare_file(path: Path) -> None:
+    """Make the folder of a file; ParameterError if the file cannot be written."""
+    with suppress(OSError):  # the check says so
+        path.parent.mkdir(parents=True, exist_ok=True)
+    check_writable(path)
 
 
 def add_topic_options(parser: argparse._ActionsContainer) -> None:

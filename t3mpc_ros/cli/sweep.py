@@ -18,7 +18,7 @@ from pathlib import Path
 import sys
 
 from t3mpc_ros.cli import shared_options
-from t3mpc_ros.parameters.command_line import check_writable, parsed_value
+from t3mpc_ros.parameters.command_line import parsed_value
 
 OUTPUT = Path('runs') / 'sweep.parquet'
 SOME_FAILED = 3
@@ -67,8 +67,7 @@ def run(options: argparse.Namespace) -> int:
         raise ValueError(
             f'--set must name each parameter once, with all of its values: got {repeated[0]} again'
         )
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    check_writable(options.output)
+    shared_options.prepare_file(options.output)
     metric = find_metric(options.metric).name
     with shared_options.executor_of(options) as executor:
         found = sweep(

@@ -60,7 +60,6 @@ def run(options: argparse.Namespace) -> None:
     """Write the model and print its skill."""
     from t3mpc_ros.bag.model_file import save_model
 
-    check_writable(options.output)
     if options.bags:
         if options.robot != 'servo':
             raise ValueError(f'robot must be servo for bags: got {options.robot}')
@@ -70,6 +69,7 @@ def run(options: argparse.Namespace) -> None:
 
     if options.keep_predictor:
         raise ValueError('--keep-predictor is for bags')
+    check_writable(options.output)
     drive = DRIVES[options.robot]
     pretrained, used = fit_simulated_runs(drive)
     save_model(options.output, pretrained, {**used.to_dict(), 'drive': drive}, origin(drive))

@@ -456,7 +456,7 @@ def _read(
                 'not known there.'
             )
         elif name != REFERENCE:
-            poses = np.column_stack([places, 2.0 * np.arctan2(table['z'], table['w'])])
+            poses = np.column_stack([places, _yaw(table)])
             twists = np.column_stack([table['linear'], table['angular']])
             if example := other_units(table['stamp'], poses, twists):
                 text = (
@@ -465,6 +465,11 @@ def _read(
                 )
                 damage[text] = 'Correct the units in its driver, or see why wheels spin.'
     return table, damage
+
+
+def _yaw(table: Mapping[str, Array]) -> Array:
+    """Return the yaw (rad) of the poses of a robot in the plane."""
+    return 2.0 * np.arctan2(table['z'], table['w'])
 
 
 def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str], doubts: list[str]) -> None:
@@ -499,7 +504,7 @@ def _motion(time: Array, table: Mapping[str, Array], geometry: WheelGeometry | N
         wheels: Any = wheels_from_twist(BodyTwist(linear, angular), geometry)
         values |= {'right': wheels.right, 'left': wheels.left}
     if 'x' in table:
-        yaw = 2.0 * np.arctan2(table['z'], table['w'])
+        yaw = _yaw(table)
         values |= {'x': table['x'][order], 'y': table['y'][order], 'yaw': yaw[order]}
     return Series(time, values)
 
