@@ -420,8 +420,10 @@ def _work(command, output, tmp_path):
     if command.startswith(DEMO) and code == 3:
         # A poor run: a robot without a processor drives late.
         raise WaitTimeoutError(log.read_text())
-    # 3: the file has no end, as the page says.
-    assert code == (3 if 'broken' in command else 0), f'{command}: {log.read_text()}'
+    # 3: the file has no end, as the page says. 4: the demo worked, and said three times that the
+    # machine was too slow for its run to be judged.
+    expected = {3} if 'broken' in command else {0, 4} if command.startswith(DEMO) else {0}
+    assert code in expected, f'{command}: {log.read_text()}'
     assert 'Traceback' not in log.read_text()
     if command == DEMO:
         assert (output / 'run' / 'report.html').stat().st_size > 100_000
