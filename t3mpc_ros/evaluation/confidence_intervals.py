@@ -33,9 +33,9 @@ class Difference(NamedTuple):
     """Half the width of the confidence interval of the mean."""
 
     @property
-    def certain(self) -> bool:
-        """Whether the interval leaves zero out."""
-        return abs(self.mean) > self.half
+    def sign(self) -> int:
+        """1 above zero, -1 below it, 0 where the interval leaves this open."""
+        return (self.mean > self.half) - (self.mean < -self.half)
 
     def p_value(self, n: int) -> float:
         """Return the p-value of Student's test that the mean of ``n`` differences is zero.

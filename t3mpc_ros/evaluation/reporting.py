@@ -51,6 +51,13 @@ class Mark(NamedTuple):
     kind: str
 
 
+def verdict_mark(verdict: str) -> Mark:
+    """Return a verdict of any page in its colour: ``apart`` where it is left open."""
+    kinds = {'not measured': 'open', 'inconclusive': 'apart', 'not comparable': 'apart'}
+    kinds |= dict.fromkeys(('held', 'holds', 'ours is better'), 'yes')
+    return Mark(verdict, kinds.get(verdict, 'no'))
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     """A table of words; its first column names the rows."""

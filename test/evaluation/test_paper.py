@@ -33,7 +33,14 @@ from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.paper import reproduce as reproduction
 from t3mpc_ros.evaluation.paper import study
-from t3mpc_ros.evaluation.paper.claims import ALONE, INTENDED, Claim, all_claims, markdown
+from t3mpc_ros.evaluation.paper.claims import (
+    ALONE,
+    INTENDED,
+    VERDICTS,
+    Claim,
+    all_claims,
+    markdown,
+)
 from t3mpc_ros.evaluation.paper.paper_figures import (
     explained,
     floor_path,
@@ -433,12 +440,9 @@ def test_without_results_every_claim_is_not_measured():
 
 def test_the_mark_of_an_exhibit_is_that_of_its_worst_claim():
     exhibit = next(e for e in EXHIBITS if len(e.claims) > 1)
-    made = [Claim(name, 'ours', '', held=True) for name in exhibit.claims]
-    assert exhibit.mark(made) == 'held'
-    assert exhibit.mark([*made[:-1], replace(made[-1], held=None)]) == 'not measured'
-    assert exhibit.mark([*made[:-1], replace(made[-1], held=False)]) == 'not held'
-    unknown = replace(made[-1], held=None, inconclusive=True)
-    assert exhibit.mark([*made[:-1], unknown]) == 'inconclusive'
+    made = [Claim(name, 'ours', '', verdict='held') for name in exhibit.claims]
+    for verdict in VERDICTS:
+        assert exhibit.mark([*made[:-1], replace(made[-1], verdict=verdict)]) == verdict
     assert exhibit.mark([]) == 'not measured'
     assert replace(exhibit, comparable=False).mark(made) == 'not comparable'
 

@@ -40,7 +40,7 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 )
 from t3mpc_ros.evaluation.bag_report.report_charts import SECTIONS
 from t3mpc_ros.evaluation.bag_report.report_page import link_table, response_table
-from t3mpc_ros.evaluation.bag_report.run_comparison import ErrorDifference
+from t3mpc_ros.evaluation.bag_report.run_comparison import _sentence
 from t3mpc_ros.evaluation.bag_report.run_data import (
     BY_BODY,
     BY_WHEEL,
@@ -58,6 +58,7 @@ from t3mpc_ros.evaluation.bag_report.verdict import (
     known_result,
 )
 from t3mpc_ros.evaluation.charts import Plane
+from t3mpc_ros.evaluation.confidence_intervals import Difference
 from t3mpc_ros.evaluation.drive_response import ResponseFit
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE, TRUTH
 
@@ -541,4 +542,4 @@ def test_a_recorded_demo_is_known_and_other_conditions_are_not():
     ],
 )  # fmt: skip
 def test_a_difference_of_two_runs_in_words(difference, half, text):
-    assert ErrorDifference(BY_WHEEL[0], difference, half).text() == text
+    assert _sentence(BY_WHEEL[0], Difference(difference, half)) == f'{text}.'

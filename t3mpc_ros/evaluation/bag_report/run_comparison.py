@@ -79,7 +79,8 @@ GROUP = 3
 MAX_RUNS = len(report_charts.TERM_COLOURS)
 DISTANCE = Channel('distance', 'distance from the path', 'distance', 'm')
 """What is compared of two robots that follow poses."""
-BETTER, WORSE, INCONCLUSIVE = 'smaller error', 'larger error', 'inconclusive'
+VERDICTS = {-1: 'smaller error', 0: 'inconclusive', 1: 'larger error'}
+"""By the sign of a difference."""
 
 
 class WrittenComparison(NamedTuple):
@@ -105,32 +106,6 @@ class ComparedRun:
     parameters: Mapping[str, str]
 
 
-class ErrorDifference(NamedTuple):
-    """How much the mean squared settled error of a run differs from that of the first."""
-
-    channel: Channel
-    difference: float
-    """In the square of the channel's unit."""
-    half: float
-    """Half the 95 % interval; infinite for less than two blocks of :data:`BLOCK`."""
-
-    @property
-    def verdict(self) -> str:
-        """Whether the error is smaller or larger; inconclusive if the interval spans zero."""
-        if not Difference(self.difference, self.half).certain:
-            return INCONCLUSIVE
-        return BETTER if self.difference < 0.0 else WORSE
-
-    def text(self) -> str:
-        """Return the difference and its verdict as text."""
-        half = format_number(self.half) if math.isfinite(self.half) else 'unknown'
-        difference = f'{self.difference:+.3g}' if math.isfinite(self.difference) else 'unknown'
-        return (
-            f'{self.channel.title}: mean squared error {difference} ± {half} '
-            f'({self.channel.unit})², {self.verdict}'
-        )
-
-
 def block_errors(run: Run, name: str) -> list[float]:
     """Return the mean squared settled error of each :data:`BLOCK` seconds of one channel."""
     if name == DISTANCE.name:
@@ -150,15 +125,18 @@ def block_errors(run: Run, name: str) -> list[float]:
     return means
 
 
-def error_differences(first: Run, other: Run) -> list[ErrorDifference]:
-    """Return how the settled error, or path error, of ``other`` differs, by channel."""
-    found = []
+def error_differences(first: Run, other: Run) -> dict[Channel, Difference]:
+    """Return how the mean squared settled error, or path error, of ``other`` differs, by channel.
+
+    An interval is infinite for less than two blocks of :data:`BLOCK`.
+    """
+    found = {}
     for channel in (DISTANCE,) if first.follows_path else other.channels:
         a, b = block_errors(first, channel.name), block_errors(other, channel.name)
         # Independent intervals, with the fewer degrees of freedom in each.
         half = math.hypot(interval(a), interval(b))
         difference = float(np.mean(b) - np.mean(a)) if a and b else math.nan
-        found.append(ErrorDifference(channel, difference, half))
+        found[channel] = Difference(difference, half)
     return found
 
 
@@ -276,14 +254,23 @@ def _verdict(first: ComparedRun, other: ComparedRun) -> VerdictBox:
     if why := why_not_comparable(first, other):
         return VerdictBox('Not comparable', [f'{why[0].upper()}{why[1:]}.'], 'apart', subject)
     found = error_differences(first.run, other.run)
-    verdicts = {each.verdict for each in found} - {INCONCLUSIVE}
+    signs = {each.sign for each in found.values()} - {0}
     headline, kind = 'Inconclusive', 'apart'
     error = 'path error' if first.run.follows_path else 'settled error'
-    if verdicts == {BETTER}:
+    if signs == {-1}:
         headline, kind = f'Smaller {error}', 'good'
-    elif verdicts == {WORSE}:
+    elif signs == {1}:
         headline, kind = f'Larger {error}', 'bad'
-    return VerdictBox(headline, [f'{each.text()}.' for each in found], kind, subject)
+    return VerdictBox(headline, [_sentence(*each) for each in found.items()], kind, subject)
+
+
+def _sentence(channel: Channel, difference: Difference) -> str:
+    half = format_number(difference.half) if math.isfinite(difference.half) else 'unknown'
+    size = f'{difference.mean:+.3g}' if math.isfinite(difference.mean) else 'unknown'
+    return (
+        f'{channel.title}: mean squared error {size} ± {half} ({channel.unit})², '
+        f'{VERDICTS[difference.sign]}.'
+    )
 
 
 def _metrics_table(runs: Sequence[ComparedRun]) -> Table:

@@ -19,12 +19,12 @@ inconclusive.
 """
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 import math
 import re
 from statistics import median
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -78,6 +78,9 @@ class Finding(NamedTuple):
     """By how much each part of the claim is satisfied, with its interval over the seeds."""
 
 
+VERDICTS = 'held', 'not held', 'inconclusive', 'not measured'
+
+
 @dataclass(frozen=True, slots=True)
 class Claim:
     """One claim with its verdict."""
@@ -88,50 +91,19 @@ class Claim:
     text: str
     """The claim and its criterion."""
     found: str = 'not measured'
-    held: bool | None = None
-    """None: not measured, or inconclusive."""
-    numbers: dict[str, object] = field(default_factory=dict)
-    inconclusive: bool = False
-    """Whether too little was measured to decide."""
+    verdict: str = 'not measured'
+    """One of :data:`VERDICTS`; inconclusive: too little was measured to decide."""
+    numbers: Mapping[str, object] = field(default_factory=dict)
 
     @property
-    def verdict(self) -> str:
-        """``'held'``, ``'not held'``, ``'inconclusive'`` or ``'not measured'``."""
-        if self.held is None:
-            return 'inconclusive' if self.inconclusive else 'not measured'
-        return 'held' if self.held else 'not held'
-
-    def decided(self, find: Callable[[], Finding], *, complete: bool) -> Self:
-        """Return the claim with its verdict.
-
-        With ``complete``, where as much was measured as the claim is about, its criterion decides.
-        Otherwise the claim is inconclusive, unless all its parts are satisfied beyond doubt, one
-        of them is not, or a run diverged.
-        """
-        try:
-            finding = find()
-        except NotMeasuredError:
-            return self
-        margins = finding.margins
-        sure = (
-            complete
-            or not all(math.isfinite(margin.mean) for margin in margins)
-            or all(margin.mean > margin.half for margin in margins)
-            or any(margin.mean < -margin.half for margin in margins)
-        )
-        return replace(
-            self,
-            found=finding.text,
-            held=bool(finding.held) if sure else None,
-            numbers=dict(finding.numbers),
-            inconclusive=not sure,
-        )
+    def held(self) -> bool | None:
+        """None: not measured, or inconclusive."""
+        return {'held': True, 'not held': False}.get(self.verdict)
 
     def record(self) -> dict[str, object]:
         """Return the claim as plain data."""
-        found = asdict(self) | {'verdict': self.verdict}
-        del found['inconclusive']
-        return found
+        names = ('name', 'origin', 'text', 'found', 'held', 'numbers', 'verdict')
+        return {name: getattr(self, name) for name in names}
 
 
 Query = Callable[..., Finding]
@@ -142,37 +114,48 @@ def all_claims(runs: ResultTable, estimated: ResultTable) -> list[Claim]:
     """Return all claims with their verdicts: of this package, then of the paper."""
     complete = {*runs.unique('seed')} >= {*HELD_OUT_SEEDS}
     complete &= all(duration >= study.DURATION for duration in runs.unique('duration'))
-    found = [
-        claim.decided(partial(query, runs), complete=complete) for claim, query in definitions()
-    ]
+    found = [_decided(*each, runs, complete=complete) for each in definitions()]
     complete &= len(estimated.unique('seed')) >= ESTIMATION_SEEDS
-    return found + [
-        claim.decided(partial(query, estimated), complete=complete)
-        for claim, query in OF_ESTIMATION
-    ]
+    return found + [_decided(*each, estimated, complete=complete) for each in OF_ESTIMATION]
+
+
+def _decided(claim: Claim, query: Query, runs: ResultTable, *, complete: bool) -> Claim:
+    """Return the claim with its verdict.
+
+    With ``complete``, where as much was measured as the claim is about, its criterion decides.
+    Otherwise the claim is inconclusive, unless all its parts are satisfied beyond doubt, one
+    of them is not, or a run diverged.
+    """
+    try:
+        held, text, numbers, margins = query(runs)
+    except NotMeasuredError:
+        return claim
+    signs = {margin.sign for margin in margins}
+    diverged = not all(math.isfinite(margin.mean) for margin in margins)
+    sure = complete or diverged or signs == {1} or -1 in signs
+    verdict = ('held' if held else 'not held') if sure else 'inconclusive'
+    return replace(claim, found=text, verdict=verdict, numbers=numbers)
 
 
 def definitions() -> Iterator[tuple[Claim, Query]]:
     """Yield the claims about the runs of the study, each with what decides it."""
+    ours, paper = partial(_of_drives, 'ours'), partial(_of_drives, 'paper')
     for noise, limit in ((study.PAPER_NOISE, 0.60), (0.0, 0.50)):
-        yield from _of_drives(
-            'ours',
+        yield from ours(
             f'share of the best baseline without preview, {{drive}}, noise {noise:g}',
             f'RMSE at most {limit:.2f} of that of the best baseline without preview ({{drive}} '
             f'drive, nominal, noise {noise:g})',
             partial(share_of_best, noise=noise, limit=limit, preview=False),
             ('velocity',),
         )
-    yield from _of_drives(
-        'ours',
+    yield from ours(
         'baselines with preview, wrong inertia in their models, {drive}',
         'RMSE no larger than that of any predictive baseline with preview whose model is 30 % off '
         'in its inertia, or within the paired interval ({drive} drive, noise '
         f'{study.PAPER_NOISE:g})',
         partial(against_preview, cases=(NOMINAL,), exact=False),
     )
-    yield from _of_drives(
-        'ours',
+    yield from ours(
         'baselines with preview, wrong inertia of the robot, {drive}',
         'RMSE no larger than that of any predictive baseline with preview and the nominal model '
         'when mass and inertia of the robot are 30 % more or less ({drive} drive, noise '
@@ -181,8 +164,7 @@ def definitions() -> Iterator[tuple[Claim, Query]]:
     )
     for part, case, drives in INTENDED:
         less, more = study.STAGES[study.PARTS.index(part) :][:2]
-        yield from _of_drives(
-            'ours',
+        yield from ours(
             f'{part} lowers RMSE, {case}, {{drive}}',
             f'Adding {part} lowers RMSE in the case {case} ({{drive}} drive, noise '
             f'{study.PAPER_NOISE:g}; {more} less {less}, same seeds, 95 % interval below zero)',
@@ -191,8 +173,7 @@ def definitions() -> Iterator[tuple[Claim, Query]]:
         )
     for part, case, drives in INTENDED + ALONE:
         less = study.WITHOUT[part]
-        yield from _of_drives(
-            'ours',
+        yield from ours(
             f'{part} is missed, {case}, {{drive}}',
             f'Leaving {part} out of the full controller costs RMSE in the case {case} ({{drive}} '
             f'drive, noise {study.PAPER_NOISE:g}; {FULL} less {less}, same seeds, interval below '
@@ -200,49 +181,42 @@ def definitions() -> Iterator[tuple[Claim, Query]]:
             partial(lowers_rmse, first=FULL, second=less, case=case),
             drives,
         )
-    yield from _of_drives(
-        'ours',
+    yield from ours(
         'noise-free against PI, {drive}',
         'RMSE no larger than that of PI with feed-forward ({drive} drive, nominal, no noise)',
         no_larger_than_pi,
     )
-    yield from _of_drives(
-        'ours',
+    yield from ours(
         'smallest growth with noise, {drive}',
         f'RMSE grows by no more than that of any baseline from no noise to {LOUDEST:g} ({{drive}} '
         'drive, nominal, in rad/s)',
         smallest_growth,
     )
-    yield from _of_drives(
-        'ours',
+    yield from ours(
         'settled, {drive}',
         f'Settled RMSE, without 1 s about each switch, at most 2 % of {REFERENCE_SPREAD:g} rad/s '
         '({drive} drive, nominal, no noise)',
         partial(settled_share, limit=0.02 * REFERENCE_SPREAD),
     )
-    yield from _of_drives(
-        'paper',
+    yield from paper(
         f'half of the best baseline, {{drive}}, noise {study.PAPER_NOISE:g}',
         'About 50 % more accurate than other methods: RMSE at most 0.50 of that of the best '
         f'baseline ({{drive}} drive, nominal, noise {study.PAPER_NOISE:g})',
         partial(share_of_best, noise=study.PAPER_NOISE, limit=0.50),
     )
-    yield from _of_drives(
-        'paper',
+    yield from paper(
         'grows only slightly, {drive}',
         f'RMSE grows only slightly from no noise to {LOUDEST:g} (here: by at most '
         f'{100 * SLIGHTLY:.0f} %; {{drive}} drive, nominal)',
         grows_slightly,
     )
-    yield from _of_drives(
-        'paper',
+    yield from paper(
         'others grow by half, {drive}',
         f'RMSE of every other method grows by more than 50 % from no noise to {LOUDEST:g} '
         '({drive} drive, nominal)',
         others_grow,
     )
-    yield from _of_drives(
-        'paper',
+    yield from paper(
         'no chatter, {drive}',
         'Control signals without high-frequency fluctuation (here: total variation of what is '
         'asked of the robot no more than the median of the baselines; {drive} drive, nominal, '
@@ -392,8 +366,7 @@ def by_seed(
     column: str = 'rmse',
 ) -> Array:
     """Return a number of each seed."""
-    wanted = {'controller': controller, 'drive': drive, 'noise': noise, 'case': case}
-    return measured(runs, column, **wanted)
+    return measured(runs, column, controller=controller, drive=drive, noise=noise, case=case)
 
 
 def measured(runs: ResultTable, column: str, **wanted: Hashable) -> Array:

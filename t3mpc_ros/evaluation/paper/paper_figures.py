@@ -178,12 +178,13 @@ def explained(run: Record) -> tuple[float, float]:
 def switches_claim(run: Record) -> Claim:
     """Decide whether the reference changes its signals as often as in the paper's run."""
     count = switch_times(run.time, run['mode']).size
+    verdict = 'held' if count == 4 else 'not held'
     return Claim(
         'four switches',
         'paper',
         'The reference changes its signals four times in a run, suddenly (60 s here)',
         f'{count} switches in {run.time[-1]:.0f} s',
-        count == 4 if run.time[-1] > LONG_ENOUGH else None,
+        verdict if run.time[-1] > LONG_ENOUGH else 'not measured',
         {'switches': count},
     )
 
@@ -220,10 +221,8 @@ def _of_run(
     run: Record, name: str, text: str, found: str, held: bool, numbers: dict[str, object]
 ) -> Claim:
     """Return the claim with its verdict; a short run refutes nothing."""
-    sure = held or bool(run.time[-1] > LONG_ENOUGH)
-    return Claim(
-        name, 'paper', text, found, bool(held) if sure else None, numbers, inconclusive=not sure
-    )
+    refuted = 'not held' if run.time[-1] > LONG_ENOUGH else 'inconclusive'
+    return Claim(name, 'paper', text, found, 'held' if held else refuted, numbers)
 
 
 def broken_at_switches(run: Record, values: Sequence[Array] | Array) -> Array:

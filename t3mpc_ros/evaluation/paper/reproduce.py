@@ -24,7 +24,7 @@ from t3mpc_ros.evaluation import open_loop_estimation, reporting
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, measured_run, run_experiment
 from t3mpc_ros.evaluation.methods import EXACT_MODEL, methods
 from t3mpc_ros.evaluation.paper import paper_figures
-from t3mpc_ros.evaluation.paper.claims import Claim, all_claims, markdown
+from t3mpc_ros.evaluation.paper.claims import VERDICTS, Claim, all_claims, markdown
 from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables, csv_columns
 from t3mpc_ros.evaluation.paper.study import (
     DRIVES,
@@ -348,15 +348,6 @@ HEADLINE = 'table3_rmse'
 """Stem of the exhibit that the page shows first."""
 
 
-_KINDS = {
-    'held': 'yes',
-    'not held': 'no',
-    'inconclusive': 'apart',
-    'not measured': 'open',
-    'not comparable': 'apart',
-}
-
-
 def page(title: str, origin: str, material: ExhibitData, pictures: Mapping[str, bytes]) -> str:
     """Return the page as HTML that loads nothing from anywhere.
 
@@ -384,12 +375,12 @@ def page(title: str, origin: str, material: ExhibitData, pictures: Mapping[str, 
 def counted(claims: Sequence[Claim]) -> str:
     """Return how many claims are held, not held, inconclusive and not measured."""
     verdicts = [claim.verdict for claim in claims]
-    return ', '.join(f'{verdicts.count(kind)} {kind}' for kind in list(_KINDS)[:4])
+    return ', '.join(f'{verdicts.count(kind)} {kind}' for kind in VERDICTS)
 
 
 def _claims(title: str, claims: Sequence[Claim], origin: str) -> reporting.Details:
     chosen = [claim for claim in claims if claim.origin == origin]
-    rows = [(claim.text, claim.found, _mark(claim.verdict)) for claim in chosen]
+    rows = [(claim.text, claim.found, reporting.verdict_mark(claim.verdict)) for claim in chosen]
     table = reporting.Table('', ('claim', 'found', ''), rows, text=3, wrap=True)
     return reporting.Details(f'{title}: {counted(chosen)}', [table], opened=True)
 
@@ -399,7 +390,7 @@ def _exhibit(
 ) -> reporting.Group:
     claims = exhibit.decided_by(material.claims)
     found: list[Sequence[str | reporting.Mark]] = [
-        (f'{claim.text}: {claim.found}', _mark(claim.verdict)) for claim in claims
+        (f'{claim.text}: {claim.found}', reporting.verdict_mark(claim.verdict)) for claim in claims
     ]
     if not found:
         found = [(exhibit.finding(material) if exhibit.finding else exhibit.caption,)]
@@ -408,7 +399,7 @@ def _exhibit(
         reporting.Items(found, 'side', 'Found here'),
     ]
     blocks: list[reporting.Block] = [
-        reporting.Heading(exhibit.title, _mark(exhibit.mark(material.claims))),
+        reporting.Heading(exhibit.title, reporting.verdict_mark(exhibit.mark(material.claims))),
         reporting.Group(sides, 'div', 'sides'),
     ]
     if figure := pictures.get(exhibit.stem):
@@ -420,7 +411,3 @@ def _exhibit(
     if more := shown[2:]:
         blocks.append(reporting.Details(f'{len(more)} more tables', more))
     return reporting.Group(blocks)
-
-
-def _mark(verdict: str) -> reporting.Mark:
-    return reporting.Mark(verdict, _KINDS[verdict])

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.confidence_intervals import Difference, format_interval, interval, mean
+from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.evaluation.patrol.path_tracking import (
     ARRIVED,
     OURS,
@@ -41,19 +41,13 @@ from t3mpc_ros.evaluation.reporting import (
     Table,
     format_mean,
     html_page,
+    verdict_mark,
 )
 from t3mpc_ros.version import VERSION
 
-BETTER, WORSE, INCONCLUSIVE = 'ours is better', 'ours is worse', 'inconclusive'
-_KINDS = {BETTER: 'yes', WORSE: 'no', INCONCLUSIVE: 'apart'}
+VERDICTS = {1: 'ours is better', -1: 'ours is worse', 0: 'inconclusive'}
+"""By the sign of how much the error of a method is above ours."""
 _DRAWN = {OURS: '#be123c', 'pure pursuit': '#0284c7', 'regulated pure pursuit': '#65a30d'}
-
-
-def verdict(difference: Difference) -> str:
-    """Return what the error of a method above ours says."""
-    if not difference.certain:
-        return INCONCLUSIVE
-    return BETTER if difference.mean > 0.0 else WORSE
 
 
 def path_table(study: TrackingStudy, path: str) -> Table:
@@ -76,9 +70,8 @@ def path_table(study: TrackingStudy, path: str) -> Table:
         if name == OURS:
             line += [EMPTY_CELL, EMPTY_CELL]
         elif above is not None:
-            judged = verdict(above)
             difference = format_interval(1e3 * above.mean, 1e3 * above.half, '+', 2)
-            line += [difference, Mark(judged, _KINDS[judged])]
+            line += [difference, verdict_mark(VERDICTS[above.sign])]
         lines.append(line)
     return Table(path.capitalize(), head, lines, (OURS,), wrap=True)
 
@@ -94,7 +87,7 @@ def summary_table(study: TrackingStudy) -> Table:
             ]
             own = {'path': path, 'controller': OURS}
             above = study.table.difference('cross_track', {**own, 'controller': name}, own)
-            judged = f'; {verdict(above)}' if name != OURS and above is not None else ''
+            judged = f'; {VERDICTS[above.sign]}' if name != OURS and above is not None else ''
             line.append(format_mean(errors, 2) + judged)
         lines.append(line)
     return Table('Error rms, mm; verdict', ('method', *study.plan.paths), lines, (OURS,))

@@ -43,12 +43,12 @@ from t3mpc_ros.evaluation.reporting import (
     Block,
     Contents,
     Heading,
-    Mark,
     Paragraph,
     Picture,
     Table,
     format_mean,
     html_page,
+    verdict_mark,
 )
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.simulation.world import World
@@ -64,7 +64,6 @@ COVERED, TIMES_SLOWER = 0.9, 3.0
 JUDGED_HORIZON, MARGIN = 5.0, 0.05
 """Horizon (s), and by which share of a random walk's skill that of a path may exceed it."""
 HOLDS, FAILS, INCONCLUSIVE = 'holds', 'does not hold', 'inconclusive'
-_KINDS = {HOLDS: 'yes', FAILS: 'no', INCONCLUSIVE: 'apart'}
 
 
 class Claim(NamedTuple):
@@ -160,8 +159,7 @@ def _time(times: Sequence[float]) -> str:
 
 def claims_table(study: PatrolStudy) -> Table:
     """Return the claims with their verdicts."""
-    rows = [(text, Mark(verdict, _KINDS[verdict]), numbers)
-            for text, verdict, numbers in claims(study)]  # fmt: skip
+    rows = [(text, verdict_mark(verdict), numbers) for text, verdict, numbers in claims(study)]
     return Table('', ('claim', 'verdict', 'measured'), rows, text=3, wrap=True)
 
 

@@ -366,7 +366,7 @@ def tune_twin(
                 continue
             tuned = store.entry(FULL, TWIN)
             difference = validate(method, tuned, objective)
-            better = difference.certain and difference.mean < 0.0
+            better = difference.sign < 0
             report(
                 f'  {FULL}, {TWIN}: on seeds {VALIDATION_SEEDS[0]} to {VALIDATION_SEEDS[-1]} the '
                 f'tuned parameters differ from the defaults by {difference.mean:+.5f} ± '
