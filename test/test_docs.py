@@ -22,9 +22,8 @@ import re
 
 import pytest
 
-from t3mpc_ros.emulator.emulator import EmulatorParameters
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS
-from t3mpc_ros.nodes.registry import NODES, parameter_class, with_parameters
+from t3mpc_ros.nodes.registry import with_parameters
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
 
@@ -194,36 +193,6 @@ def test_every_fault_of_the_emulator_is_documented():
     for kind in FAULT_KINDS:
         value = '' if math.isnan(kind.value) else f'{kind.value:g}'
         assert rows[kind.name] == f'{kind.text} | {value}'
-
-
-DEFAULT = re.compile(
-    r'(?P<before>[\d.]+) (?P<unit>[^\s(|]+) \(`(?P<name>[a-z_.]+)`\)'
-    r'|`(?P<name_before>[a-z_.]+)` \((?P<after>[\d.]+) (?P<unit_after>[^\s)|,;]+)'
-)
-"""A value beside the name of its parameter: 0.2 s (`link.ttl`), or `link.ttl` (0.2 s)."""
-
-
-def test_defaults_in_the_pages_are_those_of_the_parameters():
-    specs = {}
-    for table in (*map(parameter_class, NODES), EmulatorParameters):
-        for spec in table.specs():
-            specs.setdefault(spec.name, []).append(spec)
-    found = set()
-    for page in PAGES:
-        if page.name == 'nodes.md':  # generated
-            continue
-        for match in DEFAULT.finditer(page.read_text()):
-            name = match['name'] or match['name_before']
-            number, unit = (
-                match['before'] or match['after'],
-                match['unit'] or match['unit_after'],
-            )
-            factor = {'KiB': 2**10, 'MiB': 2**20}.get(unit, 1)
-            for spec in specs.get(name, ()):
-                found.add(name)
-                assert float(number) * factor == spec.default, f'{page.name}: {match[0]}'
-                assert factor > 1 or unit == spec.unit, f'{page.name}: {match[0]}'
-    assert len(found) >= 12
 
 
 def _table(page, head):

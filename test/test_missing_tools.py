@@ -14,68 +14,55 @@
 """Tests that need a tool beyond the README: skipped in one way, and listed with a remedy."""
 
 import ast
-import os
 from pathlib import Path
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 from support import missing_tools
 
 TESTS = Path(__file__).resolve().parent
-USERS = """
-import pytest
-from support.missing_tools import needing, needs, skip
-from t3mpc_ros.emulator.firmware_library import CompilerMissingError
-
-@needing('make', 'avr-gcc')
-def test_marked(): pass
-
-@pytest.fixture(scope='module')
-def tool(): needs('make')
-
-@pytest.mark.parametrize('number', [1, 2])
-def test_fixture(tool, number): pass
-
-def test_core(): raise CompilerMissingError('none')
-
-def test_other(): pytest.skip('of another reason: make')
-"""
-LISTED = [
-    'not installed: C compiler, 1 test skipped; remedy: apt-get install gcc libc6-dev',
-    'not installed: avr-gcc, 1 test skipped; remedy: '
-    'apt-get install gcc-avr avr-libc binutils-avr',
-    'not installed: make, 3 tests skipped; remedy: apt-get install make',
-]
 
 
-@pytest.mark.long
-def test_what_is_missing_is_listed_once_with_its_remedy(tmp_path):
+class Terminal:
+    """The terminal at the end of a run, with the reports of skipped tests."""
+
+    config = None
+
+    def __init__(self, *reasons):
+        self.stats = {'skipped': [SimpleNamespace(longrepr=('', 0, each)) for each in reasons]}
+        self.shown = []
+        self.section = self.write_line = self.shown.append
+
+
+def test_what_is_missing_is_listed_once_with_its_remedy(tmp_path, monkeypatch):
     """By the process that writes the summary, and for several runs at the end of the last."""
-    (tmp_path / 'test_users.py').write_text(USERS)
+    with pytest.raises(pytest.skip.Exception) as skipped:
+        missing_tools.skip('make', 'avr-gcc')
+    reasons = (
+        f'Skipped: {skipped.value}',
+        'Skipped: not installed: make',
+        'of another reason: make',
+    )
+    listed = [
+        'not installed: avr-gcc, 1 test skipped; remedy: '
+        'apt-get install gcc-avr avr-libc binutils-avr',
+        'not installed: make, 2 tests skipped; remedy: apt-get install make',
+    ]
+    monkeypatch.delenv('T3MPC_MISSING_TOOLS', raising=False)
+    missing_tools.list_missing(terminal := Terminal(*reasons))
+    assert terminal.shown[1].splitlines() == listed
     notes = tmp_path / 'notes'
-    notes.touch()
-
-    folders = os.pathsep.join(map(str, (TESTS, TESTS.parent)))
-
-    def run(*words, **extra):
-        done = subprocess.run(
-            [sys.executable, *map(str, words)],
-            cwd=tmp_path,
-            env={**os.environ, 'PATH': '', 'PYTHONPATH': folders, **extra},
-            capture_output=True,
-            text=True,
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        return re.findall('^not installed: .*', done.stdout + done.stderr, re.MULTILINE)
-
-    words = ['-m', 'pytest', '-c', TESTS.parent / 'pyproject.toml', '-p', 'conftest', tmp_path]
-    assert run(*words, '-n', 1, T3MPC_MISSING_TOOLS='') == LISTED
-    assert run(*words, '-n', 0, T3MPC_MISSING_TOOLS=str(notes)) == []
-    notes.write_text(2 * notes.read_text())  # a second run appends as much
-    both = [line.replace('3 tests', '6 tests').replace('1 test ', '2 tests ') for line in LISTED]
-    assert run(missing_tools.__file__, notes) == both
+    monkeypatch.setenv('T3MPC_MISSING_TOOLS', str(notes))
+    for _ in range(2):
+        missing_tools.list_missing(terminal := Terminal(*reasons))
+        assert terminal.shown == []
+    words = [sys.executable, missing_tools.__file__, notes]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    both = [line.replace('2 tests', '4 tests').replace('1 test ', '2 tests ') for line in listed]
+    assert done.stderr.splitlines() == both
 
 
 OTHERS = {

@@ -42,6 +42,8 @@ def test_every_header_is_one_that_ament_copyright_recognises():
         words = f'{path}: run python test/support/headers.py'
         assert header(mark) in text[:1000], words
         assert not text.partition(header(mark))[2].startswith(mark), words
+    for path in (ROOT / 'scripts').iterdir():
+        assert path.is_dir() or 'Apache' in path.read_text(encoding='utf-8')[:300], path
 
 
 def requirements(name):
