@@ -16,28 +16,11 @@
 from collections.abc import Mapping, Set
 import dataclasses
 import enum
-import importlib
-import inspect
-import pkgutil
 from types import GenericAlias, ModuleType
 
 import numpy as np
 
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, bytearray)
-
-
-def stateful_classes(package):
-    """Return the names of all classes of a package whose objects may change."""
-    found = set()
-    for each in pkgutil.walk_packages(package.__path__, f'{package.__name__}.'):
-        for name, kind in vars(importlib.import_module(each.name)).items():
-            if not inspect.isclass(kind) or kind.__module__ != each.name:
-                continue
-            frozen = getattr(kind, '__dataclass_params__', None)
-            if issubclass(kind, BaseException | tuple | enum.Enum) or (frozen and frozen.frozen):
-                continue
-            found.add(name)
-    return found
 
 
 def state(thing, origin_ns=0):

@@ -46,7 +46,6 @@ from t3mpc_ros.control.pose_controller import (
     PoseLoopParameters,
 )
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters, SpeedKalmanFilter
-from t3mpc_ros.control.watchdog import ResponseMonitor, WatchdogParameters
 from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultInjection
 from t3mpc_ros.emulator.link.serial_line import SerialLine
@@ -59,8 +58,7 @@ from t3mpc_ros.mpc.predictive_controller import PredictiveController, Predictive
 from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
 from t3mpc_ros.robot.interface import RobotCommand
-from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters, TransportDelay
-from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultParameters, FaultSchedule
+from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.plant.paper_plant import (
     PaperRobot,
     PaperRobotParameters,
@@ -109,25 +107,6 @@ def drive_filter(kalman, r):
     for _ in range(20):
         kalman.update(pair(r), pair(r), gap(r), sent=r.random() < 0.9)
         found += [*(array.copy() for array in kalman.state), kalman.dead_time]
-    return found
-
-
-def drive_response(monitor, r):
-    """Give commands, and measured speeds that follow them for a while, or do not."""
-    found, follows, command = [], True, np.zeros(2)
-    for _ in range(r.randrange(40, 120)):
-        if r.random() < 0.2:
-            follows = not follows
-        if r.random() < 0.2:
-            command = pair(r)
-        monitor.add_command(*command.tolist())
-        measured = command if follows else np.zeros(2)
-        found.append((monitor.update(*measured.tolist()), monitor.evidence))
-    for _ in range(25):  # it ends with evidence against any decision
-        monitor.add_command(9.0, 9.0)
-        follows = monitor.responsive if _ < 19 else not monitor.responsive
-        measured = (9.0, 9.0) if follows else (0.0, 0.0)
-        found.append((monitor.update(*measured), monitor.evidence))
     return found
 
 
@@ -269,9 +248,6 @@ def other_weights(controller):
 
 
 WEIGHTS = other_weights(None)
-
-
-# -- mpc ------------------------------------------------------------------------------------------
 
 
 # -- chaos ----------------------------------------------------------------------------------------
@@ -437,26 +413,6 @@ def drive_robot(robot, r):
     return found
 
 
-def drive_transport(delay, r):
-    """Send commands with any delay, more than fit."""
-    found, now = [], max(delay._clock_ns or 0, 0)
-    for k in range(r.choice((30, 1100))):
-        now += PERIOD_NS
-        command = RobotCommand(WheelSpeeds(float(k), 0.0), now)
-        delay.send(command, now, r.choice((0.0, 0.05, 20.0)), 0.02, 0.2)
-        if r.random() < 0.2:
-            found += [delay.arrived(now), delay.next_ns]
-    delay.send(RobotCommand(WheelSpeeds(1.0, 0.0), now), now, 1.0, 0.0, 0.0)
-    return found
-
-
-def drive_faults(schedule, r):
-    """Ask for faults at any time, with few dynamic tables."""
-    tables = FaultParameters(), FaultParameters(command_delay=0.1), FaultParameters(gyro_dead=True)
-    times = [r.choice((0.0, 1.0, 1.5, 2.0, 3.0, r.uniform(-1.0, 4.0))) for _ in range(30)]
-    return [schedule.at(time, r.choice(tables)) for time in times]
-
-
 def drive_imu(imu, r):
     """Measure, most often at one period."""
     found = []
@@ -592,7 +548,6 @@ def all_of(thing: object, *without: str) -> tuple[str, ...]:
     )
 
 
-SENT = '._sent', '._generator'
 IMU_TUNING = '._colour', '._dt', '._walk_step'
 BODY = (
     *('._arrays.state', '._arrays.modes', '._arrays.totals', '._state', '._modes', '._now'),
@@ -644,11 +599,6 @@ FRESH = {
                 scratch=BODY_OLD,
             ),
         },
-    ),
-    ResponseMonitor: Stateful(
-        lambda: ResponseMonitor(WatchdogParameters(), PERIOD),
-        drive_response,
-        {'reset': Operation(lambda m: m.reset())},
     ),
     DeadTimeEstimator: Stateful(
         lambda: DeadTimeEstimator(SpeedFilterParameters(), PERIOD, friction=True),
@@ -898,33 +848,6 @@ FRESH = {
                 ),
                 scratch=below('._imu', IMU_TUNING),
             ),
-        },
-    ),
-    TransportDelay: Stateful(
-        lambda: TransportDelay(np.random.default_rng(1)),
-        drive_transport,
-        {
-            'clear': Operation(lambda d: d.clear(), kept=('._clock_ns', *SENT)),
-            'jump back': Operation(lambda d: (d.arrived(-1), d.arrived(-2)), kept=SENT),
-        },
-    ),
-    FaultSchedule: Stateful(
-        lambda: FaultSchedule(
-            (FaultEvent(1.0, 'command_loss', 0.5, 1.0), FaultEvent(1.5, 'brown_out', True))
-        ),
-        drive_faults,
-        {
-            f'a question at {at} s': Operation(lambda s, at=at: s.at(at, FaultParameters()))
-            for at in (0.5, 1.2, 1.7, 2.5)
-        },
-    ),
-    SimulatedImu: Stateful(
-        lambda: SimulatedImu(SimulatedImuParameters(), np.random.default_rng(1)),
-        drive_imu,
-        {
-            'restart': Operation(
-                lambda i: i.restart(), continued=('._generator',), scratch=IMU_TUNING
-            )
         },
     ),
     Plant: Stateful(
