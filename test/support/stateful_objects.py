@@ -46,6 +46,7 @@ from t3mpc_ros.control.pose_controller import (
     PoseLoopParameters,
 )
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters, SpeedKalmanFilter
+from t3mpc_ros.control.watchdog import ResponseMonitor, WatchdogParameters
 from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultInjection
 from t3mpc_ros.emulator.link.serial_line import SerialLine
@@ -107,6 +108,20 @@ def drive_filter(kalman, r):
     for _ in range(20):
         kalman.update(pair(r), pair(r), gap(r), sent=r.random() < 0.9)
         found += [*(array.copy() for array in kalman.state), kalman.dead_time]
+    return found
+
+
+def drive_response(monitor, r):
+    """Give commands that the robot does not follow; it ends with evidence against the decision."""
+    found = []
+    for k in range(r.randrange(40, 120)):
+        monitor.add_command(9.0, 9.0)
+        speed = 9.0 if k % 50 < 20 else 0.0
+        found.append((monitor.update(speed, speed), monitor.evidence))
+    for _ in range(5):
+        monitor.add_command(9.0, 9.0)
+        speed = 0.0 if monitor.responsive else 9.0
+        found.append((monitor.update(speed, speed), monitor.evidence))
     return found
 
 
@@ -599,6 +614,11 @@ FRESH = {
                 scratch=BODY_OLD,
             ),
         },
+    ),
+    ResponseMonitor: Stateful(
+        lambda: ResponseMonitor(WatchdogParameters(), PERIOD),
+        drive_response,
+        {'reset': Operation(lambda m: m.reset())},
     ),
     DeadTimeEstimator: Stateful(
         lambda: DeadTimeEstimator(SpeedFilterParameters(), PERIOD, friction=True),
