@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.long_tests import few_of
 from support.tool_bench import ToolBench
 
 from t3mpc_ros.cli import robot_doctor as cli
@@ -146,31 +147,32 @@ def test_a_poor_line_does_not_pass(monkeypatch):
     assert 'pass' not in shown
 
 
-@pytest.mark.parametrize('drive', [False, True])
+def doctor_options(report, count=10, drive=False):
+    return argparse.Namespace(
+        port='dongle', robot_port='robot', count=count, drive=drive, report=report
+    )
+
+
+@pytest.mark.parametrize('drive', few_of([True, False]))
 @pytest.mark.slow
 def test_the_checklist_on_the_emulated_robot(drive, tmp_path, monkeypatch, capsys):
     """A wheel turns only with --drive and a confirmation; the report has every line."""
     bench = ToolBench()
-
-    def run_at_port(task, path, interrupted, device=''):
-        bench.run(task, robot=path == 'robot')
-
-    monkeypatch.setattr(procedure, 'run_at_port', run_at_port)
-    options = argparse.Namespace(
-        port='dongle', robot_port='robot', count=50, drive=drive, report=tmp_path / 'r.html'
+    monkeypatch.setattr(
+        procedure,
+        'run_at_port',
+        lambda task, path, *others: bench.run(task, robot=path == 'robot'),
     )
-    asked = []
 
     def answer(question):
-        asked.append(question)
         if 'RIGHT' in question:
             return 'no'
         return 'yes' if 'left wheel will' in question or 'LEFT' in question else 'skip'
 
+    options = doctor_options(tmp_path / 'r.html', count=50, drive=drive)
     checks = cli.run_doctor(options, PARAMETERS, b'', answer, lambda: False)
     verdicts = {check.name: check.verdict for check in checks}
-    measured = [check for check in checks if check.verdict == FAIL]
-    assert not measured, measured
+    assert FAIL not in verdicts.values(), verdicts
     assert verdicts['left wheel'] == (PASS if drive else SKIPPED)
     assert verdicts['right wheel'] == SKIPPED
     left, right = bench.board.counters
@@ -193,9 +195,7 @@ def test_a_silent_robot_board_does_not_end_the_examination(tmp_path, monkeypatch
         bench.run(task)
 
     monkeypatch.setattr(procedure, 'run_at_port', run_at_port)
-    options = argparse.Namespace(
-        port='dongle', robot_port='robot', count=10, drive=False, report=tmp_path / 'r.html'
-    )
+    options = doctor_options(tmp_path / 'r.html')
     checks = cli.run_doctor(options, PARAMETERS, b'', lambda question: 'skip', lambda: False)
     assert [check.name for check in checks if check.verdict == FAIL] == ['USB of the robot']
     assert any(check.name == 'robot answers by radio' for check in checks)
@@ -204,9 +204,7 @@ def test_a_silent_robot_board_does_not_end_the_examination(tmp_path, monkeypatch
 def test_a_full_disk_does_not_cost_the_checklist(monkeypatch, capsys):
     """It ended with a traceback, and said neither the file nor what to do."""
     monkeypatch.setattr(procedure, 'run_script', lambda *given: _no_answer())
-    options = argparse.Namespace(
-        port='dongle', robot_port='robot', count=10, drive=False, report=Path('/dev/full')
-    )
+    options = doctor_options(Path('/dev/full'))
     with pytest.raises(OSError, match='No space') as caught:
         cli.run_doctor(options, PARAMETERS, b'', lambda question: 'yes', lambda: False)
     assert sentence(caught.value).startswith('/dev/full cannot be written: No space')

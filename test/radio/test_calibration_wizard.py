@@ -13,6 +13,7 @@
 # limitations under the License.
 """The calibration wizard against the emulated boards, in virtual time."""
 
+import math
 import os
 from pathlib import Path
 import re
@@ -20,6 +21,7 @@ import shlex
 import sys
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from support.calibration_bench import CalibrationBench, Person
 import yaml
@@ -43,6 +45,7 @@ from t3mpc_ros.robot.calibration import (
     CalibrationError,
     DividerCorrection,
     Estimate,
+    Recording,
     SharpCurve,
 )
 from t3mpc_ros.simulation.sensors.range_sensor import output_voltage
@@ -69,8 +72,21 @@ def person(monkeypatch):
     return Person(bench)
 
 
-def wizard(person, *steps, start=None, robot_port='', **options):
-    robot = CalibrationRobot(
+class PerfectRobot(CalibrationRobot):
+    """Drives as commanded, with the errors of the twin, in no time."""
+
+    def drive(self, angles, speed, rests):
+        duration = max(map(abs, angles)) / speed
+        times = np.arange(0.0, sum(rests) + duration, 0.02)
+        share = np.clip((times - rests[0]) / duration, 0.0, 1.0)
+        rate = 1.03 * (angles.right - angles.left) * RADIUS / TRACK / duration
+        begin, end = np.searchsorted(times, (rests[0], rests[0] + duration))
+        rates = np.where((share > 0.0) & (share < 1.0), rate, 0.0)
+        return Recording(times, share * angles.right, share * angles.left, rates, begin, end)
+
+
+def wizard(person, *steps, start=None, robot_port='', robot=CalibrationRobot, **options):
+    robot = robot(
         *('dongle', robot_port, LinkParameters(), b''), os.urandom, lambda: False, person.show
     )
     options = WizardOptions(steps=steps, **options)
@@ -171,19 +187,19 @@ def _after(bench, seconds):
     return answer
 
 
-@pytest.mark.slow
 def test_a_misread_distance_is_asked_for_again(person):
     """A typo cost the drive, and twice the way in both runs gave a wheel of 70 mm."""
-    person.answers = {'Between both marks': ['-2', '1', '0.5 m', '0.59'], 'Enter to repeat': ['']}
-    found = wizard(person, 'radius', distance=0.5, speed=8.0).run()
+    answers = ['-2', '1', '0.5 m', '0.55', *3 * ['0.51']]
+    person.answers = {'Between both marks': answers, 'Enter to repeat': ['']}
+    found = wizard(person, 'radius', distance=0.5, speed=8.0, robot=PerfectRobot).run()
     shown = person.transcript
     for answer in ('-2', '1'):
-        assert f'must be from 0.448 to 0.6719 m: got {answer}; the wheels drove 0.56 m' in shown
+        assert f'must be from 0.4 to 0.6 m: got {answer}; the wheels drove 0.50 m' in shown
     assert "must be a number, or skip: got '0.5 m'" in shown
     # The other way is measured well: which one is wrong, only another drive can tell.
-    assert 'the wheel radius (m) must be the same in all runs within 2 %: got 0.03688 and' in shown
+    assert 'the wheel radius (m) must be the same in all runs within 2 %: got 0.0385 and' in shown
     assert shown.count('Move now?') == 4
-    assert found.wheel_radius.value == pytest.approx(RADIUS, rel=0.01)
+    assert found.wheel_radius.value == pytest.approx(RADIUS)
 
 
 def test_a_misread_distance_of_the_board_is_asked_for_again(person):
@@ -221,20 +237,16 @@ def test_a_misread_voltage_is_asked_for_again(person):
     assert 'Enter to repeat' not in person.transcript
 
 
-@pytest.mark.slow
 def test_a_track_far_from_the_nominal_one_is_refused(person):
     """Any was accepted: of turns that were miscounted, or by a wrong wheel radius."""
-    person.answers = {'Enter to repeat': ['skip']}
+    person.answers = {'Degrees from the mark': ['-13.4', '13.4'], 'Enter to repeat': ['skip']}
     start = Calibration(wheel_radius=Estimate(RADIUS, 1e-5))
-    geometry = WheelGeometry(0.035, 0.3)
-    found = wizard(person, 'track', start=start, speed=8.0, turns=2, geometry=geometry).run()
+    given = {'speed': 4.0, 'turns': 2, 'geometry': WheelGeometry(0.035, 0.3)}
+    found = wizard(person, 'track', start=start, robot=PerfectRobot, **given).run()
     assert 'the track must be from 0.24 to 0.36 m: got 0.15' in person.transcript
     assert found == start
 
 
-# Repeated after a refusal: test_a_misread_distance_is_asked_for_again.
-@pytest.mark.long
-@pytest.mark.slow
 def test_turns_that_are_refused_count_for_nothing(person, monkeypatch):
     """Their marks were misread: by 90 degrees in ten turns, 2.5 % of the scale of the gyro."""
     estimate, refused = calibration.estimate_track, []
@@ -246,13 +258,27 @@ def test_turns_that_are_refused_count_for_nothing(person, monkeypatch):
         return estimate(turns, *others)
 
     monkeypatch.setattr(calibration, 'estimate_track', refuse_once)
-    person.answers = {'Degrees from the mark': ['90', '-90'], 'Enter to repeat': ['']}
+    answers = ['-14.9', '14.9', '-104.9', '104.9']
+    person.answers = {'Degrees from the mark': answers, 'Enter to repeat': ['']}
     start = Calibration(wheel_radius=Estimate(RADIUS, 1e-5))
-    found = wizard(person, 'track', start=start, speed=8.0).run()
+    found = wizard(person, 'track', start=start, robot=PerfectRobot).run()
     assert refused
-    true = 1.0 / (1.0 + 0.03 * person.plant._imu._scale)
-    error = abs(found.gyro_scale.value - true)
+    error = abs(found.gyro_scale.value - 1.0 / 1.03)
     assert error < 1.5 * COVERAGE * found.gyro_scale.uncertainty < 0.005
+
+
+@pytest.mark.parametrize('rate', [0.4, -0.4])
+def test_a_bias_of_a_robot_that_turns_is_refused(person, rate):
+    """Any was taken, and beyond 0.57 rad/s only the robot refused it, after all other steps."""
+    times = np.arange(0.0, 10.0, 0.02)
+    none = np.zeros_like(times)
+    turning = Recording(times, none, none, none + rate, len(times), len(times))
+    person.answers = {'Enter to repeat': ['skip']}
+    made = wizard(person, 'rest')
+    made._robot.rest = lambda seconds: turning
+    assert made.run() == Calibration()
+    degrees = math.degrees(rate)
+    assert f'gyro must be from -20 to 20 deg/s: got {degrees:.4g}; the robot' in person.transcript
 
 
 def test_what_is_left_out_keeps_its_value(person):

@@ -28,6 +28,7 @@ from t3mpc_ros.radio.tool.procedure import Pause, Script, wait_for_board
 from t3mpc_ros.radio.tool.robot_info import LogEntry, LogKind, read_log
 from t3mpc_ros.robot.calibration import (
     CONVERTER_COUNTS,
+    MAX_GYRO_BIAS,
     MAX_SHARP_COUNT,
     Calibration,
     nominal_battery_voltage,
@@ -41,8 +42,8 @@ _SAMPLE_PERIOD = 0.01
 _IMU = ImuParameters()
 _GRAVITY_TOLERANCE = 0.1
 """g; offsets of ±0.05 and ±0.08 g (PS-MPU-6000A 3.4, 6.2)"""
-_MAX_BIAS, _MAX_NOISE = 20.0, 0.5
-"""deg/s: offset of the data sheet, ten times its noise (0.05); a hand on the robot exceeds it"""
+_MAX_NOISE = 0.5
+"""deg/s: ten times the noise of the data sheet (0.05); a hand on the robot exceeds it"""
 _WATCHDOG, _BROWN_OUT = 8, 4
 
 
@@ -282,7 +283,7 @@ def _check_imu(samples: Sequence[Samples]) -> list[Check]:
             f'{gravity:.3f} g, z up {upward:.3f} g',
             'sensor flat, z up, x forward; the robot level and at rest',
         ),
-        _verdict(9, 'rate at rest', bias <= _MAX_BIAS, f'{bias:.2f} deg/s', moved),
+        _verdict(9, 'rate at rest', bias <= MAX_GYRO_BIAS, f'{bias:.2f} deg/s', moved),
         _verdict(9, 'noise of the rate', 0.0 < noise <= _MAX_NOISE, f'{noise:.3f} deg/s', moved),
     ]
 

@@ -242,6 +242,13 @@ class CalibrationWizard:
             f'{np.std(rates):.4f} rad/s'
         )
         bias = calibration.estimate_gyro_bias(recording)
+        calibration.check_within(
+            'the bias of the gyro',
+            math.degrees(bias.value),
+            (-calibration.MAX_GYRO_BIAS, calibration.MAX_GYRO_BIAS),
+            ' deg/s',
+            'the robot must stand still; otherwise a bad sensor',
+        )
         self._keep(gyro_bias=bias)
         self._result(f'bias of the gyro {_degrees(bias)} deg/s')
 
