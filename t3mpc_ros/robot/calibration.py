@@ -46,9 +46,9 @@ GYRO_NOISE = math.radians(0.005)
 GYRO_DRIFT = math.radians(0.005)
 """Random walk of its bias, rad/s/√s: standard deviation after one second; assumed."""
 GYRO_FULL_SCALE = math.radians(500.0)
+"""rad/s"""
 MAX_GYRO_BIAS = 20.0
 """deg/s, of the data sheet (PS-MPU-6000A 3.4, 6.1)"""
-"""rad/s"""
 REFERENCE_VOLTAGE, CONVERTER_COUNTS = 5.0, 1024
 """Full scale (V) and counts of the converter of the board."""
 _SATURATION = 0.98

@@ -23,24 +23,16 @@ from support.long_tests import few_of
 
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.link.port_actions import LinkState
 
 pytestmark = pytest.mark.slow
 
 KEY = bytes(range(16))
-STRICTER = {
-    'drop_bytes', 'flip_bits', 'duplicate_bytes', 'insert_bytes', 'split', 'reorder', 'delay',
-    'stall', 'silence', 'jam', 'robot_reset', 'dongle_reset', 'radio_dead', 'imu_absent',
-    'button', 'close_port',
-}  # fmt: skip
-"""Faults from which test_avr_faults shows more than the recovery, on this emulator too."""
-KINDS = sorted((kind.name for kind in FAULT_KINDS), key=STRICTER.__contains__)
 
 
 def test_counters_equal_the_pulses_of_the_plant():
     bench = Bench({'robot_clock_error': 0.005})
     assert bench.connect() < 0.2
-    for second in range(20):
+    for second in range(8):
         bench.drive(5.0 * math.sin(0.7 * second), 6.0 * math.cos(0.4 * second))
         bench.run(1.0)
         assert bench.link.reason(bench.now_ns) == ''
@@ -48,10 +40,10 @@ def test_counters_equal_the_pulses_of_the_plant():
     pulses = bench.plant.pulses
     assert bench.counted_pulses == pulses
     assert bench.board.counters == pulses
-    assert min(map(abs, pulses)) > 1000
+    assert min(map(abs, pulses)) > 400
     quality = bench.link.quality(bench.now_ns)
     assert (quality.lost, quality.malformed, quality.sessions) == (0, 0, 1)
-    assert quality.cycles >= 1000
+    assert quality.cycles >= 450
     assert quality.robot.stale == quality.robot.duplicates == quality.robot.bad_session == 0
     check_followed(bench)
 
@@ -61,7 +53,7 @@ def test_round_trip_time_is_that_of_line_radio_and_gap():
     bench = Bench()
     bench.connect()
     bench.drive(3.0, 3.0)
-    bench.run(5.0)
+    bench.run(1.0)
     quality = bench.link.quality(bench.now_ns)
     # COBS always adds one byte, so the length is constant.
     assert quality.round_trip_median == pytest.approx(5.04e-3, abs=0.02e-3)
@@ -70,43 +62,18 @@ def test_round_trip_time_is_that_of_line_radio_and_gap():
     assert 60 <= bench.link.telemetry.raw.age <= 80
 
 
-@pytest.mark.parametrize('loss, most', few_of([(0.3, 0.10), (0.1, 0.005), (0.5, 0.45)]))
-def test_share_of_lost_cycles_with_four_retries(loss, most):
-    """Whole: the command was taken, and the state that it led to came back with it."""
-    bench = Bench()
-    bench.inject('loss', math.inf, loss)
-    bench.run(20.0, lambda: bench.link.state is LinkState.RUN)
-    bench.drive(4.0, 4.0)
-    bench.run(15.0)
-    quality = bench.link.quality(bench.now_ns)
-    # Either exchange fails with its fifth try; a CMD that came twice may have fetched the state.
-    one = (1.0 - (1.0 - loss) ** 2) ** 5
-    either = 1.0 - (1.0 - one) ** 2
-    spread = 4.0 * math.sqrt(either * (1.0 - either) / quality.cycles)
-    share = quality.lost / quality.cycles
-    print(f'\nloss {loss}: {share:.2%} of {quality.cycles} cycles ({one:.2%} to {either:.2%})')
-    print(f'round trip 99 %: {1e3 * quality.round_trip_p99:.1f} ms')
-    assert one - spread <= share <= either + spread
-    assert share <= most
-    assert quality.round_trip_p99 < 0.0115
-    check_followed(bench)
-
-
 # -- stopping -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    'fault', ['silence', 'jam', 'stall', 'radio_dead', 'dongle_reset', 'close_port', 'button']
-)
-@pytest.mark.parametrize('speed, deceleration', few_of([(7.0, 30.0), (10.0, 50.0)]))
-def test_wheels_rest_within_045_s_of_the_last_command(fault, speed, deceleration):
-    """For every fault that interrupts the commands; ``silence`` also covers a dead host."""
-    link = LinkParameters.from_dict({'robot.deceleration': deceleration})
-    bench = Bench(link=link)
+# Silence, jam, button: test_avr_faults.
+@pytest.mark.parametrize('fault', ['stall', 'radio_dead', 'dongle_reset', 'close_port'])
+def test_wheels_rest_within_045_s_of_the_last_command(fault):
+    """For every fault that interrupts the commands."""
+    bench = Bench(link=LinkParameters.from_dict({'robot.deceleration': 30.0}))
     bench.connect()
-    bench.drive(speed, speed)
-    bench.run(2.0)
-    assert bench.plant.wheels.right == pytest.approx(speed, abs=0.3)
+    bench.drive(7.0, 7.0)
+    bench.run(1.0)
+    assert bench.plant.wheels.right == pytest.approx(7.0, abs=0.3)
     bench.inject(fault, 3.0)
     still_ns = []
 
@@ -123,50 +90,29 @@ def test_wheels_rest_within_045_s_of_the_last_command(fault, speed, deceleration
     assert still_ns[-1] == bench.now_ns
 
 
-def test_a_reset_stops_the_pulses_and_the_wheels_coast():
-    bench = Bench()
-    bench.connect()
-    bench.drive(7.0, 7.0)
-    bench.run(2.0)
-    bench.inject('robot_reset')
-    bench.run(0.01)
-    assert not bench.emulator.powered
-    bench.release_controls()
-    bench.run(1.0)
-    assert bench.board.speeds == (0, 0)
-    assert not bench.board.powered or bench.board.session
-    bench.run(1.0)
-    assert max(map(abs, bench.plant.wheels)) < 0.2
-
-
 # -- every fault ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('keyed', few_of([True, False]))
-@pytest.mark.parametrize('name', few_of(KINDS, len(FAULT_KINDS) - len(STRICTER)))
-def test_the_link_recovers_from_every_fault(name, keyed):
-    bench = Bench(key=KEY if keyed else b'')
+# The others: test_avr_faults.
+@pytest.mark.parametrize(
+    'name', ['battery_wire', 'loss', 'loss_down', 'loss_up', 'move_link', 'wrong_version']
+)
+def test_the_link_recovers_from_every_fault(name):
+    bench = Bench(key=KEY)
     bench.connect()
     bench.drive(4.0, 4.0)
     bench.run(1.0)
     bench.inject(name, 1.5)
     bench.run(1.6)
-    if bench.link.telemetry.status.estop:
-        bench.link.release_estop(bench.now_ns)
-    bench.run(8.0, lambda: drives_again(bench))
-    bench.run(0.5)
-    assert drives_again(bench)
+    bench.run(2.0)
+    assert bench.link.reason(bench.now_ns) == ''
+    assert bench.plant.wheels.right == pytest.approx(4.0, abs=0.3)
     check_followed(bench)
-
-
-def drives_again(bench):
-    running = bench.link.reason(bench.now_ns) == ''
-    return running and bench.plant.wheels.right == pytest.approx(4.0, abs=0.3)
 
 
 @pytest.mark.parametrize('seed, keyed', few_of(product(range(8), (True, False))))
 def test_no_wrong_or_stale_command_is_executed(seed, keyed):
-    """A fault every half second for half a minute, most of them overlapping."""
+    """A fault every half second, most of them overlapping."""
     rng = random.Random(seed)
     bench = Bench(
         {'robot_clock_error': rng.uniform(-0.005, 0.005)}, key=KEY if keyed else b'', seed=seed
@@ -176,13 +122,13 @@ def test_no_wrong_or_stale_command_is_executed(seed, keyed):
     # Commands resume only seconds after these faults.
     slow = ('dongle_reset', 'close_port', 'move_link', 'radio_dead', 'robot_reset', 'button')
     weights = [0.1 if name in slow else 1.0 for name in names]
-    for _ in range(60):
+    for _ in range(30):
         bench.drive(rng.uniform(-9.0, 9.0), rng.uniform(-9.0, 9.0))
         bench.inject(rng.choices(names, weights)[0], rng.uniform(0.02, 0.8))
         bench.run(0.5)
         bench.link.release_estop(bench.now_ns)
     check_followed(bench)
-    assert len(bench.followed) > 200
+    assert len(bench.followed) > 100
     bench.run(3.0)
     bench.link.release_estop(bench.now_ns)
     bench.run(8.0)
@@ -202,10 +148,6 @@ def test_gyro_ranges_and_battery_are_those_of_the_plant():
     assert telemetry.imu.angular == pytest.approx(6.0 * 0.035 / 0.147, rel=0.05)
     assert any(math.isfinite(distance) for distance in telemetry.ranges)
     assert 11.0 < bench.link.battery.voltage < 13.0
-    plain = Bench()
-    plain.connect()
-    plain.run(1.0)
-    assert plain.link.telemetry.ranges == (math.inf,) * 8
 
 
 def test_the_same_seed_gives_the_same_bytes():
@@ -213,9 +155,9 @@ def test_the_same_seed_gives_the_same_bytes():
         bench = Bench({'twin.world': 'room'}, seed=4)
         bench.inject('loss', math.inf, 0.2)
         bench.inject('flip_bits')
-        bench.run(2.0)
+        bench.run(0.5)
         bench.drive(4.0, 2.0)
-        bench.run(3.0)
+        bench.run(1.0)
         return bench.written, bench.followed, bench.link.telemetry
 
     assert run() == run()

@@ -131,17 +131,6 @@ def test_a_second_robot_with_another_key_is_named_too(seed):
     assert host.board.speeds == (0, 0)
 
 
-def test_two_hosts_of_one_robot_are_no_two_robots():
-    """They take the session from each other."""
-    made = benches('54334d5043', '54334d5043')
-    made[1].emulator.inject('robot_reset', math.inf)
-    made[0].run(0.008)
-    made[1].now_ns = made[1].wake_ns = made[0].now_ns
-    run(made, 3.0)
-    assert [bench.link.quality(bench.now_ns).collisions for bench in made] == [0, 0]
-    assert all(bench.link.reason(bench.now_ns) for bench in made)
-
-
 def test_packets_that_overlap_at_one_frequency_are_disturbed():
     medium = Medium()
     first = medium.transmit(82, 130.0, 300.0)

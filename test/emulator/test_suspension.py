@@ -15,18 +15,13 @@
 
 import math
 
-import numpy as np
 import pytest
 from support.emulator_bench import MS, RobotBench, cable_bench
 from support.long_tests import few_of
 
-from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.standstill_reasons import ANSWERS_AGAIN
 
 CYCLE_NS = 20 * MS
-PHASES = 20
-USUAL_PHASES = 3
-"""Of them, those of a short check."""
 
 
 def a_moving_robot(**given):
@@ -34,7 +29,7 @@ def a_moving_robot(**given):
     bench = RobotBench(flat={'robot_clock_error': 0.003}, **given)
     bench.connect()
     bench.drive(6.0, 4.5)
-    bench.run(1.5)
+    bench.run(1.0)
     return bench
 
 
@@ -49,11 +44,11 @@ def test_no_distance_is_lost_while_the_host_is_suspended(seconds, publishes):
 
     SIGSTOP of 1.2 s and 2 s, in 2 of 7 phases of the cycle. test_link_faults.py has all of them.
     """
-    for phase in range(0, PHASES, PHASES // USUAL_PHASES):
+    for phase in (0.0, 0.35):
         bench = a_moving_robot()
         if not publishes:
             bench.release_controls()
-        bench.run(phase / PHASES * CYCLE_NS / 1e9 + 1e-6)
+        bench.run(phase * CYCLE_NS / 1e9 + 1e-6)
         bench.suspend(seconds)
         bench.run(0.5)
         bench.run_to_rest()
@@ -104,37 +99,6 @@ def test_a_suspended_host_repeats_no_command():
     assert not [command for _, command in late if command.left or command.right]
 
 
-def test_a_stalled_line_is_neither_a_restart_nor_a_lost_distance():
-    for phase, seconds in ((0, 0.8), (7, 2.0), (13, 0.8)):
-        bench = a_moving_robot()
-        bench.run(phase / PHASES * CYCLE_NS / 1e9 + 1e-6)
-        bench.inject('stall', seconds)
-        bench.run(seconds + 3.0)
-        bench.run_to_rest()
-        assert bench.counted_pulses == bench.plant.pulses, (phase, seconds)
-        assert resets(bench) == (0, 0)
-
-
-@pytest.mark.parametrize('times', few_of([3, 1]))
-def test_every_restart_of_the_robot_is_counted_once(times):
-    """Also several that the host did not see, while it was suspended."""
-    bench = a_moving_robot()
-    for _ in range(times):
-        bench.inject('robot_reset', 0.1)
-        bench.emulator.run_to(bench.now_ns + 400 * MS)
-        bench.suspend(0.4)
-    bench.run(3.0, lambda: bench.link.state is LinkState.RUN)
-    bench.run(0.2)
-    assert resets(bench) == (times, 0)
-    # Its counters began at 0 again, and what it has issued since is complete.
-    before = bench.counted_pulses
-    issued = bench.plant.pulses
-    bench.run(1.0)
-    bench.run_to_rest()
-    after, now = bench.counted_pulses, bench.plant.pulses
-    assert np.subtract(after, before) == pytest.approx(np.subtract(now, issued), abs=200)
-
-
 @pytest.mark.parametrize('phase', few_of([0.0, 0.3, 0.6, 0.9]))
 def test_a_restart_in_motion_is_named_with_what_is_unknown(phase):
     """The odometry was silently short by 6 to 8 mm, and by what the robot rolled without power."""
@@ -155,29 +119,3 @@ def test_a_restart_in_motion_is_named_with_what_is_unknown(phase):
     assert error < 2.0 * spread
     bench.run(10.0)
     assert bench.robot.restart(bench.now_ns) == ''
-
-
-def test_a_restart_at_rest_leaves_nothing_unknown():
-    bench = a_moving_robot()
-    bench.run_to_rest()
-    before = bench.states[-1]
-    bench.inject('robot_reset', 0.3)
-    bench.run(3.0, lambda: bench.link.robot_resets == 1)
-    bench.run(0.2)
-    assert bench.robot.restart(bench.now_ns) == (
-        'the robot restarted (reset button or opened port)'
-    )
-    assert bench.robot.unknown_travel == 0.0
-    assert bench.states[-1].odometry.pose == before.odometry.pose
-
-
-@pytest.mark.parametrize('suspended', [False, True])
-def test_a_restart_of_the_dongle_is_no_restart_of_the_robot(suspended):
-    bench = a_moving_robot()
-    bench.inject('dongle_reset')
-    if suspended:
-        bench.suspend(3.0)
-    bench.run(4.0)
-    bench.run_to_rest()
-    assert resets(bench) == (0, 1)
-    assert bench.counted_pulses == bench.plant.pulses

@@ -136,37 +136,6 @@ def test_round_trip_time_is_below_six_milliseconds(boards: Boards, rate: int, cy
     odometry_agrees(boards)
 
 
-@pytest.mark.parametrize(
-    ('p', 'cycles', 'limit'), [(0.3, 60, 0.15), (0.1, 500, 0.005), (0.3, 500, 0.1)]
-)
-@pytest.mark.long
-def test_share_of_lost_cycles_on_a_lossy_channel(
-    boards: Boards, p: float, cycles: int, limit: float
-) -> None:
-    """A cycle is complete if its command was executed and its own state was returned."""
-    boards.start()
-    assert boards.ask(LinkParameters().configure(1)).chip_ok
-    boards.call('loss', p, p)
-    lost = unacknowledged = 0
-    for _ in range(cycles):
-        end = boards.now_us + 14000
-        command = boards.command()
-        result = boards.exchange(command)
-        unacknowledged += not result.first & 1
-        state = codec.decode_uplink(result.payload) if result.payload else None
-        whole = state is not None and state.seq == command.seq
-        # A state fetched by the POLL is that of this cycle, never that of the previous one.
-        assert whole or not result.second & 2
-        lost += not whole
-        boards.run_until(end)
-    one = (1 - (1 - p) ** 2) ** 5
-    print(f'\np = {p}: {unacknowledged / cycles:.1%} without ACK ({100 * one:.1f} % expected)')
-    print(f'{lost / cycles:.1%} of whole cycles ({1 - (1 - one) ** 2:.1%} expected at most)')
-    assert lost / cycles <= limit
-    assert boards.radio(ROBOT).duplicates > 0
-    assert boards.radio(ROBOT).ack_damaged == 0
-
-
 @pytest.mark.parametrize('step', few_of([40, 1]))
 def test_telemetry_never_lags_by_an_exchange(boards: Boards, step: int) -> None:
     """Regression: a refresh concurrent with a packet left two payloads queued.

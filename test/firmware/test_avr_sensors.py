@@ -26,9 +26,6 @@ from support.avr_bench import on_avr
 from support.emulator_bench import RobotBench
 from support.missing_tools import AVR, needing
 
-from t3mpc_ros.geometry.types import RANGE_SENSORS
-from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
-
 pytestmark = needing(*AVR)
 
 RADIUS, TRACK = 0.035, 0.147
@@ -103,65 +100,3 @@ def test_gyro_odometry_agrees_with_the_true_pose(build):
     assert math.hypot(measured.x - true.x, measured.y - true.y) < 0.005
     assert measured.yaw == pytest.approx(true.yaw, abs=0.03)
     assert not bench.states[-1].status.slipping
-
-
-# That ranges arrive: test_ranges_battery_and_temperature_reach_the_host.
-@pytest.mark.long
-def test_ranges_agree_with_the_distance_to_a_wall(build):
-    """Backwards to the end of the corridor; the distance to both sides is constant."""
-    bench = build(flat={'twin.world': 'corridor'})
-    bench.connect()
-    bench.run(0.2)
-    rear = [RANGE_SENSORS.index(name) for name in ('rear_left', 'rear_right')]
-    rear_left = []
-
-    def check_ranges():
-        measured, true = bench.states[-1].ranges, bench.emulator.distances
-        rear_left.append((measured[rear[0]], true[rear[0]]))
-        for sensor, metres in enumerate(measured):
-            if math.isfinite(metres):
-                # 2 % of the formula, half a code step, one ADC step, 20 ms of motion.
-                step = 0.0049 * (true[sensor] + 0.0257) ** 2 / 0.282
-                limit = 0.02 * true[sensor] + 0.0025 + step + 0.02 * 0.28
-                assert abs(metres - true[sensor]) <= limit, RANGE_SENSORS[sensor]
-            else:
-                assert not 0.11 < true[sensor] < 0.78, RANGE_SENSORS[sensor]
-
-    bench.drive(-8.0, -8.0)
-    for _ in range(13):
-        bench.run(0.1)
-        check_ranges()
-    bench.drive(0.0, 0.0)
-    bench.run(0.5)
-    check_ranges()
-    measured = [metres for metres, _ in rear_left]
-    print('\nrear left', [f'{metres:.3f}' for metres in measured])
-    finite = [metres for metres in measured if math.isfinite(metres)]
-    assert finite[0] > 0.45
-    assert finite[-1] < 0.2
-    assert all(after <= before for before, after in zip(finite, finite[1:], strict=False))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize('blocked, sign', [('right', 1.0), ('left', -1.0)])
-def test_a_blocked_wheel_is_detected_and_stops_the_robot(build, blocked, sign):
-    """The steps are those of straight motion; the body turns about the blocked wheel."""
-    bench = build(
-        flat={'twin.faults.wheel_blocked': blocked},
-        parameters={'slip_stop': 0.5},
-    )
-    bench.connect()
-    bench.run(2.2)  # gyro bias calibrated
-    assert bench.robot._odometry.calibrated
-    bench.drive(-sign * 5.0, -sign * 5.0)
-    bench.run(0.45)
-    state = bench.states[-1]
-    steps = state.wheels.right - state.wheels.left
-    print(f'\ngyro {state.imu.angular:.2f} rad/s, steps {steps * RADIUS / TRACK:.2f} rad/s')
-    assert abs(steps) < 0.1
-    assert abs(state.imu.angular) > 0.5
-    assert state.status.slipping
-    bench.run(0.6)
-    assert bench.robot.reason(bench.now_ns) == SLIP_STOP_REASON
-    bench.run(0.5)
-    assert bench.board.speeds == (0, 0)

@@ -280,45 +280,6 @@ def test_stored_records_are_in_effect_as_after_a_boot(library, layout, what):
     assert not unlike(used, new, layout, (*TIMES, *copies, 'robot.reset_cause', 'robot.counters'))
 
 
-@pytest.mark.parametrize('seed', range(3))
-def test_a_booted_dongle_is_as_new(library, layout, seed):
-    used, new = core.Dongle(library), core.Dongle(library)
-    r = random.Random(seed)
-    for _ in range(30):
-        frame = bytes([1, r.randrange(256), r.randrange(20), 3]) + r.randbytes(r.choice((3, 6)))
-        used.write(
-            r.choice(
-                (frame, frame, b'\x02\x07' + bytes([9, 1, 2, 3, 4]) + b'abcde', r.randbytes(9))
-            )
-        )
-        used.run(r.choice((100, 30_000)))
-        used.reply(r.randbytes(r.randrange(33)), r.randrange(20), r.random() < 0.7)
-    used.call('bytes', b'\x05half', 5)
-    used.call('overrun')
-    for each in (used, new):
-        each.call('boot', 8)
-        each.read()
-    assert not unlike(used, new, layout)
-
-
-def test_a_transaction_of_the_dongle_leaves_nothing_to_the_next(library, layout):
-    used, new = core.Dongle(library), core.Dongle(library)
-    used.write(bytes([1, 5, 2, 3]) + b'abcdef')
-    used.reply(b'a payload')
-    used.run(1000)
-    used.reply(b'another')
-    new.run(1000)
-    assert used.frames()
-    for each in (used, new):
-        each.write(bytes([1, 6, 0, 3]) + b'xyz')
-        each.sent()
-        each.reply(b'', acknowledged=True)
-    assert used.read() == new.read()
-    assert not unlike(
-        used, new, layout, ('dongle.splitter', 'dongle.second', 'dongle.gap', 'dongle.answer')
-    )
-
-
 def test_a_released_emergency_stop_leaves_a_robot_at_rest(library, layout):
     """Released, the robot is as after any command to stand, and the command before is gone."""
     used, new = core.Robot(library), core.Robot(library)

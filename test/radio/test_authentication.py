@@ -38,7 +38,6 @@ from t3mpc_ros.radio.protocol.frames import CommandFlag, RefusalReason
 GOLDEN = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
 VECTORS = GOLDEN['authentication']
 KEY = bytes(range(100, 116))
-ALIEN = bytes(range(101, 117))
 COMMAND = frames.Command(9, 1, CommandFlag.ENABLE, 20, 3000, 3000, 0)
 SAMPLES = (
     COMMAND,
@@ -112,13 +111,8 @@ def test_estop_repeated_for_hours_keeps_the_epoch():
 
 
 def test_the_check_value_is_the_published_hash_of_the_key():
-    assert {row['check'] for row in GOLDEN['key_checks']} == {
-        int.from_bytes(siphash(bytes.fromhex(row['key']), b'\x04t3mpc')[:4], 'little')
-        for row in GOLDEN['key_checks']
-    }
-    assert all(
-        key_check(bytes.fromhex(row['key'])) == row['check'] for row in GOLDEN['key_checks']
-    )
+    for row in GOLDEN['key_checks']:
+        assert key_check(bytes.fromhex(row['key'])) == row['check']
 
 
 def test_golden_session_keys_and_tags():
@@ -143,43 +137,6 @@ def test_every_bit_of_a_signed_frame_is_protected(frame):
     assert not verifier.accept(decode_downlink(data))
 
 
-def test_a_tag_is_bound_to_its_kind_and_session():
-    signer, _ = meet()
-    signed = [signer.sign(frame._replace(host_us=10 + at)) for at, frame in enumerate(SAMPLES)]
-    assert len({frame.tag for frame in signed}) == 3
-    for key in (KEY, ALIEN, session_key(KEY, b'HOSTHOST', b'OTHERROB')):
-        for frame in signed:
-            for epoch in (0, 1):
-                if (key, epoch) != (session_key(KEY, b'HOSTHOST', b'ROBOTROB'), 0):
-                    assert frame_tag(frame, key, epoch) != frame.tag
-
-
-def test_replays_from_an_earlier_session_are_rejected():
-    """Session numbers and times may repeat: each HELLO leads to a new robot nonce."""
-    signer, verifier = meet()
-    recorded = [signer.sign(COMMAND._replace(host_us=2000 + step)) for step in range(20)]
-    for frame in recorded:
-        assert not verifier.verify(frame)
-    hello = sign_hello(KEY, 9, 0, 1000, b'HOSTHOST')
-    meet(verifier=verifier, nonces=(b'NEWHOST.', b'NEWROBOT'))
-    for frame in recorded:
-        assert verifier.verify(frame)
-    # Nor after a replay of the HELLO: the session key of the new session is unknown.
-    assert not verifier.begin_session(hello, b'THIRDROB')
-    for frame in recorded:
-        assert verifier.verify(frame)
-
-
-def test_a_repeated_hello_keeps_the_session_key():
-    signer, verifier = meet()
-    signed = signer.sign(COMMAND._replace(host_us=2000))
-    assert not verifier.begin_session(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB')
-    assert verifier.nonce == b'ROBOTROB'
-    assert not verifier.verify(signed)
-    assert not verifier.begin_session(sign_hello(KEY, 9, 0, 1000, b'HOSTHOST'), b'OTHERROB')
-    assert verifier.verify(signed) is RefusalReason.TAG
-
-
 def test_both_ends_count_the_same_wraps_of_host_us():
     """With commands 20 ms apart and losses of up to a minute, over five wraps: six hours."""
     source = random.Random(3)
@@ -193,15 +150,6 @@ def test_both_ends_count_the_same_wraps_of_host_us():
             assert not verifier.verify(signed)
             taken += 1
     assert taken > 50
-
-
-def test_a_frame_from_before_a_wrap_is_rejected_after_it():
-    signer, verifier = meet(host_us=0xFFFFFF00)
-    late = signer.sign(COMMAND._replace(host_us=0xFFFFFFFE))
-    assert not verifier.verify(signer.sign(COMMAND._replace(host_us=3)))
-    assert verifier.verify(late)
-    # The robot tests only the next epoch for it.
-    assert not verifier.verify(signer.sign(COMMAND._replace(host_us=4)))
 
 
 def test_the_signer_rejects_a_repeated_host_us():
@@ -225,13 +173,14 @@ def test_estop_needs_no_tag_but_its_release_does():
 
 
 @pytest.mark.parametrize('text', ['6465' * 8, '64 65 ' * 8, ('6465' * 8).upper() + '\n'])
-def test_a_key_file_of_32_digits_is_read(tmp_path, text):
+def test_a_key_file_of_32_digits_is_read(tmp_path, monkeypatch, text):
+    """A launch argument such as ``key_file:=~/key`` is not expanded by the shell."""
+    monkeypatch.setenv('HOME', str(tmp_path))
     path = tmp_path / 'key'
     path.write_text(text)
-    path.chmod(0o600)
-    assert read_key(path) == b'de' * 8
-    path.chmod(0o400)
-    assert read_key(path) == b'de' * 8
+    for mode in (0o600, 0o400):
+        path.chmod(mode)
+        assert read_key(path) == read_key(Path('~/key')) == b'de' * 8
 
 
 @pytest.mark.parametrize(
@@ -255,25 +204,9 @@ def test_an_invalid_key_file_is_rejected_without_quoting_it(tmp_path, text, mode
     assert error.value.__cause__ is None
 
 
-def test_a_key_file_in_the_home_folder_is_found(tmp_path, monkeypatch):
-    """A launch argument such as ``key_file:=~/key`` is not expanded by the shell."""
-    monkeypatch.setenv('HOME', str(tmp_path))
-    path = tmp_path / 'key'
-    path.write_text('6465' * 8)
-    path.chmod(0o600)
-    assert read_key(Path('~/key')) == b'de' * 8
-    with pytest.raises(KeyFileError, match='cannot be read'):
-        read_key(Path('~no_such_user/key'))
-
-
-def test_a_key_file_that_is_no_regular_file_is_rejected(tmp_path):
+def test_a_path_without_a_key_file_is_rejected(tmp_path):
     """A FIFO without a writer blocked the start for ever."""
     os.mkfifo(tmp_path / 'fifo', 0o600)
-    for path in (tmp_path / 'fifo', tmp_path, Path('/dev/zero')):
-        with pytest.raises(KeyFileError, match='must be a regular file|cannot be read'):
-            read_key(path)
-
-
-def test_a_missing_key_file_is_reported(tmp_path):
-    with pytest.raises(KeyFileError, match='cannot be read: No such file'):
-        read_key(tmp_path / 'nothing')
+    for name in (tmp_path / 'fifo', tmp_path, '/dev/zero', tmp_path / 'nothing', '~no_such/key'):
+        with pytest.raises(KeyFileError, match='must be a regular file|cannot be read: '):
+            read_key(Path(name))

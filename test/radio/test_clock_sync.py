@@ -76,27 +76,6 @@ def test_the_first_second_is_no_worse_than_arrival_stamps():
         assert np.abs(errors).max() < np.abs(arrival).max()
 
 
-def test_without_jitter_the_error_is_the_age_resolution():
-    errors, _ = drive(20.0, -0.003, 0.0, 0.0)
-    assert np.abs(errors[25:]).max() < 20e-6
-
-
-@pytest.mark.slow
-def test_the_wrap_of_the_robot_clock_has_no_effect():
-    near = 2**32 - 15_000_000
-    errors, _ = drive(20.0, 0.005, 1e-3, 0.05, boot_us=near)
-    plain, _ = drive(20.0, 0.005, 1e-3, 0.05)
-    # The difference is the truncation to microseconds.
-    np.testing.assert_allclose(errors, plain, atol=3e-6)
-
-
-def test_the_rate_of_the_robot_clock_is_estimated():
-    model = ClockModel()
-    drive(12.0, 0.005, 1e-3, 0.05, model=model)
-    # The second of a fast robot clock is shorter.
-    assert model.skew == pytest.approx(1.0 / 1.005 - 1.0, abs=1e-4)
-
-
 def test_slow_transactions_do_not_bias_the_fit():
     """A port that sometimes delays bytes by 30 ms, one way only."""
     model = ClockModel()

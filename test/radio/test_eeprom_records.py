@@ -29,15 +29,16 @@ from t3mpc_ros.radio.protocol.frames import Configured, Pong, Refusal
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 from t3mpc_ros.radio.tool import eeprom_records
 from t3mpc_ros.radio.tool.procedure import Procedure
+from t3mpc_ros.robot.calibration import Calibration, DividerCorrection, Estimate, SharpCurve
 
 VECTORS = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
-CURVES = (eeprom_records.SharpCurve(0.28, 0.02, 0.05, 0.003), *7 * (None,))
-CALIBRATION = eeprom_records.Calibration(
-    eeprom_records.Estimate(0.03512, 2e-5),
-    eeprom_records.Estimate(0.2012, 1.3e-4),
-    eeprom_records.Estimate(1.0123, 2e-4),
-    eeprom_records.Estimate(-0.01, 1e-4),
-    eeprom_records.DividerCorrection(-0.013, 0.02, 0.01),
+CURVES = (SharpCurve(0.28, 0.02, 0.05, 0.003), *7 * (None,))
+CALIBRATION = Calibration(
+    Estimate(0.03512, 2e-5),
+    Estimate(0.2012, 1.3e-4),
+    Estimate(1.0123, 2e-4),
+    Estimate(-0.01, 1e-4),
+    DividerCorrection(-0.013, 0.02, 0.01),
     CURVES,
 )
 
@@ -89,10 +90,10 @@ def test_records_of_the_specification_byte_for_byte():
     golden = VECTORS['records']['calibration']
     body = bytes.fromhex(golden['bytes'])
     names = 'wheel_radius', 'track', 'gyro_scale', 'gyro_bias'
-    calibration = eeprom_records.Calibration(
-        *(eeprom_records.Estimate(*golden[name]) for name in names),
-        eeprom_records.DividerCorrection(*golden['divider']),
-        tuple(curve and eeprom_records.SharpCurve(*curve) for curve in golden['curves']),
+    calibration = Calibration(
+        *(Estimate(*golden[name]) for name in names),
+        DividerCorrection(*golden['divider']),
+        tuple(curve and SharpCurve(*curve) for curve in golden['curves']),
     )
     assert calibration == CALIBRATION
     assert eeprom_records.encode_calibration(calibration) == body
@@ -106,9 +107,9 @@ def test_uncertainties_are_never_stored_as_smaller_or_as_none():
     source = random.Random(3)
     for _ in range(500):
         uncertainty = 10 ** source.uniform(-12, -3)
-        estimate = eeprom_records.Estimate(source.uniform(0.02, 0.05), uncertainty)
+        estimate = Estimate(source.uniform(0.02, 0.05), uncertainty)
         stored = eeprom_records.decode_calibration(
-            eeprom_records.encode_calibration(eeprom_records.Calibration(wheel_radius=estimate))
+            eeprom_records.encode_calibration(Calibration(wheel_radius=estimate))
         )
         assert stored.wheel_radius.value == pytest.approx(estimate.value, abs=5.1e-8)
         assert uncertainty * (1 - 1e-6) <= stored.wheel_radius.uncertainty <= uncertainty + 1e-7
@@ -118,21 +119,21 @@ def test_uncertainties_are_never_stored_as_smaller_or_as_none():
     'change, words',
     [
         (
-            {'wheel_radius': eeprom_records.Estimate(0.0, 1e-5)},
+            {'wheel_radius': Estimate(0.0, 1e-5)},
             r'wheel_radius must be from 0\.001 to 10',
         ),
-        ({'wheel_radius': eeprom_records.Estimate(float('nan'), 1e-5)}, 'wheel_radius must be'),
-        ({'track': eeprom_records.Estimate(0.2, 0.0)}, r'track\.uncertainty must be above 0'),
-        ({'track': eeprom_records.Estimate(0.2, 0.1)}, r'track\.uncertainty must be above 0'),
-        ({'gyro_scale': eeprom_records.Estimate(1.3, 1e-3)}, 'gyro_scale must be from 0.8 to 1.2'),
-        ({'gyro_bias': eeprom_records.Estimate(1.0, 1e-3)}, 'gyro_bias must be'),
+        ({'wheel_radius': Estimate(float('nan'), 1e-5)}, 'wheel_radius must be'),
+        ({'track': Estimate(0.2, 0.0)}, r'track\.uncertainty must be above 0'),
+        ({'track': Estimate(0.2, 0.1)}, r'track\.uncertainty must be above 0'),
+        ({'gyro_scale': Estimate(1.3, 1e-3)}, 'gyro_scale must be from 0.8 to 1.2'),
+        ({'gyro_bias': Estimate(1.0, 1e-3)}, 'gyro_bias must be'),
         (
-            {'divider': eeprom_records.DividerCorrection(0.0, 40.0, 0.1)},
+            {'divider': DividerCorrection(0.0, 40.0, 0.1)},
             r'divider\.offset must be',
         ),
         ({'curves': ()}, 'curves must be 8'),
         (
-            {'curves': (*CURVES[:7], eeprom_records.SharpCurve(2.0, 0.0, 0.0, 0.01))},
+            {'curves': (*CURVES[:7], SharpCurve(2.0, 0.0, 0.0, 0.01))},
             r'curves\[7\]\.scale',
         ),
     ],
@@ -147,7 +148,7 @@ def test_calibration_survives_reset_and_lost_frames(library, loss):
     robot = Robot(library)
     robot.call('set_cell_us', 3400)
     cable = Cable(robot, loss)
-    assert cable.run(eeprom_records.read_calibration()) == eeprom_records.Calibration()
+    assert cable.run(eeprom_records.read_calibration()) == Calibration()
     stored = cable.run(eeprom_records.write_calibration(CALIBRATION))
     assert eeprom_records.encode_calibration(stored) == eeprom_records.encode_calibration(
         CALIBRATION
@@ -197,15 +198,12 @@ def test_raw_samples(library):
 def test_dongle_and_old_firmware_are_distinguished(dongle):
     task = Procedure(eeprom_records.read_calibration(), decode_from_board)
     task.port_opened(0)
-    decoder = FrameDecoder()
-    received = b''
+    decoder, received = FrameDecoder(), b''
     for now_ns in range(0, 10_000_000_000, 10_000_000):
         for action in task.step(now_ns, received):
             if isinstance(action, Write):
                 (data,) = decoder.feed(action.data)
                 received = encode_frame(encode(_answer(data, dongle)))
-        if task.done:
-            break
     expected = 'this is the dongle' if dongle else 'make -C firmware flash'
     assert expected in task.error
 

@@ -38,20 +38,6 @@ def random_frame(source, longest=FRAME_LIMIT):
     return bytes(source.choice((0, 255, source.randrange(256))) for _ in range(size))
 
 
-def damage(wire, source):
-    """Return the bytes of a frame with one random damage."""
-    at = source.randrange(len(wire))
-    match source.randrange(4):
-        case 0:
-            return wire[:at] + bytes([wire[at] ^ 1 << source.randrange(8)]) + wire[at + 1 :]
-        case 1:
-            return wire[:at] + wire[at + 1 :]
-        case 2:
-            return wire[:at] + source.randbytes(source.randint(1, 5)) + wire[at:]
-        case _:
-            return wire[:at] + wire[at : at + 1] + wire[at:]
-
-
 def test_crc_check_value_and_golden_vectors():
     assert crc16(b'123456789') == 0x29B1
     for row in VECTORS['crc16']:
@@ -77,6 +63,9 @@ def test_cobs_adds_one_byte_removes_zeros_and_is_invertible():
         assert cobs_decode(encoded) == data
     with pytest.raises(ValueError, match='at most 254 bytes long: got 255'):
         cobs_encode(bytes(255))
+    for frame in (b'', bytes(FRAME_LIMIT + 1)):
+        with pytest.raises(ValueError, match=f'must have 1 to 78 bytes: got {len(frame)}'):
+            encode_frame(frame)
 
 
 def test_only_valid_cobs_decodes():
@@ -89,12 +78,6 @@ def test_only_valid_cobs_decodes():
             decoded += 1
             assert cobs_encode(data) == encoded
     assert decoded > 500
-
-
-def test_frames_of_invalid_length_are_rejected():
-    for frame in (b'', bytes(FRAME_LIMIT + 1)):
-        with pytest.raises(ValueError, match=f'must have 1 to 78 bytes: got {len(frame)}'):
-            encode_frame(frame)
 
 
 def test_the_stream_may_be_split_anywhere():
@@ -118,11 +101,8 @@ def test_the_stream_may_be_split_anywhere():
 
 
 def test_zeros_in_a_row_are_no_errors():
-    decoder = FrameDecoder()
-    assert decoder.feed(b'\0\0' + encode_frame(b'abc') + b'\0\0\0' + encode_frame(b'd')) == [
-        b'abc',
-        b'd',
-    ]
+    decoder, frame = FrameDecoder(), encode_frame(b'abc')
+    assert decoder.feed(b'\0\0' + frame + b'\0\0\0' + frame) == [b'abc', b'abc']
     assert decoder.counts == (2, 0, 0)
 
 
@@ -163,28 +143,3 @@ def test_every_single_bit_flip_is_detected():
             flipped = bytearray(wire)
             flipped[bit // 8] ^= 1 << bit % 8
             assert FrameDecoder().feed(bytes(flipped) + b'\0') == []
-
-
-@pytest.mark.slow
-def test_damaged_frames_never_pass_and_the_decoder_recovers():
-    """A damaged frame may destroy the next one (lost zero), never the one after that."""
-    source = random.Random(7)
-    decoder = FrameDecoder()
-    wrong = damaged = neighbours = 0
-    after_good = False
-    for number in range(20000):
-        # Unique by number: a frame from another round is wrong.
-        frame = number.to_bytes(4, 'little') + random_frame(source, 30)
-        hit = source.random() < 0.6
-        wire = damage(encode_frame(frame), source) if hit else encode_frame(frame)
-        found = decoder.feed(wire)
-        damaged += hit
-        wrong += sum(one != frame for one in found)
-        if not hit:
-            neighbours += frame not in found
-            assert frame in found or not after_good
-        after_good = not hit
-    assert damaged > 11000
-    # The CRC passes one in 65 536; there are 12 000 damaged frames.
-    assert wrong <= 2
-    assert neighbours < 0.1 * damaged

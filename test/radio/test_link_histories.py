@@ -166,7 +166,7 @@ class Arbiter(RuleBasedStateMachine):
 
 
 TestArbiter = Arbiter.TestCase
-TestArbiter.settings = settings(STATEFUL, max_examples=60)
+TestArbiter.settings = settings(STATEFUL, max_examples=40)
 
 
 class History(RuleBasedStateMachine):
@@ -302,4 +302,4 @@ class History(RuleBasedStateMachine):
 
 
 TestHistory = pytest.mark.slow(History.TestCase)
-TestHistory.settings = settings(STATEFUL, max_examples=12, stateful_step_count=20)
+TestHistory.settings = settings(STATEFUL, max_examples=8, stateful_step_count=15)

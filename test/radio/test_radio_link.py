@@ -18,7 +18,6 @@ import random
 
 import numpy as np
 import pytest
-from support.long_tests import few_of
 from support.radio_bench import MS, FakeRobot, LinkBench
 
 from t3mpc_ros.geometry.types import WheelSpeeds
@@ -28,7 +27,7 @@ from t3mpc_ros.radio.link.handshake import Session
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.setpoint_arbitration import SetpointArbiter
-from t3mpc_ros.radio.link.statistics import DiagnosticLevel, LinkStatistics
+from t3mpc_ros.radio.link.statistics import LinkStatistics
 from t3mpc_ros.radio.link.telemetry import CommandTiming, TelemetryDecoder
 from t3mpc_ros.radio.link.transaction import TransactionLayer
 from t3mpc_ros.radio.protocol import frames
@@ -75,13 +74,7 @@ def test_from_a_closed_port_to_running(key):
     bench = LinkBench(key=key)
     assert bench.link.state is LinkState.CLOSED
     assert bench.connect() < 0.2
-    assert bench.link_states == [
-        LinkState.PING,
-        LinkState.CFG,
-        LinkState.HELLO,
-        LinkState.PARAMS,
-        LinkState.RUN,
-    ]
+    assert [state.name for state in bench.link_states] == ['PING', 'CFG', 'HELLO', 'PARAMS', 'RUN']
     assert bench.robot.speeds == (0.0, 0.0)
     bench.run(0.1)
     assert bench.link.reason(bench.now_ns) == reasons.NO_COMMAND
@@ -108,34 +101,16 @@ def test_a_state_in_answer_to_hello_leads_to_info(key):
 
 
 def test_board_parameters_are_written_and_read_back():
-    parameters = LinkParameters().with_values(
-        {
-            'robot.max_speed': 7.5,
-            'robot.acceleration': 12.0,
-            'robot.deceleration': 22.0,
-            'robot.ttl_max': 0.3,
-            'robot.battery_low': 9.9,
-            'robot.battery_cutoff': 8.8,
-            'robot.idle_off': 60.0,
-            'robot.invert_right': True,
-        }
-    )
-    bench = LinkBench(parameters)
+    values = {
+        'max_speed': 7.5, 'acceleration': 12.0, 'deceleration': 22.0, 'ttl_max': 0.3,
+        'battery_low': 9.9, 'idle_off': 60.0, 'battery_cutoff': 8.8,
+    }  # fmt: skip
+    parameters = {f'robot.{name}': value for name, value in values.items()}
+    bench = LinkBench(LinkParameters.from_dict(parameters | {'robot.invert_right': True}))
     bench.connect()
-    expected = {
-        'max_speed': 7500,
-        'acceleration': 12000,
-        'deceleration': 22000,
-        'ttl_max': 300,
-        'microsteps': 16,
-        'steps_per_rev': 200,
-        'gyro_range': 500,
-        'battery_low': 9900,
-        'idle_off': 60000,
-        'invert_wheels': 2,
-        'battery_cutoff': 8800,
-        'boots': 1,
-    }
+    expected = {row.name: row.default for row in BOARD_PARAMETERS}
+    expected |= {name: round(1000 * value) for name, value in values.items()}
+    expected |= {'invert_wheels': 2, 'boots': 1}
     assert bench.link.board_parameters == expected
     assert bench.robot.parameters == list(expected.values())
     order = [type(frame).__name__ for _, frame in bench.robot.log]
@@ -171,10 +146,7 @@ def test_another_device_is_retried_with_growing_intervals():
     gaps = np.diff(bench.opens) / 1e9
     np.testing.assert_allclose(gaps, [5.2, 5.4, 5.8, 6.6, 7.0, 7.0][: len(gaps)], atol=0.02)
     assert len(gaps) >= 5
-    assert bench.link.reason(bench.now_ns) in (
-        reasons.NO_DONGLE,
-        reasons.DONGLE_STARTING,
-    )
+    assert bench.link.reason(bench.now_ns) in (reasons.NO_DONGLE, reasons.DONGLE_STARTING)
 
 
 def test_a_busy_port_is_retried_ever_less_a_new_one_at_once():
@@ -401,53 +373,6 @@ def test_a_sample_is_stamped_by_its_age_since_the_command():
     assert telemetry.stamp_ns == 25 * MS
 
 
-@pytest.mark.parametrize('skew', few_of([0.005, -0.005]))
-@pytest.mark.slow
-def test_angles_match_their_stamps_over_a_jittery_lossy_link(skew):
-    bench = LinkBench()
-    bench.robot.skew = skew
-    bench.dongle.jitter_ns = MS
-    bench.dongle.loss = 0.05
-    bench.connect()
-    bench.drive(10.0, 10.0)
-    errors, speeds, last = [], [], None
-    for _ in range(3000):
-        bench.run(0.005)
-        telemetry = bench.link.telemetry
-        if telemetry is not last and bench.robot.speeds == (10.0, 10.0):
-            last = telemetry
-            ahead = (bench.robot.reached_ns - telemetry.stamp_ns) / 1e9
-            errors.append((bench.robot.angles[0] - telemetry.angles.right) / 10.0 - ahead)
-            speeds.append(telemetry.wheels.right)
-            assert telemetry.stamp_ns <= bench.now_ns
-    # Half a step is 0.1 ms here; the bytes of the result arrive half a millisecond late.
-    settled = np.array(errors[len(errors) // 2 :])
-    assert len(settled) > 300
-    assert np.sqrt(np.mean((settled - settled.mean()) ** 2)) < 0.2e-3
-    assert abs(settled.mean()) < 0.5e-3
-    assert np.mean(speeds[50:]) == pytest.approx(10.0, rel=1e-3)
-
-
-def test_step_counters_wrap_without_a_jump():
-    bench = LinkBench()
-    bench.robot.boot(bench.now_ns, clock_us=2**32 - 700_000, steps=(2**31 - 200, -(2**31) + 150))
-    bench.connect()
-    bench.drive(-10.0, 10.0)
-    bench.run(0.2, lambda: bench.link.telemetry is not None)
-    start = bench.link.telemetry.angles
-    before = start
-    for _ in range(60):
-        bench.run(0.02)
-        angles = bench.link.telemetry.angles
-        assert angles.left - before.left < 0.5
-        assert before.right - angles.right < 0.5
-        before = angles
-    assert before.left - start.left == pytest.approx(10.0 * 1.2, abs=0.8)
-    assert before.right - start.right == pytest.approx(-10.0 * 1.2, abs=0.8)
-    left, right = bench.link.telemetry.raw.left, bench.link.telemetry.raw.right
-    assert left < 0 < right
-
-
 # -- commanding -----------------------------------------------------------------------------------
 
 
@@ -462,11 +387,8 @@ def test_the_newest_command_wins_and_none_is_queued(bench):
         bench.run(0.03)
         sent = commands(bench, since)
         assert 1 <= len(sent) <= 2
-        for frame in sent:
-            assert (frame.left, frame.right) == (
-                round(1000 * wheels.left),
-                round(1000 * wheels.right),
-            )
+        wanted = round(1000 * wheels.left), round(1000 * wheels.right)
+        assert {(frame.left, frame.right) for frame in sent} == {wanted}
         assert bench.link.sent_wheels == pytest.approx(wheels, abs=5e-4)
 
 
@@ -535,13 +457,6 @@ def test_a_setpoint_ends_with_its_command():
     assert arbiter.next_setpoint(False, until_ns)[1:3] == (0, 0)
 
 
-def test_an_emergency_stop_survives_a_jammed_link(bench):
-    bench.dongle.jam_until_ns = bench.now_ns + 300 * MS
-    bench.link.latch_estop('asked for')
-    bench.run(0.4)
-    assert bench.robot.estop
-
-
 def test_the_button_of_the_robot_is_reported_and_released(bench):
     bench.robot.estop = bench.robot.button = True
     bench.run(0.1)
@@ -560,100 +475,12 @@ def test_the_button_of_the_robot_is_reported_and_released(bench):
 # -- faults of the link ---------------------------------------------------------------------------
 
 
-def test_a_jam_stops_the_robot_and_the_link_recovers(bench):
-    bench.dongle.jam_until_ns = bench.now_ns + 1000 * MS
-    bench.run(0.22)
-    bench.robot.run_to(bench.now_ns)
-    assert bench.robot.speeds == (0.0, 0.0)
-    assert bench.robot.expired
-    bench.run(0.28)
-    assert 'does not answer' in bench.link.reason(bench.now_ns)
-    quality = bench.link.quality(bench.now_ns)
-    assert quality.level is DiagnosticLevel.ERROR
-    assert 'no telemetry for 0.5' in quality.text
-    session = bench.robot.verifier.session
-    bench.run(0.5)
-    assert bench.run(1.0, lambda: moving(bench)) < 0.05
-    assert bench.robot.verifier.session == session
-    quality = bench.link.quality(bench.now_ns)
-    assert 45 <= quality.lost <= 52
-    assert quality.level is DiagnosticLevel.WARN
-    assert 'of the cycles are lost' in quality.text
-
-
 def test_sequence_numbers_are_valid_after_a_long_jam(bench):
     """Eight bits: after 128 lost commands the robot would reject new ones as old."""
-    for jam_ns in (2600 * MS, 3500 * MS, 5100 * MS, 20_000 * MS):
+    for jam_ns in (2600 * MS, 3500 * MS, 5100 * MS):
         bench.dongle.jam_until_ns = bench.now_ns + jam_ns
         bench.run(jam_ns / 1e9)
         assert bench.run(2.0, lambda: moving(bench)) < 0.4
-
-
-@pytest.mark.parametrize('loss', few_of([0.3, 0.1]))
-def test_lost_packets_cost_their_own_cycle_only(bench, loss):
-    bench.dongle.loss = loss
-    bench.run(10.0)
-    bench.dongle.loss = 0.0
-    bench.run(0.1)
-    quality = bench.link.quality(bench.now_ns)
-    assert quality.lost_share == pytest.approx(loss, abs=0.06)
-    assert quality.robot_resets == quality.dongle_resets == 0
-    assert quality.sessions == 1
-    # Absolute counters: no distance is lost.
-    assert bench.link.telemetry.angles.right == pytest.approx(bench.robot.angles[0], abs=0.15)
-
-
-@pytest.mark.slow
-def test_frames_damaged_on_the_serial_line_are_counted(bench):
-    source = random.Random(5)
-    take = bench.dongle.receive
-
-    def noisy(data, now_ns):
-        replies = []
-        for at, wire in take(data, now_ns):
-            if source.random() < 0.3:
-                spot = source.randrange(len(wire))
-                wire = wire[:spot] + source.randbytes(1) + wire[spot + source.randrange(2) :]
-            replies.append((at, wire))
-        return replies
-
-    bench.dongle.receive = noisy
-    bench.run(20.0)
-    bench.dongle.receive = take
-    bench.run(1.0)
-    assert moving(bench)
-    counts = bench.link.quality(bench.now_ns).host
-    assert counts.crc_errors + counts.frame_errors > 20
-    assert bench.link.telemetry.angles.right == pytest.approx(bench.robot.angles[0], abs=0.15)
-
-
-def test_a_robot_restart_starts_a_session_and_keeps_angles(bench):
-    bench.run(2.0)
-    before = bench.link.telemetry.angles
-    last = bench.robot.angles
-    bench.robot.boot(bench.now_ns)
-    assert bench.run(1.0, lambda: moving(bench)) < 0.3
-    bench.run(1.0)
-    quality = bench.link.quality(bench.now_ns)
-    assert (quality.robot_resets, quality.sessions, quality.dongle_resets) == (1, 2, 0)
-    # bench.robot.angles counts from the restart; a few steps before it were not reported.
-    expected = before.right + (last[0] - before.right) + bench.robot.angles[0]
-    assert bench.link.telemetry.angles.right == pytest.approx(expected, abs=0.3)
-    assert LinkState.CLOSED not in bench.link_states[1:]
-
-
-@pytest.mark.slow
-def test_a_restart_out_of_range_is_detected(bench):
-    bench.run(3.0)
-    before = bench.link.telemetry.angles
-    bench.dongle.jam_until_ns = bench.now_ns + 10_000 * MS
-    bench.run(5.0)
-    bench.robot.boot(bench.now_ns)
-    bench.release_controls()
-    bench.run(6.0)
-    assert running(bench)
-    assert bench.link.quality(bench.now_ns).robot_resets == 1
-    assert bench.link.telemetry.angles.right == pytest.approx(before.right, abs=0.8)
 
 
 def test_an_ended_session_is_not_a_restart(bench):
@@ -666,18 +493,6 @@ def test_an_ended_session_is_not_a_restart(bench):
     assert quality.sessions == 2
     bench.run(0.5)
     assert bench.link.telemetry.angles.right == pytest.approx(bench.robot.angles[0], abs=0.15)
-
-
-def test_another_host_on_the_robot_is_detected():
-    bench = LinkBench()
-    bench.connect()
-    ours = bench.robot.verifier.session
-    theirs = ours % 255 + 1
-    bench.robot.receive(bytes([0x24, theirs, 0, 0]), bench.now_ns)
-    bench.run(0.05, lambda: not running(bench))
-    assert bench.link.reason(bench.now_ns) == 'the robot has lost its session'
-    bench.run(1.0, lambda: running(bench))
-    assert bench.robot.verifier.session not in (0, ours)
 
 
 def test_a_session_with_a_replayed_hello_is_replaced():
@@ -715,19 +530,6 @@ def test_rejected_commands_are_reported_and_end_the_session(bench):
     assert bench.run(2.0, lambda: moving(bench)) < 0.4
 
 
-def test_a_restarted_dongle_is_configured_again(bench):
-    bench.dongle.boot_delay_ns = 1500 * MS
-    bench.dongle.restart(bench.now_ns)
-    bench.run(0.4)
-    assert bench.link.state is LinkState.PING
-    assert bench.link.reason(bench.now_ns) == reasons.DONGLE_TIMEOUT
-    assert bench.run(3.0, lambda: moving(bench)) < 1.5
-    quality = bench.link.quality(bench.now_ns)
-    assert quality.dongle_resets == 1
-    assert quality.robot_resets == 0
-    assert bench.closes == 0
-
-
 def test_a_fast_dongle_restart_is_detected_by_its_clock(bench):
     """After a watchdog reset no frame is lost, but the radio is not configured."""
     bench.run(2.0)
@@ -735,30 +537,6 @@ def test_a_fast_dongle_restart_is_detected_by_its_clock(bench):
     assert bench.run(1.0, lambda: not running(bench)) < 0.05
     assert bench.run(1.0, lambda: moving(bench)) < 0.3
     assert bench.link.quality(bench.now_ns).dongle_resets == 1
-
-
-def test_unplugged_and_plugged_in_again(bench):
-    bench.run(1.0)
-    start = bench.link.telemetry.angles.right
-    for away in (0.05, 0.7, 13.0):
-        bench.unplug()
-        closes = bench.closes
-        opened = len(bench.opens)
-        bench.run(0.02)
-        # With the next cycle: while the dead device is open, it reappears under another name.
-        assert bench.closes == closes + 1
-        bench.problem = ('dongle is not there', True)
-        bench.run(away)
-        assert bench.link.reason(bench.now_ns) == 'dongle is not there'
-        assert len(bench.opens) - opened <= 5 * away + 2
-        bench.plug()
-        assert bench.run(2.0, lambda: moving(bench)) < 1.0
-    quality = bench.link.quality(bench.now_ns)
-    assert quality.port_failures == 3
-    assert quality.robot_resets == 0
-    bench.run(0.5)
-    assert bench.link.telemetry.angles.right > start
-    assert bench.link.telemetry.angles.right == pytest.approx(bench.robot.angles[0], abs=0.15)
 
 
 def test_a_busy_dongle_costs_cycles_only(bench):
@@ -908,7 +686,6 @@ def test_shutdown_before_the_session(seconds):
     assert not bench.is_open
 
 
-@pytest.mark.slow
 def test_the_link_does_not_poll_busily(bench):
     calls = 0
     step = bench.link.step
@@ -919,14 +696,14 @@ def test_the_link_does_not_poll_busily(bench):
         return step(now_ns, received)
 
     bench.link.step = counted
-    bench.run(10.0)
-    assert calls < 10 * 50 * 6
+    bench.run(2.0)
+    assert calls < 2 * 50 * 6
     bench.unplug()
     bench.release_controls()
     bench.run(0.1)
     calls = 0
-    bench.run(10.0)
-    assert calls < 10 * 5 * 4
+    bench.run(3.0)
+    assert calls < 3 * 5 * 4
 
 
 def test_stamps_increase_strictly_with_a_stopped_clock():

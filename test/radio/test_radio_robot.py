@@ -20,8 +20,7 @@ from support.radio_bench import FakeDongle, FakeRobot
 from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.radio.protocol import frames
-from t3mpc_ros.radio.radio_robot import RadioRobot, RadioRobotParameters
-from t3mpc_ros.robot.interface import RobotInterface
+from t3mpc_ros.radio.radio_robot import RadioRobotParameters
 
 KEY = bytes(range(16))
 
@@ -35,11 +34,6 @@ def ramped(made, right, left, seconds):
     made.drive(right, left)
     made.run(seconds)
     return made.states[-1]
-
-
-def test_radio_robot_implements_the_robot_interface():
-    for name in ('apply', 'advance', 'stop', 'reset_odometry', 'latch_estop', 'release_estop'):
-        assert getattr(RadioRobot, name) is not getattr(RobotInterface, name)
 
 
 def test_driving_updates_the_odometry_from_the_counters():

@@ -19,6 +19,7 @@ import random
 import stat
 
 import pytest
+from support.long_tests import few_of
 from support.tool_bench import START_NS, ToolBench
 import yaml
 
@@ -26,8 +27,8 @@ from t3mpc_ros.parameters.yaml_checks import YamlError
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
-from t3mpc_ros.radio.protocol.codec import decode_from_dongle, encode
-from t3mpc_ros.radio.protocol.frames import Command, CommandFlag, Hello, StatusFlag
+from t3mpc_ros.radio.protocol.codec import decode_from_dongle
+from t3mpc_ros.radio.protocol.frames import CommandFlag
 from t3mpc_ros.radio.protocol.framing import FrameDecoder
 from t3mpc_ros.radio.tool import (
     eeprom_records,
@@ -74,9 +75,8 @@ def accepts_key(bench, key):
 
 def test_a_key_is_written_over_usb_and_compared():
     bench = ToolBench()
-    assert 'no key' in key_provisioning.format_key_state(
-        bench.at_robot(key_provisioning.read_key_state())
-    )
+    state = bench.at_robot(key_provisioning.read_key_state())
+    assert 'no key' in key_provisioning.format_key_state(state)
     state = bench.at_robot(key_provisioning.write_key(KEY))
     assert f'{key_check(KEY):08x}' in key_provisioning.format_key_state(state)
     assert key_provisioning.holds_key(state, KEY)
@@ -98,13 +98,13 @@ def test_a_damaged_key_is_reported_and_replaced():
     bench = ToolBench(KEY)
     bench.board.write_eeprom(KEY_ADDRESS + 3, bytes([KEY[3] ^ 1]))
     bench.emulator.restart_robot()
-    assert 'damaged' in key_provisioning.format_key_state(
-        bench.at_robot(key_provisioning.read_key_state())
-    )
+    state = bench.at_robot(key_provisioning.read_key_state())
+    assert 'damaged' in key_provisioning.format_key_state(state)
     assert accepts_key(bench, KEY)
 
 
-def test_a_key_is_never_sent_to_the_dongle():
+def test_key_and_settings_are_never_sent_to_the_dongle():
+    """The answer that identifies a dongle was dropped: it was taken for an old robot board."""
     bench = ToolBench()
     received = []
     feed = bench.emulator.feed
@@ -114,8 +114,10 @@ def test_a_key_is_never_sent_to_the_dongle():
         feed(data, now_ns)
 
     bench.emulator.feed = record
-    with pytest.raises(ProcedureError, match='this is the dongle'):
-        bench.at_dongle(key_provisioning.write_key(KEY), ROBOT_BOARD)
+    writing = eeprom_records.write_settings(RobotSettings())
+    for script in (key_provisioning.write_key(KEY), eeprom_records.read_settings(), writing):
+        with pytest.raises(ProcedureError, match='this is the dongle'):
+            bench.at_dongle(script, ROBOT_BOARD)
     assert received
     assert not any(KEY in data for data in received)
 
@@ -164,10 +166,9 @@ def host_of(settings):
     return LinkParameters.from_dict(content['/**']['ros__parameters']['link'])
 
 
-@pytest.mark.slow
 def test_a_new_robot_gets_a_random_address_and_keeps_it():
     addresses = set()
-    for seed in range(20):
+    for seed in range(3):
         bench = ToolBench(erased=True)
         assert bench.at_robot(eeprom_records.read_settings()).state == frames.SETTINGS_MISSING
         settings = write(bench, seed)
@@ -176,7 +177,7 @@ def test_a_new_robot_gets_a_random_address_and_keeps_it():
         changed = write(bench, seed + 100, channel=100, microsteps=8)
         assert changed == settings._replace(channel=100, microsteps=8)
         assert bench.at_robot(eeprom_records.read_settings()).content == changed
-    assert len(addresses) == 20
+    assert len(addresses) == 3
 
 
 def test_drawn_addresses_are_receivable_and_no_numbers():
@@ -187,33 +188,6 @@ def test_drawn_addresses_are_receivable_and_no_numbers():
         assert isinstance(yaml.safe_load(text), str)
         with pytest.raises(ValueError):
             float(text)
-
-
-def test_settings_survive_a_restart_of_the_robot():
-    bench = ToolBench(erased=True)
-    settings = write(bench)
-    bench.emulator.restart_robot()
-    assert bench.at_robot(eeprom_records.read_settings()).content == settings
-
-
-def test_settings_are_never_sent_to_the_dongle():
-    """The answer that identifies a dongle was dropped: it was taken for an old robot board."""
-    bench = ToolBench()
-    writing = eeprom_records.write_settings(RobotSettings())
-    for script in (eeprom_records.read_settings(), writing):
-        with pytest.raises(ProcedureError, match='this is the dongle'):
-            bench.at_dongle(script, ROBOT_BOARD)
-
-
-def test_impossible_or_untimely_settings_have_a_remedy():
-    bench = ToolBench()
-    with pytest.raises(ValueError, match='power of two'):
-        write(bench, microsteps=3)
-    bench.board.receive(encode(Hello(7, 0)))
-    now_us = bench.board.now_us
-    bench.board.receive(encode(Command(7, 1, CommandFlag.ENABLE, 20, 0, 0, now_us)))
-    with pytest.raises(ProcedureError, match='stop the bridge'):
-        write(bench)
 
 
 def test_a_settings_file_holds_every_setting():
@@ -258,22 +232,6 @@ def test_a_wrong_settings_file_is_rejected_by_name(old, new, words):
     assert old in text
     with pytest.raises(YamlError, match=words):
         eeprom_records.settings_of_file(yaml.safe_load(text.replace(old, new, 1)))
-
-
-@pytest.mark.slow
-def test_each_of_two_robots_follows_its_own_host_only():
-    """Both receive every packet of the dongle; before they are set up, neither moves."""
-    benches = [ToolBench(erased=True) for _ in range(2)]
-    for bench in benches:
-        bench.jog(manoeuvre.LEFT, 0.2)
-        assert bench.board.counters == (0, 0)
-    hosts = [host_of(write(bench, seed)) for seed, bench in enumerate(benches)]
-    for number, host in enumerate(hosts):
-        before = [bench.board.counters for bench in benches]
-        for bench in benches:
-            bench.jog(manoeuvre.LEFT, 0.2, link=host)
-        moved = [bench.board.counters != old for bench, old in zip(benches, before, strict=True)]
-        assert moved == [number == 0, number == 1]
 
 
 # -- ping -----------------------------------------------------------------------------------------
@@ -345,7 +303,7 @@ def test_the_wrong_port_and_a_dead_chip_are_reported():
 # -- scan -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('channel, rate', [(0, '1M'), (100, '250k'), (125, '2M')])
+@pytest.mark.parametrize('channel, rate', few_of([(125, '2M'), (0, '1M'), (100, '250k')]))
 @pytest.mark.slow
 def test_the_scan_finds_the_robot_and_restores_the_radio(channel, rate):
     bench = ToolBench(channel=channel, rate=rate)
@@ -372,8 +330,7 @@ def test_the_scan_finds_the_robot_and_restores_the_radio(channel, rate):
         lambda: link_test.run_link_test(LinkParameters(channel=40), 50),
     ],
 )
-@pytest.mark.parametrize('lost', [0, 1])
-def test_an_interrupted_procedure_restores_the_radio(script, lost):
+def test_an_interrupted_procedure_restores_the_radio(script):
     """A second Ctrl-C does not interrupt the restoring, not even when its request is lost."""
     bench = ToolBench(channel=120)
     before, interruptions, dropped = bench.radio(), [], []
@@ -385,7 +342,7 @@ def test_an_interrupted_procedure_restores_the_radio(script, lost):
             procedure.interrupt(bench.now_ns)
 
     def lose(data, now_ns):
-        if interruptions and len(dropped) < lost:
+        if interruptions and not dropped:
             dropped.append(data)
         else:
             feed(data, now_ns)
@@ -394,7 +351,7 @@ def test_an_interrupted_procedure_restores_the_radio(script, lost):
     procedure = Procedure(script(), decode_from_dongle)
     bench.run(procedure)
     assert (procedure.error, bench.radio()) == ('interrupted', before)
-    assert len(dropped) == lost
+    assert dropped
     assert len(interruptions) > 1
 
 
@@ -444,16 +401,7 @@ def test_the_recommended_channel_is_the_best():
     assert link_test.recommend(found, best)[1].endswith('ping measures the link quality')
     whole = [found[1]._replace(answered=20)]
     assert link_test.recommend(whole, best) == (True, 'the robot answers as configured')
-
-
-def test_a_scan_without_result_has_a_recommendation():
-    bench = ToolBench()
-    bench.emulator.inject('jam', math.inf)
-    found = bench.at_dongle(
-        link_test.scan_channels(LinkParameters(), ('1M',), lambda *report: None)
-    )
-    good, advice = link_test.recommend(found, LinkParameters())
-    assert found == []
+    good, advice = link_test.recommend([], best)
     assert not good
     assert 'robot switched on' in advice
 
@@ -502,8 +450,7 @@ def test_key_mismatch_is_reported(here, there, expected):
 
 
 @pytest.mark.parametrize(
-    'key, wheel, revolutions',
-    [(b'', manoeuvre.LEFT, 1.0), (KEY, manoeuvre.LEFT, -0.3), (KEY, manoeuvre.RIGHT, 0.5)],
+    'key, wheel, revolutions', [(b'', manoeuvre.LEFT, -0.3), (KEY, manoeuvre.RIGHT, 0.5)]
 )
 def test_jog_turns_one_wheel_and_disables_the_drives(key, wheel, revolutions):
     bench = ToolBench(key)
@@ -534,15 +481,8 @@ def test_jog_respects_speed_and_acceleration():
 
 def test_an_interrupted_jog_stops_and_disables_the_drives():
     bench = ToolBench()
-    task = manoeuvre.Jog(
-        LinkParameters(),
-        b'',
-        random.Random(1).randbytes,
-        manoeuvre.LEFT,
-        5.0,
-        3.0,
-        lambda text: None,
-    )
+    left, entropy = manoeuvre.LEFT, random.Random(1).randbytes
+    task = manoeuvre.Jog(LinkParameters(), b'', entropy, left, 5.0, 3.0, print)
 
     def interrupt(bench):
         if bench.board.counters[0] > 2000:
@@ -581,18 +521,3 @@ def test_jog_reports_a_robot_that_does_not_answer():
     assert 'does not answer' in task.error
     assert reported == [task.error]
     assert task.result is None
-
-
-def test_unplugging_the_dongle_ends_the_jog_and_stops_the_robot():
-    bench = ToolBench()
-
-    def pull(bench):
-        if bench.board.counters[1] > 1000 and bench.emulator.port_open:
-            bench.emulator.inject('close_port', 1000.0)
-
-    bench.each = pull
-    task, _ = bench.jog(manoeuvre.RIGHT, 5.0)
-    assert 'not there' in task.error
-    bench.emulator.run_to(bench.now_ns + 1_000_000_000)
-    assert bench.board.speeds == (0, 0)
-    assert bench.board.status & StatusFlag.TTL_EXPIRED

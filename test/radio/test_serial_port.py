@@ -145,12 +145,3 @@ def test_every_error_becomes_a_port_error_with_a_remedy(line, monkeypatch, error
     monkeypatch.setattr(module.serial, 'Serial', fail)
     with pytest.raises(PortError, match=expected):
         SerialPort(line[1])
-
-
-def test_other_errors_are_not_converted(line, monkeypatch):
-    def fail(*args, **more):
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(module.serial, 'Serial', fail)
-    with pytest.raises(ZeroDivisionError):
-        SerialPort(line[1])

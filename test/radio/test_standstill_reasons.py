@@ -34,17 +34,8 @@ from t3mpc_ros.radio.tool import eeprom_records
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 
 KEY = bytes(range(16))
-CAUSES = {}
-
-
-def cause(reason, **given):
-    """Register a cause: its reported reason, and the arguments of its bench."""
-
-    def note(provoke):
-        CAUSES[provoke.__name__] = reason, given, provoke
-        return provoke
-
-    return note
+ABSENT = 'the robot does not answer: is it on, in range, on channel 82, at address 54334d5043?'
+LATCHED = 'the emergency stop of the robot is latched'
 
 
 def driving(bench):
@@ -61,38 +52,73 @@ def reported(bench):
     return '; '.join([*robot_messages.state_warnings(state), *([well.text] if well.text else [])])
 
 
-@cause('no command yet')
-def no_command(bench):
-    bench.connect()
-    bench.run(0.1)
+WHILE_DRIVING = {
+    'the commander falls silent': (
+        'no command for 0.25 s',
+        lambda bench: bench.release_controls(),
+    ),
+    'a command is not finite': (
+        'command is not finite',
+        lambda bench: bench.drive(math.nan, 1.0),
+    ),
+    'a service asks for an emergency stop': (
+        'emergency stop: asked for',
+        lambda bench: bench.robot.latch_estop('asked for by service e_stop', bench.now_ns),
+    ),
+    'the button is pressed': (LATCHED, lambda bench: bench.inject('button', 0.1)),
+    'a stranger stops the robot': (
+        LATCHED,
+        lambda bench: bench.board.receive(encode(Command(9, 200, CommandFlag.ESTOP, 0, 0, 0, 0))),
+    ),
+    'the dongle is pulled out': (
+        'dongle is not there',
+        lambda bench: bench.inject('close_port', 5.0),
+    ),
+    'the line is dead': (reasons.DONGLE_TIMEOUT, lambda bench: bench.inject('silence')),
+    'the air is jammed': (ABSENT, lambda bench: bench.inject('jam')),
+    'the bridge ends': ('the link is shut down', lambda bench: bench.robot.shut_down()),
+}
+"""What happens to a moving robot, and what is reported 0.6 s later."""
+FROM_THE_START = {
+    'no command': ('no command yet', {}, None),
+    'the radio chip is dead': (reasons.NO_CHIP, {}, ('radio_dead',)),
+    'the robot is off': (ABSENT, {}, ('robot_reset', math.inf)),
+    'the keys differ': ('the keys differ', {'key': KEY, 'robot_key': bytes(16)}, None),
+    'the host has no key': (reasons.HOST_KEY_MISSING, {'robot_key': KEY}, None),
+    'the robot has no key': (reasons.ROBOT_KEY_MISSING, {'key': KEY, 'robot_key': b''}, None),
+}
+"""What is reported after a second, and the arguments of the bench and of its fault."""
 
 
-@cause('no command for 0.25 s')
-def the_commander_falls_silent(bench):
+@pytest.mark.parametrize('reason, provoke', WHILE_DRIVING.values(), ids=WHILE_DRIVING)
+def test_what_stops_a_moving_robot_is_reported(reason, provoke):
+    bench = RobotBench()
     driving(bench)
-    bench.release_controls()
+    provoke(bench)
     bench.run(0.6)
+    assert reason in reported(bench)
 
 
-@cause('command is not finite')
-def a_command_is_not_finite(bench):
-    driving(bench)
-    bench.drive(math.nan, 1.0)
-    bench.run(0.5)
+@pytest.mark.parametrize('reason, given, fault', FROM_THE_START.values(), ids=FROM_THE_START)
+def test_why_a_robot_does_not_start_is_reported(reason, given, fault):
+    bench = RobotBench(**given)
+    if fault is not None:
+        bench.inject(*fault)
+    bench.run(1.0)
+    assert reason in reported(bench)
 
 
-@cause('emergency stop: asked for')
-def an_emergency_stop_is_asked_for(bench):
-    driving(bench)
-    bench.robot.latch_estop('asked for by service e_stop', bench.now_ns)
-    bench.run(0.3)
+CAUSES = {}
 
 
-@cause('the emergency stop of the robot is latched')
-def the_button_is_pressed(bench):
-    driving(bench)
-    bench.inject('button', 0.1)
-    bench.run(0.3)
+def cause(reason, **given):
+    """Register a cause: its reported reason, and the arguments of its bench."""
+
+    def note(provoke):
+        CAUSES[provoke.__name__] = reason, given, provoke
+        return provoke
+
+    return note
 
 
 @cause('is its button still pressed?')
@@ -104,50 +130,10 @@ def the_button_is_held_while_it_is_released(bench):
     bench.run(1.5)
 
 
-@cause('the emergency stop of the robot is latched')
-def a_stranger_stops_the_robot(bench):
-    driving(bench)
-    bench.board.receive(encode(Command(9, 200, CommandFlag.ESTOP, 0, 0, 0, 0)))
-    bench.run(0.3)
-
-
-@cause('dongle is not there')
-def the_dongle_is_pulled_out(bench):
-    driving(bench)
-    bench.inject('close_port', 5.0)
-    bench.run(0.5)
-
-
-@cause(reasons.DONGLE_TIMEOUT)
-def the_line_is_dead(bench):
-    driving(bench)
-    bench.inject('silence')
-    bench.run(0.6)
-
-
 @cause('no dongle answers on this port')
 def another_device_is_at_the_port(bench):
     bench.inject('silence')
     bench.run(8.0)
-
-
-@cause('the radio chip of the dongle does not answer')
-def the_radio_chip_is_dead(bench):
-    bench.inject('radio_dead')
-    bench.run(1.0)
-
-
-@cause('the robot does not answer: is it on, in range, on channel 82, at address 54334d5043?')
-def the_robot_is_off(bench):
-    bench.inject('robot_reset', math.inf)
-    bench.run(1.0)
-
-
-@cause('the robot does not answer: is it on, in range, on channel 82, at address 54334d5043?')
-def the_air_is_jammed(bench):
-    driving(bench)
-    bench.inject('jam')
-    bench.run(0.5)
 
 
 @cause('of the cycles are lost on the radio')
@@ -179,21 +165,6 @@ def the_robot_is_too_slow_with_its_state(bench):
     load, number = bench.board._load, count()
     bench.board._load = lambda payload: next(number) % 3 and load(payload)
     bench.run(2.5)
-
-
-@cause('the keys differ', key=KEY, robot_key=bytes(16))
-def the_keys_differ(bench):
-    bench.run(1.0)
-
-
-@cause('the robot requires signed commands: give the host the key', robot_key=KEY)
-def the_host_has_no_key(bench):
-    bench.run(1.0)
-
-
-@cause('the robot has no key to verify signatures', key=KEY, robot_key=b'')
-def the_robot_has_no_key(bench):
-    bench.run(1.0)
 
 
 @cause('the robot has no settings', erased=True)
@@ -235,13 +206,6 @@ def the_robot_has_forgotten_the_session(bench):
     driving(bench)
     bench.inject('robot_reset', 0.01)
     bench.run(1.0, lambda: bench.link.state is LinkState.HELLO)
-
-
-@cause('the link is shut down')
-def the_bridge_ends(bench):
-    driving(bench)
-    bench.robot.shut_down()
-    bench.run(1.0)
 
 
 @cause('measures no battery voltage, but its settings say that the battery is wired')
