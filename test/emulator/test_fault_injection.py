@@ -52,8 +52,7 @@ def test_an_invalid_fault_is_rejected_with_a_reason(text, words):
 
 def test_every_fault_has_valid_defaults():
     for kind in FAULT_KINDS:
-        fault = check_fault(Fault(kind.name, 0.0))
-        assert fault.duration > 0.0
+        assert check_fault(Fault(kind.name, 0.0)).duration > 0.0
 
 
 def test_of_two_faults_of_a_kind_the_later_one_holds():

@@ -53,10 +53,6 @@ def run(made, seconds):
             bench.run(MS / 1e9)
 
 
-def running(bench):
-    return bench.link.state is LinkState.RUN and not bench.link.reason(bench.now_ns)
-
-
 def drive_side_by_side(channels, apart):
     """Return the share of lost cycles of two robots whose hosts start ``apart`` s."""
     made = benches('54334d5043', 'c1a7b20d3e', channels=channels)
@@ -64,7 +60,7 @@ def drive_side_by_side(channels, apart):
     made[1].now_ns = made[1].wake_ns = made[0].now_ns
     for bench, speed in zip(made, (4.0, -3.0), strict=True):
         bench.drive(speed, speed)
-    run(made, 3.0)
+    run(made, 1.5)
     for bench, speed in zip(made, (4.0, -3.0), strict=True):
         check_followed(bench)
         quality = bench.link.quality(bench.now_ns)
@@ -100,7 +96,7 @@ def test_two_robots_with_one_address_are_named_and_stand(seed, uptime_difference
     for bench in made:
         bench.now_ns = bench.wake_ns = host.emulator.now_ns
     host.drive(5.0, 5.0)
-    run(made, 3.0)
+    run(made, 1.5)
     host_reason = host.link.reason(host.now_ns)
     assert host_reason == (
         'two robots answer on address 54334d5043, channel 82: give each an address of its own, '
@@ -113,8 +109,8 @@ def test_two_robots_with_one_address_are_named_and_stand(seed, uptime_difference
         print(f'seed {seed}: {1e3 * travelled:.1f} mm before the collision was seen')
         assert travelled < 0.01
     other.emulator.inject('robot_reset', math.inf)
-    run(made, 13.0)
-    assert running(host)
+    host.run(7.0, lambda: host.link.state is LinkState.RUN and not host.link.reason(host.now_ns))
+    host.run(0.6)
     assert host.plant.wheels.right == pytest.approx(5.0, abs=0.3)
 
 
@@ -125,7 +121,7 @@ def test_a_second_robot_with_another_key_is_named_too(seed):
     host, other = made
     other.kill()
     host.drive(5.0, 5.0)
-    run(made, 4.0)
+    run(made, 1.5)
     assert 'two robots answer on address' in host.link.reason(host.now_ns)
     assert other.plant.pulses == (0, 0)
     assert host.board.speeds == (0, 0)

@@ -47,7 +47,7 @@ def run_and_observe(bench, seconds):
     """
     start_ns, moved = bench.now_ns, 0.0
     while bench.now_ns < start_ns + seconds * NANOSECONDS:
-        bench.run(0.002)
+        bench.run(0.004)
         if bench.board.speeds != (0, 0):
             moved = (bench.now_ns - start_ns) / NANOSECONDS
     return moved
