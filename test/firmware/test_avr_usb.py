@@ -16,13 +16,13 @@
 Simulation only: simavr executes the programs of both boards.
 """
 
-from collections.abc import Iterator
 import random
 import statistics
 from typing import Any
 
 import pytest
 from support.avr_boards import (
+    GAP,
     ROBOT,
     SETTINGS_ADDRESSES,
     Boards,
@@ -33,7 +33,6 @@ from support.avr_boards import (
     request,
     settings_record,
 )
-from support.long_tests import few_of
 from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
@@ -76,15 +75,11 @@ def begin_session(boards: Boards, key: bytes, gap: int = 20) -> Signer | None:
     return Signer(session_key(key, HOST_NONCE, info.nonce), host_us)
 
 
-def signed(boards: Boards, signer: Signer, left: int, right: int) -> Any:
+def signed(boards: Boards, signer: Signer, left: int, right: int, gap: int = GAP) -> Any:
     """Return the state after one signed command."""
-    return boards.request(
-        signer.sign(
-            boards.command(left, right)._replace(
-                host_us=round(boards.now_us) % 2**32, tag=bytes(8)
-            )
-        )
-    )
+    command = boards.command(left, right)
+    stamped = command._replace(host_us=round(boards.now_us) % 2**32, tag=bytes(8))
+    return boards.request(signer.sign(stamped), None, gap)
 
 
 # -- key ------------------------------------------------------------------------------------------
@@ -173,89 +168,59 @@ def test_a_flood_on_the_console_does_not_delay_replies(boards: Boards) -> None:
 # -- radio rates ----------------------------------------------------------------------------------
 
 
-@pytest.fixture(params=few_of(['250k', '1M', '2M']))
-def boards_at_rate(request: pytest.FixtureRequest) -> Iterator[tuple[Boards, LinkParameters]]:
-    """Yield both boards at each rate: the robot by its settings, the dongle by CFG."""
-    build()
-    parameters = LinkParameters(rate=request.param)
-    wanted = parameters.configure(1)
-    pair = Boards()
-    for address in SETTINGS_ADDRESSES:
-        pair.store(address, settings_record(rate=request.param))
-    pair.run(0.13)
-    reply = pair.ask(wanted)
-    assert reply[:-1] == tuple(wanted)
-    assert reply.chip_ok
-    yield pair, parameters
-    counts = pair.radio(ROBOT)
-    assert counts.queued_acks == counts.overfull == 0
-    pair.close()
-
-
 @pytest.mark.long
-def test_cycles_work_at_every_rate(boards_at_rate: tuple[Boards, LinkParameters]) -> None:
-    boards, parameters = boards_at_rate
+@pytest.mark.parametrize('rate', ['250k', '1M', '2M'])
+def test_cycles_work_at_every_rate(rate: str) -> None:
+    """The robot by its settings, the dongle by CFG; open and signed, with refreshes and losses."""
+    build()
+    parameters = LinkParameters(rate=rate)
+    wanted, gap = parameters.configure(1), parameters.gap
+    boards = Boards()
+    for address in SETTINGS_ADDRESSES:
+        boards.store(address, settings_record(rate=rate))
+    boards.run(0.13)
+    assert boards.ask(wanted) == (*wanted, 1)
     greeting = Hello(boards.session, 0)
-    assert boards.request(greeting, Poll(0, 0, 2), parameters.gap).session == boards.session
-    boards.request(Poll(0, 0, 0), None, parameters.gap)
+    assert boards.request(greeting, Poll(0, 0, 2), gap).session == boards.session
+    boards.request(Poll(0, 0, 0), None, gap)
     times, ages = [], []
-    for _ in range(40):
+    for phase in range(0, 4000, 160):
         begun = boards.now_us
         command = boards.command(4000, 4000)
-        state = boards.request(command, None, parameters.gap)
-        assert state.seq == command.seq
+        state = boards.request(command, None, gap)
+        assert state.seq == command.seq, f'phase {phase} us'
         times.append((boards.now_us - begun) / 1000)
         ages.append(10 * state.age)
-        boards.run_until(begun + 20000)
-    print(
-        f'\n{parameters.rate}: round trip {statistics.median(times):.2f} ms, {max(times):.2f} ms'
-    )
+        assert boards.call('waiting_acks') <= 1
+        boards.run(0.0956 + phase / 1e6)
+    print(f'\n{rate}: round trip {statistics.median(times):.2f} ms, {max(times):.2f} ms')
     print(f'state sampled {statistics.median(ages)} us after its command')
     assert max(times) < 12.0
     assert max(ages) < 4000
-
-
-@pytest.mark.long
-def test_telemetry_never_lags_at_any_rate(boards_at_rate: tuple[Boards, LinkParameters]) -> None:
-    """With retransmissions of the dongle, and with refreshes of the robot during silence."""
-    boards, parameters = boards_at_rate
-    boards.request(Hello(boards.session, 0), Poll(0, 0, 2), parameters.gap)
-    boards.request(Poll(0, 0, 0), None, parameters.gap)
-    for phase in range(0, 4000, 160):
-        command = boards.command()
-        assert boards.request(command, None, parameters.gap).seq == command.seq, (
-            f'phase {phase} us'
-        )
-        assert boards.call('waiting_acks') <= 1
-        boards.run(0.0956 + phase / 1e6)
     # A refresh concurrent with a packet costs at most one acknowledgement.
     before = boards.radio(ROBOT).ack_damaged
     boards.call('loss', 0.2, 0.2)
     for _ in range(120):
         command = boards.command()
-        result = boards.exchange(command, None, parameters.gap)
+        result = boards.exchange(command, None, gap)
         if result.second & 2:
             assert codec.decode_uplink(result.payload).seq == command.seq
         boards.run(0.005)
-    assert boards.radio(ROBOT).duplicates > 10
-    assert boards.radio(ROBOT).ack_damaged == before <= 1
-
-
-@pytest.mark.long
-def test_signed_commands_are_answered_in_time_at_every_rate(
-    boards_at_rate: tuple[Boards, LinkParameters],
-) -> None:
-    boards, parameters = boards_at_rate
+    counts = boards.radio(ROBOT)
+    assert counts.duplicates > 10
+    assert counts.ack_damaged == before <= 1
+    boards.call('loss', 0.0, 0.0)
+    boards.request(boards.command(0, 0)._replace(flags=0), None, gap)
+    boards.run(1.0)
     assert request(boards, Key(1, KEY), WRITING)[0].rc == OK
     signer = begin_session(boards, KEY, parameters.gap_after(Hello(1, 0, 0, bytes(8), bytes(8))))
     assert signer is not None
-    boards.request(Poll(0, 0, 0), None, parameters.gap)
+    boards.request(Poll(0, 0, 0), None, gap)
     for _ in range(40):
-        command = signer.sign(
-            boards.command(3000, 3000)._replace(host_us=round(boards.now_us) % 2**32, tag=bytes(8))
-        )
-        state = boards.request(command, None, parameters.gap)
-        assert state.seq == command.seq
+        state = signed(boards, signer, 3000, 3000, gap)
+        assert state.seq == boards.seq
         assert state.age != 0xFFFF
         boards.run(0.012)
     assert cycle(boards, 0.01) is not None
+    assert boards.radio(ROBOT).queued_acks == boards.radio(ROBOT).overfull == 0
+    boards.close()

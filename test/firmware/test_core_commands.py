@@ -17,6 +17,7 @@ import struct
 
 import pytest
 from support import firmware_core as core
+from support.long_tests import few_of
 
 from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD, RefusalReason
 from t3mpc_ros.radio.tool import eeprom_records
@@ -118,14 +119,6 @@ def test_an_emergency_stop_is_not_weakened_by_a_parameter(robot):
     assert robot.speeds == (0.0, 0.0)
 
 
-def test_the_robot_limits_the_ttl(robot):
-    robot.send(robot.command(1000, 1000, ttl=255))
-    robot.run(249_000)
-    assert not robot.status & core.EXPIRED
-    robot.run(2_000)
-    assert robot.status & core.EXPIRED
-
-
 def test_a_ttl_of_zero_stops_without_the_expiry_flag(robot):
     robot.drive(5000, 5000, 500_000)
     robot.drive(5000, 5000, 500_000, ttl=0)
@@ -164,10 +157,8 @@ def test_frames_of_another_session_are_counted_and_ignored(robot):
     assert robot.get(core.MAX_SPEED) == (core.OK, 10_000)
 
 
-@pytest.mark.parametrize('session', [0, 1, core.SESSION, 255])
-@pytest.mark.parametrize(
-    'flags', [core.ESTOP, core.ESTOP | core.ENABLE, core.ESTOP | core.CLEAR, 7, 0xFF]
-)
+@pytest.mark.parametrize('session', [0, core.SESSION, 255])
+@pytest.mark.parametrize('flags', [core.ESTOP, core.ESTOP | core.ENABLE, 7, 0xFF])
 def test_an_emergency_stop_is_accepted_from_any_sender(robot, session, flags):
     robot.drive(5000, 5000, 500_000)
     robot.send(robot.command(5000, 5000, flags, seq=0, session=session, echo_us=0))
@@ -325,7 +316,7 @@ def test_golden_echoes_shorten_the_ttl_or_refuse_the_command(library, golden):
             assert refused_bytes == bytes([0x21, core.SESSION, robot.seq]), name
 
 
-@pytest.mark.parametrize('silence', [0.3, 6.0, 100.0, 1500.0])
+@pytest.mark.parametrize('silence', few_of([0.3, 100.0, 1500.0], 2))
 def test_commands_held_and_released_at_once_are_refused(robot, silence):
     """A stalled USB hub holds 15 commands, then releases them."""
     robot.drive(0, 0, 500_000)
@@ -340,7 +331,7 @@ def test_commands_held_and_released_at_once_are_refused(robot, silence):
     assert robot.status & core.MOVING
 
 
-@pytest.mark.parametrize('growth', [1, 5, 20, 100])
+@pytest.mark.parametrize('growth', [5, 20, 100])
 def test_no_growing_delay_is_followed_beyond_ttl_and_slack(robot, growth):
     """With an estimate of the delay, one that grew by 20 ms/s was followed until 2.4 s late.
 

@@ -20,27 +20,21 @@ import pytest
 from support import firmware_core as core
 
 
-def test_wheel_speed_is_exact_at_10_rad_per_s(robot):
-    robot.drive(10_000, -10_000, 1_000_000)
+def pulses_of(robot, left, right, us):
+    """Return the pulses that a command at a constant speed has issued in a time."""
     before = robot.pulses
-    robot.drive(10_000, -10_000, 10_000_000)
-    left, right = (
-        (after - earlier) * core.STEP / 10.0
-        for earlier, after in zip(before, robot.pulses, strict=True)
-    )
-    assert left == pytest.approx(10.0, abs=0.0003)
-    assert right == pytest.approx(-10.0, abs=0.0003)
+    robot.drive(left, right, us)
+    return [after - earlier for earlier, after in zip(before, robot.pulses, strict=True)]
+
+
+@pytest.mark.parametrize(
+    'left, right, seconds', [(10_000, -10_000, 10), (1, -3, 100)], ids=['fast', 'slow']
+)
+def test_wheel_speed_is_exact(robot, left, right, seconds):
+    robot.drive(left, right, 1_000_000)
+    expected = [0.001 * speed * seconds / core.STEP for speed in (left, right)]
+    assert pulses_of(robot, left, right, seconds * 1_000_000) == pytest.approx(expected, abs=1.5)
     assert robot.steps == robot.pulses
-
-
-def test_wheel_speed_is_exact_at_low_speed(robot):
-    robot.drive(1, -3, 100_000)
-    before = robot.pulses
-    robot.drive(1, -3, 100_000_000)
-    assert [after - earlier for earlier, after in zip(before, robot.pulses, strict=True)] == [
-        pytest.approx(0.1 / core.STEP, abs=1),
-        pytest.approx(-0.3 / core.STEP, abs=1),
-    ]
 
 
 def test_speed_crosses_zero_without_a_jump(robot):
@@ -62,14 +56,12 @@ def test_step_rate_is_limited_to_10_000_per_second(robot):
     assert robot.set(core.MAX_SPEED, 19_600) == (core.OK, 19_600)
     robot.drive(32_767, -32_768, 2_000_000)
     assert robot.status & core.LIMITED
-    before = robot.pulses
-    robot.drive(32_767, -32_768, 1_000_000)
-    rates = [after - earlier for earlier, after in zip(before, robot.pulses, strict=True)]
-    assert rates == [pytest.approx(9982, abs=2), pytest.approx(-9982, abs=2)]
+    rates = pulses_of(robot, 32_767, -32_768, 1_000_000)
+    assert rates == pytest.approx([9982, -9982], abs=2)
     assert robot.call('closest_pulses') >= 100
 
 
-@pytest.mark.parametrize('microsteps', [1, 8, 32, 256])
+@pytest.mark.parametrize('microsteps', [1, 32, 256])
 @pytest.mark.parametrize('reboot', [False, True])
 def test_microsteps_of_the_settings_keep_the_speed(library, microsteps, reboot):
     robot = core.Robot(library)
@@ -82,9 +74,7 @@ def test_microsteps_of_the_settings_keep_the_speed(library, microsteps, reboot):
     assert struct.unpack_from('<H', info, 10) == (microsteps,)
     assert robot.set(core.MICROSTEPS, microsteps) == (core.READ_ONLY, microsteps)
     robot.drive(10_000, 5_000, 1_000_000)
-    before = robot.pulses
-    robot.drive(10_000, 5_000, 1_000_000)
-    rates = [after - earlier for earlier, after in zip(before, robot.pulses, strict=True)]
+    rates = pulses_of(robot, 10_000, 5_000, 1_000_000)
     wanted = min(10.0 * 200 * microsteps / math.tau, 10_000.0)
     assert rates == [pytest.approx(wanted, abs=20), pytest.approx(wanted / 2, abs=10)]
     assert rates[0] <= 10_000
@@ -98,9 +88,8 @@ def test_an_inverted_wheel_turns_backwards_and_counts_forwards(robot, inverted, 
     assert robot.set(core.INVERT, inverted) == (core.OK, inverted)
     robot.drive(3000, 2000, 500_000)
     assert min(robot.steps) > 100
-    assert robot.pulses == tuple(
-        sign * count for sign, count in zip(signs, robot.steps, strict=True)
-    )
+    left, right = robot.steps
+    assert robot.pulses == (signs[0] * left, signs[1] * right)
 
 
 @pytest.mark.parametrize(
@@ -170,6 +159,11 @@ def test_a_command_beyond_the_limit_is_scaled_as_a_whole(robot):
     assert robot.set(core.MAX_SPEED, 0) == (core.OK, 0)
     robot.drive(8000, -2000, 1_000_000)
     assert robot.speeds == (0.0, 0.0)
+    assert robot.set(core.MAX_SPEED, 10_000)[0] == core.OK
+    for left, right in ((-32_768, 32_767), (32_767, -32_768), (-32_768, -32_768), (0, -32_768)):
+        robot.drive(left, right, 1_500_000)
+        scale = 10.0 / 32_768
+        assert robot.speeds == pytest.approx((left * scale, right * scale), abs=0.002)
 
 
 def test_drivers_switch_off_when_idle_and_on_before_a_step(robot):
@@ -184,6 +178,7 @@ def test_drivers_switch_off_when_idle_and_on_before_a_step(robot):
     assert robot.call('unpowered_pulses') == 0
 
 
+@pytest.mark.long
 def test_clock_wrap_after_hours_at_rest_has_no_effect(robot):
     """2**32 us later an old time stamp equals now, for the idle time and the command age."""
     assert robot.set(core.IDLE_OFF, 1000) == (core.OK, 1000)
@@ -215,7 +210,7 @@ def test_drivers_keep_their_power_until_a_ramp_has_ended(slow_ramps):
 # -- wraps ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('before', [1000, 50_000, 150_000, 210_000, 350_000])
+@pytest.mark.parametrize('before', [1000, 150_000, 210_000])
 @pytest.mark.parametrize('wrap', [1 << 15, 1 << 16, 1 << 31, 1 << 32])
 def test_clock_wrap_of_any_width_has_no_effect(robot, wrap, before):
     """Regression: a 16-bit overflow counter made the clock wrap at 35.8 minutes."""
@@ -252,10 +247,3 @@ def test_counters_wrap_at_32_bits(robot):
     left, right = struct.unpack_from('<ii', state, 8)
     assert -(1 << 31) <= left < -(1 << 31) + 200
     assert (1 << 31) - 200 < right < 1 << 31
-
-
-def test_extreme_speeds_are_scaled(robot):
-    for left, right in ((-32_768, 32_767), (32_767, -32_768), (-32_768, -32_768), (0, -32_768)):
-        robot.drive(left, right, 1_500_000)
-        scale = 10.0 / 32_768
-        assert robot.speeds == pytest.approx((left * scale, right * scale), abs=0.002)

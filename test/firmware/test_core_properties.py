@@ -13,9 +13,7 @@
 # limitations under the License.
 """Firmware core: every bit flip of a frame on a serial line, and the wrap of every counter."""
 
-from binascii import crc_hqx
 import ctypes
-import struct
 
 import pytest
 from support.firmware_core import ADDRESS, COUNTERS, INFO_SIZE, KEY, OK, Dongle, Robot
@@ -24,8 +22,6 @@ from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD, Configure, Key, Store, Transmit
 from t3mpc_ros.radio.protocol.framing import crc16, encode_frame
 from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, encode_settings
-
-BOOTS_ADDRESS = 32
 
 
 def damaged(frame):
@@ -104,10 +100,7 @@ def test_each_counter_of_packets_wraps_alone(robot, name, packet):
 
 def test_no_nonce_repeats_when_the_counter_of_boots_wraps(library):
     robot = Robot(library, KEY)
-    record = struct.pack('<I', (1 << 32) - 3)
-    record += crc_hqx(record, 0xFFFF).to_bytes(2, 'little')
-    for at, byte in enumerate(record, BOOTS_ADDRESS):
-        robot.call('poke_eeprom', at, byte)
+    robot.store_boots((1 << 32) - 3)
     seen = set()
     for _ in range(6):
         robot.call('boot', 1, 0)

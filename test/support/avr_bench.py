@@ -49,15 +49,9 @@ SLICE_US = 200.0
 PLANT_US = 5000.0
 """Period of the plant and of its sensors."""
 FIELDS = (
-    'seq',
-    'ttl_from_us',
-    'session.id',
-    'counters.stale',
-    'ramp.speed',
-    'ramp.target',
-    'loaded_us',
+    'seq', 'ttl_from_us', 'session.id', 'counters.stale', 'ramp.speed', 'ramp.target', 'loaded_us',
     'longest_us',
-)
+)  # fmt: skip
 
 
 @cache
@@ -69,16 +63,9 @@ def field_offsets():
     ]
     source = '\n'.join(['#include <stddef.h>', '#include "t3_robot.h"', *lines])
     with tempfile.NamedTemporaryFile(suffix='.o') as made:
-        command = [
-            'avr-gcc',
-            '-mmcu=atmega2560',
-            '-fno-common',
-            f'-I{FIRMWARE}/core',
-            '-c',
-            '-xc',
-            '-',
-        ]
-        subprocess.run([*command, '-o', made.name], input=source, text=True, check=True)
+        options = f'-mmcu=atmega2560 -fno-common -I{FIRMWARE}/core -c -xc - -o {made.name}'
+        command = ['avr-gcc', *options.split()]
+        subprocess.run(command, input=source, text=True, check=True)
         table = subprocess.run(
             ['avr-nm', '-S', made.name], capture_output=True, text=True, check=True
         )
@@ -318,10 +305,7 @@ class AvrEmulator:
             'button': (lambda: self._press_button(True), lambda: self._press_button(False)),
             'dongle_reset': (self.restart_dongle, no_action),
             'close_port': (self._unplug, self._plug_in),
-            'radio_dead': (
-                lambda: self._set_radio_power(False),
-                lambda: self._set_radio_power(True),
-            ),
+            'radio_dead': (lambda: self._power_radio(False), lambda: self._power_radio(True)),
         }
         return effects.get(name, (no_action, no_action))
 
@@ -364,6 +348,6 @@ class AvrEmulator:
     def _press_button(self, pressed):
         self.boards.call('press', pressed)
 
-    def _set_radio_power(self, on):
+    def _power_radio(self, on):
         self.boards.rules_broken = True  # the firmware does not notice at once
         self.boards.call('radio_power', DONGLE, on)

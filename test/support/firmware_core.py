@@ -41,16 +41,9 @@ OK, UNKNOWN, RANGE, READ_ONLY, BUSY, FAILED = range(6)
 MAX_SPEED, ACCELERATION, DECELERATION, TTL_MAX, MICROSTEPS = range(5)
 STEPS_PER_REV, GYRO_RANGE, BATTERY_LOW, IDLE_OFF, INVERT, CUTOFF, BOOTS = range(5, 12)
 COUNTERS = (
-    'received',
-    'duplicates',
-    'bad_session',
-    'stale',
-    'expired',
-    'bad_version',
-    'malformed',
-)
-PACKET = ('kind', 'session', 'seq', 'what', 'ttl', 'left', 'right', 'value')
-PACKET += ('echo_us', 'host_us')
+    'received', 'duplicates', 'bad_session', 'stale', 'expired', 'bad_version', 'malformed',
+)  # fmt: skip
+PACKET = 'kind', 'session', 'seq', 'what', 'ttl', 'left', 'right', 'value', 'echo_us', 'host_us'
 STEP = math.tau / 3200
 SESSION = 0x5A
 INFO_SIZE = 24
@@ -65,44 +58,31 @@ def run_make(folder, *words):
     return subprocess.run(command, capture_output=True, text=True)
 
 
+RESULTS = {
+    ctypes.c_void_p: 'robot_new dongle_new splitter_new',
+    ctypes.c_int32: 'robot_pulses robot_steps robot_speed',
+    ctypes.c_uint32: (
+        'robot_time robot_loads robot_closest_pulses robot_unpowered_pulses robot_hasty_pulses '
+        'robot_eeprom_writes robot_usb_take dongle_take dongle_time dongle_configured '
+        'splitter_feed time_us'
+    ),
+    ctypes.c_uint16: 'crc16',
+    ctypes.c_uint8: (
+        'robot_ack robot_status robot_levels robot_session dongle_sent to_wire range_code decode '
+        'encode'
+    ),
+    ctypes.c_bool: 'robot_powered robot_writing',
+}
+"""Functions by the type of their result."""
+
+
 @cache
 def load_core():
     """Return the library of the emulator, with the functions that only tests use."""
     core = ctypes.CDLL(str(compile_library()))
-    for name in ('robot_new', 'dongle_new', 'splitter_new'):
-        getattr(core, f't3_host_{name}').restype = ctypes.c_void_p
-    for name in ('robot_pulses', 'robot_steps', 'robot_speed'):
-        getattr(core, f't3_host_{name}').restype = ctypes.c_int32
-    for name in (
-        'robot_time',
-        'robot_loads',
-        'robot_closest_pulses',
-        'robot_unpowered_pulses',
-        'robot_hasty_pulses',
-        'robot_eeprom_writes',
-        'robot_usb_take',
-        'dongle_take',
-        'dongle_time',
-        'dongle_configured',
-        'splitter_feed',
-        'time_us',
-    ):
-        getattr(core, f't3_host_{name}').restype = ctypes.c_uint32
-    for name in (
-        'robot_ack',
-        'robot_status',
-        'robot_levels',
-        'robot_session',
-        'dongle_sent',
-        'to_wire',
-        'range_code',
-        'decode',
-    ):
-        getattr(core, f't3_host_{name}').restype = ctypes.c_uint8
-    core.t3_host_encode.restype = ctypes.c_uint8
-    core.t3_host_crc16.restype = ctypes.c_uint16
-    core.t3_host_robot_powered.restype = ctypes.c_bool
-    core.t3_host_robot_writing.restype = ctypes.c_bool
+    for kind, names in RESULTS.items():
+        for name in names.split():
+            getattr(core, f't3_host_{name}').restype = kind
     return core
 
 
@@ -185,6 +165,11 @@ class Robot(Part):
     def poke_eeprom(self, address, data):
         for at, value in enumerate(data, address):
             self.call('poke_eeprom', at, value)
+
+    def store_boots(self, count):
+        """Store the count of starts."""
+        record = struct.pack('<I', count)
+        self.poke_eeprom(32, record + crc16(record).to_bytes(2, 'little'))
 
     def poke(self, time):
         """Shift the clock of the robot and all its time stamps, not the clock of the host."""
