@@ -25,13 +25,9 @@ from support.other_parameters import with_other_value
 from support.properties import PROPERTY
 from support.radio_bench import FakeRobot, LinkBench
 
-from t3mpc_ros.radio.link.handshake import Handshake, Session
-from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.telemetry import CommandTiming, TelemetryDecoder
-from t3mpc_ros.radio.link.transaction import TransactionResult
 from t3mpc_ros.radio.protocol import frames
-from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.radio_robot import RadioRobot, RadioRobotParameters
 
 KEY = bytes(range(16))
@@ -74,31 +70,6 @@ def _decode(decoder, robot, now_ns, timed, session):
     timing = CommandTiming(now_ns - 6 * MS, MS) if timed else None
     state = robot.state(now_ns)._replace(session=session)
     return decoder.decode(state, now_ns, timing)
-
-
-def handshakes(source):
-    """Lost and foreign answers keep the text of the reason only."""
-    parameters, robot, now_ns = LinkParameters(), FakeRobot(), 5 * SECOND
-    session = Session(b'', source.randbytes, 0, now_ns)
-    used, fresh = (
-        Handshake(session, parameters, 'because', 'absent', 'no reply') for _ in range(2)
-    )
-    while fresh.state is not LinkState.RUN:
-        for _ in range(source.randrange(45)):
-            request, _ = used.next_request(now_ns)
-            foreign = robot.state(now_ns) if used.state is LinkState.PARAMS else None
-            used.handle(_result(request, source.choice([None, foreign])))
-        request, _ = used.next_request(now_ns)
-        robot.receive(encode(request), now_ns)
-        for each in (used, fresh):
-            if isinstance(request, frames.ParamGet | frames.ParamSet):
-                each.next_request(now_ns)
-            each.handle(_result(request, robot.answer))
-        yield used, fresh, ('reason', '_session')
-
-
-def _result(request, uplink):
-    return TransactionResult(request, None, uplink, 0, 0, None, False)
 
 
 def _live(source, make):
@@ -162,11 +133,10 @@ def links(source):
     yield used.link, fresh.link, (*LINK_KEPT, *pending), at[used], at[fresh]
 
 
-@pytest.mark.parametrize('make', [telemetry_decoders, handshakes])
 @given(seed=SEEDS)
 @PROPERTY
-def test_after_a_session_an_object_is_as_new(make, seed):
-    for used, fresh, kept in make(random.Random(seed)):
+def test_telemetry_of_a_restarted_robot_is_as_new(seed):
+    for used, fresh, kept in telemetry_decoders(random.Random(seed)):
         assert differences(used, fresh, kept) == {}
 
 
