@@ -124,13 +124,15 @@ def text_of(folder, capsys, *options):
     """Return what the program prints and the page says."""
     assert bag_main(['report', str(folder), '--output', str(folder.parent / 'out'), *options]) == 0
     page = (folder.parent / 'out' / 'report.html').read_text(encoding='utf-8')
-    return capsys.readouterr().out, page
+    printed = capsys.readouterr()
+    assert 'reading the bag' in printed.err, 'the wait of some seconds is named'
+    return printed.out, page
 
 
 # -- robots that are not ours -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('kind', ['MCAP', 'SQLITE3', 'SQLITE3 of Humble', 'MCAP of Humble'])
+@pytest.mark.parametrize('kind', ['MCAP', 'SQLITE3 of Humble'])
 @pytest.mark.slow
 def test_a_bag_of_another_robot_has_a_report(rows, tmp_path, capsys, kind):
     """As a TurtleBot's: m/s and rad/s, since nobody says how large its wheels are."""
@@ -147,15 +149,6 @@ def test_a_bag_of_another_robot_has_a_report(rows, tmp_path, capsys, kind):
     assert 'Not in the bag, or without a message: reference.' in page
     assert 'controller/' not in page
     assert 'wheel' not in page.split('>From command to motion</h2>')[1].split('<figure')[0]
-
-
-def test_one_file_is_a_bag_too(rows, tmp_path, capsys):
-    folder = write(tmp_path / 'bag', rows[:300])
-    (file,) = folder.glob('*.mcap')
-    assert bag_main(['report', str(file), '--output', str(tmp_path / 'out')]) == 0
-    printed = capsys.readouterr()
-    assert 'out/report.html' in printed.out
-    assert 'reading the bag' in printed.err, 'the wait of some seconds is named'
 
 
 def test_dead_time_lag_and_gain_of_the_robot_are_found(rows, tmp_path):
@@ -204,14 +197,6 @@ def test_the_wheels_may_be_told(rows, tmp_path, capsys):
         assert bag_main(['report', str(folder), '--output', str(tmp_path / 'no'), *wrong]) == 1
         assert words in capsys.readouterr().err
     assert not (tmp_path / 'no').exists()
-
-
-def test_topics_of_other_names_are_found_by_type_and_named(tmp_path, capsys):
-    names = ('/diff_drive_controller/odometry', '/diff_drive_controller/command')
-    rows = rows_of(names, stamped=True, duration=10.0)
-    _, page = text_of(write(tmp_path / 'bag', rows), capsys)
-    assert f'Odometry is taken from {names[0]}.' in page
-    assert f'The command is taken from {names[1]}.' in page
 
 
 def test_the_likeliest_topic_is_chosen_and_the_others_are_listed(tmp_path, capsys):
@@ -301,41 +286,14 @@ def test_a_jump_at_rest_is_found(moved, count):
 # -- way, stops ----------------------------------------------------------------------
 
 
-def test_way_and_stops_are_those_of_the_drive(rows, tmp_path):
-    run = run_of(write(tmp_path / 'bag', rows))
-    _, (seen_at, seen, _) = drive()
-    found = dict(motion_rows(run))
-    way, turned = np.trapezoid(np.abs(seen), seen_at, axis=0)
-    numbers = {name: [*map(float, re.findall(r'[\d.]+', text))] for name, text in found.items()}
-    assert numbers['path length, forwards and backwards'] == [pytest.approx(way, rel=0.03)]
-    assert numbers['turning, both ways'] == [pytest.approx(turned, rel=0.03)]
-    mean, fastest = numbers['speed while moving, mean and largest']
-    (moving,) = numbers['time moving']
-    assert fastest == pytest.approx(np.abs(seen[:, 0]).max(), rel=0.05)
-    assert mean == pytest.approx(way / moving, rel=0.03)
-    times = np.reshape(numbers['standstill at'], (-1, 2))
-    (pause,) = times[(times[:, 0] > 19.0) & (times[:, 0] < 23.0)]
-    assert pause[1] - pause[0] == pytest.approx(2.3, abs=0.5)
-    count, stood, longest = numbers['standstills']
-    assert (count, longest) == (len(times), pytest.approx(np.ptp(times, axis=1).max(), abs=0.11))
-    assert stood == pytest.approx(np.ptp(times, axis=1).sum(), abs=0.2)
-    assert stood + moving == pytest.approx(seen_at[-1], abs=0.5)
-    assert numbers['of that, motion was commanded'][0] < 0.6
-    # The units, and what is not known without a command.
-    assert [re.sub(r'[\d.]+', '#', text) for text in found.values()] == [
-        '# m', '# rad', '# and # m/s', '# s', '#, # s in all, the longest # s',
-        ', '.join(['# to #'] * len(times)) + ' s', '# s',
-    ]  # fmt: skip
-    alone = replace(run, motions={ODOMETRY: run.motions[ODOMETRY]})
-    assert dict(motion_rows(alone)).keys() == found.keys() - {'of that, motion was commanded'}
-
-
 def test_standstill_against_the_command_is_seen(rows, tmp_path):
     """Also backwards: a robot that does not back out of a dock."""
     run = run_of(write(tmp_path / 'bag', rows))
     motion, command = run.motions[ODOMETRY], run.motions[COMMAND]
     moves = ~((motion.time > 25.0) & (motion.time < 30.0))
     stood = Series(motion.time, {name: moves * each for name, each in motion.values.items()})
+    alone = motion_rows(replace(run, motions={ODOMETRY: stood}))
+    assert 'of that, motion was commanded' not in dict(alone)
     for sign in (1.0, -1.0):
         values = {name: sign * np.abs(each) for name, each in command.values.items()}
         told = Series(command.time, values)
@@ -522,7 +480,7 @@ def response_of(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('seeds', few_of([20, 60]))
+@pytest.mark.parametrize('seeds', few_of([12, 60]))
 def test_a_delay_that_is_shown_is_the_true_one(seeds):
     """Of 300 drives 38 were shown with errors of up to 0.49 s."""
     shown = 0
@@ -557,28 +515,3 @@ def test_a_slow_command_in_a_short_run_determines_no_delay(tmp_path, capsys):
     words = 'The data do not determine the delay of the robot: each from '
     assert words in page
     assert re.search(rf'{words}\d+ to \d+ ms explains the speed as well', page)
-
-
-def test_a_gap_of_a_month_is_no_response_and_no_loss(tmp_path):
-    """It was "213/435 ms, 100 % missing"."""
-    rows = [
-        (t + 30 * 86_400.0 * (t > 8.0), topic, message) if topic == '/cmd_vel' else
-        (t + 30 * 86_400.0 * (t > 8.0), topic, later(message, t))
-        for t, topic, message in following_rows()
-    ]  # fmt: skip
-    run = run_of(write(tmp_path / 'bag', rows))
-    found = compute_metrics(run, Path(), 0)
-    assert found.missing[ODOMETRY] == pytest.approx(0.0, abs=0.01)
-    for channel in run.channels:
-        assert not found.delay(channel.name) > 0.03
-        numbers = found.wheels[channel.name]
-        assert numbers.demand == pytest.approx(numbers.chatter, rel=0.05)
-        assert numbers.demand > 0.5  # as without the gap, not a millionth of it
-
-
-def later(message, t):
-    stamp = START + round(1e9 * (t + 30 * 86_400.0 * (t > 8.0)))
-    twist, pose = message.twist.twist, message.pose.pose
-    yaw = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
-    place = pose.position.x, pose.position.y, yaw
-    return odometry_message(stamp, (twist.linear.x, twist.angular.z), place)

@@ -73,10 +73,10 @@ def standing(speeds, spans):
     return [share * each for each in speeds]
 
 
-@pytest.mark.parametrize('seed', range(12))
-@pytest.mark.parametrize('noise', [0.0, 0.2])
-def test_each_stop_is_found_with_its_begin_and_end(seed, noise):
+@pytest.mark.parametrize('seed', range(6))
+def test_each_stop_is_found_with_its_begin_and_end(seed):
     """Also by odometry with the noise of the paper, 0.2 rad/s at each wheel."""
+    noise = 0.2 * (seed % 2)
     rng = np.random.default_rng(seed)
     starts = np.cumsum(rng.uniform(4.0, 9.0, rng.integers(0, 5)))
     spans = [(t, t + rng.uniform(0.8, 3.0)) for t in starts.tolist()]
@@ -89,7 +89,7 @@ def test_each_stop_is_found_with_its_begin_and_end(seed, noise):
         assert stop.end == pytest.approx(end, abs=0.08)
 
 
-@pytest.mark.parametrize('delay', [0.0, 0.1, 0.3])
+@pytest.mark.parametrize('delay', [0.0, 0.3])
 def test_a_robot_that_stands_because_it_is_to_is_not_stopped(delay):
     """The reference pauses, and the robot with it, though later."""
     rng = np.random.default_rng(3)
@@ -126,7 +126,7 @@ def test_a_short_stop_counts_where_it_was_commanded():
     assert find_stops(run_of(wanted, wanted, commanded=zero)) == ()
 
 
-@pytest.mark.parametrize('seed', range(8))
+@pytest.mark.parametrize('seed', range(4))
 def test_stalls_are_counted_and_jitter_is_none(seed):
     rng = np.random.default_rng(seed)
     received = TIME + rng.uniform(0.0, 0.02, TIME.size)  # up to two periods late
