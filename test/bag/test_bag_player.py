@@ -13,6 +13,7 @@
 # limitations under the License.
 """Playback of bags in virtual time: every message once, in order, at its time."""
 
+from functools import partial
 from itertools import pairwise
 import random
 import threading
@@ -108,11 +109,11 @@ def expected(messages):
 FORMATS = {
     'mcap': write_mcap,
     'sqlite3': write_sqlite,
-    'sqlite3, files compressed': lambda folder, messages: write_sqlite(
-        folder, messages, mode=CompressionMode.FILE, fmt=CompressionFormat.ZSTD
+    'sqlite3, files compressed': partial(
+        write_sqlite, mode=CompressionMode.FILE, fmt=CompressionFormat.ZSTD
     ),
-    'sqlite3, messages compressed': lambda folder, messages: write_sqlite(
-        folder, messages, mode=CompressionMode.MESSAGE, fmt=CompressionFormat.ZSTD
+    'sqlite3, messages compressed': partial(
+        write_sqlite, mode=CompressionMode.MESSAGE, fmt=CompressionFormat.ZSTD
     ),
 }
 
@@ -188,9 +189,13 @@ def test_a_continued_bag_is_one_sequence(tape, tmp_path):
 
 def test_path_without_a_bag_is_rejected(tmp_path):
     (tmp_path / 'notes.txt').write_text('hello')
+    (tmp_path / 'none.mcap').touch()
+    (tmp_path / 'begun.mcap').write_bytes(b'\x89MCAP0\r\n')
     (tmp_path / 'empty').mkdir()
     (tmp_path / 'broken.db3').write_bytes(b'no database' * 100)
     for path, words in (
+        ('none.mcap', 'is empty: it has no byte'),
+        ('begun.mcap', 't3mpc bag recover .*begun.mcap'),
         ('nowhere', 'there is no bag'),
         ('notes.txt', 'is no MCAP file and no sqlite3 bag'),
         ('empty', 'no complete bag file'),
@@ -316,17 +321,12 @@ def test_parameters_that_cannot_be_played_are_rejected(given, words):
         PlaybackParameters.from_dict({'storage.uris': ['bag'], **given})
 
 
-@pytest.mark.parametrize(
-    'name', ['start_offset', 'playback_duration', 'playback_until', 'seek_time', 'bag_offsets']
-)
-def test_a_time_beyond_any_bag_is_refused(name):
+@pytest.mark.parametrize(('name', 'value'), [('start_offset', 1e300), ('bag_offsets', [1e300])])
+def test_a_time_beyond_any_bag_is_refused(name, value):
     """1e300 s ended with the traceback of an OverflowError."""
-    many, value = name == 'bag_offsets', 1e300
     words = rf'play\.{name} must be from (0|-1e\+10) to 1e\+10 s: got 1e\+300'
     with pytest.raises(ParameterError, match=words):
-        PlaybackParameters.from_dict(
-            {'storage.uris': ['bag'], f'play.{name}': [value] if many else value}
-        )
+        PlaybackParameters.from_dict({'storage.uris': ['bag'], f'play.{name}': value})
 
 
 def test_one_bag_twice_is_refused(tmp_path):
@@ -374,11 +374,11 @@ WEAK = QosProfile(reliability='best_effort')
         ([LATCHED], 'reliable', 'transient_local', 1),
         ([LATCHED, WEAK, LATCHED], 'reliable', 'transient_local', 2),
         # As reported by Fast DDS for a latched publisher of another process.
-        ([QosProfile('unknown', 0, 'reliable', LATCHED.durability)],)
-        + ('reliable', 'transient_local', 1),
+        ([QosProfile('unknown', 0, 'reliable', LATCHED.durability)], 'reliable',
+         'transient_local', 1),
         ([QosProfile(reliability='unknown')], 'reliable', 'volatile', PUBLISHER_DEPTH),
     ],
-)
+)  # fmt: skip
 def test_offer_is_compatible_with_recorded_subscriptions(recorded, reliability, durability, depth):
     offer = adapt_offer_to_recorded_offers(recorded)
     assert (offer.reliability, offer.durability, offer.depth) == (reliability, durability, depth)
@@ -436,24 +436,13 @@ def test_overrides_that_ros2_bag_would_refuse_are_refused(content, words, tmp_pa
 
 
 def test_latched_messages_precede_any_later_start(write, tape, tmp_path):
-    made = tape(write(tmp_path / 'bag', ticks()))
-    written = [m for m in expected(ticks()) if m.topic == '/map']
+    """Also one from hours before: /old was published once, at the beginning."""
+    messages = [('/old', START - 5000 * SECOND), *ticks()]
+    made = tape(write(tmp_path / 'bag', messages, latched=('/map', '/old')))
+    old, *written = (m for m in expected(messages) if m.topic in ('/map', '/old'))
     for start in (START, START + 1, START + 2, START + SECOND // 2 + 1, made.end_ns, 2 * START):
         earlier = [m for m in written if m.received_ns < start]
-        assert made.latched_messages_before(start) == earlier[-1:]
-
-
-def test_several_latched_topics_are_in_order_of_receipt(tape, tmp_path):
-    """A message from hours before is found: /old was published once, at the beginning."""
-    messages = [('/old', START), ('/map', START + 2)]
-    messages += [('/a', START + 10 * i * SECOND) for i in range(1, 400)]
-    messages += [('/robot', START + 3000 * SECOND + 1), ('/map', START + 3990 * SECOND + 1)]
-    messages.sort(key=lambda m: m[1])
-    names = ('/old', '/map', '/robot')
-    made = tape(write_mcap(tmp_path / 'bag', messages, latched=names))
-    last = made.latched_messages_before(START + 3990 * SECOND)
-    assert [m.topic for m in last] == ['/old', '/map', '/robot']
-    assert [m.topic for m in made.latched_messages_before(2 * START)] == ['/old', '/robot', '/map']
+        assert made.latched_messages_before(start) == [old, *earlier[-1:]]
 
 
 def test_two_latched_publishers_keep_a_message_each(tape, tmp_path):
@@ -540,27 +529,6 @@ def test_each_message_is_due_at_its_time(bag):
     assert all(now - first == e.message.received_ns - START for now, e in player.out)
 
 
-@pytest.mark.parametrize('rate', [0.01, 0.3, 1.0, 1.1**7, 100.0])
-def test_rate_scales_time_exactly(bag, rate):
-    player = Player(bag, rate=rate).run()
-    first = player.out[0][0]
-    for now, emission in player.out:
-        assert (now - first) * rate == pytest.approx(emission.stamp_ns - START, abs=1 + rate)
-    assert player.messages == expected(ticks())
-
-
-def test_late_messages_are_due_immediately_and_in_order(bag):
-    player = Player(bag)
-    player.ask()
-    player.ask()
-    player.now += SECOND
-    while player.wake is not None and player.wake <= player.now:
-        player.ask(most=7)
-    assert player.messages == [m for m in expected(ticks()) if m.received_ns <= START + SECOND]
-    assert max(player.errors) == SECOND - 1, 'the map, 1 ns after the first tick'
-    assert player.errors[-1] == 0
-
-
 def test_start_offset_and_end_select_a_range_after_the_map(bag):
     begin, end = START + SECOND // 2 + 2, START + SECOND
     player = Player(bag, begin, end).run()
@@ -598,24 +566,6 @@ def test_loop_of_a_single_message_has_a_minimum_duration(tape, tmp_path):
     assert player.messages == []
 
 
-def test_seek_continues_with_latched_messages(bag):
-    player = Player(bag)
-    player.run(player.now + SECOND // 4)
-    count = len(player.messages)
-    target = START + SECOND + SECOND // 10
-    assert player.made.seek(player.now, target) == ''
-    player.wake = player.now
-    player.run()
-    written = expected(ticks())
-    after = [m for m in written if m.received_ns >= target]
-    assert player.messages[count:] == [*bag.latched_messages_before(target), *after]
-    assert player.made.finished
-    assert player.made.seek(player.now, START) == ''
-    assert not player.made.finished, 'it can be played again'
-    for stamp, words in ((START - 1, 'got -0.000 s'), (bag.end_ns + SECOND, 'got 2.990 s')):
-        assert words in player.made.seek(player.now, stamp)
-
-
 def test_stepping_into_the_next_loop_does_not_play_the_map_early(bag):
     begin = START + 2
     player = Player(bag, begin, START + SECOND // 100 + 1000, loop=True, paused=True).run()
@@ -643,15 +593,6 @@ def test_clock_is_published_while_paused(bag):
     player = Player(bag, clock_rate=10.0, paused=True)
     player.run(player.now + SECOND)
     assert [e.stamp_ns for _, e in player.out] == [START] * 11
-
-
-def test_reading_the_first_message_does_not_make_it_late(bag):
-    player = Player(bag)
-    player.ask()
-    assert player.out == []
-    player.now += SECOND // 2  # time to find the first message
-    player.run()
-    assert set(player.errors) == {0}
 
 
 # -- reading ahead --------------------------------------------------------------------------------
