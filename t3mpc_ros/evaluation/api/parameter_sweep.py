@@ -329,7 +329,17 @@ def _combinations(parameters: Mapping[str, Sequence[Any]]) -> list[Row]:
             ) from None
         if repeated:  # the table would count the seeds of one cell twice
             raise ScriptError(f'values must differ: got {values!r} of {name}')
+        if wrong := [value for value in values if not _is_finite(value)]:
+            raise ScriptError(f'values of {name} must be finite: got {wrong[0]}')
     return [dict(zip(parameters, each, strict=True)) for each in itertools.product(*lists)]
+
+
+def _is_finite(value: Any) -> bool:
+    """Return whether a value is no number, nor the text of one, that is infinite or NaN."""
+    try:
+        return math.isfinite(float(value))
+    except (TypeError, ValueError):
+        return True
 
 
 def numbers_or_error(job: Job) -> Row:

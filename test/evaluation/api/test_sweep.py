@@ -322,6 +322,7 @@ def test_the_key_of_a_run_ignores_files_named_like_a_case(tmp_path, monkeypatch)
         ((Proportional, {'gain': [1.0, 1.0]}), 'values must differ'),
         ((Proportional, {'gain': [20, 20.0]}), 'values must differ: got .20, 20.0. of gain'),
         ((Proportional, {'gain': [[1.0, 2.0]]}), 'gain must be numbers, truth values or texts'),
+        ((Proportional, {'gain': [20.0, math.inf]}), 'values of gain must be finite: got inf'),
         ((Proportional, {'seed': [1, 2]}), 'seed is a column of every sweep'),
         ((Proportional, {'settled': [1, 2]}), 'settled is a column of every sweep'),
         ((Proportional, {1: [1.0]}), 'parameters must map names to lists of values: got 1'),
@@ -382,6 +383,15 @@ def test_a_parameter_that_is_set_twice_is_refused(capsys):
     """Of ``--set gain=20 --set gain=10`` only the last one was swept, without a word."""
     assert main(['sweep', '--set', 'law.gain=20', '--set', 'law.gain=10']) == 1
     assert '--set must name each parameter once' in capsys.readouterr().err
+
+
+def test_a_value_that_is_not_finite_is_refused(tmp_path, capsys):
+    """A controller got the text ``nan``, and each run failed by it."""
+    script = tmp_path / 'mine.py'
+    script.write_text('def step(observation, gain):\n    return -gain * observation.speeds\n')
+    words = ['--set', 'gain=nan,2', '--robot', 'servo', '--output', f'{tmp_path / "a.parquet"}']
+    assert main(['sweep', f'{script}:step', *words]) == 1
+    assert 'values of gain must be finite: got nan' in capsys.readouterr().err
 
 
 @pytest.mark.slow
