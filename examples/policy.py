@@ -13,11 +13,10 @@
 # limitations under the License.
 """A policy that is trained in the environment of Gymnasium, in a table against our controllers."""
 
-import gymnasium
 import numpy as np
 
 import t3mpc_ros as t3
-from t3mpc_ros.gym import accelerations_of, vector_of
+from t3mpc_ros.gym import TrackingEnv, accelerations_of, vector_of
 
 
 class Policy:
@@ -67,7 +66,7 @@ def train(env, generations, seed=1):
 
 def main(duration=20.0, generations=10, episodes=8.0, executor=None):
     """Train on the paper's plant, and compare on seeds that no training has seen."""
-    env = gymnasium.make('t3mpc_ros.gym:t3mpc_ros/Tracking-v0', plant='servo', duration=episodes)
+    env = TrackingEnv('servo', duration=episodes)
     weights = train(env, generations)
     table = t3.compare(
         ['PI + feed-forward', t3.Controller(Policy(weights), name='policy'), 'feed-forward'],

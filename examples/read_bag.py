@@ -34,10 +34,14 @@ def main(path='runs/latest/bag', folder=Path('runs/examples')):
     axis.set_xlabel('time / s')
     axis.set_ylabel('m/s')
     axis.legend()
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     figure.savefig(folder / 'read_bag.png', dpi=150)
     return bag
 
 
 if __name__ == '__main__':
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:3])
+    except t3.ScriptError as error:
+        sys.exit(f'error: {error}')

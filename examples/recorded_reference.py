@@ -26,6 +26,7 @@ def main(path='runs/latest/bag', folder=Path('runs/examples'), duration=None, ex
     reference = t3.read_bag(path)['/reference']
     time = reference['stamp'] - reference['stamp'][0]
     columns = [time, reference['twist.twist.linear.x'], reference['twist.twist.angular.z']]
+    folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / 'recorded_reference.csv'
     header = 'time,linear,angular'
@@ -37,4 +38,7 @@ def main(path='runs/latest/bag', folder=Path('runs/examples'), duration=None, ex
 
 
 if __name__ == '__main__':
-    main(*sys.argv[1:])
+    try:
+        main(*sys.argv[1:3])
+    except t3.ScriptError as error:
+        sys.exit(f'error: {error}')

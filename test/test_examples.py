@@ -14,6 +14,8 @@
 """Every program of ``examples/`` runs, and shows what its docstring says."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -66,7 +68,7 @@ def _policy(module, folder):
 
 
 def _read_bag(module, folder):
-    assert module.main(BAG, folder)['/odom']['stamp'].size > 100
+    assert module.main(BAG, f'{folder}')['/odom']['stamp'].size > 100  # as on a command line
 
 
 def _recorded_reference(module, folder):
@@ -114,6 +116,15 @@ CHECKS = {
 def test_an_example_runs_and_shows_what_it_says(name, tmp_path):
     """Also where its folder is not there yet: those that a reader starts ended with an error."""
     CHECKS[name](load_example(name), tmp_path / 'made')
+
+
+@pytest.mark.parametrize('name', ['read_bag', 'recorded_reference'])
+def test_an_example_says_in_one_sentence_that_there_is_no_bag(name, tmp_path):
+    """It was a traceback."""
+    program = [sys.executable, ROOT / 'examples' / f'{name}.py', tmp_path / 'none', tmp_path]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == f'error: there is no bag {tmp_path / "none"}\n'
 
 
 def test_the_tutorial_shows_the_controller_of_the_example():
