@@ -114,18 +114,6 @@ def kick(step, size):
 # -- what all of them share -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('kind', ALL)
-def test_equal_inputs_give_equal_bits(kind):
-    def load(k, chi):
-        return 3.0 * np.tanh(chi / 0.2) + math.sin(0.1 * k)
-
-    first, second = (
-        run(make(kind), waves(400, jump=5.0), load, ramp=28.0, noise=0.2) for _ in range(2)
-    )
-    assert np.array_equal(first.chi, second.chi)
-    assert np.array_equal(first.u, second.u)
-
-
 @pytest.mark.parametrize('kind', INTEGRATING)
 def test_neither_jumps_nor_limits_cause_adaptation(kind):
     """Integral, observer and sliding variable are those of the run without jump and limit.
@@ -160,19 +148,6 @@ def test_a_saturated_step_of_10_rad_s_does_not_overshoot(kind):
     assert np.max(np.abs(log.error[460:])) < (0.25 if kind in ADAPTIVE else 0.01)
 
 
-def test_without_anti_windup_the_same_step_winds_up():
-    """What the test above would see of a PI that does not listen."""
-
-    class Deaf(ProportionalIntegral):
-        def applied(self, acceleration, *, limited):
-            pass
-
-    reference, rate = still(800)
-    reference[400:] = [10.0, -10.0]
-    log = run(make(Deaf), (reference, rate), limit=28.0)
-    assert np.max(log.error[400:] * np.array([1.0, -1.0])) > 1.0
-
-
 @pytest.mark.parametrize('kind', ALL)
 def test_jumps_close_at_the_set_rate_with_exact_tracking(kind):
     changes = {'belief': 0.0} if kind is ComputedTorque else {}
@@ -197,49 +172,28 @@ def test_it_starts_from_where_the_wheels_are(kind):
     learnt = log.probe[:, 2:] if kind is DisturbanceRejection else log.probe
     np.testing.assert_allclose(learnt, 0.0, atol=1e-9)
     assert np.max(log.chi * np.array([-1.0, 1.0])) < 1e-9
-    assert np.max(np.abs(log.chi[-1])) < 1e-6
 
 
-@pytest.mark.parametrize('kind', INTEGRATING)
-def test_a_constant_disturbance_leaves_no_error(kind):
-    log = run(make(kind), still(3000), lambda k, chi: [5.0, -7.0])
+@pytest.mark.parametrize(
+    'kind, changes',
+    [*((kind, {}) for kind in INTEGRATING), (DisturbanceRejection, {'input_gain': 1.6})],
+)
+def test_a_constant_disturbance_leaves_no_error(kind, changes):
+    log = run(make(kind, **changes), still(2000), lambda k, chi: [5.0, -7.0])
     # The model's friction, where there is none, is a disturbance that the integral meets too.
     assert np.max(np.abs(log.error[:50])) > 0.05
     assert np.max(np.abs(log.error[-1])) < 1e-6
 
 
-@pytest.mark.parametrize('kind', ALL)
-def test_settings_are_ready_for_a_logarithmic_search(kind):
-    for row in kind.parameters_type.specs():
-        if row.name.startswith('jump_transition.'):  # as the controller has it
-            continue
-        assert row.low is not None
-        assert row.high is not None
-        if row.unit == '1/s':
-            assert row.low > 0.0
-            assert row.low < row.default < row.high
-    share = 1.0 - math.exp(-T / 0.02)
-    gains = {row.name: row for row in kind.parameters_type.specs()}
-    gain = gains.get('gain', gains.get('reaching'))
-    assert gain.low <= share / T <= gain.high
-
-
 # -- PI -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('gain, integral', [(8.0, 16.0), (20.0, 400.0), (39.3, 2000.0)])
+@pytest.mark.parametrize('gain, integral', [(8.0, 16.0), (39.3, 2000.0)])
 def test_the_error_under_pi_has_the_poles_promised(gain, integral):
     log = run(make(ProportionalIntegral, gain=gain, integral=integral), still(120), kick(9, 1.0))
     e = log.error[10:, 0]
     trace, determinant = 2.0 - gain * T - integral * T**2, 1.0 - gain * T
     np.testing.assert_allclose(e[2:], trace * e[1:-1] - determinant * e[:-2], atol=1e-13)
-    # The same as eigenvalues of the loop written as a matrix on (e, I).
-    loop = np.array([[1.0 - gain * T - integral * T**2, -T], [T * integral, 1.0]])
-    fitted = np.linalg.lstsq(np.column_stack([e[1:-1], e[:-2]]), e[2:], rcond=None)[0]
-    found = np.roots([1.0, -fitted[0], -fitted[1]])
-    np.testing.assert_allclose(
-        np.sort_complex(found), np.sort_complex(np.linalg.eigvals(loop)), atol=1e-6
-    )
 
 
 def test_noise_cancels_at_the_gain_of_the_servo():
@@ -260,7 +214,7 @@ def test_noise_cancels_at_the_gain_of_the_servo():
 # -- active disturbance rejection -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize('bandwidth', [5.0, 30.0, 120.0])
+@pytest.mark.parametrize('bandwidth', [5.0, 120.0])
 def test_the_observer_has_both_poles_where_they_were_asked_for(bandwidth):
     first, second = observer_gains(bandwidth, T)
     plant = np.array([[1.0, T], [0.0, 1.0]])
@@ -279,21 +233,17 @@ def test_the_observer_has_both_poles_where_they_were_asked_for(bandwidth):
     )
 
 
-def test_shared_estimate_cancels_a_known_disturbance():
-    baseline = make(DisturbanceRejection, shared_disturbance=1.0, shared_speed=1.0)
-    log = run(baseline, still(300), lambda k, chi: [6.0 * math.sin(0.3 * k), 2.0])
+@pytest.mark.parametrize(
+    'kind, changes', [(DisturbanceRejection, {'shared_speed': 1.0}), (SlidingMode, {})]
+)
+def test_the_shared_estimate_cancels_a_known_disturbance(kind, changes):
+    def load(k, _):
+        return np.array([6.0 * math.sin(0.3 * k), 2.0])
+
+    log = run(make(kind, shared_disturbance=1.0, **changes), still(300), load)
     np.testing.assert_allclose(log.error, 0.0, atol=1e-12)
-    own = run(
-        make(DisturbanceRejection), still(300), lambda k, chi: [6.0 * math.sin(0.3 * k), 2.0]
-    )
+    own = run(make(kind), still(300), load)
     assert np.max(np.abs(own.error)) > 0.02
-
-
-@pytest.mark.parametrize('input_gain', [0.6, 1.0, 1.6])
-def test_wrong_input_gain_leaves_no_steady_error(input_gain):
-    baseline = make(DisturbanceRejection, input_gain=input_gain, gain=15.0)
-    log = run(baseline, still(3000), lambda k, chi: [5.0, -7.0])
-    assert np.max(np.abs(log.error[-1])) < 1e-6
 
 
 # -- sliding mode ---------------------------------------------------------------------------------
@@ -321,21 +271,6 @@ def test_reaching_law_holds_outside_the_boundary_layer():
     assert np.max(late) > 0.5 * most / (reaching + eta / 0.2)
     # On s the error follows a first-order lag: |e| <= 2 max |s|.
     assert np.max(np.abs(log.error[350:])) <= 2.0 * np.max(late)
-
-
-def test_beyond_the_switching_gain_the_layer_cannot_be_held():
-    baseline = make(SlidingMode, switching=2.0, reaching=0.1, boundary=0.2)
-    log = run(baseline, still(400), lambda k, chi: [6.0, 1.0])
-    assert abs(log.probe[-1, 0]) > 1.0
-    assert abs(log.probe[-1, 1]) < 0.2
-
-
-def test_what_the_filter_explains_needs_no_switching_gain():
-    def load(k, _):
-        return np.array([6.0 * math.sin(0.3 * k), 2.0])
-
-    log = run(make(SlidingMode, shared_disturbance=1.0), still(300), load)
-    np.testing.assert_allclose(log.error, 0.0, atol=1e-12)
 
 
 # -- computed torque ------------------------------------------------------------------------------
@@ -378,8 +313,7 @@ def test_computed_torque_error_is_linear_on_the_nominal_plant():
     assert np.max(np.abs(without.error[:101])) > 0.3
 
 
-@pytest.mark.parametrize('measured', [0.0, 0.5, 1.0])
-@pytest.mark.parametrize('drive', ['torque', 'velocity'])
+@pytest.mark.parametrize('drive, measured', [('torque', 0.0), ('velocity', 0.5)])
 def test_computed_torque_scales_its_model_by_the_drive(drive, measured):
     """At constant speeds nothing is left to the feedback, in either drive.
 
@@ -479,25 +413,9 @@ def test_robust_term_bounds_the_unexplained_error():
         assert abs(e[0]) == pytest.approx(0.5) if bound == 0.0 else abs(e[0]) < 0.15
 
 
-@pytest.mark.parametrize('kind', ADAPTIVE)
-@pytest.mark.parametrize('sets', [3, 7])
+@pytest.mark.parametrize('kind, sets', [*zip(ADAPTIVE, [3, 7], strict=True)])
 def test_the_adaptation_gain_means_the_same_for_any_sets(kind, sets):
     baseline = make(kind, normalised_gain=150.0, sets=sets)
     drawn = np.random.default_rng(9).uniform(-10.0, 10.0, (500, 2))
     power = np.mean([np.sum(compute_basis(point, baseline.fuzzy.sets) ** 2) for point in drawn])
     assert baseline.fuzzy.adaptation.gamma * power == pytest.approx(150.0, rel=0.03)
-
-
-def test_adaptive_baselines_differ_in_their_sets_only():
-    load = [1.0, -2.0]
-
-    def learn(kind, **changes):
-        return run(make(kind, **changes), waves(300), lambda k, chi: load).chi
-
-    type1 = learn(AdaptiveType1)
-    np.testing.assert_allclose(
-        learn(AdaptiveIntervalType2, footprint_of_uncertainty=0.0), type1, atol=1e-12
-    )
-    assert (
-        np.max(np.abs(learn(AdaptiveIntervalType2, footprint_of_uncertainty=0.5) - type1)) > 1e-4
-    )

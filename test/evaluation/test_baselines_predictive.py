@@ -28,16 +28,13 @@ from t3mpc_ros.evaluation.baselines.baseline_controller import (
 )
 from t3mpc_ros.evaluation.baselines.dynamic_matrix_control import (
     DynamicMatrix,
-    DynamicMatrixParameters,
     DynamicMatrixPreview,
-    DynamicMatrixPreviewParameters,
     identify_step_responses,
 )
 from t3mpc_ros.evaluation.baselines.linear_mpc import (
     LinearMpc,
     LinearMpcParameters,
     LinearMpcPreview,
-    LinearMpcPreviewParameters,
 )
 from t3mpc_ros.evaluation.baselines.nonlinear_mpc import (
     CasadiNmpc,
@@ -191,12 +188,9 @@ def test_future_goes_on_by_its_slope_but_a_jump_is_no_slope():
     assert np.array_equal(found[:, 1], [5, 5, 5, 9, 9, 9, 9, 9])
     known = np.outer(np.arange(20.0), [1, 2])
     assert np.array_equal(predict_reference(known, 1.0, 8, preview=True), known[:8])
-
-
-def test_slope_dies_away_without_preview():
+    # Without preview the slope dies away.
     fade = math.exp(-PERIOD / 0.2)
-    known = np.array([[1.0, 0.0], [1.1, 0.0]])
-    found = predict_reference(known, fade, 400, preview=False)
+    found = predict_reference(np.array([[1.0, 0.0], [1.1, 0.0]]), fade, 400, preview=False)
     assert found[1, 0] == 1.1
     assert found[-1, 0] == pytest.approx(1.0 + 0.1 / (1.0 - fade), rel=1e-6)
     assert not found[:, 1].any()
@@ -253,7 +247,7 @@ def _dense(drive, before, speeds, reference, weight, nominal_model):
 
 
 @pytest.mark.parametrize('drive', DRIVES)
-@pytest.mark.parametrize('size', [0.02, 2.0, 9.0])
+@pytest.mark.parametrize('size', [0.02, 9.0])
 def test_linear_plan_is_the_optimum_of_the_dense_program(drive, size):
     """Small: no bound is met. Large: some are, in the torque drive those of both motors."""
     nominal_model = _knowledge(drive)
@@ -271,24 +265,7 @@ def test_linear_plan_is_the_optimum_of_the_dense_program(drive, size):
     assert first == pytest.approx(best[:, 0], rel=1e-6, abs=1e-6)
 
 
-@pytest.mark.parametrize('size', [1.0, 3.0, 10.0])
-def test_preview_is_within_two_percent_of_knowing_everything(size):
-    """Forty rows of future against one program over the whole run."""
-    reference = _jump(size, 90, 45)
-    best = _dense(
-        'velocity', np.zeros(2), np.zeros(2), reference[1:90], 1e-3, _knowledge('velocity')
-    )
-    chi = np.zeros((90, 2))
-    for k in range(89):
-        chi[k + 1] = KEPT * chi[k] + (1.0 - KEPT) * best[:, k]
-    least = math.sqrt(_energy(chi, reference))
-    for kind in (LinearMpcPreview, DynamicMatrixPreview):
-        baseline = _make(kind, 'velocity', move_time=0.002)
-        speeds, *_ = _run(baseline, 'velocity', reference)
-        assert least * (1.0 - 1e-9) <= math.sqrt(_energy(speeds, reference)) < 1.02 * least
-
-
-@pytest.mark.parametrize('size', [6.0, 10.0])
+@pytest.mark.parametrize('size', [10.0])
 def test_jump_cost_equals_theory_with_and_without_preview(size):
     """Under a rate limit a, for a jump J.
 
@@ -348,26 +325,15 @@ def test_bounds_are_never_left(kind, drive):
 
 @pytest.mark.parametrize('drive', DRIVES)
 @pytest.mark.parametrize('kind', EVERY)
-@pytest.mark.parametrize('seen', few_of([0.5, 0.0]))
-def test_no_offset_under_disturbance_and_model_error(kind, drive, seen):
-    """Whatever share of the disturbance the shared estimate sees."""
+def test_no_offset_under_disturbance_and_model_error(kind, drive):
+    """The shared estimate sees half of the disturbance."""
     push = np.array([5.0, -3.0])
     times = {'integral_time': 0.1, 'bias_time': 0.1, 'filter_time': 0.02}
     baseline = _make(kind, drive, model_error=1.3, disturbance_share=1.0, **times)
-    reference = np.tile([2.0, 1.0], (500 + AHEAD + 1, 1))
-    speeds, *_ = _run(baseline, drive, reference, lambda chi: push, np.tile(seen * push, (500, 1)))
+    reference = np.tile([2.0, 1.0], (300 + AHEAD + 1, 1))
+    speeds, *_ = _run(baseline, drive, reference, lambda chi: push, np.tile(0.5 * push, (300, 1)))
     assert np.abs(speeds[150] - reference[0]).max() < 0.5
     assert np.abs(speeds[-1] - reference[0]).max() < 1e-6
-
-
-@pytest.mark.parametrize('kind', EVERY)
-def test_offset_stays_while_its_own_errors_are_ignored(kind):
-    """The counterpart: it is the integral, or the bias, that removes the offset."""
-    push = np.array([5.0, -3.0])
-    baseline = _make(kind, 'velocity', integral_time=50.0, bias_time=5.0, model_error=1.3)
-    reference = np.tile([2.0, 1.0], (60 + AHEAD + 1, 1))
-    speeds, *_ = _run(baseline, 'velocity', reference, lambda chi: push)
-    assert np.abs(speeds[-1] - reference[0]).min() > 0.5 * LAG * 3.0
 
 
 @pytest.mark.parametrize('drive', few_of(DRIVES))
@@ -376,32 +342,31 @@ def test_knowing_the_friction_helps_where_the_estimate_is_late(kind, drive):
     """The estimate of a filter comes late by a tenth of a second, the sign of r does not."""
     robot = {'body.com_offset': 0.0}
     loads = WheelLoads(_knowledge(drive, robot))
-    reference = _wander(500, seed=1)
-    reference[:] = 3.0 * np.sin(6.0 * PERIOD * np.arange(len(reference)))[:, None] * [1.0, -0.7]
-    late = loads(reference[np.maximum(np.arange(500) - 10, 0)])
+    time = PERIOD * np.arange(300 + AHEAD + 1)
+    reference = 3.0 * np.sin(6.0 * time)[:, None] * [1.0, -0.7]
+    late = loads(reference[np.maximum(np.arange(300) - 10, 0)])
     errors = []
     for known in (robot, {**robot, 'friction.coulomb': 0.0, 'friction.viscous': 0.0}):
         baseline = _make(
             kind, drive, robot=known, disturbance_share=0.3 if known is robot else 1.0
         )
         speeds, *_ = _run(baseline, drive, reference, loads, late)
-        errors.append(np.sqrt(np.mean((speeds - reference[:500])[100:] ** 2)))
+        errors.append(np.sqrt(np.mean((speeds - reference[:300])[100:] ** 2)))
     assert errors[0] < 0.7 * errors[1]
 
 
-@pytest.mark.parametrize('drive', few_of(DRIVES))
-@pytest.mark.parametrize('kind', few_of([CasadiNmpc, LinearMpc, LinearMpcPreview]))
-def test_observer_parts_noise_from_following(kind, drive):
+@pytest.mark.parametrize('kind', [CasadiNmpc, LinearMpcPreview])
+def test_observer_parts_noise_from_following(kind):
     """With a true model a slow observer follows as sharply, and feeds back far less noise."""
-    reference = _wander(400)
+    reference = _wander(200)
     quiet, noisy = [], []
     for filter_time in (0.001, 0.5):
         how = {'filter_time': filter_time, 'integral_time': 20.0, 'disturbance_share': 0.01}
-        quiet.append(_run(_make(kind, drive, **how), drive, reference)[0])
-        noisy.append(_run(_make(kind, drive, **how), drive, reference, noise=0.2)[0])
+        quiet.append(_run(_make(kind, 'velocity', **how), 'velocity', reference)[0])
+        noisy.append(_run(_make(kind, 'velocity', **how), 'velocity', reference, noise=0.2)[0])
     assert np.abs(quiet[0] - quiet[1]).max() < 1e-3
     # It starts from a single noisy estimate, which takes its time to be forgotten.
-    spread = [np.std((with_noise - quiet[0])[200:]) for with_noise in noisy]
+    spread = [np.std((with_noise - quiet[0])[100:]) for with_noise in noisy]
     assert spread[1] < 0.6 * spread[0]
 
 
@@ -485,8 +450,8 @@ def test_dynamic_matrix_and_state_space_agree_on_a_true_model():
 
 @pytest.mark.parametrize('drive', DRIVES)
 def test_nonlinear_mpc_equals_linear_mpc_on_linear_wheels(drive):
-    reference = _wander(250)
-    seen = np.tile([2.0, -1.0], (250, 1))
+    reference = _wander(120)
+    seen = np.tile([2.0, -1.0], (120, 1))
     same = {'disturbance_share': 1.0, 'integral_time': 1.0}
     linear, nonlinear = (
         _run(_make(kind, drive, **same), drive, reference, lambda chi: seen[0], seen)[2]
@@ -547,28 +512,12 @@ def test_condensing_closes_the_gaps_and_superposes(lasting):
         assert there[j] == pytest.approx(speeds, rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize('drive', DRIVES)
-def test_derivatives_of_the_model_are_its_differences(drive):
-    casadi = pytest.importorskip('casadi')
-    model = wheel_dynamics(_knowledge(drive, {}), 1.3, casadi)
-    at = [np.array([0.1, -2.0]), np.array([1.0, 3.0]), np.array([0.5, -1.0])]
-    for which in (0, 1):
-        slopes = np.array(model(*at)[1 + which])
-        for entry in range(2):
-            ends = []
-            for side in (1e-6, -1e-6):
-                moved = [value.copy() for value in at]
-                moved[which][entry] += side
-                ends.append(np.array(model(*moved)[0]).ravel())
-            assert slopes[:, entry] == pytest.approx((ends[0] - ends[1]) / 2e-6, abs=1e-7)
-
-
 def test_one_linearisation_a_step_follows_the_converged_plan():
     """Real-time iterations: what one leaves over, the next step takes up."""
-    reference = _wander(200)
+    reference = _wander(90)
     once, often = (
         _run(_make(CasadiNmpc, 'velocity', robot={}, iterations=count), 'velocity', reference)[0]
-        for count in (1, 5)
+        for count in (1, 4)
     )
     assert np.abs(once - often).max() < 0.02
 
@@ -584,14 +533,8 @@ def test_without_casadi_only_making_one_fails(monkeypatch):
 
 @pytest.mark.parametrize('drive', DRIVES)
 @pytest.mark.parametrize('kind', EVERY)
-def test_equal_runs_are_equal_bit_for_bit_and_lent_arrays_stay(kind, drive):
-    reference = _wander(120)
-    kept = reference.copy()
-    one, two = (
-        _run(_make(kind, drive, robot={}), drive, reference, noise=0.2)[2] for _ in range(2)
-    )
-    assert np.array_equal(one, two)
-    assert np.array_equal(reference, kept)
+def test_what_is_lent_stays_and_the_answer_too(kind, drive):
+    reference = _wander(5)
     baseline = _make(kind, drive, robot={})
     lent = [np.array([0.1 * i, -0.2]) for i in range(1, 6)]
     copies = [array.copy() for array in lent]
@@ -603,26 +546,12 @@ def test_equal_runs_are_equal_bit_for_bit_and_lent_arrays_stay(kind, drive):
     assert np.array_equal(answer, before), 'the answer must not be overwritten by the next step'
 
 
-@pytest.mark.parametrize('kind', [LinearMpcPreview, DynamicMatrixPreview, CasadiNmpc])
-def test_preview_without_a_future_is_refused(kind):
-    baseline = _make(kind, 'velocity')
+def test_no_preview_and_settings_of_another_method_are_refused():
+    baseline = _make(LinearMpcPreview, 'velocity')
     with pytest.raises(ValueError, match='future'):
         baseline.step(Observation(*(np.zeros(2) for _ in range(5)), None))
-
-
-@pytest.mark.parametrize(
-    'kind, wrong',
-    [
-        (LinearMpc, LinearMpcPreviewParameters()),
-        (LinearMpcPreview, LinearMpcParameters()),
-        (DynamicMatrix, DynamicMatrixPreviewParameters()),
-        (DynamicMatrixPreview, DynamicMatrixParameters()),
-        (CasadiNmpc, LinearMpcParameters()),
-    ],
-)
-def test_settings_of_another_method_are_refused(kind, wrong):
-    with pytest.raises(ValueError, match='parameters'):
-        kind(wrong, _knowledge('velocity'))
+    with pytest.raises(ValueError, match='parameters must be LinearMpcPreviewParameters'):
+        LinearMpcPreview(LinearMpcParameters(), _knowledge('velocity'))
 
 
 @pytest.mark.parametrize('drive', DRIVES)
@@ -633,7 +562,7 @@ def test_cut_answers_leave_no_wind_up(kind, drive):
     nominal_model = _knowledge(drive)
     speeds, command, far = np.zeros(2), np.zeros(2), np.array([6.0, -6.0])
     highest = 0.0
-    for k in range(600):
+    for k in range(400):
         reference = far if k < 50 else 0.1 * far
         future = np.tile(reference, (AHEAD, 1)) if kind.preview else None
         u = baseline.step(

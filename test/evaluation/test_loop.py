@@ -13,6 +13,7 @@
 # limitations under the License.
 """The closed loop at kernel speed: same physics, same runs, honest cases and statistics."""
 
+from copy import deepcopy
 from dataclasses import dataclass
 import math
 
@@ -85,25 +86,14 @@ class Noting(Proportional):
 
     def __init__(self, parameters, nominal_model):
         super().__init__(parameters, nominal_model)
-        self.seen, self.told, self.terms = [], [], np.zeros((5, 2))
+        self.seen, self.answers, self.told, self.terms = [], [], [], np.zeros((5, 2))
 
     def step(self, observation):
-        u = super().step(observation)
-        future = None if observation.future is None else observation.future.copy()
-        self.seen.append(
-            [
-                *(
-                    np.array(getattr(observation, name))
-                    for name in ('speeds', 'unexplained', 'command')
-                ),
-                observation.reference.copy(),
-                observation.next_reference.copy(),
-                future,
-            ]
-        )
+        self.seen.append(deepcopy(observation))
+        self.answers.append(super().step(observation))
         self.terms = np.zeros((5, 2))
-        self.terms[2] = u
-        return u
+        self.terms[2] = self.answers[-1]
+        return self.answers[-1].copy()
 
     def applied(self, acceleration, *, limited):
         self.told.append((acceleration.copy(), limited))
@@ -132,12 +122,17 @@ def assert_equal_records(first, second):
 # -- the plant --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('drive', ['torque', 'velocity'])
 @pytest.mark.parametrize(
-    'changes',
+    'drive, changes',
     [
-        {'noise.variance': 0.1, 'drive.dead_time': 0.03, 'disturbance.walk_rate': 20.0},
-        {'mass_factor': 1.3, 'inertia_factor': 0.8, 'substep': 0.0007, 'rate': 200.0},
+        (
+            'velocity',
+            {'noise.variance': 0.1, 'drive.dead_time': 0.03, 'disturbance.walk_rate': 20.0},
+        ),
+        (
+            'torque',
+            {'mass_factor': 1.3, 'inertia_factor': 0.8, 'substep': 0.0007, 'rate': 200.0},
+        ),
     ],
     ids=['late, wild walk', 'heavy, other grid'],
 )
@@ -255,10 +250,9 @@ def test_every_case_affects_the_run_load_change_from_half(robot):
         assert differs[0] == 101 if case == 'load change' else differs[0] < 10
 
 
-@pytest.mark.parametrize('robot', PLANTS)
-def test_faults_of_the_links_begin_in_time(robot):
+def test_faults_of_the_links_begin_in_time():
     nominal, overload = (
-        run(Scenario(robot, case, 2, 12.0), P) for case in ('nominal', 'overload')
+        run(Scenario('servo', case, 2, 12.0), P) for case in ('nominal', 'overload')
     )
     begin = 600
     np.testing.assert_array_equal(nominal.speeds[: begin + 1], overload.speeds[: begin + 1])
@@ -269,38 +263,16 @@ def test_faults_of_the_links_begin_in_time(robot):
     assert overload.finite
 
 
-class ElapsedNoting(Proportional):
-    """Notes the periods between its observations."""
-
-    def __init__(self, parameters, nominal_model):
-        super().__init__(parameters, nominal_model)
-        self.elapsed = []
-
-    def step(self, observation):
-        self.elapsed.append(observation.elapsed)
-        return super().step(observation)
-
-
 def test_a_method_knows_how_many_measurements_were_lost():
-    scenario = Scenario('servo', 'dropouts', 2, 20.0)
-    record, method = noted(ElapsedNoting, scenario)
-    again, _ = noted(ElapsedNoting, scenario)
-    assert_equal_records(record, again)
-    assert 1700 < len(method.elapsed) < 1900
-    assert 1990 < sum(method.elapsed) <= scenario.steps
-    assert max(method.elapsed) > 1
+    scenario = Scenario('servo', 'dropouts', 2, 10.0)
+    record, method = noted(Noting, scenario)
+    assert_equal_records(record, noted(Noting, scenario)[0])
+    elapsed = [seen.elapsed for seen in method.seen]
+    assert 850 < len(elapsed) < 950
+    assert 990 < sum(elapsed) <= scenario.steps
+    assert max(elapsed) > 1
     held = (record['sent'][1:] == record['sent'][:-1]).all(axis=1).sum()
-    assert held == scenario.steps - len(method.elapsed)
-    _, method = noted(ElapsedNoting, Scenario('servo', 'nominal', 2, 2.0))
-    assert set(method.elapsed) == {1}
-
-
-def test_the_load_change_makes_the_robot_heavier_and_rougher():
-    scenario = Scenario('torque', 'load change', 2)
-    changes = {'mass_factor': 1.3, 'inertia_factor': 1.3, 'friction_factor': 2.0}
-    assert scenario.parts.later['torque'] == changes
-    assert scenario.fault_span == (30.0, math.inf)
-    assert Scenario('torque', 'nominal', 2).fault_span is None
+    assert held == scenario.steps - len(elapsed)
 
 
 def test_a_method_knows_how_fast_both_wheels_may_change_at_once():
@@ -372,13 +344,10 @@ def test_equal_runs_are_equal_bit_for_bit_whatever_ran_between(robot, method):
 
 @pytest.mark.parametrize('robot', PLANTS)
 def test_a_simple_controller_tracks_in_both_drives(robot):
-    record = run(Scenario(robot, 'nominal', 1, 20.0, noise=0.0), P)
+    record = run(Scenario(robot, 'nominal', 1, 14.0, noise=0.0), P)
     assert record.finite
-    assert record.rmse() < 0.5  # by the jump
+    assert record.rmse() < 0.5  # by the jump at 12 s
     assert record.rmse(margins=(0.4, 0.6)) < 0.15
-    # Twice the gain takes the error away faster after the jump at 12 s.
-    faster = MethodSpec('2 P', Proportional, ProportionalParameters(gain=16.0))
-    assert run(Scenario(robot, 'nominal', 1, 20.0, noise=0.0), faster).rmse() < record.rmse()
 
 
 @pytest.mark.parametrize('robot', PLANTS)
@@ -390,28 +359,23 @@ def test_what_is_recorded_fits_together(robot):
     assert record.time[-1] == 13.99
     noise = record['measured'] - record.speeds
     assert np.var(noise) == pytest.approx(0.04, rel=0.1)
-    np.testing.assert_array_equal(record['terms'][:, 2], [entry[0] for entry in method_u(method)])
+    np.testing.assert_array_equal(record['terms'][:, 2], method.answers)
     np.testing.assert_array_equal(record['acceleration'], [told[0] for told in method.told])
     np.testing.assert_array_equal(record['limited'], [told[1] for told in method.told])
-    np.testing.assert_array_equal(record['unexplained'], [seen[1] for seen in method.seen])
+    np.testing.assert_array_equal(
+        record['unexplained'], [seen.unexplained for seen in method.seen]
+    )
     if robot == 'torque':
         inertia = wheel_inertia(scenario.true_robot().body, scenario.true_robot().geometry)
         np.testing.assert_allclose(record['sent'], record['acceleration'] @ inertia, atol=1e-15)
-        np.testing.assert_array_equal(record['estimated'], [seen[0] for seen in method.seen])
+        np.testing.assert_array_equal(record['estimated'], [seen.speeds for seen in method.seen])
         assert not record['limited'].any()
     else:
-        commands = np.array([seen[2] for seen in method.seen])
+        commands = np.array([seen.command for seen in method.seen])
         np.testing.assert_array_equal(record['sent'][:-1], commands[1:])
         change = np.abs(np.diff(record['sent'], axis=0)).max() * RATE
         assert change <= scenario.limits.wheel_acceleration * (1 + 1e-9)
         assert record['limited'].any()  # the jump at 12 s cannot be followed at once
-
-
-def method_u(method):
-    """Return what the method answered, from what it saw."""
-    for speeds, unexplained, _, reference, following, _ in method.seen:
-        slope = (following - reference) / method.nominal_model.period
-        yield (slope - 8.0 * (speeds - reference) - unexplained,)
 
 
 @pytest.mark.parametrize(
@@ -424,15 +388,15 @@ def test_observation_holds_the_reference_after_the_dead_time(robot, case, late):
     _, blind = noted(Noting, scenario)
     _, seer = noted(ForeseeingNoting, scenario)
     for k in (0, 500, 1200 - late - 1, 1200 - late, 1199, 1200, 1249):
-        *_, reference, following, future = seer.seen[k]
-        assert future.shape == (40, 2)
-        np.testing.assert_array_equal(future, sampled.speeds[k + late : k + late + 40])
-        np.testing.assert_array_equal([reference, following], future[:2])
-        *_, reference, following, future = blind.seen[k]
-        assert future is None
+        seen = seer.seen[k]
+        assert seen.future.shape == (40, 2)
+        np.testing.assert_array_equal(seen.future, sampled.speeds[k + late : k + late + 40])
+        np.testing.assert_array_equal([seen.reference, seen.next_reference], seen.future[:2])
+        seen = blind.seen[k]
+        assert seen.future is None
         r, slope = sampled.speeds[k], sampled.rate[k]
-        np.testing.assert_allclose(reference, r + late * 0.01 * slope, atol=1e-12)
-        np.testing.assert_allclose(following, r + (late + 1) * 0.01 * slope, atol=1e-12)
+        np.testing.assert_allclose(seen.reference, r + late * 0.01 * slope, atol=1e-12)
+        np.testing.assert_allclose(seen.next_reference, r + (late + 1) * 0.01 * slope, atol=1e-12)
 
 
 class NotingActuation(VelocityActuation):
@@ -470,29 +434,6 @@ def test_estimator_gets_every_measurement_once_in_order(robot, monkeypatch):
     np.testing.assert_array_equal(log[0][1], record['measured'][0])
     np.testing.assert_array_equal([entry[1] for entry in log[1::2]], record['measured'])
     assert_equal_records(record, expected)
-
-
-@pytest.mark.parametrize('robot', PLANTS)
-def test_estimate_beats_measurement_and_contains_friction(robot):
-    record = run(Scenario(robot, 'nominal', 8, 12.0), P)
-    error = np.sqrt(np.mean((record['estimated'] - record.speeds)[300:] ** 2))
-    assert error < 0.7 * 0.2
-    # What chi' = u leaves over is mostly Coulomb friction, against the motion.
-    moving = np.abs(record.speeds) > 1.0
-    against = record['unexplained'] * np.sign(record.speeds) < 0.0
-    assert against[moving].mean() > 0.8
-
-
-def test_estimator_without_the_dead_time_predicts_wrongly(monkeypatch):
-    scenario = Scenario('servo', 'dead time', 3, 15.0)
-    missed = []
-    for assumed in (None, 0.01):
-        monkeypatch.setattr(drivers, 'VelocityActuation', NotingActuation)
-        monkeypatch.setattr(NotingActuation, 'assumed', assumed)
-        record, method = noted(Noting, scenario)
-        shown = np.array([seen[0] for seen in method.seen])
-        missed.append(np.sqrt(np.mean((shown[300:-3] - record.speeds[303:]) ** 2)))
-    assert missed[0] < 0.75 * missed[1]
 
 
 def test_estimator_and_method_get_the_torque_limited_u():

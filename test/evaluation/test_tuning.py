@@ -18,11 +18,11 @@ import itertools
 import json
 import math
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
 from t3mpc_ros.evaluation.cases import ROBOTS
@@ -129,17 +129,10 @@ def test_settings_and_cube_map_onto_each_other():
         np.testing.assert_allclose(np.delete(again - point, 2), 0.0, atol=1e-12)
         assert space.values(again) == pytest.approx(values, rel=1e-12)
         assert space.values(again)['count'] == values['count']
-
-
-@pytest.mark.parametrize('low, high', [(0.1, 1e3), (1e-6, 3.3), (0.7, 0.9)])
-@pytest.mark.parametrize('log', [True, False])
-def test_cube_maps_to_the_bounds_and_their_mean(low, high, log):
-    space = SearchSpace(Gains, [SearchRange('a', low, high, log)])
-    assert space.values(np.zeros(1))['a'] == pytest.approx(low, rel=1e-12)
-    assert space.values(np.ones(1))['a'] == pytest.approx(high, rel=1e-12)
-    assert low <= space.values(np.zeros(1))['a'] < space.values(np.ones(1))['a'] <= high
-    middle = math.sqrt(low * high) if log else 0.5 * (low + high)
-    assert space.values(np.array([0.5]))['a'] == pytest.approx(middle, rel=1e-12)
+    ends = [space.values(np.full(4, p)) for p in (0.0, 0.5, 1.0)]
+    assert [values['a'] for values in ends] == pytest.approx([0.1, 10.0, 1000.0], rel=1e-12)
+    assert [values['b'] for values in ends] == pytest.approx([-3.0, 1.0, 5.0], rel=1e-12)
+    assert [values['count'] for values in (ends[0], ends[2])] == [1, 40]
 
 
 def test_whole_numbers_have_equal_cells_and_stay_whole():
@@ -148,9 +141,6 @@ def test_whole_numbers_have_equal_cells_and_stay_whole():
     counts = [space.values(point)['count'] for point in points]
     assert {type(count) for count in counts} == {int}
     assert [counts.count(n) for n in range(3, 8)] == [200] * 5
-    widened = SearchSpace(Gains, [SearchRange('count', 1, 40)])
-    for n in range(1, 41):
-        assert widened.values(widened.point(Gains(count=n))) == {'count': n}
 
 
 @pytest.mark.parametrize(
@@ -180,8 +170,8 @@ def test_bad_ranges_are_rejected_by_name_bound_and_value(tuned, complaint):
 # The search
 
 
-@pytest.mark.parametrize('n', [1, 2, 5, 8])
-@pytest.mark.parametrize('evaluations', [1, 2, 9, 10, 11, 61])
+@pytest.mark.parametrize('n', [1, 8])
+@pytest.mark.parametrize('evaluations', [1, 2, 10, 11, 61])
 def test_every_method_gets_exactly_its_evaluations(n, evaluations):
     seen, progress = [], []
 
@@ -225,15 +215,6 @@ def test_badly_scaled_gains_are_found_by_their_logarithms():
     assert found.value < 1e-5 * found.start_value
 
 
-def test_an_optimal_start_is_returned_bit_equal():
-    start = Gains(a=1.0 / 3.0, b=math.pi, c=1e-7)
-    space = SearchSpace(Gains, [SearchRange(name, 1e-9, 1e2) for name in 'abc'])
-    best = np.array([start.a, start.b, start.c])
-    found = search_best(each(lambda x: float(np.sum((x - best) ** 2))), space, start, 50, 1)
-    assert found.values == {'a': start.a, 'b': start.b, 'c': start.c}
-    assert found.value == found.start_value == 0.0
-
-
 def test_equal_seeds_give_equal_searches_without_global_rng():
     before = np.random.get_state()  # noqa: NPY002
     first, second, other = (
@@ -249,11 +230,11 @@ def test_equal_seeds_give_equal_searches_without_global_rng():
 def test_the_last_point_is_where_the_search_believes_the_optimum():
     """The mean of the distribution is nearer than its samples are."""
     better = 0
-    for seed in range(20):
+    for seed in range(10):
         found = search_best(each(sphere), linear(5), Gains(), 81, seed)
         values = [point.value for point in found.history]
         better += values[-1] < np.median(values[-9:-1])
-    assert better >= 18
+    assert better >= 9
 
 
 @pytest.mark.slow
@@ -263,14 +244,13 @@ def test_a_search_that_converged_begins_again_and_leaves_a_trap():
     def traps(x):
         return float(min(0.1 + abs(x[0] - 3.9), abs(x[0] - 0.3)))
 
-    for seed in range(5):
-        first = search_best(each(traps), linear(1), Gains(a=3.8), 60, seed)
-        assert first.values['a'] == pytest.approx(3.9, abs=0.01)
-    found = [search_best(each(traps), linear(1), Gains(a=3.8), 900, seed) for seed in range(5)]
-    assert [one.values['a'] for one in found] == pytest.approx([0.3] * 5, abs=0.01)
+    for seed in range(2):
+        for evaluations, bottom in ((60, 3.9), (900, 0.3)):
+            found = search_best(each(traps), linear(1), Gains(a=3.8), evaluations, seed)
+            assert found.values['a'] == pytest.approx(bottom, abs=0.01)
 
 
-@pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf, 1e300])
+@pytest.mark.parametrize('bad', [math.nan, -math.inf, 1e300])
 def test_values_that_are_not_numbers_count_as_worst(bad):
     """Half of the cube fails, next to the optimum."""
 
@@ -285,16 +265,12 @@ def test_values_that_are_not_numbers_count_as_worst(bad):
     assert all(one.value >= 1e300 for one in failed)
     assert found.value < 1e-3
     assert found.values['a'] <= 1.5
+    hopeless = search_best(each(lambda x: bad), linear(3), start, 70, 1)
+    assert len(hopeless.history) == 70
+    assert hopeless.values == {'a': 1.4, 'b': 2.0, 'c': 2.0}
 
 
-def test_a_method_that_always_fails_uses_the_same_budget():
-    found = search_best(each(lambda x: math.nan), linear(3), Gains(), 70, 1)
-    assert len(found.history) == 70
-    assert (found.value, found.values) == (math.inf, {'a': 2.0, 'b': 2.0, 'c': 2.0})
-
-
-@pytest.mark.parametrize('n', [1, 2, 6])
-@pytest.mark.parametrize('log', [True, False])
+@pytest.mark.parametrize('n, log', [(1, True), (6, False)])
 def test_bounds_are_never_exceeded_and_a_corner_is_reached(n, log):
     """The optimum lies outside, beyond every upper bound."""
     space = SearchSpace(Gains, [SearchRange(name, 0.5, 4.0, log) for name in LETTERS[:n]])
@@ -307,17 +283,6 @@ def test_bounds_are_never_exceeded_and_a_corner_is_reached(n, log):
     assert tried[found.history.index(min(found.history, key=lambda one: one.value))] == (
         pytest.approx([4.0] * n, rel=0.02)
     )
-
-
-def test_whole_numbers_are_searched_too():
-    space = SearchSpace(Gains, [SearchRange('count', 1, 40), SearchRange('a', 0.1, 100.0)])
-
-    def objective(points):
-        return [abs(one['count'] - 23) + (one['a'] - 7.0) ** 2 for one in points]
-
-    found = search_best(objective, space, Gains(), 250, 1)
-    assert found.values['count'] == 23
-    assert found.values['a'] == pytest.approx(7.0, rel=1e-2)
 
 
 def test_what_cannot_be_searched_is_refused():
@@ -348,7 +313,7 @@ def interrupted_after(generations):
     return objective
 
 
-@pytest.mark.parametrize('generations', [0, 1, 2, 13])
+@pytest.mark.parametrize('generations', [0, 1, 2, 9])
 def test_a_resumed_search_is_the_uninterrupted_one(tmp_path, generations):
     whole, cut = tmp_path / 'whole.jsonl', tmp_path / 'cut.jsonl'
     space, start = linear(4), Gains()
@@ -401,31 +366,14 @@ def test_torn_lines_and_those_of_another_search_are_not_used(tmp_path):
 # The objective of a run
 
 
-@dataclass
-class Measured:
-    error: float
-    varied: float
-
-    def rmse(self):
-        return self.error
-
-    def variation(self):
-        return self.varied
-
-
 @pytest.mark.parametrize(
     'error, varied, cost',
-    [
-        (0.2, 0.0, 0.2),
-        (0.2, 1000.0, 0.21),
-        (math.nan, 1.0, math.inf),
-        (1.0, math.nan, math.inf),
-        (math.inf, 1.0, math.inf),
-    ],
+    [(0.2, 1000.0, 0.21), (math.nan, 1.0, math.inf), (1.0, math.nan, math.inf)],
 )
 def test_a_thousand_of_variation_costs_a_hundredth(error, varied, cost, monkeypatch):
-    monkeypatch.setattr(tune_module, 'run', Measured)
-    assert objective((error, varied)) == pytest.approx(cost)
+    record = SimpleNamespace(rmse=lambda: error, variation=lambda: varied)
+    monkeypatch.setattr(tune_module, 'run', lambda *job: record)
+    assert objective(()) == pytest.approx(cost)
 
 
 @pytest.mark.slow
@@ -434,10 +382,9 @@ def test_tuning_mixes_noises_and_excludes_held_out_seeds():
     assert {run.seed for run in runs} == {*TUNING_SEEDS}
     assert not {*TUNING_SEEDS} & {*HELD_OUT_SEEDS}
     assert [run.noise for run in runs] == 3 * [0.0, 0.04, 0.1]
-    for scenario in runs[::4]:
-        modes = scenario.reference().modes[: scenario.steps]
-        assert np.count_nonzero(np.diff(modes)) >= 1
-        assert (scenario.robot, scenario.case) == ('torque', 'nominal')
+    modes = runs[0].reference().modes[: runs[0].steps]
+    assert np.count_nonzero(np.diff(modes)) >= 1
+    assert {(run.robot, run.case) for run in runs} == {('torque', 'nominal')}
     mixed = budget(3, noise_levels=(0.04,), cases=('nominal', 'mass +30 %'))
     cases = [(run.robot, run.case) for run in mixed.scenarios('velocity')]
     assert cases == [('servo', case) for case in ('nominal', 'mass +30 %', 'nominal')]
@@ -448,7 +395,6 @@ def test_tuning_mixes_noises_and_excludes_held_out_seeds():
     [
         ({'training_seeds': (1, 1)}, 'training_seeds must differ'),
         ({'noise_levels': (0.0, 0.1, 0.2)}, 'noise_levels must be 1 to 2, a seed each'),
-        ({'noise_levels': ()}, 'noise_levels must be 1 to 2'),
         ({'cases': ('nominal', 'mass +30 %', 'jitter')}, 'cases must be 1 to 2'),
     ],
 )
@@ -728,18 +674,10 @@ def _one(content):
     'change, complaint',
     [
         (lambda c: _one(c)['values'].update(a=2000.0), 'one, torque: a must be from 0 to 1000'),
-        (
-            lambda c: _one(c)['values'].update(a='yes'),
-            "a must be a number: got 'yes'",
-        ),
         (lambda c: _one(c).update(tuned=['z']), 'z was tuned, but has no value'),
         (lambda c: _one(c).pop('version'), "missing 1 required .* 'version'"),
-        (lambda c: _one(c).update(note='x'), "unexpected keyword argument 'note'"),
-        (lambda c: _one(c).update(values=[1.0]), "no attribute 'items'"),
         (lambda c: _one(c)['budget'].update(evaluations=0), 'evaluations must be at least 1'),
-        (lambda c: _one(c)['budget'].update(duratoin=1.0), 'did you mean duration'),
         (lambda c: c.update(format=2), 'format must be 1: got 2'),
-        (lambda c: c.pop('methods'), "'methods'"),
         (lambda c: c.update(methods=[]), "no attribute 'items'"),
     ],
 )
@@ -747,12 +685,7 @@ def test_a_file_that_does_not_fit_is_refused_by_where_and_why(stored, change, co
     path = stored(change)
     with pytest.raises(StoreError, match=complaint):
         TunedParameters.load(path).applied('one', 'torque', Gains())
-
-
-@pytest.mark.parametrize('text', ['', '{', '[]', 'null', '\udcff'])
-def test_what_is_no_such_file_is_refused(tmp_path, text):
-    path = tmp_path / 'tuned.json'
-    path.write_bytes(text.encode(errors='surrogateescape'))
+    path.write_bytes(b'\xff')
     with pytest.raises(StoreError, match='tuned.json holds no tuned parameters'):
         TunedParameters.load(path)
 
@@ -766,25 +699,6 @@ def test_unequal_budgets_are_distinguished():
         store.check_equal()
     elsewhere = TunedParameters({('one', 'torque'): ENTRY, ('two', 'twin'): other})
     elsewhere.check_equal()  # compared with nothing but methods on the twin
-
-
-def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
-    path = tmp_path / 'tuned.json'
-    write_atomically(path, 'old')
-
-    def full(*_):
-        raise OSError('no space left')
-
-    with monkeypatch.context() as patch:
-        patch.setattr('os.fsync', full)
-        with pytest.raises(OSError, match='no space'):
-            write_atomically(path, 'new')
-    with pytest.raises(UnicodeEncodeError):
-        write_atomically(path, '\udcff')
-    assert path.read_text() == 'old'
-    assert list(tmp_path.iterdir()) == [path]
-    write_atomically(path, 'new')
-    assert path.read_text() == 'new'
 
 
 # The command line

@@ -79,10 +79,10 @@ class TapeBag(ControllerBag):
 class TrainingRun:
     """A controller on the simulated robot of the paper, recorded as by the nodes.
 
-    It is disabled in the control periods ``off``; ``learnt`` are its weights at the start.
+    It is disabled in the control periods ``off``.
     """
 
-    def __init__(self, seed, duration, learnt=None, off=(), **changes):
+    def __init__(self, seed, duration, off=(), **changes):
         scenario = Scenario('servo', 'nominal', seed, duration)
         robot = PaperRobot(scenario.true_robot())
         parameters = ControllerParameters.from_dict(changes)
@@ -90,13 +90,11 @@ class TrainingRun:
         self.tape = Tape({'controller': table})
         recorded = RecordedController(parameters, TapeBag(self.tape), START - 1)
         self.controller = recorded.controller
-        if learnt is not None:
-            self.controller.set_weights(learnt)
-        self.wanted = scenario.reference().speeds
-        self.statuses, self.speeds, self.estimates, self.unexplained = [], [], [], []
+        reference = scenario.reference().speeds
+        self.statuses, self.estimates, self.unexplained = [], [], []
 
         def add_reference(k, now_ns):
-            twist = twist_from_wheels(WheelSpeeds(*self.wanted[k].tolist()), GEOMETRY)
+            twist = twist_from_wheels(WheelSpeeds(*reference[k].tolist()), GEOMETRY)
             recorded.add_reference(now_ns, State(START + k * STEP, ORIGIN, twist))
 
         for k in range(LEAD):
@@ -109,13 +107,8 @@ class TrainingRun:
                 recorded.enable(now_ns - 1, k == off[-1])
             twist = recorded.step(now_ns, state.odometry)
             self.statuses.append(self.controller.status)
-            self.speeds.append(state.true_wheels)
             self.estimates.append(self.controller.actuation.speeds.copy())
             self.unexplained.append(self.controller.actuation.disturbance.copy())
             state = robot.step(wheels_from_twist(twist, GEOMETRY))
         self.terms = np.array([status.terms for status in self.statuses])
         self.errors = -self.terms[:, 1] / self.controller.parameters.law.gain
-
-    def rmse(self, seconds):
-        n = round(100 * seconds)
-        return float(np.sqrt(np.mean((np.array(self.speeds[:n]) - self.wanted[:n]) ** 2)))

@@ -21,56 +21,25 @@ from support import robot_bags
 
 import t3mpc_ros as t3
 
-SHORT = {'plant': 'servo', 'duration': 3.0}
-
-
-class Attentive:
-    """Feed-forward with a correction; keeps what it gets."""
-
-    preview = True
-
-    def __init__(self):
-        self.seen = []
-
-    def step(self, observation):
-        self.seen.append(observation)
-        slope = (observation.next_reference - observation.reference) / 0.01
-        return slope - 5.0 * self.error(observation)
-
-    def error(self, observation):
-        return observation.speeds - observation.reference
-
-
-class InPlace(Attentive):
-    """The natural mistake: it once made the settled error 20 times larger without a word."""
-
-    def error(self, observation):
-        error = observation.speeds
-        error -= observation.reference
-        return error
-
-
-def test_a_controller_that_writes_into_an_observation_is_told():
-    t3.simulate(Attentive, **SHORT)
-    with pytest.raises(t3.ScriptError, match=r'InPlace raised ValueError .*read-only.* in error'):
-        t3.simulate(InPlace, **SHORT)
+SHORT = {'plant': 'servo', 'duration': 1.0}
 
 
 def test_no_array_of_an_observation_can_be_written():
-    controller = Attentive()
+    """``error = observation.speeds; error -= ...`` once made the error 20 times larger."""
+    seen = []
 
     def step(observation):
-        return controller.step(observation)
+        seen.append(observation)
+        return np.zeros(2)
 
     step.preview = True
-    t3.simulate(step, plant='servo', duration=1.0)
-    first = controller.seen[0]
-    names = [each.name for each in fields(first)]
-    arrays = [name for name in names if isinstance(getattr(first, name), np.ndarray)]
+    t3.simulate(step, plant='servo', duration=0.1)
+    names = [each.name for each in fields(seen[0])]
+    arrays = [name for name in names if isinstance(getattr(seen[0], name), np.ndarray)]
     assert {'speeds', 'reference', 'future'} <= {*arrays}
     for name in arrays:
         with pytest.raises(ValueError, match='read-only'):
-            getattr(first, name)[...] = 0.0
+            getattr(seen[0], name)[...] = 0.0
 
 
 def test_an_observation_that_is_kept_does_not_change():
@@ -87,7 +56,10 @@ def test_an_observation_that_is_kept_does_not_change():
 
 
 def test_what_the_limits_let_through_cannot_be_written():
-    class Follows(Attentive):
+    class Follows:
+        def step(self, observation):
+            return np.zeros(2)
+
         def applied(self, acceleration, *, limited):
             acceleration *= 0.0
 
@@ -144,10 +116,10 @@ def test_columns_of_a_result_cannot_be_written(tmp_path):
 
 def test_results_that_are_made_anew_belong_to_the_script():
     run = t3.simulate('feed-forward', **SHORT)
-    before = run.rmse(after=1.0)
+    before = run.rmse(after=0.5)
     run.error[:] = 0.0
     system = t3.fuzzy('x')
     first = system.basis([0.5])
     first[:] = 0.0
-    assert run.rmse(after=1.0) == before
+    assert run.rmse(after=0.5) == before
     assert system.basis([0.5]).sum() == pytest.approx(1.0)

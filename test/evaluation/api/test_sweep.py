@@ -28,7 +28,6 @@ import t3mpc_ros as t3
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation import run_digest
 from t3mpc_ros.evaluation.api import parameter_sweep
-from t3mpc_ros.evaluation.api.comparison_runs import checked_seeds
 from t3mpc_ros.evaluation.api.parameter_sweep import make_runs
 from t3mpc_ros.evaluation.cases import LinkFaults
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule
@@ -72,12 +71,12 @@ def test_a_row_holds_all_that_was_run():
     found = t3.sweep(
         [Proportional, 'ADRC'],
         {'gain': np.array([10.0, 20.0]), 'robot.friction_factor': [1.0, 3.0], 'noise': [0.0]},
-        seeds=[1, 2],
+        seeds=[2],
         cases=['nominal', 'mass +30 %'],
         executor=1,
         **SHORT,
     )
-    assert len(found.rows) == 2 * 2 * 2 * 2 * 2
+    assert len(found.rows) == 2 * 2 * 2 * 2
     row = found.rows[0]
     assert row['version'] == t3.__version__
     assert {'commit', 'python', 'reference', 'case', 'duration', 'robot', 'run'} <= {*row}
@@ -191,7 +190,7 @@ def test_a_sweep_with_more_values_runs_only_these(tmp_path, counted):
     found = t3.sweep(Proportional, more, seeds=[1], executor=1, output=path, **SHORT)
     assert len(counted) == 3
     assert [row['gain'] for row in found.rows] == [10.0, 20.0, 30.0]
-    t3.sweep('ADRC', {}, seeds=[1], executor=1, output=path, **SHORT)
+    t3.sweep('ADRC', {}, seeds=np.arange(1, 2), executor=1, output=path, **SHORT)
     table = parquet.read_table(path)
     assert sorted(table['controller'].to_pylist()) == ['ADRC', *['Proportional'] * 3]
     assert table.schema.metadata[b'version'] == t3.__version__.encode()
@@ -319,12 +318,10 @@ def test_the_key_of_a_run_ignores_files_named_like_a_case(tmp_path, monkeypatch)
         ((Proportional, [1.0]), 'parameters must map names to lists of values'),
         ((Proportional, {'gain': 3.0}), 'gain must be a list of values: got 3.0'),
         ((Proportional, {'gain': []}), 'each parameter must have one or more values'),
-        ((Proportional, {'gain': [1.0, 1.0]}), 'values must differ'),
         ((Proportional, {'gain': [20, 20.0]}), 'values must differ: got .20, 20.0. of gain'),
         ((Proportional, {'gain': [[1.0, 2.0]]}), 'gain must be numbers, truth values or texts'),
         ((Proportional, {'gain': [20.0, math.inf]}), 'values of gain must be finite: got inf'),
         ((Proportional, {'seed': [1, 2]}), 'seed is a column of every sweep'),
-        ((Proportional, {'settled': [1, 2]}), 'settled is a column of every sweep'),
         ((Proportional, {1: [1.0]}), 'parameters must map names to lists of values: got 1'),
         (
             ([t3.Controller(Proportional, name='a'), t3.Controller(Made, name='a')], {}),
@@ -374,11 +371,6 @@ def test_values_that_no_file_holds_are_refused_before_the_runs(tmp_path, counted
     assert not counted
 
 
-def test_seeds_may_be_integers_of_numpy():
-    """``np.arange`` was refused: *whole numbers of at least 0: got np.int64(1)*."""
-    assert checked_seeds(np.arange(1, 3)) == (1, 2)
-
-
 def test_a_parameter_that_is_set_twice_is_refused(capsys):
     """Of ``--set gain=20 --set gain=10`` only the last one was swept, without a word."""
     assert main(['sweep', '--set', 'law.gain=20', '--set', 'law.gain=10']) == 1
@@ -394,16 +386,19 @@ def test_a_value_that_is_not_finite_is_refused(tmp_path, capsys):
     assert 'values of gain must be finite: got nan' in capsys.readouterr().err
 
 
-@pytest.mark.slow
-def test_the_command_writes_the_same_rows(tmp_path, capsys):
-    parquet = pytest.importorskip('pyarrow.parquet')
-    path = tmp_path / 'runs' / 'sweep.parquet'  # no folder yet, as of the default output
+def assert_the_command_has_the_same_rows(path, capsys, *options):
     words = ['--set', 'gain=10.0,20.0', '--robot', 'servo', '--duration', '2', '--seeds', '1-2']
-    code = main(['sweep', 'ADRC', *words, '--workers', '1', '--output', str(path)])
-    assert code == 0
+    assert main(['sweep', 'ADRC', *words, '--output', str(path), *options]) == 0
     found = t3.sweep('ADRC', GAINS, seeds=[1, 2], executor=1, **SHORT)
     assert found.table() in capsys.readouterr().out
-    assert parquet.read_table(path)['overall'].to_pylist() == found.columns['overall']
+    rows = pytest.importorskip('pyarrow.parquet').read_table(path)
+    assert rows['overall'].to_pylist() == found.columns['overall']
+
+
+@pytest.mark.slow
+def test_the_command_writes_the_same_rows(tmp_path, capsys):
+    path = tmp_path / 'runs' / 'sweep.parquet'  # no folder yet, as of the default output
+    assert_the_command_has_the_same_rows(path, capsys, '--workers', '1')
 
 
 # -- clusters -----------------------------------------------------------------------------------
@@ -424,46 +419,34 @@ def test_a_cluster_gives_the_same_numbers(tmp_path, capsys):
     ):
         together = t3.sweep(Proportional, GAINS, seeds=(1, 2), executor=client, **SHORT)
         assert _numbers(together) == _numbers(alone)
-        run_by_command(cluster.scheduler_address, tmp_path, capsys)
-
-
-def run_by_command(address, folder, capsys):
-    """Run a sweep by its command on a cluster."""
-    words = ['--set', 'gain=10.0,20.0', '--robot', 'servo', '--duration', '2']
-    output = ['--seeds', '1-2', '--output', str(folder / 'shell.parquet')]
-    assert main(['sweep', 'ADRC', *words, *output, '--scheduler', address]) == 0
-    found = t3.sweep('ADRC', GAINS, seeds=[1, 2], executor=1, **SHORT)
-    assert found.table() in capsys.readouterr().out
+        assert_the_command_has_the_same_rows(
+            tmp_path / 'shell.parquet', capsys, '--scheduler', cluster.scheduler_address
+        )
 
 
 @pytest.mark.long
-@pytest.mark.slow
-def test_processes_and_a_lost_worker_give_the_same_numbers(tmp_path, capsys):
+def test_a_lost_worker_gives_the_same_numbers(tmp_path):
     """A worker that is killed in mid-run loses nothing: its runs are begun again elsewhere."""
     distributed = pytest.importorskip('distributed')
     pytest.importorskip('pyarrow')
-    alone = t3.sweep(Proportional, GAINS, seeds=range(1, 5), executor=1, **SHORT)
+    alone = t3.sweep(Proportional, GAINS, seeds=(1, 2), executor=1, **SHORT)
     options = {'n_workers': 2, 'threads_per_worker': 1, 'dashboard_address': None}
     with (
         distributed.LocalCluster(**options, host='127.0.0.1') as cluster,
         distributed.Client(cluster) as client,
     ):
-        together = t3.sweep(Proportional, GAINS, seeds=range(1, 5), executor=client, **SHORT)
-        assert _numbers(together) == _numbers(alone)
-        victim = client.run(os.getpid)
-        assert len(victim) == 2
-
-        path = tmp_path / 'lost.parquet'
-        executor = client.get_executor(pure=False)
-        first = next(iter(victim))
+        first = next(iter(client.run(os.getpid)))
         client.submit(_kill_later, workers=[first], allow_other_workers=False, pure=False)
         lost = t3.sweep(
-            Proportional, GAINS, seeds=range(1, 9), executor=executor, output=path, **SHORT
+            *(Proportional, GAINS),
+            seeds=range(1, 9),
+            executor=client.get_executor(pure=False),
+            output=tmp_path / 'lost.parquet',
+            **SHORT,
         )
         assert len(lost.rows) == 16
-        assert _numbers(lost)[:4] == _numbers(alone)[:4]
+        assert _numbers(lost)[:4] == _numbers(alone)
         assert not any(math.isnan(row['overall']) for row in lost.rows)
-        run_by_command(cluster.scheduler_address, tmp_path, capsys)
 
 
 def _kill_later():

@@ -74,8 +74,7 @@ def test_the_checker_of_gymnasium_has_nothing_to_say():
         check_env(gymnasium.make(NAME, **SHORT).unwrapped, skip_render_check=True)
 
 
-@pytest.mark.parametrize('plant', ['twin', 'servo', 'torque'])
-@pytest.mark.parametrize('faults', [None, LOSSES], ids=['', 'losses'])
+@pytest.mark.parametrize('plant, faults', [('twin', LOSSES), ('twin', None), ('torque', None)])
 def test_an_episode_is_the_run_of_the_same_controller(plant, faults):
     """To the last bit: what is learnt here is what the tables measure."""
     env = TrackingEnv(plant, faults=faults, duration=4.0)
@@ -137,39 +136,17 @@ def test_equal_seeds_are_equal_episodes_and_other_ones_differ():
     assert min(seeds[0]) >= 100_000
 
 
-def test_several_environments_step_together():
-    envs = gymnasium.make_vec(NAME, 2, 'sync', **SHORT)
-    seen, _ = envs.reset(seed=4)
-    assert seen.shape == (2, SIZE)
-    seen, rewards, *_ = envs.step(np.zeros((2, 2), np.float32))
-    assert seen.shape == (2, SIZE)
-    assert rewards.shape == (2,)
-
-
-@pytest.mark.parametrize(
-    ('action', 'text'),
-    [
-        (np.array([np.nan, 0.0]), 'action must be two finite numbers: got'),
-        (np.zeros(3), 'action must be two finite numbers: got'),
-    ],
-)
-def test_a_wrong_action_is_one_sentence(action, text):
-    env = TrackingEnv(**SHORT)
-    with pytest.raises(t3.ScriptError, match='must begin with reset'):
-        env.step(np.zeros(2))
+def test_wrong_use_of_an_episode_is_one_sentence():
+    env = TrackingEnv('servo', duration=0.5)
+    for _ in range(2):
+        with pytest.raises(t3.ScriptError, match='must begin with reset'):
+            env.step(np.zeros(2))
+        driven(env, 1)
     env.reset(seed=1)
-    with pytest.raises(t3.ScriptError, match=text):
-        env.step(action)
+    for action in (np.array([np.nan, 0.0]), np.zeros(3)):
+        with pytest.raises(t3.ScriptError, match='action must be two finite numbers: got'):
+            env.step(action)
     assert np.isfinite(env.step(np.array([5.0, -5.0]))[0]).all(), 'an action is clipped'
-
-
-def test_an_episode_that_has_ended_begins_anew_with_reset():
-    env = TrackingEnv(plant='servo', duration=2.0)
-    driven(env, 1)
-    with pytest.raises(t3.ScriptError, match='must begin with reset'):
-        env.step(np.zeros(2))
-    env.reset(seed=1)
-    env.step(np.zeros(2))
 
 
 def test_a_robot_that_diverges_ends_the_episode():
