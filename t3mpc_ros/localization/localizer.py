@@ -270,8 +270,14 @@ class Localizer:
         )
 
     def set_pose(self, pose: Pose, covariance: Array) -> None:
-        """Begin at a pose with a covariance of x, y (m), yaw (rad), shape (3, 3)."""
-        self.filter.place(pose, covariance)
+        """Begin at a pose with a covariance of x, y (m), yaw (rad), shape (3, 3).
+
+        Its variances are at least those of :data:`SYSTEMATIC`: particles that are all at one place
+        leave readings nothing to choose from, so a pose given as exact was not corrected.
+        """
+        spread = np.array(covariance, dtype=np.float64)
+        np.fill_diagonal(spread, np.maximum(np.diag(spread), np.square(SYSTEMATIC)))
+        self.filter.place(pose, spread)
         self._restart(searching=False)
 
     def scatter(self) -> None:

@@ -29,6 +29,7 @@ from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State,
 from t3mpc_ros.localization.change_detection import ChangeKind
 from t3mpc_ros.localization.localizer import (
     LONGEST_SILENCE,
+    SYSTEMATIC,
     Localization,
     Localizer,
     LocalizerParameters,
@@ -226,6 +227,15 @@ def test_a_pose_that_is_given_is_taken():
     localizer.add_odometry(drive.stamp_ns + 1, drive.odometry)
     assert error(localizer, drive) == pytest.approx((0.0, 0.0), abs=5e-3)
     assert localizer.state is Localization.LOCALIZED
+
+
+def test_a_pose_that_is_given_as_exact_can_be_corrected():
+    """Without a covariance all particles were at one place, among which readings choose none."""
+    localizer = make_localizer()
+    for covariance in (np.zeros((3, 3)), np.diag([0.0, 0.01, 0.01])):
+        localizer.set_pose(ORIGIN, covariance)
+        least = np.maximum(np.sqrt(np.diag(covariance)), SYSTEMATIC)
+        assert localizer.filter.poses.std(axis=0) == pytest.approx(least, rel=0.15)
 
 
 @pytest.mark.parametrize(
