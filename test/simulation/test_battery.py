@@ -49,7 +49,7 @@ def test_open_circuit_voltage_matches_a_measured_cell(charge, volts):
     assert open_circuit_voltage(charge) == pytest.approx(volts, abs=0.02)
 
 
-@pytest.mark.parametrize('power', [0.0, 1.0, 12.0, 60.0, 150.0])
+@pytest.mark.parametrize('power', [0.0, 12.0, 150.0])
 def test_voltage_solves_the_circuit_equation(power):
     """The power E I of the cells is P + V I_idle + R I²."""
     cell = battery(charge=0.7)
@@ -108,12 +108,6 @@ def test_excess_power_collapses_the_voltage_with_finite_values():
         assert cell.collapsed
 
 
-def test_weak_battery_collapses_under_idle_load():
-    cell = battery(resistance=10.0, charge=0.05)
-    assert cell.collapsed
-    assert all(map(math.isfinite, cell.draw(5.0, 0.1)))
-
-
 def test_collapse_and_low_warning_have_hysteresis():
     cell = battery(charge=0.4, resistance=1.0)
     inside = open_circuit_voltage(0.4, 3) - cell.parameters.idle_current
@@ -161,18 +155,11 @@ def test_a_charger_fills_the_battery_and_no_more(power):
     assert others.draw(20.0, 1.0, charger=2.0).voltage < others.draw(0.0, 1.0, charger=2.0).voltage
 
 
-def test_voltage_is_defined_before_the_first_draw():
-    assert battery().voltage == pytest.approx(3 * 4.2 - 0.15 * 0.3)
-    assert battery().charge == 1.0
-
-
-@pytest.mark.parametrize(
-    ('power', 'dt'), [(math.nan, 0.1), (math.inf, 0.1), (1.0, -0.1), (1.0, math.nan)]
-)
-def test_invalid_input_is_rejected_without_side_effects(power, dt):
+def test_invalid_input_is_rejected_without_side_effects():
     cell = battery(charge=0.5)
-    with pytest.raises(ValueError, match='must be finite'):
-        cell.draw(power, dt)
+    for power, dt in ((math.nan, 0.1), (math.inf, 0.1), (1.0, -0.1), (1.0, math.nan)):
+        with pytest.raises(ValueError, match='must be finite'):
+            cell.draw(power, dt)
     assert cell.charge == 0.5
 
 

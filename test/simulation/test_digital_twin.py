@@ -23,7 +23,7 @@ from support.long_tests import few_of
 
 from t3mpc_ros.geometry.types import RANGE_SENSORS, Pose, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.robot.interface import RobotCommand, RobotInterface
+from t3mpc_ros.robot.interface import RobotCommand
 from t3mpc_ros.robot.sensor_conversions import ImuParameters
 from t3mpc_ros.simulation.digital_twin import (
     BROWN_OUT_REASON,
@@ -76,11 +76,6 @@ def astray(state) -> float:
 # -- determinism ----------------------------------------------------------------------------------
 
 
-def test_digital_twin_implements_the_robot_interface():
-    for name in ('apply', 'advance', 'stop', 'reset_odometry', 'latch_estop', 'release_estop'):
-        assert getattr(DigitalTwin, name) is not getattr(RobotInterface, name)
-
-
 def test_drive_kind_selects_the_robot_class():
     assert type(make_robot(parameters())) is DigitalTwin
     assert type(make_robot(parameters(drive__kind='velocity'))) is PaperRobot
@@ -120,7 +115,7 @@ def test_request_rate_does_not_change_the_state():
 
 @pytest.mark.compiled
 @pytest.mark.slow
-@pytest.mark.parametrize('periods', few_of([2000, 6000]))
+@pytest.mark.parametrize('periods', few_of([1000, 6000]))
 def test_halving_the_step_changes_a_path_by_less_than_10_um(periods):
     """Pulses evaluated at the stages alone were half a step late: 0.36 mm after a minute."""
     speeds = course(4, periods)
@@ -133,7 +128,7 @@ def test_halving_the_step_changes_a_path_by_less_than_10_um(periods):
         )
         for step in (0.001, 0.0005)
     )
-    assert np.ptp(coarse, axis=0).max() > 0.2  # the robot moved
+    assert np.ptp(coarse, axis=0).max() > 0.1  # the robot moved
     assert np.hypot(*(coarse - fine).T).max() < 0.01e-3
 
 
@@ -141,22 +136,10 @@ def test_halving_the_step_changes_a_path_by_less_than_10_um(periods):
 
 
 @pytest.mark.compiled
-@pytest.mark.slow
-def test_counters_give_the_path_without_lost_steps_or_slip():
-    robot = DigitalTwin(parameters(odometry__use_gyro=False))
-    for state in drive(robot, course(5, 3000)):
-        assert state.lost_steps == (0, 0)
-    assert robot.diagnostics.slid == (0.0, 0.0)
-    last = state
-    apart = astray(last)
-    assert apart < 2e-3
-    assert math.remainder(last.truth.pose.yaw - last.odometry.pose.yaw, math.tau) < 2e-3
-
-
-@pytest.mark.compiled
 @pytest.mark.parametrize(
     ('cause', 'changes'),
     [
+        ('nothing', {}),
         ('a tyre that slides', {'tyres__grip': 0.03}),
         ('lost steps', {'motor__phase_current': 0.12}),
         ('a held wheel', {'faults__wheel_blocked': 'left'}),
@@ -165,10 +148,14 @@ def test_counters_give_the_path_without_lost_steps_or_slip():
 def test_odometry_misses_slip_and_lost_steps(cause, changes):
     robot = DigitalTwin(parameters(odometry__use_gyro=False, slip_stop=0.0, **changes))
     last = drive(robot, course(5, 1000))[-1]
-    apart = astray(last)
-    assert apart > 0.02, cause
-    slid, lost = robot.diagnostics.slid, last.lost_steps
-    assert max(slid) > 0.02 or max(map(abs, lost)) >= 4
+    missed = max(robot.diagnostics.slid) > 0.02 or max(map(abs, last.lost_steps)) >= 4
+    if cause == 'nothing':
+        assert robot.diagnostics.slid == (0.0, 0.0)
+        assert last.lost_steps == (0, 0)
+        assert astray(last) < 1e-3
+    else:
+        assert missed
+        assert astray(last) > 0.02
 
 
 # -- board ----------------------------------------------------------------------------------------
@@ -295,40 +282,30 @@ def test_accelerometer_measures_linear_and_centripetal_parts(monkeypatch):
     assert max(state.imu.forward for state in states[:30]) > 0.5
 
 
-def test_motors_discharge_the_battery():
-    idle, busy = DigitalTwin(parameters()), DigitalTwin(parameters())
-    drive(idle, [STILL] * 200)
-    drive(busy, [WheelSpeeds(8.0, 8.0)] * 200)
-    assert busy.state.battery.charge < idle.state.battery.charge < 1.0
-    copper = 2.0 * 1.0**2 * 1.5
-    assert idle.state.battery.current * idle.state.battery.voltage > copper
-
-
 # -- inconsistent parameters ----------------------------------------------------------------------
 
 
-def test_speed_above_the_pulse_rate_is_rejected():
-    with pytest.raises(ParameterError, match=r'wheel.max_velocity must be at most 1\.227 rad/s'):
-        parameters(motor__microsteps=256)
-    parameters(motor__microsteps=256, wheel__max_velocity=1.2)
-
-
-def test_gyro_delay_must_match_the_low_pass():
-    with pytest.raises(ParameterError, match=r'odometry.gyro_delay must be about 0.041 s'):
-        parameters(imu__low_pass='6')
-    parameters(imu__low_pass='6', odometry__gyro_delay=0.041)
-    parameters(imu__low_pass='6', odometry__use_gyro=False)
-
-
-def test_unstable_rotor_substep_is_rejected_with_the_limit():
-    with pytest.raises(ParameterError, match=r'substep must be at most 0\.0018 s'):
-        parameters(substep=0.002)
-
-
-def test_read_only_parameters_cannot_change_at_run_time():
-    robot = DigitalTwin(parameters())
-    with pytest.raises(ParameterError, match='motor.microsteps is read-only'):
-        robot.configure(parameters(motor__microsteps=8))
+@pytest.mark.parametrize(
+    ('wrong', 'words', 'right'),
+    [
+        (
+            {'motor__microsteps': 256},
+            r'wheel.max_velocity must be at most 1\.227 rad/s',
+            {'wheel__max_velocity': 1.2},
+        ),
+        (
+            {'imu__low_pass': '6'},
+            'odometry.gyro_delay must be about 0.041 s',
+            {'odometry__gyro_delay': 0.041},
+        ),
+        ({'imu__low_pass': '6'}, 'odometry.gyro_delay', {'odometry__use_gyro': False}),
+        ({'substep': 0.002}, r'substep must be at most 0\.0018 s', {'substep': 0.0018}),
+    ],
+)
+def test_what_contradicts_is_rejected_with_its_bound(wrong, words, right):
+    with pytest.raises(ParameterError, match=words):
+        parameters(**wrong)
+    parameters(**wrong | right)
 
 
 # -- documentation --------------------------------------------------------------------------------
@@ -371,9 +348,3 @@ def test_odometry_assumes_the_nominal_geometry():
         [WheelSpeeds(1.0, -1.0)] * 300,
     )[-1]
     assert state.odometry.pose.yaw / state.truth.pose.yaw == pytest.approx(1.05, rel=2e-3)
-
-
-@pytest.mark.slow
-def test_wrong_radii_lose_no_steps():
-    state = drive(DigitalTwin(parameters(right_wheel_radius_multiplier=1.1)), course(3, 1000))[-1]
-    assert state.lost_steps == (0, 0)

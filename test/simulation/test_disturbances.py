@@ -47,7 +47,7 @@ def test_friction_is_viscous_plus_smoothed_coulomb():
 
 def test_disturbance_never_exceeds_its_bound():
     generator = np.random.default_rng(2)
-    for seed in range(20):
+    for seed in range(8):
         share = float(generator.choice([0.0, 1.0, generator.uniform()]))
         parameters = with_constants(DisturbanceParameters, walk_share=share)(
             bound=generator.uniform(0.0, 0.1),
@@ -55,7 +55,7 @@ def test_disturbance_never_exceeds_its_bound():
             walk_rate=float(generator.choice([0.1, 100.0])),
         )
         disturbance = Disturbance(parameters, np.random.default_rng(seed))
-        for tick in range(500):
+        for tick in range(200):
             disturbance.draw(0.01)
             for torque in disturbance.torque(0.01 * tick):
                 assert abs(torque) <= parameters.bound
@@ -64,20 +64,20 @@ def test_disturbance_never_exceeds_its_bound():
 def test_disturbance_reaches_its_bound_on_each_wheel():
     parameters = with_constants(DisturbanceParameters, walk_share=0.0)(bound=1.0)
     disturbance = Disturbance(parameters, np.random.default_rng(3))
-    torques = np.array([disturbance.torque(0.05 * tick) for tick in range(8000)])
-    assert np.abs(torques).max(axis=0) == pytest.approx([1.0, 1.0], abs=0.05)
+    torques = np.array([disturbance.torque(0.05 * tick) for tick in range(3000)])
+    assert np.abs(torques).max(axis=0) == pytest.approx([1.0, 1.0], abs=0.1)
     assert abs(np.corrcoef(torques.T)[0, 1]) < 0.9
 
 
 def test_random_walk_spreads_with_the_square_root_of_time():
     parameters = DisturbanceParameters(walk_rate=0.1)
     ends = []
-    for seed in range(400):
+    for seed in range(200):
         disturbance = Disturbance(parameters, np.random.default_rng(seed))
         for _ in range(100):
             disturbance.draw(0.01)
         ends.append(disturbance.walk.copy())
-    assert np.std(ends) == pytest.approx(0.1, rel=0.1)
+    assert np.std(ends) == pytest.approx(0.1, rel=0.12)
 
 
 def test_reflection_is_bounded_and_continuous():

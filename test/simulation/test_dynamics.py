@@ -25,10 +25,8 @@ from support.equations import (
     constraint_rate,
     coriolis_matrix,
     inertia_matrix,
-    input_matrix,
     kinetic_energy,
     null_space,
-    null_space_rate,
     pose_rate,
     reduce_to_wheels,
     wheel_coriolis,
@@ -44,7 +42,7 @@ from t3mpc_ros.simulation.plant.dynamics import (
     wheel_inertia,
 )
 
-SEEDS = range(20)
+SEEDS = range(4)
 
 
 def random_robot(generator: np.random.Generator) -> tuple[BodyParameters, WheelGeometry]:
@@ -159,17 +157,6 @@ def test_null_space_solves_the_constraint_and_gives_rates(seed):
     assert np.abs(printed @ basis).max() > 1e-4
 
 
-def test_null_space_and_constraint_rates_are_derivatives():
-    geometry, small, yaw, turn = WheelGeometry(), 1e-6, 0.7, 2.3
-    for matrix, rate in (
-        (null_space, null_space_rate(yaw, turn, geometry)),
-        (constraint_matrix, constraint_rate(yaw, turn)),
-    ):
-        ahead = matrix(yaw + small * turn, geometry)
-        behind = matrix(yaw - small * turn, geometry)
-        assert rate == pytest.approx((ahead - behind) / (2.0 * small), abs=1e-8)
-
-
 @pytest.mark.parametrize('seed', SEEDS)
 def test_reduction_of_the_full_matrices_is_the_closed_form(seed):
     """(9) and (10) with E3 give (11), (12) with E4, and (13)."""
@@ -209,7 +196,7 @@ def test_kernel_solves_the_reduced_equations_and_body_form(seed):
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_kernel_agrees_with_the_unreduced_equations(seed):
-    """(4) is independent of (12), so the printed factor of (12) fails here (E4)."""
+    """(4) is independent of (12), whose printed factor gives another motion (E4)."""
     generator = np.random.default_rng(seed)
     body, geometry = random_robot(generator)
     yaw = generator.uniform(-3.0, 3.0)
@@ -218,25 +205,15 @@ def test_kernel_agrees_with_the_unreduced_equations(seed):
     coordinates = np.array([0.3, -0.2, yaw, 0.0, 0.0])
     rates = null_space(yaw, geometry) @ np.array(wheels)
     full, _ = constrained_acceleration(coordinates, rates, torque, body, geometry)
-    reduced = wheel_acceleration(*wheels, *torque, dynamics_vector(body, geometry))
-    assert full[3:] == pytest.approx(reduced, rel=1e-9, abs=1e-9)
+    dynamics = dynamics_vector(body, geometry)
+    assert full[3:] == pytest.approx(
+        wheel_acceleration(*wheels, *torque, dynamics), rel=1e-9, abs=1e-9
+    )
+    dynamics[4] /= geometry.half_separation
+    printed = wheel_acceleration(*wheels, *torque, dynamics)
+    assert np.abs(full[3:] - printed).max() > 1e-2 * np.abs(full[3:]).max()
     slip = constraint_matrix(yaw, geometry) @ full + constraint_rate(yaw, rates[2]) @ rates
     assert slip == pytest.approx(np.zeros(3), abs=1e-10)
-
-
-def test_multipliers_are_the_constraint_forces():
-    """On a circle at constant speed the side force of the wheels is m v omega."""
-    body, geometry = BodyParameters(), WheelGeometry()
-    wheels = WheelSpeeds(9.0, 5.0)
-    twist = twist_from_wheels(wheels, geometry)
-    # The torque that keeps the speeds constant balances (12).
-    torque = wheel_coriolis(wheels, body, geometry) @ np.array(wheels)
-    rates = null_space(0.0, geometry) @ np.array(wheels)
-    accelerations, multipliers = constrained_acceleration(
-        np.zeros(5), rates, torque, body, geometry
-    )
-    assert accelerations[3:] == pytest.approx([0.0, 0.0], abs=1e-10)
-    assert -multipliers[0] == pytest.approx(body.total_mass * twist.linear * twist.angular)
 
 
 def test_energy_is_conserved_to_integrator_order():
@@ -263,61 +240,3 @@ def test_energy_is_conserved_to_integrator_order():
     end = runge_kutta(reduced_rate(dynamics), start, 0.001, 2000)
     assert abs(end[0] - end[1]) < 1e-3 * abs(start[0] - start[1])
     assert end.sum() > 0.0
-
-
-def test_printed_coriolis_factor_deviates_from_free_motion():
-    """E4, second half: R^2/(2 b), because R^2/(2 b^2) deviates from the true motion.
-
-    The oracle is (4) with its multipliers in all five coordinates.
-    """
-    body, geometry = BodyParameters(com_offset=0.05), WheelGeometry()
-    start = np.array([20.0, -12.0])
-    step, count = 0.001, 1000
-
-    def full_rate(state: np.ndarray) -> np.ndarray:
-        accelerations, _ = constrained_acceleration(
-            state[:5], state[5:], np.zeros(2), body, geometry
-        )
-        return np.concatenate([state[5:], accelerations])
-
-    rates = null_space(0.4, geometry) @ start
-    full = runge_kutta(full_rate, np.concatenate([[0.0, 0.0, 0.4, 0.0, 0.0], rates]), step, count)
-    slip = constraint_matrix(full[2], geometry) @ full[5:]
-    assert slip == pytest.approx(np.zeros(3), abs=1e-9)
-
-    dynamics = dynamics_vector(body, geometry)
-    reduced = runge_kutta(reduced_rate(dynamics), start, step, count)
-    assert reduced == pytest.approx(full[8:], abs=1e-8)
-    dynamics[4] /= geometry.half_separation
-    printed = runge_kutta(reduced_rate(dynamics), start, step, count)
-    assert np.abs(printed - full[8:]).max() > 1.0
-
-
-def test_coriolis_factor_has_the_unit_of_an_inertia():
-    """E4 by the unit alone: doubling every length multiplies any kg m² by four."""
-    body, geometry = BodyParameters(), WheelGeometry()
-    doubled = WheelGeometry(2.0 * geometry.wheel_radius, 2.0 * geometry.wheel_separation)
-    heavy = BodyParameters(
-        body_inertia=4.0 * body.body_inertia,
-        wheel_inertia=4.0 * body.wheel_inertia,
-        wheel_turn_inertia=4.0 * body.wheel_turn_inertia,
-        com_offset=2.0 * body.com_offset,
-    )
-    assert wheel_inertia(heavy, doubled) == pytest.approx(4.0 * wheel_inertia(body, geometry))
-    assert coriolis_factor(heavy, doubled) == pytest.approx(4.0 * coriolis_factor(body, geometry))
-
-
-@pytest.mark.parametrize('seed', range(5))
-def test_wheel_energy_equals_the_energy_of_the_parts(seed):
-    """(11) and (14) together."""
-    generator = np.random.default_rng(seed)
-    body, geometry = random_robot(generator)
-    wheels = WheelSpeeds(*generator.uniform(-20.0, 20.0, 2))
-    yaw = generator.uniform(-3.0, 3.0)
-    rates = null_space(yaw, geometry) @ np.array(wheels)
-    parts = energy_of_the_parts(np.array([1.0, 2.0, yaw, 0.0, 0.0]), rates, body, geometry)
-    assert kinetic_energy(wheels, body, geometry) == pytest.approx(parts, rel=1e-12)
-
-
-def test_torques_act_only_on_the_wheel_angles():
-    assert input_matrix().T @ np.arange(5.0) == pytest.approx([3.0, 4.0])

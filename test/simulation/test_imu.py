@@ -61,44 +61,21 @@ def rates(imu: SimulatedImu, count: int, dt: float = 0.01) -> np.ndarray:
     return np.degrees([imu.measure(still, dt).angular for _ in range(count)])
 
 
-@pytest.mark.parametrize('span', GYRO)
-def test_gyro_counts_match_the_data_sheet(span):
-    imu = sensor(**IDEAL, gyro_range=span)
-    for degrees in (1.0, -10.0, 0.8 * float(span)):
-        imu.measure(settled(math.radians(degrees)), 0.01)
-        assert abs(imu.counts[0] - degrees * GYRO[span]) <= 0.5
-
-
-@pytest.mark.parametrize('span', ACCEL)
-def test_accelerometer_counts_match_the_data_sheet(span):
-    imu = sensor(**IDEAL, accel_range=span)
+@pytest.mark.parametrize(('span', 'force'), [*zip(GYRO, ACCEL, strict=True)])
+def test_counts_match_the_data_sheet_and_saturate(span, force):
+    imu = sensor(**IDEAL, gyro_range=span, accel_range=force)
     for share in (0.1, -0.5, 0.9):
-        imu.measure(settled(0.0, share * float(span) * GRAVITY, -share * GRAVITY), 0.01)
-        assert abs(imu.counts[1] - share * float(span) * ACCEL[span]) <= 0.5
-        assert abs(imu.counts[2] + share * ACCEL[span]) <= 0.5
-
-
-@pytest.mark.parametrize('span', GYRO)
-def test_registers_saturate_at_full_scale(span):
-    imu = sensor(**IDEAL, gyro_range=span)
+        degrees, most = share * float(span), float(force)
+        imu.measure(settled(math.radians(degrees), share * most * GRAVITY, -share * GRAVITY), 0.01)
+        expected = degrees * GYRO[span], share * most * ACCEL[force], -share * ACCEL[force]
+        assert np.abs(np.subtract(imu.counts, expected)).max() <= 0.5
     for sign, end in ((1.0, 32767), (-1.0, -32768)):
-        for excess in (1.01, 10.0, math.inf):
+        for excess in (1.01, math.inf):
             rate = math.radians(sign * excess * float(span))
             sample = imu.measure(settled(rate, sign * 1e3, sign * 1e3), 0.01)
             assert imu.counts == (end, end, end)
             assert math.degrees(sample.angular) == pytest.approx(sign * float(span), rel=2e-3)
-            assert sample.forward == pytest.approx(sign * 2.0 * GRAVITY, rel=1e-3)
-
-
-def test_samples_are_counts_times_nominal_scale():
-    imu, generator = sensor(), np.random.default_rng(2)
-    for _ in range(200):
-        sample = imu.measure(settled(*generator.normal(0.0, [3.0, 5.0, 5.0])), 0.01)
-        turn, ahead, aside = imu.counts
-        assert all(type(count) is int for count in imu.counts)
-        assert sample.angular == pytest.approx(math.radians(turn / 65.5), rel=1e-12)
-        assert sample.forward == pytest.approx(ahead / 16384.0 * 9.80665, rel=1e-12)
-        assert sample.sideways == pytest.approx(aside / 16384.0 * 9.80665, rel=1e-12)
+            assert sample.forward == pytest.approx(sign * float(force) * GRAVITY, rel=1e-3)
 
 
 def response(parameters: SimulatedImuParameters, frequency: float) -> complex:
@@ -119,7 +96,7 @@ def response(parameters: SimulatedImuParameters, frequency: float) -> complex:
     return complex(2j * np.mean(out[tail] * wave))
 
 
-@pytest.mark.parametrize('setting', REGISTER_MAP)
+@pytest.mark.parametrize('setting', ['0', '3', '6'])
 def test_low_pass_cutoff_matches_the_register_map(setting):
     parameters, frequency = SimulatedImuParameters(low_pass=setting), REGISTER_MAP[setting][0]
     gain = response(parameters, frequency)
@@ -130,7 +107,7 @@ def test_low_pass_cutoff_matches_the_register_map(setting):
     assert abs(response(parameters, 0.1 * frequency)) == pytest.approx(1.0, abs=0.005)
 
 
-@pytest.mark.parametrize('setting', REGISTER_MAP)
+@pytest.mark.parametrize('setting', ['0', '3', '6'])
 def test_low_pass_delay_matches_its_parameters(setting):
     """The delay of slow signals is the area above the step response."""
     parameters = SimulatedImuParameters(low_pass=setting)
@@ -141,16 +118,8 @@ def test_low_pass_delay_matches_its_parameters(setting):
         missing.append(1.0 - filtered[0, 1])
     area = step * (sum(missing) - 0.5 * (missing[0] + missing[-1]))
     assert area == pytest.approx(parameters.delay, rel=1e-4)
-
-
-def test_low_pass_delay_is_close_to_the_data_sheet():
-    assert SimulatedImuParameters().delay == pytest.approx(REGISTER_MAP['3'][1], abs=0.1e-3)
-    for setting in '0123':
-        assert SimulatedImuParameters(low_pass=setting).delay == pytest.approx(
-            REGISTER_MAP[setting][1], abs=0.9e-3
-        )
-    # Even one pole is slower than the data sheet at 5 Hz: no such filter matches both figures.
-    assert 1.0 / (math.tau * 5.0) > REGISTER_MAP['6'][1]
+    if setting != '6':  # even one pole is slower than the data sheet at 5 Hz
+        assert parameters.delay == pytest.approx(REGISTER_MAP[setting][1], abs=0.9e-3)
 
 
 def test_low_pass_is_independent_of_the_step():
@@ -163,13 +132,6 @@ def test_low_pass_is_independent_of_the_step():
         ends.append(filtered)
     assert ends[1] == pytest.approx(ends[0], abs=1e-12)
     assert ends[2] == pytest.approx(ends[0], abs=1e-12)
-
-
-def test_low_pass_handles_very_long_steps():
-    filtered, share = np.ones((3, 2)), SimulatedImuParameters(low_pass='0').share(1e3)
-    assert share == 1.0
-    low_pass(filtered, 5.0, 6.0, 7.0, share)
-    assert filtered == pytest.approx(settled(5.0, 6.0, 7.0))
 
 
 def test_gyro_noise_at_100_hz_matches_the_data_sheet():
@@ -218,7 +180,7 @@ def test_allan_deviation_matches_the_noise_density(setting, dt):
 def test_allan_deviation_rises_with_bias_drift():
     """K sqrt(tau/3) for a random walk K, far above the remaining noise."""
     imu = sensor(seed=3, gyro_drift=0.05, gyro_offset=0.0)
-    found = rates(imu, 100000)
+    found = rates(imu, 30000)
     expected = 0.05 * math.sqrt(10.0 / 3.0)
     assert allan(found, 1000) == pytest.approx(expected, rel=0.3)
     assert allan(found, 100) < allan(found, 1000)
@@ -262,13 +224,10 @@ def test_scale_and_acceleration_offsets_persist_over_power_up():
     )
 
 
-@pytest.mark.parametrize('dt', [-0.01, math.nan, math.inf])
-def test_invalid_time_step_is_rejected(dt):
-    with pytest.raises(ValueError, match='dt must be finite'):
-        sensor().measure(settled(), dt)
-
-
-def test_zero_time_step_repeats_the_sample():
+def test_a_time_step_of_zero_repeats_the_sample():
     imu = sensor()
     first = imu.measure(settled(), 0.01)
     assert imu.measure(settled(), 0.0) == first
+    for dt in (-0.01, math.nan, math.inf):
+        with pytest.raises(ValueError, match='dt must be finite'):
+            imu.measure(settled(), dt)

@@ -33,7 +33,7 @@ from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensors
 
 NOISY = {'noise.variance': 1.0, 'disturbance.walk_rate': 0.01}
 IMU = {'imu.gyro_drift': 10.0, 'imu.gyro_noise': 0.5}
-COUNT = 2000
+COUNT = 1000
 STILL = WheelSpeeds(0.0, 0.0)
 
 
@@ -132,8 +132,8 @@ def generators(robot):
 
 
 def drive(robot):
-    """Drive for 0.3 s."""
-    for k in range(30):
+    """Drive for 0.12 s."""
+    for k in range(12):
         now = k * NANOSECONDS // 100
         robot.apply(RobotCommand(WheelSpeeds(3.0, 2.0), now), now)
         robot.advance(now)
@@ -155,8 +155,8 @@ def test_no_parameter_shifts_the_numbers_of_a_channel(table):
     usual, tried = drive(make(parameters)), 0
     assert len(usual) >= (5 if make is DigitalTwin else 2)
     for spec in table.specs():
-        for changed in itertools.islice(alternatives(parameters, spec), 3):
+        for changed in itertools.islice(alternatives(parameters, spec), 2):
             if not spec.name.startswith(OTHER_EVENTS):
                 tried += 1
                 assert drive(make(changed)) == usual, spec.name
-    assert tried > 50
+    assert tried > 30

@@ -74,13 +74,13 @@ def drive(slip, course, seed, side=4.0):
     return example.drive(parameters, legs, slip_events(slip, course, seed))
 
 
-def yaw_errors(slip, course, seed):
+def yaw_errors(slip, course, seed, side=4.0):
     """Return the yaw errors (rad) of the steps alone and with the gyro, and the gyro's own bound.
 
     The bound: the largest scale error, and three standard deviations of a bias that wanders from
     one standstill to the other, sigma t^1.5 / sqrt 3, and of the noise in the measured bias.
     """
-    robot, truth, odometry, steps = drive(slip, course, seed)
+    robot, truth, odometry, steps = drive(slip, course, seed, side)
     imu, moving = robot.parameters.imu, 0.01 * len(truth) - 3.0
     wandered = imu.gyro_drift * moving**1.5 / math.sqrt(3.0)
     unsure = imu.gyro_noise * moving / math.sqrt(2.0)
@@ -108,7 +108,7 @@ def test_yaw_errors_are_those_of_the_documentation(slip, course, steps, gyro):
 
 @pytest.mark.parametrize('course', few_of(COURSES))
 def test_without_slip_both_headings_are_good(course):
-    steps, gyro, bound = yaw_errors('none', course, 1)
+    steps, gyro, bound = yaw_errors('none', course, 1, side=1.0)
     assert abs(steps) < math.radians(4.0)
     assert abs(gyro) <= bound
 

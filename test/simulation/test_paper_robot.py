@@ -21,7 +21,7 @@ import pytest
 from t3mpc_ros.geometry.sample_scheduler import SampleScheduler
 from t3mpc_ros.geometry.types import Pose, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.robot.interface import RobotCommand, RobotInterface, RobotState
+from t3mpc_ros.robot.interface import RobotCommand, RobotState
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
 
 MS = 1_000_000
@@ -61,29 +61,16 @@ def wander(tick: int) -> WheelSpeeds:
 # -- stops ----------------------------------------------------------------------------------------
 
 
-def end_by_silence(simulated: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
-    pass
+ENDS = {
+    'silence': lambda robot, now_ns: None,
+    'estop': lambda robot, now_ns: robot.latch_estop('test', now_ns + 100 * MS),
+    'stop': lambda robot, now_ns: robot.stop('test', now_ns),
+    'zero': lambda robot, now_ns: robot.apply(command(0.0, 0.0, now_ns), now_ns),
+    'nonsense': lambda robot, now_ns: robot.apply(command(math.nan, 1.0, now_ns), now_ns),
+}
 
 
-def end_by_estop(simulated: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
-    simulated.latch_estop('test', now_ns + int(generator.uniform(0.0, 250.0) * MS))
-
-
-def end_by_stop(simulated: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
-    simulated.stop('test', now_ns)
-
-
-def end_by_zero(simulated: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
-    simulated.apply(command(0.0, 0.0, now_ns), now_ns)
-
-
-def end_by_nonsense(simulated: PaperRobot, now_ns: int, generator: np.random.Generator) -> None:
-    simulated.apply(command(math.nan, 1.0, now_ns), now_ns)
-
-
-@pytest.mark.parametrize(
-    'end', [end_by_silence, end_by_estop, end_by_stop, end_by_zero, end_by_nonsense]
-)
+@pytest.mark.parametrize('end', ENDS)
 def test_wheels_stop_within_half_a_second_from_10_rad_s(end):
     generator = np.random.default_rng(11)
     for seed in range(6):
@@ -98,7 +85,7 @@ def test_wheels_stop_within_half_a_second_from_10_rad_s(end):
             simulated.apply(command(*wheels, now), now)
             last = now
             now += int(generator.uniform(0.0, 240.0) * MS)
-        end(simulated, last, generator)
+        ENDS[end](simulated, last)
         after = simulated.advance(last + 500 * MS)
         assert after.stamp_ns > last + 485 * MS
         assert not after.status.moving, (seed, after)
@@ -148,7 +135,7 @@ def test_finite_commands_give_finite_states():
             body__com_offset=0.1,
         )
         step = simulated.step_torque if kind == 'torque' else None
-        for _ in range(1000):
+        for _ in range(200):
             pair = generator.choice(extremes, 2) * generator.choice([-1.0, 1.0], 2)
             state = step(*pair) if step else simulated.step(WheelSpeeds(*pair))
             assert np.all(np.isfinite(numbers(state)))
@@ -168,7 +155,7 @@ def test_states_lie_on_the_time_grid_and_not_in_the_future():
     assert simulated.advance(start + 57 * MS).odometry.stamp_ns == start + 50 * MS
 
 
-@pytest.mark.parametrize('rate', [100.0, 60.0, 128.0, 333.0])
+@pytest.mark.parametrize('rate', [60.0, 333.0])
 def test_each_state_is_returned_once_on_a_grid_of_its_rate(rate):
     """A grid that rounds its period to whole nanoseconds lags one that rounds its stamps.
 
@@ -212,13 +199,6 @@ def test_command_acts_from_its_arrival_step():
     assert moved[0] > moved[2] > moved[3] > 0.0
 
 
-def test_step_equals_apply_and_advance():
-    stepped, timed = robot(), robot()
-    for tick in range(100):
-        timed.apply(command(*wander(tick), tick * PERIOD), tick * PERIOD)
-        assert numbers(stepped.step(wander(tick))) == numbers(timed.advance((tick + 1) * PERIOD))
-
-
 def test_long_gap_is_simulated_in_part_and_ends_at_standstill():
     simulated = robot()
     simulated.apply(command(10.0, 10.0, 0), 0)
@@ -253,28 +233,22 @@ def test_equal_seeds_give_bit_equal_runs():
     runs = []
     for _ in range(2):
         simulated = robot(noise__variance=0.04, seed=5)
-        runs.append([numbers(simulated.step(wander(tick))) for tick in range(300)])
+        states = [simulated.step(wander(tick)) for tick in range(300)]
+        runs.append([*map(numbers, states)])
     assert runs[0] == runs[1]
     other = robot(noise__variance=0.04, seed=6)
     assert [numbers(other.step(wander(tick))) for tick in range(300)] != runs[0]
-
-
-@pytest.mark.compiled
-def test_noise_affects_the_measurement_only():
-    silent, noisy = robot(), robot(noise__variance=0.04)
-    deviations = []
-    for tick in range(2000):
-        exact, blurred = silent.step(wander(tick)), noisy.step(wander(tick))
-        assert exact.true_wheels == blurred.true_wheels
-        assert exact.wheels == exact.true_wheels
-        deviations.append(np.array(blurred.wheels) - blurred.true_wheels)
-    assert np.var(deviations) == pytest.approx(0.04, rel=0.06)
+    # The noise is in the measurement only.
+    silent = robot(seed=5)
+    for tick, state in enumerate(states):
+        exact = silent.step(wander(tick))
+        assert state.true_wheels == exact.true_wheels == exact.wheels != state.wheels
 
 
 def trajectory(substep: float, **changes: object) -> np.ndarray:
     simulated = robot(substep=substep, **changes)
     rows = []
-    for tick in range(1000):
+    for tick in range(400):
         if simulated.parameters.drive.kind == 'torque':
             state = simulated.step_torque(
                 0.006 + 0.01 * math.sin(0.013 * tick), 0.006 + 0.01 * math.cos(0.009 * tick)
@@ -299,34 +273,27 @@ def test_torque_drive_converges_with_order_four():
 @pytest.mark.slow
 def test_velocity_drive_converges_when_substep_is_halved():
     """Order two where the ramp ends within a step, four where the drive does not limit."""
-    ramps = [trajectory(substep) for substep in (0.002, 0.001, 0.0005, 0.00025, 0.000125)]
+    ramps = [trajectory(substep) for substep in (0.002, 0.001, 0.0005, 0.00025)]
     changes = [np.abs(b - a).max() for a, b in zip(ramps, ramps[1:], strict=False)]
     assert changes[1] < 1e-3
-    assert math.log2(changes[0] / changes[-1]) / 3.0 > 1.5
+    assert math.log2(changes[0] / changes[-1]) / 2.0 > 1.5
     free = [trajectory(substep, drive__acceleration=0.0) for substep in (0.002, 0.001, 0.0005)]
     order = math.log2(np.abs(free[1] - free[0]).max() / np.abs(free[2] - free[1]).max())
     assert order == pytest.approx(4.0, abs=0.3)
 
 
 def test_odometry_without_noise_follows_ground_truth():
-    simulated = robot()
+    simulated, turned, before = robot(), np.zeros(2), np.zeros(2)
     for tick in range(2000):
         state = simulated.step(wander(tick))
+        turned += 0.005 * (before + state.true_wheels)
+        before = np.array(state.true_wheels)
+    assert np.array(state.angles) == pytest.approx(turned, abs=5e-3)
     assert state.odometry.pose[:2] == pytest.approx(state.truth.pose[:2], abs=2e-3)
     assert state.odometry.twist == state.truth.twist
     run = simulated.parameters.geometry.wheel_radius * np.array(state.angles)
     assert np.trace(state.covariance) > 0.0
     assert run.max() > 2.0
-
-
-def test_wheel_angles_integrate_the_wheel_speeds():
-    simulated, total = robot(), np.zeros(2)
-    before = np.zeros(2)
-    for tick in range(500):
-        state = simulated.step(wander(tick))
-        total += 0.005 * (before + np.array(state.true_wheels))
-        before = np.array(state.true_wheels)
-    assert np.array(state.angles) == pytest.approx(total, abs=5e-3)
 
 
 # -- robot interface ------------------------------------------------------------------------------
@@ -374,10 +341,3 @@ def test_warm_up_leaves_the_robot_unchanged():
     warm.warm_up()
     assert numbers(cold.step(WheelSpeeds(5.0, 4.0))) == numbers(warm.step(WheelSpeeds(5.0, 4.0)))
     robot(drive__kind='torque').warm_up()
-
-
-def test_paper_robot_implements_the_robot_interface():
-    assert RobotInterface in PaperRobot.__mro__
-    for name in ('apply', 'advance', 'stop', 'reset_odometry', 'latch_estop', 'release_estop'):
-        assert name in vars(RobotInterface)
-        assert getattr(PaperRobot, name) is not getattr(RobotInterface, name)

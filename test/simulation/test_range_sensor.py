@@ -18,9 +18,7 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.sensor_conversions import (
     BEYOND,
     FAULT,
@@ -67,18 +65,16 @@ def seen_at(true_distance: float) -> float:
     return sensors.readings[0]
 
 
-@pytest.mark.parametrize('centimetres', FAR)
-def test_voltage_matches_the_data_sheet_in_range(centimetres):
-    assert output_voltage(0.01 * centimetres) == pytest.approx(FAR[centimetres], rel=0.025)
-
-
-@pytest.mark.parametrize('centimetres', NEAR)
-def test_voltage_matches_the_data_sheet_near_the_sensor(centimetres):
-    assert output_voltage(0.01 * centimetres) == pytest.approx(NEAR[centimetres], rel=0.03)
+def test_voltage_matches_the_data_sheet():
+    for table, tolerance in ((FAR, 0.025), (NEAR, 0.03)):
+        for centimetres, volts in table.items():
+            assert output_voltage(0.01 * centimetres) == pytest.approx(volts, rel=tolerance)
+    assert output_voltage(0.0) == output_voltage(-0.01) == 0.0
+    assert 0.0 < output_voltage(math.inf) < output_voltage(100.0) < output_voltage(0.8)
 
 
 def test_voltage_has_a_single_peak_between_5_and_7_cm():
-    distances = np.linspace(1e-4, 2.0, 20001)
+    distances = np.linspace(1e-4, 2.0, 2001)
     voltages = np.array([output_voltage(place) for place in distances])
     peak = int(voltages.argmax())
     assert 0.05 < distances[peak] < 0.07
@@ -87,18 +83,9 @@ def test_voltage_has_a_single_peak_between_5_and_7_cm():
     assert np.all(np.diff(voltages[peak:]) < 0.0)
 
 
-@pytest.mark.parametrize('place', [0.0, -0.01, 1e-300, 1e-6])
-def test_voltage_at_contact_is_zero(place):
-    assert 0.0 <= output_voltage(place) < 1e-3
-
-
-def test_voltage_without_an_object_is_the_lowest():
-    assert 0.0 < output_voltage(math.inf) < output_voltage(100.0) < output_voltage(0.8)
-
-
 def test_board_inverts_the_curve_within_adc_resolution():
     parameters = SimulatedRangeSensorParameters()
-    for place in np.linspace(0.1005, 0.79, 1500):
+    for place in np.linspace(0.1005, 0.79, 300):
         slope = (output_voltage(place - 1e-4) - output_voltage(place + 1e-4)) / 2e-4
         found = distance_from_voltage(parameters.volts(parameters.count(output_voltage(place))))
         # Half a step, and a tenth for the error of the formula near 10 cm.
@@ -139,50 +126,29 @@ def test_every_code_round_trips():
     assert decode_range(BEYOND) == math.inf
     assert decode_range(20) == pytest.approx(0.10)
     assert decode_range(160) == pytest.approx(0.80)
-
-
-@pytest.mark.parametrize('byte', [-1, 256])
-def test_code_outside_a_byte_is_rejected(byte):
-    with pytest.raises(ValueError, match=f'from 0 to 255: got {byte}'):
-        decode_range(byte)
-
-
-def test_finite_readings_round_to_5_mm_and_no_special_code():
+    for byte in (-1, 256):
+        with pytest.raises(ValueError, match=f'from 0 to 255: got {byte}'):
+            decode_range(byte)
     for place in np.linspace(0.01, 1.265, 400):
         assert abs(decode_range(encode_range(place)) - place) <= 0.0025 + 1e-12
     assert encode_range(-1.0) == encode_range(0.0) == TOO_NEAR
     assert encode_range(1e6) == BEYOND
 
 
-def test_mounts_are_two_per_side_and_point_outwards():
-    parameters = SimulatedRangeSensorParameters(half_length=0.1, half_width=0.08, offset=0.03)
-    places = dict(zip(RANGE_SENSORS, sensor_mounts(parameters), strict=True))
-    assert places['front_left'] == pytest.approx([0.1, 0.03, 0.0])
-    assert places['front_right'] == pytest.approx([0.1, -0.03, 0.0])
-    assert places['left_front'] == pytest.approx([0.03, 0.08, math.pi / 2])
-    assert places['left_back'] == pytest.approx([-0.03, 0.08, math.pi / 2])
-    assert places['rear_left'] == pytest.approx([-0.1, 0.03, math.pi])
-    assert places['rear_right'] == pytest.approx([-0.1, -0.03, math.pi])
-    assert places['right_front'] == pytest.approx([0.03, -0.08, -math.pi / 2])
-    assert places['right_back'] == pytest.approx([-0.03, -0.08, -math.pi / 2])
-    for x, y, direction in sensor_mounts(parameters):
-        assert x * math.cos(direction) + y * math.sin(direction) > 0.0
-
-
 def test_sensor_periods_are_within_the_data_sheet():
     sensors = finders()
     counts = np.zeros(8)
-    for _ in range(20000):
+    for _ in range(4000):
         for index in sensors.due(0.01):
             counts[index] += 1
-    assert 200.0 / counts == pytest.approx(sensors.periods, rel=1e-3)
+    assert 40.0 / counts == pytest.approx(sensors.periods, rel=2e-3)
     assert all(0.0287 <= period <= 0.0479 for period in sensors.periods)
     assert len(set(sensors.periods)) == 8
 
 
 def test_sensors_start_with_random_phases():
     firsts = []
-    for seed in range(100):
+    for seed in range(40):
         sensors = finders(seed=seed)
         first = dict.fromkeys(range(8), 0)
         for tick in range(50):
@@ -190,13 +156,13 @@ def test_sensors_start_with_random_phases():
                 first[index] = first[index] or tick + 1
         firsts.append([first[index] / (1e3 * sensors.periods[index]) for index in range(8)])
     # Uniform within the first period.
-    assert np.mean(firsts) == pytest.approx(0.5, abs=0.05)
+    assert np.mean(firsts) == pytest.approx(0.5, abs=0.06)
     assert np.std(firsts) == pytest.approx(1.0 / math.sqrt(12.0), rel=0.1)
 
 
 def test_due_sensors_are_independent_of_the_time_step():
     coarse, fine = finders(), finders()
-    for tick in range(2000):
+    for tick in range(300):
         early = [index for _ in range(10) for index in fine.due(0.001)]
         # Rounding may move a sensor at the end of a period to the next one.
         assert set(coarse.due(0.01)) == set(early), tick
@@ -212,20 +178,14 @@ def test_long_gap_makes_each_sensor_due_once_in_phase():
         assert jumped.due(0.007) == patient.due(0.007)
 
 
-def test_readings_are_nan_until_first_measured():
-    sensors = finders(**QUIET)
-    assert all(map(math.isnan, sensors.readings))
-    sensors.measure(3, 0.3)
-    assert sensors.readings[3] == pytest.approx(0.3, abs=0.0045)
-    assert sum(map(math.isnan, sensors.readings)) == 7
-
-
 def test_reading_noise_follows_the_curve_slope():
     sensors = finders(voltage_noise=0.01, voltage_offset=0.0)
+    assert all(map(math.isnan, sensors.readings))
     found = []
-    for _ in range(4000):
+    for _ in range(2000):
         sensors.measure(0, 0.5)
         found.append(sensors.readings[0])
+    assert sum(map(math.isnan, sensors.readings)) == 7
     slope = (output_voltage(0.499) - output_voltage(0.501)) / 0.002
     assert np.std(found) == pytest.approx(0.01 / slope, rel=0.08)
     assert np.mean(found) == pytest.approx(0.5, abs=0.004)

@@ -19,8 +19,9 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
+from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.robot.interface import RobotCommand
+from t3mpc_ros.simulation import digital_twin
 from t3mpc_ros.simulation.digital_twin import CAPACITY, TransportDelay
 
 MS = 1_000_000
@@ -47,26 +48,21 @@ def arrivals(
     return result
 
 
-def test_zero_delay_delivers_immediately_and_unchanged():
-    transport = make_transport()
-    sent = command(3, 7)
-    transport.send(sent, 100, 0.0, 0.0, 0.0)
-    assert transport.next_ns == 100
-    assert transport.arrived(100) == [sent]
-    assert transport.next_ns is None
-    assert transport.arrived(100) == []
-
-
 def test_simultaneous_arrivals_keep_the_order_of_sending():
     transport = make_transport()
-    for number in range(50):
-        transport.send(command(number), 0, 0.1, 0.0, 0.0)
-    assert transport.arrived(NANOSECONDS) == [command(number) for number in range(50)]
+    for delay, arrival in ((0.0, 7), (0.1, 7 + 100 * MS)):
+        sent = [command(number, 3) for number in range(50)]
+        for one in sent:
+            transport.send(one, 7, delay, 0.0, 0.0)
+        assert transport.next_ns == arrival
+        assert transport.arrived(arrival) == sent
+        assert transport.next_ns is None
+        assert transport.arrived(arrival) == []
 
 
 def test_every_command_is_delivered_once_lost_or_in_transit():
     """Random operations, often equal commands, and a clock that sometimes jumps back."""
-    for seed in range(30):
+    for seed in range(6):
         generator = np.random.default_rng(seed)
         transport = make_transport(seed)
         now_ns, sent, arrived, last_ns = 0, Counter(), Counter(), -1
@@ -99,10 +95,10 @@ def test_every_command_is_delivered_once_lost_or_in_transit():
         assert arrived.total() > 20
 
 
-@pytest.mark.parametrize('loss', [0.01, 0.2, 0.7])
+@pytest.mark.parametrize('loss', [0.01, 0.7])
 def test_losses_have_the_set_rate_and_are_independent(loss):
     """Within four standard deviations of the binomial; two losses in a row too."""
-    transport, count = make_transport(2), 20_000
+    transport, count = make_transport(2), 5000
     lost = []
     for number in range(count):
         transport.send(command(0), number, 0.0, 0.0, loss)
@@ -159,32 +155,14 @@ def test_backward_time_jump_clears_the_queue():
         assert transport.arrived(60) == [command(3)]
 
 
-@pytest.mark.slow
-def test_full_queue_drops_the_oldest():
+def test_full_queue_drops_the_oldest(monkeypatch):
+    monkeypatch.setattr(digital_twin, 'CAPACITY', 50)
     transport = make_transport(6)
-    for number in range(3 * CAPACITY):
+    for number in range(150):
         transport.send(command(number, number), 0, 0.5, 0.5, 0.0)
-        assert len(transport) <= CAPACITY
+        assert len(transport) <= 50
     came = []
     while (instant := transport.next_ns) is not None:
         (one,) = transport.arrived(instant)  # each at its own instant
         came.append(one)
-    assert sorted(one.stamp_ns for one in came) == list(range(2 * CAPACITY, 3 * CAPACITY))
-
-
-@pytest.mark.parametrize(
-    'delay, jitter, loss',
-    [
-        (-0.1, 0, 0),
-        (math.nan, 0, 0),
-        (0, math.inf, 0),
-        (0, -1.0, 0),
-        (0, 0, 1.1),
-        (0, 0, math.nan),
-    ],
-)
-def test_invalid_delay_or_loss_is_rejected(delay, jitter, loss):
-    transport = make_transport()
-    with pytest.raises(ValueError, match='must be'):
-        transport.send(command(1), 0, delay, jitter, loss)
-    assert len(transport) == 0
+    assert sorted(one.stamp_ns for one in came) == list(range(100, 150))

@@ -49,10 +49,6 @@ EXAMPLE = re.search(r'```yaml\n(.*?)```', PAGE.read_text(), re.DOTALL).group(1)
 BUMPER = BumperParameters().radius
 
 
-def lengths(world):
-    return np.hypot(*(world.segments[:, 2:] - world.segments[:, :2]).T)
-
-
 # --- valid files -------------------------------------------------------------------------------
 
 
@@ -96,20 +92,9 @@ def test_bundled_world_loads_and_is_free_at_the_origin(name):
         assert array.dtype == np.float64
         assert array.flags.c_contiguous
     across = math.dist(*world.bounds())
-    for direction in np.linspace(-3.0, 3.0, 500).tolist():  # it is closed
+    for direction in np.linspace(-3.0, 3.0, 200).tolist():  # it is closed
         ray = cast_ray(0.0, 0.0, direction, world.segments, world.circles)
         assert ray < across
-
-
-def test_room_has_the_documented_size_and_objects():
-    world = load_world('room')
-    assert world.bounds() == ((-2.0, -1.5), (2.0, 1.5))
-    assert [len(a) for a in (world.segments, world.boxes, world.circles, world.patches)] == [
-        12,
-        2,
-        1,
-        1,
-    ]
 
 
 def test_empty_name_is_the_empty_plain():
@@ -136,13 +121,6 @@ def test_file_loads_by_path_and_is_named_after_it(tmp_path, monkeypatch):
     assert len(load_world(str(WORLDS_FOLDER / 'room.yaml')).segments) == 12
 
 
-def test_closed_wall_has_one_segment_more_than_an_open_one():
-    points = '[[0, 0], [3, 0], [3, 4]]'
-    assert lengths(parse_world(f'walls: [{{points: {points}}}]', 'a')).tolist() == [3.0, 4.0]
-    closed = parse_world(f'walls: [{{points: {points}, closed: true}}]', 'a')
-    assert sorted(lengths(closed)) == [3.0, 4.0, 5.0]
-
-
 def test_is_free_matches_a_dense_sampling():
     world = parse_world(
         'boxes: [{center: [1, 2], size: [0.8, 0.4], yaw: 0.5}]\n'
@@ -156,24 +134,17 @@ def test_is_free_matches_a_dense_sampling():
     turn = np.array([[cosine, sine], [-sine, cosine]])
     box = grid.reshape(-1, 2) @ turn + (1.0, 2.0)
     both = {True: 0, False: 0}
-    for _ in range(1000):
+    for _ in range(200):
         x, y = generator.uniform((-2, -1), (2, 3)).tolist()
         radius = float(generator.choice([0.0, 0.11, 0.3]))
         gap = min(float(np.hypot(*(box - (x, y)).T).min()), max(math.hypot(x + 1.0, y) - 0.6, 0.0))
         if abs(gap - radius) > 0.005 or (radius == 0.0 and math.hypot(x + 1.0, y) < 0.6):
             assert world.is_free(x, y, radius) == (gap > radius)
             both[gap > radius] += 1
-    assert min(both.values()) > 100
-    assert not world.is_free(1.0, 2.0, 0.0)
-    assert not world.is_free(-1.0, 0.0, 0.0)
-
-
-def test_inside_of_a_wall_is_free_and_non_finite_is_not():
-    world = load_world('room')
-    assert world.is_free(0, 0, 0)
-    assert world.is_free(9.0, 9.0, 0.1)
-    for numbers in ((math.nan, 0.0, 0.1), (0.0, math.inf, 0.1), (0.0, 0.0, math.nan)):
+    assert min(both.values()) > 20
+    for numbers in ((1.0, 2.0, 0.0), (-1.0, 0.0, 0.0), (math.nan, 0.0, 0.1), (9.0, 9.0, math.inf)):
         assert not world.is_free(*numbers)
+    assert world.is_free(9, 9, 0)
     with pytest.raises(ValueError, match='radius must be at least 0 m: got -0.1'):
         world.is_free(0.0, 0.0, -0.1)
 
@@ -190,7 +161,7 @@ def test_nearly_touching_walls_share_exact_end_points():
 
 def test_wall_is_split_where_other_walls_end_on_it():
     generator = np.random.default_rng(2)
-    for _ in range(20):
+    for _ in range(5):
         shares = generator.uniform(0.05, 0.95, 5)
         angle = generator.uniform(0.0, 6.0)
         along = np.array([math.cos(angle), math.sin(angle)])
@@ -223,51 +194,32 @@ BAD = {
     'boxes: [{center: [0, 0], size: [1, 0]}]': (
         'boxes[0].size[1] must be a number from 0.01 to 1000 m: got 0'
     ),
-    f'circles: [{{{CIRCLE}}}, {{center: [0, 0], radius: -1}}]': (
-        'circles[1].radius must be a number from 0.01 to 1000 m: got -1'
-    ),
-    'circles: [{center: [0, .nan], radius: 1}]': (
-        'circles[0].center[1] must be a number from -1000 to 1000 m: got nan'
-    ),
     'circles: [{center: [0, 0], radius: .inf}]': 'circles[0].radius must be a number',
-    'circles: [{center: [0, 2.0e+9], radius: 1}]': 'got 2000000000.0',
     f'circles: [{{center: [0, {10**400}], radius: 1}}]': 'circles[0].center[1] must be a number',
     'circles: [{center: [0, 1e-3], radius: 1}]': "got '1e-3', which YAML reads as text; write",
-    'circles: [{center: [0, -.5], radius: 1}]': "got '-.5', which YAML reads as text; write",
-    'circles: [{center: [0, two], radius: 1}]': "must be a number from -1000 to 1000 m: got 'two'",
     'circles: [{center: [0, true], radius: 1}]': 'circles[0].center[1] must be a number',
     'circles: [{center: [0], radius: 1}]': 'circles[0].center must have 2 entries: got 1',
     'circles: [{center: 3, radius: 1}]': 'circles[0].center must be a list: got 3',
     'circles: [{center: [0, 0]}]': 'circles[0] must have radius',
     'circles: [7]': 'circles[0] must hold center, radius, unseen by name: got 7',
     f'patches: [{{{CIRCLE}, grip: 1.2}}]': 'patches[0].grip must be a number from 0 to 1: got 1.2',
-    f'patches: [{{{CIRCLE}}}]': 'patches[0] must have grip',
-    f'circles: [{{{CIRCLE}, grip: 1}}]': "circles[0] has no 'grip'",
     'boxes: [{center: [0, 0], size: [1, 1], yaw: 45}]': (
         'boxes[0].yaw must be a number from -6.28319 to 6.28319 rad: got 45'
     ),
     'boxes: [{centre: [0, 0], size: [1, 1]}]': "boxes[0] has no 'centre'; did you mean center?",
     'wals: []': "the world has no 'wals'; did you mean walls?",
-    'zzz: []': "the world has no 'zzz'; known are name, walls, boxes, circles, patches",
-    'walls: [{points: [[0, 0]]}]': 'walls[0].points must have from 2 to 2001 entries: got 1',
     'walls: [{points: [[0, 0], [1, 1]], closed: true}]': 'must have from 3 to 2001 entries: got 2',
     'walls: [{points: [[0, 0], [1, 1]], closed: 1}]': 'walls[0].closed must be true or false',
-    'walls: [{points: [[0, 0], [1, 1], [1, 1]]}]': (
-        'walls[0].points[2] must be at least 0.01 m from the point before it: got 0 m'
-    ),
     'walls: [{points: [[0, 0], [1, 1], [0, 1], [0, 0]], closed: true}]': (
         'walls[0].points[0] must be at least 0.01 m from the point before it: got 0 m; leave the '
         'last point out'
     ),
-    'walls: [[0, 0], [1, 1]]': 'walls[0] must hold points, closed, unseen by name: got [0, 0]',
     'walls:': 'walls must be a list: got None',
     'name: 7': 'name must be a text: got 7',
-    'name: a\nwalls: []\nname: b': 'is not YAML: line 3: name is given twice in one entry',
     '': 'the world must hold name, walls, boxes, circles, patches, moving, chargers by name: got',
     f'chargers: [{{{CIRCLE}, current: -1}}]': (
         'chargers[0].current must be a number from 0 to 100 A: got -1'
     ),
-    'circles: &a [*a]': 'circles[0] must hold center, radius, unseen by name: got [',
 }
 
 
@@ -278,42 +230,30 @@ def test_a_charger_charges_where_it_stands():
     assert parse_world('walls: []', 'yard.yaml').charging_current(0.0, 0.0) == 0.0
 
 
-@pytest.mark.parametrize('text', BAD, ids=lambda text: text[:60])
-@pytest.mark.slow
-def test_invalid_file_error_names_entry_bound_and_value(text):
-    with pytest.raises(WorldError) as caught:
-        parse_world(text, 'yard.yaml')
-    message = str(caught.value)
-    assert message.startswith(('yard.yaml: ', 'yard.yaml is not YAML: '))
-    assert BAD[text] in message
-    assert len(message) < 250
+def test_invalid_file_error_names_entry_bound_and_value():
+    for text, words in BAD.items():
+        with pytest.raises(WorldError) as caught:
+            parse_world(text, 'yard.yaml')
+        assert str(caught.value).startswith('yard.yaml: ')
+        assert words in str(caught.value)
+        assert len(str(caught.value)) < 250
 
 
 @pytest.mark.slow
 def test_list_lengths_and_segment_count_are_bounded():
-    def refused(text, words):
-        with pytest.raises(WorldError, match=re.escape(words)):
-            parse_world(text, 'yard.yaml')
-
     box = '{center: [0, 0], size: [1, 1]}'
     zigzag = ', '.join(f'[{index % 2}, {0.4 * (index - 1000):g}]' for index in range(2001))
     wall = f'walls: [{{points: [{zigzag}]}}]'
-    refused(f'circles: [{", ".join(501 * ["7"])}]', 'circles must have from 0 to 500 entries')
-    refused(f'patches: [{", ".join(101 * ["7"])}]', 'patches must have from 0 to 100 entries')
-    refused(f'boxes: [{", ".join(501 * [box])}]', 'boxes must have from 0 to 500 entries')
-    assert len(parse_world(wall, 'a').segments) == 2000
-    refused(f'{wall}\nboxes: [{box}]', 'at most 2000 segments together: got 2004')
-    closed = wall.replace(']]}', ']], closed: true}')
-    refused(closed, 'at most 2000 segments together: got 2001')
-    refused(wall.replace('points: [', 'points: [[5, 5], '), 'from 2 to 2001 entries: got 2002')
-
-
-@pytest.mark.slow
-def test_splitting_walls_respects_the_segment_limit():
     feet = ', '.join(f'{{points: [[{0.1 * i:g}, 0], [{0.1 * i:g}, 1]]}}' for i in range(1500))
-    text = f'walls: [{{points: [[-1, 0], [999, 0]]}}, {feet}]'
-    with pytest.raises(WorldError, match='at most 2000 segments together: got 3001'):
-        parse_world(text, 'yard.yaml')
+    for text, words in (
+        (f'circles: [{", ".join(501 * ["7"])}]', 'circles must have from 0 to 500 entries'),
+        (f'{wall}\nboxes: [{box}]', 'at most 2000 segments together: got 2004'),
+        (wall.replace('points: [', 'points: [[5, 5], '), 'from 2 to 2001 entries: got 2002'),
+        # One wall, split where 1500 others begin.
+        (f'walls: [{{points: [[-1, 0], [999, 0]]}}, {feet}]', 'segments together: got 3001'),
+    ):
+        with pytest.raises(WorldError, match=re.escape(words)):
+            parse_world(text, 'yard.yaml')
 
 
 def test_unreadable_file_is_rejected_by_name(tmp_path):
@@ -323,14 +263,6 @@ def test_unreadable_file_is_rejected_by_name(tmp_path):
         load_world(tmp_path / 'none.yaml')
     with pytest.raises(WorldError, match='cannot be read: Is a directory'):
         load_world(tmp_path)
-    latin = tmp_path / 'latin.yaml'
-    latin.write_bytes('name: Küche'.encode('latin-1'))
-    with pytest.raises(WorldError, match=r'latin\.yaml must be UTF-8 text'):
-        load_world(latin)
-    long = tmp_path / 'long.yaml'
-    long.write_text('# ' + 1_000_000 * 'x')
-    with pytest.raises(WorldError, match=r'long\.yaml must have at most 1000000 bytes'):
-        load_world(long)
     broken = tmp_path / 'broken.yaml'
     broken.write_text('boxes: 1')
     with pytest.raises(WorldError, match=r'broken\.yaml: boxes must be a list: got 1'):
@@ -341,7 +273,7 @@ def test_unreadable_file_is_rejected_by_name(tmp_path):
 def test_damaged_file_is_parsed_or_rejected():
     generator = np.random.default_rng(4)
     read = 0
-    for _ in range(300):
+    for _ in range(60):
         text = list(EXAMPLE)
         for _ in range(generator.integers(1, 4)):
             place = int(generator.integers(len(text)))
@@ -352,7 +284,7 @@ def test_damaged_file_is_parsed_or_rejected():
             continue
         read += 1
         assert np.isfinite(world.segments).all()
-    assert 10 < read < 290
+    assert 5 < read < 55
 
 
 MOVING = """
