@@ -139,12 +139,7 @@ class Handshake:
     """
 
     def __init__(
-        self,
-        session: Session,
-        parameters: LinkParameters,
-        reason: str,
-        absent: str,
-        no_reply: str,
+        self, session: Session, parameters: LinkParameters, reason: str, absent: str, no_reply: str
     ) -> None:
         self._session = session
         self._targets = parameters.robot.to_wire()
@@ -179,13 +174,9 @@ class Handshake:
             return self._handle_info(result.uplink)
         if result.uplink is None:
             self.state = LinkState.HELLO
-            self.reason = (
-                reasons.robot_version(result.foreign_version)
-                if result.foreign_version
-                else self._no_reply
-                if result.reply is None
-                else self._absent
-            )
+            self.reason = self._no_reply if result.reply is None else self._absent
+            if result.foreign_version:
+                self.reason = reasons.robot_version(result.foreign_version)
             return _RETRY_NS
         self.state = LinkState.INFO
         return 0
@@ -202,22 +193,16 @@ class Handshake:
 
     def _queue_parameters(self, count: int) -> None:
         """Queue all writes and reads; older firmware has fewer parameters."""
-        self._pending.clear()
-        self._pending.extend((number, self._targets[number]) for number in self._targets)
-        self._pending.extend(
-            (number, None) for number in range(min(count, len(frames.BOARD_PARAMETERS)))
-        )
+        reads = range(min(count, len(frames.BOARD_PARAMETERS)))
+        self._pending = deque([*self._targets.items(), *((number, None) for number in reads)])
         if count > BOOTS_ID:
             self._pending.extend([(BOOTS_ID, None)] * _BOOTS_READS)
 
     def _handle_parameter(self, result: TransactionResult) -> int:
         number, target = self._pending[0]
         answer = result.uplink
-        expected_seq = getattr(result.request, 'seq', None)
-        if not isinstance(answer, frames.Param) or (answer.id, answer.seq) != (
-            number,
-            expected_seq,
-        ):
+        expected = number, getattr(result.request, 'seq', None)
+        if not isinstance(answer, frames.Param) or (answer.id, answer.seq) != expected:
             self._attempts += 1
             if self._attempts >= _MAX_ATTEMPTS:
                 self._attempts, self.state = 0, LinkState.HELLO
@@ -231,9 +216,9 @@ class Handshake:
             self.reason = f'parameter {what} was refused: the robot {text}'
             return _RETRY_NS if answer.rc == frames.BUSY else _REJECTED_RETRY_NS
         self.board_parameters[number] = answer.value
-        expected = self._targets.get(number, answer.value)
-        if answer.value != expected:
-            self.reason = f'parameter {name} must be {expected}: the robot keeps {answer.value}'
+        wanted = self._targets.get(number, answer.value)
+        if answer.value != wanted:
+            self.reason = f'parameter {name} must be {wanted}: the robot keeps {answer.value}'
             self._queue_parameters(self.info.parameters if self.info else 0)
             return _REJECTED_RETRY_NS
         self._pending.popleft()

@@ -20,7 +20,6 @@ they are repeated until answered.
 
 import math
 import secrets
-from typing import NamedTuple
 
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.radio.link import standstill_reasons as reasons
@@ -69,10 +68,6 @@ _COLLISION_HOLD_NS = 5 * NANOSECONDS
 """Standstill after two robots have answered."""
 _REFUSAL_QUERY_NS = NANOSECONDS // 10
 """Time without an accepted command after which AUX is requested for the reason, and again."""
-
-
-class PingRequest(NamedTuple):
-    """PING the dongle, for its counters."""
 
 
 class ActiveSession:
@@ -125,7 +120,7 @@ class ActiveSession:
             self._stops, self._stop_until_ns = _MIN_STOP_COMMANDS, now_ns + _STOP_TIMEOUT_NS
             self.due_ns = now_ns
 
-    def next(self, now_ns: int, hold: bool = False) -> frames.Downlink | PingRequest | None:
+    def next(self, now_ns: int, hold: bool) -> frames.Downlink | frames.Ping | None:
         """Return the request to send now, if any; a POLL for STATE follows each payload.
 
         ``hold``: command standstill, whatever the setpoint.
@@ -143,33 +138,30 @@ class ActiveSession:
 
     def handle(self, result: TransactionResult) -> str:
         """Process a result; return the reason for a new handshake, empty if none is needed."""
-        if isinstance(result.uplink, frames.State):
-            self._continue_cycles(result)
+        request, now_ns = result.request, result.returned_ns
+        state = result.uplink if isinstance(result.uplink, frames.State) else None
+        polls = isinstance(request, frames.Poll) and request.what == frames.STATE
+        # The first STATE, or the first after a silence, is followed by a command at once: the
+        # robot refuses every command before it, for its echo.
+        if state is not None and self.is_silent(now_ns):
+            self.due_ns = self._accepted_ns = now_ns
+        elif state is not None and polls:
+            self.due_ns = now_ns
         if result.uplink is not None:
-            self._answered_ns = result.returned_ns
-        if isinstance(result.request, frames.Command):
-            answered = isinstance(result.uplink, frames.State)
-            loss = _find_loss(result, result.request)
+            self._answered_ns = now_ns
+        if isinstance(request, frames.Command):
+            loss = _find_loss(result, request)
             self._statistics.add_cycle(result.round_trip if loss is None else loss)
-            self._lost = 0 if answered else self._lost + 1
-            self._count_disable(result)
-        elif isinstance(result.request, frames.Poll) and result.request.what == frames.STATE:
-            self._lost = 0 if isinstance(result.uplink, frames.State) else self._lost + 1
-        if isinstance(result.uplink, frames.State):
-            return self._check_state(result, result.uplink)
-        return ''
+            if self._stops is not None and not request.flags:
+                # A STATE with disabled drives completes the stop. After a pause of the host, the
+                # first command that disables them is refused for its echo.
+                disabled = state is not None and not state.status & frames.StatusFlag.ENABLED
+                self._disable_attempts = 0 if disabled else self._disable_attempts - 1
+        if polls or isinstance(request, frames.Command):
+            self._lost = 0 if state is not None else self._lost + 1
+        return '' if state is None else self._check_state(result, state)
 
-    def _continue_cycles(self, result: TransactionResult) -> None:
-        """Send the next command at once if this is the first STATE, or the first after a silence.
-
-        The robot refuses every command before it, for its echo.
-        """
-        if self.is_silent(result.returned_ns):
-            self.due_ns = self._accepted_ns = result.returned_ns
-        elif isinstance(result.request, frames.Poll) and result.request.what == frames.STATE:
-            self.due_ns = result.returned_ns
-
-    def _next_request(self, now_ns: int) -> frames.Downlink | PingRequest | None:
+    def _next_request(self, now_ns: int) -> frames.Downlink | frames.Ping | None:
         """Return the request that is due between cycles, if any."""
         if self._stops is not None:
             return None
@@ -178,7 +170,7 @@ class ActiveSession:
             return self._session.poll(frames.AUX)
         if now_ns >= self._ping_ns:
             self._ping_ns = now_ns + _PING_PERIOD_NS
-            return PingRequest()
+            return frames.Ping(0, b'')
         if self._counts_boots and now_ns >= self._boots_ns:
             # Another count than at the start of the session is that of another robot.
             self._boots_ns = now_ns + _BOOTS_PERIOD_NS
@@ -194,26 +186,10 @@ class ActiveSession:
             return self._session.command(flags, self._parameters.ttl_units, 0, 0, now_ns)
         if self._session.echo_us is None and not self._arbiter.estop:
             return self._session.poll(frames.STATE)
-        setpoint = self._arbiter.next_setpoint(
+        flags, left, right, ttl = self._arbiter.next_setpoint(
             bool(self._status & frames.StatusFlag.ESTOP), now_ns, hold or self.is_silent(now_ns)
         )
-        flags, left, right, ttl = setpoint
         return self._session.command(flags, ttl, left, right, now_ns)
-
-    def _count_disable(self, result: TransactionResult) -> None:
-        """Count commands that disable the drives; a STATE with disabled drives completes the stop.
-
-        After a pause of the host, the first one is refused for its echo.
-        """
-        if (
-            self._stops is None
-            or not isinstance(result.request, frames.Command)
-            or result.request.flags
-        ):
-            return
-        state = result.uplink
-        disabled = isinstance(state, frames.State) and not state.status & frames.StatusFlag.ENABLED
-        self._disable_attempts = 0 if disabled else self._disable_attempts - 1
 
     def _check_state(self, result: TransactionResult, state: frames.State) -> str:
         self._status = frames.StatusFlag(state.status)
@@ -524,7 +500,7 @@ class Link:
 
     def _send_active(self, active: ActiveSession, now_ns: int) -> None:
         frame = active.next(now_ns, hold=now_ns < self._collision_until_ns)
-        if isinstance(frame, PingRequest):
+        if isinstance(frame, frames.Ping):
             self._write(self._transactions.ping(_ACTIVE_PING_TIMEOUT_NS, now_ns))
         elif frame is not None:
             self._transact(frame, now_ns)
@@ -627,30 +603,25 @@ class Link:
 
     def _counts_differ(self, answer: frames.Uplink | None) -> bool:
         """Return whether an answer has another count of starts than that of the session."""
+        known = self._handshake.board_parameters if self._handshake else self._board_parameters
         return (
             isinstance(answer, frames.Param)
             and (answer.id, answer.rc) == (BOOTS_ID, frames.OK)
-            and self._known_boots() not in (None, answer.value)
+            and known.get(BOOTS_ID) not in (None, answer.value)
         )
-
-    def _known_boots(self) -> int | None:
-        """Return the count of starts that the robot of this session has reported."""
-        reported = self._handshake.board_parameters if self._handshake else self._board_parameters
-        return reported.get(BOOTS_ID)
 
     def _handle_pong(self, result: TransactionResult, now_ns: int) -> None:
         pong = result.reply
         if not isinstance(pong, frames.Pong):
             return
         self._reopen_ns = _MIN_REOPEN_NS
-        if pong.protocol != frames.VERSION:
-            self._reason = (
-                f'the dongle must speak protocol {frames.VERSION}: it speaks {pong.protocol}'
-            )
-        else:
+        if pong.protocol == frames.VERSION:
             self._configure_radio(now_ns)
             return
         # The dongle answers; the defect needs manual repair.
+        self._reason = (
+            f'the dongle must speak protocol {frames.VERSION}: it speaks {pong.protocol}'
+        )
         self._since_ns = now_ns
         self._due_ns = now_ns + _DEFECT_RETRY_NS
 
@@ -669,7 +640,9 @@ class Link:
             self._reason = reasons.RADIO_NOT_CONFIGURED
         elif isinstance(reply, frames.Refusal) and reply.code == frames.UNKNOWN:
             # Its console answers PING as well. The port stays open: opening it resets the robot.
-            if self._cable_allowed and self._speaks_over_cable():
+            pong = self._statistics.dongle
+            new = pong is not None and (pong.major, pong.minor) >= _CABLE_FIRMWARE
+            if self._cable_allowed and new:
                 self._use_cable(True)
                 self._start_handshake(LinkState.HELLO.value, now_ns)
                 return
@@ -677,11 +650,6 @@ class Link:
             self._due_ns = now_ns + _DEFECT_RETRY_NS
             return
         self._due_ns = now_ns + _CONFIGURE_RETRY_NS
-
-    def _speaks_over_cable(self) -> bool:
-        """Return whether the firmware of the robot board takes transactions over its USB."""
-        pong = self._statistics.dongle
-        return pong is not None and (pong.major, pong.minor) >= _CABLE_FIRMWARE
 
     def _use_cable(self, cable: bool) -> None:
         self.over_cable = self._transactions.over_cable = cable

@@ -13,7 +13,7 @@
 # limitations under the License.
 """Parameters of the link: radio, cycle rate, and the parameters of the robot board."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS
@@ -77,18 +77,7 @@ class RobotParameters(Parameters):
 
     def to_wire(self) -> dict[int, int]:
         """Return the values on the wire, by id of the board parameter."""
-        values = {
-            name: round(1000.0 * getattr(self, name))
-            for name in (
-                'max_speed',
-                'acceleration',
-                'deceleration',
-                'ttl_max',
-                'battery_low',
-                'battery_cutoff',
-                'idle_off',
-            )
-        }
+        values = {each.name: round(1000.0 * getattr(self, each.name)) for each in fields(self)}
         values['invert_wheels'] = self.invert_left + 2 * self.invert_right
         return {
             number: values[parameter.name]

@@ -67,9 +67,6 @@ class CableErrors(NamedTuple):
     dongle: int = 0
     """Counted by the dongle: frames to it."""
 
-    def __sub__(self, other: 'CableErrors') -> 'CableErrors':
-        return CableErrors(self.host - other.host, self.dongle - other.dongle)
-
 
 class LinkQuality(NamedTuple):
     """Quality of the link; loss rate and round trips over the last 500 cycles."""
@@ -128,12 +125,8 @@ class LinkStatistics:
         self._cable_errors = CableErrors()
         self._retransmissions = [0] * RETRY_COUNTS
         self._cycles = 0
-        self.robot_resets = 0
-        self.dongle_resets = 0
-        self.sessions = 0
-        self.collisions = 0
-        self.port_failures = 0
-        self.malformed = 0
+        self.robot_resets = self.dongle_resets = self.sessions = 0
+        self.collisions = self.port_failures = self.malformed = 0
         self.dongle: Pong | None = None
         self.robot: Aux | None = None
 
@@ -151,11 +144,10 @@ class LinkStatistics:
     def add_pong(self, pong: Pong, restarted: bool) -> None:
         """Take the counters of the dongle, which start at 0 when it does."""
         before, self.dongle = self.dongle, pong
-        counts = pong.crc_errors, pong.frame_errors, pong.overruns
-        earlier = (0, 0, 0)
-        if before is not None and not restarted:
-            earlier = before.crc_errors, before.frame_errors, before.overruns
-        new = sum((now - then) % _WRAP for now, then in zip(counts, earlier, strict=True))
+        new = 0
+        for name in ('crc_errors', 'frame_errors', 'overruns'):
+            earlier = 0 if before is None or restarted else getattr(before, name)
+            new += (getattr(pong, name) - earlier) % _WRAP
         self._cable_errors = self._cable_errors._replace(dongle=self._cable_errors.dongle + new)
 
     def count_host_errors(self, counts: FrameCounts) -> None:
@@ -170,8 +162,9 @@ class LinkStatistics:
         if not lost:
             return ''
         worst = max(Loss, key=lost.count)
-        errors = self._recent[-1][1] - self._recent[0][1]
-        return reasons.lost_cycles(worst.value, errors.host, errors.dongle)
+        before, after = self._recent[0][1], self._recent[-1][1]
+        errors = after.host - before.host, after.dongle - before.dongle
+        return reasons.lost_cycles(worst.value, *errors)
 
     def explain_losses(self) -> None:
         """Leave the cycles lost so far out of the judgement: their cause is known."""
@@ -200,14 +193,11 @@ class LinkStatistics:
         elif recent < _MIN_CYCLES:
             pass
         elif lost_share > LOSS_LIMIT:
-            level, text = (
-                DiagnosticLevel.WARN,
-                f'{100.0 * lost_share:.1f} % of the cycles are lost {self.worst_hop()}',
-            )
+            level = DiagnosticLevel.WARN
+            text = f'{100.0 * lost_share:.1f} % of the cycles are lost {self.worst_hop()}'
         elif slow > ROUND_TRIP_LIMIT * self._period:
             level = DiagnosticLevel.WARN
-            milliseconds = 1e3 * slow
-            text = f'round trips up to {milliseconds:.1f} ms: is the port in low-latency mode?'
+            text = f'round trips up to {1e3 * slow:.1f} ms: is the port in low-latency mode?'
         return LinkQuality(
             level,
             text,

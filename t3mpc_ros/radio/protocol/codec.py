@@ -18,9 +18,10 @@ names the frame, the field, the bound and the value. All numbers are little endi
 """
 
 import struct
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.protocol.frames import PAYLOAD_LIMIT, FrameError, FrameErrorKind
 
 
 class ExchangeStatus(NamedTuple):
@@ -48,8 +49,8 @@ def decode_exchange_status(status: int) -> ExchangeStatus:
         or (has_payload and not acknowledged)
         or (skipped and retransmissions)
     ):
-        raise frames.FrameError(
-            frames.FrameErrorKind.VALUE, f'RESULT.status must be consistent: got {status:#04x}'
+        raise FrameError(
+            FrameErrorKind.VALUE, f'RESULT.status must be consistent: got {status:#04x}'
         )
     return ExchangeStatus(acknowledged, has_payload, failed, skipped, retransmissions)
 
@@ -101,14 +102,14 @@ def decode_to_dongle(data: bytes) -> frames.ToDongle:
     if data[:1] != b'\x01':
         return _decode(data, _TO_DONGLE)  # type: ignore[no-any-return]
     if len(data) < 4:
-        raise frames.FrameError(
-            frames.FrameErrorKind.LENGTH, f'TX must be at least 4 bytes long: got {len(data)}'
+        raise FrameError(
+            FrameErrorKind.LENGTH, f'TX must be at least 4 bytes long: got {len(data)}'
         )
     end = 4 + data[3]
     frame = frames.Transmit(data[1], data[2], data[4:end], data[end:])
     if len(frame.first) != data[3]:
-        raise frames.FrameError(
-            frames.FrameErrorKind.LENGTH,
+        raise FrameError(
+            FrameErrorKind.LENGTH,
             f'TX must have {data[3]} bytes of payload: got {len(frame.first)}',
         )
     _check_payloads(frame)
@@ -139,21 +140,20 @@ class _Field(NamedTuple):
     name: str
     code: str
     low: int
-    """Lower bound of a number; length of a byte string."""
+    """Lower bound of a number, like the next the upper one; both are the length of bytes."""
     high: int
-    """Upper bound of a number; length of a byte string."""
 
     def check(self, kind: str, value: object) -> None:
         if self.code.endswith('s'):
             if not isinstance(value, bytes) or len(value) != self.high:
-                raise frames.FrameError(
-                    frames.FrameErrorKind.VALUE,
+                raise FrameError(
+                    FrameErrorKind.VALUE,
                     f'{kind}.{self.name} must be {self.high} bytes: got {value!r}',
                 )
         elif not isinstance(value, int) or not self.low <= value <= self.high:
             bound = f'from {self.low} to {self.high}' if self.low < self.high else f'{self.low}'
-            raise frames.FrameError(
-                frames.FrameErrorKind.VALUE, f'{kind}.{self.name} must be {bound}: got {value!r}'
+            raise FrameError(
+                FrameErrorKind.VALUE, f'{kind}.{self.name} must be {bound}: got {value!r}'
             )
 
 
@@ -173,7 +173,7 @@ class _Form:
     """
 
     def __init__(self, kind: Any, name: str, head: int, fields: str) -> None:
-        self._kind, self.name, self._head = kind, name, head
+        self._kind, self.name, self.head = kind, name, head
         self._fields = []
         for text in fields.split(', '):
             field, code, *bounds = text.split()
@@ -197,17 +197,17 @@ class _Form:
             if name not in self._names and name not in _VARIABLE_FIELDS:
                 value = getattr(frame, name)
                 if value != default:
-                    raise frames.FrameError(
-                        frames.FrameErrorKind.VALUE,
+                    raise FrameError(
+                        FrameErrorKind.VALUE,
                         f'{self.name}.{name} must be {default!r} without '
                         f'{self._kind._fields[-1]}: got {value!r}',
                     )
-        return self._struct.pack(self._head, *values)
+        return self._struct.pack(self.head, *values)
 
     def unpack(self, data: bytes) -> Any:
         if len(data) != self.size:
-            raise frames.FrameError(
-                frames.FrameErrorKind.LENGTH,
+            raise FrameError(
+                FrameErrorKind.LENGTH,
                 f'{self.name} must be at least {self.size} bytes long: got {len(data)}',
             )
         values = {}
@@ -222,152 +222,126 @@ _VARIABLE_FIELDS = ('first', 'second', 'payload')
 """Fields of TX and RESULT with variable length."""
 
 
-def _layout(kind: Any, name: str, head: int, fields: str, *longer: str) -> tuple[_Form, ...]:
-    forms = tuple(_Form(kind, name, head, text) for text in (fields, *longer))
-    _LAYOUTS[kind] = forms
-    return forms
-
-
 def _decode(data: bytes, table: dict[int, tuple[_Form, ...]]) -> Any:
-    if not data or len(data) > frames.PAYLOAD_LIMIT:
-        raise frames.FrameError(
-            frames.FrameErrorKind.LENGTH,
-            f'a frame must have 1 to {frames.PAYLOAD_LIMIT} bytes: got {len(data)}',
+    if not data or len(data) > PAYLOAD_LIMIT:
+        raise FrameError(
+            FrameErrorKind.LENGTH,
+            f'a frame must have 1 to {PAYLOAD_LIMIT} bytes: got {len(data)}',
         )
     forms = table.get(data[0])
     if forms is None:
         if table in (_DOWNLINK, _UPLINK) and data[0] >> 4 != frames.VERSION:
-            raise frames.FrameError(
-                frames.FrameErrorKind.VERSION,
+            raise FrameError(
+                FrameErrorKind.VERSION,
                 f'version must be {frames.VERSION}: got {data[0] >> 4}',
             )
-        raise frames.FrameError(
-            frames.FrameErrorKind.KIND, f'kind of frame must be known: got {data[0]:#04x}'
-        )
+        raise FrameError(FrameErrorKind.KIND, f'kind of frame must be known: got {data[0]:#04x}')
     for form in forms:
         if form.size == len(data):
             return form.unpack(data)
     sizes = ' or '.join(str(form.size) for form in forms)
-    raise frames.FrameError(
-        frames.FrameErrorKind.LENGTH,
+    raise FrameError(
+        FrameErrorKind.LENGTH,
         f'{forms[0].name} must be {sizes} bytes long: got {len(data)}',
     )
 
 
 def _check_payloads(frame: frames.Transmit) -> None:
     for name, payload, least in (('first', frame.first, 1), ('second', frame.second, 0)):
-        if not least <= len(payload) <= frames.PAYLOAD_LIMIT:
-            raise frames.FrameError(
-                frames.FrameErrorKind.LENGTH,
-                f'TX.{name} must have {least} to {frames.PAYLOAD_LIMIT} bytes: got {len(payload)}',
+        if not least <= len(payload) <= PAYLOAD_LIMIT:
+            raise FrameError(
+                FrameErrorKind.LENGTH,
+                f'TX.{name} must have {least} to {PAYLOAD_LIMIT} bytes: got {len(payload)}',
             )
 
 
 def _check_result_payload(frame: frames.Result) -> None:
     statuses = decode_exchange_status(frame.first), decode_exchange_status(frame.second)
     expected = any(status.has_payload for status in statuses)
-    if len(frame.payload) > frames.PAYLOAD_LIMIT or bool(frame.payload) != expected:
-        bound = f'1 to {frames.PAYLOAD_LIMIT}' if expected else 'no'
-        raise frames.FrameError(
-            frames.FrameErrorKind.LENGTH,
+    if len(frame.payload) > PAYLOAD_LIMIT or bool(frame.payload) != expected:
+        bound = f'1 to {PAYLOAD_LIMIT}' if expected else 'no'
+        raise FrameError(
+            FrameErrorKind.LENGTH,
             f'RESULT.payload must have {bound} bytes: got {len(frame.payload)}',
         )
 
 
 # -- layouts --------------------------------------------------------------------------------------
 
-_LAYOUTS: dict[Any, tuple[_Form, ...]] = {}
 _COMMAND = 'session B, seq B, flags B 0 7, ttl B, reserved B 0 0, left h, right h, echo_us I'
 _PARAM_SET, _ACTION = 'session B, seq B, id B, value i', 'session B, seq B, verb B, reserved H 0 0'
+_STATE = (
+    'session B, seq B, status B, time_us I, left i, right i, gyro_z h, accel_x h, accel_y h, '
+    'age H, ranges 8s'
+)
 _INFO = (
     'session B, seq B, protocol B, major B, minor B, reset_cause B, parameters B, '
     'steps_per_rev H, microsteps H, refusal B, settings B 0 5, channel B 0 125, address 5s, '
     'build I'
 )
+_AUX = (
+    'session B, seq B, status B, battery H, temperature h, accel_z h, gyro_x h, gyro_y h, '
+    'received H, duplicates H, bad_session H, stale H, expired H, bad_version H, malformed H, '
+    'refusal B, refused 3s'
+)
 _RADIO_SETUP = (
     'id B, channel B 0 125, rate B 0 2, power B 0 3, retry_delay B 0 15, retries B 0 15, '
     'address 5s'
 )
+_PONG = (
+    'id B, echo 4s, time_us I, protocol B, major B, minor B, chip_ok B 0 1, crc_errors H, '
+    'frame_errors H, overruns H, reset_cause B, settings B 0 5, channel B 0 125, address 5s, '
+    'build I'
+)
+_RECORD, _PART = 'id B, record B, part B', 'id B, rc B 0 5, record B, state B 0 4, size B, part B'
+_SAMPLES = (
+    'id B, ranges 16s, battery H, accel_x h, accel_y h, accel_z h, gyro_x h, gyro_y h, gyro_z h'
+)
+_HELLO = 'session B 1 255, seq B, flags B'
 _SIGNATURE = ', host_us I, tag 8s'
+_LAYOUTS: dict[Any, tuple[_Form, ...]] = {
+    kind: tuple(_Form(kind, name, head, text) for text in texts)
+    for kind, name, head, *texts in (
+        (frames.Command, 'CMD', 0x21, _COMMAND, _COMMAND + _SIGNATURE),
+        (frames.ParamGet, 'PARAM_GET', 0x22, 'session B, seq B, id B'),
+        (frames.ParamSet, 'PARAM_SET', 0x23, _PARAM_SET, _PARAM_SET + _SIGNATURE),
+        (
+            frames.Hello,
+            'HELLO',
+            0x24,
+            f'{_HELLO} 0 0',
+            f'{_HELLO} 1 1, host_us I, nonce 8s, tag 8s',
+        ),
+        (frames.Poll, 'POLL', 0x25, 'session B, seq B, what B 0 2'),
+        (frames.Action, 'ACTION', 0x26, _ACTION, _ACTION + _SIGNATURE),
+        (frames.State, 'STATE', 0x21, _STATE),
+        (frames.Param, 'PARAM', 0x22, 'session B, seq B, id B, rc B 0 4, value i, low i, high i'),
+        (frames.Info, 'INFO', 0x23, _INFO, _INFO + ', nonce 8s'),
+        (frames.Ack, 'ACK', 0x24, 'session B, seq B, verb B, rc B 0 4'),
+        (frames.Aux, 'AUX', 0x25, _AUX),
+        (frames.Transmit, 'TX', 0x01, 'id B, gap B'),
+        (frames.Configure, 'CFG', 0x02, 'id B', _RADIO_SETUP),
+        (frames.Ping, 'PING', 0x03, 'id B, echo 4s'),
+        (frames.Key, 'KEY', 0x04, 'id B', 'id B, key 16s'),
+        (frames.Record, 'RECORD', 0x06, _RECORD, _RECORD + ', data 16s'),
+        (frames.Store, 'STORE', 0x07, 'id B, record B, crc H'),
+        (frames.Sense, 'SENSE', 0x08, 'id B'),
+        (frames.Result, 'RESULT', 0x81, 'id B, first B, second B, dongle_us I'),
+        (frames.Configured, 'CFG', 0x82, _RADIO_SETUP + ', chip_ok B 0 1'),
+        (frames.Pong, 'PONG', 0x83, _PONG),
+        (frames.KeyState, 'KEY', 0x84, 'id B, rc B 0 5, state B 0 2, check I'),
+        (frames.RecordPart, 'RECORD', 0x86, _PART + ', data 16s'),
+        (frames.Samples, 'SENSE', 0x88, _SAMPLES),
+        (frames.Refusal, 'ERR', 0x8F, 'code B 1 3, argument B'),
+    )
+}
 
-_DOWNLINK = {
-    0x21: _layout(frames.Command, 'CMD', 0x21, _COMMAND, _COMMAND + _SIGNATURE),
-    0x22: _layout(frames.ParamGet, 'PARAM_GET', 0x22, 'session B, seq B, id B'),
-    0x23: _layout(frames.ParamSet, 'PARAM_SET', 0x23, _PARAM_SET, _PARAM_SET + _SIGNATURE),
-    0x24: _layout(
-        frames.Hello,
-        'HELLO',
-        0x24,
-        'session B 1 255, seq B, flags B 0 0',
-        'session B 1 255, seq B, flags B 1 1, host_us I, nonce 8s, tag 8s',
-    ),
-    0x25: _layout(frames.Poll, 'POLL', 0x25, 'session B, seq B, what B 0 2'),
-    0x26: _layout(frames.Action, 'ACTION', 0x26, _ACTION, _ACTION + _SIGNATURE),
-}
-_UPLINK = {
-    0x21: _layout(
-        frames.State,
-        'STATE',
-        0x21,
-        'session B, seq B, status B, time_us I, left i, right i, gyro_z h, accel_x h, '
-        'accel_y h, age H, ranges 8s',
-    ),
-    0x22: _layout(
-        frames.Param, 'PARAM', 0x22, 'session B, seq B, id B, rc B 0 4, value i, low i, high i'
-    ),
-    0x23: _layout(frames.Info, 'INFO', 0x23, _INFO, _INFO + ', nonce 8s'),
-    0x24: _layout(frames.Ack, 'ACK', 0x24, 'session B, seq B, verb B, rc B 0 4'),
-    0x25: _layout(
-        frames.Aux,
-        'AUX',
-        0x25,
-        'session B, seq B, status B, battery H, temperature h, accel_z h, gyro_x h, gyro_y h, '
-        'received H, duplicates H, bad_session H, stale H, expired H, bad_version H, '
-        'malformed H, refusal B, refused 3s',
-    ),
-}
-_TO_DONGLE = {
-    0x01: _layout(frames.Transmit, 'TX', 0x01, 'id B, gap B'),
-    0x02: _layout(frames.Configure, 'CFG', 0x02, 'id B', _RADIO_SETUP),
-    0x03: _layout(frames.Ping, 'PING', 0x03, 'id B, echo 4s'),
-}
-_FROM_DONGLE = {
-    0x81: _layout(frames.Result, 'RESULT', 0x81, 'id B, first B, second B, dongle_us I'),
-    0x82: _layout(frames.Configured, 'CFG', 0x82, _RADIO_SETUP + ', chip_ok B 0 1'),
-    0x83: _layout(
-        frames.Pong,
-        'PONG',
-        0x83,
-        'id B, echo 4s, time_us I, protocol B, major B, minor B, chip_ok B 0 1, '
-        'crc_errors H, frame_errors H, overruns H, reset_cause B, settings B 0 5, '
-        'channel B 0 125, address 5s, build I',
-    ),
-    0x8F: _layout(frames.Refusal, 'ERR', 0x8F, 'code B 1 3, argument B'),
-}
-_TO_BOARD = {
-    0x03: _TO_DONGLE[0x03],
-    0x04: _layout(frames.Key, 'KEY', 0x04, 'id B', 'id B, key 16s'),
-    0x06: _layout(
-        frames.Record, 'RECORD', 0x06, 'id B, record B, part B', 'id B, record B, part B, data 16s'
-    ),
-    0x07: _layout(frames.Store, 'STORE', 0x07, 'id B, record B, crc H'),
-    0x08: _layout(frames.Sense, 'SENSE', 0x08, 'id B'),
-}
-_FROM_BOARD = {
-    0x83: _FROM_DONGLE[0x83],
-    0x84: _layout(frames.KeyState, 'KEY', 0x84, 'id B, rc B 0 5, state B 0 2, check I'),
-    0x86: _layout(
-        frames.RecordPart,
-        'RECORD',
-        0x86,
-        'id B, rc B 0 5, record B, state B 0 4, size B, part B, data 16s',
-    ),
-    0x88: _layout(
-        frames.Samples,
-        'SENSE',
-        0x88,
-        'id B, ranges 16s, battery H, accel_x h, accel_y h, accel_z h, gyro_x h, gyro_y h, '
-        'gyro_z h',
-    ),
-    0x8F: _FROM_DONGLE[0x8F],
-}
+
+def _table(union: Any) -> dict[int, tuple[_Form, ...]]:
+    """Return the layouts of one way by their first byte."""
+    return {_LAYOUTS[kind][0].head: _LAYOUTS[kind] for kind in get_args(union)}
+
+
+_DOWNLINK, _UPLINK = _table(frames.Downlink), _table(frames.Uplink)
+_TO_DONGLE, _FROM_DONGLE = _table(frames.ToDongle), _table(frames.FromDongle)
+_TO_BOARD, _FROM_BOARD = _table(frames.ToBoard), _table(frames.FromBoard)

@@ -136,27 +136,18 @@ def encode_settings(settings: RobotSettings) -> bytes:
 
 def check_settings(settings: RobotSettings) -> None:
     """Raise ValueError for the first impossible value."""
+    sensors, powers = settings.sensors, [1 << power for power in range(9)]
+    full = len(settings.address) == 5 and len(set(settings.address)) > 1
+    known = len(sensors) == SENSOR_COUNT and set(sensors) <= set(SENSORS)
     bounds = (
-        (
-            'address',
-            len(settings.address) == 5 and len(set(settings.address)) > 1,
-            '10 hexadecimal digits, not of equal bytes',
-        ),
+        ('address', full, '10 hexadecimal digits, not of equal bytes'),
         ('channel', 0 <= settings.channel <= 125, 'from 0 to 125'),
         ('rate', settings.rate in frames.RATES, f'one of {", ".join(frames.RATES)}'),
         ('power', settings.power in frames.POWERS, f'one of {", ".join(frames.POWERS)} dBm'),
-        (
-            'microsteps',
-            settings.microsteps in [1 << power for power in range(9)],
-            'a power of two from 1 to 256',
-        ),
+        ('microsteps', settings.microsteps in powers, 'a power of two from 1 to 256'),
         ('steps_per_turn', 20 <= settings.steps_per_turn <= 10_000, 'from 20 to 10000'),
         ('divider', 1.0 <= settings.divider <= 13.0, 'from 1 to 13'),
-        (
-            'sensors',
-            len(settings.sensors) == SENSOR_COUNT and set(settings.sensors) <= set(SENSORS),
-            f'{SENSOR_COUNT} of {", ".join(SENSORS)}',
-        ),
+        ('sensors', known, f'{SENSOR_COUNT} of {", ".join(SENSORS)}'),
     )
     for name, good, bound in bounds:
         if not good:
@@ -342,22 +333,23 @@ def read_record(record: int) -> Script[Stored[bytes]]:
 def write_record(record: int, body: bytes) -> Script[bytes]:
     """Stage and store a record; return its content. A lost answer is harmless: it is read back."""
     yield from wait_for_board()
-    rc = frames.FAILED
     for _ in range(_MAX_ATTEMPTS):
-        for part in range(-(-len(body) // frames.PART_SIZE)):
-            data = body[part * frames.PART_SIZE :][: frames.PART_SIZE].ljust(
-                frames.PART_SIZE, b'\0'
-            )
+        for part, at in enumerate(range(0, len(body), frames.PART_SIZE)):
+            data = body[at : at + frames.PART_SIZE].ljust(frames.PART_SIZE, b'\0')
             yield from request_part(frames.Record(0, record, part, data))
         response = yield Request(frames.Store(0, record, crc16(body)), _WRITE_TIMEOUT)
         if isinstance(response.reply, frames.RecordPart):
-            rc = response.reply.rc
-            if rc in _REASONS:
-                raise ProcedureError(_REASONS[rc])
+            check_stored(response.reply.rc)
         stored = yield from _read_parts(record)
         if stored.state == frames.SETTINGS_GOOD and stored.content == body:
             return body
     raise ProcedureError('the robot does not confirm the record: is the cable good?')
+
+
+def check_stored(rc: int) -> None:
+    """Raise ProcedureError for the answer of a robot that does not store a record or key."""
+    if rc in _REASONS:
+        raise ProcedureError(_REASONS[rc])
 
 
 _REASONS = {
@@ -367,7 +359,7 @@ _REASONS = {
         'bridge, or press the reset button of the board'
     ),
     frames.FAILED: (
-        'the EEPROM of the board did not store the record: the robot is locked; try again; '
+        'the EEPROM of the board did not store this: the robot is locked; try again; '
         'if it fails repeatedly, the chip is worn out'
     ),
 }
@@ -515,10 +507,8 @@ def settings_of_file(content: object) -> RobotSettings:
         raise YamlError(
             f'must be a file of t3mpc robot setup --save, with link below /**, and {_BOARD}'
         ) from error
-    unknown, missing = (
-        set(values) - {*RobotSettings._fields},
-        {*RobotSettings._fields} - set(values),
-    )
+    known = {*RobotSettings._fields}
+    unknown, missing = {*values} - known, known - {*values}
     if unknown or missing:
         names = ', '.join(sorted(unknown or missing))
         raise YamlError(f'{"has unknown" if unknown else "lacks the"} settings: {names}')

@@ -21,6 +21,7 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KEY_SIZE, KeyFileError, key_check
 from t3mpc_ros.radio.protocol.frames import Key, KeyState
 from t3mpc_ros.radio.tool import procedure
+from t3mpc_ros.radio.tool.eeprom_records import check_stored
 
 ERASE_KEY = bytes(KEY_SIZE)
 _WRITE_TIMEOUT = 1.0
@@ -60,27 +61,13 @@ def write_key(key: bytes) -> procedure.Script[KeyState]:
 
     A lost answer is harmless: the state of the key is read back.
     """
-    yield from procedure.wait_for_board()
-    yield from procedure.request_reply(
-        Key(0), KeyState
-    )  # rejects a dongle, before the key is sent
+    yield from read_key_state()  # rejects a dongle, before the key is sent
     for _ in range(_MAX_ATTEMPTS):
         response = yield procedure.Request(Key(0, key), _WRITE_TIMEOUT)
-        reply = response.reply
-        if isinstance(reply, KeyState):
-            key_state = reply
-        else:
+        key_state = response.reply
+        if not isinstance(key_state, KeyState):
             key_state = yield from procedure.request_reply(Key(0), KeyState)
-        if key_state.rc == frames.BUSY:
-            raise procedure.ProcedureError(
-                'the robot stores no key while it moves or its drivers are on: stop the bridge, '
-                'or press the reset button of the board'
-            )
-        if key_state.rc == frames.FAILED:
-            raise procedure.ProcedureError(
-                'the EEPROM of the board did not store the key: the robot is locked; try again; '
-                'if it fails repeatedly, the chip is worn out'
-            )
+        check_stored(key_state.rc)
         if holds_key(key_state, key):
             return key_state
     raise procedure.ProcedureError('the robot does not confirm the key: is the cable good?')

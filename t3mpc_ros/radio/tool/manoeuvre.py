@@ -93,8 +93,7 @@ class Manoeuvre:
         self._reason_ns = 0
         self._start: WheelAngles | None = None
         self._start_ns = self._begin_ns = 0
-        self._next_ns = 0
-        self._following_ns: int | None = None
+        self._next_ns = self._following_ns = 0
         self._standstill_ns: int | None = None
         self._timeout = self._largest / speed + sum(rests) + _TIME_MARGIN
         self._finished = False
@@ -193,16 +192,19 @@ class Manoeuvre:
     _late_reason = 'the wheels do not reach their target: does the board count its steps?'
 
     def _move(self, telemetry: Telemetry, now_ns: int) -> None:
-        remaining = self._remaining()
+        remaining, status = self._remaining(), telemetry.status
         if remaining <= _FINAL_SPEED / 100.0:
-            self._finish(telemetry.status.moving, now_ns)
-        elif not telemetry.status.estop and telemetry.status.enabled:
+            self._finish(status.moving, now_ns)
+            return
+        if status.enabled and not status.estop:
             self._following_ns = now_ns
-            self._command(remaining, now_ns)
-        elif now_ns - (self._following_ns or now_ns) > _NOT_FOLLOWING_TIMEOUT * NANOSECONDS:
+        if now_ns - self._following_ns > _NOT_FOLLOWING_TIMEOUT * NANOSECONDS:
             self._fail(self.link.reason(now_ns) or 'the robot does not follow')
-        else:
-            self._command(remaining, now_ns)
+        elif now_ns >= self._next_ns:
+            self._next_ns = now_ns + _PERIOD_NS
+            size = min(self._speed, max(_FINAL_SPEED, _APPROACH_GAIN * abs(remaining)))
+            right, left = (size * angle / self._largest for angle in self._angles)
+            self.link.command(WheelSpeeds(right, left), now_ns + _COMMAND_NS)
 
     def _remaining(self) -> float:
         """Return the angle that the faster wheel still has to turn, rad."""
@@ -211,14 +213,6 @@ class Manoeuvre:
             return self._largest
         target, way = max(zip(self._angles, travelled, strict=True), key=lambda pair: abs(pair[0]))
         return self._largest - math.copysign(1.0, target) * way
-
-    def _command(self, remaining: float, now_ns: int) -> None:
-        if now_ns < self._next_ns:
-            return
-        self._next_ns = now_ns + _PERIOD_NS
-        size = min(self._speed, max(_FINAL_SPEED, _APPROACH_GAIN * abs(remaining)))
-        right, left = (size * angle / self._largest for angle in self._angles)
-        self.link.command(WheelSpeeds(right, left), now_ns + _COMMAND_NS)
 
     def _finish(self, moving: bool, now_ns: int) -> None:
         """Wait for standstill and the rest after it, then shut the link down."""

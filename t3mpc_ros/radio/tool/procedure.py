@@ -32,15 +32,7 @@ from t3mpc_ros.radio.protocol.codec import decode_from_board, decode_from_dongle
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 from t3mpc_ros.radio.serial_port import PortError, SerialPort
 
-RequestFrame = (
-    frames.Ping
-    | frames.Configure
-    | frames.Transmit
-    | frames.Key
-    | frames.Record
-    | frames.Store
-    | frames.Sense
-)
+RequestFrame = frames.ToDongle | frames.ToBoard
 ReplyFrame = frames.FromDongle | frames.FromBoard
 
 NO_BOARD = 'no robot board answers on this port: is it the USB port of the robot?'
@@ -115,24 +107,15 @@ DONGLE = Board('the dongle', decode_from_dongle)
 ROBOT_BOARD = Board("the robot's board", decode_from_board)
 
 
-class PortTask(Protocol):
-    """A task that :func:`run_at_port` can run."""
+class _PortTask(Protocol):
+    """What :func:`run_at_port` runs: a procedure or a manoeuvre."""
 
     @property
-    def done(self) -> bool:
-        """Whether the task has ended."""
-
-    def step(self, now_ns: int, received: bytes = b'') -> list[PortAction]:
-        """Return the actions to execute now; the last one is the time of the next call."""
-
-    def port_opened(self, now_ns: int) -> None:
-        """Report that the port is open."""
-
-    def port_failed(self, text: str, absent: bool, now_ns: int) -> None:
-        """Report that the port cannot be opened or used."""
-
-    def interrupt(self, now_ns: int) -> None:
-        """End early and restore the initial configuration."""
+    def done(self) -> bool: ...
+    def step(self, now_ns: int, received: bytes = b'') -> list[PortAction]: ...
+    def port_opened(self, now_ns: int) -> None: ...
+    def port_failed(self, text: str, absent: bool, now_ns: int) -> None: ...
+    def interrupt(self, now_ns: int) -> None: ...
 
 
 class Procedure(Generic[Value]):
@@ -290,7 +273,7 @@ def run_script(
 
 
 def run_at_port(
-    task: PortTask, path: str, interrupted: Callable[[], bool], device: str = DONGLE.name
+    task: _PortTask, path: str, interrupted: Callable[[], bool], device: str = DONGLE.name
 ) -> None:
     """Run a task at the port ``path`` of a device; poll ``interrupted`` 20 times a second."""
     runner = _PortRunner(task, path, device)
@@ -311,17 +294,15 @@ def run_at_port(
 
 
 class _PortRunner:
-    def __init__(self, task: PortTask, path: str, device: str) -> None:
-        self._task = task
-        self._path = path
-        self._device = device
+    def __init__(self, task: _PortTask, path: str, device: str) -> None:
+        self._task, self._path, self._device = task, path, device
         self._port: SerialPort | None = None
 
     def execute(self, actions: list[PortAction]) -> int:
         """Execute the actions; return the time of the next step."""
         wake_ns = time.monotonic_ns()
-        for action in actions:
-            try:
+        try:
+            for action in actions:
                 if isinstance(action, Wait):
                     wake_ns = action.until_ns
                 elif isinstance(action, Open):
@@ -332,9 +313,9 @@ class _PortRunner:
                     self._port.write(action.data)
                 elif isinstance(action, Close):
                     self.close()
-            except PortError as error:
-                self._report_failure(error)
-                return time.monotonic_ns()
+        except PortError as error:
+            self._report_failure(error)
+            return time.monotonic_ns()
         return wake_ns
 
     def receive(self, until_ns: int) -> bytes:

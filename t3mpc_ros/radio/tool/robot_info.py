@@ -138,8 +138,7 @@ def _format_parameter(value: frames.Param, target: int | None) -> str:
     name, unit = (row.name, row.unit) if row else (f'number {value.id}', '')
     bounds = 'fixed' if row and row.read_only else f'{value.low} to {value.high}'
     sets = '' if target is None else str(target)
-    text = f'{name:<14}  {value.value:>7}  {unit:<7}  {bounds:<16}  {sets:>11}'
-    return text.rstrip()
+    return f'{name:<14}  {value.value:>7}  {unit:<7}  {bounds:<16}  {sets:>11}'.rstrip()
 
 
 # -- log: resets, faults, longest pass of the main loop -------------------------------------------
