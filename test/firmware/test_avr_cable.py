@@ -33,39 +33,31 @@ class CableBench(Bench):
         super().__init__(emulator=CablePort(emulator), **given)
 
 
-def drive(bench):
-    """Drive for a second; return the load of the processor and its longest pass (us)."""
-    bench.connect()
-    bench.drive(7.0, 6.0)
-    bench.run(0.3)
-    boards, ram = bench.emulator.boards, bench.board.ram
-    ram.put('longest_us', 0, 2)
-    begun, busy = boards.now_us, boards.call('busy_cycles', ROBOT)
-    bench.run(1.0)
-    assert bench.link.reason(bench.now_ns) == ''
-    load = (boards.call('busy_cycles', ROBOT) - busy) / 16 / (boards.now_us - begun)
-    return load, ram.get('longest_us', 2)
-
-
-@pytest.mark.parametrize('way', [CableBench, Bench], ids=['cable', 'radio'])
 @pytest.mark.long
-def test_the_board_drives_over_the_cable_in_time(way):
+def test_the_board_drives_over_the_cable_in_time():
     """A signed CMD, a POLL and their RESULT, 50 times a second, while the wheels turn."""
-    with on_avr(way, key=KEY) as bench:
-        load, longest_us = drive(bench)
+    with on_avr(CableBench, key=KEY) as bench:
+        bench.connect()
+        bench.drive(7.0, 6.0)
+        bench.run(0.3)
+        boards, ram = bench.emulator.boards, bench.board.ram
+        ram.put('longest_us', 0, 2)
+        begun, busy = boards.now_us, boards.call('busy_cycles', ROBOT)
+        bench.run(1.0)
+        assert bench.link.reason(bench.now_ns) == ''
+        load = (boards.call('busy_cycles', ROBOT) - busy) / 16 / (boards.now_us - begun)
+        longest_us = ram.get('longest_us', 2)
         quality = bench.link.quality(bench.now_ns)
         print(
-            f'\n{way.__name__}: load {load:.1%}, longest pass {longest_us} us, round trip '
+            f'\nload {load:.1%}, longest pass {longest_us} us, round trip '
             f'{1e3 * quality.round_trip_median:.1f} ms (99 %: {1e3 * quality.round_trip_p99:.1f})'
         )
-        assert bench.link.over_cable == (way is CableBench)
+        assert bench.link.over_cable
         assert (quality.robot_resets, quality.sessions) == (0, 1)
         assert quality.lost <= 1  # in one of some hundred phases an answer misses its packet
         assert load < 0.95
         assert longest_us < 2000
         bench.kill()  # nothing moves on an old command
-        begun_ns = bench.now_ns
         bench.run(0.6)
         assert bench.board.speeds == (0, 0)
-        assert bench.now_ns - begun_ns >= 0.45e9
         assert bench.link.state is LinkState.RUN
