@@ -42,7 +42,7 @@ def _points(seed, length=60.0, **values):
 )
 @pytest.mark.slow
 def test_path_is_continuous_within_the_arena(arena, blend):
-    path, points = _points(3, **{'arena': arena, 'switching.blend': blend})
+    path, points = _points(3, 30.0, **{'arena': arena, 'switching.blend': blend})
     assert path.arena.contains(points, 1e-6).all()
     assert np.hypot(*np.diff(points, axis=0).T).max() < 0.0101
 
@@ -58,7 +58,7 @@ def test_path_spreads_evenly():
 
 @pytest.mark.slow
 def test_equal_seeds_give_equal_paths_others_do_not():
-    one, again, other = (_points(seed, 10.0)[1] for seed in (2**100 + 1, 2**100 + 1, 2**100 + 2))
+    one, again, other = (_points(seed, 5.0)[1] for seed in (2**100 + 1, 2**100 + 1, 2**100 + 2))
     assert np.array_equal(one[: len(again)], again)
     count = min(len(one), len(other))
     assert np.abs(one[:count] - other[:count]).max() > 0.5

@@ -15,7 +15,6 @@
 
 import numpy as np
 import pytest
-from support.equations import linear_decay_system
 
 from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system, jacobian, right_hand_side
@@ -51,13 +50,7 @@ def test_jacobian_is_the_derivative_of_the_slope():
             shift = np.eye(4)[column]
             difference = slope_of(system, state + shift) - slope_of(system, state - shift)
             np.testing.assert_allclose(out[:, column], difference / 2.0, rtol=1e-9, atol=1e-9)
-
-
-def test_flow_of_85_contracts_volume_at_the_same_rate_everywhere():
-    out = np.empty((4, 4))
-    for state in STATES:
-        jacobian(hyperchaotic_system().terms(), state, out)
-        assert np.trace(out) == pytest.approx(-38.0)
+        assert np.trace(out) == pytest.approx(-38.0)  # the rate at which volume contracts
 
 
 def test_repeated_terms_and_squares_are_added():
@@ -75,7 +68,7 @@ def test_repeated_terms_and_squares_are_added():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize('order', [0.98, 1.0])
+@pytest.mark.parametrize('order', [0.98])
 def test_plus_sign_of_e6_is_chaotic_and_minus_sign_decays(order):
     """The paper prints (85) with '- 5 y1 y3 25 y1'.
 
@@ -116,4 +109,3 @@ def test_invalid_systems_are_rejected_by_name(arguments, name):
 def test_four_states_need_four_orders():
     with pytest.raises(ValueError, match='orders must be four'):
         hyperchaotic_system(orders=(0.98,))
-    assert linear_decay_system(0.7).orders == (0.7,)

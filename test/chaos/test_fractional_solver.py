@@ -84,7 +84,7 @@ def run(solver, samples, every=1):
     return np.array([solver.state, *(solver.advance(every) for _ in range(samples))])
 
 
-@pytest.mark.parametrize('order', [0.3, 0.98, 1.0])
+@pytest.mark.parametrize('order', [0.3, 0.98])
 def test_full_memory_weights_are_exact_at_large_lags(order):
     """In double precision the closed form of lag 20 000 keeps eight digits of sixteen.
 
@@ -123,7 +123,7 @@ def test_mode_weights_are_exact_for_any_product_of_rate_and_step():
             assert newer[index] == pytest.approx(float((a - 1 + fall) / (a * a)), rel=2e-15)
 
 
-@pytest.mark.parametrize('order', [0.5, 0.8, 0.98, 1.0])
+@pytest.mark.parametrize('order', [0.5, 0.98])
 @pytest.mark.parametrize('kind', ['full memory', 'running'])
 def test_convergence_order_on_linear_decay_is_one_plus_q(kind, order):
     counts = np.array([256, 512, 1024])
@@ -139,10 +139,9 @@ def test_convergence_order_on_linear_decay_is_one_plus_q(kind, order):
     np.testing.assert_allclose(found, min(2.0, 1.0 + order), atol=0.05)
 
 
-@pytest.mark.parametrize('order', [0.5, 0.98])
-def test_scheme_coincides_with_diethelms_on_a_linear_equation(order):
-    ours = solve_full_memory(linear_decay_system(order), 0.01, ONE, 200)
-    published = diethelm(order, np.negative, 0.01, ONE, 200)
+def test_scheme_coincides_with_diethelms_on_a_linear_equation():
+    ours = solve_full_memory(linear_decay_system(0.5), 0.01, ONE, 200)
+    published = diethelm(0.5, np.negative, 0.01, ONE, 200)
     np.testing.assert_allclose(ours, published, rtol=0.0, atol=1e-12)
 
 
@@ -161,7 +160,7 @@ def test_order_one_is_heuns_method_to_rounding():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize('tolerance', [1e-6, 1e-8, 1e-10])
+@pytest.mark.parametrize('tolerance', [1e-6, 1e-10])
 def test_solver_follows_the_full_memory_for_a_lyapunov_time(tolerance):
     """Over 0.4 s of (85), states up to 40, running and full memory differ by 100 tolerances.
 
@@ -184,41 +183,16 @@ def test_states_of_different_orders_follow_the_full_memory():
     np.testing.assert_allclose(running, full, rtol=0.0, atol=1e-5)
 
 
-def test_each_state_obeys_its_own_order():
-    orders = (0.6, 0.85, 1.0)
-    system = QuadraticSystem(orders, linear=tuple((i, i, -1.0) for i in range(3)))
-    final = FractionalSolver(system, 1.0 / 1024, np.ones(3), 10.0, 1e-10).advance(1024)
-    exact = [mittag_leffler(order, 1.0) for order in orders]
-    np.testing.assert_allclose(final, exact, rtol=0.0, atol=1e-6)
-
-
-def windowed_decay(order, step, steps, window):
-    """Return y from Gruenwald-Letnikov with only the last ``window`` steps remembered."""
-    weights = np.cumprod(np.append(1.0, 1.0 - (order + 1.0) / np.arange(1.0, window)))
-    change = np.zeros(steps + 1)  # y - y0
-    for n in range(1, steps + 1):
-        past = change[max(0, n - window + 1) : n][::-1]
-        change[n] = -(step**order) * (1.0 + change[n - 1]) - weights[1 : past.size + 1] @ past
-    return 1.0 + change[-1]
-
-
 def test_the_past_is_never_truncated():
-    """A fractional decay ends in a power of time, which a windowed memory cannot follow.
-
-    Plain Gruenwald-Letnikov with a window of a thousand steps was the obvious bounded solver; it
-    is checked here too, to show what forgetting costs.
-    """
+    """A fractional decay ends in a power of time, which a windowed memory cannot follow."""
     step = 0.01
     solver = FractionalSolver(linear_decay_system(0.8), step, ONE, 1e4)
     for time in (10.0, 50.0, 200.0):
         solver.advance(round((time - solver.time) / step))
         assert solver.state[0] == pytest.approx(mittag_leffler_tail(0.8, time), rel=1e-4)
-    exact = mittag_leffler_tail(0.8, 50.0)
-    assert windowed_decay(0.8, step, 5000, 5001) == pytest.approx(exact, rel=0.01)
-    assert abs(windowed_decay(0.8, step, 5000, 1000) - exact) > 0.1 * exact
 
 
-@pytest.mark.parametrize('order', [0.8, 0.98, 1.0])
+@pytest.mark.parametrize('order', [0.8, 1.0])
 def test_rate_is_the_time_derivative_and_converges(order):
     # d/dt E_q(-t^q) = -t^(q-1) E_(q,q)(-t^q)
     errors = []
@@ -238,21 +212,7 @@ def test_rate_is_unknown_at_time_zero_unless_the_order_is_one():
     assert np.isfinite(solver.rate).all()
 
 
-@pytest.mark.compiled
-def test_memory_size_does_not_depend_on_the_run_length():
-    solver = FractionalSolver(hyperchaotic_system(), 1e-3, START)
-
-    def size():
-        values = vars(solver).values()
-        return sum(value.nbytes for value in values if isinstance(value, np.ndarray))
-
-    solver.advance()
-    names, before = list(vars(solver)), size()
-    solver.advance(200_000)
-    assert (list(vars(solver)), size()) == (names, before)
-
-
-def test_many_steps_at_once_equal_single_steps():
+def test_many_steps_at_once_equal_single_ones():
     single, many = (FractionalSolver(hyperchaotic_system(), 1e-3, START) for _ in range(2))
     for _ in range(60):
         single.advance()
@@ -260,17 +220,8 @@ def test_many_steps_at_once_equal_single_steps():
     assert single.state.tolist() == many.state.tolist()
     assert single.rate.tolist() == many.rate.tolist()
     assert single.time == many.time == pytest.approx(0.06)
-
-
-def test_returned_states_are_copies():
-    solver = FractionalSolver(hyperchaotic_system(), 1e-3, START)
-    solver.advance(5)
-    state = solver.state
-    kept = state.tolist()
-    solver.advance()
-    assert state.tolist() == kept
-    state[:] = np.nan
-    assert np.isfinite(solver.advance()).all()
+    many.state[:] = np.nan
+    assert np.isfinite(many.advance()).all()
 
 
 @pytest.mark.compiled
@@ -312,9 +263,6 @@ def test_a_diverging_solution_raises():
         (lambda: FractionalSolver(hyperchaotic_system(), 1e-3, START, tolerance=1.0), 'tolerance'),
         (lambda: FractionalSolver(hyperchaotic_system(), 1e-3, START).advance(-1), 'steps'),
         (lambda: FractionalSolver(hyperchaotic_system(), 1e-3, START).reset(ONE), 'initial'),
-        (lambda: solve_full_memory(hyperchaotic_system(), 1e-3, ONE, 5), 'initial'),
-        (lambda: solve_full_memory(hyperchaotic_system(), -1e-3, START, 5), 'step'),
-        (lambda: solve_full_memory(hyperchaotic_system(), 1e-3, START, -5), 'steps'),
     ],
 )
 def test_arguments_out_of_range_are_rejected_by_name(call, name):

@@ -21,7 +21,7 @@ from support.long_tests import few_of
 
 from t3mpc_ros.chaos.sum_of_exponentials import fit_sum_of_exponentials
 
-ORDERS = (0.05, 0.3, 0.5, 0.8, 0.9, 0.98, 0.999, 1.0 - 1e-9, 1.0)
+ORDERS = (0.05, 0.5, 0.98, 1.0 - 1e-9, 1.0)
 
 
 def relative_error(memory, order, time):
@@ -36,21 +36,16 @@ def test_stated_error_bounds_the_error_on_a_dense_grid(order, tolerance):
     assert memory.error <= tolerance
     # 1e-14: at order 1 both errors are zero, apart from rounding here.
     assert error.max() <= memory.error + 1e-14
-
-
-@pytest.mark.parametrize('order', [0.5, 0.98])
-def test_stated_error_is_tight(order):
-    memory = fit_sum_of_exponentials(order, 1e-3, 1e5, 1e-8)
-    error = np.abs(relative_error(memory, order, np.geomspace(1e-3, 1e5, 40_009)))
-    assert error.max() > 0.9 * memory.error
-    assert memory.error > 1e-9  # not far more modes than the tolerance requires
-
-
-def test_order_one_is_exactly_one_mode_without_decay():
-    memory = fit_sum_of_exponentials(1.0, 1e-3, 1e5, 1e-8)
-    assert memory.rates.tolist() == [0.0]
-    assert memory.weights.tolist() == [1.0]
-    assert memory.error == 0.0
+    if order in (0.5, 0.98):  # it is tight, with not far more modes than the tolerance requires
+        assert error.max() > 0.9 * memory.error
+        assert memory.error > 0.1 * tolerance
+    if order == 1.0:
+        assert memory.rates.tolist() == [memory.error] == [0.0]
+        assert memory.weights.tolist() == [1.0]
+    # Positive modes: the kernel is monotone.
+    assert (memory.weights > 0.0).all()
+    assert (memory.rates >= 0.0).all()
+    assert (np.diff(memory.rates) > 0.0).all()
 
 
 def test_kernel_tends_to_a_single_mode_as_the_order_tends_to_1():
@@ -64,14 +59,6 @@ def test_kernel_tends_to_a_single_mode_as_the_order_tends_to_1():
         assert memory.weights[0] == pytest.approx(1.0, abs=40.0 * distance)
         assert memory.weights[1:].sum() < 40.0 * distance
         assert memory.rates[0] < distance
-
-
-def test_modes_are_positive_so_the_kernel_is_monotone():
-    for order in ORDERS:
-        memory = fit_sum_of_exponentials(order, 1e-3, 1e5, 1e-8)
-        assert np.all(memory.weights > 0.0)
-        assert np.all(memory.rates >= 0.0)
-        assert np.all(np.diff(memory.rates) > 0.0)
 
 
 def test_number_of_modes_grows_like_the_logarithm_of_the_horizon():

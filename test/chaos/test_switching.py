@@ -41,13 +41,10 @@ def _switches(schedule, end):
 def test_default_switches_four_times_as_in_the_paper():
     schedule = SwitchingSchedule(SwitchingParameters())
     assert _switches(schedule, 59.99) == ([12.0, 24.0, 36.0, 48.0], [1, 2, 3, 0])
-    assert [schedule.at(time).mode for time in (0.0, 11.99, 47.99)] == [0, 0, 3]
-
-
-def test_every_signal_drives_each_output_once_by_default():
-    pairs = SwitchingSchedule(SwitchingParameters()).pairs
-    assert sorted(pair[0] for pair in pairs) == [1, 2, 3, 4]
-    assert sorted(pair[1] for pair in pairs) == [1, 2, 3, 4]
+    found = [schedule.at(time) for time in (0.0, 11.99, 12.0, 47.99)]
+    assert [each.mode for each in found] == [0, 0, 1, 3]
+    assert all((each.blend, each.blend_rate) == (1.0, 0.0) for each in found)
+    assert {*schedule.pairs} == {(1, 2), (2, 3), (3, 4), (4, 1)}
 
 
 def test_fixed_switching_repeats_the_last_dwell_on_its_grid():
@@ -63,12 +60,9 @@ def test_one_switch_time_is_a_period_and_none_is_no_switching():
     assert _switches(once, 30.0)[0] == [7.0, 14.0, 21.0, 28.0]
     never = SwitchingSchedule(SwitchingParameters(times=()))
     assert never.at(1e9).until == math.inf
-
-
-@pytest.mark.parametrize('kind', ['fixed', 'random'])
-def test_one_mode_never_switches(kind):
-    schedule = SwitchingSchedule(SwitchingParameters(kind=kind, modes=(2, 4)))
-    assert schedule.at(1e7) == (0, 0, 1.0, 0.0, 0, 0.0, math.inf)
+    for kind in ('fixed', 'random', 'memoryless'):
+        one = SwitchingSchedule(SwitchingParameters(kind=kind, modes=(2, 4)))
+        assert one.at(1e7) == (0, 0, 1.0, 0.0, 0, 0.0, math.inf)
 
 
 TIMES = st.floats(0.0, 300.0) | st.integers(0, 25).map(lambda n: 12.0 * n)
@@ -112,22 +106,15 @@ def test_random_modes_are_uniform_among_the_other_modes():
     np.testing.assert_allclose(shares[1:], 1.0 / 3.0, atol=0.03)
 
 
-def test_a_sudden_switch_has_no_transition():
-    schedule = SwitchingSchedule(SwitchingParameters())
-    for time in (0.0, 5.0, 12.0, 12.001, 30.0):
-        selection = schedule.at(time)
-        assert (selection.blend, selection.blend_rate) == (1.0, 0.0)
-
-
 def test_blend_is_continuous_with_a_continuous_derivative():
     schedule = SwitchingSchedule(SwitchingParameters(blend=2.0))
-    times = np.linspace(11.0, 15.0, 40_001)
+    times = np.linspace(11.0, 15.0, 4001)
     selections = [schedule.at(time) for time in times]
     # The weight of the new mode starts at its switch at 12 s.
     share = np.array([s.blend if s.switches else 0.0 for s in selections])
     rate = np.array([s.blend_rate for s in selections])
     step = times[1] - times[0]
-    np.testing.assert_allclose(np.gradient(share, step)[1:-1], rate[1:-1], atol=1e-4)
+    np.testing.assert_allclose(np.gradient(share, step)[1:-1], rate[1:-1], atol=1e-3)
     assert np.abs(np.diff(rate)).max() < 2.0 * 6.0 / 2.0**2 * step
     assert np.all(np.diff(share) >= 0.0)
     assert (share[0], share[-1]) == (0.0, 1.0)
@@ -154,10 +141,10 @@ def test_inconsistent_parameters_are_rejected_by_name(values, name):
         SwitchingParameters(**values)
 
 
-@pytest.mark.parametrize('time', [-1.0, math.nan, math.inf])
-def test_times_outside_the_run_are_rejected(time):
-    with pytest.raises(ValueError, match='time'):
-        SwitchingSchedule(SwitchingParameters()).at(time)
+def test_times_outside_the_run_are_rejected():
+    for time in (-1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match='time'):
+            SwitchingSchedule(SwitchingParameters()).at(time)
 
 
 MEMORYLESS = SwitchingParameters(kind='memoryless', mean_dwell=4.0, blend=2.0)
@@ -180,5 +167,3 @@ def test_the_first_mode_is_as_any_other():
     times, modes = _switches(SwitchingSchedule(MEMORYLESS, seed=3), 8000.0)
     assert (np.diff(modes) != 0).all()
     np.testing.assert_allclose(np.bincount(modes) / len(modes), 0.25, atol=0.03)
-    one = SwitchingSchedule(SwitchingParameters(kind='memoryless', modes=(2, 4)))
-    assert one.at(1e7).until == math.inf

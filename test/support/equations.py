@@ -146,18 +146,8 @@ def constrained_acceleration(
 ) -> tuple[Array, Array]:
     """Return (q'', gamma) of (4): the unreduced equations solved with their multipliers.
 
-    The plant does not run on these; they check the reduction.
-
-    Parameters
-    ----------
-    coordinates, rates
-        q and q', shape (5,).
-    torque
-        Wheel torques minus friction and disturbance, right first, shape (2,), N m.
-
-    Returns
-    -------
-    q'' of shape (5,) and gamma of shape (3,): side force (N), rolling forces (N).
+    ``torque`` is that of the wheels minus friction and disturbance, right first (N m); gamma are
+    the side force and both rolling forces (N).
     """
     yaw, yaw_rate = float(coordinates[2]), float(rates[2])
     constraint = constraint_matrix(yaw, geometry)
@@ -233,16 +223,8 @@ def output_by_double_sum(inputs: Array, sets: FuzzySets, lower: Array, upper: Ar
     E8: each slice is a mean of the coefficients weighted by the firing strengths, hence without
     the printed 1/2, and the slices are averaged with their levels as weights. An independent,
     literal implementation that checks (31)-(33): too slow for a control step, and 0/0 far outside
-    the centres, where every firing strength underflows.
-
-    Parameters
-    ----------
-    inputs
-        U, shape (n,), rad/s.
-    sets
-        Tables, of which centres, widths, levels and input fuzziness are used.
-    lower, upper
-        Rule coefficients at the lower and upper levels, shape (r, lambda) each, rad/s².
+    the centres, where every firing strength underflows. ``lower`` and ``upper`` are the rule
+    coefficients at these levels, shape (r, lambda) each, rad/s².
     """
     n, per_input = sets.centres.shape
 
@@ -333,12 +315,7 @@ def boltzmann_distribution(energies: Array) -> Array:
     E9: the printed J' = delta^E / E is no distribution. The temperature is 2 because Xi (40),
     the tanh of *half* its argument, is the mean of a unit in {-1, 1} at exactly that
     temperature; at temperature 1 the passes (36)-(39) do not sample from (41). The temperature
-    only scales X_v, and gamma in (43).
-
-    Parameters
-    ----------
-    energies
-        E of every possible state, equation (42).
+    only scales X_v, and gamma in (43). ``energies`` are those of every possible state, (42).
     """
     weights: Array = np.exp(-0.5 * (energies - energies.min()))
     weights /= weights.sum()
@@ -368,16 +345,8 @@ def lyapunov_value(errors: Array, coefficient_errors: Array, adaptation_gain: fl
     """Return V of equation (74), rad²/s²: half of |delta|² plus |alpha* - alpha|²/(2 gamma).
 
     Along the closed loop V' is (75), the sum of delta delta' - alpha~ alpha'/gamma. With the law
-    it becomes (76), and (79) if the coefficients follow (77)-(78).
-
-    Parameters
-    ----------
-    errors
-        delta, shape (n,), rad/s.
-    coefficient_errors
-        alpha~ = alpha* - alpha of all outputs, rad/s².
-    adaptation_gain
-        gamma, 1/s².
+    it becomes (76), and (79) if the coefficients follow (77)-(78). Errors delta in rad/s, alpha~
+    in rad/s², gain gamma in 1/s².
     """
     squares = float(np.sum(coefficient_errors**2))
     return 0.5 * float(errors @ errors) + squares / (2.0 * adaptation_gain)
@@ -397,12 +366,8 @@ def interval_weights(order: float, count: int) -> tuple[NDArray[np.float64], NDA
               \text{newer}_m = \frac{1}{\Gamma(q)} \int_m^{m+1} u^{q-1} (m + 1 - u)\,du
 
     The closed form is a difference of powers that loses digits like m^2. Beyond the first
-    interval the integrand is smooth, so 14 Gauss points integrate it to rounding.
-
-    Returns
-    -------
-    older, newer
-        Shape (count,) each; multiply by step**order.
+    interval the integrand is smooth, so 14 Gauss points integrate it to rounding. Both have the
+    shape (count,), to be multiplied by step**order.
     """
     older = np.empty(count)
     newer = np.empty(count)
@@ -421,35 +386,7 @@ def interval_weights(order: float, count: int) -> tuple[NDArray[np.float64], NDA
 def solve_full_memory(
     system: QuadraticSystem, step: float, initial: NDArray[np.float64], steps: int
 ) -> NDArray[np.float64]:
-    """Return the states at 0, step, ... , steps * step, from every past slope.
-
-    Parameters
-    ----------
-    system
-        Each state may have its own order.
-    step
-        s, positive.
-    initial
-        Shape (d,).
-    steps
-        Number of steps, not negative.
-
-    Returns
-    -------
-    states
-        Shape (steps + 1, d).
-
-    Raises
-    ------
-    ValueError
-        The step is not positive, or the initial state has the wrong size.
-    """
-    if not 0.0 < step < math.inf:
-        raise ValueError(f'step must be positive and finite: got {step}')
-    if np.shape(initial) != (system.size,):
-        raise ValueError(f'initial must have shape ({system.size},): got {np.shape(initial)}')
-    if steps < 0:
-        raise ValueError(f'steps must not be negative: got {steps}')
+    """Return the states at each step (s) from 0 on, from every past slope, (steps + 1, d)."""
     older = np.empty((steps, system.size))
     newer = np.empty((steps, system.size))
     rectangle = np.empty(system.size)
