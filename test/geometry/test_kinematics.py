@@ -13,6 +13,7 @@
 # limitations under the License.
 """Unicycle kinematics (1)-(3), poses, twists and states."""
 
+import itertools
 import math
 
 import numpy as np
@@ -40,14 +41,6 @@ def test_wheel_speeds_to_body_twist_and_back_is_the_identity():
         assert back == pytest.approx(wheels, rel=1e-12, abs=1e-12)
 
 
-def test_equal_wheels_go_straight_opposite_wheels_turn_in_place():
-    straight = twist_from_wheels(WheelSpeeds(4.0, 4.0), GEOMETRY)
-    assert straight == (pytest.approx(4.0 * GEOMETRY.wheel_radius), 0.0)
-    spot = twist_from_wheels(WheelSpeeds(4.0, -4.0), GEOMETRY)
-    assert spot.linear == 0.0
-    assert spot.angular > 0.0  # right wheel forward: left turn
-
-
 def test_one_turn_along_the_wheel_tracks_closes_the_circle():
     """E1: the printed (1) divides by twice the *separation* and closes after two turns only.
 
@@ -68,18 +61,6 @@ def test_one_turn_along_the_wheel_tracks_closes_the_circle():
     middle = advance_pose(ORIGIN, twist, 0.5 * duration)
     assert (middle.x, middle.y) == pytest.approx((0.0, 2.0 * radius), abs=1e-12)
     assert abs(middle.yaw) == pytest.approx(math.pi)
-
-
-def test_the_wheel_hubs_move_with_the_rim_speed_of_their_wheels():
-    wheels = WheelSpeeds(7.0, -2.5)
-    twist = twist_from_wheels(wheels, GEOMETRY)
-    half = GEOMETRY.half_separation
-    assert twist.linear + half * twist.angular == pytest.approx(
-        GEOMETRY.wheel_radius * wheels.right
-    )
-    assert twist.linear - half * twist.angular == pytest.approx(
-        GEOMETRY.wheel_radius * wheels.left
-    )
 
 
 def test_pose_rate_is_the_derivative_of_the_exact_arc():
@@ -108,7 +89,7 @@ def test_arcs_compose_for_any_subdivision():
         assert wrap_angle(walked.yaw - whole.yaw) == pytest.approx(0.0, abs=1e-12)
 
 
-@pytest.mark.parametrize('angular', [0.0, 1e-300, 1e-18, 1e-12, 1e-9, 1e-6, 1e-3, -1e-7])
+@pytest.mark.parametrize('angular', [0.0, 1e-300, 1e-12, 1e-6, -1e-3])
 def test_nearly_straight_motion_has_full_accuracy(angular):
     # The textbook form r (sin(P + w t) - sin P) loses all digits here.
     end = advance_pose(ORIGIN, BodyTwist(2.0, angular), 1.5)
@@ -127,13 +108,13 @@ def test_wrapped_angles_are_equivalent_and_in_range():
     assert wrap_angle(-math.pi) == math.pi
 
 
-@pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize('place', range(5))
-def test_a_state_with_a_non_finite_number_is_not_finite(bad, place):
+def test_a_state_with_a_non_finite_number_is_not_finite():
     numbers = [0.1, 0.2, 0.3, 0.4, 0.5]
     assert State(0, Pose(*numbers[:3]), BodyTwist(*numbers[3:])).is_finite()
-    numbers[place] = bad
-    assert not State(0, Pose(*numbers[:3]), BodyTwist(*numbers[3:])).is_finite()
+    assert State(0, Pose(1e308, 1e308, 0.0), BodyTwist(0.0, 0.0)).is_finite()
+    for bad, place in itertools.product((math.nan, math.inf, -math.inf), range(5)):
+        wrong = [*numbers[:place], bad, *numbers[place + 1 :]]
+        assert not State(0, Pose(*wrong[:3]), BodyTwist(*wrong[3:])).is_finite()
 
 
 def test_a_geometry_of_zero_size_is_rejected():

@@ -76,7 +76,7 @@ def deviation(timed, points):
 
 @pytest.mark.compiled
 @pytest.mark.parametrize('noise', [0.0, 0.002])
-@pytest.mark.parametrize('spacing', [0.005, 0.02, 0.05, 0.1, 0.2])
+@pytest.mark.parametrize('spacing', [0.005, 0.05, 0.2])
 @pytest.mark.parametrize('shape', [line, circle])
 def test_sampling_and_noise_cost_at_most_a_tenth_of_the_time(shape, spacing, noise):
     """A circle of points every 5 cm took three times its time, a line with noise 27 times."""
@@ -99,7 +99,7 @@ def test_steps_of_a_grid_are_smoothed_within_the_tolerance():
     assert tight.time[-1] > timed.time[-1]
 
 
-@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('seed', range(2))
 @pytest.mark.parametrize('tolerance', [LEAST_TOLERANCE, 0.015, 0.3])
 def test_no_path_is_left_by_more_than_the_tolerance(seed, tolerance):
     """Corners of any angle, legs of any length, noise, and a place visited twice."""

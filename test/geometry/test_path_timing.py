@@ -79,8 +79,8 @@ PATHS = {
     'turn back': np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]]),
     'corners 1': _random_corners(1),
     'curve 1': _random_curve(1),
-    **{f'corners {seed}': _random_corners(seed) for seed in (2, 3)},
-    **{f'curve {seed}': _random_curve(seed) for seed in (2, 3, 4, 5)},
+    'corners 2': _random_corners(2),
+    'curve 2': _random_curve(2),
 }
 NAMES = few_of(PATHS, 7)
 
@@ -211,7 +211,7 @@ def test_late_points_stop_the_robot_in_time():
 @pytest.mark.compiled
 def test_a_path_that_grows_after_a_rest_begins_at_rest():
     """Where the rest came in the last part of a plan, it began at the speeds of long before."""
-    for length in np.arange(0.9, 1.3, 0.01):
+    for length in np.arange(0.9, 1.3, 0.04):
         timing = PathTiming(MotionLimits(), GEOMETRY, 0.05)
         along = np.linspace(0.0, length, 100)
         speeds = []

@@ -20,7 +20,6 @@ import pytest
 from support.long_tests import few_of
 
 from t3mpc_ros.geometry.arena import OccupancyGrid
-from t3mpc_ros.geometry.path_timing import resample
 from t3mpc_ros.geometry.route_planning import (
     NEAR_COST,
     UNSEEN_COST,
@@ -81,7 +80,7 @@ def test_time_on_free_floor_is_the_distance():
     assert planner.arrival(points)[away] == pytest.approx(distance[away], rel=0.03, abs=0.06)
 
 
-@pytest.mark.parametrize('goal', [(1.5, 0.9), (1.6, -0.7), (0.3, 1.1)])
+@pytest.mark.parametrize('goal', [(1.5, 0.9), (0.3, 1.1)])
 def test_a_route_on_free_floor_is_straight(goal):
     planner = planner_of(floor())
     planner.spread((-1.3, 0.2))
@@ -90,6 +89,7 @@ def test_a_route_on_free_floor_is_straight(goal):
     assert route[-1] == pytest.approx(goal)
     assert length(np.vstack([(-1.3, 0.2), route])) < 1.01 * straight
     spans = np.hypot(*np.diff(route, axis=0).T)
+    assert spans.min() > 0.009
     assert spans.max() < 0.011
 
 
@@ -190,10 +190,3 @@ def test_without_a_map_nothing_is_safe_and_nothing_is_known():
     assert planner.unsafe_distance(place) == 0.0
     assert planner.wall_distance(place) > 100.0
     assert planner.route((1.0, 0.0), (0.0, 0.0)) is None
-
-
-def test_points_of_a_polyline_are_spaced_evenly():
-    points = resample(np.array([[0.0, 0.0], [0.3, 0.0], [0.3, 0.4]]), 0.05, round)
-    assert len(points) == 15
-    assert points[-1] == pytest.approx([0.3, 0.4])
-    assert length(points) == pytest.approx(0.7)

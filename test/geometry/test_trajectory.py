@@ -61,15 +61,6 @@ def test_a_curve_is_interpolated_with_second_order():
     assert order == pytest.approx(2.0, abs=0.1)
 
 
-def test_the_samples_are_reproduced_exactly():
-    trajectory = filled(sample(0.0, 0.1), sample(7.0, 0.11), sample(20.0, 0.09))
-    assert trajectory.at(0).twist.linear == 0.1
-    assert trajectory.at(7 * MS).twist.linear == 0.11
-    last = trajectory.at(20 * MS)
-    assert last.twist.linear == 0.09
-    assert last.rate == (0.0, 0.0)
-
-
 def test_the_value_outside_the_samples_is_unknown():
     trajectory = ReferenceTrajectory(JUMP)
     assert trajectory.at(0) is None
@@ -78,7 +69,9 @@ def test_the_value_outside_the_samples_is_unknown():
     assert trajectory.at(10 * MS - 1) is None
     assert trajectory.at(10 * MS).twist.linear == 0.1
     assert trajectory.at(10 * MS + 1) is None
-    trajectory.add(sample(20.0, 0.1))
+    trajectory.add(sample(20.0, 0.11))
+    assert trajectory.at(10 * MS).twist.linear == 0.1
+    assert trajectory.at(20 * MS) == ((0.11, 0.0), (0.0, 0.0))
     assert trajectory.at(20 * MS + 1) is None
     assert trajectory.newest_ns == 20 * MS
 
@@ -127,14 +120,6 @@ def test_a_replaced_jump_is_no_longer_reported():
     trajectory.add(sample(40.0, 0.0))
     trajectory.add(sample(40.0, 0.3))
     assert trajectory.pop_jumps() == []
-
-
-def test_a_repeated_sample_replaces_the_previous_one():
-    trajectory = filled(sample(0.0, 0.1), sample(10.0, 0.1), sample(20.0, 0.1), capacity=4)
-    for speed in (0.11, 0.12, 0.13, 0.12):
-        trajectory.add(sample(20.0, speed))
-    assert trajectory.at(0).twist.linear == 0.1  # no sample was dropped
-    assert trajectory.at(15 * MS).twist.linear == pytest.approx(0.11)
 
 
 def test_a_stamp_far_ahead_does_not_block_later_samples():

@@ -89,14 +89,13 @@ def world(text):
 
 def test_nothing_is_found_where_nothing_has_changed():
     for seed in (1, 2):
-        assert Patrol(seed).drive(world(KNOWN), 6.0 * ROUND) == ()
+        assert Patrol(seed).drive(world(KNOWN), 4.0 * ROUND) == ()
 
 
 @pytest.mark.parametrize(
     ('added', 'place', 'size'),
     [
         ('circles: [{center: [-0.95, 0.75], radius: 0.1}]\n', (-0.95, 0.75), 0.2),
-        ('circles: [{center: [-1.0, -0.75], radius: 0.05}]\n', (-1.0, -0.75), 0.1),
         ('circles: [{center: [0.3, -0.95], radius: 0.15}]\n', (0.3, -0.95), 0.3),
     ],
 )
@@ -111,7 +110,7 @@ def test_a_new_thing_is_one_event_at_its_place(added, place, size):
     assert 0.5 * size <= found.size <= size + 0.2
     assert found.confidence >= 0.95
     assert found.first_ns <= found.found_ns <= found.last_ns
-    (same,) = patrol.drive(changed, 4.0 * ROUND)
+    (same,) = patrol.drive(changed, ROUND)
     assert same.number == found.number == 1
     assert same.first_ns == found.first_ns
     assert same.last_ns > found.last_ns
@@ -179,22 +178,14 @@ def test_what_is_no_event_yet_is_suspected_and_forgotten():
     assert patrol.detector.suspected.shape == (0, 2)
 
 
-def test_an_event_is_suspected_no_more():
-    added = world(KNOWN.replace(PILLAR, PILLAR[:-2] + ', {center: [-0.95, 0.75], radius: 0.1}]\n'))
-    patrol = Patrol()
-    early = patrol.drive(added, 0.25 * ROUND)
-    while not early:
-        before = patrol.detector.suspected
-        early = patrol.drive(added, PERIOD)
-    assert np.hypot(*(before - (early[0].x, early[0].y)).T).min() < 0.1
-    assert patrol.detector.suspected.shape == (0, 2)
-
-
 def test_equal_readings_give_equal_events():
     changed = world(WALLS + BOX + 'circles: [{center: [-0.95, 0.75], radius: 0.1}]\n')
-    first, second = (Patrol(seed=5).drive(changed, ROUND) for _ in range(2))
+    patrol = Patrol(seed=5)
+    first, second = (each.drive(changed, ROUND) for each in (patrol, Patrol(seed=5)))
     assert first == second
-    assert first
+    (event,) = first
+    # What is an event is suspected no more.
+    assert np.hypot(*(patrol.detector.suspected - (event.x, event.y)).T).min() > 0.5
 
 
 @pytest.mark.compiled
@@ -205,7 +196,7 @@ def test_no_readings_of_a_fan_of_beams_are_too_much(seed):
     detector = ChangeDetector(ChangeParameters(), SEEN, MODEL)
     origin = np.column_stack([np.zeros((60, 2)), np.linspace(-1.0, 1.0, 60)])
     limits = np.tile([LEAST, MOST], (60, 1))
-    for k in range(100):
+    for k in range(50):
         beams = Beams(origin, generator.uniform(0.05, 0.9, 60), limits)
         stamp_ns = round(PERIOD * k * NANOSECONDS)
         detector.add(stamp_ns, on_ellipse(PERIOD * k), np.diag(np.square(DEVIATIONS)), beams)

@@ -151,8 +151,8 @@ def rms(values):
 @pytest.mark.compiled
 def test_a_known_start_is_tracked_while_the_odometry_drifts():
     localizer, drive = make_localizer(), Drive()
-    away, turned = rms(follow(localizer, drive, 60.0)[40:])
-    assert abs(wrap_angle(drive.odometry.yaw + 0.5 * math.pi - drive.truth.yaw)) > 0.2
+    away, turned = rms(follow(localizer, drive, 30.0)[40:])
+    assert abs(wrap_angle(drive.odometry.yaw + 0.5 * math.pi - drive.truth.yaw)) > 0.1
     assert away < 0.025
     assert turned < math.radians(1.7)
     assert localizer.state is Localization.LOCALIZED
@@ -162,24 +162,16 @@ def test_a_known_start_is_tracked_while_the_odometry_drifts():
 def test_the_covariance_covers_the_error():
     localizer, drive = make_localizer(), Drive(seed=3)
     inside = []
-    for _ in range(40):
+    for _ in range(25):
         follow(localizer, drive, 1.0)
         pose, truth = localizer.result.pose, drive.truth
         gap = np.array([pose.x - truth.x, pose.y - truth.y])
         inside.append(gap @ np.linalg.solve(localizer.result.covariance[:2, :2], gap) < 13.8)
     assert np.mean(inside) >= 0.9  # 99.9 % of a normal distribution; readings repeat their errors
-
-
-@pytest.mark.compiled
-def test_the_frame_of_the_odometry_leads_to_the_pose():
-    localizer, drive = driven(10.0)
     while not localizer.add_odometry(drive.stamp_ns, drive.odometry):
         drive.step()
-    frame, inner = localizer.result.odometry_frame, drive.odometry
-    x = frame.x + math.cos(frame.yaw) * inner.x - math.sin(frame.yaw) * inner.y
-    y = frame.y + math.sin(frame.yaw) * inner.x + math.cos(frame.yaw) * inner.y
-    assert (x, y) == pytest.approx(localizer.result.pose[:2])
-    assert wrap_angle(frame.yaw + inner.yaw - localizer.result.pose.yaw) == pytest.approx(0.0)
+    frame = localizer.result.odometry_frame
+    assert pose_in(frame, drive.odometry) == pytest.approx(localizer.result.pose)
 
 
 @pytest.mark.compiled
@@ -190,7 +182,7 @@ def test_an_unknown_start_is_found():
     follow(localizer, drive, 0.2)
     assert localizer.state is Localization.SEARCHING
     assert np.diag(localizer.result.covariance).max() > 0.3
-    follow(localizer, drive, 25.0)
+    follow(localizer, drive, 20.0)
     assert localizer.state is Localization.LOCALIZED
     assert error(localizer, drive)[0] < 0.05
 
@@ -310,17 +302,14 @@ def test_odometry_that_jumps_moves_neither_particle_nor_pose(jump):
     assert rms(follow(localizer, drive, 10.0))[0] < 0.03
 
 
-@pytest.mark.parametrize('disorder', ['a pair each 0.2 s', 'every pair', 'each twice', 'one late'])
+@pytest.mark.parametrize('disorder', ['every pair', 'each twice', 'one late'])
 def test_odometry_out_of_order_is_no_restart(disorder):
     """A swapped pair each 0.2 s was a restart each time: the robot drove, the estimate stood."""
     poses = [(10_000_000 * k, Pose(0.002 * k, 0.0, 0.0)) for k in range(1, 301)]
     if disorder == 'each twice':
         sent = [each for each in poses for _ in range(2)]
     else:
-        sent, every = (
-            [*poses],
-            {'a pair each 0.2 s': 20, 'every pair': 2, 'one late': 300}[disorder],
-        )
+        sent, every = [*poses], 2 if disorder == 'every pair' else 300
         for k in range(every - 1, len(sent), every):
             sent[k - 1], sent[k] = sent[k], sent[k - 1]
         if disorder == 'one late':
@@ -401,8 +390,8 @@ def test_a_pose_by_odometry_alone_is_noticed_and_ends(reading):
 
 @pytest.mark.compiled
 def test_readings_that_are_lost_cost_little():
-    errors = follow(make_localizer(), Drive(seed=5), 40.0, loss=0.5)
-    assert rms(errors[40:])[0] < 0.03
+    errors = follow(make_localizer(), Drive(seed=5), 15.0, loss=0.5)
+    assert rms(errors[20:])[0] < 0.03
 
 
 @pytest.mark.compiled
@@ -410,7 +399,7 @@ def test_things_that_the_map_lacks_do_not_lead_it_away():
     """A person goes along at the right: two of the eight ranges are short."""
     localizer, drive = driven(5.0)
     worst = 0.0
-    for _ in range(400):
+    for _ in range(200):
         drive.step()
         ranges = drive.ranges()
         ranges[6:] = np.minimum(ranges[6:], 0.2)
@@ -465,7 +454,8 @@ def test_one_place_that_contradicts_the_map_loses_nobody(gone, lost):
 
 @pytest.mark.compiled
 @pytest.mark.parametrize(
-    ('sensor', 'wrong', 'seconds'), [(6, math.inf, 20.0), (3, 0.3, 20.0), (5, -math.inf, 60.0)]
+    ('sensor', 'wrong', 'seconds'),
+    few_of([(6, math.inf, 20.0), (3, 0.3, 20.0), (5, -math.inf, 60.0)]),
 )
 def test_a_sensor_that_contradicts_the_map_is_not_used(sensor, wrong, seconds):
     """A patrol with a sensor that was blind was 12 to 18 mm off, with all of them 10."""
@@ -485,10 +475,10 @@ def test_no_change_excuses_readings_where_a_place_was_just_found():
     """A robot that took its place for the mirrored one called every contradiction a change."""
     lowest = {}
     for scattered in (False, True):
-        localizer, drive = driven(0.0 if scattered else 30.0, drift=0.0)
+        localizer, drive = driven(0.0 if scattered else 20.0, drift=0.0)
         if scattered:
             localizer.scatter()
-            follow(localizer, drive, 30.0)
+            follow(localizer, drive, 20.0)
         drive.room = parse_world(re.sub('boxes.*', '', TEXT), 'without the box')
         lowest[scattered] = 1.0
         for _ in range(40):
@@ -520,7 +510,7 @@ def test_a_scan_is_used_like_the_ranges():
     beams = np.column_stack([np.zeros(24), np.zeros(24), angles])
     limits = np.tile([0.05, 3.0], (24, 1))
     errors = []
-    for _ in range(400):
+    for _ in range(200):
         drive.step()
         found = drive.distances(beams) + 0.01 * drive.generator.standard_normal(24)
         localizer.add_scan(Beams(beams, np.where(found > 3.0, math.inf, found), limits))
@@ -531,17 +521,14 @@ def test_a_scan_is_used_like_the_ranges():
     assert turned < math.radians(1.0)
 
 
-def test_a_scan_without_any_reading_is_none():
-    localizer = make_localizer()
-    localizer.add_odometry(0, ORIGIN)
-    nothing = Beams(np.empty((0, 3)), np.empty(0), np.empty((0, 2)))
-    assert localizer.add_scan(nothing) == 'it has no reading'
-
-
 def test_a_robot_without_range_sensors_has_no_doubtful_one():
     """With a scan alone each update warned of the mean of nothing."""
     localizer = Localizer(make_localizer().parameters, SEEN, np.empty((0, 3)), (LEAST, MOST))
     assert localizer.doubtful == ()
+    assert PoseCorrection().step(0, ORIGIN, localizer) is None  # the place is not known yet
+    localizer.add_odometry(0, ORIGIN)
+    nothing = Beams(np.empty((0, 3)), np.empty(0), np.empty((0, 2)))
+    assert localizer.add_scan(nothing) == 'it has no reading'
 
 
 @pytest.mark.compiled
@@ -549,11 +536,11 @@ def test_equal_inputs_give_equal_bits():
     results = []
     for _ in range(2):
         localizer, drive = make_localizer(set_initial_pose=False, seed=4), Drive()
-        follow(localizer, drive, 5.0)
+        follow(localizer, drive, 2.0)
         results.append((localizer.result.pose, localizer.filter.poses.tobytes()))
     assert results[0] == results[1]
     other, drive = make_localizer(set_initial_pose=False, seed=5), Drive()
-    follow(other, drive, 5.0)
+    follow(other, drive, 2.0)
     assert other.filter.poses.tobytes() != results[0][1]
 
 
@@ -590,7 +577,7 @@ def test_the_corrected_pose_is_exact_and_moves_slowly():
     """The corrections of the filter are up to centimetres at once; the wheels feel none."""
     localizer, drive, correction = make_localizer(), Drive(), PoseCorrection()
     follow(localizer, drive, 1.0)
-    changes, pose = drive_corrected(localizer, drive, correction, 40.0)
+    changes, pose = drive_corrected(localizer, drive, correction, 20.0)
     assert changes[:, 0].max() <= 0.05 * PERIOD + 1e-9
     assert changes[:, 1].max() <= 0.2 * PERIOD + 1e-9
     assert math.hypot(pose.x - drive.truth.x, pose.y - drive.truth.y) < 0.06
@@ -614,8 +601,8 @@ def test_a_correction_is_no_contact(x, y):
     """
     monitor, correction, pose, now = ContactMonitor(), PoseCorrection(), ORIGIN, STANDSTILL
     frame, touches = ORIGIN, []
-    for k in range(17_000):
-        phase = k // 400 % 6
+    for k in range(8500):
+        phase = k // 200 % 6
         wanted = [
             (0.3, 0.0),
             (0.0, 2.0),
@@ -627,7 +614,7 @@ def test_a_correction_is_no_contact(x, y):
         step = [min(max(w - n, -a), a) for w, n, a in zip(wanted, now, (0.01, 0.14), strict=True)]
         now = BodyTwist(now.linear + step[0], now.angular + step[1])
         pose = advance_pose(pose, now, 0.01)
-        if k % 2800 == 0:  # at each of them once
+        if k % 1400 == 0:  # at each of them once
             frame = Pose(frame.x + x, frame.y + y, frame.yaw)
         localizer = SimpleNamespace(
             result=SimpleNamespace(odometry_frame=frame), state=Localization.LOCALIZED
@@ -635,13 +622,6 @@ def test_a_correction_is_no_contact(x, y):
         found = correction.step(k * 10_000_000, pose, localizer)
         touches.append(monitor.is_in_contact(State(k * 10_000_000, found, now), now, 0.01))
     assert not any(touches)
-
-
-def test_there_is_no_corrected_pose_before_the_place_is_known():
-    localizer, drive = make_localizer(set_initial_pose=False), Drive()
-    drive.step()
-    localizer.add_odometry(drive.stamp_ns, drive.odometry)
-    assert PoseCorrection().step(drive.stamp_ns, drive.odometry, localizer) is None
 
 
 @pytest.mark.parametrize('impossible', [math.nan, -0.3])
@@ -664,7 +644,7 @@ def test_impossible_readings_are_no_readings(impossible):
 def test_a_search_ends_when_readings_fit_for_some_time():
     """Where half of them happened to fit, a carried robot took the place for known."""
     localizer, drive = make_localizer(seed=3), Drive(seed=3)
-    follow(localizer, drive, 20.0)
+    follow(localizer, drive, 10.0)
     drive.carry(2.5)
     lost = early = False
     for _ in range(600):
@@ -689,8 +669,8 @@ def turned_too_far(localizer, drive, seconds):
 
 
 def yaw_errors(drift):
-    """Return mean errors of 20 s: after a drift of a minute, and 40 s after it."""
-    localizer, drive = driven(60.0, drift)
+    """Return mean errors of 20 s: after a drift of 40 s, and 40 s after it."""
+    localizer, drive = driven(40.0, drift)
     drifting = turned_too_far(localizer, drive, 20.0)
     drive.drift = 0.0
     turned_too_far(localizer, drive, 40.0)
@@ -710,27 +690,27 @@ def test_the_drift_of_a_gyro_is_measured_by_the_map():
 @pytest.mark.compiled
 def test_a_robot_at_rest_does_not_turn_with_its_gyro():
     """Its pose loop followed the odometry, which did not turn then, and the robot did."""
-    localizer, drive = driven(90.0, drift=-0.009)
+    localizer, drive = driven(40.0, drift=-0.009)
     yaw = drive.truth.yaw
-    for _ in range(round(20.0 / PERIOD)):
+    for _ in range(round(10.0 / PERIOD)):
         drive.stamp_ns += round(PERIOD * 1e9)
         drive.odometry = moved_pose(drive.odometry, (0.0, 0.0, drive.drift * PERIOD))
         for sensor, reading in enumerate(drive.ranges().tolist()):
             localizer.add_range(sensor, reading)
         localizer.add_odometry(drive.stamp_ns, drive.odometry)
         used = pose_in(localizer.result.odometry_frame, drive.odometry)
-        assert abs(wrap_angle(used.yaw - yaw)) < 0.04  # 0.18 by the odometry
+        assert abs(wrap_angle(used.yaw - yaw)) < 0.03  # 0.09 by the odometry
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize('angle', [-0.3, 0.3])
+@pytest.mark.parametrize('angle', few_of([-0.3, 0.3]))
 def test_a_slip_is_no_drift(angle):
     assert abs(turned_after_slip(angle) - turned_after_slip(0.0)) < 0.003
 
 
 @functools.cache
 def turned_after_slip(angle):
-    localizer, drive = driven(60.0, drift=0.0)
+    localizer, drive = driven(20.0, drift=0.0)
     drive.odometry = moved_pose(drive.odometry, (0.0, 0.0, angle))
     turned_too_far(localizer, drive, 10.0)
     return turned_too_far(localizer, drive, 10.0)
@@ -739,7 +719,7 @@ def turned_after_slip(angle):
 @pytest.mark.compiled
 def test_a_slip_is_no_reason_to_look_elsewhere():
     """A turn that the odometry missed led to another place that looked alike, 1.4 m away."""
-    for seed in (1, 2, 3):
+    for seed in (1, 2):
         localizer, drive = make_localizer(seed=seed), Drive(seed=seed)
         follow(localizer, drive, 10.0)
         x, y, yaw = drive.odometry

@@ -159,10 +159,10 @@ def test_an_invalid_map_file_is_rejected_with_its_name(tmp_path, change, reason)
     assert str(tmp_path) in str(raised.value)
 
 
-@pytest.mark.parametrize('kept', [0, 2, 30, -100])
-def test_a_truncated_image_is_rejected(tmp_path, kept):
-    path = write_map(tmp_path, walled_grid())
-    image = tmp_path / 'map.pgm'
-    image.write_bytes(image.read_bytes()[:kept])
-    with pytest.raises(MapError, match='map.pgm'):
-        load_grid(path)
+def test_a_truncated_image_is_rejected(tmp_path):
+    path, image = write_map(tmp_path, walled_grid()), tmp_path / 'map.pgm'
+    whole = image.read_bytes()
+    for kept in (0, 2, 30, -100):
+        image.write_bytes(whole[:kept])
+        with pytest.raises(MapError, match='map.pgm'):
+            load_grid(path)

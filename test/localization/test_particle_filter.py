@@ -51,8 +51,7 @@ def make_filter(**values):
     return ParticleFilter(parameters, SEEN.field, SEEN.free_places(0.1), MODEL)
 
 
-@pytest.mark.parametrize('linear', [0.3, -0.3, 0.0])
-@pytest.mark.parametrize('angular', [1.0, -0.2, 0.0])
+@pytest.mark.parametrize(('linear', 'angular'), [(0.3, 1.0), (-0.3, -0.2), (0.0, 1.0), (0.3, 0.0)])
 def test_motion_of_the_odometry_leads_from_pose_to_pose(linear, angular):
     begin = Pose(0.3, -0.2, 2.9)
     end = advance_pose(begin, BodyTwist(linear, angular), 0.5)
@@ -79,7 +78,7 @@ def test_driving_backwards_is_no_turn():
     assert found.poses == pytest.approx(np.tile([-0.2, 0.0, 0.0], (500, 1)), abs=1e-9)
 
 
-@pytest.mark.parametrize('occupied', [1, 2, 10, 100])
+@pytest.mark.parametrize('occupied', [1, 2, 100])
 def test_the_number_of_particles_is_that_of_the_bound(occupied):
     """Fox (2003), equation (7), with the bins that the drawn particles are in."""
     bins = np.arange(20000) % occupied
@@ -88,11 +87,8 @@ def test_the_number_of_particles_is_that_of_the_bound(occupied):
     share = 2.0 / (9.0 * max(occupied - 1, 1))
     bound = (occupied - 1) / 0.1 * (1.0 - share + math.sqrt(share) * 2.33) ** 3
     assert count == max(50, math.ceil(bound))
-
-
-def test_particles_everywhere_are_as_many_as_permitted():
-    bins = np.arange(3000, dtype=np.int64)
-    assert needed_particles(bins, np.empty(8192, dtype=np.int64), 0.05, 0.99, 10) == 3000
+    everywhere = np.arange(3000, dtype=np.int64)
+    assert needed_particles(everywhere, table, 0.05, 0.99, 10) == 3000
 
 
 def test_resampling_keeps_the_mean_and_shrinks_the_number():
@@ -135,11 +131,11 @@ def test_the_estimate_is_the_heaviest_cluster_and_not_the_mean():
     assert abs(found.estimate().pose.yaw) == pytest.approx(math.pi)
 
 
-@pytest.mark.parametrize('expected', [0.05, 0.3, 0.75, 0.95, math.inf])
+@pytest.mark.parametrize('expected', [0.05, 0.75, math.inf])
 def test_the_readings_at_a_place_have_probability_one(expected):
     """Density within the limits, and what is beyond them on either side."""
     least, most = 0.1, 0.8
-    grid = np.linspace(least, most, 20001)[1:-1]
+    grid = np.linspace(least, most, 4001)[1:-1]
     hit = [hit_likelihood(z, expected, least, most, MODEL) for z in grid]
     beyond = hit_likelihood(math.inf, expected, least, most, MODEL)
     near = hit_likelihood(-math.inf, expected, least, most, MODEL)
@@ -154,20 +150,16 @@ def test_something_in_front_of_the_map_is_likelier_than_behind():
 
 
 @pytest.mark.parametrize(
-    ('change', 'reason'),
+    ('table', 'change', 'reason'),
     [
-        ({'max_particles': 100}, 'max_particles must be at least'),
-        ({'recovery_alpha_fast': 0.001}, 'recovery_alpha_fast must be above'),
+        (ParticleFilterParameters, {'max_particles': 100}, 'max_particles must be at least'),
+        (ParticleFilterParameters, {'recovery_alpha_fast': 0.001}, 'alpha_fast must be above'),
+        (RangeModelParameters, {'z_rand': 0.5}, 'sum to at most 1'),
     ],
 )
-def test_parameters_that_contradict_are_rejected(change, reason):
+def test_parameters_that_contradict_are_rejected(table, change, reason):
     with pytest.raises(ParameterError, match=reason):
-        ParticleFilterParameters.from_dict(change)
-
-
-def test_weights_above_one_are_rejected():
-    with pytest.raises(ParameterError, match='sum to at most 1'):
-        RangeModelParameters.from_dict({'z_rand': 0.5})
+        table.from_dict(change)
 
 
 def test_beams_of_a_scan_are_evenly_spaced_without_nan():
@@ -185,11 +177,8 @@ def test_beams_of_a_scan_are_evenly_spaced_without_nan():
     ('first', 'increment', 'limits', 'reason'),
     [
         (math.nan, 0.1, (0.1, 3.0), 'angle_min must be finite: got nan'),
-        (0.0, math.nan, (0.1, 3.0), 'angle_increment must be finite and not 0: got nan'),
         (0.0, 0.0, (0.1, 3.0), 'angle_increment must be finite and not 0: got 0'),
         (0.0, 0.1, (math.nan, 3.0), 'range_min .* must be finite and at least 0 m: got nan'),
-        (0.0, 0.1, (-0.1, 3.0), 'range_min .* must be finite and at least 0 m: got -0.1'),
-        (0.0, 0.1, (0.1, math.nan), 'range_max .* must be finite and above 0.1 m: got nan'),
         (0.0, 0.1, (0.1, math.inf), 'range_max .* must be finite and above 0.1 m: got inf'),
         (0.0, 0.1, (0.1, 0.1), 'range_max .* must be finite and above 0.1 m: got 0.1'),
     ],
