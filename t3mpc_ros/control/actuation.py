@@ -141,8 +141,7 @@ class VelocityActuation:
             raise ValueError(f'period must be positive: got {period} s')
         self.speed_filter = SpeedKalmanFilter(filter_parameters, drive, period)
         state = self.speed_filter.state
-        self.speeds = state.speeds
-        """Estimated chi at the last measurement, rad/s, shape (2,)."""
+        self.speeds = state.speeds  # estimated chi at the last measurement, rad/s, shape (2,)
         self.predicted = state.predicted
         """Predicted chi when the next command takes effect, rad/s, shape (2,)."""
         self._geometry = geometry
@@ -159,8 +158,7 @@ class VelocityActuation:
         """Acceleration u that the last command realises before the deadband, rad/s², (2,)."""
         self.command: Array = np.zeros(2)
         """Last commanded wheel speeds, rad/s, shape (2,); zeros with a torque drive."""
-        self._wanted = np.zeros(2)
-        """The same before the deadband, from which the limits go on."""
+        self._wanted = np.zeros(2)  # the same before the deadband, from which the limits go on
         self._actuation_command = TypedKernel(actuation_command)
         self.reset(np.zeros(2))
 
@@ -206,8 +204,7 @@ class VelocityActuation:
         self.speed_filter.reset(speeds)
         self.applied[:] = 0.0
         self._sent = False
-        self.limited = False
-        """Whether a limit changed the last command."""
+        self.limited = False  # whether a limit changed the last command
         self.command[:] = 0.0
         if last_command is not None:
             self.command[:] = last_command
@@ -235,8 +232,8 @@ class VelocityActuation:
     def send_acceleration(self, acceleration: Array, elapsed: float = 0.0) -> Array:
         """Command u by E19, and return the part within the limits, rad/s², shape (2,).
 
-        The last command was sent ``elapsed`` s ago, by default one period: its change is limited
-        by what the accelerations permit in that time.
+        The change of the command is what the accelerations permit in ``elapsed`` s, one period at
+        least.
         """
         self._sent = True
         if not self.takes_speeds:
@@ -331,9 +328,7 @@ def wheel_limits(parameters: LimitParameters, geometry: WheelGeometry) -> Array:
 def limit_scale(right: float, left: float, limits: Array) -> float:
     """Return the largest factor, at most 1, that scales two wheels into their limits.
 
-    A common factor preserves the curvature of the path.
-
-    limits : shape (3,), of the mean, of half the difference, of each wheel
+    A common factor preserves the curvature of the path. ``limits``: a row of :func:`wheel_limits`.
     """
     mean, half = abs(0.5 * right + 0.5 * left), abs(0.5 * right - 0.5 * left)
     scale = min(limits[0] / max(mean, limits[0]), limits[1] / max(half, limits[1]))
@@ -347,12 +342,7 @@ def limit_command(
     """Write the admissible wheel speeds (rad/s); return whether a limit changed the target.
 
     The target is scaled into the speed limits. The result is the nearest point to it, on the line
-    from the previous command, that the acceleration limits permit.
-
-    right, left : target, rad/s
-    previous    : previous command, rad/s, shape (2,)
-    limits      : shape (2, 3), see :func:`wheel_limits`
-    out         : shape (2,), overwritten; may be ``previous``
+    from the previous command, that the acceleration limits permit. ``out`` may be ``previous``.
     """
     scale = limit_scale(right, left, limits[0])
     step_right, step_left = scale * right - previous[0], scale * left - previous[1]
@@ -372,15 +362,10 @@ def actuation_command(
     command_gain: float,
     applied: Array,
 ) -> bool:
-    """Write the command of E19 and the acceleration it realises; return whether it is limited.
+    """Write the command of E19 and the u (rad/s²) it realises; return whether it is limited.
 
-    acceleration : shape (2,), desired u, rad/s²
-    predicted    : shape (2,), chi when the command takes effect, rad/s
-    command      : shape (2,), the previous command, overwritten by the next one, rad/s
-    limits       : shape (2, 3), see :func:`wheel_limits`
-    period       : time since the previous command, s
-    command_gain : T / (1 - exp(-T/lag)), s
-    applied      : shape (2,), overwritten, the u that the command realises, rad/s²
+    ``command`` is the previous command, ``period`` s old; ``command_gain`` is T / (1 -
+    exp(-T/lag)).
     """
     right = predicted[0] + command_gain * acceleration[0]
     left = predicted[1] + command_gain * acceleration[1]

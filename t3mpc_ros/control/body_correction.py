@@ -59,17 +59,13 @@ from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import Structure, TypedKernel, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 
-HISTORY = 64
-"""Number of commands kept."""
-BLOCK = 0.25
-"""Time over which E20 is averaged, s."""
-SKILL_TIME = 5.0
-"""Time constant of the measured skill, s."""
+HISTORY = 64  # number of commands kept
+BLOCK = 0.25  # time over which E20 is averaged, s
+SKILL_TIME = 5.0  # time constant of the measured skill, s
 DEAD_ZONE = 0.010
 """Error of a wheel that is not worth correcting, rad/s: noise of the gyro and of the rotors,
 averaged over a block."""
-FULL_SKILL, NO_SKILL = 0.6, 0.2
-"""Skill from which on the authority is 1, and up to which it is 0."""
+FULL_SKILL, NO_SKILL = 0.6, 0.2  # skill from which on the authority is 1, and up to which it is 0
 IMPLAUSIBLE = 0.2
 """Error relative to the commanded wheel speeds above which nothing is corrected: the odometry has
 no yaw, or the wheels do not move the robot."""
@@ -83,30 +79,25 @@ STANDSTILL_SPEED = 0.05
 
 ASYMMETRY, TURNING, CREEP, GYRO_SCALE, BIAS, DELAY = 0, 1, 2, 5, 6, 7
 """k_m, k_w, k_1 of k_1 to k_3, s, c, tau: rows of the estimate."""
-ROWS = 8
-"""Number of rows; those before GYRO_SCALE are gains of the robot."""
-CREEP_SPEED = 5.0
-"""U, rad/s."""
+ROWS = 8  # number of rows; those before GYRO_SCALE are gains of the robot
+CREEP_SPEED = 5.0  # U, rad/s
 BIAS_DEVIATION, DELAY_DEVIATION = 0.01, 0.02
 """Standard deviations of c after a standstill (rad/s of a wheel) and of tau (s) at the start."""
 WALK = (0.0005, 0.0005, 0.0005, 0.0005, 0.0005, 0.0, 0.0003, 0.0005)
 """Random walk of each: standard deviation after a second, in its unit."""
 NOISE, SLOPE_NOISE = 0.006, 0.01
 """Standard deviation of the mean of a block, rad/s, and per slope of w_c, s."""
-SUDDEN = 3.0
-"""Innovation (in its standard deviation) that is not learnt."""
+SUDDEN = 3.0  # innovation (in its standard deviation) that is not learnt
 SLACK, LARGEST, JUMP = 1.5, 4.0, 6.0
 """Of a cumulative sum of innovations (in their standard deviations, at most LARGEST): what a block
 takes off, and the sum at which the bias has jumped; three blocks in a row at least. Page 1954, doi
 10.1093/biomet/41.1-2.100."""
 JUMP_SHARE = 0.5
 """Variance by which a jump makes k_m and k_w uncertain again, over that of ``wheel_tolerance``."""
-WARNED_BIAS = 0.01
-"""Bias that is reported, rad/s."""
+WARNED_BIAS = 0.01  # bias that is reported, rad/s
 WARNED_SCALE, WARNED_DEVIATION = 0.01, 0.004
 """Scale error that is reported, where the error of the robot beside it is so uncertain."""
-CLIP = 2.0
-"""Largest innovation that is learnt at once, in its standard deviation."""
+CLIP = 2.0  # largest innovation that is learnt at once, in its standard deviation
 
 WATCHED = 20
 """Number of blocks that say how well the turn follows the commands: the last five seconds."""
@@ -177,50 +168,33 @@ class BodyMemory(Structure):
     leave of that; the last two without sudden errors.
     """
 
-    yaw: float
-    """Last yaw of the odometry, rad."""
-    started: bool
-    """Whether there is one."""
+    yaw: float  # last yaw of the odometry, rad
+    started: bool  # whether there is one
     last_reference: float
-    yaw_error: float
-    """Integral of w_a - s w_a - c - w_r."""
-    commands: int
-    """Number of known commands, at most HISTORY."""
+    yaw_error: float  # integral of w_a - s w_a - c - w_r
+    commands: int  # number of known commands, at most HISTORY
     block_time: float
-    last: float
-    """Last w_c."""
-    linked: bool
-    """Whether it is that of the last period; a gap belongs to no block."""
-    rise: float
-    """Sum of the changes of w_c."""
-    achieved_sum: float
-    """Sum of w_a."""
-    square_sum: float
-    """Sum of the squared commands of a wheel."""
-    spoilt: bool
-    """Whether nothing is learnt from the block."""
+    last: float  # last w_c
+    linked: bool  # whether it is that of the last period; a gap belongs to no block
+    rise: float  # sum of the changes of w_c
+    achieved_sum: float  # sum of w_a
+    square_sum: float  # sum of the squared commands of a wheel
+    spoilt: bool  # whether nothing is learnt from the block
     above: float
-    below: float
-    """Cumulative sums of positive and of negative innovations."""
+    below: float  # cumulative sums of positive and of negative innovations
     raw_power: float
     error_power: float
     residual_power: float
     command_power: float
-    authority: float
-    """Share of the correction that is in use."""
-    rest_sum: float
-    """Sum of what E20 does not explain of a step, and of its square."""
+    authority: float  # share of the correction that is in use
+    rest_sum: float  # sum of what E20 does not explain of a step, and of its square
     rest_square: float
-    change_square: float
-    """Sum of the squared changes of w_c in a period."""
+    change_square: float  # sum of the squared changes of w_c in a period
     largest_change: float
-    slowest: float
-    """Least speed of a wheel."""
+    slowest: float  # least speed of a wheel
     steps: int
-    rings: int
-    """Number of blocks in which the rotors ring still."""
-    chain: int
-    """Number of steps since a gap, at most 2; of the last two steps:"""
+    rings: int  # number of blocks in which the rotors ring still
+    chain: int  # number of steps since a gap, at most 2; of the last two steps:
     last_achieved: float
     before_achieved: float
     last_rest: float
@@ -248,35 +222,23 @@ SKILL = 'raw_power', 'error_power', 'residual_power', 'command_power', 'authorit
 class BodyConstants(NamedTuple):
     """Constants of :func:`correct_body`."""
 
-    turn: float
-    """R/b"""
-    period: float
-    """s"""
-    yaw_gain: float
-    """k, 1/s"""
-    bound: float
-    """Bound of the correction by the gains, rad/s"""
-    yaw_bound: float
-    """v-bar, rad/s"""
-    jump_variance: float
-    """Variance that a jump adds to those of k_m and k_w."""
+    turn: float  # R/b
+    period: float  # s
+    yaw_gain: float  # k, 1/s
+    bound: float  # bound of the correction by the gains, rad/s
+    yaw_bound: float  # v-bar, rad/s
+    jump_variance: float  # variance that a jump adds to those of k_m and k_w
 
 
 class BodyState(NamedTuple):
     """State of :func:`correct_body`, changed in place."""
 
-    memory: Sequence[BodyMemory]
-    """Array of one."""
-    history: Array
-    """Commands, newest first, rad/s, shape (n, 2)."""
-    sums: Array
-    """Sums over the present block of what the turn is per gain, shape (5,)."""
-    estimate: Array
-    """Gains, s, c, tau, shape (8,)."""
-    covariance: Array
-    """Of the estimate, shape (8, 8)."""
-    work: Array
-    """Work space: row h of E20, and P h, shape (2, 8)."""
+    memory: Sequence[BodyMemory]  # array of one
+    history: Array  # commands, newest first, rad/s, shape (n, 2)
+    sums: Array  # sums over the present block of what the turn is per gain, shape (5,)
+    estimate: Array  # gains, s, c, tau, shape (8,)
+    covariance: Array  # of the estimate, shape (8, 8)
+    work: Array  # work space: row h of E20, and P h, shape (2, 8)
     watched: Array
     """Unexplained share and roughness of the last blocks, newest first, NaN where a block does not
     say it, shape (n, 2)."""
@@ -483,11 +445,9 @@ class BodyCorrection:
         """Return the correction (rad/s): added to the right, subtracted from the left wheel.
 
         yaw       : of the odometry, rad, ``elapsed`` s after the last one
-        reference : of the wheels now, rad/s, shape (2,)
-        planned   : reference to which the correction is added, rad/s, shape (2,)
-        sent      : wheel speeds commanded at the last step, rad/s, shape (2,)
+        reference : of the wheels now; ``planned``: the one to which the correction is added, rad/s
+        sent      : wheel speeds commanded at the last step, rad/s
         delay     : time between a command and the motion it causes, s
-        learn     : whether anything is learnt from this step
         """
         return self._correct_body(
             yaw, elapsed, reference, planned, sent, delay, learn, self._constants, self._state

@@ -35,8 +35,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS, Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 
-HIGHEST = 1000.0
-"""Largest frequency, Hz."""
+HIGHEST = 1000.0  # largest frequency, Hz
 
 
 @dataclass(frozen=True)
@@ -84,10 +83,8 @@ class CommandShaper:
         self.lead_ns = round(self._ahead * period * NANOSECONDS)
         """Time by which the reference of :meth:`step` is ahead of the shaped one, ns."""
         self._planned: Array = np.zeros((2 * self._ahead + 2, 2))
-        self.reference: Array = np.zeros(2)
-        """Shaped reference at the instant, rad/s, shape (2,)."""
-        self.rate: Array = np.zeros(2)
-        """Its derivative until one period later, rad/s², shape (2,)."""
+        self.reference: Array = np.zeros(2)  # shaped reference at the instant, rad/s, shape (2,)
+        self.rate: Array = np.zeros(2)  # its derivative until one period later, rad/s², shape (2,)
 
     def retune(self, parameters: CommandShaperParameters) -> None:
         """Use other frequencies; lower ones as far as the lead allows, which is kept."""
@@ -100,10 +97,9 @@ class CommandShaper:
         self._planned[:, 1] = 0.5 * (speeds[0] - speeds[1])
 
     def step(self, planned: Array, elapsed: float) -> None:
-        """Update :attr:`reference` and :attr:`rate`.
+        """Update the shaped reference by the reachable one (rad/s) one lead later.
 
-        planned : reachable reference one lead after the instant, rad/s, shape (2,)
-        elapsed : time since the last step (s); over a gap the reference is interpolated
+        Over a gap, ``elapsed`` s since the last step, the reference is interpolated.
         """
         count = min(max(round(elapsed / self._period), 1), len(self._planned))
         shape(
@@ -129,15 +125,10 @@ def shape(
     reference: Array,
     rate: Array,
 ) -> None:
-    """Append a row, and write the shaped reference and its rate of change.
+    """Append a row, and write the shaped reference (rad/s) and its rate of change (rad/s²).
 
-    rows      : shape (2 ahead + 2, 2), newest first: mean of the wheels, half their difference
-    planned   : shape (2,), newest reference, right wheel first, rad/s
-    count     : number of periods since the last row; rows between are interpolated
-    ahead     : number of periods by which the newest row is ahead of the instant
-    delays    : shape (2,), d of both columns in periods
-    period    : s
-    reference, rate : shape (2,), overwritten, right wheel first, rad/s and rad/s²
+    ``rows``, shape (2 ahead + 2, 2), are newest first: mean of the wheels, half their difference.
+    Those of ``count`` periods without a step are interpolated; ``delays`` are the d in periods.
     """
     newest = (0.5 * (planned[0] + planned[1]), 0.5 * (planned[0] - planned[1]))
     for i in range(2):

@@ -42,17 +42,13 @@ from t3mpc_ros.parameters.table import Parameters, group, parameter
 TERM_NAMES = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
 """Summands of the law, in the order of the rows of ``terms``."""
 
-FRICTION_WEIGHTS = 'friction.coefficients'
-"""Name of the weights of the friction term."""
+FRICTION_WEIGHTS = 'friction.coefficients'  # name of the weights of the friction term
 
-INERTIA_WEIGHTS = 'inertia.coefficients'
-"""Name of the weights of the inertia term."""
+INERTIA_WEIGHTS = 'inertia.coefficients'  # name of the weights of the inertia term
 
-MAX_SMOOTHING = 100.0
-"""Largest width epsilon of the compensator, rad/s."""
+MAX_SMOOTHING = 100.0  # largest width epsilon of the compensator, rad/s
 
-TANH_GAP = 0.2785
-"""E14: the maximum of |x| - x tanh(x), rounded up (0.27846, at x = 0.6392)."""
+TANH_GAP = 0.2785  # E14: the maximum of |x| - x tanh(x), rounded up (0.27846, at x = 0.6392)
 
 
 @dataclass(frozen=True)
@@ -140,8 +136,7 @@ class InertiaTermParameters(Parameters):
         (0.0, 1e4),
         dynamic=True,
     )
-    acceleration: ClassVar[float] = 50.0
-    """a_0, rad/s²."""
+    acceleration: ClassVar[float] = 50.0  # a_0, rad/s²
 
 
 @dataclass(frozen=True)
@@ -222,10 +217,8 @@ def fitting_gain(parameters: Nt3fsMpcParameters, drive: str) -> tuple[float, flo
 class LinearTerm(NamedTuple):
     """Basis and coefficients of a term that is linear in its own parameters, for kernels."""
 
-    basis: Array
-    """Of the last evaluation, shape (n,)."""
-    coefficients: Array
-    """rad/s², shape (n, n): row i for the estimate of wheel i."""
+    basis: Array  # of the last evaluation, shape (n,)
+    coefficients: Array  # rad/s², shape (n, n): row i for the estimate of wheel i
 
     @classmethod
     def of(cls, wheels: int) -> 'LinearTerm':
@@ -235,12 +228,7 @@ class LinearTerm(NamedTuple):
 
 @kernel
 def add_friction(reference: Array, width: float, term: LinearTerm, outputs: Array) -> None:
-    """Write the basis s of E23, and add the friction to the estimates g of (31).
-
-    reference : shape (n,), r, rad/s
-    width     : w, rad/s
-    outputs   : shape (n,), g, rad/s², updated
-    """
+    """Write the basis s of E23 at r (rad/s), and add the friction to the estimates g of (31)."""
     for j in range(term.basis.size):
         term.basis[j] = math.tanh(reference[j] / width)
     add_term(term, outputs)
@@ -248,12 +236,7 @@ def add_friction(reference: Array, width: float, term: LinearTerm, outputs: Arra
 
 @kernel
 def add_inertia(rate: Array, acceleration: float, term: LinearTerm, outputs: Array) -> None:
-    """Write the basis a of E24, and add the wrong inertia to the estimates g of (31).
-
-    rate         : shape (n,), r', rad/s²
-    acceleration : a_0, rad/s²
-    outputs      : shape (n,), g, rad/s², updated
-    """
+    """Write the basis a of E24 at r' (rad/s²), and add the wrong inertia to the estimates g."""
     for j in range(term.basis.size):
         term.basis[j] = rate[j] / acceleration
     add_term(term, outputs)
@@ -283,7 +266,7 @@ def law_terms(
     terms: Array,
     command: Array,
 ) -> None:
-    r"""Write the terms of the law and their sum, equations (66)-(67) with E12.
+    r"""Write the terms of the law, shape (5, n), and their sum, equations (66)-(67) with E12.
 
     .. math:: u_i = -g_i(\chi|\alpha_i) - K\delta_i + \dot r_i + v_{c,i} + v_{p,i}, \qquad
               \delta = \chi - r
@@ -291,15 +274,8 @@ def law_terms(
     E12: the printed :math:`+\omega_i` is the unknown estimation error and cannot be applied; the
     correct term is :math:`\dot r_i`. With it, (68)-(69) follow from (64)-(65), and by (70)-(71)
     the error system (72)-(73) of each wheel,
-    :math:`\dot\delta = \tilde\alpha^T\Phi - K\delta + \omega + v_c + v_p`. The compensator is
-    (81)-(82),
-    :math:`v_c = -(\bar\omega + \bar v_p)\tanh(\delta/\epsilon)`.
-
-    speeds, reference : shape (n,), chi and r, rad/s
-    reference_rate, estimate, predictive : shape (n,), r', g and v_p, rad/s²
-    gain, bound, smoothing : K (1/s), omega-bar + v_p-bar (rad/s²), epsilon (rad/s)
-    terms : shape (5, n), overwritten, rows as in ``TERM_NAMES``, rad/s²
-    command : shape (n,), overwritten, u, rad/s²
+    :math:`\dot\delta = \tilde\alpha^T\Phi - K\delta + \omega + v_c + v_p`.
+    ``gain`` is K (1/s); ``bound`` and ``smoothing`` as of :func:`compensator`.
     """
     for i in range(speeds.size):
         error = speeds[i] - reference[i]
@@ -313,11 +289,11 @@ def law_terms(
 
 @kernel
 def compensator(error: float, bound: float, smoothing: float) -> float:
-    """Return v_c (rad/s²) for one wheel, equations (81)-(82) with the width of E14.
+    r"""Return v_c (rad/s²) for one wheel, equations (81)-(82) with the width of E14.
 
-    error : delta, rad/s
-    bound : omega-bar + v_p-bar, rad/s²
-    smoothing : epsilon, rad/s; the paper's tanh(delta) has epsilon = 1 rad/s
+    .. math:: v_c = -(\bar\omega + \bar v_p)\tanh(\delta/\epsilon)
+
+    bound : omega-bar + v_p-bar, rad/s²; smoothing : epsilon, 1 rad/s in the paper
     """
     return -bound * math.tanh(error / smoothing)
 
@@ -361,12 +337,9 @@ def ultimate_bound(gain: float, bound: float, smoothing: float, wheels: int = 2)
 class CertificateReading(NamedTuple):
     """Value of V, its rate and the bound of the rate at one step."""
 
-    value: float = 0.0
-    """Half of |delta|², rad²/s²: the measurable part of V (74)."""
-    rate: float = 0.0
-    """Measured rate of the value, averaged over the window, rad²/s³."""
-    bound: float = 0.0
-    """Upper bound of the rate by E14, averaged over the window, rad²/s³."""
+    value: float = 0.0  # half of |delta|², rad²/s²: the measurable part of V (74)
+    rate: float = 0.0  # measured rate of the value, averaged over the window, rad²/s³
+    bound: float = 0.0  # upper bound of the rate by E14, averaged over the window, rad²/s³
 
     @property
     def margin(self) -> float:
@@ -397,17 +370,13 @@ class Certificate:
 
     def reset(self) -> None:
         """Clear the averages."""
-        self.reading = CertificateReading()
-        """Reading at the last step."""
+        self.reading = CertificateReading()  # reading at the last step
         self._started = False
 
     def update(
         self, errors: Sequence[float], gain: float, bound: float, smoothing: float, dt: float
     ) -> CertificateReading:
-        """Return the reading after errors (rad/s), ``dt`` s after the last ones.
-
-        gain, bound, smoothing : as in :func:`law_terms`
-        """
+        """Return the reading after errors (rad/s), ``dt`` s after the last ones."""
         last, value = self.reading, 0.5 * squared_norm(errors)
         rate = (value - last.value) / dt if self._started and dt > 0.0 else 0.0
         allowed = lyapunov_rate_bound(errors, gain, bound, smoothing)
@@ -458,8 +427,7 @@ class Nt3fsMpcController:
         )
         self.terms, self.command = self._output.terms, self._output.command
         """Terms of the last step, rows as in ``TERM_NAMES``, and their sum u, rad/s²."""
-        self.saturated = False
-        """Whether a limit changed the last command."""
+        self.saturated = False  # whether a limit changed the last command
         self._step_law = TypedKernel(step_law)
         self._set_applied_term = TypedKernel(set_applied_term)
         self._gains = self._law_gains()
@@ -566,10 +534,8 @@ class Nt3fsMpcController:
     ) -> Array:
         """Return the wheel accelerations u (rad/s²) of (66)-(67), shape (2,).
 
-        speeds : chi predicted for the instant at which u takes effect, rad/s, shape (2,)
-        reference : reachable r at that instant, rad/s, shape (2,)
-        reference_rate : its derivative until the next step, rad/s², shape (2,)
-        dt : time since the last step, s
+        speeds, reference : chi predicted for the instant at which u takes effect, and reachable r
+        reference_rate : derivative of r until the next step, rad/s²
         future_jumps : future jumps of the error, see :meth:`PredictiveController.step`
         """
         speeds, reference = contiguous(speeds), contiguous(reference)
@@ -595,11 +561,11 @@ class Nt3fsMpcController:
         return self.command
 
     def set_applied(self, acceleration: Array, *, saturated: bool) -> None:
-        """Set the acceleration that the actuation applied at the last step.
+        """Set the acceleration (rad/s²) that the actuation applied at the last step.
 
-        acceleration : applied wheel accelerations, rad/s², shape (2,)
-        saturated : whether a limit changed the command. The adaptation then pauses, because the
-            error is not an estimation error, and the predictor uses the applied part of v_p.
+        If a limit changed the command, the adaptation pauses, because the error is not an
+        estimation
+        error, and the predictor uses the applied part of v_p.
         """
         self.saturated = saturated
         if saturated and not self._set_applied_term(
@@ -645,14 +611,10 @@ class LawGains(NamedTuple):
 class LawOutput(NamedTuple):
     """Results of :func:`step_law`."""
 
-    estimate: Array
-    """g, rad/s², shape (n,)."""
-    adaptation_error: Array
-    """Error from which the fuzzy systems learn, rad/s, shape (n,)."""
-    terms: Array
-    """Terms of u, rows as in ``TERM_NAMES``, rad/s², shape (5, n)."""
-    command: Array
-    """u, rad/s², shape (n,)."""
+    estimate: Array  # g, rad/s², shape (n,)
+    adaptation_error: Array  # error from which the fuzzy systems learn, rad/s, shape (n,)
+    terms: Array  # terms of u, rows as in ``TERM_NAMES``, rad/s², shape (5, n)
+    command: Array  # u, rad/s², shape (n,)
 
 
 @kernel
@@ -669,16 +631,10 @@ def step_law(
     inertia: LinearTerm,
     output: LawOutput,
 ) -> bool:
-    """Write terms and command of the law, and adapt the fuzzy systems.
+    """Write terms and command of the law, and adapt the fuzzy systems, unless ``saturated``.
 
-    Returns False, and changes nothing, if a speed is not finite.
-
-    speeds ... reference_rate : as in :func:`law_terms`
-    dt         : time since the last step, s
-    saturated  : whether a limit changed the last command
-    predictive : signals of the predictive term
-    fuzzy, friction, inertia : parts of the estimate g by (31), E23 and E24, adapted
-    output     : overwritten
+    Return False, and change nothing, if a speed is not finite. ``fuzzy``, ``friction`` and
+    ``inertia`` are parts of the estimate g by (31), E23 and E24.
     """
     fuzzy_estimate, adaptation_error = output.estimate, output.adaptation_error
     fuzzy_estimate[:] = 0.0
@@ -718,12 +674,7 @@ def step_law(
 
 @kernel
 def set_applied_term(acceleration: Array, output: LawOutput, predictive: Signals) -> bool:
-    """Write the v_p that was applied when a limit changed u; return False if it is not finite.
-
-    acceleration : shape (2,), the command after the limits, rad/s²
-    output       : of :func:`step_law`
-    predictive   : signals of the predictive term
-    """
+    """Write the v_p that was applied when a limit changed u; return whether it is finite."""
     for i in range(acceleration.size):
         predictive.applied[i] = output.terms[4, i] + (acceleration[i] - output.command[i])
         if not math.isfinite(predictive.applied[i]):

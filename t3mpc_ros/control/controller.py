@@ -95,14 +95,12 @@ from t3mpc_ros.parameters.table import (
 JUMP_DETECTION_FACTOR = 2.2
 """A reference acceleration above this multiple of the acceleration limit is a jump."""
 
-BODY_WEIGHTS = 'body.estimate'
-"""Name of what the body correction has learnt."""
+BODY_WEIGHTS = 'body.estimate'  # name of what the body correction has learnt
 
 FEEDBACK_RANGE = {'body': (0.8, 1.2), 'paper': (0.0, 1.4)}
 """Permitted slope of the command in the speed error, relative to the one that fits."""
 
-MIN_DEAD_TIME_CHANGE = 0.0005
-"""Smallest change (s) of the dead time in use."""
+MIN_DEAD_TIME_CHANGE = 0.0005  # smallest change (s) of the dead time in use
 
 NO_DEAD_TIME = 0.001
 """Estimated dead time (s) up to which the lag in use may be too long: there is no shorter one."""
@@ -110,8 +108,7 @@ TOO_FAST = 8.0
 """Likelihood ratio, 2 log, of a response before the lag has passed above which the lag in use is
 too long: that of 2.8 standard deviations."""
 
-MAX_MISSED = 20
-"""Largest number of periods without a step through which a ramp goes on."""
+MAX_MISSED = 20  # largest number of periods without a step through which a ramp goes on
 
 REPORTED_DEAD_TIME, REPORTED_DISTURBANCE = 0.008, 1.0
 """Difference of the dead time from the configured one, and duration of a disturbed response, that
@@ -121,15 +118,11 @@ INTERVALS, OTHER_RATE = 21, 0.2
 relative difference from the period from which that counts."""
 OTHER_FREQUENCY = 1.5
 """Ratio of the measured frequency of the rotors to the one in use from which it is used."""
-EARLY = 0.6
-"""Share of the period before which an odometry is too early for a step."""
+EARLY = 0.6  # share of the period before which an odometry is too early for a step
 
-POSE_JUMP = 0.25, 0.5
-"""Change of the pose (m, rad) from one message to the next that is no motion."""
-SNAPSHOT_PERIOD = 0.25
-"""Time between two snapshots of the weights, s."""
-SNAPSHOT_COUNT = 3
-"""Number of snapshots kept; the oldest one is older than the response time-out."""
+POSE_JUMP = 0.25, 0.5  # change of the pose (m, rad) from one message to the next that is no motion
+SNAPSHOT_PERIOD = 0.25  # time between two snapshots of the weights, s
+SNAPSHOT_COUNT = 3  # number of snapshots kept; the oldest one is older than the response time-out
 
 
 @dataclass(frozen=True)
@@ -254,18 +247,12 @@ class Status(NamedTuple):
 
     stamp_ns: int
     reason: Reason
-    error: Array
-    """delta = chi - r, rad/s; NaN while no reference is known."""
-    terms: Array
-    """Shape (5, 2), rows as in ``TERM_NAMES``, rad/s²."""
-    applied: Array
-    """Wheel accelerations after the limits, rad/s²."""
-    certificate: CertificateReading
-    """Reading of the run-time certificate."""
-    skill: Array
-    """Skill of the predictor in the middle of its horizon."""
-    limited: bool
-    """Whether a limit changed the command."""
+    error: Array  # delta = chi - r, rad/s; NaN while no reference is known
+    terms: Array  # shape (5, 2), rows as in ``TERM_NAMES``, rad/s²
+    applied: Array  # wheel accelerations after the limits, rad/s²
+    certificate: CertificateReading  # reading of the run-time certificate
+    skill: Array  # skill of the predictor in the middle of its horizon
+    limited: bool  # whether a limit changed the command
 
     @property
     def estimate(self) -> Array:
@@ -306,8 +293,7 @@ class Controller:
     ) -> None:
         self.parameters = parameters
         self._pose_reference = PoseReference()
-        self.pose_controller = PoseController(parameters.pose)
-        """The pose loop."""
+        self.pose_controller = PoseController(parameters.pose)  # the pose loop
         self.keep_out = (
             KeepOut(parameters.keep_out, _largest(parameters.limits), obstacles, saved)
             if parameters.keep_out.enabled
@@ -354,10 +340,8 @@ class Controller:
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self._longer_hold_ns = 0
         """Time by which a command is in advance because it is held longer than a period, ns."""
-        self._excess_lag = 0.0
-        """Part of the lag that the response contradicts, s."""
-        self.dead_time = self._make_dead_time_estimator()
-        """Estimate of the dead time."""
+        self._excess_lag = 0.0  # part of the lag that the response contradicts, s
+        self.dead_time = self._make_dead_time_estimator()  # estimate of the dead time
         self._set_dead_time(self.parameters.speed_filter.dead_time)
         self.disturbed = False
         """Whether the response is disturbed, so that nothing is learned from it."""
@@ -368,15 +352,13 @@ class Controller:
         self._steps_since_snapshot = 0
         self._place = ORIGIN
         self._last_stamp_ns: int | None = None
-        self._step_ns = 0
-        """Instant of the last step, with odometry or without."""
+        self._step_ns = 0  # instant of the last step, with odometry or without
         self._reach = ReachMonitor()
         self.drive_monitor = DriveMonitor(
             feels=self.keep_out is not None, follows_pose=self.parameters.pose.enabled
         )
         """Pauses of the commands."""
-        self.odometry_twist = OdometryTwist()
-        """Whether the odometry has a twist."""
+        self.odometry_twist = OdometryTwist()  # whether the odometry has a twist
         self.ignored_odometry = 0
         """Number of messages that were ignored: repeated, or overtaken by a later one."""
         self.status = self._make_status(0, Reason.NO_ODOMETRY)
@@ -657,10 +639,7 @@ class Controller:
         return applied
 
     def _check_keep_out(self, odometry: State, reason: Reason, begin: Array) -> Reason:
-        """Return the reason after contact and range sensors were considered.
-
-        begin : planned wheel speeds, rad/s
-        """
+        """Return the reason after contact and range sensors; ``begin``: planned speeds, rad/s."""
         keep_out = self.keep_out
         assert keep_out is not None
         keep_out.ranges.update(odometry.stamp_ns, odometry.pose)
@@ -1023,13 +1002,9 @@ class SwitchingTracker:
     def step(
         self, now_ns: int, speeds: Array, reference: Array, reference_next: Array, dt: float
     ) -> Array:
-        """Return u (rad/s²), shape (2,).
+        """Return u (rad/s²), shape (2,), which takes effect at ``now_ns``.
 
-        now_ns : the instant at which u takes effect, ns
-        speeds : predicted wheel speeds at that instant, rad/s, shape (2,)
-        reference, reference_next : reference at that instant and one period later, including
-            jumps, rad/s, shape (2,)
-        dt : time since the last step, s
+        reference, reference_next : at that instant and one period later, including jumps, rad/s
         """
         if self.parameters.jump_transition.method == 'predictive':
             return self._step_predictive(now_ns, speeds, reference, reference_next, dt)
@@ -1072,16 +1047,11 @@ wheel_speeds = kernel(kinematics.wheel_speeds)
 class Sampling(NamedTuple):
     """Parameters of :func:`sample_reference`."""
 
-    period: float
-    """Control period, s."""
-    hold_ns: float
-    """How long the newest sample is held."""
-    preview: bool
-    """Whether to use future samples; else the slope extrapolates the reference."""
-    radius: float
-    """Wheel radius, m."""
-    half: float
-    """Half of the wheel separation, m."""
+    period: float  # control period, s
+    hold_ns: float  # how long the newest sample is held
+    preview: bool  # whether to use future samples; else the slope extrapolates the reference
+    radius: float  # wheel radius, m
+    half: float  # half of the wheel separation, m
 
     @classmethod
     def of(cls, parameters: ControllerParameters) -> Self:
@@ -1098,14 +1068,10 @@ class Sampling(NamedTuple):
 class SampledReference(NamedTuple):
     """Results of :func:`sample_reference`: wheel speeds, rad/s, shape (2,) each."""
 
-    speeds: Array
-    """Measured, at the stamp of the odometry."""
-    reference: Array
-    """Reference at that stamp."""
-    begin: Array
-    """Reference when the next command takes effect."""
-    end: Array
-    """Reference one period later."""
+    speeds: Array  # measured, at the stamp of the odometry
+    reference: Array  # reference at that stamp
+    begin: Array  # reference when the next command takes effect
+    end: Array  # reference one period later
 
 
 @kernel
@@ -1120,11 +1086,8 @@ def sample_reference(
 ) -> tuple[bool, float, float]:
     """Write measured and reference wheel speeds; return whether the reference is known.
 
-    Also returned: the largest magnitudes of the measured speeds and of the tracking error.
-
-    stamp_ns  : stamp of the odometry with twist ``linear``, ``angular``
-    effect_ns : instant at which the next command takes effect
-    result    : overwritten
+    Also return the largest magnitudes of the measured speeds and of the tracking error. The next
+    command takes effect at ``effect_ns``.
     """
     speeds, reference, begin, end = result
     period, hold_ns, preview, radius, half = sampling

@@ -48,14 +48,11 @@ from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
 
-MAX_DEAD_TIME = 0.15
-"""Largest dead time of the grid, s."""
-GRID_STEP = 0.005
-"""Distance of two dead times of the grid, s."""
+MAX_DEAD_TIME = 0.15  # largest dead time of the grid, s
+GRID_STEP = 0.005  # distance of two dead times of the grid, s
 GRID_SIZE = 31
 
-PRIOR_DEVIATION = 0.03
-"""Standard deviation of the configured dead time, s."""
+PRIOR_DEVIATION = 0.03  # standard deviation of the configured dead time, s
 IDENTIFIED_DEVIATION = 0.005
 """Standard deviation at and below which the dead time is identified, s."""
 USED_DIFFERENCE, USED_DEVIATIONS = 0.004, 3.0
@@ -65,8 +62,7 @@ MIN_DEVIATION = 0.0005
 """Standard deviation at which older data is forgotten as newer data is accepted, s."""
 UNCERTAINTY_FACTOR = 2.0
 """Factor of the standard deviation in the tests, for errors that are not noise."""
-TOLERANCE = 0.004
-"""Standard deviation of the dead time within a run that is no disturbance, s."""
+TOLERANCE = 0.004  # standard deviation of the dead time within a run that is no disturbance, s
 RATE_TOLERANCE = 0.02
 """Model error of fast changes: a ramp limit of the robot and its oscillation add to the delay, s.
 
@@ -76,26 +72,20 @@ FRICTION_WIDTH = 0.3
 """Filtered wheel speed at which the Coulomb friction of the model has 76 % of its value, rad/s."""
 FRICTION_DEVIATION = 0.3
 """Prior standard deviation of the speed that friction takes from a wheel, rad/s."""
-FRICTION_WALK = 0.01
-"""Standard deviation of its change in a second, rad/s."""
+FRICTION_WALK = 0.01  # standard deviation of its change in a second, rad/s
 SERVO_VARIANCE = 0.04
 """Least variance of the speeds of a servo, (rad/s)². Disturbances move it for many periods, so as
 white noise they count for more than their size."""
 
 OFFSET_TIME = 1.0
 """Time constant of the offset between measurement and model, which is no delay, s."""
-RATE_HOLD_TIME = 0.1
-"""Time constant with which the drive settles after an acceleration, s."""
-WINDOW_TIME = 0.15
-"""Time constant of the window of the disturbance test, s."""
-CLEAR_TIME = 0.3
-"""Time without evidence after which a disturbance has ended, s."""
+RATE_HOLD_TIME = 0.1  # time constant with which the drive settles after an acceleration, s
+WINDOW_TIME = 0.15  # time constant of the window of the disturbance test, s
+CLEAR_TIME = 0.3  # time without evidence after which a disturbance has ended, s
 BLOCK_TIME, BLOCK_MAX_TIME = 0.25, 2.0
 """Duration of a block with enough information, and of any block, s."""
-BLOCK_DEVIATION = 0.012
-"""Standard deviation from one block that has enough information, s."""
-ADOPTION_TIME = 15.0
-"""Driving time after which a changed response is adopted, s."""
+BLOCK_DEVIATION = 0.012  # standard deviation from one block that has enough information, s
+ADOPTION_TIME = 15.0  # driving time after which a changed response is adopted, s
 CHANGE_TIME, CHANGE_FIT = 5.0, 1.1
 """The same (s) where one dead time explains it as well, up to this factor of the squared errors,
 as the estimate explains what is accepted: late commands of a busy machine have no such time."""
@@ -108,24 +98,18 @@ DRIFT_BOUND, SERVO_DRIFT_BOUND, DRIFT_MEMORY = 2.0, 4.0, 0.25
 same of a servo, whose disturbances are no white noise, and the factor by which accepted data is
 then forgotten with each block."""
 
-NOISE_QUANTILE = 5.0
-"""Bound of the chi-square test, as a quantile of the normal distribution."""
+NOISE_QUANTILE = 5.0  # bound of the chi-square test, as a quantile of the normal distribution
 RATIO_BOUND = 18.0
 """Likelihood ratio, 2 log, above which a better dead time is evidence of a disturbance."""
-QUIET_EVIDENCE = 0.7
-"""Fraction of the bounds below which the response may be undisturbed again."""
-BLOCK_BOUND = 9.0
-"""Likelihood ratio, 2 log, of a block that contradicts the estimate."""
-RECENT_DEVIATION = 0.007
-"""Standard deviation of an estimate from the recent data alone, s."""
+QUIET_EVIDENCE = 0.7  # fraction of the bounds below which the response may be undisturbed again
+BLOCK_BOUND = 9.0  # likelihood ratio, 2 log, of a block that contradicts the estimate
+RECENT_DEVIATION = 0.007  # standard deviation of an estimate from the recent data alone, s
 DRIVING_INFORMATION = 1000.0
 """Information per second from which time counts as driving, 1/s³: 0.5 rad/s² by default."""
-CLIP = 16.0
-"""Squared errors are limited to this multiple of their variance."""
+CLIP = 16.0  # squared errors are limited to this multiple of their variance
 NOISE_PRIOR_RATIO = 1.5
 """Prior of the variance of the innovation, as a multiple of the noise variance."""
-NOISE_PRIOR_COUNT = 100.0
-"""Weight of that prior, in measured speeds."""
+NOISE_PRIOR_COUNT = 100.0  # weight of that prior, in measured speeds
 MIN_NOISE_VARIANCE = 0.01
 """Least variance of measured speeds, (rad/s)², also where they are configured as exact: counts of
 16 microsteps have 0.006 at 100 Hz."""
@@ -181,12 +165,9 @@ ESTIMATE = np.dtype(
 class Drive(NamedTuple):
     """Constants of :func:`update_dead_time`."""
 
-    lag: float
-    """s"""
-    period: float
-    """s"""
-    noise_variance: float
-    """(rad/s)²"""
+    lag: float  # s
+    period: float  # s
+    noise_variance: float  # (rad/s)²
     mean_speeds: bool
     """Whether the measured speeds are means over a period, as those from counters of steps or
     encoder pulses, or the speeds at the stamp."""
@@ -198,10 +179,8 @@ class Drive(NamedTuple):
 class ResponseHistory(NamedTuple):
     """Response without dead time, newest first, changed in place."""
 
-    age: Array
-    """s, shape (n,)"""
-    undelayed: Array
-    """rad/s, shape (2, n)"""
+    age: Array  # s, shape (n,)
+    undelayed: Array  # rad/s, shape (2, n)
 
 
 class DeadTimeEstimator:
@@ -295,12 +274,11 @@ class DeadTimeEstimator:
     def step(self, measured: Array, command: Array, dt: float) -> bool:
         """Update the estimate with one measurement; return whether the response is disturbed.
 
-        measured, command : wheel speeds, rad/s, shape (2,); the command was sent at the previous
-        step, after the limits, and the robot keeps it until the next one arrives; ``measured`` is
-        NaN where there is no measurement
-
-        dt : time since the previous measurement, s, positive; after a gap that stops the robot,
-        call :meth:`reset` instead
+        ``command`` was sent at the previous step, ``dt`` s ago, after the limits, and the robot
+        keeps
+        it; ``measured`` is NaN where there is no measurement. After a gap that stops the robot,
+        call
+        :meth:`reset` instead.
         """
         return self._update(
             self._state,
@@ -316,10 +294,7 @@ class DeadTimeEstimator:
 def update_dead_time(
     state: Any, history: ResponseHistory, drive: Drive, measured: Array, command: Array, dt: float
 ) -> bool:
-    """Update the estimate with one measurement; return whether the response is disturbed.
-
-    state : shape (1,), of the type ESTIMATE; other arguments as in :class:`DeadTimeEstimator`
-    """
+    """Do :meth:`DeadTimeEstimator.step`; ``state`` has the type ESTIMATE and shape (1,)."""
     estimate = state[0]
     follow_command(estimate, history, drive, command, dt)
     if math.isnan(measured[0]):

@@ -73,10 +73,8 @@ def in_one_direction(jump: Array, time: float) -> Array:
 class MotorLimit(NamedTuple):
     """What the motors of a torque drive have for a jump."""
 
-    inertia: Array
-    """theta_bar of (11), kg m², shape (2, 2)."""
-    torque: float
-    """Largest torque of a wheel, N m."""
+    inertia: Array  # theta_bar of (11), kg m², shape (2, 2)
+    torque: float  # largest torque of a wheel, N m
 
     def accelerations(self, jump: Array) -> Array:
         r"""Return the largest accelerations for a jump (rad/s), rad/s², shape (2,), positive.
@@ -103,14 +101,10 @@ class CommandLimit(NamedTuple):
     cross together, as with :class:`MotorLimit`.
     """
 
-    mean: float
-    """Of the mean of both wheels."""
-    half: float
-    """Of half of their difference."""
-    wheel: float
-    """Of each wheel."""
-    ramp: float
-    """Acceleration of the ramp by the parameter."""
+    mean: float  # of the mean of both wheels
+    half: float  # of half of their difference
+    wheel: float  # of each wheel
+    ramp: float  # acceleration of the ramp by the parameter
 
     def accelerations(self, jump: Array) -> Array:
         """Return those for a jump (rad/s), rad/s², shape (2,); NaN where they limit nothing."""
@@ -158,16 +152,13 @@ class JumpTransition:
         limit: RampLimit | None = None,
     ) -> None:
         self.parameters = parameters
-        self.limit = limit
-        """What limits the ramps of the next jumps."""
+        self.limit = limit  # what limits the ramps of the next jumps
         self._lag = lag
         self._period = period
-        self.count = 0
-        """Number of unfinished transitions; without one rbar is r."""
+        self.count = 0  # number of unfinished transitions; without one rbar is r
         rows, instants = np.zeros((4, 8, 2)), np.zeros(8, dtype=np.int64)
         self._transitions = Transitions._make((*rows, instants, np.zeros(8, dtype=np.bool_)))
-        self.plan = Plan(*np.zeros((6, 2)))
-        """Results of the last step."""
+        self.plan = Plan(*np.zeros((6, 2)))  # results of the last step
         self.reachable, self.rate = self.plan[:2]
         self._step_transitions = TypedKernel(step_transitions)
 
@@ -203,12 +194,7 @@ class JumpTransition:
         return total
 
     def announce(self, instant_ns: int, jump: Array, slope_after: Array) -> None:
-        """Add a jump of r, past or future, shape (2,) each.
-
-        instant_ns  : first instant with the new value, ns
-        jump        : change in addition to the previous slope, rad/s
-        slope_after : r' after the jump, rad/s²
-        """
+        """Add a jump of r (rad/s), past or future, after which r' is ``slope_after`` (rad/s²)."""
         k = self.count
         if k == len(self._transitions.instants):
             longer = (np.concatenate((rows, np.zeros_like(rows))) for rows in self._transitions)
@@ -229,9 +215,8 @@ class JumpTransition:
                 known.passed[k] = True
 
     def step(self, now_ns: int, reference: Array, reference_next: Array) -> None:
-        """Update :attr:`plan` for the period that starts at ``now_ns``.
+        """Update :attr:`plan` for the period that starts when the next command takes effect.
 
-        now_ns : instant at which the next command takes effect, ns
         reference, reference_next : r then and one period later, with its jumps, rad/s, shape (2,)
         """
         self.count = self._step_transitions(
@@ -250,35 +235,23 @@ class JumpTransition:
 class Transitions(NamedTuple):
     """Jumps that are known, for kernels; the first ``count`` rows are valid."""
 
-    jumps: Array
-    """Change of r, rad/s, shape (n, 2)."""
-    slopes_after: Array
-    """r' after the jump, rad/s², shape (n, 2)."""
-    covered: Array
-    """Commanded part of the jump, rad/s, shape (n, 2)."""
-    accelerations: Array
-    """Of the ramp where a limit determines it, else NaN, rad/s², shape (n, 2)."""
-    instants: NDArray[np.int64]
-    """When r jumps, ns, shape (n,)."""
-    passed: NDArray[np.bool_]
-    """Whether it has, shape (n,)."""
+    jumps: Array  # change of r, rad/s, shape (n, 2)
+    slopes_after: Array  # r' after the jump, rad/s², shape (n, 2)
+    covered: Array  # commanded part of the jump, rad/s, shape (n, 2)
+    accelerations: Array  # of the ramp where a limit determines it, else NaN, rad/s², shape (n, 2)
+    instants: NDArray[np.int64]  # when r jumps, ns, shape (n,)
+    passed: NDArray[np.bool_]  # whether it has, shape (n,)
 
 
 class Plan(NamedTuple):
     """Results of :func:`step_transitions`, shape (2,) each; rad/s but for the rate."""
 
-    reachable: Array
-    """rbar now."""
-    rate: Array
-    """Its derivative until the next step, rad/s²."""
-    response: Array
-    """Response of the servo to the commanded parts of all jumps."""
-    passed: Array
-    """Sum of the jumps that r has made."""
-    offset: Array
-    """h now."""
-    offset_next: Array
-    """h one period later."""
+    reachable: Array  # rbar now
+    rate: Array  # its derivative until the next step, rad/s²
+    response: Array  # response of the servo to the commanded parts of all jumps
+    passed: Array  # sum of the jumps that r has made
+    offset: Array  # h now
+    offset_next: Array  # h one period later
 
 
 @kernel
@@ -293,14 +266,7 @@ def step_transitions(
     acceleration: float,
     plan: Plan,
 ) -> int:
-    """Update h for the period that starts at ``now_ns``; return the number of transitions left.
-
-    count        : number of transitions
-    reference, reference_next : r now and one period later, with its jumps, rad/s, shape (2,)
-    period, lag  : of control and of the servo, s
-    acceleration : of the ramp, rad/s²
-    plan         : updated
-    """
+    """Update h for the period that starts at ``now_ns``; return the number of transitions left."""
     jumps, instants, passed = transitions.jumps, transitions.instants, transitions.passed
     if count > 0:
         keep = math.exp(-period / lag) if lag > 0.0 else 0.0
@@ -359,9 +325,7 @@ def advance(
 ) -> None:
     """Advance the ramp of jump ``k`` and wheel ``i`` by one period after its start.
 
-    left         : time until the jump, less the lead of the command, s
-    slope        : r' without the jump, rad/s²
-    acceleration : of the ramp, unless the transition has its own, rad/s²
+    ``left`` (s): time until the jump, less the lead of the command; ``slope``: r' without the jump
     """
     size = abs(transitions.jumps[k, i])
     rest = transitions.jumps[k, i] - transitions.covered[k, i]

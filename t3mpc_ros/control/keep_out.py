@@ -63,16 +63,11 @@ ray clears it."""
 NEAREST_TRUSTED = 0.08
 """Distance from the face of a sensor below which a ray neither clears nor marks: a Sharp sensor
 reads 13 cm for an object at 3 cm."""
-STANDING_ROOM = 0.12
-"""Radius of the floor that is free because the robot stands there, m."""
-MEMORY = 60.0
-"""Default time after which floor that was seen to be free counts as unseen, s."""
-MARGIN = 25
-"""Cells of unknown floor around what is published."""
-ENDING = 5.0
-"""Rest of that time with which floor is published as unseen, s."""
-SURELY_SEEN = 0.7
-"""Share of its range up to which a sensor sees every surface across its beam."""
+STANDING_ROOM = 0.12  # radius of the floor that is free because the robot stands there, m
+MEMORY = 60.0  # default time after which floor that was seen to be free counts as unseen, s
+MARGIN = 25  # cells of unknown floor around what is published
+ENDING = 5.0  # rest of that time with which floor is published as unseen, s
+SURELY_SEEN = 0.7  # share of its range up to which a sensor sees every surface across its beam
 SURFACE_HALF_WIDTH, SURFACE_DEPTH = 0.04, 0.1
 """Half the width of what surely is across a beam, and its largest depth, m."""
 NEW_WITHIN, NEW_APART, NEW_EXTENT = 0.6, 0.1, 0.2
@@ -82,28 +77,21 @@ beam sees one point of it."""
 NEW_FOR, JUST_SEEN = 2.0, 0.3
 """Time for which a thing has come, and may move on (s), and time for which floor around it that
 was seen to be free is so (s)."""
-CLEARINGS = 4
-"""Rays that must pass over an occupied cell to clear it."""
-DIRECTIONS = 48
-"""Directions among which a detour is chosen."""
-TURNING_SPEED = 0.02
-"""Speed below which the robot may turn in any direction, m/s."""
-SECTORS = 16
-"""Sectors around the robot, each with its nearest unsafe cell."""
-SEARCH_RADIUS = 0.5
-"""Distance from the centre up to which cells are considered, m."""
+CLEARINGS = 4  # rays that must pass over an occupied cell to clear it
+DIRECTIONS = 48  # directions among which a detour is chosen
+TURNING_SPEED = 0.02  # speed below which the robot may turn in any direction, m/s
+SECTORS = 16  # sectors around the robot, each with its nearest unsafe cell
+SEARCH_RADIUS = 0.5  # distance from the centre up to which cells are considered, m
 CAUTIOUS_SPEED = 0.12
 """Largest speed of a robot that sees less than usual, or where something has come, m/s."""
 TOUCHED_SIZE = 0.15
 """Half the width, and the depth, that a thing is taken to have which the robot has touched and
 cannot see, m."""
-TOUCHED_NEAR = 1.0
-"""Distance from such a thing within which the robot drives cautiously, m."""
+TOUCHED_NEAR = 1.0  # distance from such a thing within which the robot drives cautiously, m
 TRAIL_SPACING, TRAIL_LENGTH = 0.02, 8
 """Distance between two poses of the way that the robot came (m), and their number: it backs off
 so far."""
-RETREAT_MARGIN = 0.035
-"""Distance that it then may be nearer to obstacles than otherwise, m."""
+RETREAT_MARGIN = 0.035  # distance that it then may be nearer to obstacles than otherwise, m
 RETREAT_SPEED, RETREAT_TURN, RETREAT_TIME = 0.08, 0.5, 6.0
 """Speed (m/s) and longest time (s) of backing off, and the angle to the way back (rad) above which
 the robot turns first."""
@@ -115,8 +103,7 @@ TURN_WEIGHT = 0.12
 class FreeSpaceMapParameters(Parameters):
     """Size of the map, and how much a reading is trusted."""
 
-    resolution: ClassVar[float] = 0.02
-    """Side of a cell, m, assumed."""
+    resolution: ClassVar[float] = 0.02  # side of a cell, m, assumed
     half_size: float = parameter(
         3.0,
         'half the side of the square map around the origin of the odometry; floor beyond it is '
@@ -127,8 +114,7 @@ class FreeSpaceMapParameters(Parameters):
     beam_half_width: ClassVar[float] = 0.025
     """Half the width over which a ray shows the floor to be free, m, assumed: half of the smallest
     obstacle."""
-    error_floor: ClassVar[float] = 0.02
-    """Largest error of a short reading, m, assumed."""
+    error_floor: ClassVar[float] = 0.02  # largest error of a short reading, m, assumed
     error_growth: ClassVar[float] = 0.12
     """Growth of the error with the square of the distance, 1/m, assumed; noise and offset of 10 mV
     each make 0.08."""
@@ -145,27 +131,20 @@ class FreeSpaceMapParameters(Parameters):
 class MapGrid(NamedTuple):
     """Cells, for kernels."""
 
-    cells: Cells
-    """State of each cell, shape (n, n), row by y."""
-    cleared: Cells
-    """Rays that passed over an occupied cell, shape (n, n)."""
-    seen: NDArray[np.float32]
-    """When a cell was last seen to be free, s, shape (n, n)."""
-    low: float
-    """Coordinate of the first edge, m."""
-    size: float
-    """Side of a cell, m."""
+    cells: Cells  # state of each cell, shape (n, n), row by y
+    cleared: Cells  # rays that passed over an occupied cell, shape (n, n)
+    seen: NDArray[np.float32]  # when a cell was last seen to be free, s, shape (n, n)
+    low: float  # coordinate of the first edge, m
+    size: float  # side of a cell, m
 
 
 class FreeSpaceMap:
     """Cells around the origin of the odometry.
 
-    mounts : x, y (m) and direction (rad) of each sensor's face in the frame of the robot, shape
-        (s, 3)
-    segments, circles : known obstacles: walls (ax, ay, bx, by), shape (n, 4), and pillars (x, y,
-        radius), shape (m, 3), in the frame of the odometry, m
-    saved : a map in the frame of the odometry, of which the obstacles are used: floor that was
-        free is looked at again
+    mounts : x, y (m) and direction (rad) of each sensor's face in the frame of the robot
+    segments, circles : walls (ax, ay, bx, by) and pillars (x, y, radius), in the frame of the
+        odometry, m
+    saved : a map in that frame, of which the obstacles are used: free floor is looked at again
     """
 
     def __init__(
@@ -196,8 +175,7 @@ class FreeSpaceMap:
 
     def clear(self) -> None:
         """Forget everything but the known obstacles."""
-        self.now = 0.0
-        """Time since then, s."""
+        self.now = 0.0  # time since then, s
         self.last_come = -math.inf
         """Time of the last reading of a thing that had come, s; see :func:`has_come`."""
         self.grid.cells[:] = UNKNOWN
@@ -249,7 +227,7 @@ class FreeSpaceMap:
     def mark_touched(self, pose: Pose, sign: float, distance: float) -> None:
         """Mark what the robot at ``pose`` touches ahead (``sign`` 1) or behind (-1).
 
-        distance : from the centre of the robot, which stands on free floor, m
+        It is beyond a distance (m) from the centre of the robot, which stands on free floor.
         """
         depth, low, size = distance + TOUCHED_SIZE, self.grid.low, self.grid.size
         window, near = self._near(pose.x, pose.y, math.hypot(depth, TOUCHED_SIZE))
@@ -371,9 +349,7 @@ def add_ray(
 ) -> bool:
     """Mark the cells along a ray as free up to ``free`` m, and the one at ``hit`` m as occupied.
 
-    Return whether what it met has come, see :func:`has_come`.
-
-    hit : below zero if the ray met nothing
+    Return whether what it met has come, see :func:`has_come`; ``hit`` is below zero for nothing.
     """
     low, size = grid.low, grid.size
     count = grid.cells.shape[0]
@@ -462,8 +438,7 @@ class KeepOutParameters(Parameters):
         'm',
         (0.02, 2.0),
     )
-    ahead: ClassVar[float] = 0.05
-    """l: distance of the point ahead, m, assumed."""
+    ahead: ClassVar[float] = 0.05  # l: distance of the point ahead, m, assumed
     rate: float = parameter(
         2.0,
         'lambda: speed of the approach per distance; times the speed at most the deceleration',
@@ -487,8 +462,7 @@ class KeepOutParameters(Parameters):
     stuck_time: float = parameter(
         6.0, 'time without progress after which the robot is stuck', 's', (0.5, 600.0)
     )
-    stuck_distance: ClassVar[float] = 0.05
-    """Motion that is progress, m, assumed."""
+    stuck_distance: ClassVar[float] = 0.05  # motion that is progress, m, assumed
     world: str = parameter(
         '',
         'known walls and pillars: name of a bundled world, or path of a YAML file, in the frame '
@@ -560,8 +534,7 @@ class KeepOut:
         """What is known of the floor."""
         self.ranges = RangeMonitor(mounts, parameters.range_timeout, parameters.map.range)
         """Which range sensors can be relied on."""
-        self.limits = limits
-        """Replaceable at run time."""
+        self.limits = limits  # replaceable at run time
         self._nearest = np.zeros((SECTORS, 4))
         self._rows = np.zeros((2 * SECTORS + 4, 3))
         self._find_nearest = TypedKernel(find_nearest)
@@ -579,10 +552,8 @@ class KeepOut:
     def _begin(self, *, looks: bool) -> None:
         self._looks, self._has_looked = looks, False
         self.map.clear()
-        self.activity = Activity.FREE
-        """What it does."""
-        self.changed = False
-        """Whether the last twist was changed."""
+        self.activity = Activity.FREE  # what it does
+        self.changed = False  # whether the last twist was changed
         self._standing_room = self._cautious = False
         self._targets: deque[float] = deque()
         self._seen_from: Pose | None = None
@@ -590,22 +561,16 @@ class KeepOut:
         self._detour: float | None = None
         self._progress: Pose | None = None
         self._waited = 0.0
-        self._looked_at = 0.0
-        """Time of the map at which the robot began to look around, s."""
+        self._looked_at = 0.0  # time of the map at which the robot began to look around, s
         self.touched: list[tuple[float, float]] = []
         """Where the robot was when it touched something that it cannot see, m."""
-        self._trail: deque[Pose] = deque(maxlen=TRAIL_LENGTH)
-        """The way that the robot came."""
-        self._retreat_time = 0.0
-        """Time left to back off, s."""
+        self._trail: deque[Pose] = deque(maxlen=TRAIL_LENGTH)  # the way that the robot came
+        self._retreat_time = 0.0  # time left to back off, s
 
     def add_reading(
         self, sensor: int, reading: float, pose: Pose, stamp_ns: int | None = None
     ) -> bool:
-        """Add a reading (m, REP 117) of a sensor of the robot at ``pose``.
-
-        Return whether it was used: its stamp, if it has one, is new, and it is possible.
-        """
+        """Add a reading (m, REP 117) of a sensor; return whether it is possible and new."""
         if not self.ranges.accept(sensor, reading, stamp_ns):
             return False
         if reading == math.inf:
@@ -619,9 +584,7 @@ class KeepOut:
     def step(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist nearest to ``wanted``, or one that looks around.
 
-        wanted : twist that follows the path
         pose : predicted pose at the instant at which the twist takes effect
-        elapsed : time since the last step, s
         """
         if not self._standing_room:
             # The robot stands where it stands.
@@ -838,8 +801,8 @@ def find_nearest(
 
     least : UNKNOWN; OCCUPIED if floor that has not been seen is no reason
     oldest : time before which a cell must have been seen to count as unseen, s
-    nearest : shape (SECTORS, 4), overwritten: direction to the cell in the frame of the robot
-        (2 numbers), its state, its distance in m; a distance of inf without one
+    nearest : shape (SECTORS, 4): direction to the cell in the frame of the robot (2 numbers), its
+        state, its distance in m; a distance of inf without one
     """
     low, size = grid.low, grid.size
     count = grid.cells.shape[0]
@@ -874,10 +837,7 @@ def find_nearest(
 def find_free(
     nearest: Array, cosine: Array, sine: Array, distance: float, free: NDArray[np.bool_]
 ) -> None:
-    """Write which directions are free, shape (k,), given their cosines and sines.
-
-    nearest : see :func:`find_nearest`
-    """
+    """Write which directions are free, given their cosines and sines; see :func:`find_nearest`."""
     for k in range(cosine.size):
         free[k] = True
         for sector in range(nearest.shape[0]):

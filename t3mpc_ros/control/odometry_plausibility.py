@@ -34,59 +34,40 @@ MAX_DELAY, MAX_LEAD = 0.3, 0.05
 """Offset of odometry stamps from the node's clock beyond which the clocks differ, s."""
 MAX_SIMULATED_OFFSET = 5.0
 """The same with simulated time, which may pass many times faster than messages travel, s."""
-NO_STAMP = 1e8
-"""Offset of a stamp that is no time of today, s: three years."""
-RATE_TOLERANCE = 0.2
-"""Relative difference between measured and set rate that is reported."""
+NO_STAMP = 1e8  # offset of a stamp that is no time of today, s: three years
+RATE_TOLERANCE = 0.2  # relative difference between measured and set rate that is reported
 
 GAP = 1.7
 """Interval from which a message is missing, in periods: with a jitter of 30 % none reaches it."""
-RECENT = 10.0
-"""Time for which gaps and jumps are reported, s."""
+RECENT = 10.0  # time for which gaps and jumps are reported, s
 MANY_JUMPS = 3
 """Jumps of the pose in that time from which they are: a localisation makes one now and then."""
-MANY_MISSING = 0.02
-"""Share of missing messages that is reported."""
-LATE = 0.1
-"""Delay beyond the median from which a message is late, s."""
+MANY_MISSING = 0.02  # share of missing messages that is reported
+LATE = 0.1  # delay beyond the median from which a message is late, s
 
-FILTER_TIME = 0.2
-"""Time constant of each of the three stages of the filter, s."""
-ROW_INTERVAL = 0.5
-"""Time between two rows of the fit, s."""
-SETTLING_TIME = 1.5
-"""Time after an interruption until the filter has forgotten it, s."""
+FILTER_TIME = 0.2  # time constant of each of the three stages of the filter, s
+ROW_INTERVAL = 0.5  # time between two rows of the fit, s
+SETTLING_TIME = 1.5  # time after an interruption until the filter has forgotten it, s
 CONFIRMATION_TIME = 1.0
 """Time for which a row waits: an interruption is often noticed late, as the robot has stopped."""
-MEMORY = 1.0 - 1.0 / 240.0
-"""Forgetting factor of a row: 120 s."""
+MEMORY = 1.0 - 1.0 / 240.0  # forgetting factor of a row: 120 s
 CORRELATION = 2.7
 """Variance of a mean of rows over that of independent ones: (1 + r) / (1 - r), r = 0.46."""
-MAX_STEP = 0.25
-"""Longest time between two messages that is no interruption, s."""
+MAX_STEP = 0.25  # longest time between two messages that is no interruption, s
 PRIOR = 1.0, 0.2, 0.03, 0.3
 """Standard deviation before any row of g - 1, T (s), κ (s²), and of o over the scale."""
-KNOWN = 0.2
-"""Standard deviation from which a gain counts as unknown."""
-MIN_ROWS = 20
-"""Rows from which the noise is known."""
+KNOWN = 0.2  # standard deviation from which a gain counts as unknown
+MIN_ROWS = 20  # rows from which the noise is known
 
-SCALES = 0.05, 0.3
-"""Velocities that count as small, m/s and rad/s."""
-STANDING = 0.05
-"""Measured velocity of a standing robot, in the scales."""
+SCALES = 0.05, 0.3  # velocities that count as small, m/s and rad/s
+STANDING = 0.05  # measured velocity of a standing robot, in the scales
 STANDING_TIME = 0.3
 """Time for which a robot stands against its command before it counts as stopped, s."""
-GAIN_TOLERANCE = 0.03
-"""Deviation of a gain from 1 that is reported, once it is certain."""
-CERTAIN = 4.0
-"""Standard deviations from which a deviation is certain."""
-SIGN_MEMORY = 0.998
-"""Forgetting factor of the sign of the response, per step: 5 s at 100 Hz."""
-SIGN_EXCITATION = 300.0
-"""Sum of squared commands, in the scales, from which the sign is known."""
-OPPOSITE = -0.3
-"""Quotient of velocities below which the robot moves the other way."""
+GAIN_TOLERANCE = 0.03  # deviation of a gain from 1 that is reported, once it is certain
+CERTAIN = 4.0  # standard deviations from which a deviation is certain
+SIGN_MEMORY = 0.998  # forgetting factor of the sign of the response, per step: 5 s at 100 Hz
+SIGN_EXCITATION = 300.0  # sum of squared commands, in the scales, from which the sign is known
+OPPOSITE = -0.3  # quotient of velocities below which the robot moves the other way
 
 
 class Gain(NamedTuple):
@@ -94,8 +75,7 @@ class Gain(NamedTuple):
 
     value: float
     deviation: float
-    falls: bool
-    """Whether it is clearly smaller for large commands: the robot is at a limit."""
+    falls: bool  # whether it is clearly smaller for large commands: the robot is at a limit
 
 
 class ResponseGain:
@@ -187,10 +167,8 @@ class Gaps:
         self._recent: deque[tuple[int, float, int]] = deque()
         self.number = 0
         self.missing = 0
-        self.longest = 0.0
-        """Longest gap, s."""
-        self.restarts = 0
-        """Stamps that were older than the one before."""
+        self.longest = 0.0  # longest gap, s
+        self.restarts = 0  # stamps that were older than the one before
 
     def update(self, stamp_ns: int) -> float | None:
         """Add a message; return the time since the one before, s, None at a restart."""
@@ -253,9 +231,7 @@ class Gaps:
 class InputMonitor:
     """Collects stamps of the odometry, and measured velocities with their commands.
 
-    The results are for diagnostics only; they change no command.
-
-    rate : set rate, Hz
+    The results are for diagnostics only; they change no command. ``rate``: set rate, Hz.
     """
 
     def __init__(self, rate: float) -> None:
@@ -263,14 +239,10 @@ class InputMonitor:
         self.gaps = Gaps(rate)
         self._offsets: deque[float] = deque(maxlen=max(5, round(rate)))
         self._typical = 0.0
-        self.late = 0
-        """Messages that took much longer than the others."""
-        self.jumps = 0
-        """Changes of the pose that no motion explains."""
-        self._jumps_ns: deque[int] = deque(maxlen=1000)
-        """Stamps of those in the last 10 s."""
-        self._jump = 0.0, 0.0
-        """Distance (m) and turn (rad) of the last one."""
+        self.late = 0  # messages that took much longer than the others
+        self.jumps = 0  # changes of the pose that no motion explains
+        self._jumps_ns: deque[int] = deque(maxlen=1000)  # stamps of those in the last 10 s
+        self._jump = 0.0, 0.0  # distance (m) and turn (rad) of the last one
         self._last: State | None = None
         self._standing = 0.0
         self._follows = False
@@ -350,8 +322,7 @@ class InputMonitor:
     ) -> list[str]:
         """Return what does not fit, with the likely cause.
 
-        tolerated_gap : longest gap in the odometry that is not reported, s
-        geometry : what the robot is assumed to have
+        ``tolerated_gap`` (s) is not reported; ``geometry`` is what the robot is assumed to have.
         """
         found = []
         offset = self.offset

@@ -122,12 +122,9 @@ class PoseLoopParameters(Parameters):
 class PoseError(NamedTuple):
     """Reference pose in the frame of the robot."""
 
-    along: float
-    """m, positive if the reference is ahead"""
-    across: float
-    """m, positive if it is to the left"""
-    yaw: float
-    """rad"""
+    along: float  # m, positive if the reference is ahead
+    across: float  # m, positive if it is to the left
+    yaw: float  # rad
 
     @property
     def distance(self) -> float:
@@ -208,12 +205,9 @@ class PoseController:
 
     def reset(self) -> None:
         """Follow again from the next step on."""
-        self.rejoining = False
-        """Whether the robot is on its way to the reference."""
-        self.error = PoseError(*ORIGIN)
-        """Error of the last step."""
-        self.curvature = 0.0
-        """Integral of the error across, 1/m."""
+        self.rejoining = False  # whether the robot is on its way to the reference
+        self.error = PoseError(*ORIGIN)  # error of the last step
+        self.curvature = 0.0  # integral of the error across, 1/m
 
     def step(
         self,
@@ -226,10 +220,7 @@ class PoseController:
     ) -> BodyTwist:
         """Return the twist to track.
 
-        reference, twist : pose and twist of the reference at the instant at which the result takes
-            effect
-        pose : predicted pose of the robot at that instant
-        elapsed : time since the last step, s
+        reference, twist, pose : reference and predicted pose at the instant of effect
         learn : whether the robot did what it was to do, so that its error counts
         """
         parameters = self.parameters

@@ -20,8 +20,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, RANGE_SENSORS, Array, 
 
 LOOKS_ALONG = 0.7
 """Cosine of the direction of a sensor from which on it looks along the motion of the robot."""
-BEYOND_RANGE = 1.05
-"""Finite readings above this multiple of the range of a sensor are impossible."""
+BEYOND_RANGE = 1.05  # finite readings above this multiple of the range of a sensor are impossible
 REPEATS = 8
 """Equal readings in a row from which on a sensor may be frozen: 0.3 s of a Sharp sensor."""
 FROZEN_MOTION, FROZEN_TURN = 0.08, 0.8
@@ -36,8 +35,7 @@ does."""
 NOTHING_SEEN = 3.0
 """Way (m) without a reading of anything after which it is in doubt whether any sensor sees:
 without their supply Sharp sensors read "nothing in range"."""
-BRAKES = 0.4
-"""Share of the time-out after which the robot brakes."""
+BRAKES = 0.4  # share of the time-out after which the robot brakes
 LEAP = 0.1
 """Change of the pose (m) within a step that is no motion: the robot was carried, or found."""
 
@@ -61,24 +59,18 @@ class SensorRecord:
         cosine, sine = math.cos(direction), math.sin(direction)
         self._share = cosine, sine, sine * x - cosine * y
         """Motion of its face along its beam by the motion of the robot: forward, left, turn."""
-        self.looks = cosine
-        """1 ahead, -1 astern."""
+        self.looks = cosine  # 1 ahead, -1 astern
         self.stamp_ns: int | None = None
-        self.received_ns: int | None = None
-        """Stamp of the odometry after the last valid reading."""
-        self.pending = False
-        """Whether a valid reading has come since the last odometry."""
-        self.cause = RangeFault.SILENT
-        """What a sensor without valid readings is."""
+        self.received_ns: int | None = None  # stamp of the odometry after the last valid reading
+        self.pending = False  # whether a valid reading has come since the last odometry
+        self.cause = RangeFault.SILENT  # what a sensor without valid readings is
         self.fault: RangeFault | None = None
-        self.age = 0.0
-        """Time since the last valid reading, s."""
+        self.age = 0.0  # time since the last valid reading, s
         self._reading = math.nan
         self._repeats = 0
         self._along = self._turn = 0.0
         self._misses = 0
-        self._missed: tuple[float, float] | None = None
-        """The last surface that it has not seen, m."""
+        self._missed: tuple[float, float] | None = None  # the last surface that it has not seen, m
 
     def add(self, reading: float) -> None:
         """Add a valid reading."""
@@ -123,10 +115,7 @@ class RangeMonitor:
 
     "Nothing in range" is no distance: a sensor that is frozen there is told from one before a
     large room by what the others have seen (:meth:`miss`). "Too near" is none, either.
-
-    mounts : x, y (m) and direction (rad) of each face in the frame of the robot, shape (s, 3)
-    timeout : time without a valid reading after which a sensor is lost, s
-    limit : distance up to which a sensor sees, m
+    A sensor is lost without a valid reading for the time-out (s), and sees up to ``limit`` m.
     """
 
     def __init__(self, mounts: Array, timeout: float, limit: float) -> None:
@@ -145,10 +134,7 @@ class RangeMonitor:
         """Way since then (m), in steps beyond the noise of a pose, and the end of the last one."""
 
     def accept(self, sensor: int, reading: float, stamp_ns: int | None) -> bool:
-        """Return whether a reading (m, REP 117) is to be used.
-
-        stamp_ns : None of a reading without a stamp
-        """
+        """Return whether a reading (m, REP 117) is to be used; one without a stamp has None."""
         record = self._sensors[sensor]
         if stamp_ns is not None and self._now_ns is not None:
             timeout_ns = self._timeout * NANOSECONDS

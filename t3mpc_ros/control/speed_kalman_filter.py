@@ -51,31 +51,21 @@ class SpeedFilterParameters(Parameters):
 class FilterState(NamedTuple):
     """State of both wheels, for kernels; shape (2,) each."""
 
-    speeds: Array
-    """Estimated chi at the last measurement, rad/s."""
-    disturbance: Array
-    """Estimated disturbance acceleration, rad/s²."""
-    predicted: Array
-    """Predicted chi when a command sent now takes effect, rad/s."""
+    speeds: Array  # estimated chi at the last measurement, rad/s
+    disturbance: Array  # estimated disturbance acceleration, rad/s²
+    predicted: Array  # predicted chi when a command sent now takes effect, rad/s
 
 
 class DriveModel(NamedTuple):
     """Constants of :func:`update_filter`."""
 
-    velocity: bool
-    """Whether the drive takes wheel speeds; else accelerations."""
-    filtered: bool
-    """Whether measured speeds are filtered; else they are the estimate."""
-    speed_gain: float
-    """Stationary Kalman gain of chi."""
-    disturbance_gain: float
-    """Stationary Kalman gain of d, 1/s."""
-    lag: float
-    """s"""
-    period: float
-    """Nominal time between steps, s."""
-    late: float
-    """Dead time beyond whole periods, as a fraction of a period."""
+    velocity: bool  # whether the drive takes wheel speeds; else accelerations
+    filtered: bool  # whether measured speeds are filtered; else they are the estimate
+    speed_gain: float  # stationary Kalman gain of chi
+    disturbance_gain: float  # stationary Kalman gain of d, 1/s
+    lag: float  # s
+    period: float  # nominal time between steps, s
+    late: float  # dead time beyond whole periods, as a fraction of a period
 
 
 class SpeedKalmanFilter:
@@ -128,8 +118,8 @@ class SpeedKalmanFilter:
     def update(self, applied: Array, measured: Array, dt: float, *, sent: bool) -> None:
         """Propagate over ``dt`` s, if a command was ``sent``, and correct by a measurement.
 
-        applied  : commanded wheel speeds (rad/s) or accelerations (rad/s²), shape (2,)
-        measured : wheel speeds, rad/s, shape (2,); NaN: there is no measurement
+        ``applied``: commanded wheel speeds (rad/s) or accelerations (rad/s²); ``measured``: wheel
+        speeds, rad/s, NaN without a measurement
         """
         self._update(
             self.state, self._commands, applied, contiguous(measured), sent, dt, self.model
@@ -182,7 +172,7 @@ def delayed_servo_response(
 ) -> None:
     """Write the wheel speeds after ``dt`` s in which the command changes from a row to the next.
 
-    late : fraction of ``dt`` during which the older command, ``commands[row]``, is active
+    The older command is active for a fraction ``late`` of that time.
     """
     servo_response(speeds, commands[row], disturbance, math.exp(-late * dt / lag), lag, out)
     decay = math.exp(-(1.0 - late) * dt / lag)
@@ -191,10 +181,7 @@ def delayed_servo_response(
 
 @kernel
 def predict_actuation(state: FilterState, commands: Array, model: DriveModel) -> None:
-    """Write the wheel speeds at which a command sent now takes effect.
-
-    commands : shape (n + 2, 2), newest last, rad/s; n whole periods of dead time
-    """
+    """Write the wheel speeds at which a command sent now takes effect; commands newest last."""
     out, disturbance = state.predicted, state.disturbance
     late, lag, period = model.late, model.lag, model.period
     whole = commands.shape[0] - 2

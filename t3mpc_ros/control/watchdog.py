@@ -165,8 +165,7 @@ class InputWatchdog:
     def elapsed(self, stamp_ns: int) -> float | None:
         """Return the time since the previous odometry, s; None if integration must restart.
 
-        The result is None for the first message, for a stamp that decreases, and for a gap longer
-        than the time-out.
+        That is for the first message, a stamp that decreases, and a gap longer than the time-out.
         """
         last, self._odometry_ns = self._odometry_ns, stamp_ns
         if last is None:
@@ -184,9 +183,7 @@ class InputWatchdog:
     ) -> Reason:
         """Return TRACKING if the robot may move at this odometry stamp, else the reason to stop.
 
-        stamp_ns : stamp of the odometry
-        finite : whether every number of the odometry is finite
-        known : whether the reference is known at this stamp
+        finite, known : whether every number of the odometry is finite, and the reference is known
         speed, error : largest magnitudes of measured wheel speed and of tracking error, rad/s
         """
         if self._reference_pending:
@@ -234,8 +231,7 @@ BLOCK_TIME, BLOCKS = 0.5, 6
 """Time over which twist and pose are compared (s), and the number of comparisons needed."""
 BLOCK_MOTION = 0.05, 0.3
 """Root of the sum of squares of the motions in them that is needed, m and rad."""
-TWIST_MEMORY = 1.0 - 1.0 / 60.0
-"""Forgetting factor of a comparison: 30 s."""
+TWIST_MEMORY = 1.0 - 1.0 / 60.0  # forgetting factor of a comparison: 30 s
 TWIST_TOLERANCE, TWIST_CERTAIN = 0.05, 4.0
 """Deviation of the factor between twist and pose that counts, and its standard deviations."""
 TOGETHER = 0.9
@@ -269,8 +265,7 @@ class TwistFactor:
     """
 
     def __init__(self) -> None:
-        self.value = 1.0
-        """The factor in use; 1 unless it is certainly another one."""
+        self.value = 1.0  # the factor in use; 1 unless it is certainly another one
         self._sums = [[0.0] * 3 for _ in range(2)]
         """Of each velocity, sums of squares of the pose, of products, of squares of the twist."""
         self._blocks = self._aside = 0.0
@@ -373,8 +368,7 @@ class OdometryTwist:
     def __init__(self) -> None:
         self.missing = False
         """Whether the odometry has no twist: speeds are differences of its pose."""
-        self.known = False
-        """Whether it ever had one."""
+        self.known = False  # whether it ever had one
         self._factor = TwistFactor()
         self._units = TwistUnits()
         self._anchor: Pose | None = None
@@ -461,10 +455,8 @@ class ResponseMonitor:
             maxlen=max(1, round(parameters.response_window / period))
         )
         self._timeout_steps = max(1, round(parameters.response_timeout / period))
-        self.evidence = 0
-        """Against the present decision."""
-        self.responsive = True
-        """Whether the robot follows commands."""
+        self.evidence = 0  # against the present decision
+        self.responsive = True  # whether the robot follows commands
 
     def reset(self) -> None:
         """Clear the commands and assume a responsive robot."""
@@ -505,10 +497,8 @@ class ResponseMonitor:
 MOTION, ASKED_MOTION = (0.03, 0.15), (0.1, 0.5)
 """Change of the pose (m, rad) that is motion, and what the commands to a robot that stands must
 have asked of it."""
-STANDING_TIME = 1.5
-"""Time in which commands must move the robot, s."""
-ASTRAY_TIME = 5.0
-"""Time in which a robot may move otherwise than commanded, s."""
+STANDING_TIME = 1.5  # time in which commands must move the robot, s
+ASTRAY_TIME = 5.0  # time in which a robot may move otherwise than commanded, s
 PAUSE = 0.8
 """Duration of a pause, s: a robot that has stopped because of slip asks for half a second."""
 TRIALS = 3
@@ -522,8 +512,7 @@ rad/s for 1.5 s."""
 CONTACT_MOTION, CONTACT_LEAD = 0.05, 0.15
 """Commanded motion (m) of which too little leads anywhere where the robot is held, and the time by
 which the pose is behind the commands, s."""
-CONTACT_WINDOW = 4.0
-"""Longest time in which that motion is commanded, s."""
+CONTACT_WINDOW = 4.0  # longest time in which that motion is commanded, s
 CONTACT_SHARES = 0.3, 0.4
 """Share of the commanded motion below which the robot is held, and share above which it moves
 sideways, as along what it touches."""
@@ -546,8 +535,7 @@ may be a fifth of the way of a point beside it, and most of that of its centre."
 FROZEN_MOTION = 0.08, 0.6
 """Motion by the twist (m, rad) during which a pose that is equal to the last bit is frozen; a
 camera of 5 Hz repeats the pose of a robot for less."""
-RECOVERY_TIME = 5.0
-"""Time of driving as commanded after which earlier pauses do not count, s."""
+RECOVERY_TIME = 5.0  # time of driving as commanded after which earlier pauses do not count, s
 
 
 class ContactMonitor:
@@ -647,18 +635,14 @@ class DriveMonitor:
         ``follows_pose``: also where the pose is frozen, by which the robot is led.
         """
         self._feels, self._follows_pose = feels, follows_pose
-        self.contact_monitor = ContactMonitor()
-        """Where something holds the robot."""
+        self.contact_monitor = ContactMonitor()  # where something holds the robot
         self.reset()
 
     def reset(self) -> None:
         """Forget all pauses."""
-        self.pauses = 0
-        """Pauses since the robot drove as commanded."""
-        self.contact = False
-        """Whether this pause began because something held the robot."""
-        self._frozen = False
-        """Whether it began because the pose was frozen."""
+        self.pauses = 0  # pauses since the robot drove as commanded
+        self.contact = False  # whether this pause began because something held the robot
+        self._frozen = False  # whether it began because the pose was frozen
         self._trials = 0
         self._stopped = False
         """Whether a pause began because something held the robot, or it stopped by itself."""
@@ -675,8 +659,7 @@ class DriveMonitor:
         self._time = 0.0
         self.contact = self._frozen = False
         self._pose: Pose | None = None
-        self._unchanged = 0.0
-        """Share of FROZEN_MOTION since the pose last changed."""
+        self._unchanged = 0.0  # share of FROZEN_MOTION since the pose last changed
         self.contact_monitor.restart(None)
         self._restart(None)
 
@@ -691,9 +674,7 @@ class DriveMonitor:
     ) -> Reason:
         """Return TRACKING if the robot may move, else the reason why nothing is commanded.
 
-        command : twist of the last period
-        elapsed : time since the last odometry, s
-        following : whether the wheels respond to the commands
+        ``command``: twist of the last period; ``following``: whether the wheels respond
         """
         if self._ended:
             return Reason.STOPPED_AGAIN

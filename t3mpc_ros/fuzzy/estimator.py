@@ -86,16 +86,11 @@ class AdaptationParameters(Parameters):
 class AdaptationGains(NamedTuple):
     """Gains and bounds of :func:`adapt`."""
 
-    gamma: float
-    """1/s²"""
-    radius: float
-    """rho, largest Euclidean norm of each output's coefficients, rad/s²."""
-    leakage: float
-    """sigma, 1/s"""
-    dead_zone: float
-    """Width, rad/s."""
-    step_limit: float
-    """Largest gamma |Phi|² dt, 1/s."""
+    gamma: float  # 1/s²
+    radius: float  # rho, largest Euclidean norm of each output's coefficients, rad/s²
+    leakage: float  # sigma, 1/s
+    dead_zone: float  # width, rad/s
+    step_limit: float  # largest gamma |Phi|² dt, 1/s
 
 
 @kernel
@@ -170,11 +165,7 @@ def adapt(
 
 @kernel
 def estimate(inputs: Array, tables: FuzzyTables, outputs: Array) -> bool:
-    """Write basis and outputs (31); return False, and change nothing, unless inputs are finite.
-
-    inputs  : shape (n,), U, rad/s
-    outputs : shape (m,), overwritten, g, rad/s²
-    """
+    """Write basis and outputs (31); return False, and change nothing, unless inputs are finite."""
     for i in range(inputs.size):
         if not math.isfinite(inputs[i]):
             return False
@@ -232,8 +223,8 @@ class FuzzyEstimator:
     def evaluate(self, inputs: Array) -> Array:
         """Return the estimates g (rad/s²), shape (m,), equation (31), and store the basis.
 
-        inputs : U, the wheel speeds chi, shape (n,), rad/s
-        Values that do not fit raise ValueError and change nothing.
+        Inputs are the wheel speeds chi, rad/s. Those that do not fit raise ValueError and change
+        nothing.
         """
         values = np.ascontiguousarray(inputs, dtype=np.float64)
         sets = self.sets
@@ -243,12 +234,9 @@ class FuzzyEstimator:
         return outputs
 
     def adapt(self, errors: Array, dt: float) -> None:
-        """Adapt the coefficients to the tracking errors, equations (77)-(78).
+        """Adapt the coefficients to the tracking errors delta = chi - r, equations (77)-(78).
 
         The basis is that of the last :meth:`evaluate`; without one the coefficients do not change.
-
-        errors : delta = chi - r at the same instant, shape (m,), rad/s
-        dt : time since the last step, s
         Values that do not fit raise ValueError and change nothing.
         """
         if not 0.0 <= dt < math.inf:

@@ -119,20 +119,17 @@ class FuzzySets:
     last input changes fastest.
     """
 
-    centres: Array
-    """Centres o, shape (n, M), rad/s."""
+    centres: Array  # centres o, shape (n, M), rad/s
     widths: Array
     """Widths beta, shape (n, M, lambda, 2, 2), rad/s; the last two axes are the level
     (lower, upper) and the bound (lower, upper width)."""
     levels: Array
     """Slice levels, shape (lambda, 2): lower and upper level of each slice, in (0, 1]. The paper
     has the lower one strictly below; when they are equal, the slice is one level."""
-    input_fuzziness: float
-    """beta_U, rad/s."""
+    input_fuzziness: float  # beta_U, rad/s
     nonsingleton_gain: Array = field(init=False)
     """beta_U² / (beta² + beta_U²), the weight of the centre in (16)-(19); shape as widths."""
-    sharpness: Array = field(init=False)
-    """1/beta, s/rad, shape as widths."""
+    sharpness: Array = field(init=False)  # 1/beta, s/rad, shape as widths
     shares: Array = field(init=False)
     """Levels over their sum, shape (lambda, 2). E8: the sum runs over lower *and* upper levels,
     so that the shares add up to one and the output lies in the hull of the coefficients."""
@@ -259,19 +256,14 @@ def build_sets(parameters: FuzzyParameters, inputs: int = 2) -> FuzzySets:
 class FuzzyTables(NamedTuple):
     """Sets, work space and coefficients of a fuzzy system, for kernels."""
 
-    centres: Array
-    """Tables of :class:`FuzzySets`, as the next three."""
+    centres: Array  # tables of :class:`FuzzySets`, as the next three
     nonsingleton_gain: Array
     sharpness: Array
     shares: Array
-    grades: Array
-    """Work space, shape (n, M, lambda, 2, 2)."""
-    firings: Array
-    """Work space, shape (r, lambda, 2, 2)."""
-    phi: Array
-    """Basis Phi of the last evaluation, shape (2 r lambda,)."""
-    coefficients: Array
-    """alpha, shape (m, 2 r lambda), rad/s²."""
+    grades: Array  # work space, shape (n, M, lambda, 2, 2)
+    firings: Array  # work space, shape (r, lambda, 2, 2)
+    phi: Array  # basis Phi of the last evaluation, shape (2 r lambda,)
+    coefficients: Array  # alpha, shape (m, 2 r lambda), rad/s²
 
     @classmethod
     def of(cls, sets: FuzzySets, outputs: int) -> Self:
@@ -299,11 +291,6 @@ def fuzzify(inputs: Array, centres: Array, nonsingleton_gain: Array, maxima: Arr
     The product is that of the input's Gaussian about U and the set's Gaussian about o. The second
     form is exactly U when the input is not fuzzy. With the upper width it is (16) at the upper
     level of a slice and (17) at the lower one, with the lower width (18) and (19).
-
-    inputs : shape (n,), U, rad/s
-    centres : shape (n, M), o, rad/s
-    nonsingleton_gain : shape (n, M, lambda, 2, 2), the last fraction
-    maxima : shape as nonsingleton_gain, overwritten, x*, rad/s
     """
     for i in range(centres.shape[0]):
         # Above 1e9 rad/s the nearest rule has all of the weight, so the limit does not change the
@@ -324,14 +311,10 @@ def square_distances(maxima: Array, centres: Array, sharpness: Array, squares: A
     r"""Write the exponents :math:`((x^* - o)/\beta)^2` of the memberships (20)-(23) with E7.
 
     With the upper width these are the exponents of (20) at the upper level of a slice and of (21)
-    at the lower one, with the lower width those of (22) and (23).
+    at the lower one, with the lower width those of (22) and (23). ``squares`` may be ``maxima``.
 
     E7: the exponent of a Gaussian is squared; the printed one is linear, and grades exceed one on
     one side of the centre.
-
-    maxima, sharpness : shape (n, M, lambda, 2, 2), x* (rad/s) and 1/beta (s/rad)
-    centres : shape (n, M), rad/s
-    squares : shape as maxima, overwritten; may be maxima itself
     """
     for i in range(centres.shape[0]):
         for h in range(centres.shape[1]):
@@ -352,9 +335,6 @@ def relative_memberships(squares: Array) -> None:
     of a slice and level cancels. Removing the largest one before the exponential makes it exactly
     one: the sum cannot underflow, however far the inputs are from all centres. The ratio of lower
     and upper bound is kept in the grades of the first input.
-
-    squares : shape (n, M, lambda, 2, 2), exponents from :func:`square_distances`, overwritten
-        with the relative grades
     """
     for j in range(squares.shape[2]):
         for level in range(2):
@@ -388,12 +368,9 @@ def _subtract_nearest(squares: Array, j: int, level: int, bound: int) -> float:
 def firing_strengths(grades: Array, firings: Array) -> None:
     r"""Write the firing strengths of the rules, :math:`\Omega^l = \prod_i \zeta_i`, (24)-(27).
 
-    A rule (28) combines one set of each input. Upper grades give (24) at the upper level of a
-    slice and (25) at the lower one, lower grades (26) and (27).
-
-    grades : shape (n, M, lambda, 2, 2)
-    firings : shape (r, lambda, 2, 2) with r = M**n, overwritten; the last input's set changes
-        fastest from rule to rule
+    A rule (28) combines one set of each input; the last input's set changes fastest from rule to
+    rule. Upper grades give (24) at the upper level of a slice and (25) at the lower one, lower
+    grades (26) and (27).
     """
     inputs, sets = grades.shape[0], grades.shape[1]
     # Slices, levels and bounds are contiguous in memory and have the same computation.
@@ -413,7 +390,7 @@ def firing_strengths(grades: Array, firings: Array) -> None:
 
 @kernel
 def basis(firings: Array, shares: Array, phi: Array) -> None:
-    r"""Write the basis, equation (33) with E8.
+    r"""Write the basis, equation (33) with E8, in the order of (32).
 
     .. math:: \Phi = \frac{\varsigma_j}{\sum_j(\underline\varsigma_j + \bar\varsigma_j)}
                      \frac{\bar\Omega^l + \underline\Omega^l}
@@ -421,13 +398,8 @@ def basis(firings: Array, shares: Array, phi: Array) -> None:
 
     E8: with the printed factor 0.5 / (sum of upper levels) the basis adds up to less than one,
     which biases the output towards zero; with the sum of all levels it is a convex combination.
-    The sums are over the rules, where the printed (33) repeats rule one.
-
-    firings : shape (r, lambda, 2, 2), up to a factor common to the rules
-    shares : shape (lambda, 2), levels over the sum of all levels
-    phi : shape (2 r lambda,), overwritten, in the order of (32): lower levels first, element
-        l lambda + j is rule l, slice j; then the same for the upper levels, (32)'s last block
-        running to rule r
+    The sums are over the rules, where the printed (33) repeats rule one. Lower levels come first:
+    element l lambda + j is rule l, slice j; then the same for the upper levels.
     """
     rules, slices = firings.shape[0], firings.shape[1]
     block = rules * slices
@@ -445,13 +417,10 @@ def basis(firings: Array, shares: Array, phi: Array) -> None:
 
 @kernel
 def evaluate_basis(inputs: Array, tables: FuzzyTables) -> None:
-    """Write the basis Phi of the inputs in one call: (16)-(27), (33) with E7 and E8.
+    """Write the basis Phi of finite inputs (rad/s) in one call: (16)-(27), (33) with E7 and E8.
 
     Exponentials are computed per input and set, not per rule. For any finite inputs the basis is
     not negative and adds up to one; ``grades`` and ``firings`` are relative to the largest.
-
-    inputs : shape (n,), U, rad/s, finite
-    tables : work space and phi are overwritten
     """
     fuzzify(inputs, tables.centres, tables.nonsingleton_gain, tables.grades)
     square_distances(tables.grades, tables.centres, tables.sharpness, tables.grades)
@@ -462,12 +431,7 @@ def evaluate_basis(inputs: Array, tables: FuzzyTables) -> None:
 
 @kernel
 def combine(coefficients: Array, phi: Array, outputs: Array) -> None:
-    r"""Write the outputs :math:`g = \alpha^T\Phi`, equation (31).
-
-    coefficients : shape (m, 2 r lambda), alpha, rad/s²
-    phi : shape (2 r lambda,)
-    outputs : shape (m,), overwritten, g, rad/s²
-    """
+    r"""Write the outputs :math:`g = \alpha^T\Phi`, equation (31), rad/s²."""
     for z in range(outputs.size):
         total = 0.0
         for k in range(phi.size):

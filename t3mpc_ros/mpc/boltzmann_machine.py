@@ -31,10 +31,8 @@ from t3mpc_ros.mpc.quadratic_program import cholesky, solve_lower, solve_upper
 class LayerSizes(NamedTuple):
     """Number of past values in the visible layer, and of hidden units."""
 
-    delta_lags: int
-    """Past tracking errors in (35), the paper's tau."""
-    move_lags: int
-    """Past predictive signals; (35) has one, which cannot represent a dead time."""
+    delta_lags: int  # past tracking errors in (35), the paper's tau
+    move_lags: int  # past predictive signals; (35) has one, which cannot represent a dead time
     hidden: int
 
     @property
@@ -46,39 +44,28 @@ class LayerSizes(NamedTuple):
 class BoltzmannMachine(NamedTuple):
     """Weights and work space of one machine; kernels change the arrays in place."""
 
-    visible_weights: Array
-    """X_v, shape (visible, hidden)."""
-    output_weights: Array
-    """X_o, shape (hidden,)."""
+    visible_weights: Array  # X_v, shape (visible, hidden)
+    output_weights: Array  # X_o, shape (hidden,)
     delta_lags: int
     """Number of visible units that are tracking errors; the rest are predictive signals."""
-    scales: Array
-    """(delta_scale in rad/s, move_scale in rad/s²)."""
-    lags: Array
-    """Shape (visible,): eta_0 of the last pass, (35)."""
-    mu0: Array
-    """Shape (hidden,): (39)."""
-    eta1: Array
-    """Shape (visible,): (38), the reconstruction of eta_0."""
-    mu1: Array
-    """Shape (hidden,): (37), the features of the output layer."""
+    scales: Array  # (delta_scale in rad/s, move_scale in rad/s²)
+    lags: Array  # shape (visible,): eta_0 of the last pass, (35)
+    mu0: Array  # shape (hidden,): (39)
+    eta1: Array  # shape (visible,): (38), the reconstruction of eta_0
+    mu1: Array  # shape (hidden,): (37), the features of the output layer
 
 
 class History(NamedTuple):
     """Past errors and moves of one output, newest first, and how well they were predicted."""
 
-    errors: Array
-    """Tracking errors (rad/s): errors[0] is the newest."""
+    errors: Array  # tracking errors (rad/s): errors[0] is the newest
     moves: Array
     """Applied v_p (rad/s²): moves[i] was held from errors[i] on; moves[0] is not yet known."""
-    offsets: Array
-    """Offsets e (rad/s) used after each instant, shape (middle,)."""
+    offsets: Array  # offsets e (rad/s) used after each instant, shape (middle,)
     residuals: Array
     """Last errors (rad/s) of machine and persistence: one step, then middle of the horizon."""
-    prediction_mse: Array
-    """Mean squared error of the machine, (rad/s)²: one step, middle."""
-    persistence_mse: Array
-    """The same of persistence, which predicts no change."""
+    prediction_mse: Array  # mean squared error of the machine, (rad/s)²: one step, middle
+    persistence_mse: Array  # the same of persistence, which predicts no change
     recent_mse: Array
     """The same of persistence over about one second: the variation there is to predict."""
     planned_moves: Array
@@ -93,12 +80,9 @@ class RlsState(NamedTuple):
 
     information: Array
     """Shape (hidden, hidden): weighted sum of mu_1 mu_1ᵀ over the recent past, A."""
-    prior: Array
-    """Shape (hidden, hidden): the same of the pretraining, R_0."""
-    anchor: Array
-    """Shape (hidden,): the pretrained output weights."""
-    total: Array
-    """Work space, shape (hidden, hidden); the next two (hidden, hidden) and (hidden,)."""
+    prior: Array  # shape (hidden, hidden): the same of the pretraining, R_0
+    anchor: Array  # shape (hidden,): the pretrained output weights
+    total: Array  # work space, shape (hidden, hidden); the next two (hidden, hidden) and (hidden,)
     lower: Array
     move: Array
     power: Array
@@ -116,11 +100,8 @@ def make_machine(
 
     The rows of X_v are orthogonal and of length ``spread``: X_v X_vᵀ = spread² I. In the linear
     range mu_1 = X_vᵀ X_v X_vᵀ eta_0 / 8, so the three passes preserve every direction of eta_0
-    equally; with independent random weights their condition number is raised to the third power.
-    This requires at least as many hidden as visible units.
-
-    delta_scale, move_scale : values that are 1 inside the machine: rad/s and rad/s²
-    spread : length of each row of X_v; at 2 an eta_0 in the linear range is reconstructed exactly
+    equally (at 2 exactly); with independent random weights their condition number is raised to the
+    third power. This requires at least as many hidden as visible units.
     """
     if shape.delta_lags < 1 or shape.move_lags < 1:
         raise ValueError(f'shape must have at least one lag of each kind: got {shape}')
@@ -222,15 +203,10 @@ def infer_visible(visible_weights: Array, mu: Array, eta: Array) -> None:
 
 @kernel
 def set_visible(machine: BoltzmannMachine, errors: Array, moves: Array, first: int) -> None:
-    """Write the scaled visible vector (35) into ``machine.lags``.
+    """Write the scaled visible vector (35) into ``machine.lags``, newest lags from ``first`` on.
 
     The paper's vector contains one v_p only. Further lags are needed because a move acts one
-    dead time later.
-
-    errors : delta, newest first (rad/s), at least first + delta_lags values
-    moves  : v_p, newest first (rad/s²), at least first + move_lags values; moves[first] is held
-             from the instant of errors[first] on
-    first  : index of the newest lag: 0 to predict the future, more to predict past values again
+    dead time later; moves[first] is held from the instant of errors[first] on.
 
     Values are limited to ten scales: beyond, every hidden unit is saturated, and (43) must remain
     finite for any measurement.
@@ -282,10 +258,8 @@ def gradient_step(machine: BoltzmannMachine, error: float, rate: float, floor: f
     """Update X_o by rate * error * mu_1 / (floor + |mu_1|²), equation (44) normalised.
 
     (44) itself is rate * error * mu_1. Normalised by |mu_1|², a rate below 2 is stable at any
-    amplitude; without it the useful rate depends on the square of the amplitude.
-
-    error : delta - delta_hat (rad/s)
-    floor : value of |mu_1|² (dimensionless) below which the steps are reduced
+    amplitude; without it the useful rate depends on the square of the amplitude. Below ``floor``
+    the steps are reduced.
     """
     squared = floor
     for j in range(machine.mu1.size):
@@ -309,15 +283,14 @@ def rls_step(
               \quad A \leftarrow \lambda A + g \mu_1 \mu_1^T
 
     (44) with the matrix (A + R_0)^-1 for gamma: recursive least squares that forgets *towards the
-    pretrained weights* X_o^0. X_o minimises the sum of g lambda^(t-i) (delta_i - X_oᵀ mu_1i)²
-    plus |X_o - X_o^0|² in the metric R_0. Without excitation X_o returns to X_o^0, whereas plain
-    forgetting loses information and then bursts. The lags of a slow signal are nearly parallel,
-    so a scalar gamma needs thousands of steps where this needs dozens. The weight
-    g = (mean |mu_1|² in pretraining) / (recent mean |mu_1|²) is the normalisation.
-
-    error            : delta - delta_hat (rad/s)
-    forgetting       : lambda, forgetting factor of A per step
-    power_forgetting : forgetting factor of the recent mean of |mu_1|²
+    pretrained weights* X_o^0, by ``forgetting``, lambda per step. X_o minimises the sum of
+    g lambda^(t-i) (delta_i - X_oᵀ mu_1i)² plus |X_o - X_o^0|² in the metric R_0. Without
+    excitation X_o returns to X_o^0, whereas plain forgetting loses information and then bursts.
+    The
+    lags of a slow signal are nearly parallel, so a scalar gamma needs thousands of steps where
+    this
+    needs dozens. The weight g = (mean |mu_1|² in pretraining) / (recent mean |mu_1|²) is the
+    normalisation.
     """
     n = machine.mu1.size
     squared = 0.0

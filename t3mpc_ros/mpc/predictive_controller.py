@@ -74,8 +74,7 @@ class PredictiveParameters(Parameters):
     control_horizon: int = parameter(
         5, 'control horizon n_c: later changes of v_p are zero', bounds=(1, 50)
     )
-    error_weight: ClassVar[float] = 1.0
-    """mu of (60), s²/rad²: only its ratio to pi matters."""
+    error_weight: ClassVar[float] = 1.0  # mu of (60), s²/rad²: only its ratio to pi matters
     move_weight: float = parameter(
         0.029, 'pi of (60), with mu = 1 s²/rad²', 's⁴/rad²', (1e-9, 1e6), dynamic=True
     )
@@ -93,43 +92,32 @@ class PredictiveParameters(Parameters):
         (0.0, 1e3),
         dynamic=True,
     )
-    probe: ClassVar[float] = 1.0
-    """Step dv of the step response (48), (51), rad/s², assumed."""
-    delta_lags: ClassVar[int] = 4
-    """Past errors in the visible layer, tau of (35), assumed."""
+    probe: ClassVar[float] = 1.0  # step dv of the step response (48), (51), rad/s², assumed
+    delta_lags: ClassVar[int] = 4  # past errors in the visible layer, tau of (35), assumed
     move_lags: ClassVar[int] = 4
     """Past v_p in the visible layer, assumed; they must cover the dead time."""
-    hidden: ClassVar[int] = 12
-    """Number of hidden units, assumed; at least that of the lags."""
-    spread: ClassVar[float] = 1.0
-    """Length of each row of the initial X_v, assumed."""
-    delta_scale: ClassVar[float] = 3.0
-    """Error that is 1 inside the machine, rad/s, assumed."""
-    move_scale: ClassVar[float] = 20.0
-    """v_p that is 1 inside the machine, rad/s², assumed."""
+    hidden: ClassVar[int] = 12  # number of hidden units, assumed; at least that of the lags
+    spread: ClassVar[float] = 1.0  # length of each row of the initial X_v, assumed
+    delta_scale: ClassVar[float] = 3.0  # error that is 1 inside the machine, rad/s, assumed
+    move_scale: ClassVar[float] = 20.0  # v_p that is 1 inside the machine, rad/s², assumed
     learning: bool = parameter(True, 'whether the machine learns online', dynamic=True)
     algorithm: str = parameter(
         'recursive',
         'learning of the output layer: recursive least squares, or the normalised gradient (44)',
         choices=('recursive', 'gradient'),
     )
-    memory: ClassVar[float] = 20.0
-    """Time constant of forgetting, s, assumed."""
+    memory: ClassVar[float] = 20.0  # time constant of forgetting, s, assumed
     trust: ClassVar[float] = 30.0
     """Weight of the pretraining, as a duration of online learning, s, assumed."""
-    output_rate: ClassVar[float] = 0.05
-    """gamma of (44), normalised, assumed."""
-    contrast_rate: ClassVar[float] = 1e-4
-    """gamma of (43) online, assumed."""
+    output_rate: ClassVar[float] = 0.05  # gamma of (44), normalised, assumed
+    contrast_rate: ClassVar[float] = 1e-4  # gamma of (43) online, assumed
     offset_gain: float = parameter(
         0.0032, 'gain of the offset e on the last prediction error', bounds=(0.0, 1.0)
     )
     noise: ClassVar[float] = 0.05
     """Standard deviation of the noise of a sample of the error, rad/s, assumed."""
-    skill_memory: ClassVar[float] = 5.0
-    """Time constant of the skill, s, assumed."""
-    skill_low: ClassVar[float] = -1.0
-    """Skill up to which the authority of v_p is 0, assumed."""
+    skill_memory: ClassVar[float] = 5.0  # time constant of the skill, s, assumed
+    skill_low: ClassVar[float] = -1.0  # skill up to which the authority of v_p is 0, assumed
     skill_high: ClassVar[float] = 0.0
     """Skill from which the authority of v_p is 1, assumed; 0 is as good as persistence."""
     gain_low: ClassVar[float] = 0.2
@@ -141,8 +129,7 @@ class PredictiveParameters(Parameters):
     )
     nominal: ClassVar[NominalLoopParameters] = NominalLoopParameters()
     """Loop of the pretraining; the controller replaces its feedback gain by its own."""
-    excitation: ClassVar[ExcitationParameters] = ExcitationParameters()
-    """Run of the pretraining."""
+    excitation: ClassVar[ExcitationParameters] = ExcitationParameters()  # run of the pretraining
 
     def check_consistency(self) -> None:
         """Raise :class:`ParameterError` for horizons or periods in the wrong order."""
@@ -187,16 +174,11 @@ class MoveConstants(NamedTuple):
     skill_high: float
     gain_low: float
     gain_high: float
-    average: int
-    """Control periods in the mean of a sample."""
-    decimation: int
-    """Control periods in a period T."""
-    nominal_response: float
-    """Nominal step response in the middle of the horizon."""
-    decay: float
-    """Decay of a known jump per control period."""
-    decays: Array
-    """Decay of a known jump after 0, 1, ... periods T, shape (n_p + 1,)."""
+    average: int  # control periods in the mean of a sample
+    decimation: int  # control periods in a period T
+    nominal_response: float  # nominal step response in the middle of the horizon
+    decay: float  # decay of a known jump per control period
+    decays: Array  # decay of a known jump after 0, 1, ... periods T, shape (n_p + 1,)
 
     @classmethod
     def of(
@@ -221,52 +203,36 @@ class MoveConstants(NamedTuple):
 class Responses(NamedTuple):
     """Responses of each output over the horizon, shape (outputs, n_p) each."""
 
-    steps: Array
-    """Step responses (48), (rad/s)/(rad/s²)."""
-    free: Array
-    """Psi_free (56), rad/s."""
-    prediction: Array
-    """Predictions Psi (52), rad/s."""
-    known: Array
-    """Future errors of known jumps, rad/s."""
+    steps: Array  # step responses (48), (rad/s)/(rad/s²)
+    free: Array  # Psi_free (56), rad/s
+    prediction: Array  # predictions Psi (52), rad/s
+    known: Array  # future errors of known jumps, rad/s
 
 
 class PlanWork(NamedTuple):
     """Work space and results of the quadratic programs."""
 
-    matrix: Array
-    """S (54), shape (n_p, n_c)."""
+    matrix: Array  # S (54), shape (n_p, n_c)
     program: Workspace
-    status: Indices
-    """Status of each last solution, shape (outputs,)."""
+    status: Indices  # status of each last solution, shape (outputs,)
 
 
 class Signals(NamedTuple):
     """State of the computation of v_p, shape (outputs,) each."""
 
-    sums: Array
-    """Sum of the errors of the present sample, rad/s."""
-    applied_sums: Array
-    """Sum of the v_p applied since the last sample, rad/s²."""
+    sums: Array  # sum of the errors of the present sample, rad/s
+    applied_sums: Array  # sum of the v_p applied since the last sample, rad/s²
     applied: Array
     """v_p applied in the present control period, rad/s², where a limit reduced it: the machine
     learns from it, and the next change starts from it, limited to the range from zero to v."""
-    v: Array
-    """v_p (63), held between samples, rad/s²."""
-    dither: Array
-    """Random part of v_p, rad/s²."""
-    next_dither: Array
-    """Random part of the next v_p, rad/s²."""
-    jumps: Array
-    """Residual of the known jumps of the error, rad/s."""
-    authorities: Array
-    """Fraction of the bound of v_p in use."""
-    skills: Array
-    """Skill in the middle of the horizon."""
-    errors: Array
-    """The last errors delta = chi - r, rad/s."""
-    jump_free_errors: Array
-    """The same without the residual of the known jumps, rad/s."""
+    v: Array  # v_p (63), held between samples, rad/s²
+    dither: Array  # random part of v_p, rad/s²
+    next_dither: Array  # random part of the next v_p, rad/s²
+    jumps: Array  # residual of the known jumps of the error, rad/s
+    authorities: Array  # fraction of the bound of v_p in use
+    skills: Array  # skill in the middle of the horizon
+    errors: Array  # the last errors delta = chi - r, rad/s
+    jump_free_errors: Array  # the same without the residual of the known jumps, rad/s
 
 
 @kernel
@@ -283,10 +249,8 @@ def accumulate_sample(
 ) -> bool:
     """Add a control period to the sums of the sample; return False if an error is not finite.
 
-    speeds, reference : shape (outputs,), chi and r, rad/s
     sampled : whether this period's errors belong to the sample
     due     : whether the sample is complete; :func:`predictive_step` then ends the period
-    decay   : decay of a known jump per control period
     """
     for z in range(speeds.size):
         if not math.isfinite(speeds[z] - reference[z]):
@@ -306,10 +270,7 @@ def accumulate_sample(
 def predict_known_errors(jump: float, decays: Array, change: Array, known: Array) -> None:
     """Write the future errors caused by past and future known jumps, decaying with K.
 
-    jump   : residual of the past jumps, rad/s
-    decays : shape (n_p + 1,), decay of a jump after 0, 1, ... periods T
-    change : shape (n_p,), jumps in each future period T, rad/s
-    known  : shape (n_p,), overwritten, rad/s
+    ``jump`` is the residual of the past ones; ``change`` has the jumps in each future period T.
     """
     for j in range(known.size):
         known[j] = jump * decays[j + 1]
@@ -328,14 +289,7 @@ def plan_moves(
     work: PlanWork,
     prediction: Array,
 ) -> int:
-    """Write the optimal changes and the predicted errors; return the status of the solver.
-
-    steps, free  : the step response (48) and Psi_free (56)
-    v_previous   : v_p(t-1), inside v_max (rad/s²)
-    v_max        : bound of v_p (rad/s²)
-    work         : overwritten, with the optimal changes
-    prediction   : Psi (52), shape (n_p,), overwritten
-    """
+    """Write the optimal changes and the predicted errors Psi (52); return the solver's status."""
     matrix, program = work.matrix, work.program
     toeplitz(steps, matrix)
     status = solve_quadratic_program(
@@ -366,11 +320,7 @@ def predictive_step(
 ) -> None:
     """Process the sample of each output, and update its v_p: (34)-(63) in one call.
 
-    wheels    : state of each output
-    responses : overwritten
-    change    : shape (n_p, outputs), jumps in each future period T, rad/s
-    samples   : number of previous samples
-    work      : overwritten
+    ``change``, shape (n_p, outputs), has the jumps in each future period T, rad/s.
     """
     for z in range(len(wheels)):
         wheel = wheels[z]
@@ -484,8 +434,7 @@ class PredictiveController:
         if not (period > 0.0 and outputs > 0):
             raise ValueError(f'period and outputs must be positive: got {period}, {outputs}')
         self._timing = SampleTiming(period, parameters.decimation, parameters.average)
-        self.span = span = self._timing.span
-        """Predictive period T, s."""
+        self.span = span = self._timing.span  # predictive period T, s
         if parameters.move_lags * span < parameters.nominal.dead_time + span:
             raise ParameterError(
                 f'{parameters.move_lags} periods of v_p must cover the dead time of '
@@ -547,10 +496,8 @@ class PredictiveController:
             array[:] = 0.0
         self._generator = np.random.default_rng((self.parameters.seed, 1))
         self.status[:] = OPTIMAL
-        self.phase = 0
-        """Control periods since the last sample, below ``decimation``."""
-        self.samples = 0
-        """Number of samples."""
+        self.phase = 0  # control periods since the last sample, below ``decimation``
+        self.samples = 0  # number of samples
         for predictor in self._predictors:
             reset_history(predictor.history, 0.0)
         self.skill = np.array(
@@ -596,18 +543,14 @@ class PredictiveController:
         self.reset()
 
     def notify_jump(self, jump: Array) -> None:
-        """Add a known jump of the error by ``jump`` (rad/s) at the next step.
-
-        Call it before :meth:`step` of the same period; jumps are added.
-        """
+        """Add a known jump of the error (rad/s) at the :meth:`step` of this period."""
         if np.shape(jump) != self.status.shape or not np.isfinite(jump).all():
             raise ValueError(f'jump must be {self.status.size} finite numbers: got {jump}')
         self.signals.jumps[:] += jump
 
     def step(self, errors: Array, known_change: Array | None = None) -> Array:
-        """Return v_p (rad/s²), shape (outputs,), equation (63).
+        """Return v_p (rad/s²), shape (outputs,), equation (63), for errors delta = chi - r, rad/s.
 
-        errors : measured or estimated tracking errors delta = chi - r, rad/s, shape (outputs,)
         known_change : known future jumps of delta, shape (n_p, outputs), rad/s: row j is the sum
             of the jumps between t + jT and t + (j+1)T. Each is added to Psi_free from its time on,
             and decays. Used only in steps that solve the quadratic program, see :attr:`due`.

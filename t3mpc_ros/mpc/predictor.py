@@ -42,7 +42,7 @@ from t3mpc_ros.mpc.pretraining import ExcitationParameters, pretrain
 def roll_forward(
     machine: BoltzmannMachine, history: History, first: int, offset: float, out: Array
 ) -> None:
-    r"""Write the iterated predictions delta_hat(t+1) ... delta_hat(t+n) into ``out``.
+    r"""Write the iterated predictions delta_hat(t+1) ... delta_hat(t+n) into ``out`` (rad/s).
 
     .. math:: \hat\delta(t+j) = y_{BM}(\hat\delta(t+j-1), \ldots, v_p(t+j-1), \ldots) + e(t)
 
@@ -51,12 +51,8 @@ def roll_forward(
     it were added once to the finished response, as for a model without measured inputs, a steady
     error would remain, because the measured lags already contain part of the disturbance.
 
-    machine : its work space is overwritten
-    history : errors and moves are read, and ``planned_moves``, v_p for t, t+1, ... (rad/s²),
-              instead of moves[first]; lagged_errors and lagged_moves are overwritten
-    first   : index of the error to start from: 0 is the present one
-    offset  : e(t), the filtered prediction error (rad/s)
-    out     : shape (n,), n at most n_p, overwritten (rad/s)
+    ``history.planned_moves``, v_p for t, t+1, ..., are used instead of moves[first]; errors[first]
+    is the one to start from, 0 the present one.
     """
     n_errors = machine.delta_lags
     n_moves = machine.lags.size - n_errors
@@ -80,10 +76,7 @@ def roll_forward(
 def free_response(
     machine: BoltzmannMachine, history: History, v_previous: float, out: Array
 ) -> None:
-    """Write Psi_free (56): the response to a constant v_p(t-1), (46), (57)-(59).
-
-    out : shape (n_p,), overwritten (rad/s)
-    """
+    """Write Psi_free (56): the response to a constant v_p(t-1), (46), (57)-(59), rad/s."""
     history.planned_moves[:] = v_previous
     roll_forward(machine, history, 0, history.offsets[0], out)
 
@@ -100,11 +93,7 @@ def step_response(
     """Write s_0 ... s_{n_p-1}, equation (48), in (rad/s)/(rad/s²).
 
     s_j = (delta_hat_step(t+j+1) - delta_hat_free(t+j+1)) / dv: the response to a constant
-    v_p(t-1) + dv, (49)-(51), minus that to a constant v_p(t-1) (59).
-
-    v_previous, probe : v_p(t-1) and dv (rad/s²)
-    free              : Psi_free (56), shape (n_p,)
-    out               : shape (n_p,), overwritten
+    v_p(t-1) + dv, (49)-(51), minus ``free``, that to a constant v_p(t-1) (59); ``probe`` is dv.
     """
     history.planned_moves[:] = v_previous + probe
     roll_forward(machine, history, 0, history.offsets[0], out)
@@ -116,10 +105,9 @@ def step_response(
 def toeplitz(step: Array, out: Array) -> None:
     """Write S, the lower-triangular Toeplitz matrix of the step response, (54) with E11.
 
-    E11: the printed last row repeats s_{n_p-1}; it is s_{n_p-1}, s_{n_p-2}, ..., s_0.
-
-    step : shape (n_p,)
-    out  : shape (n_p, n_c); changes after n_c periods are zero
+    E11: the printed last row repeats s_{n_p-1}; it is s_{n_p-1}, s_{n_p-2}, ..., s_0. Changes
+    after
+    n_c periods are zero.
     """
     for j in range(out.shape[0]):
         for i in range(out.shape[1]):
@@ -145,12 +133,7 @@ def predict_responses(
     steps: Array,
     free: Array,
 ) -> None:
-    """Write the step response (48), and Psi_free (56) plus the known errors.
-
-    v_previous, probe : v_p(t-1), dv (rad/s²)
-    known             : future errors caused by known jumps, shape (n_p,) (rad/s)
-    steps, free       : shape (n_p,), overwritten
-    """
+    """Write the step response (48), and Psi_free (56) plus the ``known`` errors of known jumps."""
     free_response(machine, history, v_previous, free)
     step_response(machine, history, v_previous, probe, free, steps)
     for j in range(free.size):
@@ -162,18 +145,14 @@ class LearningConstants(NamedTuple):
 
     recursive: bool
     """Whether by least squares (:func:`rls_step`), otherwise by the normalised gradient (44)."""
-    contrast_rate: float
-    """gamma of (43)."""
-    output_rate: float
-    """gamma of (44), normalised."""
+    contrast_rate: float  # gamma of (43)
+    output_rate: float  # gamma of (44), normalised
     rls_forgetting: float
     """lambda of :func:`rls_step` per predictive period; the next two are per period as well."""
     power_forgetting: float
     skill_forgetting: float
-    offset_gain: float
-    """Gain of the offset e on the last prediction error."""
-    noise: float
-    """Standard deviation of the noise of an error (rad/s)."""
+    offset_gain: float  # gain of the offset e on the last prediction error
+    noise: float  # standard deviation of the noise of an error (rad/s)
 
 
 @kernel
@@ -184,11 +163,7 @@ def update_mse(history: History, term: int, forgetting: float, noise: float) -> 
     is therefore power / (power + (2 noise)²); the error of persistence for independent noise is
     sqrt(2) noise. Forgetting is reduced by the same weight, so the skill is constant in quiet
     times. The power is a short-term mean: weighting each sample by its own size would select
-    samples.
-
-    term       : 0 for one step, 1 for the middle of the horizon
-    forgetting : forgetting factor per step at full weight
-    noise      : standard deviation of the noise of an error (rad/s)
+    samples. ``term`` is 0 for one step, 1 for the middle of the horizon.
     """
     missed = history.residuals[2 * term] * history.residuals[2 * term]
     persistence = history.residuals[2 * term + 1] * history.residuals[2 * term + 1]
@@ -224,10 +199,10 @@ def authority(
     """Return the fraction of the bound of v_p that the machine may use, in [0, 1].
 
     score : skill; the authority is 0 up to ``low`` and 1 from ``high`` on
-    gain  : step response of the machine in the middle of the horizon, over the nominal one; the
-            authority is 0 up to ``gain_low`` and 1 from ``gain_high`` on. A decaying error is
-            predictable without a model of v_p, so the skill alone does not detect a wrong sign or
-            a missing effect of v_p. Too large a response only reduces the moves.
+    gain  : step response of the machine in the middle of the horizon, over the nominal one. A
+            decaying error is predictable without a model of v_p, so the skill alone does not
+            detect a wrong sign or a missing effect of v_p. Too large a response only reduces the
+            moves.
     """
     return smooth_step(score, low, high) * smooth_step(gain, gain_low, gain_high)
 
@@ -245,10 +220,7 @@ def observe(
 ) -> None:
     """Add a measured error: update skill, weights and offset e.
 
-    error   : the newest tracking error (rad/s)
-    applied : v_p applied since the previous one (rad/s²)
-    score   : whether the skill is updated, which needs a complete history
-    learn   : whether the weights are updated
+    ``applied`` is the v_p since the previous error; the skill needs a complete history.
     """
     for i in range(history.errors.size - 1, 0, -1):
         history.errors[i] = history.errors[i - 1]
@@ -294,10 +266,7 @@ def evaluate_offline(
     moves: Array,
     learning: LearningConstants,
 ) -> None:
-    """Set the mean squared errors of ``history`` to those of a whole run, without learning.
-
-    errors, moves : *newest first*, longer than the history
-    """
+    """Set the mean squared errors of ``history`` to those of a run, without learning."""
     history.prediction_mse[:] = 0.0
     history.persistence_mse[:] = 0.0
     count = errors.size - 1 - history.errors.size
@@ -321,9 +290,7 @@ class WheelState(NamedTuple):
 class Predictor:
     """Machine of one output, with its learning state, its history and a trial run.
 
-    machine : initial weights; the arrays are changed in place
-    horizon : n_p
-    trial : (errors, moves) of a run that is not used for fitting, *newest first*
+    The trial, (errors, moves) newest first, is not used for fitting.
     """
 
     def __init__(

@@ -78,9 +78,8 @@ class ExcitationParameters(Parameters):
 def ridge_regression(features: Array, targets: Array, penalty: float) -> Array:
     """Return the X_o that minimises |targets - features X_o|² + p |X_o|².
 
-    features : mu_1 of each instant, shape (N, hidden)
-    targets : delta of each instant over its scale, shape (N,)
-    penalty : p as a fraction of the mean of the diagonal of featuresᵀ features
+    Features are the mu_1 of each instant, targets its delta over the scale; ``penalty`` is p as a
+    fraction of the mean of the diagonal of featuresᵀ features.
     """
     square = features.T @ features
     weight = penalty * np.trace(square) / square.shape[0] + np.finfo(np.float64).tiny
@@ -93,9 +92,9 @@ def contrastive_divergence_epoch(
 ) -> None:
     """Learn from every instant of a run by (43), oldest first, and write each mu_1.
 
-    errors, moves : newest first, length N; NaN where unknown
-    rate          : gamma of (43); 0 leaves X_v unchanged
-    features      : row i belongs to errors[i], shape (N - lags, hidden); NaN if a lag is unknown
+    Errors and moves are newest first, NaN where unknown; row i of the features belongs to
+    errors[i],
+    and is NaN if a lag is unknown.
     """
     n_errors, n_moves = machine.delta_lags, machine.lags.size - machine.delta_lags
     for i in range(features.shape[0] - 1, -1, -1):
@@ -126,10 +125,8 @@ def pretrain(
     """Fit the machine to a run: CD-1 epochs for X_v (43), then ridge regression for X_o.
 
     machine, rls : changed in place; the run becomes the prior of the RLS state
-    errors, moves : the run, *newest first*, in rad/s and rad/s²: simulated or recorded, NaN in
-        gaps
+    errors, moves : the run, *newest first*, simulated or recorded, NaN in gaps
     trust : weight of the prior, as a number of later instants
-    noise : standard deviation of the noise of the errors, rad/s
     """
     lags = max(machine.delta_lags, machine.lags.size - machine.delta_lags)
     count, hidden = max(errors.size - lags, 0), machine.output_weights.size
@@ -161,12 +158,9 @@ def pretrain(
 class SampleTiming(NamedTuple):
     """Control period, predictive period, and averaging of the errors."""
 
-    period: float
-    """Control period, s."""
-    decimation: int
-    """Control periods per predictive period."""
-    average: int
-    """Number of newest errors, 1 to ``decimation``, in the mean of one sample."""
+    period: float  # control period, s
+    decimation: int  # control periods per predictive period
+    average: int  # number of newest errors, 1 to ``decimation``, in the mean of one sample
 
     @property
     def span(self) -> float:
@@ -175,10 +169,7 @@ class SampleTiming(NamedTuple):
 
 
 def nominal_transition(loop: NominalLoopParameters, duration: float) -> Array:
-    """Return the exact map of (delta, a, v_p, w, noise) to (delta, a) after ``duration`` s.
-
-    Rows (delta, a), shape (2, 5).
-    """
+    """Return the exact map of (delta, a, v_p, w, noise) to (delta, a) after ``duration`` s."""
     gain, lag = loop.feedback_gain, loop.lag
     rates = np.zeros((5, 5))
     rates[0] = (-gain, 1.0, 0.0, 1.0, -gain)
@@ -213,12 +204,10 @@ def simulate_nominal_loop(
 ) -> None:
     """Write the measured errors of the nominal loop, one per predictive period.
 
-    step_matrix, late_matrix : shape (2, 5), transitions of (delta, a) over the first part of a
-        control period, in which the older v_p acts, and over the rest; inputs v_p, w, noise
-    whole_delay              : dead time in whole control periods
-    decimation, average      : control periods per sample, and measurements in its mean
-    moves                    : v_p of each predictive period
-    disturbance, noise       : of each control period
+    The matrices are the transitions of (delta, a) over the first part of a control period, in
+    which
+    the older v_p acts, and over the rest. Moves are per predictive, disturbance and noise per
+    control period; the dead time has ``whole_delay`` control periods.
     """
     delta, actuator = 0.0, 0.0
     errors[:] = 0.0
@@ -263,8 +252,6 @@ def simulate_excitation(
 
     v_p and the disturbance w are random levels of a given mean duration; v_p changes only with
     the predictive period. The feedback acts on the noisy error.
-
-    move_scale : scale of v_p (rad/s²), of which ``excitation.move`` is a fraction
     """
     count = max(round(excitation.duration / timing.span), 2)
     fine = count * timing.decimation

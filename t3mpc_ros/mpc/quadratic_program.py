@@ -34,48 +34,33 @@ from t3mpc_ros.kernels import kernel
 Indices = NDArray[np.int64]
 
 
-OPTIMAL = 0
-"""The solution satisfies the Karush-Kuhn-Tucker conditions."""
-NOT_POSITIVE = 1
-"""mu SᵀS + pi I is not positive definite, or a number is not finite; dv is zero."""
-INFEASIBLE = 2
-"""No dv satisfies the constraints (v_p(t-1) is outside its bound); dv is zero."""
-UNFINISHED = 3
-"""The maximum number of iterations was reached; dv is zero."""
+OPTIMAL = 0  # the solution satisfies the Karush-Kuhn-Tucker conditions
+NOT_POSITIVE = 1  # mu SᵀS + pi I is not positive definite, or a number is not finite; dv is zero
+INFEASIBLE = 2  # no dv satisfies the constraints (v_p(t-1) is outside its bound); dv is zero
+UNFINISHED = 3  # the maximum number of iterations was reached; dv is zero
 
-BOUND_TOLERANCE = 1e-10
-"""Tolerance of a bound, relative to the larger of the two bounds."""
+BOUND_TOLERANCE = 1e-10  # tolerance of a bound, relative to the larger of the two bounds
 
 
 class Workspace(NamedTuple):
     """Results and work space of the solver for n = n_c changes."""
 
-    hessian: Array
-    """mu SᵀS + pi I, shape (n, n)."""
-    gradient: Array
-    """mu SᵀPsi_free, shape (n,)."""
-    lower: Array
-    """Cholesky factor L of the Hessian, shape (n, n)."""
-    changes: Array
-    """Solution dv, shape (n,), rad/s²."""
+    hessian: Array  # mu SᵀS + pi I, shape (n, n)
+    gradient: Array  # mu SᵀPsi_free, shape (n,)
+    lower: Array  # Cholesky factor L of the Hessian, shape (n, n)
+    changes: Array  # solution dv, shape (n,), rad/s²
     multipliers: Array
     """Shape (2, 2n): multipliers of the lower and of the upper bounds of the rows, all >= 0."""
-    active: Indices
-    """Shape (n,): active rows, in the order in which they were added."""
-    sides: Array
-    """Shape (n,): 1 where an active row is at its upper bound, -1 at its lower."""
-    active_multipliers: Array
-    """Shape (n,): multipliers of the active rows."""
-    basis: Array
-    """Shape (n, n): orthonormal rows that span L⁻¹ times the active normals."""
+    active: Indices  # shape (n,): active rows, in the order in which they were added
+    sides: Array  # shape (n,): 1 where an active row is at its upper bound, -1 at its lower
+    active_multipliers: Array  # shape (n,): multipliers of the active rows
+    basis: Array  # shape (n, n): orthonormal rows that span L⁻¹ times the active normals
     triangle: Array
     """Shape (n, n): L⁻¹ times normal k is the sum over j <= k of triangle[j, k] basis[j]."""
-    normal: Array
-    """Shape (n,): work space, as the next two."""
+    normal: Array  # shape (n,): work space, as the next two
     projection: Array
     unconstrained: Array
-    components: Indices
-    """Shape (n + 1,): work space of :func:`is_dependent`."""
+    components: Indices  # shape (n + 1,): work space of :func:`is_dependent`
 
 
 def make_workspace(moves: int) -> Workspace:
@@ -123,8 +108,6 @@ def solve_quadratic_program(
     matrix, free              : S, shape (n_p, n_c); Psi_free, shape (n_p,)
     error_weight, move_weight : mu and pi (> 0)
     v_previous                : v_p(t-1), rad/s²; inside v_max, or the status is INFEASIBLE
-    dv_max, v_max             : rad/s², zero allowed
-    max_iterations            : maximum number of additions and removals of bounds
     """
     n = work.gradient.size
     normal_equations(matrix, free, error_weight, move_weight, work.hessian, work.gradient)
@@ -228,13 +211,7 @@ def normal_equations(
     hessian: Array,
     gradient: Array,
 ) -> None:
-    """Write mu SᵀS + pi I and mu SᵀPsi_free, the two terms of half the gradient (61).
-
-    matrix  : S, shape (n_p, n_c)
-    free    : Psi_free, shape (n_p,)
-    hessian : shape (n_c, n_c), overwritten
-    gradient : shape (n_c,), overwritten
-    """
+    """Write mu SᵀS + pi I and mu SᵀPsi_free, the two terms of half the gradient (61)."""
     n = gradient.size
     for i in range(n):
         for k in range(i + 1):

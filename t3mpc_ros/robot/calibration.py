@@ -36,8 +36,7 @@ from t3mpc_ros.parameters.table import Parameters, parameter
 
 Array = npt.NDArray[np.float64]
 
-COVERAGE = 1.96
-"""Half width of an interval of 95 %, in standard uncertainties."""
+COVERAGE = 1.96  # half width of an interval of 95 %, in standard uncertainties
 STEP_ANGLE = math.radians(0.05 * 1.8) / math.sqrt(3.0)
 """Standard uncertainty of the angle of a resting rotor, rad: at most 5 % of a full step, not
 cumulative (17HS4401 data sheet)."""
@@ -45,23 +44,17 @@ GYRO_NOISE = math.radians(0.005)
 """Noise density of the MPU6050, rad/s/√Hz: PS-MPU-6000A-00 r3.4, 6.1."""
 GYRO_DRIFT = math.radians(0.005)
 """Random walk of its bias, rad/s/√s: standard deviation after one second; assumed."""
-GYRO_FULL_SCALE = math.radians(500.0)
-"""rad/s"""
-MAX_GYRO_BIAS = 20.0
-"""deg/s, of the data sheet (PS-MPU-6000A 3.4, 6.1)"""
+GYRO_FULL_SCALE = math.radians(500.0)  # rad/s
+MAX_GYRO_BIAS = 20.0  # deg/s, of the data sheet (PS-MPU-6000A 3.4, 6.1)
 REFERENCE_VOLTAGE, CONVERTER_COUNTS = 5.0, 1024
 """Full scale (V) and counts of the converter of the board."""
-_SATURATION = 0.98
-"""Share of the full scale from which a gyro sample counts as saturated."""
+_SATURATION = 0.98  # share of the full scale from which a gyro sample counts as saturated
 _MIN_REST = 2.0
-_MAX_REST_SPREAD = 0.0035
-"""rad/s: a gyro at rest scatters by 6e-4."""
-_MAX_GAP = 0.1
-"""s, in a turn: at 50 samples a second, four in a row are lost."""
+_MAX_REST_SPREAD = 0.0035  # rad/s: a gyro at rest scatters by 6e-4
+_MAX_GAP = 0.1  # s, in a turn: at 50 samples a second, four in a row are lost
 _MIN_DISTANCE, _MIN_TURNS, _MIN_RANGES, _MIN_VOLTAGES = 0.5, 2.0, 4, 2
 _MIN_RANGE_RATIO, _MIN_VOLTAGE_SPAN = 2.0, 1.0
-PLAUSIBLE = 0.8, 1.2
-"""Least and largest plausible value, in multiples of the nominal one."""
+PLAUSIBLE = 0.8, 1.2  # least and largest plausible value, in multiples of the nominal one
 _MAX_DIFFERENCE, _MAX_UNCERTAINTY = 0.02, 0.01
 """Relative, of repeated runs and of their mean; marks of 1 mm, 2 m apart, leave 0.0005."""
 MAX_SHARP_COUNT, MIN_SHARP_COUNT = 983, 12
@@ -76,18 +69,15 @@ class Estimate(NamedTuple):
     """A calibrated value."""
 
     value: float
-    uncertainty: float
-    """Standard uncertainty, greater than 0."""
+    uncertainty: float  # standard uncertainty, greater than 0
 
 
 class DividerCorrection(NamedTuple):
     """Battery voltage = (1 + gain) · nominal voltage + offset."""
 
     gain: float
-    offset: float
-    """V"""
-    uncertainty: float
-    """Standard uncertainty of the corrected voltage, V."""
+    offset: float  # V
+    uncertainty: float  # standard uncertainty of the corrected voltage, V
 
     def voltage(self, nominal: float) -> float:
         """Return the battery voltage (V) of a nominal one (V)."""
@@ -97,14 +87,10 @@ class DividerCorrection(NamedTuple):
 class SharpCurve(NamedTuple):
     """Voltage of a distance sensor at the distance d: scale / (d + shift) + offset."""
 
-    scale: float
-    """V m"""
-    shift: float
-    """m"""
-    offset: float
-    """V"""
-    uncertainty: float
-    """Largest standard uncertainty of a distance within the calibrated ones, m."""
+    scale: float  # V m
+    shift: float  # m
+    offset: float  # V
+    uncertainty: float  # largest standard uncertainty of a distance within the calibrated ones, m
 
     def voltage(self, distance: float) -> float:
         """Return the voltage (V) at a distance (m)."""
@@ -114,12 +100,9 @@ class SharpCurve(NamedTuple):
 class Calibration(NamedTuple):
     """Calibration of a robot; None: not calibrated, the nominal value holds."""
 
-    wheel_radius: Estimate | None = None
-    """m"""
-    track: Estimate | None = None
-    """Distance between the wheels, m."""
-    gyro_scale: Estimate | None = None
-    """True rate / rate by the scale of the data sheet."""
+    wheel_radius: Estimate | None = None  # m
+    track: Estimate | None = None  # distance between the wheels, m
+    gyro_scale: Estimate | None = None  # true rate / rate by the scale of the data sheet
     gyro_bias: Estimate | None = None
     """Rate that the gyro reports at rest, by the scale of the data sheet, rad/s."""
     divider: DividerCorrection | None = None
@@ -130,14 +113,11 @@ class Calibration(NamedTuple):
 class MarkUncertainty(NamedTuple):
     """Standard uncertainties of what a person measures."""
 
-    distance: float = 1e-3
-    """Of each mark on the floor, m."""
+    distance: float = 1e-3  # of each mark on the floor, m
     angle: float = math.radians(1.0)
     """Of each reading of the robot's direction against a mark, rad."""
-    range: float = 2e-3
-    """Of the distance between a sensor and a board in front of it, m."""
-    voltage: float = 0.02
-    """Of each reading of the meter, V."""
+    range: float = 2e-3  # of the distance between a sensor and a board in front of it, m
+    voltage: float = 0.02  # of each reading of the meter, V
 
 
 MARKS = MarkUncertainty()
@@ -146,55 +126,42 @@ MARKS = MarkUncertainty()
 class StraightRun(NamedTuple):
     """A run between two marks."""
 
-    distance: float
-    """Between the marks by tape, m; positive also backward."""
-    right: float
-    """Angle of the right wheel from the step counter, rad."""
+    distance: float  # between the marks by tape, m; positive also backward
+    right: float  # angle of the right wheel from the step counter, rad
     left: float
 
 
 class Recording(NamedTuple):
     """Samples of a motion between two rests, each array of shape (n,)."""
 
-    times: Array
-    """s, increasing"""
-    right: Array
-    """Wheel angle, rad."""
+    times: Array  # s, increasing
+    right: Array  # wheel angle, rad
     left: Array
-    rates: Array
-    """Gyro, bias included, rad/s."""
-    begin: int
-    """Number of the first sample in motion; n without motion."""
-    end: int
-    """Number of the first sample of the rest after it."""
+    rates: Array  # gyro, bias included, rad/s
+    begin: int  # number of the first sample in motion; n without motion
+    end: int  # number of the first sample of the rest after it
 
 
 class GyroTurn(NamedTuple):
     """A turn as measured by the gyro."""
 
-    rotation: float
-    """Integral of rate minus bias, by the scale of the data sheet, rad."""
-    uncertainty: float
-    """From noise and drift, rad."""
-    right: float
-    """Wheel angles, rad."""
+    rotation: float  # integral of rate minus bias, by the scale of the data sheet, rad
+    uncertainty: float  # from noise and drift, rad
+    right: float  # wheel angles, rad
     left: float
 
 
 class VoltageReading(NamedTuple):
     """Battery voltage of the meter, and of the board without correction."""
 
-    meter: float
-    """V"""
-    nominal: float
-    """V, see :func:`nominal_battery_voltage`."""
+    meter: float  # V
+    nominal: float  # V, see :func:`nominal_battery_voltage`
 
 
 class RangeReading(NamedTuple):
     """Samples of a distance sensor in front of a board."""
 
-    distance: float
-    """m"""
+    distance: float  # m
     counts: tuple[int, ...]
 
 

@@ -25,8 +25,7 @@ from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
 
 ESTOP_DECELERATION = 60.0
 """Least deceleration of an emergency stop, rad/s²; that of the board is the same."""
-SLIP_RELEASE_TIME = 0.5
-"""s without a motion command after which the robot follows commands again."""
+SLIP_RELEASE_TIME = 0.5  # s without a motion command after which the robot follows commands again
 SLIP_STOP_REASON = (
     'gyro and steps disagree: a wheel slips, is blocked, or has lost steps; '
     f'stop commanding motion for {SLIP_RELEASE_TIME:g} s to resume'
@@ -100,9 +99,8 @@ class CommandLimiterParameters(Parameters):
     def check_stopping_time(self, silence: float, deceleration: float, names: str) -> None:
         """Raise ParameterError when the robot could take longer than allowed to stop.
 
-        silence : time from the last command to the beginning of the stop, s
-        deceleration : deceleration of the stop, rad/s²
-        names : what these depend on, for the error text
+        The stop begins after a ``silence`` (s); ``names`` are those of the parameters it depends
+        on.
         """
         time = silence + self.wheel_speed / deceleration
         if time > self.max_stopping_time + 1e-9:
@@ -129,13 +127,11 @@ class LimitedCommand(NamedTuple):
     """Output of the limiter for one period."""
 
     wheels: WheelSpeeds
-    target: WheelSpeeds
-    """End of the ramp."""
+    target: WheelSpeeds  # end of the ramp
     estop: bool
     timed_out: bool
     limited: bool
-    reason: str
-    """Why the target is zero, unless a zero command is the reason; otherwise empty."""
+    reason: str  # why the target is zero, unless a zero command is the reason; otherwise empty
 
 
 class _Ramp(NamedTuple):
@@ -143,11 +139,9 @@ class _Ramp(NamedTuple):
 
     start: WheelSpeeds
     target: WheelSpeeds
-    rate: float
-    """rad/s²"""
+    rate: float  # rad/s²
     since_ns: int
-    hold: float
-    """s, period for which the end of the ramp was returned"""
+    hold: float  # s, period for which the end of the ramp was returned
 
     def at(self, elapsed: float) -> WheelSpeeds:
         """Return the wheel speeds after ``elapsed`` seconds."""
@@ -173,11 +167,9 @@ class CommandLimiter:
         self.parameters = parameters
         self._geometry = geometry
         self._estop = ''
-        self.reason = NO_COMMAND
-        """Why the robot is stopped; empty while it follows a command."""
+        self.reason = NO_COMMAND  # why the robot is stopped; empty while it follows a command
         self._command: RobotCommand | None = None
-        self.timed_out = False
-        """Whether the last command expired."""
+        self.timed_out = False  # whether the last command expired
         self._ramp = _Ramp(ZERO_WHEEL_SPEEDS, ZERO_WHEEL_SPEEDS, 0.0, 0, 0.0)
         self._clock_ns: int | None = None
         ramp_towards(0.0, 0.0, 0.0, 0.0, 0.0)  # compile now, so that no stop waits for it
@@ -325,10 +317,8 @@ class SlipMonitor:
     """
 
     def __init__(self) -> None:
-        self.stopped = False
-        """Whether the robot must stand still."""
-        self._last_motion_command = 0.0
-        """Time of the last motion command during the stop, s."""
+        self.stopped = False  # whether the robot must stand still
+        self._last_motion_command = 0.0  # time of the last motion command during the stop, s
 
     def rejects(self, command: RobotCommand, now: float) -> bool:
         """Decide whether a command that arrives at ``now`` (s) is rejected."""
@@ -337,11 +327,9 @@ class SlipMonitor:
         return self.stopped
 
     def update(self, slipping_for: float, limit: float, now: float) -> bool:
-        """Decide whether the robot must stand still at ``now`` (s).
+        """Decide whether the robot must stand still at ``now``, s.
 
-        slipping_for : time for which gyro and steps have disagreed, s; 0 when they agree
-        limit : largest permitted ``slipping_for``, s; 0 disables the stop
-        now : s, of the clock of :meth:`rejects`
+        ``slipping_for`` (s) is 0 when gyro and steps agree; a limit of 0 disables the stop.
         """
         if limit > 0.0 and slipping_for > limit:
             if not self.stopped:
@@ -363,10 +351,9 @@ def _scale_within(limit: float, value: float) -> float:
 def ramp_towards(
     right: float, left: float, target_right: float, target_left: float, reach: float
 ) -> tuple[float, float]:
-    """Return the pair (rad/s) moved towards its target by at most ``reach`` in each wheel.
+    """Return the pair (rad/s) moved towards its target by at most ``reach``, unlimited below 0.
 
     One factor serves both wheels, so that slowing down to zero keeps the curvature of the path.
-    A negative ``reach`` means no limit.
     """
     gap_right, gap_left = target_right - right, target_left - left
     widest = max(abs(gap_right), abs(gap_left))

@@ -37,8 +37,7 @@ class FrameNames(NamedTuple):
 
     base: str = 'base_link'
     imu: str = 'imu_link'
-    range_prefix: str = ''
-    """The frame of a range sensor is this, then ``<sensor>_range_link``."""
+    range_prefix: str = ''  # the frame of a range sensor is this, then ``<sensor>_range_link``
     right_wheel_joint: str = 'right_wheel_joint'
     left_wheel_joint: str = 'left_wheel_joint'
 
@@ -51,29 +50,21 @@ class Masses(NamedTuple):
     """Masses (kg) and inertias (kg m²) of the body and of a wheel, as in (14)."""
 
     body: float
-    body_inertia: float
-    """About the vertical through the centre of mass."""
-    com_offset: float
-    """Centre of mass ahead of the axle, m."""
+    body_inertia: float  # about the vertical through the centre of mass
+    com_offset: float  # centre of mass ahead of the axle, m
     wheel: float
-    wheel_inertia: float
-    """About the axle."""
-    wheel_turn_inertia: float
-    """About a diameter."""
+    wheel_inertia: float  # about the axle
+    wheel_turn_inertia: float  # about a diameter
 
 
 class FixedFrame(NamedTuple):
     """A frame that does not move in the base frame."""
 
     name: str
-    x: float
-    """m, forward"""
-    y: float
-    """m, to the left"""
-    z: float
-    """m above the floor"""
-    yaw: float
-    """rad"""
+    x: float  # m, forward
+    y: float  # m, to the left
+    z: float  # m above the floor
+    yaw: float  # rad
 
 
 def sensor_mounts(parameters: RangeSensorParameters) -> Array:

@@ -52,8 +52,7 @@ STANDSTILL_RATE = 1e-4
 """rad/s, far below the gyro noise: the response of its filter to a turn has decayed."""
 LARGEST_CORRECTION = 0.02, 0.04
 """Largest correction of the pose by a measured bias, m and rad: the pose may jump by that."""
-MIN_SAMPLES = 20
-"""Smallest number of samples for a standard deviation."""
+MIN_SAMPLES = 20  # smallest number of samples for a standard deviation
 
 
 @dataclass(frozen=True)
@@ -128,30 +127,23 @@ class GyroMemory(Structure):
     """Memory of the filter besides pose and covariance; rates in rad/s, times in s."""
 
     bias: float
-    calibrated: bool
-    """Whether the bias has been measured at a standstill; the gyro is then in use."""
+    calibrated: bool  # whether the bias has been measured at a standstill; the gyro is then in use
     first_pole: float
-    second_pole: float
-    """State of the low-pass filter of the gyro."""
+    second_pole: float  # state of the low-pass filter of the gyro
     last_rate: float
-    last_dt: float
-    """0 before the first rate."""
-    disagreement: float
-    """Rate of the gyro beyond that of the steps, smoothed."""
+    last_dt: float  # 0 before the first rate
+    disagreement: float  # rate of the gyro beyond that of the steps, smoothed
     disagrees_for: float
     slipping: bool
     standstill_for: float
-    pushed_for: float
-    """Time for which a robot at a standstill still counts as pushed."""
+    pushed_for: float  # time for which a robot at a standstill still counts as pushed
     count: float
     """Samples in the average of a standstill; the next three are their duration and sums."""
     time: float
     total: float
     squares: float
-    suspect: float
-    """Measurement of the bias that needs confirmation."""
-    suspect_variance: float
-    """Its variance, (rad/s)²; 0 without one."""
+    suspect: float  # measurement of the bias that needs confirmation
+    suspect_variance: float  # its variance, (rad/s)²; 0 without one
 
 
 class GyroConstants(Structure):
@@ -320,7 +312,7 @@ class GyroOdometry:
 def delayed_rate(memory: GyroMemory, rate: float, dt: float, delay: float) -> float:
     """Return the output (rad/s) of a gyro with this ``delay`` (s) at the end of ``dt``.
 
-    ``rate`` is the mean over ``dt``. Within ``dt`` the rate changes linearly with the slope of
+    Within ``dt`` the rate, of which the mean is given, changes linearly with the slope of
     consecutive means; a constant rate would be wrong by half the change of a period. The two
     poles have half the delay each and are integrated exactly.
     """
@@ -341,11 +333,9 @@ def delayed_rate(memory: GyroMemory, rate: float, dt: float, delay: float) -> fl
 
 @kernel
 def detect_slip(memory: GyroMemory, excess: float, dt: float, limit: float, time: float) -> bool:
-    """Decide whether gyro and steps disagree now; after ``time`` set ``memory.slipping``.
+    """Decide whether gyro and steps disagree now; after ``time`` (s) set ``memory.slipping``.
 
-    excess : gyro minus steps, rad/s
-    limit : of the magnitude of the smoothed excess, rad/s; half of it ends a slip
-    time : duration of a disagreement that counts as slip, s
+    ``excess`` is gyro minus steps; half of the limit of its smoothed magnitude ends a slip.
     """
     smoothing = time / 3.0
     memory.disagreement += (excess - memory.disagreement) * dt / (smoothing + dt)
@@ -370,9 +360,9 @@ def propagate_covariance(
 ) -> None:
     """Propagate errors of yaw, bias and scale to the pose: ``matrix`` <- F ``matrix`` F'.
 
-    matrix : shape (5, 5), of (x, y, yaw, bias, scale); changed in place
-    across : d(x, y) by the yaw; fused : d(pose) by the turn measured by the gyro
-    dt : s, effect of the bias on that turn; turn : rad, effect of the scale
+    ``across`` is d(x, y) by the yaw, ``fused`` d(pose) by the turn measured by the gyro; ``dt``
+    and
+    ``turn`` are the effects of bias and scale on that turn.
     """
     for column in range(5):
         shift = dt * matrix[3, column] + turn * matrix[4, column]
@@ -408,11 +398,8 @@ def estimate_bias(
 
     A mean beyond 5 sigma is used only when a second one confirms it: a robot turned by hand does
     not turn so evenly. It is then a jump at an unknown time since the last standstill, which
-    ``drift``, scaled to its size, represents in the covariance.
-
-    covariance : shape (5, 5); drift, memory : see :func:`update_filter`
-    variance : of the mean, from the noise alone, above 0, (rad/s)²
-    spread : largest standard deviation of the samples; limit : largest bias, rad/s
+    ``drift``, scaled to its size, represents in the covariance. ``variance`` is that of the mean,
+    from the noise alone; ``spread`` the largest standard deviation of the samples.
     """
     count = memory.count
     innovation = memory.total / count
@@ -476,13 +463,9 @@ def update_filter(
 
     With the variances V of the two travels and N of the turn measured by the gyro, and
     h = 1 / 2b, the excess of the gyro over the steps changes the travels by ``K excess dt``,
-    ``K = V (h, -h) / (h² sum V + N)``.
-
-    pose : shape (3,), m, m, rad; covariance : shape (5, 5); both changed in place
-    drift : shape (5, 5), covariance that a random walk of the bias by 1 rad/s/√s would have
-        added since the last bias measurement
-    memories, settings : arrays of one
-    right, left : rad; gyro : rad/s, NaN without one; dt : s; jitter : rad², of each angle
+    ``K = V (h, -h) / (h² sum V + N)``. ``drift`` is the covariance that a random walk of the bias
+    by
+    1 rad/s/√s would have added since the last bias measurement; ``gyro`` is NaN without one.
     """
     memory, constants = memories[0], settings[0]
     radius, half, per_metre = (
@@ -568,10 +551,7 @@ def is_disturbed(
     still: bool,
     constants: GyroConstants,
 ) -> bool:
-    """Decide whether a wheel slips now, or somebody pushes a robot that is ``still``.
-
-    excess : gyro minus steps, rad/s; rate : of the gyro, without bias, rad/s
-    """
+    """Decide whether a wheel slips now, or somebody pushes a robot that is ``still``."""
     limit = constants.slip_threshold + 3.0 * constants.gyro_scale_tolerance * abs(rate)
     disagrees = detect_slip(
         memory, excess, min(dt, constants.gyro_hold), limit, constants.slip_time

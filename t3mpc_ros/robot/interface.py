@@ -37,82 +37,59 @@ class RobotCommand(NamedTuple):
 class WheelAngles(NamedTuple):
     """Angles turned by the wheels since the start of the robot, from the step counters."""
 
-    right: float
-    """rad"""
-    left: float
-    """rad"""
+    right: float  # rad
+    left: float  # rad
 
 
 class RobotStatus(NamedTuple):
     """Status flags of the robot."""
 
-    enabled: bool
-    """The drives may move."""
-    moving: bool
-    """A wheel turns."""
-    estop: bool
-    """The emergency stop is latched."""
-    timed_out: bool
-    """The last command has expired."""
-    limited: bool
-    """The command exceeds a limit and is scaled with its curvature kept."""
+    enabled: bool  # the drives may move
+    moving: bool  # a wheel turns
+    estop: bool  # the emergency stop is latched
+    timed_out: bool  # the last command has expired
+    limited: bool  # the command exceeds a limit and is scaled with its curvature kept
     slipping: bool = False
     """Gyro and steps disagree: a wheel slips, is blocked, or its motor has lost steps."""
-    imu_fault: bool = False
-    """The IMU does not respond."""
-    low_battery: bool = False
-    """The battery should be charged."""
+    imu_fault: bool = False  # the IMU does not respond
+    low_battery: bool = False  # the battery should be charged
 
 
 class ImuSample(NamedTuple):
     """Planar part of an IMU measurement, in the body frame."""
 
-    angular: float
-    """rad/s about the vertical, counter-clockwise, bias included"""
-    forward: float
-    """m/s²"""
-    sideways: float
-    """m/s², to the left"""
+    angular: float  # rad/s about the vertical, counter-clockwise, bias included
+    forward: float  # m/s²
+    sideways: float  # m/s², to the left
 
 
 class BatteryReading(NamedTuple):
     """Supply of motors and board."""
 
-    voltage: float
-    """V"""
-    current: float
-    """A, drawn; NaN if not measured"""
-    charge: float
-    """Remaining charge, 0 to 1; NaN if unknown"""
+    voltage: float  # V
+    current: float  # A, drawn; NaN if not measured
+    charge: float  # remaining charge, 0 to 1; NaN if unknown
 
 
 class RobotState(NamedTuple):
     """Measured and estimated state of the robot at one instant."""
 
     stamp_ns: int
-    wheels: WheelSpeeds
-    """Measured, noise included."""
+    wheels: WheelSpeeds  # measured, noise included
     angles: WheelAngles
-    odometry: State
-    """Pose of the odometry, twist from the measured wheel speeds."""
-    covariance: npt.NDArray[np.float64]
-    """Of the odometry pose (x, y, yaw), shape (3, 3)."""
+    odometry: State  # pose of the odometry, twist from the measured wheel speeds
+    covariance: npt.NDArray[np.float64]  # of the odometry pose (x, y, yaw), shape (3, 3)
     commanded: WheelSpeeds
     """Wheel speeds sent to the motors, after every limit; estimators use this."""
     status: RobotStatus
-    reason: str
-    """Why the robot does not follow the command; empty when it does."""
-    true_wheels: WheelSpeeds | None = None
-    """Known only in simulation."""
-    truth: State | None = None
-    """Known only in simulation."""
-    imu: ImuSample | None = None
-    """None without an IMU, or when it does not respond."""
+    reason: str  # why the robot does not follow the command; empty when it does
+    true_wheels: WheelSpeeds | None = None  # known only in simulation
+    truth: State | None = None  # known only in simulation
+    imu: ImuSample | None = None  # none without an IMU, or when it does not respond
     ranges: tuple[float, ...] = ()
     """m, one for each sensor in :data:`RANGE_SENSORS`: -inf nearer than the measuring range, inf
     beyond it, NaN not measured; empty without range sensors."""
-    battery: BatteryReading | None = None
-    """None if not measured."""
+    battery: BatteryReading | None = None  # none if not measured
     lost_steps: tuple[int, int] | None = None
     """Full steps the rotors are behind their fields, right first: known only in simulation."""
 

@@ -27,8 +27,7 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 # -- IMU ------------------------------------------------------------------------------------------
 
-GRAVITY = 9.80665
-"""m/s² per g of the data sheet."""
+GRAVITY = 9.80665  # m/s² per g of the data sheet
 IMU_DATA_SHEET = 'PS-MPU-6000A-00 r3.4'
 _LSB_PER_DEGREE = {'250': 131.0, '500': 65.5, '1000': 32.8, '2000': 16.4}
 _LSB_PER_G = {'2': 16384.0, '4': 8192.0, '8': 4096.0, '16': 2048.0}
@@ -110,18 +109,15 @@ class ImuParameters(Parameters):
 
 # -- range sensors --------------------------------------------------------------------------------
 
-CODE_STEP = 0.005
-"""m per step of the range code in a radio frame."""
-NOT_MEASURED, TOO_NEAR, BEYOND, FAULT = 0, 1, 254, 255
-"""Range codes that are not a distance."""
+CODE_STEP = 0.005  # m per step of the range code in a radio frame
+NOT_MEASURED, TOO_NEAR, BEYOND, FAULT = 0, 1, 254, 255  # range codes that are not a distance
 
 
 @dataclass(frozen=True)
 class RangeSensorParameters(Parameters):
     """Type, measuring range, beam and mounting of the range sensors."""
 
-    type: ClassVar[str] = 'GP2Y0A21YK0F'
-    """The sensors whose voltages the board converts."""
+    type: ClassVar[str] = 'GP2Y0A21YK0F'  # the sensors whose voltages the board converts
     minimum: ClassVar[float] = 0.10
     """Smallest distance, m (Sharp E4-A00201EN); the board reports anything nearer as too near."""
     maximum: ClassVar[float] = 0.80

@@ -47,10 +47,8 @@ def integrate_arc(
 ) -> tuple[float, float, float, float, float, float, float]:
     """Move ``pose`` along the exact arc of (1)-(3); return the derivatives of its end.
 
-    pose : shape (3,), x, y (m), yaw (rad, kept in (-pi, pi]); changed in place
-    run_right, run_left : travel of the wheels, m; half : b (E1: half the separation), m
-    returns : d(x, y) by the yaw at the start (m); d(x, y) by the right travel, by the left
-        travel; d yaw by the right travel (1/m), the negative of that by the left one
+    These are d(x, y) by the yaw at the start (m); d(x, y) by the right travel, by the left travel;
+    d yaw by the right travel (1/m), the negative of that by the left one. ``half`` is b (E1), m.
     """
     run = 0.5 * (run_right + run_left)
     half_turn = 0.25 * (run_right - run_left) / half
@@ -82,10 +80,7 @@ def integrate_arc(
 
 @kernel
 def add_noise(covariance: Array, variance: float, x: float, y: float, yaw: float) -> None:
-    """Add the noise of a scalar with ``variance`` that moves the pose by these factors.
-
-    covariance : shape (n, n), n at least 3, pose first; changed in place
-    """
+    """Add the noise of a scalar with ``variance`` that moves the pose by these factors."""
     effect = (x, y, yaw)
     for row in range(3):
         for column in range(3):
@@ -108,11 +103,6 @@ def dead_reckon(
     The travels of the wheels are independent, each with variance
     ``per_metre |travel| + radius² jitter``; the covariance becomes F C F' + G V G' with the exact
     derivatives F by the pose and G by the travels.
-
-    pose : shape (3,), x, y (m), yaw (rad, kept in (-pi, pi]); changed in place
-    covariance : shape (3, 3); changed in place
-    right, left : angles turned since the last update, rad; jitter : variance of each, rad²
-    radius, half : R and b (E1: half the separation), m
     """
     run_right, run_left = radius * right, radius * left
     across_x, across_y, right_x, right_y, left_x, left_y, bend = integrate_arc(
