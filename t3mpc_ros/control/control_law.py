@@ -275,7 +275,7 @@ def law_terms(
     correct term is :math:`\dot r_i`. With it, (68)-(69) follow from (64)-(65), and by (70)-(71)
     the error system (72)-(73) of each wheel,
     :math:`\dot\delta = \tilde\alpha^T\Phi - K\delta + \omega + v_c + v_p`.
-    ``gain`` is K (1/s); ``bound`` and ``smoothing`` as of :func:`compensator`.
+    ``gain`` is K (1/s); ``bound`` and ``smoothing`` are those of the compensator, (81)-(82).
     """
     for i in range(speeds.size):
         error = speeds[i] - reference[i]
