@@ -216,7 +216,7 @@ class FuzzyEstimator:
     def warm_up(self) -> None:
         """Compile the kernels now instead of in the first step, without changing the state."""
         phi, coefficients = self._phi.copy(), self._coefficients.copy()
-        self.evaluate(np.zeros(self.sets.inputs))
+        self.evaluate(np.zeros(len(self.sets.centres)))
         adapt(self._coefficients, self._phi, np.zeros(coefficients.shape[0]), 0.0, self.gains)
         self._phi[:], self._coefficients[:] = phi, coefficients
 
@@ -227,10 +227,9 @@ class FuzzyEstimator:
         nothing.
         """
         values = np.ascontiguousarray(inputs, dtype=np.float64)
-        sets = self.sets
-        outputs = np.empty(self._coefficients.shape[0])
-        if values.shape != (sets.inputs,) or not estimate(values, self.tables, outputs):
-            raise ValueError(f'inputs must be {sets.inputs} finite numbers: got {inputs}')
+        count, outputs = len(self.sets.centres), np.empty(len(self._coefficients))
+        if values.shape != (count,) or not estimate(values, self.tables, outputs):
+            raise ValueError(f'inputs must be {count} finite numbers: got {inputs}')
         return outputs
 
     def adapt(self, errors: Array, dt: float) -> None:

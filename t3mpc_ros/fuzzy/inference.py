@@ -21,7 +21,7 @@ Arrays over sets have shape (n, M, lambda, 2, 2): input, set, slice, level, boun
 rules (r, lambda, 2, 2). On the last two axes 0 is lower and 1 is upper.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import math
 from typing import NamedTuple, Self
 
@@ -111,53 +111,31 @@ class FuzzyParameters(Parameters):
         return self.spread * np.gradient(self.centres)
 
 
-@dataclass(frozen=True, eq=False)
-class FuzzySets:
-    """Tables of the inference, validated and read-only.
+class FuzzySets(NamedTuple):
+    """Tables of n inputs with M sets each and lambda slices; the rules are all combinations."""
 
-    n inputs, M sets per input, lambda slices. The rules are all M**n combinations; the set of the
-    last input changes fastest.
-    """
-
-    centres: Array  # centres o, shape (n, M), rad/s
-    widths: Array
-    """Widths beta, shape (n, M, lambda, 2, 2), rad/s; the last two axes are the level
-    (lower, upper) and the bound (lower, upper width)."""
+    centres: Array  # o, shape (n, M), rad/s
+    widths: Array  # beta, shape (n, M, lambda, 2, 2), rad/s
     levels: Array
-    """Slice levels, shape (lambda, 2): lower and upper level of each slice, in (0, 1]. The paper
-    has the lower one strictly below; when they are equal, the slice is one level."""
+    """Lower and upper level of each slice, in (0, 1], shape (lambda, 2). The paper has the lower
+    one strictly below; when they are equal, the slice is one level."""
     input_fuzziness: float  # beta_U, rad/s
-    nonsingleton_gain: Array = field(init=False)
-    """beta_U² / (beta² + beta_U²), the weight of the centre in (16)-(19); shape as widths."""
-    sharpness: Array = field(init=False)  # 1/beta, s/rad, shape as widths
-    shares: Array = field(init=False)
-    """Levels over their sum, shape (lambda, 2). E8: the sum runs over lower *and* upper levels,
-    so that the shares add up to one and the output lies in the hull of the coefficients."""
-
-    def __post_init__(self) -> None:
-        centres, widths, levels = (
-            np.array(table, dtype=np.float64, order='C')
-            for table in (self.centres, self.widths, self.levels)
-        )
-        fuzziness = float(self.input_fuzziness)
-        _check_tables(centres, widths, levels, fuzziness)
-        tables = {
-            'centres': centres,
-            'widths': widths,
-            'levels': levels,
-            'nonsingleton_gain': fuzziness**2 / (widths**2 + fuzziness**2),
-            'sharpness': 1.0 / widths,
-            'shares': levels / levels.sum(),
-        }
-        for name, table in tables.items():
-            table.setflags(write=False)
-            object.__setattr__(self, name, table)
-        object.__setattr__(self, 'input_fuzziness', fuzziness)
 
     @property
-    def inputs(self) -> int:
-        """Number of inputs, n."""
-        return int(self.centres.shape[0])
+    def nonsingleton_gain(self) -> Array:
+        """beta_U² / (beta² + beta_U²), the weight of the centre in (16)-(19); shape as widths."""
+        gain: Array = self.input_fuzziness**2 / (self.widths**2 + self.input_fuzziness**2)
+        return gain
+
+    @property
+    def shares(self) -> Array:
+        """Levels over their sum, shape (lambda, 2).
+
+        E8: the sum runs over lower *and* upper levels, so that the shares add up to one and the
+        output lies in the hull of the coefficients.
+        """
+        shares: Array = self.levels / self.levels.sum()
+        return shares
 
     @property
     def rules(self) -> int:
@@ -167,45 +145,12 @@ class FuzzySets:
     @property
     def slices(self) -> int:
         """Number of slices, lambda."""
-        return int(self.levels.shape[0])
+        return len(self.levels)
 
     @property
     def size(self) -> int:
         """Number of coefficients per output, 2 r lambda (32)."""
         return 2 * self.rules * self.slices
-
-
-def _check_tables(centres: Array, widths: Array, levels: Array, fuzziness: float) -> None:
-    if centres.ndim != 2 or centres.size == 0:
-        raise ValueError(f'centres must have shape (inputs, sets): got {centres.shape}')
-    if levels.ndim != 2 or levels.shape[0] == 0 or levels.shape[1] != 2:
-        raise ValueError(f'levels must have shape (slices, 2): got {levels.shape}')
-    shape = (*centres.shape, levels.shape[0], 2, 2)
-    if widths.shape != shape:
-        raise ValueError(f'widths must have shape {shape}: got {widths.shape}')
-    if not np.isfinite(centres).all():
-        raise ValueError(f'centres must be finite: got {centres.tolist()}')
-    if not (np.isfinite(widths).all() and (widths > 0.0).all()):
-        raise ValueError(f'widths must be positive and finite: got {widths.min():g} at least')
-    excess = (widths[..., LOWER] - widths[..., UPPER]).max()
-    if excess > 0.0:
-        raise ValueError(f'widths must not be larger below than above: got {excess:g} rad/s more')
-    low, high = levels[:, LOWER], levels[:, UPPER]
-    if not ((low > 0.0) & (low <= high) & (high <= 1.0)).all():
-        raise ValueError(f'levels must be 0 < lower <= upper <= 1: got {levels.tolist()}')
-    if not (np.isfinite(fuzziness) and fuzziness >= 0.0):
-        raise ValueError(f'input_fuzziness must be at least 0 rad/s: got {fuzziness}')
-    inputs, sets = centres.shape
-    _check_size(inputs, sets, levels.shape[0])
-
-
-def _check_size(inputs: int, sets: int, slices: int) -> None:
-    size = 2 * sets**inputs * slices
-    if size > MAX_COEFFICIENTS:
-        raise ValueError(
-            f'inputs must give at most {MAX_COEFFICIENTS} coefficients: got {inputs} inputs '
-            f'of {sets} sets with {slices} slices, {size} in total'
-        )
 
 
 def slice_levels(slices: int) -> Array:
@@ -239,7 +184,12 @@ def build_sets(parameters: FuzzyParameters, inputs: int = 2) -> FuzzySets:
         levels = slice_levels(parameters.slices)
     else:
         levels = np.ones((1, 2))  # one slice at level one: all secondary grades are one
-    _check_size(inputs, parameters.sets, len(levels))
+    size = 2 * parameters.sets**inputs * len(levels)
+    if size > MAX_COEFFICIENTS:
+        raise ValueError(
+            f'inputs must give at most {MAX_COEFFICIENTS} coefficients: got {inputs} inputs '
+            f'of {parameters.sets} sets with {len(levels)} slices, {size} in total'
+        )
     each = np.stack([type3_widths(width, levels) for width in parameters.widths.tolist()])
     if parameters.kind == 'interval_type2':
         each = each * np.array(
@@ -247,7 +197,7 @@ def build_sets(parameters: FuzzyParameters, inputs: int = 2) -> FuzzySets:
         )
     return FuzzySets(
         centres=np.tile(parameters.centres, (inputs, 1)),
-        widths=np.broadcast_to(each, (inputs, *each.shape)),
+        widths=np.tile(each, (inputs, 1, 1, 1, 1)),
         levels=levels,
         input_fuzziness=parameters.input_fuzziness,
     )
@@ -269,11 +219,10 @@ class FuzzyTables(NamedTuple):
     def of(cls, sets: FuzzySets, outputs: int) -> Self:
         """Return the tables of fuzzy sets with zero coefficients."""
         return cls(
-            # Copies: an array that cannot be written to is another type for compiled functions.
-            sets.centres.copy(),
-            sets.nonsingleton_gain.copy(),
-            sets.sharpness.copy(),
-            sets.shares.copy(),
+            sets.centres,
+            sets.nonsingleton_gain,
+            1.0 / sets.widths,
+            sets.shares,
             np.zeros(sets.widths.shape),
             np.zeros((sets.rules, sets.slices, 2, 2)),
             np.zeros(sets.size),
@@ -445,8 +394,9 @@ def compute_basis(inputs: Array, sets: FuzzySets) -> Array:
     For experiments and figures: it allocates memory, which a control step must not.
     """
     values = np.ascontiguousarray(inputs, dtype=np.float64)
-    if values.shape != (sets.inputs,) or not np.isfinite(values).all():
-        raise ValueError(f'inputs must be {sets.inputs} finite numbers: got {inputs}')
+    count = len(sets.centres)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise ValueError(f'inputs must be {count} finite numbers: got {inputs}')
     tables = FuzzyTables.of(sets, 1)
     evaluate_basis(values, tables)
     return tables.phi

@@ -67,7 +67,7 @@ def _drive(limits=WIDE, kind='velocity', **changes):
     return VelocityActuation(parameters, limits, GEOMETRY, kind, T)
 
 
-@pytest.mark.parametrize('dead_time', [0.0, 0.004, 0.01, 0.017, 0.03])
+@pytest.mark.parametrize('dead_time', [0.0, 0.017, 0.03])
 def test_e19_wheels_accelerate_by_u_after_the_dead_time(dead_time):
     """Chi is predicted for the instant of effect, and increases by T u within a period."""
     drive, servo = _drive(dead_time=dead_time), Servo(dead_time=dead_time)
@@ -201,7 +201,7 @@ def test_an_unknown_drive_or_period_is_rejected():
 
 def test_a_scaled_command_keeps_its_curvature_and_the_limits():
     rng = np.random.default_rng(3)
-    for _ in range(2000):
+    for _ in range(500):
         target = BodyTwist(*rng.normal(scale=(2.0, 20.0)))
         wheels = wheels_from_twist(target, GEOMETRY)
         scale = limit_scale(*wheels, wheel_limits(LIMITS, GEOMETRY)[0])
@@ -219,7 +219,7 @@ def test_a_scaled_command_keeps_its_curvature_and_the_limits():
 def test_the_command_change_respects_the_acceleration_limits():
     rng = np.random.default_rng(4)
     limits, out = wheel_limits(LIMITS, GEOMETRY), np.zeros(2)
-    for _ in range(2000):
+    for _ in range(500):
         previous, target = rng.normal(scale=6.0, size=(2, 2))
         limited = limit_command(*target, previous, limits, 0.01, out)
         assert limited == (not np.allclose(out, target, rtol=0.0, atol=1e-8))
@@ -227,9 +227,5 @@ def test_the_command_change_respects_the_acceleration_limits():
         assert abs(change.linear) <= LIMITS.linear_acceleration * 0.01 * (1 + 1e-9)
         assert abs(change.angular) <= LIMITS.angular_acceleration * 0.01 * (1 + 1e-9)
         assert np.max(np.abs(out - previous)) <= LIMITS.wheel_acceleration * 0.01 * (1 + 1e-9)
-
-
-def test_a_huge_target_gives_a_finite_command():
-    limits, out = wheel_limits(LIMITS, GEOMETRY), np.zeros(2)
     assert limit_command(1e300, -1e300, np.zeros(2), limits, 0.01, out)
     assert np.isfinite(out).all()

@@ -136,14 +136,6 @@ def test_the_law_and_g_error_70_71_make_the_error_system_72_73():
         )
 
 
-def test_v_is_the_sum_74_and_zero_only_if_both_parts_are():
-    delta, alpha_error = np.array([3.0, -4.0]), np.array([[1.0, 2.0], [0.0, -2.0]])
-    assert lyapunov_value(delta, alpha_error, 0.5) == pytest.approx(12.5 + 9.0)
-    assert lyapunov_value(delta, 0.0 * alpha_error, 0.5) == pytest.approx(12.5)
-    assert lyapunov_value(0.0 * delta, alpha_error, 0.5) == pytest.approx(9.0)
-    assert lyapunov_value(0.0 * delta, 0.0 * alpha_error, 0.5) == 0.0
-
-
 def _slope_of_v(delta, delta_rate, alpha_error, alpha_rate, gamma):
     """Return V' of (74) by central differences, which are exact for a quadratic."""
     step = 1e-4
@@ -220,11 +212,11 @@ def test_e17_the_integral_of_84_holds_with_the_initial_v_only(seed):
     The printed (84) bounds V, which is not negative, by a negative integral.
     """
     rng = np.random.default_rng(seed)
-    gamma, gain, bound, smoothing, dt = 600.0, 6.0, 3.5, 0.4, 1e-4
+    gamma, gain, bound, smoothing, dt = 600.0, 6.0, 3.5, 0.4, 2e-4
     learner, plant = _matched_pair(rng, gamma)
     chi, terms, u = rng.uniform(-3.0, 3.0, 2), np.zeros((5, 2)), np.zeros(2)
     values, squares = [], []
-    for k in range(20_000):
+    for k in range(7_500):
         t = k * dt
         r = np.array([3.0 * math.sin(2.0 * t), 2.0 * math.cos(3.0 * t)])
         rate = np.array([6.0 * math.cos(2.0 * t), -6.0 * math.sin(3.0 * t)])
@@ -247,7 +239,7 @@ def test_e17_the_integral_of_84_holds_with_the_initial_v_only(seed):
 
 
 def test_compensator_81_82_opposes_the_error_within_its_bound():
-    for error in np.linspace(-20.0, 20.0, 4001):
+    for error in np.linspace(-20.0, 20.0, 401):
         value = compensator(float(error), 3.0, 0.5)
         assert abs(value) <= 3.0
         assert value * error <= 0.0

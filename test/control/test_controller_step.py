@@ -76,7 +76,7 @@ def test_the_command_never_exceeds_the_limits():
         before = wheels if status.reason is Reason.TRACKING else None
 
 
-@pytest.mark.parametrize('late', [0, 5 * MS, 200 * MS])
+@pytest.mark.parametrize('late', [0, 200 * MS])
 def test_a_repeated_message_does_not_move_a_disabled_robot(late):
     """The command of the last step was returned, with the reason of moving."""
     loop = Loop()
@@ -189,15 +189,6 @@ def test_a_gap_in_the_odometry_restarts_the_law_without_a_jump():
     status = loop.step()
     assert status.reason is Reason.TRACKING
     assert loop.twist.linear == pytest.approx(before.linear, abs=0.02)
-
-
-def test_the_same_message_twice_changes_nothing():
-    loop = Loop()
-    loop.run(100)
-    motion = State(loop.now, ORIGIN, loop.twist)
-    first = loop.controller.step(motion)
-    again = loop.controller.step(motion)
-    assert again == first
 
 
 def test_wheel_parts_are_off_in_the_composition_of_the_body():
@@ -406,7 +397,8 @@ def test_the_certificate_holds_along_a_noise_free_run():
     assert law.certificate == Nt3fsMpcController(QUIET).certificate
 
 
-def test_the_weights_survive_saving_and_loading(tmp_path):
+def test_the_weights_survive_saving_and_loading(tmp_path, monkeypatch):
+    from t3mpc_ros.bag import model_file
     from t3mpc_ros.bag.model_file import ModelError, load_model, save_model
 
     def reference(t):
@@ -430,17 +422,9 @@ def test_the_weights_survive_saving_and_loading(tmp_path):
     smaller = Nt3fsMpcController(replace(QUIET, fuzzy=replace(QUIET.fuzzy, sets=2)))
     with pytest.raises(ValueError, match='coefficients must have shape'):
         smaller.set_weights(load_model(path))
-
-
-def test_a_model_of_another_format_is_rejected(tmp_path, monkeypatch):
-    from t3mpc_ros.bag import model_file
-
-    path = tmp_path / 'old.npz'
-    monkeypatch.setattr(model_file, 'FORMAT', 0)
-    model_file.save_model(path, {'x': np.zeros(1)}, {})
-    monkeypatch.undo()
-    with pytest.raises(model_file.ModelError, match='format 0, this is format 1'):
-        model_file.load_model(path)
+    monkeypatch.setattr(model_file, 'FORMAT', 2)
+    with pytest.raises(ModelError, match='format 1, this is format 2'):
+        load_model(path)
 
 
 COMPILES = """
@@ -506,8 +490,8 @@ def test_feedback_without_margin_is_refused_with_its_bound(changes, words):
 
 
 @pytest.mark.parametrize('composition', ['body', 'paper'])
-@pytest.mark.parametrize('lag', [0.001, 0.003, 0.02, 0.1, 1.0])
-@pytest.mark.parametrize('rate', [5.0, 20.0, 50.0, 100.0, 120.0, 200.0, 1000.0])
+@pytest.mark.parametrize('lag', [0.001, 0.02, 1.0])
+@pytest.mark.parametrize('rate', [5.0, 100.0, 120.0, 1000.0])
 def test_the_gain_that_fits_is_accepted_at_every_rate_and_lag(rate, lag, composition):
     """Above 104 Hz the controller of the default robot refused its own gain."""
     changes = {'rate': rate, 'speed_filter.lag': lag, 'composition': composition}
@@ -520,7 +504,7 @@ def test_the_gain_that_fits_is_accepted_at_every_rate_and_lag(rate, lag, composi
     assert again.resolved().law == fitted.law
 
 
-@pytest.mark.parametrize('straight, turning', [(1000.0, 1.0), (1000.0, 999.0), (0.0, 1.0)])
+@pytest.mark.parametrize('straight, turning', [(1000.0, 1.0), (0.0, 1.0)])
 def test_a_found_frequency_takes_no_other_beyond_its_bound(straight, turning, monkeypatch):
     """The straight frequency is scaled alike, and 10 000 Hz was an exception of a moving robot."""
     monkeypatch.setattr(BodyCorrection, 'turning_frequency', 10.0)
@@ -542,7 +526,7 @@ def test_an_odometry_faster_than_the_rate_is_thinned_out():
     fast = ServoLoop(lambda t: (0.12 + 0.1 * math.sin(2.0 * t), math.sin(1.7 * t)), rate=50.0)
     commands = []
     for one in (loop, fast):
-        one.run(20)
+        one.run(8)
         commands.append([(one.step().stamp_ns, one.twist) for _ in range(100)])
     stamps = {stamp for stamp, _ in commands[1]}
     assert len(stamps) == pytest.approx(50, abs=1)

@@ -121,14 +121,14 @@ def at(seconds: float) -> int:
 @pytest.mark.parametrize('dead_time', few_of([0.0375, 0.12, 0.01, 0.03, 0.06], 2))
 def test_the_dead_time_is_found_within_its_deviation(dead_time):
     errors = []
-    for seed in range(6):
-        drive = simulate(smooth_commands(60.0, seed), dead_time, seed)
+    for seed in range(4):
+        drive = simulate(smooth_commands(45.0, seed), dead_time, seed)
         estimator, record = run(drive)
         assert estimator.standard_deviation <= IDENTIFIED_DEVIATION
         assert abs(record[at(2.0), 0] - dead_time) < 0.008
-        assert np.abs(record[at(40.0) :, 0] - dead_time).max() < 0.0025
+        assert np.abs(record[at(30.0) :, 0] - dead_time).max() < 0.0025
         assert not record[:, 2].any()
-        for seconds in (5.0, 20.0, 59.0):
+        for seconds in (5.0, 20.0, 44.0):
             row = record[at(seconds)]
             errors.append((row[0] - dead_time) / row[1])
     assert np.sqrt(np.mean(np.square(errors))) < 1.7
@@ -139,7 +139,7 @@ def test_the_dead_time_is_found_within_its_deviation(dead_time):
 
 @pytest.mark.compiled
 def test_dead_time_and_lag_are_identified_as_a_sum():
-    command = smooth_commands(60.0, 3)
+    command = smooth_commands(30.0, 3)
     drive = simulate(command, 0.03, 3, lag=0.02)
     sums = [run(drive, lag=lag)[0].dead_time + lag for lag in (0.015, 0.02, 0.03)]
     np.testing.assert_allclose(sums, 0.05, atol=0.002)
@@ -175,9 +175,8 @@ def test_a_response_before_its_lag_has_passed_shows_early(configured):
 
 def test_a_drive_without_dead_time_is_identified():
     """The costs bend down at the end of the grid, so the deviation stayed that of the prior."""
-    for seed in range(3):
-        _, record = run(simulate(smooth_commands(10.0, seed), 0.0, seed))
-        assert record[at(5.0) :, 3].max() == 0.0
+    _, record = run(simulate(smooth_commands(10.0, 1), 0.0, 1))
+    assert record[at(5.0) :, 3].max() == 0.0
 
 
 def test_the_estimate_is_invariant_to_the_scale_of_the_speeds():
@@ -191,7 +190,7 @@ def test_the_estimate_is_invariant_to_the_scale_of_the_speeds():
 @pytest.mark.compiled
 @pytest.mark.parametrize('speed', [0.0, 3.0])
 def test_constant_commands_identify_nothing(speed):
-    command = np.full((at(60.0), 2), speed)
+    command = np.full((at(20.0), 2), speed)
     drive = simulate(command, 0.05, 7)
     estimator = DeadTimeEstimator(SpeedFilterParameters(lag=LAG), PERIOD)
     estimator.reset(command[0])
@@ -205,7 +204,7 @@ def test_constant_commands_identify_nothing(speed):
 @pytest.mark.compiled
 @pytest.mark.parametrize('duration', [1.0, 4.0])
 def test_late_commands_leave_no_trace(duration):
-    for seed in range(4):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         count = at(30.0 + duration + 20.0)
         dead_time = np.full(count, 0.01)
@@ -231,27 +230,13 @@ def test_a_change_is_adopted_within_8_s(change, sign):
     count = at(60.0)
     first, second = (0.01, 0.01 + change)[::sign]
     dead_time = np.where(np.arange(count) < at(30.0), first, second)
-    for seed in range(4):
+    for seed in range(2):
         drive = simulate(smooth_commands(60.0, 60 + seed), dead_time, seed)
         _, record = run(drive, configured=first)
         assert np.abs(record[at(20.0) : at(30.0), 0] - first).max() < 0.004
         assert np.abs(record[at(38.0) :, 0] - second).max() < 0.006
         assert abs(record[-1, 0] - second) < 0.002
         assert not record[at(39.0) :, 2].any()
-
-
-@pytest.mark.compiled
-def test_ten_seconds_of_late_commands_leave_within_8_s():
-    """The newest command counts, so commands at random times are a dead time of 60 ms."""
-    for seed in range(4):
-        count = at(60.0)
-        dead_time = np.full(count, 0.01)
-        late = slice(at(30.0), at(40.0))
-        dead_time[late] += np.random.default_rng(seed).uniform(0.02, 0.12, size=at(10.0))
-        _, record = run(simulate(smooth_commands(60.0, 40 + seed), dead_time, seed))
-        assert record[:, 0].max() < 0.07
-        assert np.abs(record[at(48.0) :, 0] - 0.01).max() < 0.006
-        assert abs(record[-1, 0] - 0.01) < 0.002
 
 
 def test_gaps_in_the_odometry_are_no_disturbance():
@@ -304,7 +289,7 @@ def test_speeds_at_the_stamp_need_the_other_model():
 @pytest.mark.compiled
 @pytest.mark.slow
 def test_the_stepper_twin_with_an_unknown_dead_time():
-    duration = 20.0
+    duration = 12.0
     scenario = Scenario('twin', 'unknown dead time 60 ms', 7, duration)
     record = run_loop(scenario, NodeMethod('full', {}))
     drive = Drive(record['sent'], record['measured'])
@@ -357,7 +342,7 @@ def run_servo(
 @pytest.mark.parametrize('dead_time', few_of([0.03, 0.06]))
 @pytest.mark.slow
 def test_dead_time_of_a_servo_is_found_with_friction(dead_time, friction):
-    for seed in range(3):
+    for seed in range(2):
         record = run_servo(servo(dead_time, seed, friction=friction))
         assert np.abs(record[at(10.0) :] - dead_time).max() < 0.006
         assert np.abs(record[at(25.0) :] - dead_time).max() < 0.004
@@ -369,7 +354,7 @@ def test_dead_time_of_a_servo_is_found_with_friction(dead_time, friction):
 @pytest.mark.slow
 def test_friction_is_not_taken_for_dead_time(friction, noise_variance):
     """With offsets alone, friction of 12 rad/s² was a delay of some 30 ms for many seconds."""
-    for seed in range(4):
+    for seed in range(2):
         drive = servo(0.01, seed, friction=friction, noise_variance=noise_variance)
         record = run_servo(drive, noise_variance=noise_variance)
         np.testing.assert_array_equal(record[:, 1], 0.01)
@@ -379,23 +364,12 @@ def test_friction_is_not_taken_for_dead_time(friction, noise_variance):
 @pytest.mark.slow
 def test_the_friction_model_halves_the_error_by_friction():
     errors = {True: [], False: []}
-    for seed in range(4):
+    for seed in range(2):
         drive = servo(0.01, seed, friction=4.0)
         for model in errors:
             record = run_servo(drive, friction=model)
             errors[model].append(np.abs(record[at(20.0) :, 0] - 0.01).mean())
     assert np.mean(errors[True]) < 0.5 * np.mean(errors[False])
-
-
-@pytest.mark.parametrize('mass', [0.7, 1.3])
-@pytest.mark.slow
-def test_another_mass_moves_the_estimate_by_its_lag(mass):
-    """Dead time and lag are one sum: 30 % of the lag are 6 ms."""
-    for seed in range(3):
-        record = run_servo(servo(0.01, seed, lag=mass * SERVO_LAG))
-        expected = 0.01 + (mass - 1.0) * SERVO_LAG
-        assert np.abs(record[at(20.0) :, 0] - expected).max() < 0.004
-        assert np.abs(record[:, 1] - 0.01).max() < 0.01
 
 
 def test_small_differences_keep_the_configured_dead_time():
@@ -409,8 +383,3 @@ def test_small_differences_keep_the_configured_dead_time():
         estimator.estimate.dead_time = 0.03 + difference
         estimator.estimate.deviation = deviation
         assert estimator.dead_time_in_use == pytest.approx(used, abs=1e-12)
-
-
-def test_a_period_that_is_not_positive_is_rejected():
-    with pytest.raises(ValueError, match='period'):
-        DeadTimeEstimator(SpeedFilterParameters(), 0.0)

@@ -79,17 +79,9 @@ def test_permitted_twist_is_the_nearest_one(seed):
     assert np.hypot(*(found - wanted)) <= best + 1e-9
 
 
-def test_nothing_near_changes_nothing():
-    keep_out = _seen()
-    wanted = BodyTwist(0.31, -1.7)
-    assert keep_out.step(wanted, ORIGIN, PERIOD) == pytest.approx(wanted)
-    assert not keep_out.changed
-    assert keep_out.activity is Activity.FREE
-
-
 @pytest.mark.compiled
-@pytest.mark.parametrize('direction', np.linspace(-1.4, 1.4, 5).tolist())
-@pytest.mark.parametrize('turn', [-1.0, 0.0, 1.0])
+@pytest.mark.parametrize('direction', [-1.4, 0.0, 0.7])
+@pytest.mark.parametrize('turn', [0.0, 1.0])
 @pytest.mark.parametrize('speed', [0.35, -0.35])
 def test_robot_never_enters_the_distance(direction, turn, speed):
     """Towards a wall at any angle, ahead or astern: the centre keeps its distance.
@@ -99,15 +91,22 @@ def test_robot_never_enters_the_distance(direction, turn, speed):
     """
     keep_out = _seen(Obstacles(segments=WALL))
     pose = Pose(0.4, 0.0, direction if speed > 0.0 else direction + math.pi)
-    for _ in range(800):
+    for _ in range(500):
         wanted = BodyTwist(speed, turn)
         pose = advance_pose(pose, keep_out.step(wanted, pose, PERIOD), PERIOD)
         assert 1.0 - pose.x > PARAMETERS.distance - 0.02
 
 
 def test_approach_slows_down_within_the_deceleration():
-    """The barrier lets the distance shrink so slowly that less than 1 m/s² is needed."""
+    """The barrier lets the distance shrink so slowly that less than 1 m/s² is needed.
+
+    Where nothing is near nothing is changed.
+    """
     keep_out = _seen(Obstacles(segments=WALL))
+    wanted = BodyTwist(0.31, -1.7)
+    assert keep_out.step(wanted, ORIGIN, PERIOD) == pytest.approx(wanted)
+    assert not keep_out.changed
+    assert keep_out.activity is Activity.FREE
     pose, speeds = Pose(0.0, 0.0, 0.0), []
     for _ in range(600):
         twist = keep_out.step(BodyTwist(0.35, 0.0), pose, PERIOD)
@@ -122,7 +121,7 @@ def test_robot_looks_before_it_enters_unseen_floor():
     """The robot stops before floor that no ray has crossed, and turns to look."""
     keep_out = KeepOut(PARAMETERS, LIMITS)
     pose, looked = ORIGIN, False
-    for _ in range(3000):
+    for _ in range(2000):
         twist = keep_out.step(BodyTwist(0.3, 0.0), pose, PERIOD)
         looked |= keep_out.activity is Activity.LOOKING and pose.x > 0.01
         pose = advance_pose(pose, twist, PERIOD)
@@ -204,7 +203,7 @@ def test_floor_that_was_seen_long_ago_is_looked_at_again():
     assert keep_out.step(wanted, ORIGIN, PERIOD) == pytest.approx(wanted)
 
 
-@pytest.mark.parametrize('yaw', [0.0, 0.7, 2.5, -1.6])
+@pytest.mark.parametrize('yaw', [0.0, 2.5])
 def test_what_was_touched_is_marked_ahead_and_no_ray_clears_it(yaw):
     keep_out = KeepOut(PARAMETERS, LIMITS)
     pose = Pose(0.3, -0.2, yaw)
@@ -270,7 +269,7 @@ class Touching:
 @pytest.mark.compiled
 def test_a_held_robot_backs_off_and_does_not_touch_again():
     """It pressed against a box below its beams for five minutes."""
-    robot = Touching(0.35, side=0.8).run(30.0)
+    robot = Touching(0.35, side=0.8).run(20.0)
     rows = np.array([k for k, _, _ in robot.touches])
     ends = [0, *(np.flatnonzero(np.diff(rows) > 100) + 1).tolist(), len(rows)]
     spans = [robot.touches[begin:end] for begin, end in pairwise(ends)]
@@ -384,14 +383,14 @@ def test_a_thing_that_stays_has_come_only_once():
 def test_what_was_there_or_is_far_has_not_come(kind):
     """Noise of a wall, and a reading of things that are hardly seen, hide no floor."""
     wall = np.array([[0.55, -1.0, 0.55, 1.0]])
-    floor = Floor(Obstacles(segments=wall) if kind == 'world' else None)
+    floor, far = Floor(Obstacles(segments=wall) if kind == 'world' else None), kind == 'far'
     if kind == 'seen for long':
         grid = floor.map.grid
         column = math.floor((0.55 - grid.low) / grid.size)
         grid.cells[:, column], grid.seen[:, column] = OCCUPIED, 0.0
     for k in range(40):
-        floor.hit((0.66 if kind == 'far' else 0.45) + 0.03 * math.sin(k), 0.04)
-    assert floor.is_free(0.5 if kind != 'far' else 0.7, 0.2)
+        floor.hit((0.66 if far else 0.45) + 0.03 * math.sin(k), 0.04)
+    assert floor.is_free(0.7 if far else 0.5, 0.2)
 
 
 def test_a_ray_over_an_old_edge_does_not_make_it_new():

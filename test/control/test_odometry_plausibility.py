@@ -116,11 +116,11 @@ ROBOTS = [
 """Robots that fit, however slow, noisy or coarse."""
 
 
-@pytest.mark.parametrize('robot', few_of(ROBOTS, step=3), ids=str)
+@pytest.mark.parametrize('robot', few_of(ROBOTS, step=4), ids=str)
 @pytest.mark.parametrize('seed', few_of([1, 2]))
 def test_a_robot_that_fits_gives_no_warning(robot, seed):
     drive = Drive(seed=seed, **robot)
-    for _ in range(12):
+    for _ in range(6):
         assert drive.run(10.0) == []
     for axis, true in enumerate(robot.get('gains', (1.0, 1.0))):
         gain = drive.monitor.gain(axis)
@@ -142,9 +142,7 @@ EACH_ONCE = [
 OTHERS = [(r, *g) for r in NOMINAL for g in GEOMETRIES if (r, *g) not in EACH_ONCE]
 
 
-@pytest.mark.parametrize(
-    ('robot', 'gains', 'values'), few_of([*EACH_ONCE, *OTHERS], len(GEOMETRIES))
-)
+@pytest.mark.parametrize(('robot', 'gains', 'values'), few_of([*EACH_ONCE, *OTHERS], 3))
 def test_a_geometry_wrong_by_5_percent_is_named_within_a_minute(robot, gains, values):
     """20 % were silent."""
     (warning,) = Drive(**robot, gains=gains).run(60.0)
@@ -168,8 +166,11 @@ def test_a_geometry_wrong_by_5_percent_is_named_within_a_minute(robot, gains, va
     ],
 )
 def test_what_does_not_fit_is_named(robot, words):
-    (warning,) = Drive(**robot).run(30.0)
+    drive = Drive(**robot)
+    (warning,) = drive.run(30.0)
     assert warning.startswith(words)
+    if robot.get('offset') == 1.0:  # simulated time may run ahead of the messages
+        assert drive.warnings(simulated=True) == []
 
 
 def test_a_robot_at_its_limit_is_no_wrong_geometry():
@@ -182,7 +183,7 @@ def test_a_stopped_robot_gets_no_advice_about_its_geometry():
     """During an emergency stop the velocity was "0.61 times the command: check geometry"."""
     drive = Drive()
     drive.run(20.0)
-    for _ in range(60):
+    for _ in range(20):
         assert drive.run(0.5, stopped=True) == []
     drive.run(5.0, stopped=False)
     assert drive.monitor.gain(0).value == pytest.approx(1.0, abs=0.01), 'nothing was learnt'
@@ -208,12 +209,13 @@ def test_gaps_are_counted_with_the_longest_and_the_last():
     assert 'had 1 gaps in the last 10 s, the longest 0.52 s, the last 2.0 s ago: 5 %' in (
         warning.replace('%', ' %').replace('  ', ' ')
     )
-    assert drive.run(11.0) == []
-    assert gaps.number == 1
+    drive.run(0.021, silent=True)
+    assert drive.run(11.0, silent=False) == []  # a single message is counted only
+    assert gaps.number == 2
     assert drive.monitor.jumps == 0
 
 
-@pytest.mark.parametrize('silence', [9.0, 3600.0, 86400.0])
+@pytest.mark.parametrize('silence', [9.0, 3600.0])
 def test_no_more_than_all_messages_of_a_time_are_missing(silence):
     """After a clock had been set by an hour, 35995 % were missing."""
     gaps = Gaps(100.0)
@@ -224,14 +226,6 @@ def test_no_more_than_all_messages_of_a_time_are_missing(silence):
     share = float(re.search(r'([\d.]+)%', gaps.warning(0.1)).group(1))
     assert share == pytest.approx(10.0 * min(silence, 6.0), abs=1.0)
     assert ('a clock was set' in gaps.warning(0.1)) == (silence > 10.0)
-
-
-def test_a_single_lost_message_is_counted_only():
-    drive = Drive()
-    drive.run(5.0)
-    drive.run(0.011, silent=True)
-    assert drive.run(1.0, silent=False) == []
-    assert drive.monitor.gaps.number == 1
 
 
 def test_jumps_late_messages_and_restarts_are_counted():
@@ -264,7 +258,7 @@ def test_a_pose_that_jumps_again_and_again_is_named():
     assert drive.monitor.jumps == 4
 
 
-@pytest.mark.parametrize('period', [0.01, 0.1, 0.2])
+@pytest.mark.parametrize('period', [0.01, 0.2])
 def test_without_a_twist_a_turn_on_the_spot_is_no_jump(period):
     """A robot of 5 Hz gave up its path as it turned: its pose had "jumped by 0.00 m"."""
 
@@ -278,26 +272,13 @@ def test_without_a_twist_a_turn_on_the_spot_is_no_jump(period):
     assert jumps(Pose(0.4, 0.0, 0.0), seconds=30.0)  # a driver that was started again
 
 
-def test_simulated_time_may_run_ahead_of_the_messages():
-    drive = Drive(offset=1.0)
-    drive.run(10.0)
-    assert drive.warnings(simulated=True) == []
-
-
-def test_without_excitation_the_gain_is_unknown():
-    made = InputMonitor(100.0)
-    for step in range(6000):
-        state = State(step * 10_000_000, Pose(0.0, 0.0, 0.0), BodyTwist(0.0, 0.0))
-        made.update(state, state.stamp_ns, None if step % 2 else BodyTwist(0.0, 0.0))
-    assert made.gain(0) is made.gain(1) is None
-
-
 def test_a_robot_that_only_stands_and_noise_say_nothing():
     """With commands of zero the prior remains, and no warning."""
     made, random = InputMonitor(100.0), np.random.default_rng(3)
-    for step in range(6000):
+    for step in range(3000):
         twist = BodyTwist(*(0.01 * random.standard_normal(2)).tolist())
         state = State(step * 10_000_000, Pose(0.0, 0.0, 0.0), twist)
         made.update(state, state.stamp_ns, BodyTwist(0.0, 0.0))
         if step % 100 == 0:
             assert made.warnings(simulated_time=False, tolerated_gap=0.1, geometry=GEOMETRY) == []
+    assert made.gain(0) is made.gain(1) is None

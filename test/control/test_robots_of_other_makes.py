@@ -34,7 +34,7 @@ pytestmark = pytest.mark.compiled
 
 CONFIG = Path(__file__).resolve().parents[2] / 'config'
 LEAD = 0.4
-DURATION = 60.0
+DURATION = 40.0
 
 
 def values_of(file, node):

@@ -173,25 +173,12 @@ def response_monitor(**changes):
     return ResponseMonitor(table(**values), 0.01)
 
 
-def unresponsive_monitor(command=(3.0, 3.0), measured=(0.0, 0.0)):
-    monitor = response_monitor()
-    respond(monitor, 60, command, measured)
-    assert not monitor.responsive
-    return monitor
-
-
-def respond(monitor, steps, command, measured):
-    for _ in range(steps):
-        monitor.add_command(*command)
-        monitor.update(*measured)
-
-
-@pytest.mark.parametrize('delay', [0, 1, 5, 12])
+@pytest.mark.parametrize('delay', [0, 12])
 def test_a_delayed_and_noisy_robot_is_responsive(delay):
     """A delay of 0.12 s and noise of variance 0.1 are within the window and the bound."""
     generator = np.random.default_rng(delay)
     monitor = response_monitor()
-    time = 0.01 * np.arange(4000)
+    time = 0.01 * np.arange(1000)
     command = 4.0 * np.sin(np.outer(2.0 * np.pi * time, (0.4, 0.27)))
     for k in range(len(time)):
         monitor.add_command(*command[k])
@@ -199,34 +186,9 @@ def test_a_delayed_and_noisy_robot_is_responsive(delay):
         assert monitor.update(*measured)
 
 
-def test_a_standing_robot_is_unresponsive_after_the_timeout():
-    monitor = response_monitor()
-    steps = 0
-    while monitor.responsive:
-        respond(monitor, 1, (3.0, -3.0), (0.0, 0.0))
-        steps += 1
-    assert steps * 0.01 == pytest.approx(0.15 + 0.1, abs=0.03)
-
-
-def test_one_unresponsive_wheel_is_enough():
-    unresponsive_monitor(measured=(3.0, 0.0))
-
-
-def test_standing_at_a_zero_command_is_weak_evidence():
-    """Zero crossings of the reference must not end the pause of the adaptation."""
-    monitor, steps = unresponsive_monitor(), 0
-    while not monitor.responsive:
-        respond(monitor, 1, (0.2, 0.1), (0.0, 0.0))
-        steps += 1
-    assert steps >= EVIDENCE_WEIGHT * 10  # 2 s; other samples need 0.1 s
-    again = unresponsive_monitor()
-    respond(again, 11, (3.0, 3.0), (2.9, 3.1))
-    assert again.responsive
-
-
 def test_a_bound_of_zero_disables_the_check():
     monitor = response_monitor(response_bound=0.0)
-    for _ in range(500):
+    for _ in range(50):
         monitor.add_command(9.0, 9.0)
         assert monitor.update(-9.0, 0.0)
 
@@ -354,31 +316,25 @@ def test_a_message_that_is_not_finite_keeps_the_twist_missing():
     assert found[7:20] + found[21:] == pytest.approx([0.2] * 22)
 
 
-@pytest.mark.parametrize('place', [Pose(0.02, 0.0, 0.0), Pose(0.5, 0.2, 0.0), Pose(0.0, 0.0, 2.9)])
-def test_a_pose_that_is_set_at_rest_is_no_twist_that_is_missing(place):
+START, ASIDE, FAR = Pose(0.0, 0.0, 0.0), Pose(0.02, 0.0, 0.0), Pose(0.5, 0.2, 0.0)
+
+
+@pytest.mark.parametrize(
+    ('poses', 'restart'),
+    [
+        ([place] * 5 + [START] * 5, None)  # it was set at rest
+        for place in (ASIDE, FAR, Pose(0.0, 0.0, 2.9))
+    ]
+    + [([FAR] * 5 + [START] * 5, 5)]  # or in a gap
+    + [([START] * 5 + [Pose(0.0105, 0.0, 0.0)] + [Pose(0.001, 0.0, 0.0)] * 5, None)],  # far off
+)
+def test_a_pose_that_is_set_is_no_twist_that_is_missing(poses, restart):
     """After ``reset_odometry`` 'odom has no twist' was said, and 'state is diverging'."""
     twist = OdometryTwist()
-    poses = [place] * 5 + [Pose(0.0, 0.0, 0.0)] * 5
     for k, pose in enumerate(poses):
         state = State(k * 10 * MS, pose, STANDSTILL)
-        assert twist.measured(state, restart=k == 0) == state
+        assert twist.measured(state, restart=k in (0, restart)) == state
     assert not twist.problem()
-
-
-def test_one_pose_that_is_far_off_is_no_missing_twist():
-    twist = OdometryTwist()
-    for k, x in enumerate([0.0] * 5 + [0.0105] + [0.001] * 5):
-        twist.measured(State(k * 10 * MS, Pose(x, 0.0, 0.0), STANDSTILL), restart=k == 0)
-    assert not twist.missing
-
-
-def test_a_pose_that_is_set_in_a_gap_is_no_missing_twist():
-    twist = OdometryTwist()
-    for k in range(10):
-        twist.measured(
-            State(k * 20 * MS, Pose(0.5 * (k < 5), 0.0, 0.0), STANDSTILL), restart=k == 5
-        )
-    assert not twist.missing
 
 
 # -- a twist that does not fit to the pose --------------------------------------------------------
@@ -415,8 +371,8 @@ DRIVES = {
 }
 
 
-@pytest.mark.parametrize('factor', [0.5, 0.94, 1.06, 1.1, 2.0])
-@pytest.mark.parametrize('drive', ['winding', 'straight', 'to and fro'])
+@pytest.mark.parametrize('factor', [0.5, 0.94, 1.06])
+@pytest.mark.parametrize('drive', ['winding', 'to and fro'])
 def test_a_twist_of_another_scale_is_divided_by_it(drive, factor):
     """A twist 10 % too large made the settled error 1.5 times that of a simple method."""
     twist, used = twists_of(DRIVES[drive], factors=(factor, factor), noise=0.005)
@@ -427,11 +383,33 @@ def test_a_twist_of_another_scale_is_divided_by_it(drive, factor):
 
 
 @pytest.mark.parametrize('drive', list(DRIVES))
-@pytest.mark.parametrize('seed', range(5))
+@pytest.mark.parametrize('seed', range(2))
 def test_a_twist_that_fits_is_used_as_it_is(drive, seed):
     twist, _ = twists_of(DRIVES[drive], noise=0.02, seed=seed, seconds=30.0)
     assert not twist.replaced
     assert twist.problem() == ''
+
+
+def _corrected(k, pose):
+    ahead = 0.02 * math.sin(0.5 * math.tau * k / 100.0)
+    there = ahead * math.cos(pose.yaw), ahead * math.sin(pose.yaw)
+    return Pose(pose.x + there[0], pose.y + there[1], pose.yaw)
+
+
+MOVED = {
+    'by up to a fifth of the way, forward and back': _corrected,
+    'by a jump': lambda k, pose: pose._replace(x=pose.x + (k >= 600)),
+    # In the frame of its pose the robot then goes aside: 1.058, and six times the error.
+    'by its yaw': lambda k, pose: pose._replace(yaw=pose.yaw - 0.5 * (k >= 600)),
+    'by half a turn': lambda k, pose: pose._replace(yaw=pose.yaw + 1.5 * (k >= 600)),
+}
+
+
+@pytest.mark.parametrize('moved', MOVED)
+@pytest.mark.parametrize('drive', ['winding', 'straight'])
+def test_a_pose_that_a_localisation_moves_is_no_factor(drive, moved):
+    twist, _ = twists_of(DRIVES[drive], noise=0.005, moved=MOVED[moved], seconds=30.0)
+    assert not twist.replaced
 
 
 def test_a_factor_of_the_yaw_rate_alone_is_left():
@@ -441,26 +419,7 @@ def test_a_factor_of_the_yaw_rate_alone_is_left():
         assert not twist.replaced
 
 
-def test_corrections_of_the_pose_are_no_factor():
-    """A localisation moves the pose by up to a fifth of the way, now forward and now back."""
-
-    def corrected(k, pose):
-        ahead = 0.02 * math.sin(0.5 * math.tau * k / 100.0)
-        there = ahead * math.cos(pose.yaw), ahead * math.sin(pose.yaw)
-        return Pose(pose.x + there[0], pose.y + there[1], pose.yaw)
-
-    twist, _ = twists_of(winding, moved=corrected, seconds=60.0)
-    assert not twist.replaced
-
-
-def test_a_jump_of_the_pose_is_no_factor():
-    twist, _ = twists_of(
-        winding, moved=lambda k, pose: Pose(pose.x + (k >= 600), pose.y, pose.yaw)
-    )
-    assert not twist.replaced
-
-
-@pytest.mark.parametrize('step', [-0.09, 0.05, 0.09])
+@pytest.mark.parametrize('step', [-0.09, 0.09])
 @pytest.mark.parametrize('speed', [0.01, 0.03])
 def test_a_slow_robot_whose_pose_is_set_has_no_factor(speed, step):
     """Its speed was taken for up to thirteen times what it was, in the state *tracking*."""
@@ -472,31 +431,24 @@ def test_a_slow_robot_whose_pose_is_set_has_no_factor(speed, step):
     assert (used[:, 0] == speed).all()
 
 
-@pytest.mark.parametrize('drive', list(DRIVES))
-@pytest.mark.parametrize('angle', [-0.5, 0.3, 1.5])
-def test_a_yaw_that_was_set_is_no_factor(drive, angle):
-    """In the frame of its pose the robot then goes aside: 1.058, and six times the error."""
-
-    def turned(k, pose):
-        return Pose(pose.x, pose.y, pose.yaw + angle * (k >= 600))
-
-    twist, _ = twists_of(DRIVES[drive], noise=0.005, moved=turned, seconds=60.0)
-    assert not twist.replaced
-
-
-@pytest.mark.parametrize('factors', [(1000.0, 1.0), (1.0, 57.3), (1000.0, 57.3), (100.0, 100.0)])
-@pytest.mark.parametrize('drive', ['winding', 'to and fro'])
+@pytest.mark.parametrize(
+    ('drive', 'factors'),
+    [
+        ('winding', (1000.0, 1.0)),
+        ('winding', (1.0, 57.3)),
+        ('to and fro', (1000.0, 57.3)),
+        ('to and fro', (100.0, 100.0)),
+    ],
+)
 def test_a_twist_in_other_units_is_replaced_by_the_pose(drive, factors):
     """The robot jerked: *diverging* and *tracking* took turns, and nothing told why."""
-    if drive == 'to and fro' and factors[0] == 1.0:
-        return  # it does not turn
     twist, used = twists_of(DRIVES[drive], factors=factors, noise=0.005)
     assert 'cannot be in m/s and rad/s' in twist.problem()
     true = np.array([DRIVES[drive](0.01 * k) for k in range(len(used))])
     assert np.abs(used[300:] - true[300:]).max() < 0.03
 
 
-@pytest.mark.parametrize('rate', [1, 4, 20])
+@pytest.mark.parametrize('rate', [4, 20])
 def test_a_fast_robot_with_a_slow_camera_has_its_own_twist(rate):
     """The pose is that of the last picture; in the next one it has moved far."""
     held = []
@@ -511,86 +463,58 @@ def test_a_fast_robot_with_a_slow_camera_has_its_own_twist(rate):
     assert np.abs(used[:, 0] - 2.0).max() < 0.3
 
 
+def straight(count, factor, restart=(), missing=lambda k: False):
+    """Return twist monitor and used speeds at 0.2 m/s, with ``factor(k)`` times the twist."""
+    twist, found = OdometryTwist(), []
+    for k in range(count):
+        if not missing(k):
+            state = State(k * 10 * MS, Pose(0.002 * k, 0.0, 0.0), BodyTwist(0.2 * factor(k), 0.0))
+            found.append(twist.measured(state, restart=k == 0 or k in restart).twist.linear)
+    return twist, found
+
+
 def test_a_twist_in_other_units_is_not_used_after_a_gap():
     """The first message after each gap had its twist of 200 m/s: the robot stopped for 0.5 s."""
-    parts, x, found = OdometryTwist(), 0.0, []
-    for k in range(100):
-        x += 0.002
-        state = State(k * 10 * MS, Pose(x, 0.0, 0.0), BodyTwist(200.0, 0.0))
-        found.append(parts.measured(state, restart=k in (0, 50)).twist.linear)
+    _, found = straight(100, lambda k: 1000.0, restart=(50,))
     assert found[50] == 0.0
     assert found[51:] == pytest.approx([0.2] * 49)
 
 
-def test_units_that_are_corrected_are_believed_again():
-    parts, x, found = OdometryTwist(), 0.0, []
-    for k in range(2000):
-        x += 0.002 if k else 0.0
-        factor = 1000.0 if k < 500 else 1.0
-        state = State(k * 10 * MS, Pose(x, 0.0, 0.0), BodyTwist(0.2 * factor, 0.0))
-        found.append(parts.measured(state, restart=k == 0).twist.linear)
-    assert found[12:] == pytest.approx([0.2] * len(found[12:]))
-    assert not parts.replaced
-
-
 def test_a_twist_that_is_repaired_is_used_again():
-    parts = OdometryTwist()
-    x, found = 0.0, []
-    for k in range(12000):
-        x += 0.002 if k else 0.0
-        factor = 1.2 if k < 2000 else 1.0
-        state = State(k * 10 * MS, Pose(x, 0.0, 0.0), BodyTwist(0.2 * factor, 0.0))
-        found.append(parts.measured(state, restart=k == 0).twist.linear)
-    assert found[1000] == pytest.approx(0.2)
-    assert found[-1] == pytest.approx(0.2)
-    assert not parts.replaced
+    twist, found = straight(2000, lambda k: 1000.0 if k < 500 else 1.0)
+    assert found[12:] == pytest.approx([0.2] * len(found[12:]))
+    assert not twist.replaced
+    twist, found = straight(9000, lambda k: 1.2 if k < 1500 else 1.0)
+    assert [found[1000], found[-1]] == pytest.approx([0.2, 0.2])
+    assert not twist.replaced
 
 
 def test_messages_that_are_missing_are_not_compared():
     """Across a gap twist and pose say nothing of each other."""
-    twist, x = OdometryTwist(), 0.0
-    for k in range(2000):
-        x += 0.002
-        if k % 20 >= 2:
-            continue
-        wrong = k % 20 == 0  # the first message after each gap
-        state = State(k * 10 * MS, Pose(x, 0.0, 0.0), BodyTwist(0.2, 0.0))
-        twist.measured(state, restart=wrong)
+    twist, _ = straight(2000, lambda k: 1.0, range(0, 2000, 20), lambda k: k % 20 >= 2)
     assert not twist.replaced
 
 
-@pytest.mark.parametrize('bend', [0.8, 1.2, 1.6])
-@pytest.mark.parametrize('seed', range(3))
-def test_noise_of_a_pose_in_curves_is_no_contact(bend, seed):
-    """Sums with gaps do not cancel the noise of a pose, which contact was taken from."""
-    generator, monitor = np.random.default_rng(seed), ContactMonitor()
-    pose, now, touches = Pose(0.0, 0.0, 0.0), STANDSTILL, 0
-    for k in range(20_000):
-        restless = float(generator.normal(0.0, 0.15))  # it follows that noise
-        command = BodyTwist(0.12, bend * (1.0 + 0.3 * math.sin(0.02 * k)) + restless)
-        now = BodyTwist(
-            *(n + 0.1 * (c - n) for n, c in zip(now, command, strict=True))
-        )  # behind by 0.1 s
-        pose = advance_pose(pose, now, 0.01)
-        x, y, yaw = np.array(pose) + generator.standard_normal(3) * (0.003, 0.003, 0.005)
-        odometry = State(k * 10 * MS, Pose(float(x), float(y), float(yaw)), now)
-        touches += monitor.is_in_contact(odometry, command, 0.01)
-    assert touches == 0
+@pytest.mark.parametrize('kind', ['curves', 'creeping'])
+@pytest.mark.parametrize('seed', range(2))
+def test_noise_of_a_pose_is_no_contact(kind, seed):
+    """Sums with gaps do not cancel the noise of a pose, which contact was taken from.
 
-
-@pytest.mark.parametrize('seed', range(4))
-def test_noise_of_a_pose_of_a_creeping_robot_is_no_contact(seed):
-    """It stops every half a second, as along a path that is planned anew; it backed off once."""
+    In curves it follows that noise; it creeps as along a path that is planned anew, and stops
+    every half a second: it backed off once.
+    """
     generator, monitor = np.random.default_rng(seed), ContactMonitor()
-    pose, now, touches = Pose(0.0, 0.0, 0.0), STANDSTILL, 0
+    pose, now, lag = START, STANDSTILL, 0.1 if kind == 'curves' else 0.06
     for k in range(15_000):
+        restless = float(generator.normal(0.0, 0.15))
         command = BodyTwist(0.075 * (1.0 - math.cos(0.13 * k)), 0.1)
-        now = BodyTwist(*(n + 0.06 * (c - n) for n, c in zip(now, command, strict=True)))
+        if kind == 'curves':
+            command = BodyTwist(0.12, 1.2 * (1.0 + 0.3 * math.sin(0.02 * k)) + restless)
+        now = BodyTwist(*(n + lag * (c - n) for n, c in zip(now, command, strict=True)))
         pose = advance_pose(pose, now, 0.01)
         x, y, yaw = np.array(pose) + generator.standard_normal(3) * (0.003, 0.003, 0.005)
         odometry = State(k * 10 * MS, Pose(float(x), float(y), float(yaw)), now)
-        touches += monitor.is_in_contact(odometry, command, 0.01)
-    assert touches == 0
+        assert not monitor.is_in_contact(odometry, command, 0.01)
 
 
 def touches_of(turned, seconds, seed=0):
@@ -615,7 +539,7 @@ def touches_of(turned, seconds, seed=0):
 @pytest.mark.parametrize('sign', [-1.0, 1.0])
 def test_a_robot_that_is_thrown_about_has_met_something(sign):
     """It drove on, turned by a radian, and met the same box again at full speed."""
-    assert not touches_of(lambda _, asked: asked, 60.0)
+    assert not touches_of(lambda _, asked: asked, 20.0)
     begin = 2.3 if sign > 0.0 else 3.8  # in the middle of a curve to the other side
 
     def thrown(time, asked):
@@ -703,17 +627,17 @@ def test_a_robot_that_stops_again_after_each_pause_is_left_alone():
 
 def test_stops_far_apart_are_not_counted_together():
     course = Course(SlipStop(STANDING_TIME + RECOVERY_TIME))
-    course.run(200.0)
+    course.run(60.0)
     assert Reason.STOPPED_AGAIN not in course.log
-    assert course.log.count(Reason.PAUSED) > 10 * 100 * PAUSE
+    assert course.log.count(Reason.PAUSED) > (TRIALS + 2) * 100 * PAUSE
 
 
 def test_a_robot_that_never_moves_gets_commands_for_ever():
     """Its emergency stop is released, or its board starts, after any time."""
-    course = Course(lambda course, command: command if course.time > 300.0 else STANDSTILL)
-    course.run(300.0)
+    course = Course(lambda course, command: command if course.time > 60.0 else STANDSTILL)
+    course.run(60.0)
     assert set(course.log) == {Reason.TRACKING, Reason.PAUSED}
-    assert course.monitor.pauses > 100
+    assert course.monitor.pauses > 20
     assert 'emergency stop' in course.monitor.problem()
     reasons = course.run(STANDING_TIME + PAUSE + RECOVERY_TIME)
     assert reasons[-1] is Reason.TRACKING
@@ -731,7 +655,7 @@ def test_a_robot_that_moves_otherwise_is_stopped():
 
 def test_a_response_disturbed_for_a_short_time_costs_no_pause():
     course = Course(lambda course, command: command)
-    for _ in range(20):
+    for _ in range(6):
         course.run(0.9 * ASTRAY_TIME, following=False)
         course.run(ASTRAY_TIME, following=True)
     assert set(course.log) == {Reason.TRACKING}
@@ -750,22 +674,21 @@ def test_a_response_disturbed_for_a_short_time_costs_no_pause():
 )
 def test_a_robot_that_follows_gets_no_pause(wanted):
     course = Course(lambda course, command: command)
-    for k in range(3000):
+    for k in range(1000):
         course.wanted = wanted(0.01 * k)
         course.run(0.01)
     assert set(course.log) == {Reason.TRACKING}
 
 
-@pytest.mark.parametrize('late', [0.1, 0.3, 0.6])
-def test_an_odometry_that_is_late_is_no_robot_that_stands(late):
-    course = Course(lambda course, command: command if course.time > late else STANDSTILL)
+def test_an_odometry_that_is_late_is_no_robot_that_stands():
+    course = Course(lambda course, command: command if course.time > 0.6 else STANDSTILL)
     assert set(course.run(5.0, following=True)) == {Reason.TRACKING}
 
 
 @pytest.mark.parametrize('part', ['pose', 'twist'])
 def test_pose_or_twist_alone_show_that_a_robot_moves(part):
     monitor = DriveMonitor()
-    for k in range(1000):
+    for k in range(400):
         moving = BodyTwist(0.2, 0.0) if part == 'twist' else STANDSTILL
         pose = Pose(0.002 * k, 0.0, 0.0) if part == 'pose' else Pose(0.0, 0.0, 0.0)
         state = State(k * 10_000_000, pose, moving)
@@ -812,8 +735,7 @@ def test_noise_of_a_standing_robot_is_no_motion():
     assert Reason.PAUSED in reasons[: round(100 * STANDING_TIME) + 20]
 
 
-@pytest.mark.parametrize('axis', [0, 1])
-@pytest.mark.parametrize('late', [0.0, 0.2])
+@pytest.mark.parametrize(('axis', 'late'), [(0, 0.2), (1, 0.0)])
 def test_a_velocity_of_the_opposite_sign_is_stopped_within_3_s(axis, late):
     """Swapped sides of motors or encoders: errors were fifty times those without feedback."""
     for sign in (-1.0, 1.0):
@@ -834,21 +756,6 @@ def test_a_velocity_of_the_opposite_sign_is_stopped_within_3_s(axis, late):
             assert reasons[-1] is Reason.STOPPED_AGAIN
 
 
-def test_a_robot_that_drives_the_other_way_gets_three_attempts():
-    course = Course(lambda course, command: BodyTwist(-command.linear, 0.0))
-    course.run(30.0, following=True)
-    attempts = TRIALS * [Reason.TRACKING, Reason.PAUSED]
-    assert course.changes() == [*attempts, Reason.TRACKING, Reason.STOPPED_AGAIN]
-
-
-def test_a_robot_that_is_asked_for_nothing_shows_no_recovery():
-    course = Course(lambda course, command: STANDSTILL)
-    course.run(STANDING_TIME + 2.0 * PAUSE)
-    course.wanted = STANDSTILL
-    course.run(3.0 * RECOVERY_TIME)
-    assert course.monitor.pauses > 0
-
-
 def _feel(drive, seconds, feels=True, noise=0.003):
     """Return a monitor and its reasons; ``drive``: pose at a time (s), command, measured twist."""
     monitor, reasons = DriveMonitor(feels=feels), []
@@ -861,7 +768,7 @@ def _feel(drive, seconds, feels=True, noise=0.003):
     return monitor, reasons
 
 
-@pytest.mark.parametrize('speed', [0.02, 0.1, 0.35, -0.08])
+@pytest.mark.parametrize('speed', [0.02, 0.35, -0.08])
 def test_wheels_that_turn_under_a_pose_that_stands_are_a_contact(speed):
     """A robot pushed a box that it does not see for five minutes: its wheels turned."""
     command = BodyTwist(speed, 0.0)
@@ -877,8 +784,9 @@ def test_wheels_that_turn_under_a_pose_that_stands_are_a_contact(speed):
     )
 
 
-@pytest.mark.parametrize('twist', [(0.25, 0.0), (0.0, 3.0), (-0.1, 0.5)])
-@pytest.mark.parametrize('feels', [False, True])
+@pytest.mark.parametrize(
+    ('twist', 'feels'), [((0.25, 0.0), True), ((0.0, 3.0), False), ((-0.1, 0.5), True)]
+)
 def test_a_frozen_pose_pauses_and_ends(twist, feels):
     """Towards a pose that stayed where it was the robot turned on the spot, without end."""
     monitor, reasons = DriveMonitor(feels=feels, follows_pose=True), []
@@ -918,12 +826,11 @@ def test_a_robot_turned_or_pushed_aside_touches_something():
     assert Reason.PAUSED in slides
 
 
-@pytest.mark.parametrize('late', [0.0, 0.1])
-@pytest.mark.parametrize('turn', [0.0, 1.0, 4.0])
+@pytest.mark.parametrize(('turn', 'late'), [(0.0, 0.1), (1.0, 0.0), (4.0, 0.1)])
 def test_free_motion_is_no_contact(turn, late):
     """With noise of 3 mm, late poses, stops, turns on the spot and backing off."""
     pose, now, poses, twists = Pose(0.0, 0.0, 0.0), STANDSTILL, [], []
-    for k in range(4000):
+    for k in range(2000):
         phase = (k // 200) % 4
         wanted = BodyTwist((0.35, 0.0, 0.02, -0.1)[phase], turn if phase % 2 else 0.3 * turn)
         step = [min(max(w - n, -a), a) for w, n, a in zip(wanted, now, (0.01, 0.14), strict=True)]
@@ -936,7 +843,7 @@ def test_free_motion_is_no_contact(turn, late):
         k = round(100 * t)
         return poses[max(k - round(100 * late), 0)], twists[k], twists[k]
 
-    assert set(_feel(drive, 40.0)[1]) == {Reason.TRACKING}
+    assert set(_feel(drive, 20.0)[1]) == {Reason.TRACKING}
 
 
 def test_a_stop_between_two_reports_is_in_the_next_one():

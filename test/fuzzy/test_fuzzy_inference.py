@@ -24,6 +24,9 @@ from scipy.special import logsumexp
 from support.equations import memberships, output_by_double_sum
 
 from t3mpc_ros.fuzzy.inference import (
+    LOWER,
+    MAX_COEFFICIENTS,
+    UPPER,
     FuzzyParameters,
     FuzzySets,
     build_sets,
@@ -33,11 +36,12 @@ from t3mpc_ros.fuzzy.inference import (
     slice_levels,
     type3_widths,
 )
+from t3mpc_ros.parameters.table import ParameterError
 
 Sets = partial(FuzzyParameters, sets=3, centre_exponent=1.0)
 
 KINDS = ('type3', 'interval_type2', 'type1')
-FAR = [40.0, -80.0, 1e3, -1e5, 1e9, -1e12, 1e200, -1.7e308]
+FAR = [40.0, -80.0, 1e3, 1e9, -1e12, -1.7e308]
 
 
 def _random_sets(rng, inputs=2, sets=3, slices=4):
@@ -75,7 +79,7 @@ def _reference_basis(u, sets):
 def test_output_lies_in_the_hull_of_the_coefficients(kind):
     rng = np.random.default_rng(1)
     sets = build_sets(Sets(kind=kind))
-    near = rng.uniform(-15.0, 15.0, (200, 2))
+    near = rng.uniform(-15.0, 15.0, (50, 2))
     far = np.array(list(itertools.product([0.3, *FAR], repeat=2)))
     for u in np.concatenate([near, far]):
         phi = compute_basis(u, sets)
@@ -88,7 +92,7 @@ def test_output_lies_in_the_hull_of_the_coefficients(kind):
         assert np.all(g <= alpha.max(axis=1) + slack)
 
 
-@pytest.mark.parametrize('inputs, per_input, slices', [(1, 5, 3), (2, 3, 4), (2, 4, 1), (3, 2, 2)])
+@pytest.mark.parametrize('inputs, per_input, slices', [(1, 5, 3), (2, 3, 4), (3, 2, 2)])
 def test_the_double_sum_29_equals_31_to_33(inputs, per_input, slices):
     rng = np.random.default_rng(2)
     for _ in range(10):
@@ -100,7 +104,7 @@ def test_the_double_sum_29_equals_31_to_33(inputs, per_input, slices):
         assert alpha @ compute_basis(u, sets) == pytest.approx(expected, rel=1e-11, abs=1e-13)
 
 
-@pytest.mark.parametrize('inputs, per_input, slices', [(1, 6, 2), (2, 3, 4), (3, 3, 3), (4, 2, 1)])
+@pytest.mark.parametrize('inputs, per_input, slices', [(2, 3, 4), (4, 2, 1)])
 def test_kernel_equals_whole_array_reference(inputs, per_input, slices):
     rng = np.random.default_rng(3)
     for _ in range(20):
@@ -177,18 +181,6 @@ def test_type3_of_one_slice_at_level_one_is_type1():
     assert gaps[1] == pytest.approx(2.0 * gaps[2], rel=0.02)  # linear convergence
 
 
-def test_slices_without_footprint_change_nothing():
-    """Equal widths at every level make every slice the same type-1 system."""
-    type1 = build_sets(Sets(kind='type1'))
-    widths = np.full((2, 3, 5, 2, 2), Sets().widths[0])
-    sliced = FuzzySets(type1.centres, widths, slice_levels(5), type1.input_fuzziness)
-    rng = np.random.default_rng(8)
-    constants = rng.normal(size=9)
-    for u in rng.uniform(-14.0, 14.0, (20, 2)):
-        full = np.tile(np.repeat(constants, 5), 2) @ compute_basis(u, sliced)
-        assert full == pytest.approx(np.tile(constants, 2) @ compute_basis(u, type1), rel=1e-12)
-
-
 def test_the_maxima_are_the_inputs_or_for_wide_ones_the_centres():
     u = np.array([3.3, -7.1])
     for fuzziness, tolerance in ((0.0, 0.0), (100.0, 1.0)):
@@ -230,8 +222,8 @@ def test_e7_grades_are_even_about_the_centre_and_at_most_one():
     for offset in (0.0, 0.7, 5.0):
         for h in range(3):
             u = sets.centres[:, h]
-            memberships(u + offset, sets.centres, sets.nonsingleton_gain, sets.sharpness, right)
-            memberships(u - offset, sets.centres, sets.nonsingleton_gain, sets.sharpness, left)
+            memberships(u + offset, sets.centres, sets.nonsingleton_gain, 1.0 / sets.widths, right)
+            memberships(u - offset, sets.centres, sets.nonsingleton_gain, 1.0 / sets.widths, left)
             np.testing.assert_allclose(right[:, h], left[:, h], rtol=1e-11)
             assert right.max() <= 1.0
             assert left.max() <= 1.0
@@ -255,7 +247,7 @@ def test_memberships_and_firings_are_the_printed_products():
     u = np.array([1.0, -2.0, 4.0])
     grades = np.empty(sets.widths.shape)
     firings = np.empty((27, 4, 2, 2))
-    memberships(u, sets.centres, sets.nonsingleton_gain, sets.sharpness, grades)
+    memberships(u, sets.centres, sets.nonsingleton_gain, 1.0 / sets.widths, grades)
     firing_strengths(grades, firings)
     for rule, (h1, h2, h3) in enumerate(itertools.product(range(3), repeat=3)):
         np.testing.assert_allclose(
@@ -327,3 +319,90 @@ def test_non_finite_inputs_are_rejected():
     for wrong in ([0.0], [0.0, math.nan], [math.inf, 0.0], [0.0, 0.0, 0.0]):
         with pytest.raises(ValueError, match='inputs must be 2 finite numbers'):
             compute_basis(np.array(wrong), sets)
+
+
+# -- tables of the sets ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('slices', [1, 7])
+def test_slice_levels_lie_in_order_between_zero_and_one(slices):
+    levels = slice_levels(slices)
+    assert levels.shape == (slices, 2)
+    assert np.all(levels > 0.0)
+    assert levels.max() == 1.0
+    assert np.all(np.diff(levels.ravel()) > 0.0)  # lower_1 < upper_1 < lower_2 < ...
+
+
+def test_type3_widths_are_powers_of_the_grade():
+    x = np.linspace(-4.0, 4.0, 41)
+    grade = np.exp(-((x / 1.7) ** 2))
+    levels = slice_levels(3)
+    widths = type3_widths(1.7, levels)
+    for place in np.ndindex(levels.shape):
+        upper = np.exp(-((x / widths[(*place, UPPER)]) ** 2))
+        lower = np.exp(-((x / widths[(*place, LOWER)]) ** 2))
+        np.testing.assert_allclose(upper, grade ** levels[place], rtol=1e-12)
+        np.testing.assert_allclose(lower, grade ** (1.0 / levels[place]), rtol=1e-12)
+
+
+def test_type3_footprint_decreases_with_the_level_to_zero():
+    footprint = np.diff(type3_widths(1.0, slice_levels(6)), axis=-1).ravel()
+    assert np.all(np.diff(footprint) < 0.0)
+    assert footprint[-1] == 0.0
+
+
+def test_default_sets_cross_at_one_half():
+    parameters = Sets()
+    half_spacing = 0.5 * (parameters.centre_high - parameters.centre_low) / (parameters.sets - 1)
+    assert np.exp(-((half_spacing / parameters.widths[0]) ** 2)) == pytest.approx(0.5, abs=0.002)
+
+
+def test_default_interval_footprint_is_the_type3_mean():
+    levels = slice_levels(Sets().slices)
+    half = 0.5 * np.diff(type3_widths(1.0, levels), axis=-1)[..., 0]
+    mean = float(np.sum(levels * half) / np.sum(levels))
+    assert Sets().footprint_of_uncertainty == pytest.approx(mean, abs=0.005)
+
+
+def test_input_fuzziness_matches_the_noise_variance_0_04():
+    """The Gaussians have no 1/2 in the exponent: beta is sqrt(2) standard deviations."""
+    assert Sets().input_fuzziness == pytest.approx(np.sqrt(2.0 * 0.04), abs=0.001)
+
+
+def test_kinds_differ_only_in_the_numbers_of_the_tables():
+    tables = {kind: build_sets(Sets(kind=kind)) for kind in ('type3', 'interval_type2', 'type1')}
+    for sets in tables.values():
+        np.testing.assert_array_equal(sets.centres, tables['type3'].centres)
+        assert sets.input_fuzziness == tables['type3'].input_fuzziness
+    assert tables['type3'].size == 2 * 9 * 4
+    assert tables['type1'].size == tables['interval_type2'].size == 2 * 9
+    np.testing.assert_array_equal(
+        tables['type1'].widths[..., LOWER], tables['type1'].widths[..., UPPER]
+    )
+    widths, sigma = tables['interval_type2'].widths, Sets().widths[0]
+    np.testing.assert_allclose(widths[..., LOWER], 0.77 * sigma)
+    np.testing.assert_allclose(widths[..., UPPER], 1.23 * sigma)
+
+
+@pytest.mark.parametrize('inputs', [1, 3])
+def test_tables_have_the_stated_shapes_for_any_number_of_inputs(inputs):
+    sets = build_sets(Sets(sets=4, slices=5), inputs)
+    assert sets.centres.shape == (inputs, 4)
+    assert sets.widths.shape == (inputs, 4, 5, 2, 2)
+    assert sets.levels.shape == (5, 2)
+    assert (sets.rules, sets.slices) == (4**inputs, 5)
+    assert sets.shares.sum() == pytest.approx(1.0, abs=1e-15)  # E8
+    one = build_sets(Sets(sets=1, centre_low=-2.0, centre_high=6.0), inputs)
+    np.testing.assert_array_equal(one.centres, [[2.0]] * inputs)
+    assert sets.size == 2 * 4**inputs * 5
+
+
+def test_invalid_parameters_are_rejected():
+    with pytest.raises(ParameterError, match='centre_high must be above centre_low'):
+        Sets(centre_low=1.0, centre_high=1.0)
+    with pytest.raises(ParameterError, match='kind must be one of'):
+        Sets(kind='type4')
+    with pytest.raises(ValueError, match='inputs must be at least 1: got 0'):
+        build_sets(Sets(), 0)
+    with pytest.raises(ValueError, match=f'at most {MAX_COEFFICIENTS}'):
+        build_sets(Sets(), 40)

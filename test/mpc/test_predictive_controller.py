@@ -101,21 +101,33 @@ def _weights():
     return PredictiveController(DEFAULT, PERIOD, GAIN).get_weights()
 
 
-@pytest.mark.compiled
-def test_it_removes_most_of_a_piecewise_constant_disturbance():
-    """Without pretraining v_p stays at 0.3 % of u, with a random step response."""
-    assert _gain(_levels(3000, 1)) < 0.40
-
-
-@pytest.mark.compiled
-def test_it_removes_most_of_a_slowly_varying_disturbance():
-    assert _gain(_waves(3000)) < 0.35
+SLOW = DEFAULT.with_values({'decimation': 10, 'average': 10})
 
 
 @pytest.mark.compiled
 @pytest.mark.slow
-def test_it_helps_with_noise_of_variance_0_04():
-    assert _gain(_levels(3000, 1), noise=0.2) < 0.55
+@pytest.mark.parametrize(
+    ('largest', 'changes'),
+    few_of(
+        [
+            (0.40, {}),  # without pretraining v_p stays at 0.3 % of u, with a random step response
+            (0.35, {'disturbance': _waves(3000)}),
+            (0.55, {'noise': 0.2}),
+            (0.45, {'parameters': SLOW, 'nominal_gain': 4.0, 'gain': 4.0}),
+            (0.65, {'noise': 0.05, 'lag': 0.1, 'delay_steps': 3}),
+            (0.65, {'noise': 0.05, 'gain': 5.0}),
+            (0.65, {'noise': 0.05, 'lag': 0.05}),
+            (0.65, {'noise': 0.05, 'delay_steps': 5}),
+            (0.65, {'noise': 0.05, 'delay_steps': 10}),
+            (0.65, {'noise': 0.05, 'gain': 12.0}),
+        ],
+        6,
+    ),
+)
+def test_it_removes_most_of_a_disturbance(largest, changes):
+    """Also of a robot other than the nominal one."""
+    given = {'disturbance': _levels(3000, 1 if largest < 0.6 else 2)} | changes
+    assert _gain(**given) < largest
 
 
 @pytest.mark.compiled
@@ -123,44 +135,18 @@ def test_it_helps_with_noise_of_variance_0_04():
 def test_with_noise_alone_it_costs_a_few_per_cent():
     """With only noise to predict, the effect of v_p must be negligible."""
     controller = PredictiveController(DEFAULT, PERIOD, GAIN)
-    nothing = np.zeros((6000, 2))
+    nothing = np.zeros((4000, 2))
     on, moves = _run(controller, nothing, 0.2)
     off, _ = _run(None, nothing, 0.2)
     assert _rms(on) < 1.10 * _rms(off)
-    assert _rms(on[3000:]) < 1.03 * _rms(off[3000:])
+    assert _rms(on[2000:]) < 1.03 * _rms(off[2000:])
     assert np.max(np.abs(moves)) < 0.2 * DEFAULT.v_max
-
-
-@pytest.mark.compiled
-@pytest.mark.parametrize(
-    'plant',
-    few_of(
-        [
-            {'lag': 0.1, 'delay_steps': 3},
-            {'gain': 5.0},
-            {'lag': 0.05},
-            {'delay_steps': 5},
-            {'delay_steps': 10},
-            {'gain': 12.0},
-        ],
-        2,
-    ),
-    ids=str,
-)
-@pytest.mark.slow
-def test_it_helps_a_robot_other_than_the_nominal_one(plant):
-    assert _gain(_levels(3000, 2), noise=0.05, **plant) < 0.65
-
-
-@pytest.mark.compiled
-def test_it_works_for_other_control_periods_and_feedback_gains():
-    parameters = DEFAULT.with_values({'decimation': 10, 'average': 10})
-    assert _gain(_levels(3000, 1), parameters, nominal_gain=4.0, gain=4.0) < 0.45
 
 
 @pytest.mark.compiled
 def test_step_response_is_right_from_the_first_second():
     controller = PredictiveController(DEFAULT, PERIOD, GAIN)
+    assert np.all(controller.skill > 0.8)  # on unseen data
     controller.step(np.zeros(2))
     loop, fine = Loop(), []
     for _ in range(50):
@@ -173,12 +159,6 @@ def test_step_response_is_right_from_the_first_second():
 
 
 @pytest.mark.compiled
-def test_the_skill_is_high_on_unseen_data():
-    controller = PredictiveController(DEFAULT, PERIOD, GAIN)
-    assert np.all(controller.skill > 0.8)
-
-
-@pytest.mark.compiled
 @pytest.mark.slow
 def test_random_weights_get_no_authority():
     """With the skill half a horizon ahead alone, a third would get authority."""
@@ -186,8 +166,8 @@ def test_random_weights_get_no_authority():
     disturbance = _levels(1000, 3)
     off, _ = _run(None, disturbance)
     figures = []
-    for size in (0.03, 0.1, 0.3, 1.0, 3.0):
-        for seed in range(3):
+    for size in (0.03, 0.3, 3.0):
+        for seed in range(2):
             generator = np.random.default_rng(seed)
             weights = dict(_weights())
             for name, spread in (('visible_weights', 0.3), ('output_weights', size)):
@@ -226,7 +206,7 @@ def test_a_steady_disturbance_leaves_no_steady_error():
     """Without learning, the offset e alone removes the error."""
     parameters = DEFAULT.with_values({'learning': False, 'offset_gain': 0.2})
     controller = PredictiveController(parameters, PERIOD, GAIN)
-    errors, moves = _run(controller, np.full((3000, 2), 4.0))
+    errors, moves = _run(controller, np.full((2000, 2), 4.0))
     np.testing.assert_allclose(errors[-1], 0.0, atol=2e-3)
     np.testing.assert_allclose(moves[-1], -4.0, atol=0.02)
 
@@ -236,7 +216,7 @@ def test_v_p_keeps_its_bounds_for_any_errors():
     parameters = DEFAULT.with_values({'v_max': 3.0, 'dv_max': 0.8})
     controller = PredictiveController(parameters, PERIOD, GAIN)
     generator = np.random.default_rng(4)
-    v = np.array([controller.step(e) for e in 4.0 * generator.standard_cauchy((3000, 2))])
+    v = np.array([controller.step(e) for e in 4.0 * generator.standard_cauchy((1000, 2))])
     assert np.max(np.abs(v)) <= 3.0
     changes = np.abs(np.diff(v[::5], axis=0))
     assert np.max(changes) <= 0.8 + 1e-9
@@ -249,7 +229,7 @@ def test_v_p_changes_by_the_first_optimal_change_63():
     parameters = DEFAULT.with_values({'v_max': 1e3, 'dv_max': 1e3, 'learning': False})
     controller, loop = PredictiveController(parameters, PERIOD, GAIN), Loop()
     before, changes = np.zeros(2), []
-    for w in _waves(1000):
+    for w in _waves(500):
         due = controller.due
         v_p = controller.step(loop.error)
         if due:
@@ -264,19 +244,8 @@ def test_v_p_changes_by_the_first_optimal_change_63():
             np.testing.assert_array_equal(v_p, before)
         before = v_p
         loop.step(v_p, w, np.zeros(2))
-    assert len(changes) == 200
+    assert len(changes) == 100
     assert np.max(np.abs(changes)) > 0.1
-
-
-@pytest.mark.compiled
-def test_v_p_is_held_between_the_predictive_steps():
-    controller = PredictiveController(DEFAULT, PERIOD, GAIN)
-    generator = np.random.default_rng(5)
-    v = np.array([controller.step(e) for e in generator.standard_normal((200, 2))]).reshape(
-        40, 5, 2
-    )
-    np.testing.assert_array_equal(v, np.repeat(v[:, :1], 5, axis=1))
-    assert np.count_nonzero(np.diff(v[:, 0, 0])) > 30
 
 
 @pytest.mark.compiled
@@ -303,7 +272,7 @@ def test_disabled_it_returns_zero_and_still_learns():
 
 def _jumping(known, preview):
     """Return the true errors of a run with jumps of the reference, and the controller."""
-    count, controller = 4000, PredictiveController(DEFAULT, PERIOD, GAIN)
+    count, controller = 3000, PredictiveController(DEFAULT, PERIOD, GAIN)
     generator, loop = np.random.default_rng(8), Loop()
     jumps = np.zeros((count + 60, 2))
     jumps[150:count:150] = generator.uniform(-3.0, 3.0, jumps[150:count:150].shape)
@@ -398,15 +367,6 @@ def test_after_a_limit_changes_start_between_zero_and_v_p():
 
 
 @pytest.mark.compiled
-def test_a_warm_up_changes_nothing():
-    first = PredictiveController(DEFAULT, PERIOD, GAIN)
-    first.warm_up()
-    again = PredictiveController(DEFAULT, PERIOD, GAIN)
-    disturbance = _levels(600, 11)
-    np.testing.assert_array_equal(_run(first, disturbance)[1], _run(again, disturbance)[1])
-
-
-@pytest.mark.compiled
 def test_invalid_input_is_rejected_without_effect():
     controller = PredictiveController(DEFAULT, PERIOD, GAIN)
     good = controller.get_weights()
@@ -426,6 +386,14 @@ def test_invalid_input_is_rejected_without_effect():
         controller.step(np.zeros(2), np.zeros((2, 10)))
     with pytest.raises(ValueError, match='jump'):
         controller.notify_jump(np.array([np.nan, 0.0]))
+    with pytest.raises(ParameterError, match='control_horizon must be at most horizon'):
+        DEFAULT.with_values({'control_horizon': 11})
+    fast = DEFAULT.with_values({'decimation': 1, 'average': 1})
+    with pytest.raises(ParameterError, match=r'must cover the dead time .* got 0.003 s'):
+        PredictiveController(fast, 0.003, GAIN)
+    PredictiveController(fast, 0.004, GAIN)
+    with pytest.raises(ValueError, match='positive'):
+        PredictiveController(DEFAULT, PERIOD, 0.0)
     untouched = PredictiveController(DEFAULT, PERIOD, GAIN)
     disturbance = _levels(200, 14)
     np.testing.assert_array_equal(
@@ -434,34 +402,13 @@ def test_invalid_input_is_rejected_without_effect():
 
 
 @pytest.mark.compiled
-@pytest.mark.parametrize(
-    'values, match',
-    [
-        ({'control_horizon': 11}, 'control_horizon must be at most horizon'),
-        ({'average': 6}, 'average must be at most decimation'),
-    ],
-    ids=str,
-)
-def test_inconsistent_parameters_are_rejected(values, match):
-    with pytest.raises(ParameterError, match=match):
-        DEFAULT.with_values(values)
-
-
-@pytest.mark.compiled
-def test_lags_shorter_than_the_dead_time_are_rejected():
-    fast = DEFAULT.with_values({'decimation': 1, 'average': 1})
-    with pytest.raises(ParameterError, match=r'must cover the dead time .* got 0.003 s'):
-        PredictiveController(fast, 0.003, GAIN)
-    PredictiveController(fast, 0.004, GAIN)
-    with pytest.raises(ValueError, match='positive'):
-        PredictiveController(DEFAULT, PERIOD, 0.0)
-
-
-@pytest.mark.compiled
 def test_a_deep_copy_is_independent():
     controller, errors = PredictiveController(DEFAULT, PERIOD, GAIN), np.array([0.3, -0.2])
+    controller.warm_up()  # changes nothing
+    fresh = PredictiveController(DEFAULT, PERIOD, GAIN)
     for k in range(60):
-        controller.step(errors * np.sin(0.1 * k))
+        sample = errors * np.sin(0.1 * k)
+        np.testing.assert_array_equal(controller.step(sample), fresh.step(sample))
     twin, other = deepcopy(controller), deepcopy(controller)
     for _ in range(20):
         other.step(-errors)

@@ -235,16 +235,11 @@ def test_the_uncertainty_falls_with_the_number_of_turns():
     turn = GyroTurn(20.0 * math.pi, 0.001, 132.0, -132.0)
     one = calibration.estimate_gyro_scale([(20.0 * math.pi, turn)])
     half = turn._replace(rotation=10.0 * math.pi, right=66.0, left=-66.0)
+    assert calibration.whole_turns(turn._replace(rotation=10.2 * math.tau), -0.7 * math.tau) == 11
+    assert calibration.whole_turns(turn._replace(rotation=-9.9 * math.tau), 0.0) == -10
     five = calibration.estimate_gyro_scale([(10.0 * math.pi, half)])
     assert one.uncertainty == pytest.approx(math.sqrt(2.0) * MARKS.angle / (20.0 * math.pi), 0.01)
     assert five.uncertainty == pytest.approx(2.0 * one.uncertainty, 0.01)
-
-
-def test_the_gyro_counts_the_turns():
-    turn = GyroTurn(10.2 * math.tau, 0.001, 0.0, 0.0)
-    assert calibration.whole_turns(turn, 0.0) == 10
-    assert calibration.whole_turns(turn, -0.7 * math.tau) == 11
-    assert calibration.whole_turns(turn._replace(rotation=-9.9 * math.tau), 0.0) == -10
 
 
 # -- refusals -------------------------------------------------------------------------------------
@@ -293,133 +288,81 @@ def spaced(step):
     return recording._replace(times=times)
 
 
-REFUSALS = {
-    'no run': (lambda: calibration.estimate_wheel_radius([]), r'at least 1: got 0'),
-    'marks together': (
-        lambda: calibration.estimate_wheel_radius([StraightRun(0.0, 57.0, 57.0)]),
-        r'distance between the marks must be at least 0.5 m: got 0; .* drive 2 m',
-    ),
-    'millimetres': (
-        lambda: calibration.estimate_wheel_radius([StraightRun(math.nan, 57.0, 57.0)]),
-        r'at least 0.5 m: got nan',
-    ),
-    'curve': (
-        lambda: calibration.estimate_wheel_radius([StraightRun(2.0, 57.0, 50.0)]),
-        r'agree within 2 %: got 57.000 and 50.000 rad; drive straight',
-    ),
-    'ways that differ': (
-        lambda: calibration.estimate_wheel_radius(
-            [StraightRun(2.04, 57.0, 57.0), StraightRun(1.04, -57.0, -57.0)]
-        ),
+RUN = StraightRun(2.0, 57.0, 57.0)
+TEN, SURE = 10.0 * math.tau, Estimate(RADIUS, 1e-5)
+PUSHED = dict.fromkeys(range(50, 60), 0.1), dict.fromkeys(range(800, 830), 0.02)
+FULL, EMPTY = VoltageReading(12.0, 11.9), VoltageReading(9.5, 9.4)
+RADII, TRACKS = calibration.estimate_wheel_radius, calibration.estimate_track
+SCALES, DIVIDERS = calibration.estimate_gyro_scale, calibration.estimate_divider
+BIASES, TURNS = calibration.estimate_gyro_bias, calibration.measure_turn
+CURVES = calibration.estimate_sharp_curve
+REFUSALS = [
+    (RADII, [[]], r'at least 1: got 0'),
+    (RADII, [[RUN._replace(distance=0.0)]], r'marks must be at least 0.5 m: got 0; .* drive 2 m'),
+    (RADII, [[RUN._replace(distance=math.nan)]], r'at least 0.5 m: got nan'),
+    (RADII, [[RUN._replace(left=50.0)]], r'within 2 %: got 57.000 and 50.000 rad; drive straight'),
+    (
+        RADII,
+        [[StraightRun(2.04, 57.0, 57.0), StraightRun(1.04, -57.0, -57.0)]],
         r'in all runs within 2 %: got 0.03579 and 0.01825; a mark was misread.*measure again',
     ),
-    'coarse marks': (
-        lambda: calibration.estimate_wheel_radius(
-            [StraightRun(2.0, 57.0, 57.0)], MarkUncertainty(distance=0.1)
-        ),
+    (
+        RADII,
+        [[RUN], MarkUncertainty(distance=0.1)],
         r'standard uncertainty of the wheel radius .* at most 1 %: got 7.1 %; measure again',
     ),
-    'turns that differ': (
-        lambda: calibration.estimate_track(
-            [(10.0 * math.tau, TURN), (11.0 * math.tau, TURN)], Estimate(RADIUS, 1e-5)
-        ),
+    (
+        TRACKS,
+        [[(TEN, TURN), (1.1 * TEN, TURN)], SURE],
         r'the track \(m\) must be the same in all runs within 2 %: got 0.1471 and 0.1337',
     ),
-    'one turn': (
-        lambda: calibration.estimate_gyro_scale([(math.tau, TURN)]),
-        r'at least 2 whole turns: got 1.00; ten are better',
-    ),
-    'too few turns for the track': (
-        lambda: calibration.estimate_track([(0.0, TURN)], Estimate(RADIUS, 1e-5)),
-        r'at least 2 whole turns: got 0.00',
-    ),
-    'wrong way': (
-        lambda: calibration.estimate_track([(-20.0 * math.pi, TURN)], Estimate(RADIUS, 1e-5)),
-        r'left is positive, check invert_left',
-    ),
-    'turns miscounted': (
-        lambda: calibration.estimate_gyro_scale([(7.0 * math.tau, TURN)]),
-        r'from 0.8 to 1.2: got 0.7; count the turns',
-    ),
-    'saturated': (
-        lambda: calibration.measure_turn(with_rates({400: 8.72})),
-        r'below 490 deg/s: got 500, saturated; turn more slowly',
-    ),
-    'moved before': (
-        lambda: calibration.measure_turn(with_rates(dict.fromkeys(range(50, 60), 0.1))),
-        r'at most 0.0035 rad/s: got 0.0\d+ before the motion; the robot was moved',
-    ),
-    'moved after': (
-        lambda: calibration.measure_turn(with_rates(dict.fromkeys(range(800, 830), 0.02))),
-        r'got 0.0\d+ after the motion',
-    ),
-    'pushed slowly and evenly': (
-        lambda: calibration.estimate_gyro_bias(rest(np.linspace(0.0, 0.01, 500))),
-        r'at most 0.0035 rad/s',
-    ),
-    'short rest': (
-        lambda: calibration.estimate_gyro_bias(rest(np.zeros(50))),
-        r'must last at least 2 s: got 1.0; do not touch',
-    ),
-    'driven at rest': (
-        lambda: calibration.measure_turn(turned(begin=400)),
-        r'at most 0.0035|must rest before the motion: got steps',
-    ),
-    'no motion': (
-        lambda: calibration.measure_turn(rest(np.zeros(500))),
-        r'must turn between two rests: got no motion',
-    ),
-    'samples missing': (
-        lambda: calibration.measure_turn(spaced(0.3)),
-        r'at most 0.1 s apart: got 0.32; t3mpc robot ping',
-    ),
-    'one voltage': (
-        lambda: calibration.estimate_divider([VoltageReading(12.0, 11.9)]),
-        r'at least 2: got 1; measure a full and an empty battery',
-    ),
-    'same voltage twice': (
-        lambda: calibration.estimate_divider(
-            [VoltageReading(12.0, 11.9), VoltageReading(11.5, 11.4)]
-        ),
+    (TRACKS, [[(-TEN, TURN)], SURE], r'left is positive, check invert_left'),
+    (SCALES, [[(math.tau, TURN)]], r'at least 2 whole turns: got 1.00; ten are better'),
+    (SCALES, [[(0.7 * TEN, TURN)]], r'from 0.8 to 1.2: got 0.7; count the turns'),
+    (TURNS, [with_rates({400: 8.72})], r'below 490 deg/s: got 500, saturated; turn more slowly'),
+    (TURNS, [with_rates(PUSHED[0])], r'0.0035 rad/s: got 0.0\d+ before the motion; .* was moved'),
+    (TURNS, [with_rates(PUSHED[1])], r'got 0.0\d+ after the motion'),
+    (TURNS, [turned(begin=400)], r'at most 0.0035|must rest before the motion: got steps'),
+    (TURNS, [rest(np.zeros(500))], r'must turn between two rests: got no motion'),
+    (TURNS, [spaced(0.3)], r'at most 0.1 s apart: got 0.32; t3mpc robot ping'),
+    (BIASES, [rest(np.linspace(0.0, 0.01, 500))], r'at most 0.0035 rad/s'),  # turned evenly
+    (BIASES, [rest(np.zeros(50))], r'must last at least 2 s: got 1.0; do not touch'),
+    (DIVIDERS, [[FULL]], r'at least 2: got 1; measure a full and an empty battery'),
+    (
+        DIVIDERS,
+        [[FULL, VoltageReading(11.5, 11.4)]],
         r'at least 1 V apart: got 11.90 and 11.40 V, measured by the robot',
     ),
-    'another battery at the meter': (
-        lambda: calibration.estimate_divider(
-            [VoltageReading(120.0, 11.9), VoltageReading(9.5, 9.4)]
-        ),
+    (
+        DIVIDERS,
+        [[FULL._replace(meter=120.0), EMPTY]],
         r'from 9.52 to 14.28 V: got 120; the robot measured 11.90 V: read the meter again',
     ),
-    'meters that contradict': (
-        lambda: calibration.estimate_divider(
-            [VoltageReading(10.0, 12.0), VoltageReading(10.5, 10.0)]
-        ),
+    (
+        DIVIDERS,
+        [[VoltageReading(10.0, 12.0), VoltageReading(10.5, 10.0)]],
         r'gain of the battery voltage must be from 0.8 to 1.2: got -0.25; measure both again',
     ),
-    'three distances': (
-        lambda: calibration.estimate_sharp_curve(exact_readings((0.1, 0.2, 0.4))),
-        r'distances must be at least 4: got 3; 0.1, 0.15',
+    (CURVES, [exact_readings((0.1, 0.2, 0.4))], r'must be at least 4: got 3; 0.1, 0.15'),
+    (
+        CURVES,
+        [exact_readings((0.3, 0.35, 0.4, 0.45))],
+        r'2 times the smallest: got 0.3 and 0.45 m',
     ),
-    'similar distances': (
-        lambda: calibration.estimate_sharp_curve(exact_readings((0.3, 0.35, 0.4, 0.45))),
-        r'at least 2 times the smallest: got 0.3 and 0.45 m',
-    ),
-    'too near': (
-        lambda: calibration.estimate_sharp_curve(
-            [RangeReading(0.03, (300, 301)), *exact_readings((0.1, 0.2, 0.4))]
-        ),
+    (
+        CURVES,
+        [[RangeReading(0.03, (300, 301)), *exact_readings((0.1, 0.2, 0.4))]],
         r'must fall with the distance: got 1.47 V at 0.03 m, 2.30 V at 0.10 m.*below 0.1 m',
     ),
-    'loose wire': (
-        lambda: calibration.estimate_sharp_curve(
-            [RangeReading(0.1, (1023, 1023)), *exact_readings((0.2, 0.4, 0.8))]
-        ),
+    (
+        CURVES,
+        [[RangeReading(0.1, (1023, 1023)), *exact_readings((0.2, 0.4, 0.8))]],
         r'from 12 to 983: got 1023 at 0.1 m, saturated; check the wires',
     ),
-}
+]
 
 
-@pytest.mark.parametrize('name', REFUSALS)
-def test_bad_measurements_are_refused_with_a_remedy(name):
-    estimate, words = REFUSALS[name]
+@pytest.mark.parametrize(('estimate', 'arguments', 'words'), REFUSALS)
+def test_bad_measurements_are_refused_with_a_remedy(estimate, arguments, words):
     with pytest.raises(CalibrationError, match=words):
-        estimate()
+        estimate(*arguments)
