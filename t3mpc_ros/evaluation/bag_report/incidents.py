@@ -272,7 +272,7 @@ def find_stops(run: Run) -> tuple[Stop, ...]:
     of a stop. After the last command to move it counts only if the nodes gave a
     reason, and only up to the end of the reference: a drive that is over is no stop.
     """
-    motion, wanted = run.motions.get(run.measured), run.motions.get(REFERENCE)
+    motion, wanted = run.motion, run.motions.get(REFERENCE)
     command = run.motions.get(COMMAND)
     first, last = driving(run)
     if motion is None or len(motion) < 3 or not (first < last or command is None):
@@ -338,7 +338,7 @@ def _asks_for_motion(demand: Series, start: float, end: float) -> bool:
 
 def find_blocked_wheels(run: Run) -> tuple[tuple[float, float, str], ...]:
     """Return when one wheel stood although it was commanded to turn; see :class:`Incidents`."""
-    motion, command = run.motions.get(run.measured), run.motions.get(COMMAND)
+    motion, command = run.motion, run.motions.get(COMMAND)
     if motion is None or command is None or run.geometry is None:
         return ()
     found = []

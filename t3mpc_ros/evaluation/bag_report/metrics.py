@@ -52,7 +52,7 @@ def latencies(run: Run, *, first: bool = False) -> Series | None:
     ``first`` selects the first command after each message: further ones do not wait for it.
     """
     odometry, commands = run.receipts.get(ODOMETRY), run.receipts.get(COMMAND)
-    if odometry is None or commands is None:
+    if odometry is None or commands is None or ODOMETRY in run.untrusted:
         return None
     index = np.searchsorted(odometry, commands, 'right') - 1
     counted = index >= 0
@@ -70,7 +70,7 @@ def estimation_target(run: Run, wheel: str) -> Series | None:
     derivative, so that both see the same smoothing. It is NaN around switches, where u jumps
     between two of its sparse samples. None when either is absent.
     """
-    motion = run.motions.get(run.measured)
+    motion = run.motion
     applied = run.numbers.get(f'controller/terms/applied/{wheel}')
     if motion is None or applied is None:
         return None
@@ -236,7 +236,7 @@ RUN_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics], float]], ...] = (
     ('switches', '', lambda found: found.run.switches.size),
     (
         'stood although it was to move', 's',
-        lambda found: found.incidents.stopped if found.run.measured else math.nan,
+        lambda found: math.nan if found.run.motion is None else found.incidents.stopped,
     ),
     ('odometry to command, median', 'ms', lambda found: 1e3 * found.latency),
     ('odometry to command, 99 % below', 'ms', lambda found: 1e3 * found.latency_99),
@@ -265,7 +265,8 @@ def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
     delay = latencies(run)
     delays = np.array([math.nan]) if delay is None else delay['value']
     prompt = latencies(run, first=True)
-    missing = {name: timing.missing for name, timing in run.timing.items()}
+    valid = ((name, each) for name, each in run.timing.items() if name not in run.untrusted)
+    missing = {name: timing.missing for name, timing in valid}
     incidents = find_incidents(run)
     verdict = judge(
         run,
@@ -296,7 +297,7 @@ def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
 
 def responses(run: Run) -> Mapping[str, ResponseFit]:
     """Return the fitted response of each channel that is identifiable."""
-    command, motion = run.motions.get(COMMAND), run.motions.get(run.measured)
+    command, motion = run.motions.get(COMMAND), run.motion
     if command is None or motion is None:
         return {}
     fits = {each.name: fit_response(command, motion, each.name) for each in run.channels}

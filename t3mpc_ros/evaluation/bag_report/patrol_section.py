@@ -46,7 +46,7 @@ _SAMPLE = 0.05
 
 def followed_reference(run: Run) -> Series | None:
     """Return the reference if the controller follows its positions; None if its speeds alone."""
-    reference, motion = run.motions.get(REFERENCE), run.motions.get(run.measured)
+    reference, motion = run.motions.get(REFERENCE), run.motion
     if motion is None or reference is None or not run.follows_path:
         return None
     return reference if 'x' in reference.values and len(reference) > 1 else None
@@ -54,7 +54,7 @@ def followed_reference(run: Run) -> Series | None:
 
 def patrol_blocks(run: Run) -> Iterator[Block]:
     """Yield the section; nothing for a robot that hardly left its place."""
-    motion = run.motions.get(run.measured)
+    motion = run.motion
     if motion is None or len(motion) < 2:
         return
     rarely = np.concatenate([[True], np.diff(np.floor(motion.time / _SAMPLE)) > 0.0])

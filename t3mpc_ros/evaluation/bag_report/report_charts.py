@@ -135,7 +135,8 @@ def distance(run: Run, metrics: ReportMetrics) -> Shown:
 
 def error(run: Run, metrics: ReportMetrics) -> Shown:
     """Yield the tracking error of both channels over time, of a robot that follows speeds."""
-    series = None if run.follows_path else tracking_error(run, run.measured)
+    known = run.motion is not None and not run.follows_path
+    series = tracking_error(run, run.measured) if known else None
     if not is_long(series):
         return
     moving = driven(series.time, run)
@@ -217,7 +218,7 @@ def control(run: Run, metrics: ReportMetrics) -> Shown:
 
 def response(run: Run, metrics: ReportMetrics) -> Shown:
     """Yield command and measured speed of both channels with the fit."""
-    command, motion = run.motions.get(COMMAND), run.motions.get(run.measured)
+    command, motion = run.motions.get(COMMAND), run.motion
     if not is_long(command) or not is_long(motion):
         return
     for name, title, _, unit in run.channels:
@@ -341,6 +342,8 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
         f'The robot moved in x {_extent(x, "m")} and in y {_extent(y, "m")}, and ended '
         f'{format_number(float(np.hypot(x[-1] - x[0], y[-1] - y[0])))} m from its start.'
     )
+    if run.motion is None:
+        seen = f'Nothing measured from {run.topics[run.measured]} is valid.'
     if slips:
         seen += f' A wheel slips for {sum(end - start for start, end in slips):.1f} s.'
     if named := [

@@ -69,6 +69,8 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 SPEEDS, FLOOR, FURTHER = SECTIONS[:2], SECTIONS[2:4], SECTIONS[4:]
 """Sections before the events and tables, that of what the robot follows first, and the others."""
 MAX_EVENTS = 300
+INVALID = 'not valid'
+"""Mark of a topic of which nothing that is measured is valid."""
 
 
 def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> Table:
@@ -221,12 +223,11 @@ def _errors(run: Run) -> list[Block]:
     for source in (TRUTH, ODOMETRY):
         if source not in run.motions or REFERENCE not in run.motions:
             continue
+        lacking = INVALID if source in run.untrusted else UNMEASURED
         for channel, pair in zip(run.channels, errors_of(run, source).values(), strict=True):
             for extent, values in zip(('driven', 'driven, settled'), pair, strict=True):
                 numbers = (values.rmse, values.mae, values.largest)
-                cells = [
-                    format_number(number) if values.count else UNMEASURED for number in numbers
-                ]
+                cells = [format_number(number) if values.count else lacking for number in numbers]
                 cells += [f'{values.seconds:.1f}', str(values.count)]
                 rows.append([LABELS[source], channel.title, extent, *cells, channel.unit])
     if not rows:
@@ -301,9 +302,8 @@ def _timing(run: Run) -> list[Block]:
     for name, timing in run.timing.items():
         rate = format_number(1.0 / timing.period if timing.period > 0.0 else math.nan)
         jitter, missing = format_number(1e3 * timing.jitter), format_number(100.0 * timing.missing)
-        rows[name in run.motions].append(
-            [run.topics[name], str(timing.count), rate, jitter, missing]
-        )
+        topic = run.topics[name] + (f', {INVALID}' if name in run.untrusted else '')
+        rows[name in run.motions].append([topic, str(timing.count), rate, jitter, missing])
     motions, scalars = (Table('', head, rows[kind], wrap=True) for kind in (True, False))
     blocks: list[Block] = [motions] if motions.rows else []
     if scalars.rows:
@@ -336,7 +336,7 @@ def _contents(recording: BagReader) -> Iterator[Block]:
 
 def motion_rows(run: Run) -> list[list[str]]:
     """Return path length, turning, speeds and stops as rows; none when there are few samples."""
-    motion, command = run.motions.get(run.measured), run.motions.get(COMMAND)
+    motion, command = run.motion, run.motions.get(COMMAND)
     if motion is None:
         return []
     time, linear = incidents.smooth(motion, 'linear')

@@ -200,6 +200,11 @@ class Run:
         """Relative name of the motion that errors refer to: ground truth where recorded."""
         return next((name for name in (TRUTH, ODOMETRY) if name in self.motions), '')
 
+    @property
+    def motion(self) -> Series | None:
+        """The measured motion; None without one, or where nothing of it is valid."""
+        return None if self.measured in self.untrusted else self.motions.get(self.measured)
+
 
 def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     """Return the run in ``recording``; of the fullest namespace unless one is given."""

@@ -125,7 +125,7 @@ def settled(time: Array, run: Run) -> NDArray[np.bool_]:
 
 def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, ErrorStatistics]]:
     """Return the statistics while driven and those while driven and settled, by wheel."""
-    error = tracking_error(run, measured)
+    error = None if measured in run.untrusted else tracking_error(run, measured)
     if error is None:
         nothing = statistics(np.empty(0))
         return dict.fromkeys((each.name for each in run.channels), (nothing, nothing))
@@ -165,7 +165,7 @@ def on_reference_frame(run: Run) -> Series | None:
     From each time on at which the odometry was set, ground truth is laid on it anew. Positions are
     NaN about that time, while the reference may still be, or is interpolated, in the old frame.
     """
-    motion, reference = run.motions.get(run.measured), run.motions.get(REFERENCE)
+    motion, reference = run.motion, run.motions.get(REFERENCE)
     sets = odometry_sets(run)
     if motion is None or reference is None or not sets:
         return motion

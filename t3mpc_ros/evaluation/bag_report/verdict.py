@@ -230,7 +230,7 @@ def _lacking(run: Run) -> tuple[str, ...]:
 def _without(run: Run, lacking: Sequence[str]) -> str:
     """Return what the robot did, and why its tracking cannot be judged."""
     text = f'the bag holds no {" and no ".join(lacking)}, so tracking cannot be judged'
-    motion = run.motions.get(run.measured)
+    motion = run.motion
     if motion is None or len(motion) < 2:
         return text
     steps = np.diff(motion.time)
