@@ -29,7 +29,6 @@ from support.golden_bags import (
     GOLDEN_SCENARIOS,
     ControllerBag,
     RecordedController,
-    run_golden_scenario,
 )
 from support.long_tests import few_of
 from support.other_parameters import with_other_value
@@ -39,7 +38,6 @@ from t3mpc_ros.bag.controller_journal import (
     Event,
     Journal,
     parameters_from_json,
-    parameters_to_json,
 )
 from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.model_file import save_model
@@ -65,7 +63,6 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
     compare,
     compare_bags,
     compare_columns,
-    write_divergence_figure,
 )
 from t3mpc_ros.evaluation.topic_roles import SCALARS, ReportOptions, choose_topics, find_topics
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State
@@ -192,15 +189,6 @@ def test_the_golden_runs_have_all_that_they_are_for(inputs, again):
     assert np.count_nonzero((linear > 0.022) | (angular > 0.31)) >= 3, 'jumps as the track has it'
 
 
-@pytest.mark.long
-def test_equal_recipes_give_equal_bags(tmp_path):
-    recipe = GOLDEN_SCENARIOS['stops']
-    made = [run_golden_scenario(recipe, tmp_path / name) for name in ('one', 'other')]
-    one, other = (columns_of(each, ['/cmd_vel'])['/cmd_vel'].numbers for each in made)
-    np.testing.assert_array_equal(one, other)
-    assert len(one) > 800
-
-
 # -- what is detected -----------------------------------------------------------------------------
 
 
@@ -234,10 +222,9 @@ def test_named_settings_exist_and_the_same_change_nothing(inputs):
 
 
 def compared(was, now, tolerances):
-    recorded, computed = ({SPEEDS[0]: np.array(values)} for values in (was, now))
     everywhere = np.full(len(was), math.nan)
-    recorded |= {name: everywhere for name in FIELDS if name != SPEEDS[0]}
-    computed |= {name: everywhere for name in FIELDS if name != SPEEDS[0]}
+    recorded, computed = (dict.fromkeys(FIELDS, everywhere) for _ in range(2))
+    recorded[SPEEDS[0]], computed[SPEEDS[0]] = np.array(was), np.array(now)
     time = np.arange(float(len(was)))
     outcome = compare_columns(time, recorded, computed, np.ones(len(was), dtype=bool), tolerances)
     [row] = outcome.rows
@@ -453,13 +440,6 @@ def test_the_journal_numbers_events_and_counts_references():
     assert list(journal.reset()) == [2, Event.RESET, 0, 2, 0]
     assert list(journal.configure()) == [3, Event.CONFIGURE, 0, 2, 1]
     assert list(journal.odometry_timeout(5)) == [4, Event.ODOMETRY_TIMEOUT, 5, 2, 0]
-
-
-def test_settings_survive_their_topic_to_the_last_bit():
-    parameters = ControllerParameters.from_dict({'law.gain': 0.1 + 0.2})
-    revision, values = parameters_from_json(parameters_to_json(3, parameters.to_dict()))
-    assert revision == 3
-    assert ControllerParameters.from_dict(values) == parameters
     for text in ('', '{}', '[1]', '{"revision": null, "settings": {}}'):
         with pytest.raises(ValueError, match='no revision of parameters'):
             parameters_from_json(text)
@@ -743,7 +723,7 @@ def test_a_damaged_bag_is_refused_or_read_never_more(bag, tmp_path):
     generator = np.random.default_rng(5)
     copy = tmp_path / 'damaged.mcap'
     refused = 0
-    for k in range(60):
+    for k in range(30):
         content = bytearray(whole)
         if k % 3:
             content[int(generator.integers(len(whole)))] ^= 1 << int(generator.integers(8))
@@ -757,7 +737,7 @@ def test_a_damaged_bag_is_refused_or_read_never_more(bag, tmp_path):
             continue
         for name, column in read.items():
             np.testing.assert_array_equal(column.numbers, sound[name].numbers)
-    assert refused > 30
+    assert refused > 15
 
 
 # -- the commands ---------------------------------------------------------------------------------
@@ -769,7 +749,9 @@ def test_a_replay_written_as_a_bag_compares_with_its_source(bag, tmp_path, capsy
     assert 'x real time' in printed
     assert 's to compile and to warm up are not counted' in printed
     assert bag_program('compare', bag, tmp_path / 'again', '--abs', '1e-6', '--rel', '1e-6') == 0
-    assert bag_program('compare', tmp_path / 'again', '--abs', '1e-6', '--rel', '1e-6') == 0
+    picture, limits = tmp_path / 'same.png', ('--abs', '1e-6', '--rel', '1e-6')
+    assert bag_program('compare', tmp_path / 'again', *limits, '--picture', picture) == 0
+    assert picture.read_bytes().startswith(b'\x89PNG')
 
 
 def test_a_replay_with_other_parameters_reports_an_open_loop(bag, tmp_path, capsys):
@@ -783,11 +765,6 @@ def test_a_replay_with_other_parameters_reports_an_open_loop(bag, tmp_path, caps
     assert bag_program('compare', bag, tmp_path / 'what', '--picture', picture) == 3
     assert picture.read_bytes().startswith(b'\x89PNG')
     assert 'law.gain' in capsys.readouterr().out
-
-
-def test_a_picture_is_drawn_of_two_runs_that_agree(inputs, again, tmp_path):
-    write_divergence_figure(compare(inputs, again), tmp_path / 'same.png')
-    assert (tmp_path / 'same.png').read_bytes().startswith(b'\x89PNG')
 
 
 def test_wrong_tolerances_are_refused(bag):
