@@ -39,24 +39,15 @@ PUBLISHER_DEPTH = 1000
 """History depth of a publisher of the player."""
 
 # In the order of the enumerations in rmw/types.h: metadata before version 9 contains the numbers.
-HISTORY = ('system_default', 'keep_last', 'keep_all', 'unknown')
-RELIABILITY = ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available')
-DURABILITY = ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available')
-LIVELINESS = (
-    'system_default',
-    'automatic',
-    'manual_by_node',
-    'manual_by_topic',
-    'unknown',
-    'best_available',
-)
-
-_POLICIES = {
-    'history': HISTORY,
-    'reliability': RELIABILITY,
-    'durability': DURABILITY,
-    'liveliness': LIVELINESS,
-}
+POLICIES = {
+    'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
+    'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
+    'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
+    'liveliness': (
+        'system_default', 'automatic', 'manual_by_node', 'manual_by_topic', 'unknown',
+        'best_available',
+    ),
+}  # fmt: skip
 
 # Infinite durations of Fast DDS and Connext in bags of Foxy; rosbag2 converts them as well.
 _FOXY_UNLIMITED = {(0x7FFFFFFF, 0xFFFFFFFF), (0x7FFFFFFF, 0x7FFFFFFF)}
@@ -71,7 +62,7 @@ class QosError(BagError):
 
 @dataclass(frozen=True)
 class QosProfile:
-    """Offered QoS profile of one publisher; policy names as in :data:`HISTORY` and its siblings.
+    """Offered QoS profile of one publisher; policy names as in :data:`POLICIES`.
 
     Durations are ``int`` nanoseconds; 0 means unspecified.
     """
@@ -87,7 +78,7 @@ class QosProfile:
     avoid_ros_namespace_conventions: bool = False
 
     def __post_init__(self) -> None:
-        for name, policies in _POLICIES.items():
+        for name, policies in POLICIES.items():
             if getattr(self, name) not in policies:
                 raise QosError(
                     f'{name} must be one of {", ".join(policies)}: got {getattr(self, name)!r}'
@@ -114,7 +105,7 @@ class QosProfile:
     @classmethod
     def from_object(cls, profile: Any, nanoseconds: Callable[[Any], int]) -> 'QosProfile':
         """Return a profile of rclpy or rosbags, given how to convert its durations."""
-        fields: dict[str, Any] = {name: getattr(profile, name).name.lower() for name in _POLICIES}
+        fields: dict[str, Any] = {name: getattr(profile, name).name.lower() for name in POLICIES}
         for name in _DURATIONS:
             value = min(nanoseconds(getattr(profile, name)), UNLIMITED)
             fields[f'{name.removesuffix("_duration")}_ns'] = value
@@ -131,7 +122,7 @@ class QosProfile:
                 lifespan_ns=_duration_from_mapping(mapping['lifespan']),
                 liveliness_lease_ns=_duration_from_mapping(mapping['liveliness_lease_duration']),
                 avoid_ros_namespace_conventions=bool(mapping['avoid_ros_namespace_conventions']),
-                **{name: _policy_name(mapping[name], _POLICIES[name]) for name in _POLICIES},
+                **{name: _policy_name(mapping[name], POLICIES[name]) for name in POLICIES},
             )
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise QosError(f'not a QoS profile: {error!r}') from error

@@ -39,6 +39,7 @@ if TYPE_CHECKING:  # help and completion do without the libraries for bags, whic
     from t3mpc_ros.bag.qos import QosProfile
     from t3mpc_ros.bag.reader import BagReader
     from t3mpc_ros.bag.recovery import Damage, FileResult, RecoveryResult
+    from t3mpc_ros.evaluation.process_replay.controller_replay import ControllerInputs
     from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances
 
 
@@ -68,6 +69,7 @@ def size_text(count: int) -> str:
 
 
 _MAX_LISTED_ENTRIES = 6  # longer tables are only counted
+_CALIBRATED = ('calibration.', 'odometry.gyro_scale', 'wheel_radius', 'wheel_separation')
 
 
 def _add_info(commands: Commands) -> None:
@@ -185,17 +187,12 @@ def _info_table(title: str, table: Mapping[str, str]) -> str:
 
 def _calibrations(records: Mapping[str, Mapping[str, str]]) -> list[str]:
     """Return the values and uncertainties of each calibrated robot."""
-    texts = []
-    for node, table in records.items():
-        if not table.get('calibration.date', ''):
-            continue
-        names = [name for name in table if name.startswith(_CALIBRATED)]
-        rows = [(f'  {name}', table[name]) for name in names]
-        texts.append(f'calibration of {node}\n' + columns(rows))
-    return texts
-
-
-_CALIBRATED = ('calibration.', 'odometry.gyro_scale', 'wheel_radius', 'wheel_separation')
+    return [
+        f'calibration of {node}\n'
+        + columns([(f'  {name}', table[name]) for name in table if name.startswith(_CALIBRATED)])
+        for node, table in records.items()
+        if table.get('calibration.date', '')
+    ]
 
 
 EXIT_LOSS = 3
@@ -434,25 +431,27 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
     add('--namespace', help='of the robot, where the bag holds several')
 
 
-def _run_replay(options: argparse.Namespace) -> None:
+def _changed_inputs(options: argparse.Namespace) -> tuple['ControllerInputs', dict[str, object]]:
+    """Return the inputs of the recorded controller, and the parameters that are to change."""
     from t3mpc_ros.bag.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
-    from t3mpc_ros.evaluation.process_replay.controller_replay import (
-        OPEN_LOOP,
-        load_inputs,
-        make_controllers,
-        replay_controller,
-    )
-    from t3mpc_ros.evaluation.process_replay.replay_comparison import compare
+    from t3mpc_ros.evaluation.process_replay.controller_replay import load_inputs
 
     changes = parse_assignments(ControllerParameters, options.parameters)
     model = load_model(options.model) if options.model else None
+    return load_inputs(options.bag, options.namespace, model), changes
+
+
+def _run_replay(options: argparse.Namespace) -> None:
+    from t3mpc_ros.evaluation.process_replay import controller_replay
+    from t3mpc_ros.evaluation.process_replay.replay_comparison import compare
+
     begin = time.perf_counter()
-    inputs = load_inputs(options.bag, options.namespace, model)
+    inputs, changes = _changed_inputs(options)
     read = time.perf_counter()
-    controllers = make_controllers(inputs, changes)
+    controllers = controller_replay.make_controllers(inputs, changes)
     ready = time.perf_counter()
-    again = replay_controller(inputs, changes, controllers)
+    again = controller_replay.replay_controller(inputs, changes, controllers)
     end = time.perf_counter()
     reading, starting, running = read - begin, ready - read, end - ready
     span = again.steps / again.parameters.rate
@@ -464,7 +463,7 @@ def _run_replay(options: argparse.Namespace) -> None:
         f'{starting:.2f} s to compile and to warm up are not counted\n{outcome.table()}'
     )
     if changes or options.model:
-        text += f'\n{OPEN_LOOP}'
+        text += f'\n{controller_replay.OPEN_LOOP}'
     record: dict[str, Any] = {
         'steps': again.steps,
         'seconds': span,
@@ -513,34 +512,23 @@ def _add_compare(commands: Commands) -> None:
 
 def _run_compare(options: argparse.Namespace) -> int:
     """Print the comparison; return 0 when all is within the tolerances, 3 otherwise."""
-    from t3mpc_ros.bag.model_file import load_model
-    from t3mpc_ros.control.controller import ControllerParameters
-    from t3mpc_ros.evaluation.process_replay.controller_replay import (
-        OPEN_LOOP,
-        load_inputs,
-        replay_controller,
-    )
-    from t3mpc_ros.evaluation.process_replay.replay_comparison import (
-        compare,
-        compare_bags,
-        write_divergence_figure,
-    )
+    from t3mpc_ros.evaluation.process_replay import controller_replay, replay_comparison
 
     tolerances = _tolerances(options)
-    changes = parse_assignments(ControllerParameters, options.parameters)
-    model = load_model(options.model) if options.model else None
-    inputs = load_inputs(options.bag, options.namespace, model)
+    inputs, changes = _changed_inputs(options)
+    changed = changes or options.model
     if options.other is not None:
-        if changes or model:
+        if changed:
             raise ValueError('--set and --model are for a replay: give one bag only')
-        other = load_inputs(options.other, options.namespace)
-        outcome = compare_bags(inputs, other, tolerances)
+        other = controller_replay.load_inputs(options.other, options.namespace)
+        outcome = replay_comparison.compare_bags(inputs, other, tolerances)
     else:
-        outcome = compare(inputs, replay_controller(inputs, changes), tolerances)
-    text = outcome.table() + (f'\n{OPEN_LOOP}' if changes or model else '')
+        again = controller_replay.replay_controller(inputs, changes)
+        outcome = replay_comparison.compare(inputs, again, tolerances)
+    text = outcome.table() + (f'\n{controller_replay.OPEN_LOOP}' if changed else '')
     print_result(options, lambda: text, outcome.to_dict)
     if options.picture:
-        write_divergence_figure(outcome, options.picture)
+        replay_comparison.write_divergence_figure(outcome, options.picture)
         print(f'drawn to {options.picture}', file=sys.stderr)
     return SAME if outcome.same else DIFFERS
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.control.control_law import TERM_NAMES
-from t3mpc_ros.evaluation.bag_report.incidents import STILL, UNDER_WAY
+from t3mpc_ros.evaluation.bag_report.incidents import UNDER_WAY, exceeds
 from t3mpc_ros.evaluation.bag_report.metrics import compute_metrics
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
 from t3mpc_ros.evaluation.topic_roles import ReportOptions, bag_display_name
@@ -80,7 +80,7 @@ def recorded_run(bag: Path, namespace: str | None = None) -> LiveData:
     events += [(when, 'note', f'{node}: {text}') for when, _, node, text in run.complaints]
     for stop in incidents.stops:
         later = run.motions[run.measured].between(stop.end, math.inf)
-        if any(np.any(np.abs(later[k]) > UNDER_WAY * least) for k, least in STILL.items()):
+        if exceeds(later, UNDER_WAY).any():
             events.append((stop.end, 'resume', 'the robot moves again'))
     for event in sorted(events + incidents.events()):
         data.report(*event)

@@ -50,7 +50,7 @@ from t3mpc_ros.evaluation.bag_report.run_comparison import error_differences
 from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Series, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     driven,
-    settled,
+    driven_and_settled,
     settled_rmse,
     statistics,
     tracking_error,
@@ -305,7 +305,7 @@ def test_a_bag_and_a_run_have_the_same_settled_error(run, duration, switches):
     recorded = replace(run, motions=motions, switches=record.switches)
     truth = tracking_error(recorded, TRUTH).time
     np.testing.assert_array_equal(driven(truth, recorded), simulated.counted)
-    np.testing.assert_array_equal(settled(truth, recorded), simulated.settled)
+    np.testing.assert_array_equal(driven_and_settled(truth, recorded), simulated.settled)
     both = math.hypot(*settled_rmse(recorded)) / math.sqrt(2.0)
     assert both == pytest.approx(SETTLED.value(simulated))
 

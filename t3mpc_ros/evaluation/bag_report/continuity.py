@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from t3mpc_ros.control.watchdog import FAR_BEYOND, TwistUnits
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, Pose, State
 
-Integers = NDArray[np.int64]
-
 MIN_GAP = 2.0
 """Least time without a message that is a gap, s."""
 GAP_PERIODS = 20.0
@@ -73,8 +71,10 @@ def within_gaps(time: Array, series: Array) -> NDArray[np.bool_]:
     return inside
 
 
-def pose_jumps(stamps: Array, positions: Array, speeds: Array, least: float) -> Integers:
-    """Return the rows whose position is farther from that before than the speed explains.
+def pose_jumps(
+    stamps: Array, positions: Array, speeds: Array, least: float = POSE_JUMP
+) -> list[tuple[int, float]]:
+    """Return row and distance (m) of each position farther from that before than it can be driven.
 
     By more than ``least`` metres, or :data:`REST_JUMP` at rest if that is less; stamps (s),
     positions (m, shape (n, 2)), forward speeds (m/s).
@@ -84,49 +84,37 @@ def pose_jumps(stamps: Array, positions: Array, speeds: Array, least: float) -> 
     intervals = np.abs(np.diff(stamps))
     rests = (fastest < REST_SPEED) & (intervals <= REST_INTERVAL)
     allowed = np.where(rests, min(least, REST_JUMP), least)
-    return np.flatnonzero(away > allowed + SPEED_MARGIN * fastest * intervals) + 1
+    rows = np.flatnonzero(away > allowed + SPEED_MARGIN * fastest * intervals)
+    return list(zip((rows + 1).tolist(), away[rows].tolist(), strict=True))
+
+
+def jumps_often(stamps: Array, positions: Array, speeds: Array) -> bool:
+    """Return whether the position jumps as if a topic held several robots."""
+    jumps = len(pose_jumps(stamps, positions, speeds, MIXED_STEP))
+    return jumps > max(MIN_JUMPS, MIXED_SHARE * stamps.size)
 
 
 def continuity_notes(
     topic: str, received: Array, stamps: Array, positions: Array, speeds: Array
 ) -> list[str]:
-    """Return sentences on gaps and jumps of the pose of an odometry topic.
-
-    Times (s), positions (m, shape (n, 2)) and forward speeds (m/s) are in the order of the bag.
-    """
-    notes = shortened(
-        [
-            f'No message of {topic} for {high - low:.1f} s from {low:.1f} s on.'
-            for low, high in gaps(np.sort(received))
-        ],
-        'gaps',
-    )
-    away = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    jumps = [
-        f'The position of {topic} jumps by {away[k - 1]:.4g} m at {received[k]:.1f} s.'
-        for k in pose_jumps(stamps, positions, speeds, POSE_JUMP).tolist()
+    """Return sentences on gaps and jumps of an odometry topic, whose data are as in the bag."""
+    silent = [
+        f'No message of {topic} for {high - low:.1f} s from {low:.1f} s on.'
+        for low, high in gaps(np.sort(received))
     ]
-    return notes + shortened(jumps, 'jumps of the position')
-
-
-def shortened(notes: list[str], what: str) -> list[str]:
-    """Return at most five sentences and the number of the others."""
-    if len(notes) > _MAX_LISTED:
-        return [*notes[:_MAX_LISTED], f'There are {len(notes) - _MAX_LISTED} more {what}.']
-    return notes
-
-
-def jumps_often(stamps: Array, positions: Array, speeds: Array) -> bool:
-    """Return whether the position jumps as if a topic held several robots."""
-    jumps = pose_jumps(stamps, positions, speeds, MIXED_STEP).size
-    return jumps > max(MIN_JUMPS, MIXED_SHARE * stamps.size)
+    jumps = [
+        f'The position of {topic} jumps by {away:.4g} m at {received[k]:.1f} s.'
+        for k, away in pose_jumps(stamps, positions, speeds)
+    ]
+    found = []
+    for notes, what in ((silent, 'gaps'), (jumps, 'jumps of the position')):
+        more = len(notes) - _MAX_LISTED
+        found += notes[:_MAX_LISTED] + ([f'There are {more} more {what}.'] if more > 0 else [])
+    return found
 
 
 def other_units(stamps: Array, poses: Array, twists: Array) -> str:
-    """Return a twist that shows that those of an odometry are in other units; '' if none does.
-
-    Stamps (s) in the order of the bag, poses (x, y in m, yaw in rad) and twists, shape (n, ...).
-    """
+    """Return a twist that shows that those of an odometry are in other units; '' if none does."""
     units = TwistUnits()
     if not np.any(np.abs(twists) > FAR_BEYOND):  # no message can contradict its pose
         return ''

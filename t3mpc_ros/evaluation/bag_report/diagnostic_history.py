@@ -51,17 +51,6 @@ MAX_CHANGES = 1000
 """Changes of the state of nodes that are kept."""
 
 
-class Diagnostics(NamedTuple):
-    """What the nodes reported about themselves."""
-
-    complaints: tuple[DiagnosticEvent, ...]
-    """Each distinct warning or error with its first time, in order."""
-    changes: tuple[DiagnosticEvent, ...]
-    """Each state of a node that follows another one of it, in order; not that it was well from the
-    start."""
-    links: 'tuple[LinkHistory, ...]'
-
-
 @dataclass(frozen=True)
 class LinkHistory:
     """Metrics of one link over time."""
@@ -141,10 +130,13 @@ def _over(measure: Callable[[Array], Any], values: Array) -> float:
     return float(measure(values)) if np.isfinite(values).any() else math.nan
 
 
-def read_diagnostics(recording: BagReader, namespace: str) -> Diagnostics:
-    """Return the warnings and errors of all nodes, and all links of the bag.
+def read_diagnostics(
+    recording: BagReader, namespace: str
+) -> tuple[list[DiagnosticEvent], list[DiagnosticEvent], list[LinkHistory]]:
+    """Return what the nodes report, in ``/diagnostics`` and in that of the namespace.
 
-    ``/diagnostics`` is read for the whole bag, and below the namespace for that robot.
+    Each distinct warning or error with its first time; each state of a node that follows another
+    one of it, but not that it was well from the start; and the radio links.
     """
     found: dict[tuple[str, str, str], float] = {}
     changes: list[DiagnosticEvent] = []
@@ -168,22 +160,12 @@ def read_diagnostics(recording: BagReader, namespace: str) -> Diagnostics:
     links = []
     for name, entries in rows.items():
         keys = [k for k in (*SHARES, *COUNTERS) if any(k in numbers for _, numbers in entries)]
-        links.append(
-            LinkHistory(
-                name,
-                np.array([when for when, _ in entries]),
-                {
-                    key: np.array([numbers.get(key, math.nan) for _, numbers in entries])
-                    for key in keys
-                },
-            )
-        )
+        values = {
+            key: np.array([numbers.get(key, math.nan) for _, numbers in entries]) for key in keys
+        }
+        links.append(LinkHistory(name, np.array([when for when, _ in entries]), values))
     complaints = sorted(found.items(), key=lambda item: item[1])
-    return Diagnostics(
-        tuple((when, *key) for key, when in complaints),
-        tuple(sorted(changes)[:MAX_CHANGES]),
-        tuple(links),
-    )
+    return [(when, *key) for key, when in complaints], sorted(changes)[:MAX_CHANGES], links
 
 
 def _text(status: Any) -> str:

@@ -13,7 +13,7 @@
 # limitations under the License.
 """What interrupted a recorded run: stops of the robot, stalls of the machine, gaps, jumps."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 from typing import NamedTuple
@@ -21,12 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.continuity import (
-    MIN_GAP,
-    POSE_JUMP,
-    gaps,
-    pose_jumps,
-)
+from t3mpc_ros.evaluation.bag_report.continuity import MIN_GAP, gaps, pose_jumps
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import SLIP, Cause, cause_between
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series, moves
 from t3mpc_ros.evaluation.record import spans_of
@@ -127,14 +122,8 @@ class Incidents:
             (jump.time, 'jump', f'of the position of {jump.name}, by {jump.distance:.4g} m')
             for jump in self.jumps
         ]
-        found += [
-            (
-                start,
-                'slip',
-                f'for {end - start:.1f} s a wheel slips, is blocked, or has lost steps',
-            )
-            for start, end in self.slips
-        ]
+        slips = 'a wheel slips, is blocked, or has lost steps'
+        found += [(start, 'slip', f'for {end - start:.1f} s {slips}') for start, end in self.slips]
         return sorted(found)
 
 
@@ -208,6 +197,14 @@ def still_rows(linear: Array, angular: Array, factor: float = 1.0) -> NDArray[np
     return still
 
 
+def exceeds(speeds: Series | Mapping[str, Array], factor: float) -> NDArray[np.bool_]:
+    """Return where a speed exceeds ``factor`` times :data:`STILL`."""
+    found: NDArray[np.bool_] = np.any(
+        [np.abs(speeds[name]) > factor * least for name, least in STILL.items()], axis=0
+    )
+    return found
+
+
 def find_slips(run: Run) -> tuple[Span, ...]:
     """Return start and end of each time in which diagnostics say that a wheel slips, s."""
     begun: dict[str, float] = {}
@@ -229,15 +226,10 @@ def standstills(motion: Series) -> list[Span]:
     still = still_rows(linear, angular)
     found = []
     for each in spans_of(still_rows(linear, angular, HOLD)):
-        if np.mean(still[each]) < 0.5:
-            continue
-        low, high = float(time[each][0]), float(time[each][-1])
-        found.append(
-            (
-                _edge(motion, low, -1, 0.5 * (low + high)),
-                _edge(motion, high, 0, 0.5 * (low + high)),
-            )
-        )
+        if np.mean(still[each]) >= 0.5:
+            low, high = float(time[each][0]), float(time[each][-1])
+            middle = 0.5 * (low + high)
+            found.append((_edge(motion, low, -1, middle), _edge(motion, high, 0, middle)))
     return merged(found)
 
 
@@ -248,7 +240,7 @@ def _edge(motion: Series, at: float, which: int, middle: float) -> float:
     the robot does not move within half of :data:`BRAKING`.
     """
     near = motion.between(at - 0.5 * BRAKING, at + 0.5 * BRAKING)
-    fast = np.any([np.abs(near[k]) > UNDER_WAY * least for k, least in STILL.items()], axis=0)
+    fast = exceeds(near, UNDER_WAY)
     fast &= near.time < middle if which else near.time > middle
     return float(near.time[fast][which]) if fast.any() else at
 
@@ -294,7 +286,8 @@ def find_stops(run: Run) -> tuple[Stop, ...]:
             start = max(min(start, by_command[0][0]), low - BRAKING, first)
         elif stop - start < PAUSE:
             continue
-        if not (start < stop and _asks_for_motion(demand, start, stop)):
+        asked = asks_for_motion(demand, np.linspace(start, stop, 50))
+        if not (start < stop and np.mean(asked) >= 0.5):
             continue
         cause = cause_between(run.changes, start, stop)
         if start >= last - PAUSE and not cause.known:
@@ -309,12 +302,8 @@ def _begin_of_stop(motion: Series, asked: Series, standstill: float) -> float:
     At most :data:`BRAKING` before; the standstill itself for a robot that did not.
     """
     near = motion.between(standstill - BRAKING, standstill)
-    apart = [
-        np.abs(near[name] - asked.held(name, near.time)) > UNDER_WAY * least
-        for name, least in STILL.items()
-    ]
-    moving = [np.abs(near[name]) > UNDER_WAY * least for name, least in STILL.items()]
-    following = near.time[~np.any(apart, axis=0) & np.any(moving, axis=0)]
+    apart = {name: near[name] - asked.held(name, near.time) for name in STILL}
+    following = near.time[~exceeds(apart, UNDER_WAY) & exceeds(near, UNDER_WAY)]
     return float(following[-1]) if following.size else standstill
 
 
@@ -326,14 +315,11 @@ def _commanded_stops(command: Series) -> list[Span]:
     return merged([(float(time[k] + waits[k]), float(time[k + 1])) for k in rows], 1e-9)
 
 
-def _asks_for_motion(demand: Series, start: float, end: float) -> bool:
-    """Return whether a reference or command asks for motion in most of a time."""
-    time = np.linspace(start, end, 50)
-    asked = np.zeros(time.size, dtype=np.bool_)
-    for name, least in STILL.items():
-        asked |= np.abs(demand.held(name, time)) > DEMANDED * least
-    asked &= time >= demand.time[0]
-    return bool(np.mean(asked) >= 0.5)
+def asks_for_motion(demand: Series, time: Array) -> NDArray[np.bool_]:
+    """Return at which times a reference or command asks for motion, shape (n,)."""
+    held = {name: demand.held(name, time) for name in STILL}
+    asked: NDArray[np.bool_] = exceeds(held, DEMANDED) & (time >= demand.time[0])
+    return asked
 
 
 def find_blocked_wheels(run: Run) -> tuple[tuple[float, float, str], ...]:
@@ -408,10 +394,8 @@ def find_jumps(run: Run) -> tuple[Jump, ...]:
         if motion is None or 'x' not in motion.values or name in run.untrusted:
             continue
         places = np.stack([motion['x'], motion['y']], axis=1)
-        given = motion.time, places, motion['linear']
-        away = np.linalg.norm(np.diff(places, axis=0), axis=1)
         found += [
-            Jump(float(motion.time[k]), name, float(away[k - 1]))
-            for k in pose_jumps(*given, POSE_JUMP).tolist()
+            Jump(float(motion.time[k]), name, away)
+            for k, away in pose_jumps(motion.time, places, motion['linear'])
         ]
     return tuple(sorted(found))

@@ -14,7 +14,8 @@
 """Changes of the map in a bag: what a patrol found, as a table and as points on the floor."""
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,12 +24,12 @@ from t3mpc_ros.evaluation.reporting import Block, Heading, Paragraph, Table
 from t3mpc_ros.geometry.types import Array
 
 TOPIC = 'map_changes'
+NUMBERS = ('x_m', 'y_m', 'size_m', 'confidence', 'first_seen_s', 'found_s', 'last_seen_s')
 
 
 class RecordedChange(NamedTuple):
     """What contradicted the map, as last published."""
 
-    name: str
     kind: str
     state: str
     """there, gone or withdrawn"""
@@ -50,45 +51,27 @@ class RecordedChange(NamedTuple):
 def read_map_changes(
     recording: BagReader, namespace: str, local: Callable[[Array], Array]
 ) -> tuple[RecordedChange, ...]:
-    """Return the changes in a bag, in the order in which they were found.
-
-    local : maps receive times to times of the run, s
-    """
+    """Return the changes in a bag; ``local`` maps receive times to times of the run, s."""
     topic = recording.topics.get(f'{namespace}/{TOPIC}')
     if topic is None or not topic.type_name.endswith('DiagnosticArray'):
         return ()
     found: dict[str, RecordedChange] = {}
     for received, message in recording.messages(topic.name):
         for status in message.status:
-            try:
-                begin = found[status.name].found if status.name in found else None
-                change = _change(
-                    status, float(local(np.array([received]))[0]) if begin is None else begin
+            values = {each.key: each.value for each in status.values}
+            before = found.get(status.name)
+            with suppress(KeyError, ValueError):  # of another publisher
+                x, y, size, confidence, first, event, last = (
+                    float(values[key]) for key in NUMBERS
                 )
-            except (KeyError, ValueError):  # of another publisher
-                continue
-            found[status.name] = change
+                gone = 'withdrawn' if values.get('withdrawn') == 'True' else 'gone'
+                found[status.name] = RecordedChange(
+                    values['kind'], 'there' if values['present'] == 'True' else gone,
+                    x, y, size, confidence,
+                    before.found if before else float(local(np.array([received]))[0]),
+                    event - first, last - first,
+                )  # fmt: skip
     return tuple(found.values())
-
-
-def _change(status: Any, found: float) -> RecordedChange:
-    values = {each.key: each.value for each in status.values}
-    first, event, last = (
-        float(values[f'{key}_s']) for key in ('first_seen', 'found', 'last_seen')
-    )
-    gone = 'withdrawn' if values.get('withdrawn') == 'True' else 'gone'
-    return RecordedChange(
-        status.name,
-        values['kind'],
-        'there' if values['present'] == 'True' else gone,
-        float(values['x_m']),
-        float(values['y_m']),
-        float(values['size_m']),
-        float(values['confidence']),
-        found,
-        event - first,
-        last - first,
-    )
 
 
 def map_change_blocks(changes: tuple[RecordedChange, ...]) -> Iterator[Block]:
@@ -99,17 +82,12 @@ def map_change_blocks(changes: tuple[RecordedChange, ...]) -> Iterator[Block]:
     head = ['found / s', 'kind', 'place', 'size', 'confidence', 'seen before', 'seen for', 'state']
     rows = [
         [
-            f'{each.found:.1f}',
-            each.kind,
-            f'x {each.x:.2f} m, y {each.y:.2f} m',
-            f'{each.size:.2f} m',
-            f'{each.confidence:.2f}',
-            f'{each.seen_before:.1f} s',
-            f'{each.seen_for:.1f} s',
-            each.state,
+            f'{each.found:.1f}', each.kind, f'x {each.x:.2f} m, y {each.y:.2f} m',
+            f'{each.size:.2f} m', f'{each.confidence:.2f}', f'{each.seen_before:.1f} s',
+            f'{each.seen_for:.1f} s', each.state,
         ]
         for each in changes
-    ]
+    ]  # fmt: skip
     yield Table('', head, rows, text=4)
     yield Paragraph(
         'New: a thing that the map lacks; missing: one that is not where the map has it; moving: '

@@ -154,7 +154,7 @@ class ReportMetrics:
     def delay(self, channel: str) -> float:
         """Return the time from command to motion of a channel, s; NaN if it is not clear."""
         fit = self.responses.get(channel)
-        return fit.dead_time + fit.lag if fit and fit.clear else math.nan
+        return fit.delay if fit and fit.clear else math.nan
 
     def numbers(self) -> list[tuple[str, str]]:
         """Return the main numbers that are known, each with its unit, and what it is.

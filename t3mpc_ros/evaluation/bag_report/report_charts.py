@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS
-from t3mpc_ros.evaluation.bag_report.continuity import POSE_JUMP, gaps, pose_jumps
+from t3mpc_ros.evaluation.bag_report.continuity import gaps, pose_jumps
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED
 from t3mpc_ros.evaluation.bag_report.metrics import (
     UNMEASURED,
@@ -36,9 +36,9 @@ from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
 from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
     driven,
+    driven_and_settled,
     odometry_sets,
     path_distance,
-    settled,
     tracking_error,
 )
 from t3mpc_ros.evaluation.charts import Chart, Curve, Line, LineStyle, Plane, thinned
@@ -140,7 +140,7 @@ def error(run: Run, metrics: ReportMetrics) -> Shown:
     if not is_long(series):
         return
     moving = driven(series.time, run)
-    calm = moving & settled(series.time, run)
+    calm = driven_and_settled(series.time, run)
     lines, seen = [], []
     for wheel, (name, title, _, unit) in zip(WHEELS, run.channels, strict=True):
         found, text = metrics.wheels[name], UNMEASURED
@@ -236,7 +236,7 @@ def response(run: Run, metrics: ReportMetrics) -> Shown:
             value, near = predicted(fit, command, name, time), time >= start
             lines.append(Line('fit', 'c4', time[near], value[near], (4, 2)))
             seen = (
-                f'The robot responds {1e3 * (fit.dead_time + fit.lag):.0f} ms late: dead time '
+                f'The robot responds {1e3 * fit.delay:.0f} ms late: dead time '
                 f'{1e3 * fit.dead_time:.0f} ms, lag {1e3 * fit.lag:.0f} ms, gain {fit.gain:.3g}. '
                 f'The fit is drawn from {start:.1f} to {end:.1f} s, where the command varies most.'
             )
@@ -314,7 +314,7 @@ def path(run: Run, metrics: ReportMetrics) -> Shown:
     for name, motion in shown.items():
         x, y = _on_floor(run) if name == ODOMETRY else (motion['x'], motion['y'])
         positions = np.stack([x, y], axis=1)
-        breaks = pose_jumps(motion.time, positions, motion['linear'], POSE_JUMP)
+        breaks = [row for row, _ in pose_jumps(motion.time, positions, motion['linear'])]
         curves.append(_curve(name, motion, x, y, breaks))
     measured = curves[-1]
     reference = run.motions.get(REFERENCE)
@@ -371,10 +371,7 @@ def _curve(
 
 
 def _on_floor(run: Run) -> tuple[Array, Array]:
-    """Return the positions of the odometry, with its frame laid on the first common true pose.
-
-    Later, their distance is the drift.
-    """
+    """Return the positions of the odometry, with its frame laid on the first common true pose."""
     odometry, truth = run.motions[ODOMETRY], run.motions.get(TRUTH)
     x, y = odometry['x'], odometry['y']
     if truth is None:

@@ -82,7 +82,7 @@ def response_table(run: Run, fits: Mapping[str, ResponseFit]) -> Table:
         if fit is None:
             rows.append([each.title, *[EMPTY_CELL] * 5])
             continue
-        times = fit.dead_time, fit.lag, fit.dead_time + fit.lag
+        times = fit.dead_time, fit.lag, fit.delay
         numbers = [f'{1e3 * value:.0f}' for value in times] if fit.clear else [EMPTY_CELL] * 3
         gain = format_number(fit.gain) if fit.clear else EMPTY_CELL
         rows.append([each.title, *numbers, gain, format_number(100.0 * max(fit.explained, 0.0))])
@@ -371,10 +371,7 @@ def motion_rows(run: Run) -> list[list[str]]:
         more = f', and {len(stops) - 5} more' if len(stops) > 5 else ''
         rows.append(['standstill at', f'{where}{more} s'])
     if command is not None:
-        commanded = np.zeros(time.size, dtype=np.bool_)
-        for name, least in incidents.STILL.items():
-            commanded |= np.abs(command.held(name, time)) > incidents.DEMANDED * least
-        commanded &= time >= command.time[0]
+        commanded = incidents.asks_for_motion(command, time)
         disobeyed = step * sum(int(np.count_nonzero(commanded[each])) for each in spans)
         rows.append(['of that, motion was commanded', f'{disobeyed:.1f} s'])
     return rows

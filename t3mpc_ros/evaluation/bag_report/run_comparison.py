@@ -36,9 +36,8 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 from t3mpc_ros.evaluation.bag_report.report_page import verdict_box
 from t3mpc_ros.evaluation.bag_report.run_data import Channel, Run, Series, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import (
-    driven,
+    driven_and_settled,
     path_distance,
-    settled,
     tracking_error,
 )
 from t3mpc_ros.evaluation.charts import Chart, Curve, Plane
@@ -117,7 +116,7 @@ def block_errors(run: Run, name: str) -> list[float]:
         return []
     counted = np.isfinite(error[name])
     if name != DISTANCE.name:
-        counted &= driven(error.time, run) & settled(error.time, run)
+        counted &= driven_and_settled(error.time, run)
     squares = error[name][counted] ** 2
     size = max(1, round(BLOCK / float(np.median(np.diff(error.time)))))
     count = squares.size // size
@@ -360,7 +359,7 @@ def _settled_extent(runs: Sequence[ComparedRun], name: str) -> tuple[float, floa
     for each in runs:
         error = tracking_error(each.run, each.run.measured)
         if error is not None:
-            rows = driven(error.time, each.run) & settled(error.time, each.run)
+            rows = driven_and_settled(error.time, each.run)
             found.append(report_charts.extent_of(error, rows, [name]))
     known = [each for each in found if each is not None]
     return (min(low for low, _ in known), max(high for _, high in known)) if known else None

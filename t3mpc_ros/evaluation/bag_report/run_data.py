@@ -240,7 +240,9 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         else:
             motions[name] = _motion(table['stamp'] - clock.origin, table, geometry)
     oddities += _oddities_of_motions(topics, raw)
-    diagnostics = diagnostic_history.read_diagnostics(recording, choice.namespaces[0])
+    complaints, changes, links = diagnostic_history.read_diagnostics(
+        recording, choice.namespaces[0]
+    )
     expected = NAMES if choice.ours else (REFERENCE, ODOMETRY, COMMAND)
     return Run(
         duration=recording.duration,
@@ -260,9 +262,9 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
         },
         switches=_switches(numbers, motions.get(REFERENCE)),
         lead=clock.lead,
-        complaints=diagnostics.complaints,
-        changes=diagnostics.changes,
-        links=diagnostics.links,
+        complaints=tuple(complaints),
+        changes=tuple(changes),
+        links=tuple(links),
         oddities=tuple(dict.fromkeys(oddities)),
         remarks=tuple(notes),
         doubts=tuple(doubts),

@@ -52,10 +52,7 @@ class ErrorStatistics:
 
 
 def statistics(error: Array, period: float = math.nan) -> ErrorStatistics:
-    """Return root mean square, mean and largest of the absolute error.
-
-    Each sample of ``error`` stands for ``period`` seconds.
-    """
+    """Return statistics of the absolute error, of which each sample stands for ``period`` s."""
     size = np.abs(error[np.isfinite(error)])
     if not size.size:
         return ErrorStatistics(math.nan, math.nan, math.nan, 0, 0.0)
@@ -88,11 +85,7 @@ def tracking_error(run: Run, measured: str) -> Series | None:
 
 
 def counted_span(time: Array, run: Run) -> Span:
-    """Return from when to when errors at ``time`` (s) count; (inf, -inf) if they never do.
-
-    The robot is controlled while it is driven and has a reference; the start of that time does not
-    count, see :func:`t3mpc_ros.evaluation.record.counted_from`.
-    """
+    """Return from when to when errors at ``time`` (s) count; (inf, -inf) if they never do."""
     first, last = driving(run)
     if not time.size or not first < last:
         return math.inf, -math.inf
@@ -118,9 +111,10 @@ def apart_from(time: Array, spans: Sequence[Span]) -> NDArray[np.bool_]:
     return away
 
 
-def settled(time: Array, run: Run) -> NDArray[np.bool_]:
-    """Return which stamps of an error (s) are settled, as those of a simulated run."""
-    return counted_rows(time, run.switches, *counted_span(time, run), ROBOT_WINDOW)
+def driven_and_settled(time: Array, run: Run) -> NDArray[np.bool_]:
+    """Return which of them are settled as well, as those of a simulated run."""
+    calm = counted_rows(time, run.switches, *counted_span(time, run), ROBOT_WINDOW)
+    return driven(time, run) & calm
 
 
 def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, ErrorStatistics]]:
@@ -129,8 +123,7 @@ def errors_of(run: Run, measured: str) -> dict[str, tuple[ErrorStatistics, Error
     if error is None:
         nothing = statistics(np.empty(0))
         return dict.fromkeys((each.name for each in run.channels), (nothing, nothing))
-    moving = driven(error.time, run)
-    calm = moving & settled(error.time, run)
+    moving, calm = driven(error.time, run), driven_and_settled(error.time, run)
     period = float(np.median(np.diff(error.time))) if len(error) > 1 else math.nan
     return {
         wheel: (statistics(error[wheel][moving], period), statistics(error[wheel][calm], period))
@@ -220,7 +213,7 @@ def settled_rmse(
     error = tracking_error(run, run.measured)
     if error is None:
         return math.nan, math.nan
-    rows = driven(error.time, run) & settled(error.time, run) & (error.time < until)
+    rows = driven_and_settled(error.time, run) & (error.time < until)
     rows &= apart_from(error.time, spared)
     right, left = (statistics(error[each.name][rows]).rmse for each in run.channels)
     return right, left
