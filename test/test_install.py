@@ -174,17 +174,6 @@ def test_every_installed_node_starts_and_exits_with_0(tree, graph, monkeypatch):
         group.end_all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('tree', few_of(['copied', 'symlinked'], 0), indirect=True)
-def test_the_installed_program_computes_lyapunov_exponents(tree):
-    done = tree.run('t3mpc', 'exponents', '--duration', '20')
-    assert done.returncode == 0, done.stderr
-    # The sum is the trace of the Jacobian, whatever the duration.
-    assert float(re.search(r'sum: (-?[\d.]+)', done.stdout).group(1)) == pytest.approx(
-        -38, abs=0.1
-    )
-
-
 def test_colcon_test_runs_the_tests_and_reports_them(copied):
     """Without pytest as a test dependency it ran nothing and reported success."""
     workspace = copied.source.parent.parent

@@ -168,16 +168,3 @@ def test_an_installation_by_pip_runs_in_any_folder(installed, tmp_path):
     assert shown.startswith(str(installed))
     for name in sorted(EXECUTABLES):
         assert 't3mpc_ros' in _run(nodes / name, '--version', cwd=tmp_path)
-
-
-@pytest.mark.long
-@pytest.mark.ros
-def test_the_demo_runs_after_an_installation_by_pip(installed, tmp_path, graph):
-    words = [installed / 'bin' / 't3mpc', 'demo', '--duration', '5', '--headless']
-    graph = {key: value for key, value in os.environ.items() if key.startswith('ROS_')}
-    # A demo that the machine was too slow for is repeated; one that does not follow fails.
-    done = run(
-        [ROOT / '.ci' / 'demo', *words], 900.0, cwd=tmp_path, env=clean_environment(**graph)
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert (tmp_path / 'runs' / 'latest' / 'report.html').is_file()

@@ -13,8 +13,6 @@
 # limitations under the License.
 """``t3mpc robot`` as a command: exit codes, messages, and one run over pseudo terminals."""
 
-import itertools
-import json
 import os
 import signal
 import subprocess
@@ -28,10 +26,8 @@ from support.waiting import communicate
 
 from t3mpc_ros.cli import robot as cli
 from t3mpc_ros.cli import robot_calibrate
-from t3mpc_ros.radio.protocol.authentication import key_check, read_key
 from t3mpc_ros.radio.serial_port import SerialPort
 from t3mpc_ros.radio.tool import procedure
-from t3mpc_ros.radio.tool.manoeuvre import Jog
 from t3mpc_ros.robot.calibration import Recording
 
 
@@ -56,64 +52,6 @@ def ports(tmp_path):
     assert 'Traceback' not in output
     assert not dongle.is_symlink()
     assert not robot.is_symlink()
-
-
-@pytest.mark.long
-def test_bench_session_from_key_to_jog(ports, tmp_path, capsys, monkeypatch):
-    """Over pseudo terminals, in the order of docs/robot.md."""
-    dongle, robot = ports
-    key = str(tmp_path / 'key')
-
-    def run(*arguments):
-        code = cli.main(arguments)
-        output = capsys.readouterr()
-        return code, output.out + output.err
-
-    assert run('key', 'create', key)[0] == 0
-    assert run('key', 'create', key)[0] == 2
-    check = f'{key_check(read_key(tmp_path / "key")):08x}'
-    assert check in run('key', 'check', key)[1]
-    assert 'no key' in run('key', 'state', '--port', robot)[1]
-    code, output = run('key', 'write', key, '--port', robot)
-    assert (code, check in output) == (0, True)
-    assert run('key', 'state', '--port', robot, '--key', key)[0] == 0
-    code, output = run('key', 'write', key, '--port', dongle)
-    assert (code, 'this is the dongle' in output) == (2, True)
-    code, output = run('parameters', '--port', dongle)
-    assert (code, 'give the host the key' in output) == (2, True)
-    code, output = run('parameters', '--port', dongle, '--key', key, '--set', 'robot.idle_off=5')
-    assert (code, 'ttl_max' in output, '5000' in output) == (0, True, True)
-    assert 'robot answers by radio' in run('ping', '--port', dongle, '--count', '20')[1]
-    code, output = run('scan', '--port', dongle)
-    assert (code, 'channel 82 at 1M' in output) == (0, True)
-    code, output = run('jog', 'left', '0.2', '--port', dongle, '--key', key, '--yes')
-    assert (code, 'target 640' in output) == (0, True)
-
-    for command, name in (
-        (['ping', '--count', '20', '--port', dongle], 'rows'),
-        (['scan', '--port', dongle], 'channels'),
-        (['parameters', '--port', dongle, '--key', key], 'values'),
-        (['key', 'state', '--port', robot, '--key', key], 'equal_to_the_file'),
-        (['key', 'check', key], 'check'),
-    ):
-        assert cli.main([*command, '--json', '-']) in (0, 1)  # 1: a slow machine
-        assert json.loads(capsys.readouterr().out)[name], command
-    assert cli.main(['log', '--port', robot, '--json', '-']) == 0
-    assert isinstance(json.loads(capsys.readouterr().out), list)
-
-    # Ctrl-C during a jog: the robot stops, then the command ends.
-    moves, move = itertools.count(), Jog._move
-
-    def interrupted(task, *given):
-        move(task, *given)
-        if task.travelled.left > 1.0 and next(moves) == 0:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(Jog, '_move', interrupted)
-    code, output = run('jog', 'left', '90', '--port', dongle, '--key', key, '--yes')
-    assert code == 130
-    assert 'interrupted' in output
-    assert run('key', 'erase', '--port', robot)[0] == 0
 
 
 def test_port_errors_contain_a_remedy(tmp_path, capsys):

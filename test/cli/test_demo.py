@@ -219,24 +219,6 @@ def test_a_wait_shows_progress(tmp_path, monkeypatch):
     assert re.fullmatch(r'controller, \d+ s: controller ready', shown[-1])
 
 
-@pytest.mark.long
-def test_the_demo_names_what_it_waits_for_and_its_own_domain(tmp_path):
-    """Two demos at once; their nodes once met in the domain of the caller."""
-    folders = [tmp_path / 'one', tmp_path / 'two']
-    demos = [start_demo(each, stand_ins(each), '--duration', '1') for each in folders]
-    domains = []
-    for folder, demo in zip(folders, demos, strict=True):
-        _, errors = communicate(demo)
-        lines = [line.strip() for line in errors.splitlines()]
-        expected = [f'starting {name}' for name in NODES] + ['waiting for discovery']
-        assert [line for line in lines if line in expected] == expected
-        assert any(re.search(r'running: ', line) for line in lines)
-        (domain,) = {(folder / f'{name}.domain').read_text() for name in NODES}
-        assert f'ROS_DOMAIN_ID {domain}, on loopback' in lines
-        domains.append(domain)
-    assert domains[0] != domains[1]
-
-
 # -- exit codes -----------------------------------------------------------------------------------
 
 SOUND = following_rows()

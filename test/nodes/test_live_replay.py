@@ -101,7 +101,7 @@ def eventful_run(harness, bag, model, late):
     harness.remove(recorder)
 
 
-@pytest.mark.parametrize('late', [False, True])
+@pytest.mark.parametrize('late', [pytest.param(False, marks=pytest.mark.long), True])
 def test_a_recorded_controller_replays_bit_for_bit(late, harness, tmp_path):
     """With stops, an unresponsive robot, a timeout, dynamic parameters and a model file.
 

@@ -21,7 +21,6 @@ from unittest.mock import Mock
 
 import pytest
 from rclpy.parameter import Parameter
-from std_srvs.srv import SetBool
 from support.bag_messages import STORE
 from support.file_watch import no_file_left_open
 from support.object_state import state
@@ -186,34 +185,6 @@ def test_changed_parameters_are_published_with_their_revision(start):
 
 
 # -- services -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    'name, service, kept',
-    [
-        ('controller', '~/enable', ('_journal',)),
-        ('controller', '~/reset', ('_journal',)),
-        ('reference_generator', '~/pause', ()),
-        ('sim_robot', 'e_stop', ()),
-        ('sim_robot', 'reset_odometry', ()),
-        ('sim_robot', '~/set_pose', ()),
-        ('radio_bridge', 'e_stop', ()),
-        ('radio_bridge', 'reset_odometry', ()),
-        ('player', '~/pause', ()),
-    ],
-)
-def test_a_service_called_twice_has_its_effect_once(name, service, kept, start):
-    node = start(name)
-    times = '_simulated_time', '_real_time_factor', '_robot._limiter._clock_ns', '_thread'
-    kept = ('_Node__', *times, *kept)
-    states = []
-    for _ in range(2):
-        kind = next(each for each in node.services if each.service_name.endswith(service[2:]))
-        answer = call(node, service, **({'data': True} if kind.srv_type is SetBool else {}))
-        confirmed = (name, service) != ('radio_bridge', 'e_stop')  # it has no robot here
-        assert answer.success == confirmed, answer.message
-        states.append(whole_state(node, kept))
-    assert difference(*states) == set()
 
 
 @pytest.mark.parametrize('name', ['sim_robot', 'radio_bridge'])

@@ -25,15 +25,12 @@ from nav_msgs.msg import Odometry
 import pytest
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Int32, Int64MultiArray, String
-from std_srvs.srv import SetBool, Trigger
+from std_srvs.srv import Trigger
 from support.ros_graph import (
     LATCHED,
-    CommandSource,
     diagnostic_level,
     odometry,
-    reason,
     record,
-    twist,
 )
 from support.waiting import wait_for_acknowledgement
 
@@ -42,7 +39,6 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recording import SEED_RECORD, RecordingMetadata
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.chaos.seed_fingerprint import matches_fingerprint
-from t3mpc_ros.geometry.types import ORIGIN
 from t3mpc_ros.nodes.base_node import ERROR, OK, WARN
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode
@@ -274,32 +270,6 @@ def test_a_fault_starts_one_snapshot_with_its_reason(harness, logged, tmp_path):
     assert 'following commands' in texts(folder)
 
 
-def test_an_e_stop_of_the_own_robot_starts_a_snapshot(harness, tmp_path):
-    recorder = record(harness, tmp_path, 'odom', 'cmd_vel', namespace='a')
-    robots = [harness.add(SimRobotNode, namespace=name) for name in ('a', 'b')]
-    drivers = [CommandSource(harness, f'{name}/cmd_vel') for name in ('a', 'b')]
-    for source in drivers:
-        source.message = twist(0.1)
-    for name in ('a', 'b'):
-        harness.spin_until(
-            lambda name=name: any(s.level == OK for s in harness.statuses(f'{name}/sim_robot'))
-        )
-    harness.call(SetBool, 'b/e_stop', data=True)
-    harness.spin_until(lambda: harness.statuses('b/sim_robot')[-1].level == ERROR)
-    assert not recorder._snapshots.busy
-    assert values(recorder)['snapshots'] == 0, 'only the own robot starts a snapshot'
-    harness.call(SetBool, 'a/e_stop', data=True)
-    harness.spin_until(lambda: values(recorder)['snapshots'] == 1)
-    harness.remove(recorder)
-    (folder,) = snapshots(tmp_path)
-    assert '_a-sim-robot-emergency-stop' in folder.name
-    with open_bag(folder) as recording:
-        assert recording.topics['/a/odom'].message_count > 50
-        assert recording.topics['/a/cmd_vel'].message_count > 10
-        status = recording.metadata_records['snapshot']['reason']
-    assert status == f'a/sim_robot: {reason(robots[0])}'
-
-
 def test_snapshot_mode_writes_snapshots_only(harness, tmp_path):
     recorder = record(
         harness, tmp_path, 'text', storage__snapshot_mode=True, storage__snapshot_duration=60.0
@@ -458,18 +428,6 @@ def test_a_bag_holds_the_fingerprint_of_a_secret_seed_only(harness, tmp_path, so
     content = all_bytes(tmp_path)
     assert text.encode() in content, 'the search finds text that is present'
     assert not [form for seed in seeds for form in forms(seed) if form in content]
-
-
-@pytest.mark.long
-def test_a_hundred_patrols_differ(harness):
-    seeds, places = set(), set()
-    for _ in range(100):
-        reference = harness.add(ReferenceGeneratorNode, source='portrait')
-        seeds.add(reference._seed)
-        source = reference._make_source(ORIGIN)
-        places.add([source.advance()[0][:2] for _ in range(500)][-1])
-        harness.remove(reference)
-    assert len(seeds) == len(places) == 100
 
 
 def test_secret_seed_excludes_a_given_seed(harness):

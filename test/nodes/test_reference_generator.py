@@ -14,11 +14,9 @@
 """Grid, latched topics, pause and seeds of the reference generator node."""
 
 import math
-import secrets
 import sys
 from types import SimpleNamespace
 
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point, PoseArray, PoseStamped, TransformStamped, Twist
 from geometry_msgs.msg import Pose as Place
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
@@ -72,23 +70,6 @@ def test_late_subscribers_receive_signals_and_path(harness):
     assert set(np.diff(stamps)) <= {NANOSECONDS // 10}
 
 
-def test_a_paused_reference_stands_still_and_resumes(harness):
-    reference = harness.add(ReferenceGeneratorNode, ramp=0.0)
-    received = harness.subscribe(Odometry, 'reference')
-    harness.spin_until(lambda: received and speed(received[-1]) > 0.0)
-    assert harness.call(SetBool, 'reference_generator/pause', data=True).success
-    harness.spin_until(lambda: speed(received[-1]) == 0.0)
-    held = received[-1].pose.pose
-    count = len(received)
-    harness.spin_until(lambda: len(received) > count + 10, 'the paused reference is published')
-    assert all(speed(message) == 0.0 for message in received[count:])
-    assert received[-1].pose.pose == held
-    assert reason(reference) == 'paused'
-    assert harness.call(SetBool, 'reference_generator/pause', data=False).success
-    harness.spin_until(lambda: speed(received[-1]) > 0.0)
-    assert on_grid(received, 100)
-
-
 def test_reseed_changes_the_reference_and_hides_the_seed(harness, logged):
     """The seed determines the path of the robot."""
     seed = 918_273_645
@@ -140,6 +121,12 @@ def test_a_pause_and_its_end_are_ramps(harness, source):
         for _ in range(2):
             assert harness.call(SetBool, 'reference_generator/pause', data=on).success
         harness.spin_until(reached(condition))
+        if on:
+            held, count = received[-1].pose.pose, len(received)
+            harness.spin_until(reached(lambda v: len(received) > count + 10))
+            assert {speed(message) for message in received[count:]} == {0.0}
+            assert received[-1].pose.pose == held
+            assert reason(reference) == 'paused'
     limit = reference.parameters.motion.linear_acceleration / reference.parameters.rate
     assert _largest_change(received[first:]) <= limit * (1 + 1e-9)
     assert on_grid(received, 100)
@@ -345,9 +332,13 @@ def test_a_path_begins_where_the_robot_is(harness, tmp_path, source):
         message = Path(poses=[PoseStamped(), PoseStamped()])
         for x, pose in zip((0.5, 1.5), message.poses, strict=True):
             pose.pose.position.x, pose.pose.position.y = x, -0.2
-    _, received = _drive(
-        harness, 'path', message, lambda m: speed(m) > 0.1, source=source, **given
+    paths = harness.subscribe(Path, 'reference/path', LATCHED)
+    reference, received = _drive(
+        harness, 'path', message, lambda m: speed(m) > 0.1 and paths, source=source, **given
     )
+    # No path is published further ahead than the lead: a patrol keeps its future.
+    newest = max(stamp(pose) for pose in paths[-1].poses)
+    assert newest <= reference.now_ns() + round(reference.parameters.lead * NANOSECONDS)
     first, last = (received[k].pose.pose.position for k in (0, -1))
     assert (first.x, first.y) == pytest.approx((0.5, -0.2), abs=1e-9)
     assert speed(received[0]) == 0.0
@@ -510,38 +501,3 @@ def test_a_twist_message_is_followed_until_it_expires(harness):
     )
     assert received[-1].twist.twist.angular.z == pytest.approx(0.4, abs=0.02)
     harness.spin_until(lambda: speed(received[-1]) == 0.0)  # no more messages
-
-
-def test_a_patrol_keeps_its_seed_and_its_future(harness, logged, monkeypatch):
-    """No parameter, topic, log line or service answer has a seed; no path is ahead of the lead.
-
-    Each further seed, by service or at random times, is as secret as the first.
-    """
-    seeds = []
-
-    def random_seed():
-        seeds.append(secrets.randbits(128))
-        return seeds[-1]
-
-    monkeypatch.setattr('t3mpc_ros.nodes.reference_generator._random_seed', random_seed)
-    status = harness.subscribe(DiagnosticArray, '/diagnostics')
-    path = harness.subscribe(Path, 'reference/path', LATCHED)
-    reference, received = _drive(
-        harness,
-        '',
-        None,
-        lambda m: len(seeds) > 2 and path,
-        source='portrait',
-        reseed__shortest=0.3,
-        reseed__longest=0.6,
-    )
-    answer = harness.call(Trigger, 'reference_generator/reseed').message
-    texts = [repr(each) for each in (*logged(''), *status, *path, *received, answer)]
-    texts.append(repr(reference.parameters.to_dict()))
-    texts.append(repr([p.get_parameter_value() for p in reference._parameters.values()]))
-    assert len(seeds) >= 4
-    for seed in seeds:
-        for form in (str(seed), f'{seed:x}', f'{seed:X}'):
-            assert not [text for text in texts if form in text]
-    newest = max(stamp(pose) for pose in path[-1].poses)
-    assert newest <= reference.now_ns() + round(reference.parameters.lead * NANOSECONDS)
