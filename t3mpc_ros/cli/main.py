@@ -39,6 +39,7 @@ from t3mpc_ros.cli.shared_options import (
     ArgumentParser,
     add_json,
     add_seeds,
+    new_folder,
     print_result,
     reject_removed,
     run_command,
@@ -247,7 +248,7 @@ def _parser(
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     demo.add_argument('--duration', type=SECONDS, default=60.0, help='seconds (default 60)')
-    demo.add_argument('--output', type=Path, help='folder (default runs/<time>)')
+    demo.add_argument('--output', type=new_folder, help='folder (default runs/<time>)')
     demo.add_argument('--headless', action='store_true', help='no bar, no browser')
     demo.add_argument('--view', action='store_true', help='show the run on a live page')
     demo.add_argument('--seed', type=int, help='seed of reference and robot')

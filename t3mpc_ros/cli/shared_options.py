@@ -199,6 +199,13 @@ def seed_range(text: str) -> tuple[int, ...]:
     return tuple(range(low, high + 1))
 
 
+def new_folder(text: str) -> Path:
+    """Return the path of a folder that exists or can be made."""
+    if Path(text).is_file():
+        raise argparse.ArgumentTypeError(f'must be a folder, or the path of a new one: got {text}')
+    return Path(text)
+
+
 def uncounted_seeds(text: str) -> tuple[int, ...]:
     """Return the seeds of ``A-B``, where a number alone was their number in earlier versions."""
     if text.isdecimal() and int(text):

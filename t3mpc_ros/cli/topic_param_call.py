@@ -89,6 +89,9 @@ def _with_graph(
     """Return a command that runs in the graph."""
 
     def run_in_graph(options: argparse.Namespace) -> int | None:
+        from t3mpc_ros.nodes.node_main import check_environment
+
+        check_environment()
         from t3mpc_ros.nodes.graph_client import graph  # takes a second
 
         with StopSignal() as stop, graph(stop) as opened:

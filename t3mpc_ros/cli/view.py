@@ -70,6 +70,9 @@ def _view(options: argparse.Namespace) -> None:
                 while not stop():
                     time.sleep(0.1)
             return
+        from t3mpc_ros.nodes.node_main import check_environment
+
+        check_environment()
         from t3mpc_ros.nodes.viewer import view_node  # takes a second
 
         run = LiveRun()

@@ -67,6 +67,9 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
     command line, with one line on standard error that names it and the reason; 1, with such a
     line, for a conflict with another process.
     """
+    # Both before rcl, which would name neither value nor bound, and ends the process.
+    if problem := environment_problem(os.environ) or arguments.parameter_file_problem(argv):
+        return _usage_error(name, problem)
     import rclpy
     from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
     from rclpy.executors import ExternalShutdownException
@@ -74,9 +77,6 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
 
     from t3mpc_ros.parameters.table import ParameterError
 
-    # Both before rcl, which would name neither value nor bound.
-    if problem := domain_problem(os.environ) or arguments.parameter_file_problem(argv):
-        return _usage_error(name, problem)
     try:
         words = remove_ros_args(list(argv))[1:]
         if {'-h', '--help'} & set(words):
@@ -180,18 +180,31 @@ def init_ros(words: Sequence[str]) -> None:
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
-    if problem := domain_problem(os.environ):
-        raise ValueError(problem)
+    check_environment()
     provide_log_directory(os.environ)
     rclpy.init(args=list(words), signal_handler_options=SignalHandlerOptions.NO)
 
 
-def domain_problem(environment: Mapping[str, str]) -> str:
-    """Return what is wrong with ``ROS_DOMAIN_ID``; '' if nothing is."""
+def check_environment() -> None:
+    """Raise ValueError for what ROS cannot start with: before the first import of rclpy."""
+    if problem := environment_problem(os.environ):
+        raise ValueError(problem)
+
+
+def environment_problem(environment: Mapping[str, str]) -> str:
+    """Return what is wrong with ``ROS_DOMAIN_ID`` or ``RMW_IMPLEMENTATION``; '' if nothing is."""
     text = environment.get('ROS_DOMAIN_ID', '')
-    if not text or (text.isdecimal() and int(text) <= MAX_DOMAIN):
+    if text and not (text.isdecimal() and int(text) <= MAX_DOMAIN):
+        return f'ROS_DOMAIN_ID must be a whole number from 0 to {MAX_DOMAIN}: got {text}'
+    # The index of ROS packages; where a wheel is used without a set-up, that of its environment.
+    prefixes = (environment.get('AMENT_PREFIX_PATH') or sys.prefix).split(os.pathsep)
+    index = Path('share', 'ament_index', 'resource_index', 'rmw_typesupport')
+    names = {path.name for prefix in prefixes for path in Path(prefix, index).glob('rmw_*')}
+    known = sorted(names - {'rmw_implementation'})
+    wanted = environment.get('RMW_IMPLEMENTATION')
+    if not wanted or not known or wanted in known:
         return ''
-    return f'ROS_DOMAIN_ID must be a whole number from 0 to {MAX_DOMAIN}: got {text}'
+    return f'RMW_IMPLEMENTATION must be one that is installed, {", ".join(known)}: got {wanted}'
 
 
 def provide_log_directory(environment: MutableMapping[str, str]) -> None:

@@ -46,6 +46,7 @@ from t3mpc_ros.nodes.base_node import ERROR, OK, WARN, BaseNode
 from t3mpc_ros.nodes.raw_subscriptions import TopicSubscriptions, topic_information
 from t3mpc_ros.nodes.registry import NODES
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters
+from t3mpc_ros.parameters.table import ParameterError
 
 TAKE_PERIOD = 0.04
 """Time between two reads of the subscriptions, s; each queues up to 1000 messages meanwhile."""
@@ -68,6 +69,10 @@ class RecorderNode(BaseNode[RecordingParameters]):
         super().__init__('recorder', **options)
         parameters = self.parameters
         self._folder = Path(parameters.uri or f'bag_{datetime.now():%Y_%m_%d-%H_%M_%S}').resolve()
+        if self._folder.is_file():
+            raise ParameterError(
+                f'storage.uri must be a folder, or the path of a new one: got file {self._folder}'
+            )
         self._metadata = RecordingMetadata(
             parameters.attachments,
             parameters.max_attachment_size,

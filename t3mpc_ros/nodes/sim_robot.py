@@ -136,6 +136,7 @@ class SimRobotNode(RobotNode[SimRobotParameters]):
         super().__init__('sim_robot', **options)
         parameters = self.parameters
         self.hardware_id = f'simulated robot {parameters.seed}'
+        self.get_logger().info('initialising (the first start compiles the kernels, about 15 s)')
         robot = make_robot(parameters)
         try:
             robot.set_pose(parameters.pose)

@@ -201,6 +201,7 @@ CASES = [
         (words, {}, 2, text)
         for words, text in {
             'demo --duration 0': 'must be from 1 to 86400 seconds: got 0',
+            'demo --output key': 'must be a folder, or the path of a new one: got key',
             'demo --loss 1': 'must be from 0 to below 1: got 1',
             'demo --robot mine': 'invalid choice',
             'estimation --gain x': "invalid number value: 'x'",

@@ -15,14 +15,16 @@
 
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 
 import pytest
 
 import t3mpc_ros
+from t3mpc_ros.cli.process_group import executable
 from t3mpc_ros.nodes.arguments import Origin, parameter_origins, unmatched_files
-from t3mpc_ros.nodes.node_main import domain_problem, provide_log_directory
+from t3mpc_ros.nodes.node_main import environment_problem, provide_log_directory
 from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
 
 
@@ -126,6 +128,7 @@ INVALID = [
     ('recorder', '--ros-args --params-file MISSING', 'MISSING', 'cannot be read'),
     ('recorder', '--ros-args --params-file BROKEN', 'BROKEN', 'is not YAML'),
     ('recorder', '--ros-args -p storage.uri:=FILE/bag', 'FILE/bag'),
+    ('recorder', '--ros-args -p storage.uri:=FILE', 'storage.uri must be a folder', 'FILE'),
 ]
 """Executable, arguments, and the words of the one line that it prints."""
 
@@ -203,6 +206,18 @@ def test_ros_starts_without_a_home_folder(tmp_path):
 @pytest.mark.parametrize('text', ['233', '-1', '1.5', 'abc'])
 def test_a_domain_that_cannot_be_is_named(text):
     """Some were accepted, others ended in the words of a port number or of a source file."""
-    assert domain_problem({'ROS_DOMAIN_ID': text}).endswith(f'from 0 to 232: got {text}')
-    assert all(not domain_problem({'ROS_DOMAIN_ID': each}) for each in ('', '0', '232'))
-    assert not domain_problem({})
+    assert environment_problem({'ROS_DOMAIN_ID': text}).endswith(f'from 0 to 232: got {text}')
+    assert all(not environment_problem({'ROS_DOMAIN_ID': each}) for each in ('', '0', '232'))
+    assert not environment_problem({})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('words, code', [(['sim_robot'], 2), (['t3mpc', 'topic', 'list'], 1)])
+def test_a_middleware_that_is_not_installed_is_named(words, code):
+    """The text of a source file of rcl, and exit code 102."""
+    program = str(executable(words[0]))
+    environment = os.environ | {'RMW_IMPLEMENTATION': 'rmw_none'}
+    done = subprocess.run([program, *words[1:]], env=environment, capture_output=True, text=True)
+    assert done.returncode == code
+    (line,) = done.stderr.splitlines()
+    assert re.search('RMW_IMPLEMENTATION must be one .*, rmw_fastrtps_cpp: got rmw_none', line)

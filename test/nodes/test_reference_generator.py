@@ -123,7 +123,7 @@ def test_a_pause_and_its_end_are_ramps(harness, source):
         harness.spin_until(reached(condition))
         if on:
             held, count = received[-1].pose.pose, len(received)
-            harness.spin_until(reached(lambda v: len(received) > count + 10))
+            harness.spin_until(reached(lambda v, count=count: len(received) > count + 10))
             assert {speed(message) for message in received[count:]} == {0.0}
             assert received[-1].pose.pose == held
             assert reason(reference) == 'paused'
