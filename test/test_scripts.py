@@ -508,54 +508,58 @@ def test_an_unreachable_index_is_an_error_with_a_remedy(index, tmp_path):
     assert not (root / '.venv' / 'stamp').exists()
 
 
-def test_a_sourced_ros_does_not_enter_the_local_environment(ready, tmp_path):
+@pytest.fixture
+def environment_of(ready):
+    """Return a function that runs a program and returns its environment."""
+    program = ready.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
+    program.write_text('#!/bin/sh\nenv\n')
+
+    def environment(**given):
+        lines = ready.run('t3mpc', **given).stdout.splitlines()
+        return dict(line.split('=', 1) for line in lines if '=' in line)
+
+    return environment
+
+
+def test_a_sourced_ros_does_not_enter_the_local_environment(environment_of, ready, tmp_path):
     """Regression: modules and libraries of a system ROS took precedence."""
     libraries = tmp_path / 'ros' / 'lib'
     libraries.mkdir(parents=True)
     (libraries / 'librcl.so').touch()
-    program = ready.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
-    program.write_text('#!/bin/sh\nenv\n')
-    output = ready.run(
-        't3mpc',
+    found = environment_of(
         PYTHONPATH=tmp_path / 'ros',
         AMENT_PREFIX_PATH=tmp_path / 'ros',
         LD_LIBRARY_PATH=f'{libraries}:{tmp_path / "own"}',
         RMW_IMPLEMENTATION='rmw_cyclonedds_cpp',
         ROS_DOMAIN_ID='7',
         PYTHONDONTWRITEBYTECODE='1',
-    ).stdout
-    environment = dict(line.split('=', 1) for line in output.splitlines() if '=' in line)
-    assert environment['AMENT_PREFIX_PATH'] == str(ready.root / '.venv')
-    assert environment['LD_LIBRARY_PATH'] == str(tmp_path / 'own')
-    assert environment['ROS_DOMAIN_ID'] == '7'
-    assert not {'PYTHONPATH', 'RMW_IMPLEMENTATION', 'PYTHONDONTWRITEBYTECODE'} & set(environment)
+    )
+    assert found['AMENT_PREFIX_PATH'] == str(ready.root / '.venv')
+    assert found['LD_LIBRARY_PATH'] == str(tmp_path / 'own')
+    assert found['ROS_DOMAIN_ID'] == '7'
+    assert not {'PYTHONPATH', 'RMW_IMPLEMENTATION', 'PYTHONDONTWRITEBYTECODE'} & set(found)
 
 
-def test_programs_run_in_a_locale_of_utf8(ready):
-    """In another, Python failed on its own path file if the path of the checkout had an umlaut."""
-    program = ready.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
-    program.write_text('#!/bin/sh\necho "$LC_ALL"\n')
-    none = {'LC_ALL': '', 'LC_CTYPE': '', 'LANG': ''}
-    for given, seen in (
-        ({'LC_ALL': 'C'}, 'C.UTF-8'),
-        ({'LC_ALL': 'xx_XX.UTF-8'}, 'C.UTF-8'),  # of a terminal elsewhere; not installed here
-        (none, 'C.UTF-8'),
-        (none | {'LANG': 'C.UTF-8'}, ''),
-    ):
-        assert ready.run('t3mpc', **given).stdout == f'{seen}\n', given
+NO_LOCALE = {'LC_ALL': '', 'LC_CTYPE': '', 'LANG': ''}
 
 
-def test_matplotlib_has_a_folder_without_a_home(ready):
-    """Each of its commands began with a warning of two lines, and listed all fonts again."""
-    program = ready.root / '.venv' / 'lib' / 't3mpc_ros' / 't3mpc'
-    program.write_text('#!/bin/sh\necho "$MPLCONFIGDIR"\n')
-    own = f'{ready.root}/.venv/matplotlib'
-    for home, given, seen in (
-        (ready.root, '', ''),
-        ('/dev/null', '', own),
-        ('/dev/null', '/chosen', '/chosen'),
-    ):
-        assert ready.run('t3mpc', HOME=home, MPLCONFIGDIR=given).stdout == f'{seen}\n'
+@pytest.mark.parametrize(
+    'given, name, seen',
+    [
+        # In another locale, Python failed on its own path file if the checkout had an umlaut.
+        ({'LC_ALL': 'C'}, 'LC_ALL', 'C.UTF-8'),
+        ({'LC_ALL': 'xx_XX.UTF-8'}, 'LC_ALL', 'C.UTF-8'),  # of a terminal elsewhere
+        (NO_LOCALE, 'LC_ALL', 'C.UTF-8'),
+        (NO_LOCALE | {'LANG': 'C.UTF-8'}, 'LC_ALL', ''),
+        # Without a home, each command of matplotlib began with a warning, and listed all fonts.
+        ({'HOME': '/tmp', 'MPLCONFIGDIR': ''}, 'MPLCONFIGDIR', ''),
+        ({'HOME': '/dev/null', 'MPLCONFIGDIR': ''}, 'MPLCONFIGDIR', '.venv/matplotlib'),
+        ({'HOME': '/dev/null', 'MPLCONFIGDIR': '/chosen'}, 'MPLCONFIGDIR', '/chosen'),
+    ],
+)
+def test_programs_run_in_a_locale_of_utf8_and_with_a_home(given, name, seen, environment_of):
+    found = environment_of(**given).get(name, '')
+    assert found.endswith(seen) if seen else not found
 
 
 real_environment = pytest.mark.skipif(

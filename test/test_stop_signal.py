@@ -85,20 +85,28 @@ def test_ctrl_c_while_an_executable_imports_is_quiet(module, code):
     assert (done.returncode, done.stderr) == (code, '')
 
 
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def installed_executable(folder, name):
+    """Return an executable as pip installs it, with the Python of the test."""
+    for each in ('bin', 'lib/t3mpc_ros'):
+        (folder / each).mkdir(parents=True)
+    (folder / 'bin' / 'python3').symlink_to(sys.executable)
+    program = folder / 'lib' / 't3mpc_ros' / name
+    program.write_bytes((ROOT / 'resource' / 'executable').read_bytes())
+    program.chmod(0o755)
+    return program
+
+
 @pytest.mark.parametrize('number', SIGNALS)
 def test_a_signal_before_the_imports_is_quiet(number, tmp_path):
     """While Python reads its path files, where the wheels of ROS start it anew."""
-    root = Path(__file__).resolve().parent.parent
-    for folder in ('bin', 'lib/t3mpc_ros'):
-        (tmp_path / folder).mkdir(parents=True)
-    (tmp_path / 'bin' / 'python3').symlink_to(sys.executable)
-    program = tmp_path / 'lib' / 't3mpc_ros' / 'controller'
-    program.write_bytes((root / 'resource' / 'executable').read_bytes())
-    program.chmod(0o755)
+    program = installed_executable(tmp_path, 'controller')
     (tmp_path / 'sitecustomize.py').write_text(
         f'import os\nprint("here", flush=True)\nos.kill(os.getpid(), {int(number)})\n'
     )
-    environment = os.environ | {'PYTHONPATH': f'{tmp_path}{os.pathsep}{root}'}
+    environment = os.environ | {'PYTHONPATH': f'{tmp_path}{os.pathsep}{ROOT}'}
     with attended():
         done = subprocess.run([program], capture_output=True, text=True, env=environment)
     assert (done.returncode, done.stdout, done.stderr) == (0, 'here\n', '')
@@ -110,14 +118,8 @@ def test_a_signal_before_the_imports_is_quiet(number, tmp_path):
 @pytest.mark.parametrize('name', few_of(['controller', 't3mpc']))
 def test_ctrl_c_while_python_starts_is_quiet(name, delay, tmp_path):
     """It ended with 16 lines, or 34, where Python had its own handler and not ours yet."""
-    root = Path(__file__).resolve().parent.parent
-    for folder in ('bin', 'lib/t3mpc_ros'):
-        (tmp_path / folder).mkdir(parents=True)
-    (tmp_path / 'bin' / 'python3').symlink_to(sys.executable)
-    program = tmp_path / 'lib' / 't3mpc_ros' / name
-    program.write_bytes((root / 'resource' / 'executable').read_bytes())
-    program.chmod(0o755)
-    environment = os.environ | {'PYTHONPATH': str(root)}
+    program = installed_executable(tmp_path, name)
+    environment = os.environ | {'PYTHONPATH': str(ROOT)}
     with attended():
         done = subprocess.Popen(
             [program, 'topic', 'list'],
@@ -136,7 +138,7 @@ def test_ctrl_c_while_python_starts_is_quiet(name, delay, tmp_path):
 
 def test_a_process_of_a_pool_may_import_the_executable():
     """Each ran the program anew: ``t3mpc compare`` under ``scripts/run`` ended with an error."""
-    executable = Path(__file__).resolve().parent.parent / 'resource' / 'executable'
+    executable = ROOT / 'resource' / 'executable'
     assert 'main' in runpy.run_path(str(executable), run_name='__mp_main__')
 
 

@@ -275,6 +275,16 @@ class BaseNode(Node, Generic[P]):
         self._matching.remove(made)
         self.destroy_subscription(made.subscription)
 
+    def import_tf2(self, effect: str = '') -> Any:
+        """Return tf2_ros; None without it, of which the ``effect`` is logged once."""
+        try:
+            import tf2_ros
+        except ImportError:
+            if effect:
+                self.get_logger().info(f'tf2_ros is not installed: {effect}', once=True)
+            return None
+        return tf2_ros
+
     def offer(self, kind: type, name: str, action: Callable[..., tuple[str, str]]) -> None:
         """Offer a service of type Trigger or SetBool.
 

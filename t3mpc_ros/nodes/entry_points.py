@@ -17,6 +17,8 @@ Only the executables import this module, before all others: those take one to tw
 SIGINT would end the process with a traceback.
 """
 
+from functools import partial
+
 from t3mpc_ros.stop_signal import StopSignal
 
 _STOP = StopSignal().install()
@@ -30,41 +32,11 @@ def _main(name: str) -> None:
     main(name, _STOP)
 
 
-def reference_generator() -> None:
-    """Run the reference generator."""
-    _main('reference_generator')
-
-
-def controller() -> None:
-    """Run the controller."""
-    _main('controller')
-
-
-def sim_robot() -> None:
-    """Run the simulated robot."""
-    _main('sim_robot')
-
-
-def radio_bridge() -> None:
-    """Run the bridge to the real robot."""
-    _main('radio_bridge')
-
-
-def recorder() -> None:
-    """Run the recorder."""
-    _main('recorder')
-
-
-def player() -> None:
-    """Run the player."""
-    _main('player')
-
-
-def localizer() -> None:
-    """Run the localizer."""
-    _main('localizer')
-
-
-def composed() -> None:
-    """Run several nodes in this process."""
-    _main('composed')
+reference_generator = partial(_main, 'reference_generator')
+controller = partial(_main, 'controller')
+sim_robot = partial(_main, 'sim_robot')
+radio_bridge = partial(_main, 'radio_bridge')
+recorder = partial(_main, 'recorder')
+player = partial(_main, 'player')
+localizer = partial(_main, 'localizer')
+composed = partial(_main, 'composed')

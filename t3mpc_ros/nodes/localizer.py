@@ -169,7 +169,11 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         self._markers = self.create_publisher(MarkerArray, 'map_changes/markers', qos.LATCHED)
         self._suspected = self.create_publisher(PoseArray, 'map_changes/suspected', qos.LATCHED)
         self._shown_suspected = np.empty((0, 2))
-        self._broadcaster = self._make_broadcaster() if parameters.tf_broadcast else None
+        self._broadcaster = None
+        if parameters.tf_broadcast and (
+            tf2_ros := self.import_tf2('map_to_odom is published alone')
+        ):
+            self._broadcaster = tf2_ros.TransformBroadcaster(self)
         self._scan: MatchingSubscription | None = None
         self._ranges: list[MatchingSubscription] = []
         if parameters.scan_topic:
@@ -199,14 +203,6 @@ class LocalizerNode(BaseNode[LocalizerNodeParameters]):
         self.create_steady_timer(TRANSFORM_PERIOD, self._publish_transform)
         self.create_steady_timer(CLOUD_PERIOD, self._publish_cloud)
         self.create_steady_timer(CHANGES_PERIOD, self._publish_changes)
-
-    def _make_broadcaster(self) -> Any:
-        try:
-            import tf2_ros
-        except ImportError:
-            self.get_logger().info('tf2_ros is not installed: the transform is map_to_odom alone')
-            return None
-        return tf2_ros.TransformBroadcaster(self)
 
     def _use_map(self, known: LocalizationMap) -> None:
         """Begin on a map; MapError: the robot fits nowhere."""

@@ -14,7 +14,8 @@
 """``ros2 run t3mpc_ros reference_generator``: publishes the reference, chaotic or given."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 import secrets
@@ -284,9 +285,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
 
     def _make_transform_buffer(self) -> Any:
         """Return the transforms known to tf2, None without tf2_ros."""
-        try:
-            import tf2_ros
-        except ImportError:
+        if (tf2_ros := self.import_tf2()) is None:
             return None
         buffer = tf2_ros.Buffer()
         self._transform_listener = tf2_ros.TransformListener(buffer, self)
@@ -297,26 +296,28 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         if stamp and stamp in self._path_stamps:
             return  # both subscriptions receive it
         self._path_stamps.append(stamp)
-        try:
+        with self._input('path'):
             points = self._own_points(
                 conversions.frame_from_serialized(message), conversions.points_from_path(message)
             )
-        except (PathError, struct.error) as error:
-            self._reject('path', error)
-            return
-        self._ended = ''
-        self._refused.pop('path', None)
-        if not isinstance(self._source, GivenPathSource):
-            self._points = points  # the robot has not reported where it is
-        elif self.parameters.path_mode == 'append':
-            self._source.append(points)
-        else:
-            self._source.replace(points)
+            self._ended = ''
+            if not isinstance(self._source, GivenPathSource):
+                self._points = points  # the robot has not reported where it is
+            elif self.parameters.path_mode == 'append':
+                self._source.append(points)
+            else:
+                self._source.replace(points)
 
-    def _reject(self, topic: str, error: Exception) -> None:
-        self._rejected += 1
-        self._refused[topic] = self.steady_ns(), f'the last {topic} is ignored: {error}'
-        self.get_logger().warning(f'{topic} is ignored: {error}')
+    @contextmanager
+    def _input(self, topic: str) -> Iterator[None]:
+        """Take a message in the ``with`` block, which raises ValueError for one to refuse."""
+        try:
+            yield
+            self._refused.pop(topic, None)
+        except (ValueError, struct.error) as error:  # a PathError among them
+            self._rejected += 1
+            self._refused[topic] = self.steady_ns(), f'the last {topic} is ignored: {error}'
+            self.get_logger().warning(f'{topic} is ignored: {error}')
 
     def _own_points(self, frame: str, points: Array) -> Array:
         """Return points of a frame, shape (n, 2), in that of the reference, or raise PathError."""
@@ -338,41 +339,28 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         raise PathError(f'its frame is {frame}, and no transform from it to {own} is known')
 
     def _on_map(self, message: OccupancyGrid, info: dict[str, Any]) -> None:
-        try:
+        with self._input('keep_out/map'):
             grid = conversions.grid_from_occupancy(message)
-        except ValueError as error:
-            self._reject('keep_out/map', error)
-            return
-        if self._planned is not None:
-            self._mapped = True
-            self._refused.pop('keep_out/map', None)
-            self._planned.set_map(grid)
+            if self._planned is not None:
+                self._mapped = True
+                self._planned.set_map(grid)
 
     def _on_goal(self, message: PoseStamped, info: dict[str, Any]) -> None:
         place = np.array([[message.pose.position.x, message.pose.position.y]])
-        try:
+        with self._input('goal_pose'):
             x, y = self._own_points(message.header.frame_id, place)[0].tolist()
             if self._planned is None:
                 raise PathError('no odom yet: send it again when the robot has reported its pose')
             if self._planned.charging:
                 raise PathError('the battery is charged first: send it again after that')
-        except PathError as error:
-            self._reject('goal_pose', error)
-            return
-        self._refused.pop('goal_pose', None)
-        self._planned.go_to((x, y))
+            self._planned.go_to((x, y))
 
     def _on_suspected(self, message: PoseArray, info: dict[str, Any]) -> None:
-        try:
-            places = self._own_points(
-                message.header.frame_id, conversions.points_from_poses(message.poses)
-            )
-        except PathError as error:
-            self._reject('map_changes/suspected', error)
-            return
-        self._refused.pop('map_changes/suspected', None)
-        if self._planned is not None:
-            self._planned.look_at(places)
+        with self._input('map_changes/suspected'):
+            points = conversions.points_from_poses(message.poses)
+            places = self._own_points(message.header.frame_id, points)
+            if self._planned is not None:
+                self._planned.look_at(places)
 
     def _on_battery(self, message: BatteryState, info: dict[str, Any]) -> None:
         if self._planned is not None and not self._planned.observe_battery(message.voltage):

@@ -306,14 +306,8 @@ class RobotNode(BaseNode[P]):
         )
 
     def _make_broadcaster(self, kind: str) -> Any:
-        try:
-            import tf2_ros
-        except ImportError:
-            self.get_logger().info(
-                'tf2_ros is not installed: no transform is published', once=True
-            )
-            return None
-        return getattr(tf2_ros, kind)(self)
+        tf2_ros = self.import_tf2('no transform is published')
+        return tf2_ros and getattr(tf2_ros, kind)(self)
 
 
 def _other_type(message: type) -> type[Twist | TwistStamped]:

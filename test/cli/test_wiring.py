@@ -719,7 +719,6 @@ def observed(monkeypatch, tmp_path, capsys):
         code = main(shlex.split(words))
         files = [each for each in tmp_path.glob('new*') if each.is_file()]
         names = ' '.join(each.name for each in files)
-        content = [each.read_bytes() for each in files]
         for each in files:
             each.unlink()
         graph = GRAPH.method_calls[-1] if GRAPH.method_calls else ('', ())
@@ -730,7 +729,6 @@ def observed(monkeypatch, tmp_path, capsys):
             'text': printed.out,
             'error': printed.err,
             'files': names,
-            'content': content,
             'browser': opened[0] if opened else None,
             'graph': (graph[0], *graph[1]),
             'fault': tuple(fault[0][0]) if fault else (),
@@ -766,23 +764,6 @@ def test_every_option_has_a_row(command):
     for option in options(commands()[command]).values():
         names = option.option_strings
         assert not names or any(f'{name} ' in used for name in names), option
-
-
-@pytest.mark.parametrize(
-    ('words', 'option', 'name'),
-    [
-        (words, option, expected['files'])
-        for words, (_, rows) in TABLE.items()
-        for option, expected in rows.items()
-        if 'files' in expected
-    ],
-)
-def test_a_file_that_exists_is_written_anew(words, option, name, observed):
-    """Of a second run nothing of the first may be left in it."""
-    first = observed(f'{words} {option}', TABLE[words][0])
-    Path(name).write_text(1000 * 'of an earlier run\n')
-    again = observed(f'{words} {option}', TABLE[words][0])
-    assert (again['code'], again['content']) == (first['code'], first['content'])
 
 
 def takes_zero(option):
@@ -823,21 +804,6 @@ def test_zero_reaches_its_function_or_is_refused(words, observed):
             continue
         values = [np.ravel(found.get(path)) for path in rows[row]]
         assert any(value.dtype.kind in 'if' and 0 in value for value in values), changed
-
-
-def test_every_number_that_may_be_zero_is_tried():
-    for command, parser in commands().items():
-        if command == 'demo':
-            continue
-        tried = {
-            word
-            for words, rows in WITH_ZERO.items()
-            for word, *_ in rows
-            if f'{words} '.startswith(f'{command} ')
-        }
-        for option in filter(takes_zero, options(parser).values()):
-            assert tried & {*option.option_strings}, f'{command} {option.dest}'
-    assert sum(map(len, WITH_ZERO.values())) > 20
 
 
 # -- the demo -------------------------------------------------------------------------------------
