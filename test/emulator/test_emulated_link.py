@@ -105,6 +105,7 @@ def test_the_link_recovers_from_every_fault(name):
     bench.inject(name, 1.5)
     bench.run(1.6)
     bench.run(2.0)
+    assert bench.emulator.port_number == (name == 'move_link')
     assert bench.link.reason(bench.now_ns) == ''
     assert bench.plant.wheels.right == pytest.approx(4.0, abs=0.3)
     check_followed(bench)

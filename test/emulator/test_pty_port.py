@@ -16,6 +16,7 @@
 from itertools import product
 import os
 from pathlib import Path
+import re
 import select
 import signal
 import subprocess
@@ -34,68 +35,37 @@ ROOT = Path(__file__).resolve().parents[2]
 KEY = bytes(range(16))
 
 
-class Process:
-    def __init__(self, *arguments):
-        command = [sys.executable, '-m', 't3mpc_ros.cli.emulator', *map(str, arguments)]
-        environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-        self.child = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-        )
-
-    def ready(self):
-        """Return the line with the path of the port."""
-        for line in self.child.stdout:
-            if 'dongle and robot' in line:
-                return line
-        raise AssertionError(self.child.stderr.read())
-
-    def stop(self, number):
-        """Send a signal; return the exit code and the remaining output."""
-        self.child.send_signal(number)
-        output, errors = communicate(self.child)
-        assert errors == ''
-        return self.child.returncode, output
-
-
-@pytest.fixture
-def start():
-    needs('C compiler')
-    started = []
-
-    def run(*arguments):
-        started.append(Process(*arguments))
-        return started[-1]
-
-    yield run
-    for process in started:
-        if process.child.poll() is None:
-            process.child.kill()
-            process.child.communicate()
-
-
 @pytest.mark.slow
-def test_a_command_reaches_the_process_over_a_pty_with_a_key(start, tmp_path, capsys):
-    key_file = tmp_path / 'key'
+def test_a_command_reaches_the_process_over_a_pty_with_a_key(tmp_path, capsys):
+    needs('C compiler')
+    key_file, path = tmp_path / 'key', tmp_path / 'dongle'
     key_file.write_text(KEY.hex())
     key_file.chmod(0o600)
-    path = tmp_path / 'dongle'
-    process = start('--link', path, '--key', key_file, '--loss', '0.05', '--fault', 'jam:0:0.2')
-    ready = process.ready()
-    assert str(path) in ready
-    assert f'kill {process.child.pid}' in ready
-    read = ['parameters', '--port', str(path), '--key', str(key_file)]
-    # A process that gets no processor for 0.3 s looks like a dongle that restarted, and the jam of
-    # the start like a robot out of range.
-    for _ in range(5):
-        if robot.main(read) == 0:
-            break
-        errors = capsys.readouterr().err
-        assert 'the dongle stopped answering' in errors or 'the robot does not answer' in errors
-    else:
-        pytest.fail('the parameters were never read')
-    assert 'ttl_max' in capsys.readouterr().out
-    assert path.is_symlink()
-    assert process.stop(signal.SIGINT) == (0, 't3mpc emulator: stopped\n')
+    words = f'--link {path} --key {key_file} --loss 0.05 --fault jam:0:0.2'
+    command = [sys.executable, '-m', 't3mpc_ros.cli.emulator', *words.split()]
+    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as child:
+        try:
+            ready = next((line for line in child.stdout if 'dongle and robot' in line), '')
+            assert str(path) in ready
+            assert f'kill {child.pid}' in ready
+            read = ['parameters', '--port', str(path), '--key', str(key_file)]
+            # A process that gets no processor for 0.3 s looks like a dongle that restarted, and
+            # the jam of the start like a robot out of range.
+            for _ in range(5):
+                if robot.main(read) == 0:
+                    break
+                errors = capsys.readouterr().err
+                assert re.search('the dongle stopped answering|the robot does not answer', errors)
+            assert 'ttl_max' in capsys.readouterr().out
+            assert path.is_symlink()
+            child.send_signal(signal.SIGINT)
+            assert communicate(child) == ('t3mpc emulator: stopped\n', '')
+            assert child.returncode == 0
+        finally:
+            child.kill()
     assert not path.is_symlink()
 
 

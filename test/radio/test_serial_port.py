@@ -109,19 +109,16 @@ def test_a_blocked_reader_does_not_block_write(line):
         port.write(bytes(200_000))
 
 
-def test_a_missing_port_is_absent(tmp_path):
-    with pytest.raises(PortError, match='nothing does not exist') as error:
-        SerialPort(str(tmp_path / 'nothing'))
-    assert error.value.absent
-
-
-def test_a_file_is_rejected_as_port(tmp_path):
+def test_a_missing_port_is_absent_and_a_file_is_none(tmp_path):
     """It said: Could not configure port: (25, 'Inappropriate ioctl for device')."""
-    path = tmp_path / 'file'
-    path.write_text('no port')
-    with pytest.raises(PortError, match='file is no serial port: ls -l /dev/serial') as error:
-        SerialPort(str(path))
-    assert not error.value.absent
+    (tmp_path / 'file').write_text('no port')
+    for name, text in (
+        ('nothing', 'nothing does not exist'),
+        ('file', 'file is no serial port: ls -l /dev/serial'),
+    ):
+        with pytest.raises(PortError, match=text) as error:
+            SerialPort(str(tmp_path / name))
+        assert error.value.absent == (name == 'nothing')
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from collections.abc import Callable, Generator
 from contextlib import suppress
 import select
 import time
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.radio.link import standstill_reasons as reasons
@@ -206,27 +206,33 @@ class Procedure(Generic[Value]):
             self._actions.append(Close())
 
 
+def _ask(
+    frame: RequestFrame, kind: Any, timeout: float, attempts: int, silent: str
+) -> Script[Any]:
+    """Return the reply of a kind to a frame that is repeated, or raise ProcedureError(silent)."""
+    for _ in range(attempts):
+        response = yield Request(frame, timeout)
+        if isinstance(response.reply, kind):
+            return response.reply
+    raise ProcedureError(silent)
+
+
 def wait_for_board(absent: str = NO_BOARD) -> Script[frames.Pong]:
     """Wait for a board to start; return its PONG, or raise ProcedureError(absent)."""
-    for _ in range(_MAX_PINGS):
-        response = yield Request(frames.Ping(0, b'look'), _PING_TIMEOUT)
-        if isinstance(response.reply, frames.Pong):
-            return response.reply
-    raise ProcedureError(absent)
+    return _ask(frames.Ping(0, b'look'), frames.Pong, _PING_TIMEOUT, _MAX_PINGS, absent)
 
 
 def request_reply(frame: RequestFrame, kind: type[Reply]) -> Script[Reply]:
     """Return the reply of the robot board to a frame, which is sent again after a timeout."""
-    for _ in range(_MAX_ATTEMPTS):
-        response = yield Request(frame, _REPLY_TIMEOUT)
-        if isinstance(response.reply, kind):
-            return response.reply
-        if isinstance(response.reply, frames.Refusal):
-            # A robot board refuses this as well; the answer of a dongle is no frame of a robot.
-            configuration = yield Request(frames.Configure(0), _REPLY_TIMEOUT)
-            is_robot = isinstance(configuration.reply, frames.Refusal)
-            raise ProcedureError(OLD_FIRMWARE if is_robot else WRONG_BOARD)
-    raise ProcedureError('the board stopped answering: did it restart, is the cable good?')
+    silent = 'the board stopped answering: did it restart, is the cable good?'
+    kinds = kind, frames.Refusal
+    reply = yield from _ask(frame, kinds, _REPLY_TIMEOUT, _MAX_ATTEMPTS, silent)
+    if isinstance(reply, kind):
+        return reply
+    # A robot board refuses this as well; the answer of a dongle is no frame of a robot.
+    configuration = yield Request(frames.Configure(0), _REPLY_TIMEOUT)
+    is_robot = isinstance(configuration.reply, frames.Refusal)
+    raise ProcedureError(OLD_FIRMWARE if is_robot else WRONG_BOARD)
 
 
 def wait_for_dongle() -> Script[frames.Pong]:
@@ -254,11 +260,9 @@ def configure_radio(frame: frames.Configure) -> Script[None]:
 
 def read_radio_setup() -> Script[frames.Configure]:
     """Return the radio configuration of the dongle, or raise ProcedureError."""
-    for _ in range(3):
-        response = yield Request(frames.Configure(0), _PING_TIMEOUT)
-        if isinstance(response.reply, frames.Configured):
-            return frames.Configure(*response.reply[:-1])
-    raise ProcedureError(reasons.DONGLE_TIMEOUT)
+    request, silent = frames.Configure(0), reasons.DONGLE_TIMEOUT
+    reply = yield from _ask(request, frames.Configured, _PING_TIMEOUT, 3, silent)
+    return frames.Configure(*reply[:-1])
 
 
 def run_script(
