@@ -17,7 +17,7 @@ import pytest
 
 from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import FaultInjection, parse_fault
-from t3mpc_ros.emulator.link.serial_line import BYTE_NS, SerialLine
+from t3mpc_ros.emulator.serial_line import BYTE_NS, SerialLine
 
 MS = 1_000_000
 

@@ -31,8 +31,8 @@ from support.emulator_bench import Bench
 from t3mpc_ros.emulator.emulator import EmulatorParameters
 from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import Fault, FaultInjection
-from t3mpc_ros.emulator.link.serial_line import SerialLine
 from t3mpc_ros.emulator.plant import Plant, Registers
+from t3mpc_ros.emulator.serial_line import SerialLine
 from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.radio.protocol.codec import decode_downlink
 from t3mpc_ros.radio.protocol.frames import Command

@@ -49,8 +49,8 @@ from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters, SpeedKa
 from t3mpc_ros.control.watchdog import ResponseMonitor, WatchdogParameters
 from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultInjection
-from t3mpc_ros.emulator.link.serial_line import SerialLine
 from t3mpc_ros.emulator.plant import Plant
+from t3mpc_ros.emulator.serial_line import SerialLine
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.sample_scheduler import RealTimeFactor, SampleScheduler, SimulatedTime
