@@ -912,9 +912,7 @@ NEVER_RESET = {
     # The state is in the memory of the C core: see test_core_fresh_state.py.
     **dict.fromkeys(('Board', 'Motion', 'RobotBoard', 'Dongle', 'Emulator'), 'C core'),
     **dict.fromkeys(('c_short_Array_7', 'c_ushort_Array_9'), 'C core'),
-    **dict.fromkeys(
-        ('RadioChannel', 'Medium', 'Transmission', '_Exchange'), 'one emulator, never reset'
-    ),
+    **dict.fromkeys(('RadioChannel', 'Medium', '_Exchange'), 'one emulator, never reset'),
     **dict.fromkeys(('PtyPort', '_ConsolePort', 'StopTimeMonitor'), 'one process, never reset'),
     **dict.fromkeys(
         ('InputMonitor', 'Gaps', 'ResponseGain', 'GivenPathSource', 'SmoothedPath', 'PauseRamp'),
