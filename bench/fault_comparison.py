@@ -32,7 +32,7 @@ import math
 from pathlib import Path
 import re
 import sys
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import numpy as np
@@ -45,7 +45,7 @@ from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.cases import NO_FAULTS, LinkFaults
 from t3mpc_ros.evaluation.drivers import NodeDriver, NodeMethod
-from t3mpc_ros.evaluation.experiment import map_jobs
+from t3mpc_ros.evaluation.experiment import ResultTable, map_jobs
 from t3mpc_ros.evaluation.loop import ReportLink
 from t3mpc_ros.evaluation.methods import (
     EXACT_MODEL,
@@ -56,8 +56,9 @@ from t3mpc_ros.evaluation.methods import (
     SHAPED_IN_TIME,
     methods_for,
 )
-from t3mpc_ros.evaluation.record import RATE, Numbers, measure, stamp_of
+from t3mpc_ros.evaluation.record import RATE, measure, stamp_of
 from t3mpc_ros.evaluation.reporting import replace_section
+from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
 from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist
 from t3mpc_ros.robot.interface import RobotState
@@ -131,19 +132,6 @@ def frozen_yaw(link: Any, k: int, pose: Any) -> Mapping[str, float]:
     if k == round(BEGIN * RATE):
         link.kept = pose.yaw
     return {'yaw': link.kept} if k >= BEGIN * RATE else {}
-
-
-def stamped_late(late: float) -> Send:
-    """Return a fault: stamps that are late, as those of a clock that differs."""
-    shift = round(late * 1e9)
-
-    def send(link: Any, k: int, state: RobotState) -> list[RobotState]:
-        odometry = state.odometry
-        if odometry.stamp_ns < shift:
-            return []
-        return [state._replace(odometry=odometry._replace(stamp_ns=odometry.stamp_ns - shift))]
-
-    return send
 
 
 def late(seconds: float) -> LinkFaults:
@@ -242,10 +230,7 @@ FAULTS: Mapping[str, Fault] = {
     'noise 0.04 (rad/s)², none assumed': Fault(assumed={'speed_filter.noise_variance': 0.0}),
     'lag 20 ms assumed, none': Fault(assumed={'speed_filter.lag': 0.02}),
     'shaper for another robot': Fault(
-        assumed={
-            'command_shaper.straight_frequency': 6.0,
-            'command_shaper.turning_frequency': 4.0,
-        }
+        assumed={'command_shaper.straight_frequency': 6.0, 'command_shaper.turning_frequency': 4.0}
     ),
 }
 
@@ -330,32 +315,32 @@ class Watched:
         return self.made[-1]
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """One run of a method with a fault."""
 
     fault: str
-    name: str
+    controller: str
     seed: int
 
 
-def run_job(pair: tuple[Job, Job]) -> tuple[Numbers, list[tuple[float, str]]]:
-    """Return the numbers of a run, and what the diagnostics said when."""
-    job, fault = pair[0], FAULTS[pair[0].fault]
+def run_job(job: Job) -> Row:
+    """Return the job, its numbers, and what the diagnostics said when."""
+    fault = FAULTS[job.fault]
     events = [
         FaultEvent(BEGIN, name, value, fault.lasting) for name, value in fault.events.items()
     ]
-    method: Any = methods_for('twin')[job.name]
+    method: Any = methods_for('twin')[job.controller]
     links = fault.links if isinstance(method, NodeMethod) else fault.forward_links or fault.links
     own = OwnParts(robot_parameters=fault.changes, events=events, links=links)
     scenario = Scenario('twin', 'nominal', job.seed, DURATION, own=own)
     send = fault.send or (lambda link, k, state: [state])
     kind = type('Faulty', (Link,), {'send_changed': send})
     if isinstance(method, NodeMethod):
-        method = Watched(NodeMethod(job.name, {**method.changes, **fault.assumed}))
+        method = Watched(NodeMethod(job.controller, {**method.changes, **fault.assumed}))
     with patch.object(loop, 'ReportLink', kind):
         numbers = measure(loop.run(scenario, method))
-    return numbers, method.made[0].said if isinstance(method, Watched) else []
+    said = method.made[0].said if isinstance(method, Watched) else []
+    return {**job._asdict(), **numbers, 'said': said}
 
 
 def first_said(fault: Fault, said: Iterable[tuple[float, str]], limit: float = NAMED) -> str:
@@ -377,20 +362,13 @@ def kind(text: str) -> str:
     return re.sub(r'[-\d.]+', '', text)[:50]
 
 
-Found = Mapping[Job, tuple[Numbers, list[tuple[float, str]]]]
-"""Numbers of each run, and what the diagnostics said when."""
-
-
-def row(name: str, found: Found) -> tuple[str, bool]:
+def row(name: str, found: ResultTable) -> tuple[str, bool]:
     """Return a line of the table, and whether it is as it must be."""
     fault, stops = FAULTS[name], {each.value for each in Reason if not each.moves}
     counted = BODY if fault.body else WHEELS
 
-    def seeds(method: str) -> list[int]:
-        return [job.seed for job in found if (job.fault, job.name) == (name, method)]
-
     def mean(case: str, method: str, metric: str) -> float:
-        values = [found[Job(case, method, seed)][0][metric] for seed in seeds(method)]
+        values = found.values(metric, fault=case, controller=method)
         return float(np.mean(values)) if values else math.nan
 
     errors = {each: [mean(name, each, metric) for metric in counted] for each in (FULL, *SIMPLE)}
@@ -398,8 +376,7 @@ def row(name: str, found: Found) -> tuple[str, bool]:
     ratio = float(np.max(np.divide(errors[FULL], best)))
     cost = max(mean(name, FULL, metric) / mean('none', FULL, metric) for metric in counted)
     stopped, texts, later = mean(name, FULL, 'stopped'), [], 0
-    for seed in seeds(FULL):
-        said = found[Job(name, FULL, seed)][1]
+    for said in found.values('said', fault=name, controller=FULL):
         texts.append(first_said(fault, said))
         later += bool(first_said(fault, said, DURATION))
         stopped += sum(text in stops for _, text in said) and 0.005
@@ -444,15 +421,15 @@ def main() -> int:
         for name in (FULL, *SIMPLE, EXACT)
         for seed in (chosen.nmpc_seeds if name == EXACT else chosen.seeds)
     ]
-    results = map_jobs(run_job, [(job, job) for job in jobs], chosen.workers, progress=True)
-    lines, failed = table(rows, dict(zip(jobs, results, strict=True)))
+    results = map_jobs(run_job, jobs, chosen.workers, progress=True)
+    lines, failed = table(rows, ResultTable(results))
     print(lines)
     if chosen.page is not None:
         replace_section(chosen.page, BEGIN_MARK, END_MARK, f'\n{lines}\n')
     return failed
 
 
-def table(rows: Iterable[str], found: Found) -> tuple[str, bool]:
+def table(rows: Iterable[str], found: ResultTable) -> tuple[str, bool]:
     """Return the table of these faults, and whether a line is not as it must be."""
     lines = [f'| {" | ".join(HEAD)} |', '|---' * len(HEAD) + '|']
     failed = False

@@ -20,14 +20,7 @@ import sys
 from typing import Any
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.cli.shared_options import (
-    Commands,
-    add_json,
-    add_seeds,
-    add_workers,
-    executor_of,
-    print_result,
-)
+from t3mpc_ros.cli import shared_options
 from t3mpc_ros.parameters.command_line import bounded_float
 
 DEFAULT_SEEDS = '101-105'
@@ -36,7 +29,7 @@ RUNS = '.runs.jsonl'
 """End of the name of the file with the finished runs of an interrupted study."""
 
 
-def add_parser(commands: Commands) -> None:
+def add_parser(commands: shared_options.Commands) -> None:
     """Add the subcommand ``patrol``."""
     parser = commands.add_parser(
         'patrol', help='coverage and predictability of the chaotic patrol against other paths'
@@ -54,7 +47,7 @@ def add_parser(commands: Commands) -> None:
         help='as --robot twin, and the path goes around what the robot has seen; the robot rests '
         'and looks before floor that it has not; also with --safety',
     )
-    add_seeds(parser, DEFAULT_SEEDS, 'path, robot and room')
+    shared_options.add_seeds(parser, DEFAULT_SEEDS, 'path, robot and room')
     text = (
         'of each patrol (default 18, three times what the boustrophedon needs); from 2.2 on '
         'with predictability'
@@ -87,8 +80,8 @@ def add_parser(commands: Commands) -> None:
         help='instead: how well the simulated robot knows its place in a known room, by odometry '
         'and by the particle filter, also with more noise and after it was carried; a table',
     )
-    add_workers(parser)
-    add_json(parser, 'also write every run')
+    shared_options.add_workers(parser)
+    shared_options.add_json(parser, 'also write every run')
     add('--output', type=Path, default=OUTPUT, help=f'folder of the page (default {OUTPUT})')
     parser.set_defaults(run=run)
 
@@ -111,10 +104,10 @@ def run(options: argparse.Namespace) -> int:
     name = 'tracking' if options.tracking else 'patrol'
     page, plan, compare = (_tracking if options.tracking else _patrols)(options)
     runs = options.output / f'{name}{RUNS}'
-    with executor_of(options) as executor:
+    with shared_options.executor_of(options) as executor:
         study = compare(plan, runs, executor, print_report)
     record = page.record(study)
-    print_result(options, lambda: page.markdown(study), lambda: record)
+    shared_options.print_result(options, lambda: page.markdown(study), lambda: record)
     drawn = write_pictures({each.stem: each.draw for each in page.PICTURES}, study, figures)
     write_atomically(options.output / f'{name}.json', strict_json(record))
     written = options.output / f'{name}.html'
@@ -129,9 +122,11 @@ def _tune_tracking(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.patrol import path_tracking_page
     from t3mpc_ros.evaluation.patrol.path_tracking import tune_trackers
 
-    with executor_of(options) as executor:
+    with shared_options.executor_of(options) as executor:
         found = tune_trackers(executor, print_report)
-    print_result(options, lambda: path_tracking_page.tuning_markdown(found), lambda: found)
+    shared_options.print_result(
+        options, lambda: path_tracking_page.tuning_markdown(found), lambda: found
+    )
     return 0
 
 
@@ -140,11 +135,11 @@ def _safety(options: argparse.Namespace) -> int:
     from t3mpc_ros.evaluation.patrol.safety_study import compare_safety, safety_table
 
     seconds = 60.0 * options.minutes
-    with executor_of(options) as executor:
+    with shared_options.executor_of(options) as executor:
         measured = compare_safety(
             options.seeds, seconds, executor, print_report, planned=options.planned
         )
-    print_result(options, safety_table(measured).markdown, lambda: measured.rows)
+    shared_options.print_result(options, safety_table(measured).markdown, lambda: measured.rows)
     return 0
 
 
@@ -158,9 +153,9 @@ def _compare_localizations(options: argparse.Namespace) -> int:
 
     plan = LocalizationPlan(seeds=options.seeds, duration=60.0 * options.minutes)
     runs = options.output / f'localization{RUNS}'
-    with executor_of(options) as executor:
+    with shared_options.executor_of(options) as executor:
         measured = compare_localizations(plan, runs, executor, print_report)
-    print_result(options, lambda: markdown(plan, measured), lambda: measured.rows)
+    shared_options.print_result(options, lambda: markdown(plan, measured), lambda: measured.rows)
     return 0
 
 

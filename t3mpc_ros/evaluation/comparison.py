@@ -44,6 +44,8 @@ BETTER, WORSE, INCONCLUSIVE = 'better', 'worse', 'inconclusive'
 LEVEL = 0.05
 """Largest probability of one wrong verdict in a table."""
 Key = TypeVar('Key', bound=Hashable)
+Judged = Mapping[tuple[str, str, record.Metric], tuple[Difference, str]]
+"""Differences with their verdicts by method, case and metric."""
 
 
 @dataclass(frozen=True)
@@ -66,21 +68,20 @@ class ComparisonPlan:
 
     def runs(self) -> list[Run]:
         """Return every run, methods of one seed next to each other."""
-        found = []
-        for case in self.cases:
-            for seed in self.seeds:
-                scenario = replace(self.scenario, case=case, seed=seed)
-                for name, method in self.methods.items():
-                    row = {
-                        'controller': name,
-                        'robot': scenario.robot,
-                        'case': case,
-                        'seed': seed,
-                        'noise': scenario.noise,
-                        'duration': scenario.duration,
-                    }
-                    found.append(Run((scenario, method), row))
-        return found
+        common = {
+            'robot': self.scenario.robot,
+            'noise': self.scenario.noise,
+            'duration': self.scenario.duration,
+        }
+        return [
+            Run(
+                (replace(self.scenario, case=case, seed=seed), method),
+                {'controller': name, 'case': case, 'seed': seed, **common},
+            )
+            for case in self.cases
+            for seed in self.seeds
+            for name, method in self.methods.items()
+        ]
 
 
 StepTimes = Mapping[str, float]
@@ -95,9 +96,8 @@ def step_times(plan: ComparisonPlan, clock_ns: Callable[[], int]) -> StepTimes:
     State estimate and limits are part of a step. It is no number of the runs: those depend on no
     machine. Weights are not pretrained for it, they take no time.
     """
-    case, seed = plan.cases[0], plan.seeds[0]
     length = min(TIMED, plan.scenario.duration)
-    scenario = replace(plan.scenario, case=case, seed=seed, duration=length)
+    scenario = replace(plan.scenario, case=plan.cases[0], seed=plan.seeds[0], duration=length)
     found = {}
     for name, method in plan.methods.items():
         if isinstance(method, MethodSpec):
@@ -117,13 +117,13 @@ class TimedMethod:
 
     def driver(self, scenario: Scenario) -> Driver:
         """Return a new driver."""
-        driver, clock_ns, taken_ns = self._method.driver(scenario), self._clock_ns, self.taken_ns
+        driver = self._method.driver(scenario)
         step = driver.step
 
         def timed_step(state: RobotState) -> RobotCommand:
-            begin = clock_ns()
+            begin = self._clock_ns()
             command = step(state)
-            taken_ns.append(clock_ns() - begin)
+            self.taken_ns.append(self._clock_ns() - begin)
             return command
 
         driver.step = timed_step  # type: ignore[method-assign]
@@ -146,13 +146,12 @@ def difference(
     return None if first == second else results.difference(metric.name, first, second)
 
 
-def verdicts(differences: Mapping[Key, Difference | None], seeds: int) -> dict[Key, str]:
+def verdicts(found: Mapping[Key, Difference], seeds: int) -> dict[Key, str]:
     """Return the verdict on every paired difference of a table, with Holm's correction.
 
     Each is the mean over as many ``seeds``. Whose run diverged is worse than the other, and if
-    both have one it is open; without a difference there is no verdict.
+    both have one it is open.
     """
-    found = {key: each for key, each in differences.items() if each is not None}
     certain = holm({key: each.p_value(seeds) for key, each in found.items()}, LEVEL)
     certain |= {key for key, each in found.items() if math.isinf(each.mean)}
     return {
@@ -161,18 +160,25 @@ def verdicts(differences: Mapping[Key, Difference | None], seeds: int) -> dict[K
     }
 
 
-def case_judgement(
-    plan: ComparisonPlan, results: ResultTable, case: str
-) -> dict[tuple[str, record.Metric], tuple[Difference, str]]:
-    """Return by method and metric the differences that a case is judged by, with verdicts."""
+def judge(
+    plan: ComparisonPlan, results: ResultTable, cases: Sequence[str], count: int | None = None
+) -> Judged:
+    """Return the differences that cases are judged by, of each the first ``count`` metrics."""
     found = {
-        (method, metric): each
+        (method, case, metric): each
+        for case in cases
+        for metric in judged_metrics(case)[:count]
         for method in plan.methods
-        for metric in judged_metrics(case)
         if (each := difference(plan, results, case, method, metric)) is not None
     }
     judged = verdicts(found, len(plan.seeds))
     return {key: (each, judged[key]) for key, each in found.items()}
+
+
+def first_verdicts(plan: ComparisonPlan, results: ResultTable) -> dict[tuple[str, str], str]:
+    """Return the verdict on the first judged metric of every method and case."""
+    judged = judge(plan, results, plan.cases, 1)
+    return {(method, case): verdict for (method, case, _), (_, verdict) in judged.items()}
 
 
 def judged_metrics(case: str) -> tuple[record.Metric, ...]:
@@ -229,18 +235,6 @@ def _verdict_notes(plan: ComparisonPlan, count: int) -> list[str]:
     return [text] if count else []
 
 
-def first_verdicts(plan: ComparisonPlan, results: ResultTable) -> dict[tuple[str, str], str]:
-    """Return the verdict on the first judged metric of every method and case."""
-    return verdicts(
-        {
-            (method, case): difference(plan, results, case, method, judged_metrics(case)[0])
-            for method in plan.methods
-            for case in plan.cases
-        },
-        len(plan.seeds),
-    )
-
-
 def _cell(values: Sequence[float], metric: record.Metric) -> str:
     """Return mean ± half the interval and the number of seeds, or how many diverged."""
     if diverged := sum(map(math.isnan, values)):
@@ -268,18 +262,16 @@ def case_table(plan: ComparisonPlan, results: ResultTable, case: str) -> Table:
         for metric in judged:
             head += [f'{metric.heading} − {plan.against}', 'verdict']
     head.append('knows')
-    judgement = case_judgement(plan, results, case)
+    judgement = judge(plan, results, [case])
     rows = []
     for method in plan.methods:
         cells = [method]
         for metric in metrics:
             cells.append(_cell(results.values(metric.name, case=case, controller=method), metric))
         for metric in judged if compared else ():
-            if (method, metric) in judgement:
-                found, verdict = judgement[method, metric]
-                cells += [format_interval(*found, '+', metric.digits), verdict]
-            else:
-                cells += [EMPTY_CELL, EMPTY_CELL]
+            found, verdict = judgement.get((method, case, metric), (None, EMPTY_CELL))
+            shown = format_interval(*found, '+', metric.digits) if found else EMPTY_CELL
+            cells += [shown, verdict]
         cells.append(known_by(plan, method, case))
         rows.append(tuple(cells))
     title = f'{case}: {CASES[case].text}'

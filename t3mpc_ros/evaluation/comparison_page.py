@@ -28,11 +28,11 @@ from t3mpc_ros.evaluation.comparison import (
     WORSE,
     ComparisonPlan,
     StepTimes,
-    case_judgement,
     case_table,
     description,
     difference,
     first_verdicts,
+    judge,
     judged_metrics,
     knowledge_table,
     known_by,
@@ -41,7 +41,7 @@ from t3mpc_ros.evaluation.comparison import (
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.evaluation.drivers import MethodSpec, NodeMethod
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.plotting import drawing, file_of, new_figure, scale_by_size
+from t3mpc_ros.evaluation.plotting import drawing, file_of, new_figure, scale_by_size, whisker
 from t3mpc_ros.evaluation.record import METRICS, VARIATION
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.parameters.provenance import machine, provenance
@@ -142,17 +142,17 @@ def _method_record(
 ) -> dict[str, Any]:
     runs = results.where(case=case, controller=method)
     names = [metric.name for metric in METRICS if metric.name in runs[0]]
-    judgement = case_judgement(plan, results, case)
-    differences = {}
-    for metric in METRICS:
-        found = difference(plan, results, case, method, metric)
-        if found is not None:
-            differences[metric.name] = {
-                'mean': found.mean,
-                'half_interval': found.half,
-                'p': found.p_value(len(plan.seeds)),
-                'verdict': judgement[method, metric][1] if (method, metric) in judgement else '',
-            }
+    judged = judge(plan, results, [case])
+    differences = {
+        metric.name: {
+            'mean': found.mean,
+            'half_interval': found.half,
+            'p': found.p_value(len(plan.seeds)),
+            'verdict': judged.get((method, case, metric), (None, ''))[1],
+        }
+        for metric in METRICS
+        if (found := difference(plan, results, case, method, metric)) is not None
+    }
     return {
         'mean': {name: mean([run[name] for run in runs]) for name in names},
         'runs': [{name: run[name] for name in ('seed', *names)} for run in runs],
@@ -163,10 +163,9 @@ def _method_record(
 def _draw_differences(plan: ComparisonPlan, results: ResultTable, case: str) -> Any:
     """Return a figure of the paired differences of the first judged metric, or None."""
     metric = judged_metrics(case)[0]
-    judgement = case_judgement(plan, results, case)
     rows = [
         (method, *found)
-        for (method, judged), found in judgement.items()
+        for (method, _, judged), found in judge(plan, results, [case]).items()
         if judged is metric and math.isfinite(found[0].mean)
     ]
     if not rows:
@@ -177,7 +176,7 @@ def _draw_differences(plan: ComparisonPlan, results: ResultTable, case: str) -> 
     colours = {BETTER: '#15803d', WORSE: '#be123c', INCONCLUSIVE: '#6b7280'}
     ends: list[float] = []
     for place, (_, found, verdict) in zip(places, rows, strict=True):
-        half = found.half if math.isfinite(found.half) else 0.0
+        half = whisker(found.half)
         ends += [found.mean - half, found.mean + half]
         axis.errorbar(found.mean, place, xerr=half, fmt='o', color=colours[verdict], markersize=4)
     axis.axvline(0.0, color='#1f2937', linewidth=0.8)

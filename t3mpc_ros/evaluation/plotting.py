@@ -129,17 +129,10 @@ def draw_world(axis: Any, world: World) -> None:
         axis.add_patch(Circle((x, y), radius, fc='#d1d5db', ec='#374151', lw=1.4))
     for x, y, length, width, yaw in world.boxes.tolist():
         left, bottom = x - 0.5 * length, y - 0.5 * width
-        axis.add_patch(
-            Rectangle(
-                (left, bottom),
-                length,
-                width,
-                angle=math.degrees(yaw),
-                rotation_point='center',
-                color='#d1d5db',
-                lw=0.0,
-            )
-        )
+        angle = math.degrees(yaw)
+        box = Rectangle((left, bottom), length, width, angle=angle, rotation_point='center')
+        box.set(color='#d1d5db', lw=0.0)
+        axis.add_patch(box)
     walls = list(world.segments.reshape(-1, 2, 2))
     axis.add_collection(LineCollection(walls, colors='#374151', linewidths=1.4))
 
@@ -164,6 +157,11 @@ def new_panels(count: int, height: float) -> tuple[Any, list[Any]]:
     """Return a figure and ``count`` panels of ``height`` inches with one common time axis."""
     figure = new_figure(0.7 + height * count)
     return figure, list(figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0])
+
+
+def whisker(half: float) -> float:
+    """Return the length of an error bar: none for a single seed, whose interval is infinite."""
+    return half if math.isfinite(half) else 0.0
 
 
 def mark_switches(axis: Any, times: Array) -> None:
@@ -229,20 +227,10 @@ def run_figure(name: str, columns: Mapping[str, Array]) -> Any:
         speed, reference = columns[f'speed_{side}'], columns[f'reference_{side}']
         axis.plot(*thinned(time, reference), color=COLOURS[REFERENCE], lw=1.0, label='reference')
         axis.plot(*thinned(time, speed), color=COLOURS[TRUTH], lw=1.0, label=name)
-        axis.set_ylabel('rad/s')
-        axis.set_title(f'{side} wheel')
-        error = speed - reference
-        strength = 1.0 if side == 'right' else 0.45
-        label = f'{side} wheel'
-        axes[2].plot(
-            *thinned(time, error),
-            color=COLOURS['error'],
-            lw=0.8,
-            alpha=strength,
-            label=label,
-        )
-    axes[2].set_title('error')
-    axes[2].set_ylabel('rad/s')
+        axis.set(title=f'{side} wheel', ylabel='rad/s')
+        style = {'color': COLOURS['error'], 'alpha': 1.0 if side == 'right' else 0.45}
+        axes[2].plot(*thinned(time, speed - reference), lw=0.8, label=f'{side} wheel', **style)
+    axes[2].set(title='error', ylabel='rad/s')
     name_time(axes)
     add_legend(axes[0])
     add_legend(axes[2])
@@ -264,8 +252,7 @@ def plane_figure(x: Array, y: Array, names: Sequence[str]) -> Any:
     figure = new_figure(4.2)
     axis = figure.subplots()
     axis.plot(x, y, color=COLOURS['value'], lw=0.5)
-    axis.set_xlabel(names[0])
-    axis.set_ylabel(names[1])
+    axis.set(xlabel=names[0], ylabel=names[1])
     return figure
 
 
@@ -276,10 +263,8 @@ def sweep_figure(lines: Mapping[str, Mapping[float, list[float]]], name: str, la
     for line, values in lines.items():
         ordered = sorted(values)
         means = [mean(values[value]) for value in ordered]
-        halves = [interval(values[value]) for value in ordered]
-        shown = [half if math.isfinite(half) else 0.0 for half in halves]
+        shown = [whisker(interval(values[value])) for value in ordered]
         axis.errorbar(ordered, means, yerr=shown, marker='o', markersize=3, capsize=2, label=line)
-    axis.set_xlabel(name)
-    axis.set_ylabel(label)
+    axis.set(xlabel=name, ylabel=label)
     add_legend(axis)
     return figure

@@ -450,7 +450,7 @@ def test_a_difference_among_many_counts_less():
     assert set(verdicts({'a': least, **others}, 6).values()) == {INCONCLUSIVE}
     certain = Difference(0.3, 0.01)
     assert verdicts({'a': certain, **others}, 6)['a'] == WORSE
-    diverged = {'a': Difference(math.inf, math.nan), 'b': None}
+    diverged = {'a': Difference(math.inf, math.nan)}
     assert verdicts(diverged, 6) == {'a': WORSE}
     assert verdicts({'a': Difference(math.nan, math.nan)}, 6) == {'a': INCONCLUSIVE}
     assert Difference(-0.5, math.inf).p_value(1) == 1.0

@@ -24,36 +24,10 @@ from support.long_tests import few_of
 
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.evaluation import fault_study
+from t3mpc_ros.evaluation import fault_page, fault_study
 from t3mpc_ros.evaluation.drivers import NodeMethod
-from t3mpc_ros.evaluation.fault_page import (
-    BEGIN_MARK,
-    END_MARK,
-    TITLES,
-    UNDETECTED,
-    UNREPORTED,
-    console_text,
-    markdown_tables,
-    page_section,
-    table_row,
-    update_page,
-)
-from t3mpc_ros.evaluation.fault_study import (
-    FAULT_RUNS,
-    STRENGTHS,
-    FaultRun,
-    evaluate_outcome,
-    study_faults,
-    undisturbed,
-)
 from t3mpc_ros.evaluation.loop import run
-from t3mpc_ros.evaluation.scenario import (
-    KINDS,
-    OwnParts,
-    Scenario,
-    noisy_twin,
-    sampled_speeds,
-)
+from t3mpc_ros.evaluation.scenario import KINDS, OwnParts, Scenario, noisy_twin, sampled_speeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 from t3mpc_ros.simulation.digital_twin import BROWN_OUT_REASON
@@ -65,26 +39,26 @@ PAGE = Path(__file__).resolve().parents[2] / 'docs' / 'faults.md'
 NUMBER = re.compile(r'(?<![\w.])\d+(?:\.\d+)?')
 
 
-def short_run(*events, pauses=(), **changes):
+def short_run(*events, duration=6.0, pauses=(), **changes):
     own = OwnParts(events=events, robot_parameters=changes, pauses=pauses)
-    return run(Scenario('twin', 'nominal', 1, 6.0, own=own), NodeMethod('full', {}))
+    return run(Scenario('twin', 'nominal', 1, duration, own=own), NodeMethod('full', {}))
 
 
 def fault_run(course, name):
-    (found,) = (one for one in FAULT_RUNS if (one.course, one.name) == (course, name))
+    (found,) = (one for one in fault_study.FAULT_RUNS if (one.course, one.name) == (course, name))
     return found
 
 
 def row_text(result):
     """Return the row of the page's table."""
-    return f'| {" | ".join(table_row(result))} |\n'
+    return f'| {" | ".join(fault_page.table_row(result))} |\n'
 
 
 def page_rows():
     """Return the rows of the page's outcome tables by (course, fault)."""
-    text = PAGE.read_text().partition(BEGIN_MARK)[2].partition(END_MARK)[0]
+    text = PAGE.read_text().partition(fault_page.BEGIN_MARK)[2].partition(fault_page.END_MARK)[0]
     rows = {}
-    for course, title in TITLES.items():
+    for course, title in fault_page.TITLES.items():
         part = text.partition(f'### {title}\n')[2].partition('###')[0]
         for line in part.splitlines():
             if line.startswith('| `'):
@@ -103,15 +77,15 @@ def assert_same(line, other):
 
 
 def test_equal_runs_are_bit_equal_with_scheduled_faults(tmp_path):
-    event = FaultEvent(3.0, 'command_delay', 0.1, 1.0)
-    first = short_run(event)
+    event = FaultEvent(2.0, 'command_delay', 0.1, 0.5)
+    first = short_run(event, duration=3.0)
     path = tmp_path / 'ride.yaml'
-    path.write_text('- {at: 3.0, fault: command_delay, value: 0.1, for: 1.0}\n')
-    second = short_run(**{'faults.schedule': str(path)})
+    path.write_text('- {at: 2.0, fault: command_delay, value: 0.1, for: 0.5}\n')
+    second = short_run(duration=3.0, **{'faults.schedule': str(path)})
     for name, column in first.columns.items():
         np.testing.assert_array_equal(column, second[name])
     assert first.robot_reasons == second.robot_reasons
-    assert not np.array_equal(first.speeds, short_run().speeds)
+    assert not np.array_equal(first.speeds, short_run(duration=3.0).speeds)
 
 
 def test_robot_waits_for_gyro_calibration_then_tracks():
@@ -142,20 +116,17 @@ def test_what_cannot_be_run_is_refused():
 
 # --- what becomes of it -------------------------------------------------------------------------
 
+SLIP_STOP = f'{SLIP_STOP_REASON}; {Reason.PAUSED.value}'
 EXPECTED = {
     'command_delay 0.1 s': ('bounded', '', ''),
     'command_jitter 0.05 s': ('bounded', '', ''),
     'command_loss 1': ('stops', f'no command for 0.25 s; {Reason.PAUSED.value}', 'by itself'),
-    'gyro_bias_jump 0.35 rad/s': (
-        'stops',
-        f'{SLIP_STOP_REASON}; {Reason.PAUSED.value}',
-        'by itself',
-    ),
+    'gyro_bias_jump 0.35 rad/s': ('stops', SLIP_STOP, 'by itself'),
     'gyro_dead': ('bounded', '', ''),
     'ranges_dead': ('bounded', '', ''),
-    'wheel_blocked right': ('stops', f'{SLIP_STOP_REASON}; {Reason.PAUSED.value}', 'by itself'),
+    'wheel_blocked right': ('stops', SLIP_STOP, 'by itself'),
     'load_change 3 kg': ('bounded', '', ''),
-    'slippery 0': ('stops', f'{SLIP_STOP_REASON}; {Reason.PAUSED.value}', 'by itself'),
+    'slippery 0': ('stops', SLIP_STOP, 'by itself'),
     'supply_sag 5 V': ('stops', BROWN_OUT_REASON, 'by itself'),
     'brown_out': ('stops', BROWN_OUT_REASON, 'by itself'),
 }
@@ -167,13 +138,13 @@ SHORT = ('gyro_bias_jump 0.35 rad/s', 'command_delay 0.1 s')
 @pytest.mark.parametrize('name', few_of(dict.fromkeys((*SHORT, *EXPECTED)), 1))
 def test_the_loop_stays_bounded_or_stops_with_a_reason(name):
     """One strength of each fault, and the page says of it what comes out here."""
-    (result,) = study_faults([fault_run('chaotic', name)])
+    (result,) = fault_study.study_faults([fault_run('chaotic', name)])
     assert (result['verdict'], result['reason'], result['resumption']) == EXPECTED[name]
     assert_same(row_text(result), page_rows()['chaotic', name])
 
 
 def test_every_fault_is_among_those_expected():
-    assert [name.split()[0] for name in EXPECTED] == list(FAULTS) == list(STRENGTHS)
+    assert [name.split()[0] for name in EXPECTED] == list(FAULTS) == list(fault_study.STRENGTHS)
 
 
 @pytest.mark.parametrize(
@@ -188,20 +159,24 @@ def test_every_fault_is_among_those_expected():
     ),
 )
 def test_undetected_faults_are_named(course, name):
-    (result,) = study_faults([fault_run(course, name)])
+    (result,) = fault_study.study_faults([fault_run(course, name)])
     assert not result['detected']
     assert 'odometry is wrong' in result['undetected']
     line = row_text(result)
-    assert (UNREPORTED if 'collision' in name else UNDETECTED) in line
-    assert 'not detected' in console_text([result])
+    assert (fault_page.UNREPORTED if 'collision' in name else fault_page.UNDETECTED) in line
+    assert 'not detected' in fault_page.console_text([result])
     assert_same(line, page_rows()[course, name])
 
 
 def test_the_page_has_a_row_for_every_trial_and_no_other():
-    assert list(page_rows()) == [(one.course, one.name) for one in FAULT_RUNS]
+    assert list(page_rows()) == [(one.course, one.name) for one in fault_study.FAULT_RUNS]
     names = {name.split()[0] for _, name in page_rows()}
     assert names >= {*FAULTS}
-    assert page_section([]).partition('\n###')[0].split(END_MARK)[0].strip() in PAGE.read_text()
+    assert {line.count('|') for line in page_rows().values()} == {7}
+    assert (
+        fault_page.page_section([]).partition('\n###')[0].split(fault_page.END_MARK)[0].strip()
+        in PAGE.read_text()
+    )
 
 
 # --- the judge ----------------------------------------------------------------------------------
@@ -210,27 +185,32 @@ AT = fault_run('chaotic', 'gyro_dead')
 
 
 def judged(record, parameters=None):
-    undisturbed_run = undisturbed('chaotic', AT.duration)
-    return evaluate_outcome(record, undisturbed_run, 10.0, 15.0, parameters or noisy_twin())
+    undisturbed_run = fault_study.undisturbed('chaotic', AT.duration)
+    return fault_study.evaluate_outcome(
+        record, undisturbed_run, 10.0, 15.0, parameters or noisy_twin()
+    )
 
 
 def changed(column, rows, value):
     """Return the run without a fault with another value in some rows of a column."""
-    record = undisturbed('chaotic', AT.duration)
+    record = fault_study.undisturbed('chaotic', AT.duration)
     values = record[column].copy()
     values[rows] = value
     return replace(record, columns={**record.columns, column: values})
 
 
 def test_a_run_without_fault_is_bounded_and_notices_nothing():
-    result = judged(undisturbed('chaotic', AT.duration))
+    result = judged(fault_study.undisturbed('chaotic', AT.duration))
     found = [result[name] for name in ('verdict', 'recovery_time', 'detected', 'undetected')]
     assert found == ['bounded', 0.0, [], []]
+    result |= {'name': AT.name, 'course': 'arc'}
+    lines = fault_page.markdown_tables([result, {**result, 'course': 'chaotic'}]).splitlines()
+    assert {line.count('|') for line in lines if line.startswith('|')} == {7}
 
 
 def test_a_robot_moving_with_a_stop_reason_is_out_of_bounds():
     """A slip stop once lasted for no more than a period, and only the reason stayed."""
-    record = undisturbed('chaotic', AT.duration)
+    record = fault_study.undisturbed('chaotic', AT.duration)
     says = tuple(SLIP_STOP_REASON if 11.0 <= time < 15.0 else '' for time in record.time)
     result = judged(replace(record, robot_reasons=says))
     assert result['verdict'] == 'unbounded'
@@ -246,7 +226,7 @@ def test_speeds_beyond_the_limits_are_unbounded(field, value):
 
 
 def test_a_lasting_error_is_impaired_a_passing_one_recovers():
-    speeds = undisturbed('chaotic', AT.duration).speeds
+    speeds = fault_study.undisturbed('chaotic', AT.duration).speeds
     lasting, passing = slice(1500, None), slice(1500, 2000)
     result = judged(changed('speeds', lasting, speeds[lasting] + 1.0))
     assert result['verdict'] == 'impaired'
@@ -263,7 +243,8 @@ def two(monkeypatch):
     """Let the command make two short trials only."""
     event = FaultEvent(10.0, 'gyro_dead', True, 2.0)
     made = tuple(
-        FaultRun('gyro_dead', course, event, '', 17.0) for course in ('chaotic', 'straight')
+        fault_study.FaultRun('gyro_dead', course, event, '', 17.0)
+        for course in ('chaotic', 'straight')
     )
     monkeypatch.setattr(fault_study, 'FAULT_RUNS', made)
 
@@ -271,7 +252,7 @@ def two(monkeypatch):
 @pytest.mark.long
 def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     page, numbers = tmp_path / 'page.md', tmp_path / 'numbers.json'
-    page.write_text(f'before\n{BEGIN_MARK}\nold\n{END_MARK}\nafter\n')
+    page.write_text(f'before\n{fault_page.BEGIN_MARK}\nold\n{fault_page.END_MARK}\nafter\n')
     html = tmp_path / 'faults.html'
     files = ['--output', str(page), '--json', str(numbers), '--html', str(html)]
     assert main(['faults', '--workers', '1', *files]) == 0
@@ -279,8 +260,8 @@ def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     assert 'gyro_dead' in shown.out
     assert '2/2 [' in shown.err
     text = page.read_text()
-    assert text.startswith(f'before\n{BEGIN_MARK}\n')
-    assert text.endswith(f'{END_MARK}\nafter\n')
+    assert text.startswith(f'before\n{fault_page.BEGIN_MARK}\n')
+    assert text.endswith(f'{fault_page.END_MARK}\nafter\n')
     assert 'old' not in text
     assert text.count('| `gyro_dead` |') == 2
     shown = html.read_text(encoding='utf-8')
@@ -289,17 +270,18 @@ def test_command_writes_the_table_between_the_marks(two, tmp_path, capsys):
     assert [one['course'] for one in json.loads(numbers.read_text())] == ['chaotic', 'straight']
 
 
-@pytest.mark.parametrize('text', ['', BEGIN_MARK, f'{END_MARK}{BEGIN_MARK}', 2 * BEGIN_MARK])
+@pytest.mark.parametrize(
+    'text',
+    [
+        '',
+        fault_page.BEGIN_MARK,
+        f'{fault_page.END_MARK}{fault_page.BEGIN_MARK}',
+        2 * fault_page.BEGIN_MARK,
+    ],
+)
 def test_a_page_without_the_marks_is_left_alone(text, tmp_path):
     page = tmp_path / 'page.md'
     page.write_text(text)
     with pytest.raises(ValueError, match='must hold the lines'):
-        update_page(page, [])
+        fault_page.update_page(page, [])
     assert page.read_text() == text
-
-
-def test_every_row_of_the_table_has_as_many_cells_as_its_head():
-    result = {'name': AT.name, 'course': 'arc', **judged(undisturbed('chaotic', AT.duration))}
-    lines = markdown_tables([result, {**result, 'course': 'chaotic'}]).splitlines()
-    assert {line.count('|') for line in lines if line.startswith('|')} == {7}
-    assert {line.count('|') for line in page_rows().values()} == {7}

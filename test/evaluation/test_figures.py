@@ -44,11 +44,7 @@ from t3mpc_ros.evaluation.paper.study import STAGES, WITHOUT
 from t3mpc_ros.evaluation.patrol import path_tracking_page, patrol_page
 from t3mpc_ros.evaluation.patrol.path_tracking import OURS as TRACKER
 from t3mpc_ros.evaluation.patrol.path_tracking import TRACKED_PATHS, TrackingPlan, TrackingStudy
-from t3mpc_ros.evaluation.patrol.patrol_comparison import (
-    OURS,
-    PatrolPlan,
-    PatrolStudy,
-)
+from t3mpc_ros.evaluation.patrol.patrol_comparison import OURS, PatrolPlan, PatrolStudy
 from t3mpc_ros.evaluation.patrol.patrol_metrics import CoverageGrid, visits
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
 from t3mpc_ros.evaluation.process_replay import replay_comparison
@@ -272,20 +268,14 @@ VALUES = {1.0: [0.1, 0.2, 0.4], 2.0: [0.7, 0.8, 1.0, 1.5], 3.0: [0.3]}
 
 
 def test_a_sweep_shows_means_and_their_intervals():
+    metric = METRICS[0]
+    fields = {'case': 'nominal', 'error': ''}
     rows = [
-        {
-            'controller': name,
-            'gain': gain,
-            'case': 'nominal',
-            'error': '',
-            metric.name: factor * value,
-        }
+        {'controller': name, 'gain': gain, **fields, metric.name: factor * value}
         for factor, name in ((1.0, 'a'), (10.0, 'b'))
         for gain, values in VALUES.items()
         for value in values
-        for metric in METRICS[:1]
     ]
-    metric = METRICS[0]
     sweep = Sweep(rows, ('gain',))
     (axis,) = sweep.plot('gain', metric.name).axes
     for factor, container in zip((1.0, 10.0), axis.containers, strict=True):
@@ -323,8 +313,14 @@ def results_of():
     return Results(ResultTable(rows))
 
 
-def rmse_of(results, name, drive, noise, case):
-    return results.runs.values('rmse', controller=name, drive=drive, noise=noise, case=case)
+def rmse_of(results, name, drive, noise=0.04, case='nominal'):
+    found = results.runs.values('rmse', controller=name, drive=drive, noise=noise, case=case)
+    return np.array(found)
+
+
+def assert_bars(middles, half, runs):
+    assert middles == pytest.approx([np.mean(each) for each in runs])
+    assert half == pytest.approx([interval(each) for each in runs])
 
 
 def test_bars_of_the_methods_have_means_intervals_and_names():
@@ -334,27 +330,22 @@ def test_bars_of_the_methods_have_means_intervals_and_names():
         assert {*names} == {'PI', 'MPC', FULL}
         bar = next(each for each in axis.containers if hasattr(each, 'errorbar'))
         middles, half = halves(bar, 0)
-        for k, name in enumerate(names):
-            runs = rmse_of(results, name, drive, 0.04, 'nominal')
-            assert bar.patches[k].get_width() == pytest.approx(np.mean(runs))
-            assert middles[k] == pytest.approx(np.mean(runs))
-            assert half[k] == pytest.approx(interval(runs))
-            assert (to_hex(bar.patches[k].get_facecolor()) == paper_figures.OURS) == (name == FULL)
+        assert_bars(middles, half, [rmse_of(results, name, drive) for name in names])
+        for patch, name, middle in zip(bar.patches, names, middles, strict=True):
+            assert patch.get_width() == pytest.approx(middle)
+            assert (to_hex(patch.get_facecolor()) == paper_figures.OURS) == (name == FULL)
         assert drive in title(axis)
     assert axis.get_xlabel() == 'RMSE / rad/s'
 
 
 def test_growth_with_noise_has_intervals_and_begins_at_zero():
     results = results_of()
-    figure = paper_figures.noise_growth(results)
-    top, bottom = np.array(figure.axes).reshape(2, 2)
+    top, bottom = np.array(paper_figures.noise_growth(results).axes).reshape(2, 2)
     for axis, growth, drive in zip(top, bottom, results.drives, strict=True):
         for container, line in zip(axis.containers, growth.lines, strict=True):
             name = container.get_label().removesuffix(' (preview)')
-            runs = [rmse_of(results, name, drive, noise, 'nominal') for noise in (0.0, 0.04)]
             middles, half = halves(container, 1)
-            assert middles == pytest.approx([np.mean(each) for each in runs])
-            assert half == pytest.approx([interval(each) for each in runs])
+            assert_bars(middles, half, [rmse_of(results, name, drive, n) for n in (0.0, 0.04)])
             assert line.get_ydata() == pytest.approx(middles - middles[0])
     assert top[0].get_ylabel() == 'RMSE / rad/s'
     assert {axis.get_xlabel() for axis in bottom} == {'noise variance / (rad/s)²'}
@@ -366,11 +357,9 @@ def test_stages_are_bars_by_case():
         found = [each for each in axis.containers if hasattr(each, 'errorbar')]
         assert [each.get_label().removesuffix(' (+preview)') for each in found] == [*STAGES]
         for stage, bar in zip(STAGES, found, strict=True):
-            _, half = halves(bar, 1)
-            for k, case in enumerate(results.cases(drive)):
-                runs = rmse_of(results, stage, drive, 0.04, case)
-                assert bar.patches[k].get_height() == pytest.approx(np.mean(runs))
-                assert half[k] == pytest.approx(interval(runs))
+            heights = [patch.get_height() for patch in bar.patches]
+            runs = [rmse_of(results, stage, drive, case=case) for case in results.cases(drive)]
+            assert_bars(heights, halves(bar, 1)[1], runs)
         assert axis.get_ylabel() == 'RMSE / rad/s'
 
 
@@ -379,22 +368,18 @@ def test_parts_are_paired_differences_left_of_zero_if_better():
     figure = paper_figures.parts(results)
     axes = np.array(figure.axes).reshape(len(results.drives), -1)
     assert 'left of zero: better with it' in figure._supxlabel.get_text()
-    stages = list(STAGES)
     for row, drive in zip(axes, results.drives, strict=True):
         for axis in row:
             part = title(axis)
-            after = paper_figures.PARTS.index(part) + 1
-            for container, (less, more) in zip(
-                axis.containers,
-                ((stages[after - 1], stages[after]), (WITHOUT[part], FULL)),
-                strict=True,
-            ):
-                middles, half = halves(container, 0)
-                for k, case in enumerate(results.cases(drive)):
-                    with_it = np.array(rmse_of(results, more, drive, 0.04, case))
-                    apart = with_it - rmse_of(results, less, drive, 0.04, case)
-                    assert middles[k] == pytest.approx(np.mean(apart))
-                    assert half[k] == pytest.approx(interval(apart))
+            added = [*STAGES][paper_figures.PARTS.index(part) :][:2]
+            pairs = added, (WITHOUT[part], FULL)
+            for container, (less, more) in zip(axis.containers, pairs, strict=True):
+                apart = [
+                    rmse_of(results, more, drive, case=case)
+                    - rmse_of(results, less, drive, case=case)
+                    for case in results.cases(drive)
+                ]
+                assert_bars(*halves(container, 0), apart)
 
 
 # -- pages ----------------------------------------------------------------------------------------
@@ -420,16 +405,9 @@ def test_differences_of_methods_are_coloured_by_their_verdict(caught):
     noise = np.array([-0.01, 0.0, 0.02])
     methods = {name: methods_for('servo')[name] for name in ('feed-forward', *apart)}
     plan = ComparisonPlan(Scenario('servo', 'nominal', 1), ('nominal',), methods, (1, 2, 3))
-
+    fields = {'case': 'nominal', 'overall': 2.0, 'variation': 9.0}
     rows = [
-        {
-            'controller': name,
-            'case': 'nominal',
-            'seed': seed,
-            'settled': 1.0 + n,
-            'overall': 2.0,
-            'variation': 9.0,
-        }
+        {'controller': name, 'seed': seed, 'settled': 1.0 + n, **fields}
         for name, shift in {'feed-forward': None, **apart}.items()
         for seed, n in enumerate(0.0 * noise if shift is None else shift + noise)
     ]
@@ -464,11 +442,8 @@ def test_errors_of_faults_are_named_and_judged_by_the_worst(caught):
     page = fault_page.page([OUTCOME, other])
     (axis,) = caught[0].axes
     shown = lines(axis)
-    assert {name: [*x] for name, (x, _) in shown.items()} == {
-        'before': [0.1, 0.3],
-        'during': [0.7, 0.9],
-        'after': [0.2],
-    }
+    errors = {'before': [0.1, 0.3], 'during': [0.7, 0.9], 'after': [0.2]}
+    assert {name: [*x] for name, (x, _) in shown.items()} == errors
     names = [tick.get_text() for tick in axis.get_yticklabels()]
     assert dict(zip(axis.get_yticks(), names, strict=True))[shown['after'][1][0]] == 'gyro_dead'
     assert [to_hex(each.get_color()) for each in axis.lines] == [GREY, RED, COMMAND]
@@ -495,12 +470,8 @@ PATROLS = PatrolStudy(
     PatrolPlan((OURS, 'random walk'), (1, 2), duration=600.0),
     ResultTable(
         [
-            {
-                'controller': name,
-                'seed': seed,
-                'curve': np.linspace(0.0, first, 11),
-                **{f'skill_{h:g}': first if h < 5.0 else later for h in HORIZONS},
-            }
+            {'controller': name, 'seed': seed, 'curve': np.linspace(0.0, first, 11)}
+            | {f'skill_{h:g}': first if h < 5.0 else later for h in HORIZONS}
             for (name, seed), (first, later) in SKILLS.items()
         ]
     ),
@@ -652,16 +623,13 @@ def test_tracked_paths_have_the_drives_of_their_methods():
     assert not any(axis.get_visible() for axis in empty)
 
 
-def test_divergences_are_marked_at_their_time_and_field(caught, tmp_path):
-    """Beside the name of the field; pale where all agree, dark beyond the tolerance.
-
-    Above, the first one: both runs, and their difference with its tolerance.
-    """
+def test_the_first_divergence_and_all_of_them_are_shown(caught, tmp_path):
+    """Both runs and the tolerance; below, pale where all agree, dark beyond the tolerance."""
     time = 5.0 + 0.1 * np.arange(100)
-    was = {name: np.zeros(100) for name in ('command', 'speed', 'estimate')}
+    was = {name: np.full(100, 2.0) for name in ('command', 'speed', 'estimate')}
     was['estimate'][:50] = np.nan  # not recorded before 10 s
     now = {name: values.copy() for name, values in was.items()}
-    now['speed'][20:25] += 1.0
+    now['speed'][20:25] += 0.5
     now['estimate'][80:] += 1.0
     rows = tuple(
         FieldComparison(name, 100, 1.0, 1.0, beyond, when, first)
@@ -669,21 +637,19 @@ def test_divergences_are_marked_at_their_time_and_field(caught, tmp_path):
             ('command', 0, math.nan, -1), ('speed', 5, 7.0, 20), ('estimate', 20, 13.0, 80)
         )
     )  # fmt: skip
-    outcome = Comparison(
-        rows, Tolerances(0.01, 0.1), time, was, now, np.ones(100, dtype=bool), (), ()
-    )
+    tolerances, compared = Tolerances(0.01, 0.1), np.ones(100, dtype=bool)
+    outcome = Comparison(rows, tolerances, time, was, now, compared, (), ())
     replay_comparison.write_divergence_figure(outcome, tmp_path / 'x.png')
     close, apart, axis = caught[0].axes
-    shown = {name: y for name, (_, y) in (lines(close) | lines(apart)).items()}
-    near = (time >= 7.0 - 0.5) & (time <= 7.0 + 1.5)
     assert title(close) == 'speed'
+    shown = {name: y for name, (_, y) in (lines(close) | lines(apart)).items()}
+    near = (time >= 6.5) & (time <= 8.5)
     assert shown['recorded'] == pytest.approx(was['speed'][near])
     assert shown['recomputed'] == pytest.approx(now['speed'][near])
-    assert shown['tolerance'] == pytest.approx(0.01)
-    assert shown['difference'].max() == pytest.approx(1.0)
-    places = dict(
-        zip([each.get_text() for each in axis.get_yticklabels()], axis.get_yticks(), strict=True)
-    )
+    assert shown['tolerance'] == pytest.approx(0.01 + 0.1 * 2.0)
+    assert max(shown['difference']) == pytest.approx(0.5)
+    names = [each.get_text() for each in axis.get_yticklabels()]
+    places = dict(zip(names, axis.get_yticks(), strict=True))
     assert places.keys() == was.keys()
     for name, same, dark in (
         ('command', (5.5, 7.1, 13.5), ()),

@@ -117,10 +117,7 @@ def test_the_table_has_medians_and_counts():
 def test_three_times_the_noise_does_not_lose_the_place(seed):
     """New particles near the pose had any yaw: it was turned by 10 degrees, and up to 2 m off."""
     case = replace(
-        CASES['noise x 3, 20 % of the readings lost'],
-        seed=seed,
-        duration=36.0,
-        known_world='room',
+        CASES['noise x 3, 20 % of the readings lost'], seed=seed, duration=36.0, known_world='room'
     )
     found = measured_localization((case, 'noise'))
     assert found['largest'] < 0.25

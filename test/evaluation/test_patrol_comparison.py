@@ -13,40 +13,27 @@
 # limitations under the License.
 """``t3mpc patrol``: runs, claims, tables, page."""
 
-import contextlib
 from dataclasses import fields, replace
 import json
 import math
 
 import numpy as np
 import pytest
-from support.long_tests import few_of
 from support.unrendered import unrendered  # noqa: F401 - a fixture
 
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.patrol import patrol_comparison, patrol_page
-from t3mpc_ros.evaluation.patrol.patrol_comparison import (
-    CLEARANCE,
-    OURS,
-    PATHS,
-    PatrolPlan,
-    PatrolStudy,
-    compare_patrols,
-    free_cells,
-    measured_patrol,
-    patrol_track,
-)
 from t3mpc_ros.evaluation.patrol.patrol_metrics import CoverageGrid
 from t3mpc_ros.geometry.path_timing import MotionLimits
 from t3mpc_ros.simulation.world import clearance, load_world
 
 
-@pytest.mark.parametrize('name', PATHS)
+@pytest.mark.parametrize('name', patrol_comparison.PATHS)
 @pytest.mark.slow
 def test_every_path_is_driven_within_arena_and_limits(name):
-    plan = PatrolPlan(duration=40.0)
-    track = patrol_track(plan, name, 101)
+    plan = patrol_comparison.PatrolPlan(duration=40.0)
+    track = patrol_comparison.patrol_track(plan, name, 101)
     left, bottom, right, top = plan.arena
     assert (track.position >= np.array([left, bottom]) - 1e-6).all()
     assert (track.position <= np.array([right, top]) + 1e-6).all()
@@ -58,16 +45,18 @@ def test_every_path_is_driven_within_arena_and_limits(name):
 
 def test_cells_near_walls_and_boxes_do_not_count():
     world = load_world('room')
-    grid = free_cells(PatrolPlan(arena=(-2.0, -1.5, 2.0, 1.5)), world)
+    grid = patrol_comparison.free_cells(
+        patrol_comparison.PatrolPlan(arena=(-2.0, -1.5, 2.0, 1.5)), world
+    )
     centres = grid.centres()[grid.free]
     assert 0 < centres.shape[0] < 400
-    assert all(world.is_free(x, y, CLEARANCE) for x, y in centres)
-    assert free_cells(PatrolPlan(), None).free.all()
+    assert all(world.is_free(x, y, patrol_comparison.CLEARANCE) for x, y in centres)
+    assert patrol_comparison.free_cells(patrol_comparison.PatrolPlan(), None).free.all()
 
 
 def judged(duration=1300.0, **rows):
     """Return the claims on patrols of three seeds with the given columns of each path."""
-    names = {'own': OURS, 'walk': 'random walk', 'lanes': 'boustrophedon'}
+    names = {'own': patrol_comparison.OURS, 'walk': 'random walk', 'lanes': 'boustrophedon'}
     table = ResultTable(
         [
             {'controller': names[short], 'seed': seed, **dict(zip(columns, values, strict=True))}
@@ -75,7 +64,11 @@ def judged(duration=1300.0, **rows):
             for seed, values in enumerate(zip(*seeds, strict=True), 1)
         ]
     )
-    return patrol_page.claims(PatrolStudy(PatrolPlan(seeds=(1, 2, 3), duration=duration), table))
+    return patrol_page.claims(
+        patrol_comparison.PatrolStudy(
+            patrol_comparison.PatrolPlan(seeds=(1, 2, 3), duration=duration), table
+        )
+    )
 
 
 @pytest.mark.parametrize(
@@ -127,64 +120,29 @@ def test_the_command_writes_page_pictures_and_numbers(tmp_path, capsys):
     run = numbers['paths']['boustrophedon']['runs'][0]
     assert run['skill_5'] > 0.9
     assert run['time_to_90'] is None  # not within two minutes
-    assert {path.stem for path in (tmp_path / 'figures').iterdir()} == {
-        'coverage',
-        'heat_maps',
-        'paths',
-        'predictability',
-    }
-
-
-@pytest.mark.parametrize('robot', few_of(['exact', 'twin'], 1))
-def test_an_interrupted_study_goes_on_with_equal_results(tmp_path, monkeypatch, robot):
-    """Only the patrols that are missing are run; those in the file are equal to the last bit."""
-    plan = PatrolPlan(('boustrophedon', 'random walk'), (102, 101), 5.0, robot)
-    whole = compare_patrols(plan).table
-    done = []
-
-    def until(last):
-        def measured(job):
-            if len(done) == last:
-                raise KeyboardInterrupt
-            done.append(job)
-            return measured_patrol(job)
-
-        return measured
-
-    file, said = tmp_path / 'runs.jsonl', []
-    for last in (3, 4):
-        monkeypatch.setattr(patrol_comparison, 'measured_patrol', until(last))
-        with contextlib.suppress(KeyboardInterrupt):
-            resumed = compare_patrols(plan, file, report=said.append).table
-    assert len(done) == 4
-    assert '3 are there already, 1 to do' in said[-1]
-    np.testing.assert_equal(resumed.rows, whole.rows)
-    assert [(row['seed'], 'track' in row) for row in whole] == [
-        (102, True), (102, True), (101, False), (101, False)
-    ]  # fmt: skip
-    # A longer patrol is another one.
-    monkeypatch.setattr(patrol_comparison, 'measured_patrol', measured_patrol)
-    compare_patrols(replace(plan, duration=6.0), file, report=said.append)
-    assert '0 are there already, 4 to do' in said[-1]
+    drawn = {path.stem for path in (tmp_path / 'figures').iterdir()}
+    assert drawn == {'coverage', 'heat_maps', 'paths', 'predictability'}
 
 
 def test_the_key_of_a_patrol_changes_with_its_plan(monkeypatch):
     found = []
-    monkeypatch.setattr(
-        patrol_comparison,
-        'run_experiment',
-        lambda runs, *_, **__: found.extend(run.key for run in runs),
-    )
-    base = PatrolPlan(('boustrophedon',), (1,))
+
+    def keep(runs, *_, **__):
+        found.extend(run.key for run in runs)
+
+    monkeypatch.setattr(patrol_comparison, 'run_experiment', keep)
+    base = patrol_comparison.PatrolPlan(('boustrophedon',), (1,))
     changes = {
         'paths': ('random walk',), 'seeds': (2,), 'duration': 60.0,
         'arena': (-1.0, -1.0, 1.0, 1.0), 'robot': 'twin',
     }  # fmt: skip
-    assert {*changes, 'planned'} == {each.name for each in fields(PatrolPlan)}
+    assert {*changes, 'planned'} == {each.name for each in fields(patrol_comparison.PatrolPlan)}
     for plan in (base, *(replace(base, **{name: value}) for name, value in changes.items())):
-        compare_patrols(plan)
-    compare_patrols(replace(base, robot='twin', planned=True))
-    compare_patrols(PatrolPlan(('boustrophedon',), (3, 1)))  # only the first has a track
+        patrol_comparison.compare_patrols(plan)
+    patrol_comparison.compare_patrols(replace(base, robot='twin', planned=True))
+    patrol_comparison.compare_patrols(
+        patrol_comparison.PatrolPlan(('boustrophedon',), (3, 1))
+    )  # only the first has a track
     assert len(found) == len({*found}) == 9
 
 
@@ -192,17 +150,17 @@ def test_a_wrong_plan_is_refused(capsys, tmp_path):
     assert main(['patrol', '--paths', 'Lorentz', '--output', str(tmp_path)]) == 1
     assert 'did you mean Lorenz?' in capsys.readouterr().err
     with pytest.raises(ValueError, match=r'arena must contain the start'):
-        PatrolPlan(arena=(0.5, -1.0, 2.0, 1.0))
+        patrol_comparison.PatrolPlan(arena=(0.5, -1.0, 2.0, 1.0))
     with pytest.raises(ValueError, match='planned needs the robot twin'):
-        PatrolPlan(planned=True)
+        patrol_comparison.PatrolPlan(planned=True)
     with pytest.raises(ValueError, match='blocked must leave at least one cell free'):
         CoverageGrid((0.0, 0.0), (1.0, 1.0), 1, 1, np.ones((1, 1), dtype=bool))
 
 
 @pytest.mark.slow
 def test_the_twin_drives_among_unknown_boxes_and_sees_them():
-    plan = PatrolPlan(duration=20.0, robot='twin')
-    track = patrol_track(plan, 'random waypoints', 101)
+    plan = patrol_comparison.PatrolPlan(duration=8.0, robot='twin')
+    track = patrol_comparison.patrol_track(plan, 'random waypoints', 101)
     assert track.contacts == 0
     assert track.grid.free.sum() < 400
     # Rays end at walls or boxes, within the errors of the sensors.

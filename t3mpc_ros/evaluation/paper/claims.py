@@ -511,22 +511,20 @@ OF_ESTIMATION: Sequence[tuple[Claim, Query]] = (
 # -- tables ---------------------------------------------------------------------------------------
 
 
-def claims_table(claims: Sequence[Claim], origin: str) -> Table:
-    """Return the claims of one origin, ``'ours'`` or ``'paper'``, with what was found."""
-    title = 'Claims of this package' if origin == 'ours' else 'Claims of the paper'
-    rows = [(claim.text, claim.found, claim.verdict) for claim in claims if claim.origin == origin]
-    return Table(title, ('claim', 'found', 'verdict'), rows)
-
-
 def markdown(tables: Mapping[str, Sequence[Table]], claims: Sequence[Claim]) -> str:
     """Return claims and tables as one Markdown text."""
+    rows: dict[str, list[tuple[str, str, str]]] = {'ours': [], 'paper': []}
+    for claim in claims:
+        rows[claim.origin].append((claim.text, claim.found, claim.verdict))
+    titles = {'ours': 'Claims of this package', 'paper': 'Claims of the paper'}
+    head = ('claim', 'found', 'verdict')
     parts = [
         'Means over held-out seeds ± half the 95 % interval (Student\'s t). RMSE: true wheel '
         'speeds less reference, both wheels, without the first 3 s. Noise: variance of the '
         'measured wheel speeds, (rad/s)². An asterisk: the interval of a paired difference '
         'excludes zero.',
         '## Claims',
-        *(claims_table(claims, origin).markdown() for origin in ('ours', 'paper')),
+        *(Table(title, head, rows[origin]).markdown() for origin, title in titles.items()),
     ]  # fmt: skip
     for heading, group in tables.items():
         if group:

@@ -45,14 +45,7 @@ from t3mpc_ros.evaluation.open_loop_estimation import (
 )
 from t3mpc_ros.evaluation.paper.claims import REFERENCE_SPREAD, Claim
 from t3mpc_ros.evaluation.paper.paper_tables import Results, label, rank
-from t3mpc_ros.evaluation.paper.study import (
-    PAPER_NOISE,
-    PARTS,
-    SETTLING,
-    STAGES,
-    WITHOUT,
-    Extent,
-)
+from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, PARTS, SETTLING, STAGES, WITHOUT, Extent
 from t3mpc_ros.evaluation.record import START, Record, switch_times
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.scenario import PLANT_OF, Scenario
@@ -356,10 +349,7 @@ def estimates(showcase: FigureRuns) -> Any:
     run = showcase.torque
     target = {'color': plotting.COLOURS['target'], 'lw': 0.9, 'label': 'unknown, $\\dot\\chi - u$'}
     found = {'color': plotting.COLOURS['estimate'], 'lw': 1.3, 'label': 'estimate g'}
-    columns = (
-        (true_unknown(run), target),
-        (estimated_unknown(run)[:-1], found),
-    )
+    columns = ((true_unknown(run), target), (estimated_unknown(run)[:-1], found))
     figure, axes = run_and_zoom(run, 'rad/s²', 2.0, 4.0, columns)
     for axis, wheel, share in zip(axes[:, 0], WHEELS, explained(run), strict=True):
         axis.set_title(f'{wheel} wheel, {100 * share:.0f} % of the variance explained')
@@ -578,7 +568,7 @@ def parts(results: Results) -> Any:
                     axis.errorbar(
                         [sign * pair['difference'] for pair in pairs],
                         [cases.index(pair['case']) + beside for pair in pairs],
-                        xerr=[_whisker(pair['ci95']) for pair in pairs],
+                        xerr=[plotting.whisker(pair['ci95']) for pair in pairs],
                         fmt='o', markersize=4, elinewidth=1.4, label=words, color=colour,
                         markerfacecolor=face,
                     )  # fmt: skip
@@ -640,8 +630,4 @@ def _name_wheels(axes: Any) -> None:
 
 def _bars(rows: Sequence[Row]) -> tuple[list[float], list[float]]:
     """Return the RMSE of rows and the lengths of their whiskers."""
-    return [row['rmse_mean'] for row in rows], [_whisker(row['rmse_ci95']) for row in rows]
-
-
-def _whisker(ci95: float) -> float:
-    return ci95 if math.isfinite(ci95) else 0.0
+    return [row['rmse_mean'] for row in rows], [plotting.whisker(row['rmse_ci95']) for row in rows]

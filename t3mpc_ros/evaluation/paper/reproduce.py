@@ -23,17 +23,9 @@ from typing import Any
 from t3mpc_ros.evaluation import open_loop_estimation, reporting
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, measured_run, run_experiment
 from t3mpc_ros.evaluation.methods import EXACT_MODEL, methods
-from t3mpc_ros.evaluation.paper import paper_figures
+from t3mpc_ros.evaluation.paper import paper_figures, study
 from t3mpc_ros.evaluation.paper.claims import VERDICTS, Claim, all_claims, markdown
 from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables, csv_columns
-from t3mpc_ros.evaluation.paper.study import (
-    DRIVES,
-    WITHOUT,
-    Extent,
-    chosen_extent,
-    measure,
-    study_runs,
-)
 from t3mpc_ros.evaluation.plotting import write_pictures
 from t3mpc_ros.evaluation.run_digest import source_digest
 from t3mpc_ros.parameters.provenance import machine, provenance
@@ -64,7 +56,7 @@ def reproduce(
     ``estimation_seeds`` the same of the comparison (86).
     """
     write = report or (lambda text: None)
-    extent = chosen_extent(quick=quick, seeds=seeds)
+    extent = study.chosen_extent(quick=quick, seeds=seeds)
     results = Results(run_study(extent, output, workers, fresh=fresh, report=report))
     write('  runs for the figures')
     showcase = paper_figures.simulate_figure_runs(extent, results, workers)
@@ -92,7 +84,7 @@ def reproduce(
             'estimation_noises': list(variances),
             'methods': {
                 drive: {name: asdict(each.parameters) for name, each in methods(drive).items()}
-                for drive in DRIVES
+                for drive in study.DRIVES
             },
             'sources': source_digest(),
         },
@@ -121,7 +113,7 @@ def reproduce(
 
 
 def run_study(
-    extent: Extent,
+    extent: study.Extent,
     output: Path,
     workers: int | Executor = 1,
     *,
@@ -130,8 +122,8 @@ def run_study(
 ) -> ResultTable:
     """Return the runs of the study; those that the folder of the output holds are not repeated."""
     return run_experiment(
-        study_runs(extent),
-        partial(measured_run, numbers=measure),
+        study.study_runs(extent),
+        partial(measured_run, numbers=study.measure),
         workers,
         store=output / RUNS,
         fresh=fresh,
@@ -139,7 +131,7 @@ def run_study(
     )
 
 
-def _origin(extent: Extent, *, quick: bool) -> str:
+def _origin(extent: study.Extent, *, quick: bool) -> str:
     words = [
         f'version {VERSION}, sources {source_digest()}',
         f'{len(extent.seeds)} held-out seeds, runs of {extent.duration:g} s at 100 Hz',
@@ -319,7 +311,7 @@ EXHIBITS = (
         'Paired differences on the same seeds with their 95 % intervals at noise 0.04: a part '
         'helps where the whole interval lies left of zero. An asterisk in the tables: it excludes '
         'zero.',
-        tuple(f'{part} is missed' for part in WITHOUT),
+        tuple(f'{part} is missed' for part in study.WITHOUT),
         'parts',
         lambda m: paper_figures.parts(m.results),
         'What each part is worth',

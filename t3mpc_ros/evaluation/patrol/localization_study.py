@@ -29,13 +29,7 @@ import numpy as np
 from t3mpc_ros.chaos.chaotic_path import PortraitParameters
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
-from t3mpc_ros.evaluation.patrol.patrol_run import (
-    PatrolScenario,
-    contact_count,
-    path_error,
-    portrait_points,
-    run_patrol,
-)
+from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.record import ON_PATH, RATE, Record, spans_of
 from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.result_file import Row
@@ -57,10 +51,10 @@ TRIPLED = MappingProxyType(
     }
 )
 """Parameters of a twin with three times the noise of wheels, gyro and ranges."""
-_LOCALIZED = PatrolScenario(localization='filter')
+_LOCALIZED = patrol_run.PatrolScenario(localization='filter')
 _TRIPLED = replace(_LOCALIZED, range_loss=0.2, robot=dict(TRIPLED))
-CASES: Mapping[str, PatrolScenario] = {
-    'odometry alone': PatrolScenario(localization='odometry'),
+CASES: Mapping[str, patrol_run.PatrolScenario] = {
+    'odometry alone': patrol_run.PatrolScenario(localization='odometry'),
     'particle filter': _LOCALIZED,
     'noise x 3, 20 % of the readings lost': _TRIPLED,
     'carried by 1 m and 90 degrees': replace(_LOCALIZED, carried_at=CARRIED_AT),
@@ -104,11 +98,11 @@ def compare_localizations(
     return run_experiment(runs, measured_localization, workers, store=store, report=report)
 
 
-def measured_localization(job: tuple[PatrolScenario, str]) -> Row:
+def measured_localization(job: tuple[patrol_run.PatrolScenario, str]) -> Row:
     """Return the row of one patrol, see :func:`localization_errors`."""
     case, _ = job
-    points = portrait_points(case.seed, PortraitParameters())
-    return localization_errors(run_patrol(points, case), case.carried_at)
+    points = patrol_run.portrait_points(case.seed, PortraitParameters())
+    return localization_errors(patrol_run.run_patrol(points, case), case.carried_at)
 
 
 def localization_errors(record: Record, carried_at: float = math.inf) -> Row:
@@ -136,8 +130,8 @@ def localization_errors(record: Record, carried_at: float = math.inf) -> Row:
         'lost': lost_time(position),
         'found': found if math.isfinite(carried_at) else math.nan,
         'deceived': float((off & record['localized'].astype(np.bool_)).sum()) / RATE,
-        'on_path': float((path_error(record) < ON_PATH).mean()),
-        'contacts': contact_count(record),
+        'on_path': float((patrol_run.path_error(record) < ON_PATH).mean()),
+        'contacts': patrol_run.contact_count(record),
     }
 
 

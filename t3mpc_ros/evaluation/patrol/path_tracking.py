@@ -32,30 +32,18 @@ import numpy as np
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.confidence_intervals import mean, rms
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
+from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.patrol.path_trackers import (
     PurePursuitParameters,
     Pursuit,
     RegulatedParameters,
-)
-from t3mpc_ros.evaluation.patrol.patrol_run import (
-    GRIP,
-    LIMITS,
-    PatrolScenario,
-    path_error,
-    run_patrol,
-    world_file,
 )
 from t3mpc_ros.evaluation.record import RATE, Record
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.run_digest import digest
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_file import load_path
-from t3mpc_ros.geometry.path_timing import (
-    distance_to_path,
-    polyline_length,
-    resample,
-    time_path,
-)
+from t3mpc_ros.geometry.path_timing import distance_to_path, polyline_length, resample, time_path
 from t3mpc_ros.geometry.types import ORIGIN, Array
 from t3mpc_ros.parameters.table import find_names
 
@@ -239,11 +227,13 @@ def drive(job: tuple[TrackingJob, TrackingMethod]) -> Record:
         'right_wheel_radius_multiplier': 1.0 + float(radius),
         'wheel_separation_multiplier': 1.0 + float(separation),
     }
-    least = float(time_path(points, LIMITS, WheelGeometry(), 1.0 / RATE, ORIGIN).time[-1])
+    least = float(
+        time_path(points, patrol_run.LIMITS, WheelGeometry(), 1.0 / RATE, ORIGIN).time[-1]
+    )
     spare = SLOW_SPARE_TIME if isinstance(method.pursuit, RegulatedParameters) else SPARE_TIME
     tracker = None if method.pursuit is None else Pursuit(points, method.pursuit)
-    with world_file(slippery_floor(points, generator)) as world:
-        scenario = PatrolScenario(
+    with patrol_run.world_file(slippery_floor(points, generator)) as world:
+        scenario = patrol_run.PatrolScenario(
             seed=seed,
             duration=math.ceil(spare * least) + 2.0,
             world=world,
@@ -251,7 +241,7 @@ def drive(job: tuple[TrackingJob, TrackingMethod]) -> Record:
             robot=robot,
             controller=method.controller,
         )
-        return run_patrol(iter([points]), scenario, tracker=tracker)
+        return patrol_run.run_patrol(iter([points]), scenario, tracker=tracker)
 
 
 def slippery_floor(points: Array, generator: np.random.Generator) -> str:
@@ -260,7 +250,9 @@ def slippery_floor(points: Array, generator: np.random.Generator) -> str:
     places = along[generator.integers(0, len(along), PATCHES)]
     lines = ['name: slippery_floor', 'patches:']
     for x, y in places.tolist():
-        lines.append(f'  - {{center: [{x:.4f}, {y:.4f}], radius: {PATCH_RADIUS}, grip: {GRIP}}}')
+        lines.append(
+            f'  - {{center: [{x:.4f}, {y:.4f}], radius: {PATCH_RADIUS}, grip: {patrol_run.GRIP}}}'
+        )
     return '\n'.join(lines) + '\n'
 
 
@@ -289,7 +281,7 @@ def errors_of(record: Record, points: Array, *, timed: bool) -> Row:
     return {
         'cross_track': rms(distance),
         'largest': float(max(distance.max(), distance_to_path(path, driven).max())),
-        'timed': rms(path_error(record)[: len(track)]) if timed else math.nan,
+        'timed': rms(patrol_run.path_error(record)[: len(track)]) if timed else math.nan,
         'time': float(record.time[arrival]) if arrival < record.time.size else math.nan,
         'speed': speed.tolist(),
         'acceleration': acceleration.tolist(),

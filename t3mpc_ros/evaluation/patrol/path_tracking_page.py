@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from t3mpc_ros.evaluation import reporting
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.evaluation.patrol.path_tracking import (
     ARRIVED,
@@ -30,19 +31,6 @@ from t3mpc_ros.evaluation.patrol.path_tracking import (
 )
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
 from t3mpc_ros.evaluation.plotting import TitledDrawing, new_figure
-from t3mpc_ros.evaluation.reporting import (
-    EMPTY_CELL,
-    Block,
-    Contents,
-    Heading,
-    Mark,
-    Paragraph,
-    Picture,
-    Table,
-    format_mean,
-    html_page,
-    verdict_mark,
-)
 from t3mpc_ros.version import VERSION
 
 VERDICTS = {1: 'ours is better', -1: 'ours is worse', 0: 'inconclusive'}
@@ -50,7 +38,7 @@ VERDICTS = {1: 'ours is better', -1: 'ours is worse', 0: 'inconclusive'}
 _DRAWN = {OURS: '#be123c', 'pure pursuit': '#0284c7', 'regulated pure pursuit': '#65a30d'}
 
 
-def path_table(study: TrackingStudy, path: str) -> Table:
+def path_table(study: TrackingStudy, path: str) -> reporting.Table:
     """Return errors, time and verdict of each method on a path."""
     head = ['method', 'error rms, mm', 'largest, mm', 'from the timed reference rms, mm']
     head += ['time, s', 'commands within the limits']
@@ -60,23 +48,23 @@ def path_table(study: TrackingStudy, path: str) -> Table:
     lines = []
     for name in study.plan.methods:
         rows = study.table.where(path=path, controller=name)
-        line: list[str | Mark] = [name]
+        line: list[str | reporting.Mark] = [name]
         for column in ('cross_track', 'largest', 'timed'):
-            line.append(format_mean([1e3 * row[column] for row in rows], 2))
+            line.append(reporting.format_mean([1e3 * row[column] for row in rows], 2))
         line.append(_time([row['time'] for row in rows]))
         line.append('yes' if all(row['within_limits'] for row in rows) else 'no')
         own = {'path': path, 'controller': OURS}
         above = study.table.difference('cross_track', {**own, 'controller': name}, own)
         if name == OURS:
-            line += [EMPTY_CELL, EMPTY_CELL]
+            line += [reporting.EMPTY_CELL, reporting.EMPTY_CELL]
         elif above is not None:
             difference = format_interval(1e3 * above.mean, 1e3 * above.half, '+', 2)
-            line += [difference, verdict_mark(VERDICTS[above.sign])]
+            line += [difference, reporting.verdict_mark(VERDICTS[above.sign])]
         lines.append(line)
-    return Table(path.capitalize(), head, lines, (OURS,), wrap=True)
+    return reporting.Table(path.capitalize(), head, lines, (OURS,), wrap=True)
 
 
-def summary_table(study: TrackingStudy) -> Table:
+def summary_table(study: TrackingStudy) -> reporting.Table:
     """Return the rms error and the verdict of each method on each path."""
     lines = []
     for name in study.plan.methods:
@@ -88,9 +76,9 @@ def summary_table(study: TrackingStudy) -> Table:
             own = {'path': path, 'controller': OURS}
             above = study.table.difference('cross_track', {**own, 'controller': name}, own)
             judged = f'; {VERDICTS[above.sign]}' if name != OURS and above is not None else ''
-            line.append(format_mean(errors, 2) + judged)
+            line.append(reporting.format_mean(errors, 2) + judged)
         lines.append(line)
-    return Table('Error rms, mm; verdict', ('method', *study.plan.paths), lines, (OURS,))
+    return reporting.Table('Error rms, mm; verdict', ('method', *study.plan.paths), lines, (OURS,))
 
 
 def _time(times: Sequence[float]) -> str:
@@ -133,19 +121,22 @@ def markdown(study: TrackingStudy) -> str:
 
 def page(study: TrackingStudy, drawn: Mapping[str, bytes]) -> str:
     """Return the page as self-contained HTML, with the pictures by their stems."""
-    blocks: list[Block] = [Contents(), Paragraph(description(study.plan))]
+    blocks: list[reporting.Block] = [
+        reporting.Contents(),
+        reporting.Paragraph(description(study.plan)),
+    ]
     if 'tracks' in drawn:
-        blocks.append(Picture(PICTURES[0].title, drawn['tracks'], PICTURES[0].title))
+        blocks.append(reporting.Picture(PICTURES[0].title, drawn['tracks'], PICTURES[0].title))
     for path in study.plan.paths:
-        blocks += [Heading(path.capitalize()), path_table(study, path)]
-    blocks.append(Paragraph(EXPLANATION, 'quiet'))
-    return html_page('Path tracking compared', blocks)
+        blocks += [reporting.Heading(path.capitalize()), path_table(study, path)]
+    blocks.append(reporting.Paragraph(EXPLANATION, 'quiet'))
+    return reporting.html_page('Path tracking compared', blocks)
 
 
 def tuning_markdown(found: Mapping[str, Sequence[tuple[str, float]]]) -> str:
     """Return the choices of :func:`.path_tracking.tune_trackers` as tables in Markdown."""
     tables = [
-        Table(
+        reporting.Table(
             f'{name}, seeds {TUNING_SEEDS[0]} to {TUNING_SEEDS[-1]}',
             ('choice', 'error rms, mm'),
             [(choice, f'{1e3 * error:.2f}') for choice, error in each],

@@ -32,23 +32,13 @@ from numpy.typing import NDArray
 from t3mpc_ros.chaos.chaotic_path import PortraitParameters
 from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
+from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.patrol.baseline_paths import BASELINE_PATHS, Rectangle
 from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     CoverageGrid,
     coverage_at,
     patrol_metrics,
     visits,
-)
-from t3mpc_ros.evaluation.patrol.patrol_run import (
-    LIMITS,
-    PatrolScenario,
-    contact_count,
-    outside_avoidance,
-    portrait_points,
-    room_with_boxes,
-    run_patrol,
-    share_on_path,
-    world_file,
 )
 from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.result_file import Row
@@ -211,8 +201,8 @@ def patrol_track(plan: PatrolPlan, name: str, seed: int) -> PatrolTrack:
         return _exact_track(plan, points)
     text = plan_world(plan, seed)
     walls = text.partition('boxes:')[0]
-    with world_file(walls) as known, world_file(text) as path:
-        scenario = PatrolScenario(
+    with patrol_run.world_file(walls) as known, patrol_run.world_file(text) as path:
+        scenario = patrol_run.PatrolScenario(
             seed,
             plan.duration,
             known,
@@ -220,7 +210,7 @@ def patrol_track(plan: PatrolPlan, name: str, seed: int) -> PatrolTrack:
             plan=PlanParameters(enabled=plan.planned),
             arena=plan.arena,
         )
-        record = run_patrol(points, scenario)
+        record = patrol_run.run_patrol(points, scenario)
     return _twin_track(plan, record, parse_world(text, 'room'))
 
 
@@ -228,8 +218,8 @@ def path_points(plan: PatrolPlan, name: str, seed: int) -> Iterator[Array]:
     """Return the pieces of a path, m, each of shape (k, 2); they never end before the patrol."""
     if name == OURS:
         parameters = PortraitParameters.from_dict({'arena': list(plan.arena)})
-        return portrait_points(seed, parameters)
-    length = LIMITS.linear * plan.duration + 10.0
+        return patrol_run.portrait_points(seed, parameters)
+    length = patrol_run.LIMITS.linear * plan.duration + 10.0
     return iter([BASELINE_PATHS[name](plan.area, length, np.random.default_rng((seed, 21)))])
 
 
@@ -237,7 +227,7 @@ def plan_world(plan: PatrolPlan, seed: int) -> str:
     """Return the room of a seed as YAML: walls 0.25 m around the arena, boxes, slippery floor."""
     left, bottom, right, top = plan.arena
     size = (2.0 * max(-left, right) + 0.5, 2.0 * max(-bottom, top) + 0.5)
-    return room_with_boxes(seed, size, BOXES)
+    return patrol_run.room_with_boxes(seed, size, BOXES)
 
 
 def free_cells(plan: PatrolPlan, world: World | None) -> CoverageGrid:
@@ -253,7 +243,7 @@ def free_cells(plan: PatrolPlan, world: World | None) -> CoverageGrid:
 
 
 def _exact_track(plan: PatrolPlan, points: Iterator[Array]) -> PatrolTrack:
-    timing = PathTiming(LIMITS, WheelGeometry(), SAMPLE, ORIGIN)
+    timing = PathTiming(patrol_run.LIMITS, WheelGeometry(), SAMPLE, ORIGIN)
     count = math.floor(plan.duration / SAMPLE) + 1
     position = np.empty((count, 2))
     for row in position:
@@ -270,12 +260,12 @@ def _twin_track(plan: PatrolPlan, record: Record, world: World) -> PatrolTrack:
         record.time[rows],
         record['truth'][rows, :2],
         record['reference_pose'][rows, :2],
-        outside_avoidance(record)[rows],
+        patrol_run.outside_avoidance(record)[rows],
         free_cells(plan, world),
         world,
         range_hits(record['truth'][rows], record['ranges'][rows]),
-        contact_count(record),
-        share_on_path(record),
+        patrol_run.contact_count(record),
+        patrol_run.share_on_path(record),
     )
 
 

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from t3mpc_ros.evaluation import reporting
 from t3mpc_ros.evaluation.confidence_intervals import (
     Difference,
     format_interval,
@@ -38,18 +39,7 @@ from t3mpc_ros.evaluation.patrol.patrol_comparison import (
 from t3mpc_ros.evaluation.patrol.patrol_metrics import SHARES
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
-from t3mpc_ros.evaluation.plotting import TitledDrawing, draw_world, new_figure
-from t3mpc_ros.evaluation.reporting import (
-    Block,
-    Contents,
-    Heading,
-    Paragraph,
-    Picture,
-    Table,
-    format_mean,
-    html_page,
-    verdict_mark,
-)
+from t3mpc_ros.evaluation.plotting import TitledDrawing, draw_world, new_figure, whisker
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.simulation.world import World
 from t3mpc_ros.version import VERSION
@@ -157,13 +147,16 @@ def _time(times: Sequence[float]) -> str:
     return f'reached in {reached} of {len(times)}' if reached else 'not reached'
 
 
-def claims_table(study: PatrolStudy) -> Table:
+def claims_table(study: PatrolStudy) -> reporting.Table:
     """Return the claims with their verdicts."""
-    rows = [(text, verdict_mark(verdict), numbers) for text, verdict, numbers in claims(study)]
-    return Table('', ('claim', 'verdict', 'measured'), rows, text=3, wrap=True)
+    rows = [
+        (text, reporting.verdict_mark(verdict), numbers)
+        for text, verdict, numbers in claims(study)
+    ]
+    return reporting.Table('', ('claim', 'verdict', 'measured'), rows, text=3, wrap=True)
 
 
-def coverage_table(study: PatrolStudy) -> Table:
+def coverage_table(study: PatrolStudy) -> reporting.Table:
     """Return coverage, times, evenness and, on the twin, errors and contacts of each path."""
     shares = [f'{100.0 * share:g}' for share in SHARES]
     head = ['path', 'coverage, %', *(f'{share} %, s' for share in shares), 'evenness']
@@ -182,10 +175,10 @@ def coverage_table(study: PatrolStudy) -> Table:
             line.append(_cell(rows, 'avoiding', 1, 100.0))
             line.append(str(sum(row['contacts'] > 0 for row in rows)))
         lines.append(line)
-    return Table('Coverage of a 20 × 20 grid', head, lines, (OURS,), wrap=True)
+    return reporting.Table('Coverage of a 20 × 20 grid', head, lines, (OURS,), wrap=True)
 
 
-def surprise_table(study: PatrolStudy) -> Table:
+def surprise_table(study: PatrolStudy) -> reporting.Table:
     """Return skill of the observer, entropies and exponent of each path."""
     numbers = {
         **{f'skill at {horizon:g} s': f'skill_{horizon:g}' for horizon in HORIZONS},
@@ -206,11 +199,13 @@ def surprise_table(study: PatrolStudy) -> Table:
             words = bool(values) and isinstance(values[0], str)
             line.append(mode(values) if words else _cell(rows, column))
         lines.append(line)
-    return Table('How hard the path is to predict', ['path', *numbers], lines, (OURS,), wrap=True)
+    return reporting.Table(
+        'How hard the path is to predict', ['path', *numbers], lines, (OURS,), wrap=True
+    )
 
 
 def _cell(rows: Sequence[Row], column: str, digits: int = 3, factor: float = 1.0) -> str:
-    return format_mean([factor * row[column] for row in rows if column in row], digits)
+    return reporting.format_mean([factor * row[column] for row in rows if column in row], digits)
 
 
 def description(plan: PatrolPlan) -> str:
@@ -311,7 +306,7 @@ def draw_predictability(study: PatrolStudy) -> Any:
     axis = figure.subplots()
     for place, (name, style) in enumerate(_styles(study.plan.paths)):
         values = [study.table.values(column, controller=name) for column in columns]
-        halves = [half if math.isfinite(half := interval(row)) else 0.0 for row in values]
+        halves = [whisker(interval(row)) for row in values]
         # Side by side, so that the intervals do not cover each other.
         places = np.array(HORIZONS) * (1.0 + 0.012 * (place - 0.5 * len(study.plan.paths)))
         means = [mean(row) for row in values]
@@ -328,9 +323,7 @@ PICTURES = (
     TitledDrawing('coverage', 'Coverage over time', draw_coverage),
     TitledDrawing('heat_maps', 'Time in the cells, first seed', draw_heat_maps),
     TitledDrawing(
-        'predictability',
-        'Skill of an observer who watched the first half',
-        draw_predictability,
+        'predictability', 'Skill of an observer who watched the first half', draw_predictability
     ),
     TitledDrawing('paths', 'Paths, first seed; orange: hits of the range sensors', draw_paths),
 )
@@ -382,17 +375,17 @@ def markdown(study: PatrolStudy) -> str:
 
 def page(study: PatrolStudy, drawn: Mapping[str, bytes]) -> str:
     """Return the page as self-contained HTML, with pictures by their stems."""
-    shown = {each.stem: [Picture(each.title, drawn[each.stem], each.title)]
+    shown = {each.stem: [reporting.Picture(each.title, drawn[each.stem], each.title)]
              for each in PICTURES if each.stem in drawn}  # fmt: skip
-    blocks: list[Block] = [*shown.get('coverage', ()), Contents()]
-    blocks.append(Paragraph(description(study.plan)))
+    blocks: list[reporting.Block] = [*shown.get('coverage', ()), reporting.Contents()]
+    blocks.append(reporting.Paragraph(description(study.plan)))
     if claims(study):
-        blocks += [Heading('Does our path do what it should?'), claims_table(study)]
-    blocks += [Heading('Coverage'), coverage_table(study), *shown.get('heat_maps', ())]
-    blocks += [Heading('Predictability'), surprise_table(study)]
-    blocks += [*shown.get('predictability', ()), Paragraph(EXPLANATION, 'quiet')]
-    blocks += [Heading('Paths'), *shown.get('paths', ())]
-    return html_page('Patrols compared', blocks)
+        blocks += [reporting.Heading('Does our path do what it should?'), claims_table(study)]
+    blocks += [reporting.Heading('Coverage'), coverage_table(study), *shown.get('heat_maps', ())]
+    blocks += [reporting.Heading('Predictability'), surprise_table(study)]
+    blocks += [*shown.get('predictability', ()), reporting.Paragraph(EXPLANATION, 'quiet')]
+    blocks += [reporting.Heading('Paths'), *shown.get('paths', ())]
+    return reporting.html_page('Patrols compared', blocks)
 
 
 def record(study: PatrolStudy) -> dict[str, Any]:

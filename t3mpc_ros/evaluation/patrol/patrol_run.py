@@ -17,10 +17,10 @@ The loop has the timing of the nodes: the reference is stamped ahead by its lead
 the robot leads to one command, which arrives after the dead time of the link or is lost.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 import math
 from pathlib import Path
 import tempfile
@@ -99,15 +99,18 @@ Visitors = Callable[[float, State], MovingDisc | None]
 """Returns what comes at a time of the twin (s), given the true state of the robot."""
 
 
+FaultKind = Literal[
+    'silent', 'frozen', 'blind', 'nan', 'negative', 'far', 'late', 'repeated', 'disordered'
+]
+"""``blind``: it reads "nothing in range"; ``late``: stamps are 0.5 s old; ``repeated``: stamps
+stay; ``disordered``: every second reading comes after the next one."""
+
+
 class SensorFault(NamedTuple):
     """A range sensor that fails for a time of the twin."""
 
     sensor: int
-    kind: Literal[
-        'silent', 'frozen', 'blind', 'nan', 'negative', 'far', 'late', 'repeated', 'disordered'
-    ]
-    """``blind``: it reads "nothing in range"; ``late``: stamps are 0.5 s old; ``repeated``: stamps
-    stay; ``disordered``: every second reading comes after the next one."""
+    kind: FaultKind
     begin: float
     """s"""
     end: float = math.inf
@@ -126,34 +129,33 @@ class FaultyRanges:
     def __init__(self, faults: tuple[SensorFault, ...]) -> None:
         self._faults = faults
         self._frozen: dict[int, tuple[float, int]] = {}
-        self._waiting: dict[int, deque[tuple[float, int]]] = {}
+        self._waiting: dict[int, tuple[float, int]] = {}
 
     def received(self, sensor: int, reading: float, stamp_ns: int) -> list[tuple[float, int]]:
         """Return which readings (m) with which stamps arrive instead of one of a sensor."""
         time = stamp_ns / NANOSECONDS
-        kinds = [
+        kinds = (
             each.kind
             for each in self._faults
             if each.sensor == sensor and each.begin <= time < each.end
-        ]
-        if not kinds:
+        )
+        if (kind := next(kinds, '')) == '':
             self._frozen[sensor] = reading, stamp_ns
-            return [(reading, stamp_ns)]
-        kind, (frozen, frozen_ns) = kinds[0], self._frozen.get(sensor, (reading, stamp_ns))
-        if kind == 'silent':
-            return []
-        if kind == 'late':
-            return [(reading, stamp_ns - round(LATE * NANOSECONDS))]
-        if kind == 'disordered':
-            waiting = self._waiting.setdefault(sensor, deque())
-            waiting.appendleft((reading, stamp_ns))
-            if len(waiting) < 2:
+        frozen, frozen_ns = self._frozen.get(sensor, (reading, stamp_ns))
+        match kind:
+            case '':
+                return [(reading, stamp_ns)]
+            case 'silent':
                 return []
-            found = [*waiting]
-            waiting.clear()
-            return found
-        if kind == 'repeated':
-            return [(reading, frozen_ns)]
+            case 'late':
+                return [(reading, stamp_ns - round(LATE * NANOSECONDS))]
+            case 'repeated':
+                return [(reading, frozen_ns)]
+            case 'disordered' if sensor in self._waiting:
+                return [(reading, stamp_ns), self._waiting.pop(sensor)]
+            case 'disordered':
+                self._waiting[sensor] = reading, stamp_ns
+                return []
         return [(READINGS.get(kind, frozen), stamp_ns)]
 
 
@@ -190,11 +192,6 @@ class PatrolScenario:
     """Where places are revisited, m."""
     carried_at: float = math.inf
     """When the robot is carried by 1 m and turned by 90 degrees, s."""
-
-    @property
-    def limits(self) -> MotionLimits:
-        """Limits of the path."""
-        return PLANNED_LIMITS if self.plan.enabled else LIMITS
 
     def __post_init__(self) -> None:
         if self.localization not in LOCALIZATIONS:
@@ -244,21 +241,11 @@ def run_patrol(
 ) -> Record:
     """Return the record of a robot that follows a path; equal arguments give equal runs.
 
-    Its rows begin at the end of the standstill, its time is that since then.
-
-    Parameters
-    ----------
-    points
-        Pieces (m), shape (k, 2), of the path from where the robot starts, at (0, 0) facing x; a
-        path that ends leaves the robot at its last point.
-    scenario
-        World and robot.
-    tracker
-        Law in place of the controller; the path is then only recorded as the reference.
-    visitors
-        What comes while the robot drives.
-    use_localizer
-        Called before the drive with the localisation, if there is one.
+    Its rows begin at the end of the standstill, its time is that since then. ``points`` are pieces
+    (m), shape (k, 2), of the path from where the robot starts, at (0, 0) facing x; a path that
+    ends leaves the robot at its last point. A ``tracker`` is a law in place of the controller: the
+    path is then only recorded as the reference. ``use_localizer`` is called before the drive with
+    the localisation, if there is one.
     """
     parameters = DigitalTwinParameters.from_dict(
         {
@@ -274,8 +261,15 @@ def run_patrol(
     driver = PathDriver(points, scenario, parameters.geometry, tracker)
     if use_localizer is not None and driver.localizer is not None:
         use_localizer(driver.localizer)
+
+    def visit(state: RobotState) -> None:
+        assert visitors is not None
+        assert state.truth is not None
+        if found := visitors(state.stamp_ns / NANOSECONDS, state.truth):
+            robot.add_obstacle(found)
+
     if visitors is not None:
-        driver.on_state = lambda state: _visit(robot, visitors, state)
+        driver.on_state = visit
     rest = round(START * RATE)
     count = round(scenario.duration * RATE)
     loop = reports_of(robot, driver, rest + count, start=START, latency_ns=stamp_of(1) - 1)
@@ -289,14 +283,6 @@ def run_patrol(
         robot_reasons=record.robot_reasons[rest:],
         driver_reasons=record.driver_reasons[rest:],
     )
-
-
-def _visit(robot: DigitalTwin, visitors: Visitors, state: RobotState) -> None:
-    """Let come what comes at a state of the robot."""
-    assert state.truth is not None
-    found = visitors(state.stamp_ns / NANOSECONDS, state.truth)
-    if found is not None:
-        robot.add_obstacle(found)
 
 
 class CarriedTwin(DigitalTwin):
@@ -343,16 +329,13 @@ class PathDriver:
             load_world(scenario.known_world).obstacles,
         )
         self._controller.warm_up()
-        self._timing = PathTiming(scenario.limits, geometry, 1.0 / RATE, ORIGIN)
+        limits = PLANNED_LIMITS if scenario.plan.enabled else LIMITS
+        self._timing = PathTiming(limits, geometry, 1.0 / RATE, ORIGIN)
         self._plan: PlannedPath | None = None
         if scenario.plan.enabled:
+            arena, advance = Arena(scenario.arena), partial(next, points)
             self._plan = PlannedPath(
-                scenario.plan,
-                self._timing,
-                1.0 / RATE,
-                ORIGIN,
-                lambda: next(points),
-                Arena(scenario.arena),
+                scenario.plan, self._timing, 1.0 / RATE, ORIGIN, advance, arena
             )
             self._plan.plan.use_random_numbers(SecretRandom(scenario.seed, 'revisits'))
         self._clock = PathClock(WaitParameters())
@@ -387,9 +370,8 @@ class PathDriver:
         self._k, self._driving = k, enabled
         while len(self._references) <= k + round(LEAD * RATE):
             stamp = stamp_of(len(self._references))
-            reference = (ORIGIN, BodyTwist(0.0, 0.0))
-            if len(self._references) >= round(START * RATE):
-                reference = self._next_reference(stamp)
+            driving = len(self._references) >= round(START * RATE)
+            reference = self._next_reference(stamp) if driving else (ORIGIN, STANDSTILL)
             self._references.append(reference)
             self._controller.add_reference(State(stamp, *reference))
         if changed:
@@ -464,10 +446,10 @@ class PathDriver:
         keep_out = self._controller.keep_out
         activity = Activity.FREE if keep_out is None else keep_out.activity
         changed = keep_out is not None and keep_out.changed
-        reference = self._references[self._k]
+        pose, twist = self._references[self._k]
         return {
-            'reference_pose': reference[0],
-            'reference_twist': reference[1],
+            'reference_pose': pose,
+            'reference_twist': twist,
             'pose': self._pose,
             'command': self._twist,
             'activity': ACTIVITIES.index(activity),

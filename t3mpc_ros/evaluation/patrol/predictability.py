@@ -290,24 +290,22 @@ def predictability(t: Array, x: Array, y: Array) -> tuple[Skill, ...]:
     climatology = _square_errors(path[:half].mean(axis=0), target)
     if climatology.min() <= 0.0:  # a robot that stands where it stood
         return tuple(Skill(h, 1.0, CLIMATOLOGY, 0.0, 0.0, 1.0) for h in HORIZONS)
-    each = {CLIMATOLOGY: np.zeros(steps.size)}
+    skills = {CLIMATOLOGY: np.zeros(steps.size)}
     errors = {CLIMATOLOGY: np.hypot(*(path[:half].mean(axis=0) - target).transpose(2, 0, 1))}
     for name, predict in _PREDICTORS.items():
         found = predict(path, half, origins, steps)
-        each[name] = 1.0 - _square_errors(found, target) / climatology
+        skills[name] = 1.0 - _square_errors(found, target) / climatology
         errors[name] = np.hypot(*(found - target).transpose(2, 0, 1))
-    best = [max(each, key=lambda name: each[name][row]) for row in range(steps.size)]
-    return tuple(
-        Skill(
-            horizon,
-            float(each[best[row]][row]),
-            best[row],
-            float(np.sqrt((1.0 - each[best[row]][row]) * climatology[row])),
-            float(np.median(errors[best[row]][row])),
-            float((errors[best[row]][row] < KNOWN).mean()),
-        )
-        for row, horizon in enumerate(HORIZONS)
-    )
+    best = []
+    for row, horizon in enumerate(HORIZONS):
+        reached = {name: float(each[row]) for name, each in skills.items()}
+        name = max(reached, key=reached.__getitem__)
+        skill = reached[name]
+        error = math.sqrt((1.0 - skill) * climatology[row])
+        known = float((errors[name][row] < KNOWN).mean())
+        median = float(np.median(errors[name][row]))
+        best.append(Skill(horizon, skill, name, error, median, known))
+    return tuple(best)
 
 
 Rows = NDArray[np.int64]

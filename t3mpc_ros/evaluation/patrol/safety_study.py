@@ -21,6 +21,7 @@ often, how fast and for how long, and how it came to rest.
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from itertools import pairwise
 import math
 from typing import NamedTuple
 
@@ -29,15 +30,7 @@ import numpy as np
 from t3mpc_ros.chaos.chaotic_path import PortraitParameters
 from t3mpc_ros.chaos.path_replanning import PlanParameters
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
-from t3mpc_ros.evaluation.patrol.patrol_run import (
-    START,
-    PatrolScenario,
-    SensorFault,
-    portrait_points,
-    room_with_boxes,
-    run_patrol,
-    world_file,
-)
+from t3mpc_ros.evaluation.patrol import patrol_run
 from t3mpc_ros.evaluation.record import RATE, Record, spans_of
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import Row
@@ -141,8 +134,8 @@ class SafetyCase:
     """By seed, what comes while the robot drives."""
     unseen: bool = False
     """Whether there are boxes that the sensors do not see."""
-    faults: Callable[[int], Sequence[SensorFault]] | None = None
-    """By seed, the faults of the range sensors."""
+    faults: tuple[patrol_run.FaultKind, int] | None = None
+    """Fault of the range sensors, and how many of them have it."""
 
 
 FAULTS_BEGIN, FAULTS_END = 8.0, 38.0
@@ -156,21 +149,13 @@ def cut_time(seed: int) -> float:
     return float(np.random.default_rng((seed, 44)).uniform(FAULTS_BEGIN, FAULTS_END))
 
 
-def _all_silent(seed: int) -> Sequence[SensorFault]:
-    return [SensorFault(sensor, 'silent', cut_time(seed)) for sensor in range(8)]
-
-
-def _front_frozen(seed: int) -> Sequence[SensorFault]:
-    return [SensorFault(sensor, 'frozen', cut_time(seed)) for sensor in range(2)]
-
-
 CASES: Mapping[str, SafetyCase] = {
     'standing': SafetyCase(),
     'placed later': SafetyCase(visitors=PlacedThings),
     'people': SafetyCase(visitors=People),
     'unseen': SafetyCase(unseen=True),
-    'sensors silent': SafetyCase(faults=_all_silent),
-    'front sensors frozen': SafetyCase(faults=_front_frozen),
+    'sensors silent': SafetyCase(faults=('silent', 8)),
+    'front sensors frozen': SafetyCase(faults=('frozen', 2)),
 }
 """The cases by name."""
 
@@ -193,14 +178,14 @@ class Contact(NamedTuple):
 def gaps(record: Record, world: World) -> tuple[Array, Array]:
     """Return the gap between bumper and obstacles (m), and its rate by the robot's own motion.
 
-    world : with all that moved; its time is that of the twin, ``START`` before that of the record
+    The world is that with all that moved; its time is that of the twin.
     """
     truth, twist = record['truth'], record['twist']
     gap, closing = np.empty(len(record)), np.zeros(len(record))
     for row, ((x, y, yaw), (speed, _)) in enumerate(
         zip(truth.tolist(), twist.tolist(), strict=True)
     ):
-        now = world.at(START + float(record.time[row]))
+        now = world.at(patrol_run.START + float(record.time[row]))
         gap[row] = clearance(x, y, *now.obstacles) - RADIUS
         if gap[row] < 0.01:
             step = 1e-3 * math.copysign(1.0, speed)
@@ -214,7 +199,7 @@ def contacts(record: Record, world: World) -> list[Contact]:
     gap, closing = gaps(record, world)
     apart = np.flatnonzero(gap < 0.0)
     touches = gap < 0.0
-    for last, following in zip(apart, apart[1:], strict=False):
+    for last, following in pairwise(apart):
         if following - last < BOUNCE * RATE:
             touches[last:following] = True
     found = []
@@ -231,7 +216,7 @@ def contacts(record: Record, world: World) -> list[Contact]:
 def was_seen(record: Record, world: World, begin: int) -> bool:
     """Return whether a beam had met what is touched at a row; walls and boxes always were."""
     x, y, _ = record['truth'][begin].tolist()
-    time = START + float(record.time[begin])
+    time = patrol_run.START + float(record.time[begin])
     plain, hidden = clearance(x, y, world.segments, world.circles), clearance(x, y, *world.unseen)
     there = [each for each in world.moving if each.appears <= time < each.vanishes]
     away = [math.dist(each.position(time), (x, y)) - each.radius for each in there]
@@ -241,7 +226,7 @@ def was_seen(record: Record, world: World, begin: int) -> bool:
     mounts = sensor_mounts(RangeSensorParameters())
     which, out, nothing = np.arange(len(mounts)), np.empty(len(mounts)), np.empty((0, 4))
     for row in range(max(begin - round(SEEN_FOR * RATE), 0), -1, -1):
-        time = START + float(record.time[row])
+        time = patrol_run.START + float(record.time[row])
         if time < thing.appears:
             return False
         circle = np.array([[*thing.position(time), thing.radius]])
@@ -268,12 +253,9 @@ def at_places(found: Sequence[Contact]) -> list[list[Contact]]:
 def safety_run(
     case: str, seed: int, duration: float, *, planned: bool = False
 ) -> tuple[Record, World]:
-    """Return the record of a case, and its world with all that came.
-
-    planned : whether the path is planned on what the robot has seen
-    """
+    """Return the record of a case, and its world with all that came."""
     kind = CASES[case]
-    text = room_with_boxes(seed, ROOM, BOXES)
+    text = patrol_run.room_with_boxes(seed, ROOM, BOXES)
     if kind.unseen:
         walls, _, patches = text.partition('patches:')
         text = f'{walls}{unseen_boxes(seed)}\npatches:{patches}'
@@ -285,15 +267,19 @@ def safety_run(
         came.extend([found] if found else [])
         return found
 
-    with world_file(text) as path:
-        scenario = PatrolScenario(
+    fault, count = kind.faults or ('silent', 0)
+    faults = [patrol_run.SensorFault(each, fault, cut_time(seed)) for each in range(count)]
+    with patrol_run.world_file(text) as path:
+        scenario = patrol_run.PatrolScenario(
             seed,
             duration,
             world=path,
-            faults=tuple(kind.faults(seed)) if kind.faults else (),
+            faults=tuple(faults),
             plan=PlanParameters(enabled=planned),
         )
-        record = run_patrol(portrait_points(seed, PortraitParameters()), scenario, visitors=visit)
+        record = patrol_run.run_patrol(
+            patrol_run.portrait_points(seed, PortraitParameters()), scenario, visitors=visit
+        )
     world = parse_world(text, 'room')
     return record, replace(world, moving=tuple(came))
 
@@ -330,7 +316,7 @@ def measured_safety(job: tuple[tuple[str, float, bool], int]) -> Row:
         'came': len(world.moving),
     }
     if CASES[case].faults:
-        first = round((cut_time(seed) - START) * RATE)
+        first = round((cut_time(seed) - patrol_run.START) * RATE)
         moves = (record['commanded'][first:] != 0.0).any(axis=1)
         ends = float(np.flatnonzero(moves)[-1] + 1) / RATE if moves.any() else 0.0
         row['rest'] = math.nan if moves[-1] else ends
@@ -363,51 +349,34 @@ def compare_safety(
     return run_experiment(runs, measured_safety, workers, report=report)
 
 
-HEAD = (
-    'case',
-    'runs',
-    'runs with contact',
-    'with what was seen',
-    'places touched',
-    'most contacts at a place',
-    'fastest after the first, m/s',
-    'longest push, s',
-    'rest after the fault, s',
-    'driven after it, m',
-)
+WORST: Mapping[str, tuple[str, int]] = {
+    'most contacts at a place': ('most_at_a_place', 0),
+    'fastest after the first, m/s': ('fastest_again', 3),
+    'longest push, s': ('pushing', 2),
+    'rest after the fault, s': ('rest', 2),
+    'driven after it, m': ('after', 3),
+}
+"""Number and digits of the columns with the worst of a case, by their headings."""
 
 
 def safety_table(table: ResultTable) -> Table:
-    """Return the worst of each case."""
+    """Return counts and the worst of each case."""
+    head = ('case', 'runs', 'runs with contact', 'with what was seen', 'places touched', *WORST)
     lines = []
-    for case in table.unique('controller'):
-        rows = table.where(controller=case)
+    for case, rows in (
+        (case, table.where(controller=case)) for case in table.unique('controller')
+    ):
+        names = 'contacts', 'contacts_seen'
+        touched, seen = (sum(bool(row[name]) for row in rows) for name in names)
+        counts = len(rows), touched, seen, sum(row['places'] for row in rows)
+        lines.append([case, *map(str, counts), *(_worst(rows, *each) for each in WORST.values())])
+    return Table('', head, lines)
 
-        def worst(column: str, digits: int, rows: Sequence[Row] = rows) -> str:
-            values = [float(row[column]) for row in rows if column in row]
-            if not values:
-                return EMPTY_CELL
-            goes_on = sum(map(math.isnan, values))
-            if goes_on:
-                return f'{goes_on} of {len(rows)} drive on'
-            return f'{max(values):.{digits}f}'
 
-        touched, seen = (
-            sum(bool(row[name]) for row in rows) for name in ('contacts', 'contacts_seen')
-        )
-        places = sum(row['places'] for row in rows)
-        lines.append(
-            [
-                case,
-                str(len(rows)),
-                str(touched),
-                str(seen),
-                str(places),
-                worst('most_at_a_place', 0),
-                worst('fastest_again', 3),
-                worst('pushing', 2),
-                worst('rest', 2),
-                worst('after', 3),
-            ]
-        )
-    return Table('', HEAD, lines)
+def _worst(rows: Sequence[Row], column: str, digits: int) -> str:
+    values = [float(row[column]) for row in rows if column in row]
+    if not values:
+        return EMPTY_CELL
+    if goes_on := sum(map(math.isnan, values)):
+        return f'{goes_on} of {len(rows)} drive on'
+    return f'{max(values):.{digits}f}'
