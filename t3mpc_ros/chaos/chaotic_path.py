@@ -97,11 +97,7 @@ class PortraitPath:
     """
 
     def __init__(
-        self,
-        system: ReferenceParameters,
-        parameters: PortraitParameters,
-        speed: float,
-        seed: int,
+        self, system: ReferenceParameters, parameters: PortraitParameters, speed: float, seed: int
     ) -> None:
         if not speed > 0.0:
             raise ValueError(f'speed must be positive: got {speed} m/s')
@@ -176,8 +172,7 @@ class PortraitPath:
     def _evened(self, states: Array) -> Array:
         """Return the distribution functions at states of shape (n, 4)."""
         scaled = (states[:, None, :] - self._centres) / self._widths
-        evened: Array = 0.5 + 0.5 * np.tanh(0.5 * scaled).mean(axis=1)
-        return evened
+        return 0.5 + 0.5 * np.tanh(0.5 * scaled).mean(axis=1)
 
     def _next_points(self) -> Array:
         """Return evenly spaced points along the next piece of the portraits."""
@@ -201,15 +196,13 @@ class PortraitPath:
         if mode.blend < 1.0:
             before = _mirror(values[self._pair(mode.previous)], self._mirrored_before)
             place = mode.blend * place + (1.0 - mode.blend) * before
-        point: Array = self.arena.from_unit_square(place[None])[0]
-        return point
+        return self.arena.from_unit_square(place[None])[0]
 
     def _pair(self, mode: int) -> list[int]:
         return [number - 1 for number in self._pairs[mode]]
 
     def _draw_mirror(self) -> NDArray[np.bool_]:
-        drawn: NDArray[np.bool_] = self._mirrors.uniform(2) < 0.5
-        return drawn
+        return self._mirrors.uniform(2) < 0.5
 
     def _line_to(self, point: Array) -> list[Array]:
         """Return the evenly spaced points from the last point to ``point``."""
@@ -229,5 +222,4 @@ class PortraitPath:
 
 
 def _mirror(values: Array, mirrored: NDArray[np.bool_]) -> Array:
-    found: Array = np.where(mirrored, 1.0 - values, values)
-    return found
+    return np.where(mirrored, 1.0 - values, values)

@@ -22,7 +22,6 @@ path leads to a place that was not visited for long. With a low battery it leads
 place, and on from there when the battery is charged.
 """
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 import math
@@ -33,7 +32,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.geometry.arena import OCCUPIED_PERCENT, Arena, OccupancyGrid
-from t3mpc_ros.geometry.path_timing import PathTiming, resample
+from t3mpc_ros.geometry.path_timing import PathTiming, lengths_along, resample
 from t3mpc_ros.geometry.route_planning import SPACING, WAY_OUT, RoutePlanner
 from t3mpc_ros.geometry.types import Array, BodyTwist, Pose, wrap_angle
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
@@ -256,13 +255,11 @@ class PathPlan:
     def _freshness(self, points: Array) -> Array:
         """Return the cost of places (m): a way leads over floor that was not visited for long."""
         last = self._visited[tuple(self._cells(points))]
-        found: Array = FRESH_COST * last / max(float(self._visited.max()), 1e-9)
-        return found
+        return FRESH_COST * last / max(float(self._visited.max()), 1e-9)
 
     def _cells(self, points: Array) -> NDArray[np.int64]:
         cells = np.floor((points - self._low) / CELL).astype(np.int64)
-        found: NDArray[np.int64] = np.clip(cells, 0, np.array(self._visited.shape) - 1).T
-        return found
+        return np.clip(cells, 0, np.array(self._visited.shape) - 1).T
 
     def forget(self, count: int) -> None:
         """Remove the first points, which have been passed."""
@@ -354,11 +351,7 @@ class PathPlan:
         return int(where[int(np.argmin(costs))])
 
     def _detour(
-        self,
-        begin: tuple[float, float],
-        path: Array,
-        blocked: NDArray[np.bool_],
-        fixed: int,
+        self, begin: tuple[float, float], path: Array, blocked: NDArray[np.bool_], fixed: int
     ) -> bool:
         """Append a route to where the given path is free again; return whether there is one."""
         self._planner.spread(begin)
@@ -453,8 +446,7 @@ class PathPlan:
         return True
 
     def _direction(self) -> Array:
-        direction: Array = self.points[-1] - self.points[max(len(self.points) - BACK, 0)]
-        return direction
+        return self.points[-1] - self.points[max(len(self.points) - BACK, 0)]
 
     def _append_smoothly(
         self,
@@ -476,7 +468,7 @@ class PathPlan:
         self._append(after, joint + 1 + np.arange(1, RAMP + 1))
         # Smoothing moves points towards each other where the path turns back.
         points, numbers = self._smoothed(self.points[kept:], places, miss), self._next[kept:]
-        lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        lengths = lengths_along(points)
         points = resample(points, SPACING, round)
         even = np.interp(np.linspace(0.0, lengths[-1], len(points)), lengths, numbers)
         self.points = np.vstack([self.points[:kept], points])
@@ -509,15 +501,13 @@ def keeps_off(distances: Array, least: float) -> NDArray[np.bool_]:
     A robot that finds itself too near, because the map or its pose on it has changed, may leave.
     """
     reached = np.maximum.accumulate(distances)
-    found: NDArray[np.bool_] = distances >= np.where(reached < least, WAY_OUT * reached, least)
-    return found
+    return distances >= np.where(reached < least, WAY_OUT * reached, least)
 
 
 def alignments(vectors: Array, direction: Array) -> Array:
     """Return the cosines of the angles between vectors, shape (n, 2), and a direction."""
     sizes = np.maximum(np.hypot(*vectors.T) * math.hypot(*direction), 1e-9)
-    found: Array = vectors @ direction / sizes
-    return found
+    return vectors @ direction / sizes
 
 
 class _Look:
@@ -525,7 +515,7 @@ class _Look:
 
     def __init__(self, pose: Pose, directions: list[float], period: float) -> None:
         self.pose = pose
-        self.directions = deque(directions)
+        self.directions = directions
         self._rate, self._period = 0.0, period
 
     def advance(self, rate: float) -> tuple[Pose, BodyTwist]:
@@ -539,13 +529,8 @@ class _Look:
         x, y, yaw = self.pose
         self.pose = Pose(x, y, yaw + self._rate * self._period)
         if abs(gap) < 0.02 and abs(self._rate) < 0.05:
-            self.directions.popleft()
+            self.directions.pop(0)
         return result
-
-    @property
-    def ended(self) -> bool:
-        """Whether it rests in the last direction."""
-        return not self.directions
 
 
 class _Unseeable(NamedTuple):
@@ -612,7 +597,7 @@ class PlannedPath:
         self._time += self._period
         if self._look is not None:
             self._pose, twist = self._look.advance(rate)
-            if self._look.ended:
+            if not self._look.directions:  # it rests in the last one
                 self._begin_at(self._look.pose)
                 self._feed()
             return self._pose, twist
@@ -689,10 +674,8 @@ class PlannedPath:
         self.plan.extend(self._fed, self._time)
         goes_on = self._feed()
         if self._look is not None:
-            if self._seen >= self._fed + SEEN and len(self._look.directions) > 1:
-                last = self._look.directions[-1]
-                self._look.directions.clear()
-                self._look.directions.append(last)
+            if self._seen >= self._fed + SEEN:
+                del self._look.directions[:-1]
         elif self._rested > REST and not goes_on and not self.at_charging_place:
             self._look_around()
 
@@ -712,7 +695,7 @@ class PlannedPath:
     def _go_on(self) -> None:
         """Remove the points that the reference has passed."""
         points = self.plan.points[: self._fed]
-        lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
+        lengths = lengths_along(points)
         place = self._fed - 1
         if not (self._timing.standing and self._timing.arrived):
             # Not farther than it drove: where the path crosses itself, another place is as near.

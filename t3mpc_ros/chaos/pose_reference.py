@@ -183,9 +183,9 @@ class PathClock:
             return
         if self._start is None:
             self._start, self._stamp_ns = pose, stamp_ns
-        self._set_off = self._set_off or _distance(self._start, pose) > APPROACH
+        self._set_off = self._set_off or math.dist(self._start[:2], pose[:2]) > APPROACH
         elapsed, self._stamp_ns = (stamp_ns - self._stamp_ns) / NANOSECONDS, stamp_ns
-        self.rate = self._rate(_distance(references[0][1], pose), max(elapsed, 0.0))
+        self.rate = self._rate(math.dist(references[0][1][:2], pose[:2]), max(elapsed, 0.0))
 
     def _rate(self, distance: float, elapsed: float) -> float:
         begin = self._parameters.distance
@@ -202,10 +202,6 @@ class PathClock:
         if self._held >= self._parameters.patience:
             self._held = -self._parameters.patience
         return max(2.0 - distance / begin, 0.0)
-
-
-def _distance(one: Pose, other: Pose) -> float:
-    return math.hypot(one.x - other.x, one.y - other.y)
 
 
 class PauseRamp:

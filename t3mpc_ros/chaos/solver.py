@@ -50,9 +50,7 @@ from t3mpc_ros.chaos.system import QuadraticSystem, Terms, right_hand_side
 from t3mpc_ros.kernels import kernel
 
 
-def mode_weights(
-    decay: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def mode_weights(decay: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     r"""Return the weights of the older and the newer slope in a mode's advance over one step.
 
     .. math:: \phi_o(a) = \int_0^1 e^{-a u} u\,du = \frac{1 - (1 + a) e^{-a}}{a^2}, \qquad

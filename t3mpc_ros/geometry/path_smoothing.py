@@ -37,7 +37,12 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.path_timing import MotionLimits, PathEnd, distance_to_path
+from t3mpc_ros.geometry.path_timing import (
+    MotionLimits,
+    PathEnd,
+    distance_to_path,
+    lengths_along,
+)
 from t3mpc_ros.geometry.types import Array, Pose, wrap_angle
 
 SPACING = 0.005
@@ -103,8 +108,7 @@ class SmoothedPath:
         self.tolerance = tolerance
         """m"""
         self._limits, self._geometry, self._closed = limits, geometry, closed
-        runs = np.hypot(*np.diff(points, axis=0).T)
-        self._lengths = np.concatenate([[0.0], np.cumsum(runs)])
+        self._lengths = lengths_along(points)
         self.length = float(self._lengths[-1])
         """Length of the given path, m."""
         self._count = max(1, math.ceil(self.length / SPACING))
@@ -151,10 +155,7 @@ class SmoothedPath:
         pieces = self.pieces(begin)
         first = next(pieces)
         joint = self._joint(end, first) if self.tolerance else None
-        if joint is not None:
-            yield joint
-        else:
-            yield self._ahead(end, first)
+        yield self._ahead(end, first) if joint is None else joint
         yield from pieces
 
     def _ahead(self, end: PathEnd, points: Array) -> Array:
@@ -173,7 +174,7 @@ class SmoothedPath:
         joined: list[tuple[float, Array]] = []
         sharp = SHARP if end.moving else STANDING_SHARP
         farthest = max(self.tolerance, math.hypot(*(points[0] - end.pose[:2])))
-        lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        lengths = lengths_along(points)
         spans = [span for span in JOINTS if span < lengths[-1]]
         for span in [*spans, lengths[-1]] if len(points) > 2 else []:
             at = min(int(np.searchsorted(lengths, span)), len(points) - 1)
@@ -198,8 +199,7 @@ class SmoothedPath:
         places = self._at(np.clip(along, 0.0, self.length))
         ahead = 2.0 * self.points[0] - self._at(np.clip(-along, 0.0, self.length))
         behind = 2.0 * self.points[-1] - self._at(np.clip(2.0 * self.length - along, 0.0, None))
-        found: Array = np.where(before, ahead, np.where(after, behind, places))
-        return found
+        return np.where(before, ahead, np.where(after, behind, places))
 
     def _cuts(self, index: Array, given: Array) -> Array:
         """Return how far the corners of the path are from its chords between grid points, m."""
@@ -240,8 +240,7 @@ class SmoothedPath:
         share = (share * share * (3.0 - 2.0 * share))[:, None]
         rows = np.arange(len(given))
         blend = (1.0 - share) * curves[lower, rows] + share * curves[lower + 1, rows]
-        found: Array = blend[MARGIN:-MARGIN]
-        return found
+        return blend[MARGIN:-MARGIN]
 
 
 def local_times(curves: Array, limits: MotionLimits, geometry: WheelGeometry) -> Array:
@@ -275,11 +274,10 @@ def join_curve(begin: PathEnd, end: PathEnd) -> Array:
         left = np.array([-ahead[1], ahead[0]])
         conditions += [np.array(pose[:2]), chord * ahead, chord * chord * bend * left]
     share = np.linspace(0.0, 1.0, max(2, math.ceil(chord / SPACING)) + 1)[1:, None]
-    curve: Array = sum(
+    return sum(
         np.polynomial.polynomial.polyval(share, each) * condition
         for each, condition in zip(_HERMITE, conditions, strict=True)
     )
-    return curve
 
 
 _HERMITE = (
@@ -308,8 +306,7 @@ def _end_at(points: Array, index: int) -> PathEnd:
 def _window(width: float) -> Array:
     reach = math.ceil(REACH * width / SPACING)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) * SPACING / width) ** 2)
-    found: Array = weights / weights.sum()
-    return found
+    return weights / weights.sum()
 
 
 def _convolved(points: Array, window: Array) -> Array:

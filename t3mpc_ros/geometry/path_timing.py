@@ -506,15 +506,8 @@ class _CurveBuilder:
             self._nodes.append(self._before)
         self._turn_to(direction, run_x / length, run_y / length, length)
         self._last = x, y
-        self._marks.append(
-            _Mark(
-                self._taken + len(self._nodes),
-                self._last,
-                self._before,
-                self._carried,
-                self._segment,
-            )
-        )
+        nodes = self._taken + len(self._nodes)
+        self._marks.append(_Mark(nodes, self._last, self._before, self._carried, self._segment))
 
     def run_to_last(self) -> None:
         """Make the curve known up to the last point."""
@@ -624,9 +617,7 @@ def step_range(
     The lower bound is above the upper one if there is none.
     """
     lowest, highest = acceleration_range(nodes, limits, k, b)
-    lowest = max(lowest, -b / (2.0 * STEP))
-    highest = min(highest, (ceiling - b) / (2.0 * STEP))
-    return lowest, highest
+    return max(lowest, -b / (2.0 * STEP)), min(highest, (ceiling - b) / (2.0 * STEP))
 
 
 @kernel
@@ -760,12 +751,17 @@ def polyline_length(points: Array) -> float:
     return float(np.hypot(*np.diff(points, axis=0).T).sum())
 
 
+def lengths_along(points: Array) -> Array:
+    """Return the length (m) of a polyline, shape (n, 2), up to each of its points."""
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+
+
 def resample(points: Array, spacing: float, rounding: Callable[[float], int] = math.ceil) -> Array:
     """Return evenly spaced points along a polyline, shape (n, 2), with both ends.
 
     Their distance is ``spacing`` (m) at most, or about that with ``rounding`` :func:`round`.
     """
-    lengths = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    lengths = lengths_along(points)
     count = max(1, rounding(float(lengths[-1]) / spacing))
     along = np.linspace(0.0, lengths[-1], count + 1)
     return np.column_stack([np.interp(along, lengths, column) for column in points.T])

@@ -92,8 +92,7 @@ class RoutePlanner:
         right, above = np.minimum(column + 1, columns - 1), np.minimum(row + 1, rows - 1)
         low = (1.0 - across) * field[row, column] + across * field[row, right]
         high = (1.0 - across) * field[above, column] + across * field[above, right]
-        found: Array = np.where(inside, (1.0 - up) * low + up * high, outside)
-        return found
+        return np.where(inside, (1.0 - up) * low + up * high, outside)
 
     def spread(
         self, begin: tuple[float, float], extra: Callable[[Array], Array] | None = None
@@ -136,8 +135,7 @@ class RoutePlanner:
         place = np.floor((points - self._origin) / self._scale + 0.5).astype(np.int64)
         inside = ((place >= 0) & (place < [columns, rows])).all(axis=1)
         column, row = np.clip(place, 0, [columns - 1, rows - 1]).T
-        found: Array = np.where(inside, self._scale * self._times[row, column], math.inf)
-        return found
+        return np.where(inside, self._scale * self._times[row, column], math.inf)
 
     def reached_places(self) -> Array:
         """Return the nodes of the search that have a way, x and y (m), shape (n, 2)."""
@@ -169,8 +167,7 @@ def nearest_distances(marked: NDArray[np.bool_]) -> Array:
     distance_transform(
         squares, np.empty(longest), np.empty(longest, dtype=np.int64), np.empty(longest + 1)
     )
-    found: Array = np.sqrt(squares)
-    return found
+    return np.sqrt(squares)
 
 
 @kernel

@@ -82,12 +82,7 @@ class SimulatedTime:
     :meth:`step` advances the clock.
     """
 
-    def __init__(
-        self,
-        rate: float,
-        real_time_factor: float,
-        max_burst: int = 50,
-    ) -> None:
+    def __init__(self, rate: float, real_time_factor: float, max_burst: int = 50) -> None:
         self._period_ns = NANOSECONDS / rate
         self._slack_ns = round(0.2 * self._period_ns)
         self._max_burst = max_burst

@@ -156,8 +156,7 @@ class ReferenceTrajectory:
 @kernel
 def is_jump(samples: Array, index: int, jump: Array) -> bool:
     """Return whether the slope up to a sample is that of a jump."""
-    beyond: bool = abs(samples[index, 2]) > jump[0] or abs(samples[index, 3]) > jump[1]
-    return beyond
+    return abs(samples[index, 2]) > jump[0] or abs(samples[index, 3]) > jump[1]
 
 
 @kernel

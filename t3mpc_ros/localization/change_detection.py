@@ -157,8 +157,7 @@ class Place:
     @property
     def centres(self) -> Array:
         """Of its cells, m, shape (n, 2)."""
-        found: Array = CELL * (np.array(list(self.cells)) + 0.5)
-        return found
+        return CELL * (np.array(list(self.cells)) + 0.5)
 
 
 Cell = tuple[int, int]

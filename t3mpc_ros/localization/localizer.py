@@ -143,10 +143,7 @@ class LocalizerParameters(ParticleFilterParameters):
     )
     initial_pose: StartPoseParameters = group(StartPoseParameters)
     robot_radius: float = parameter(
-        0.1,
-        'smallest distance of the centre from an obstacle',
-        'm',
-        (0.0, 5.0),
+        0.1, 'smallest distance of the centre from an obstacle', 'm', (0.0, 5.0)
     )
     localized_deviation: float = parameter(
         0.15,
@@ -511,8 +508,7 @@ class Localizer:
         assert self.result is not None
         found = np.empty((beams.reading.size, 3))
         explain_readings(np.array(self.result.pose), self._field, beams, self._model, found)
-        telling: Array = found[found[:, 0] != 0.0]
-        return telling
+        return found[found[:, 0] != 0.0]
 
 
 def followed(share: float, fits: Array) -> float:

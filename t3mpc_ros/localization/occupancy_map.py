@@ -119,21 +119,10 @@ def map_of_world(world: World) -> LocalizationMap:
 def map_of_grid(
     occupancy: NDArray[np.int8], resolution: float, origin: tuple[float, float, float]
 ) -> LocalizationMap:
-    """Return the map of an occupancy grid, as of ``nav_msgs/OccupancyGrid``.
+    """Return the map of the cells of an :class:`.OccupancyGrid`.
 
-    Parameters
-    ----------
-    occupancy
-        0 (free) to 100 (occupied) percent, -1 unknown, shape (rows, columns), row by y.
-    resolution
-        Side of a cell, m.
-    origin
-        x, y (m) and yaw (rad) of the corner of the first cell; the yaw must be 0.
-
-    Raises
-    ------
-    MapError
-        A value is out of its range, or no cell is occupied.
+    ``origin`` is x, y (m) and yaw (rad) of the corner of the first cell; MapError: a value is out
+    of its range, the yaw is not 0, or no cell is occupied.
     """
     if occupancy.ndim != 2 or not 4 <= occupancy.size <= MAX_CELLS:
         raise MapError(f'the grid must have 4 to {MAX_CELLS} cells: got {occupancy.shape}')

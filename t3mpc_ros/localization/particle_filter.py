@@ -31,13 +31,7 @@ from numpy.typing import NDArray
 from t3mpc_ros.geometry.types import Array, Pose, wrap_angle
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.localization.occupancy_map import DistanceField
-from t3mpc_ros.localization.range_model import (
-    NAMES,
-    Beams,
-    RangeModel,
-    best_logarithm,
-    weigh,
-)
+from t3mpc_ros.localization.range_model import NAMES, Beams, RangeModel, best_logarithm, weigh
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
 CANDIDATES = 16
@@ -71,21 +65,13 @@ class ParticleFilterParameters(Parameters):
         0.001, 'variance of a turn per square of the turn', bounds=(0.0, 10.0), source=NAMES
     )
     alpha2: float = parameter(
-        0.001,
-        'variance of a turn per square of the travel',
-        'rad²/m²',
-        (0.0, 10.0),
-        source=NAMES,
+        0.001, 'variance of a turn per square of the travel', 'rad²/m²', (0.0, 10.0), source=NAMES
     )
     alpha3: float = parameter(
         0.005, 'variance of a travel per square of the travel', bounds=(0.0, 10.0), source=NAMES
     )
     alpha4: float = parameter(
-        0.0001,
-        'variance of a travel per square of the turn',
-        'm²/rad²',
-        (0.0, 10.0),
-        source=NAMES,
+        0.0001, 'variance of a travel per square of the turn', 'm²/rad²', (0.0, 10.0), source=NAMES
     )
     yaw_drift: float = parameter(
         1e-5,
@@ -282,11 +268,7 @@ class ParticleFilter:
         drawn = np.searchsorted(cumulative, generator.random(parameters.max_particles))
         bins = self._bins(self.poses)[np.minimum(drawn, len(self.poses) - 1)]
         count = needed_particles(
-            bins,
-            self._table,
-            parameters.pf_err,
-            parameters.pf_z,
-            parameters.min_particles,
+            bins, self._table, parameters.pf_err, parameters.pf_z, parameters.min_particles
         )
         added = round(lost * count)
         kept = max(count - added, 1)
@@ -317,8 +299,7 @@ class ParticleFilter:
         self._weigh(poses, logarithms, self._field, beams, self._search_model)
         cumulative = np.cumsum(np.exp(logarithms - logarithms.max()))
         comb = cumulative[-1] * (np.arange(count) + self._generator.random()) / count
-        found: Array = poses[np.minimum(np.searchsorted(cumulative, comb), len(poses) - 1)]
-        return found
+        return poses[np.minimum(np.searchsorted(cumulative, comb), len(poses) - 1)]
 
     def _bins(self, poses: Array) -> NDArray[np.int64]:
         """Return the number of the bin of each pose, shape (n,), from 0 on."""
@@ -374,8 +355,7 @@ class ParticleFilter:
     def spread(self, pose: Pose) -> Array:
         """Return the mean square distance of all particles from a pose, shape (3, 3)."""
         gap = self._gaps(pose)
-        found: Array = gap.T @ (gap * self.weights[:, None])
-        return found
+        return gap.T @ (gap * self.weights[:, None])
 
     def _gaps(self, pose: Pose) -> Array:
         """Return the particles less a pose, yaw wrapped, shape (n, 3)."""

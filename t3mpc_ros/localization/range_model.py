@@ -104,16 +104,7 @@ class RangeModel(NamedTuple):
     @classmethod
     def of(cls, parameters: RangeModelParameters, radius: float) -> 'RangeModel':
         """Return the model of a table."""
-        return cls(
-            parameters.z_hit,
-            parameters.z_short,
-            parameters.z_max,
-            parameters.z_rand,
-            parameters.sigma_hit,
-            parameters.sigma_hit_growth,
-            parameters.lambda_short,
-            radius,
-        )
+        return cls(**vars(parameters), radius=radius)
 
 
 class Beams(NamedTuple):

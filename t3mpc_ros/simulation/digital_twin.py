@@ -254,13 +254,8 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
         if stale := self._limiter.staleness(command, now_ns):
             return stale
         faults = self._faults
-        self._channel.send(
-            command,
-            now_ns,
-            self._parameters.drive.dead_time + faults.command_delay,
-            faults.command_jitter,
-            faults.command_loss,
-        )
+        delay = self._parameters.drive.dead_time + faults.command_delay
+        self._channel.send(command, now_ns, delay, faults.command_jitter, faults.command_loss)
         return ''
 
     # -- simulation only --------------------------------------------------------------------------
@@ -305,20 +300,10 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
     def warm_up(self) -> None:
         """Compile every kernel of a step, on a separate robot."""
         DigitalTwin(self._parameters).step(interface.ZERO_WHEEL_SPEEDS)
-        world = load_world('room')
-        clearance(0.0, 0.0, world.segments, world.circles)
+        world, count = load_world('room'), len(self._mounts)
+        clearance(0.0, 0.0, *world.obstacles)
         grip_at(0.0, 0.0, world.patches)
-        which = np.arange(self._mounts.shape[0])
-        cast_rays(
-            0.0,
-            0.0,
-            0.0,
-            self._mounts,
-            which,
-            world.segments,
-            world.circles,
-            np.empty(self._mounts.shape[0]),
-        )
+        cast_rays(0.0, 0.0, 0.0, self._mounts, np.arange(count), *world.seen, np.empty(count))
 
     # -- simulation step --------------------------------------------------------------------------
 
@@ -442,14 +427,8 @@ class DigitalTwin(FixedStepRobot[DigitalTwinParameters]):
             return  # the readings cannot change
         due = self._ranges.due(dt)
         if due and not empty:
-            cast_rays(
-                *self._drivetrain.pose,
-                self._mounts,
-                np.array(due),
-                world.segments,
-                world.circles,
-                self._distances,
-            )
+            pose, which = self._drivetrain.pose, np.array(due)
+            cast_rays(*pose, self._mounts, which, *world, self._distances)
         for sensor in due:
             self._ranges.measure(sensor, float(self._distances[sensor]))
 

@@ -123,10 +123,7 @@ class ScheduleError(ScriptError):
 class FaultEvent:
     """One entry of a schedule: a value of a fault for a time interval.
 
-    Raises
-    ------
-    ScheduleError
-        The fault does not exist, or value or time is out of range.
+    ScheduleError: the fault does not exist, or value or time is out of range.
     """
 
     at: float
@@ -170,14 +167,7 @@ class FaultSchedule:
     An event is active from its start up to, but not including, its end. Of several events of one
     fault the one with the latest start applies; when it ends, the next one that is still active
     applies, and finally the dynamic value. Of two with the same start the later in the list
-    applies.
-
-    Parameters
-    ----------
-    events
-        In any order.
-    name
-        Name of the schedule, for messages.
+    applies. ``name`` is for messages.
     """
 
     def __init__(self, events: Iterable[FaultEvent] = (), name: str = '') -> None:
@@ -198,12 +188,7 @@ class FaultSchedule:
         """Return the faults that are active ``elapsed`` seconds after the start of the robot.
 
         Faults without an active event are as in ``dynamic``. The result depends on the arguments
-        alone, not on earlier calls.
-
-        Raises
-        ------
-        ValueError
-            ``elapsed`` is not a number, or infinite.
+        alone, not on earlier calls. ValueError: ``elapsed`` is not finite.
         """
         if not self._since <= elapsed < self._until:
             self._evaluate(elapsed)

@@ -95,18 +95,8 @@ class LinkDelay(NamedTuple):
 class PlantRobot:
     """A plant behind the robot interface; a command acts from the step at which it has arrived.
 
-    A command that arrives after a later one is ignored.
-
-    Parameters
-    ----------
-    plant, parameters
-        A new plant, and the true robot, which gives rate, steps and geometry.
-    changed, change_ns
-        The robot from ``change_ns`` on; None if it does not change.
-    link
-        Faults of the commands.
-    seed
-        Of the numbers that the link draws.
+    A command that arrives after a later one is ignored. From ``change_ns`` on the robot is
+    ``changed``; ``seed`` is that of the numbers that the link draws.
     """
 
     def __init__(

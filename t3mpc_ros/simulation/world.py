@@ -29,6 +29,7 @@ import numpy as np
 import numpy.typing as npt
 
 from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.path_timing import lengths_along
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters import yaml_checks
@@ -80,7 +81,7 @@ class MovingDisc(NamedTuple):
 
     def position(self, time: float) -> tuple[float, float]:
         """Return where its centre is at a time (s), m."""
-        lengths = np.append(0.0, np.cumsum(np.hypot(*np.diff(self.points, axis=0).T)))
+        lengths = lengths_along(self.points)
         along, whole = max(time - self.start, 0.0) * self.speed, float(lengths[-1])
         if self.repeat and whole > 0.0:
             along = whole - abs(along % (2.0 * whole) - whole)
@@ -268,30 +269,32 @@ def _world(content: object, stem: str) -> World:
     way = 'radius', 'points', 'speed'
     options = 'start', 'appears', 'vanishes', 'repeat', 'unseen'
     moving = [_moving(*each) for each in _entries(read, 'moving', MAX_MOVING, way, *options)]
-    patches = [
-        (
-            *_disc(where, each),
-            yaml_checks.check_number(each['grip'], f'{where}.grip', 0.0, 1.0),
-        )
-        for where, each in _entries(read, 'patches', MAX_PATCHES, (*disc, 'grip'))
-    ]
-    chargers = [
-        (
-            *_disc(where, each),
-            yaml_checks.check_number(each['current'], f'{where}.current', 0.0, MAX_CURRENT, 'A'),
-        )
-        for where, each in _entries(read, 'chargers', MAX_CHARGERS, (*disc, 'current'))
-    ]
+    patches = _floor(read, 'patches', MAX_PATCHES, 'grip', 1.0)
+    chargers = _floor(read, 'chargers', MAX_CHARGERS, 'current', MAX_CURRENT, 'A')
     return World(
         name,
         segments,
         _rows(circles, 3),
-        _rows(patches, 4),
+        patches,
         _rows(boxes, 5),
         Obstacles(unseen, _rows(hidden, 3)),
         tuple(moving),
-        _rows(chargers, 4),
+        chargers,
     )
+
+
+def _floor(
+    read: dict[str, Any], name: str, count: int, key: str, most: float, unit: str = ''
+) -> Array:
+    """Return discs on the floor, and a number of each from 0 to ``most``, shape (k, 4)."""
+    rows = [
+        (
+            *_disc(where, each),
+            yaml_checks.check_number(each[key], f'{where}.{key}', 0.0, most, unit),
+        )
+        for where, each in _entries(read, name, count, ('center', 'radius', key))
+    ]
+    return _rows(rows, 4)
 
 
 def _flag(read: dict[str, Any], where: str, key: str) -> bool:
@@ -321,8 +324,7 @@ def _without(rows: Array, others: Array) -> Array:
     """Return the rows that are none of the others; the same array where there are no others."""
     if not len(others):
         return rows
-    kept: Array = rows[~(rows[:, None, :] == others[None, :, :]).all(axis=2).any(axis=1)]
-    return kept
+    return rows[~(rows[:, None, :] == others[None, :, :]).all(axis=2).any(axis=1)]
 
 
 def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:

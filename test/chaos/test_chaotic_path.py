@@ -37,8 +37,7 @@ def _points(seed, length=60.0, **values):
 
 
 @pytest.mark.parametrize(
-    'arena, blend',
-    few_of([(SQUARE, 0.0), (TRIANGLE, 2.0), (SQUARE, 2.0), (TRIANGLE, 0.0)], 2),
+    'arena, blend', few_of([(SQUARE, 0.0), (TRIANGLE, 2.0), (SQUARE, 2.0), (TRIANGLE, 0.0)], 2)
 )
 @pytest.mark.slow
 def test_path_is_continuous_within_the_arena(arena, blend):

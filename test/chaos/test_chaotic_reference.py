@@ -74,8 +74,7 @@ def test_wheels_are_the_selected_scaled_states():
 
 @pytest.mark.compiled
 @pytest.mark.parametrize(
-    'output, blend',
-    few_of([('body', 0.0), ('wheels', 4.0), ('wheels', 0.0), ('body', 4.0)], 2),
+    'output, blend', few_of([('body', 0.0), ('wheels', 4.0), ('wheels', 0.0), ('body', 4.0)], 2)
 )
 @pytest.mark.slow
 def test_rate_is_the_derivative_of_the_wheels_away_from_jumps(output, blend):

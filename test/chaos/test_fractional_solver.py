@@ -71,12 +71,7 @@ def diethelm(order, slope, step, initial, steps):
 def hyperchaos(y):
     y1, y2, y3, y4 = y
     return np.array(
-        [
-            35 * (y2 * y3 + y2 - y1),
-            -5 * y1 * y3 + 25 * y1 + y2 + y4,
-            -4 * y3 + y1 * y2,
-            -100 * y2,
-        ]
+        [35 * (y2 * y3 + y2 - y1), -5 * y1 * y3 + 25 * y1 + y2 + y4, -4 * y3 + y1 * y2, -100 * y2]
     )
 
 

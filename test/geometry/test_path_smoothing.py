@@ -69,8 +69,7 @@ def deviation(timed, points):
     driven = np.column_stack([timed.x, timed.y])
     dense = np.vstack([points, resample(points, 0.01)])
     return max(
-        distance_to_path(driven[::3], points).max(),
-        distance_to_path(dense, driven[::3]).max(),
+        distance_to_path(driven[::3], points).max(), distance_to_path(dense, driven[::3]).max()
     )
 
 

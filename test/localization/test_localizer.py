@@ -603,14 +603,9 @@ def test_a_correction_is_no_contact(x, y):
     frame, touches = ORIGIN, []
     for k in range(8500):
         phase = k // 200 % 6
-        wanted = [
-            (0.3, 0.0),
-            (0.0, 2.0),
-            (0.011, 1.2),
-            (0.1, 0.5),
-            (0.02, 0.0),
-            (0.04, 2.0),
-        ][phase]
+        wanted = [(0.3, 0.0), (0.0, 2.0), (0.011, 1.2), (0.1, 0.5), (0.02, 0.0), (0.04, 2.0)][
+            phase
+        ]
         step = [min(max(w - n, -a), a) for w, n, a in zip(wanted, now, (0.01, 0.14), strict=True)]
         now = BodyTwist(now.linear + step[0], now.angular + step[1])
         pose = advance_pose(pose, now, 0.01)

@@ -18,13 +18,7 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.simulation.world import (
-    cast_ray,
-    cast_rays,
-    clearance,
-    grip_at,
-    parse_world,
-)
+from t3mpc_ros.simulation.world import cast_ray, cast_rays, clearance, grip_at, parse_world
 
 NO_SEGMENTS, NO_CIRCLES = np.zeros((0, 4)), np.zeros((0, 3))
 SQUARE = np.array([[-1.0, -1, 1, -1], [1, -1, 1, 1], [1, 1, -1, 1], [-1, 1, -1, -1]])

@@ -577,10 +577,7 @@ def rotor_torques(
 
 @kernel
 def change_tyre_modes(
-    arrays: DrivetrainArrays,
-    constants: DrivetrainConstants,
-    tyres: Array,
-    obstacles: Obstacles,
+    arrays: DrivetrainArrays, constants: DrivetrainConstants, tyres: Array, obstacles: Obstacles
 ) -> None:
     """Let tyres roll or slide after a step, with the torques of its last stage."""
     state, modes, work, body = arrays.state, arrays.modes, arrays.work, constants.body
