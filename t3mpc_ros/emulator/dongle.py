@@ -25,12 +25,9 @@ from t3mpc_ros.emulator.firmware_library import Board
 from t3mpc_ros.emulator.radio_channel import RadioChannel, RadioParameters
 from t3mpc_ros.radio.protocol.frames import PAYLOAD_LIMIT
 
-SEND_US = 140.0
-"""Delay from the decision to send to the start of the exchange."""
-FINISH_US = 60.0
-"""Delay from the end of an exchange until the firmware has read its outcome."""
-ENCODE_US = 270.0
-"""Delay from there to the first byte of the RESULT."""
+SEND_US = 140.0  # delay from the decision to send to the start of the exchange
+FINISH_US = 60.0  # delay from the end of an exchange until the firmware has read its outcome
+ENCODE_US = 270.0  # delay from there to the first byte of the RESULT
 _POWER_ON_RESET = 1
 _SERIAL_ROOM = 4096
 _WORD = 0xFFFFFFFF

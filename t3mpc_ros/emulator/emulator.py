@@ -32,8 +32,7 @@ from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parame
 from t3mpc_ros.radio.protocol.frames import RATES, Command
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 
-_EXTERNAL_RESET, _BROWN_OUT_RESET = 2, 4
-"""Reset flags as in the MCUSR register of an AVR."""
+_EXTERNAL_RESET, _BROWN_OUT_RESET = 2, 4  # reset flags as in the MCUSR register of an AVR
 _ROBOT_BOOT_LOADER_NS = NANOSECONDS
 _CONSOLE_PERIOD_US = 500.0
 """Period at which the board is advanced while its console is busy, to reply in time."""
@@ -121,8 +120,7 @@ class Emulator:
         self.board.on_settings = self._follow_settings
         self._follow_settings(self.board.radio_settings)
         self._boot_ns = now_ns
-        self._robot_off = False
-        """Whether the robot board is without power or in its boot loader."""
+        self._robot_off = False  # whether the robot board is without power or in its boot loader
         self.dongle = Dongle(
             self._events,
             self._channel,
@@ -138,8 +136,7 @@ class Emulator:
         self._from_console = SerialLine(self._events, no_faults, self._deliver_from_console)
         self._console_output: list[tuple[int, bytes]] = []
         self.board.on_console = self._from_console.send
-        self.port_open = True
-        """Whether the dongle is plugged in."""
+        self.port_open = True  # whether the dongle is plugged in
         self.port_number = 0
         """Number of the device; increments when the dongle changes its device name."""
 

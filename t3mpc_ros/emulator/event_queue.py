@@ -17,8 +17,7 @@ from collections.abc import Callable
 import heapq
 from itertools import count
 
-MICROSECOND = 1000
-"""ns"""
+MICROSECOND = 1000  # ns
 
 Callback = Callable[[], None]
 

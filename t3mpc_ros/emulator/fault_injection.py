@@ -27,19 +27,14 @@ class FaultKind(NamedTuple):
     """A kind of fault with its default value and duration."""
 
     name: str
-    value: float
-    """Default value; NaN: the fault takes no value."""
-    high: float
-    """Upper bound of the value; the lower bound is 0."""
-    text: str
-    """Effect of the fault and meaning of its value."""
-    duration: float = math.inf
-    """Default duration, s."""
+    value: float  # default value; NaN: the fault takes no value
+    high: float  # upper bound of the value; the lower bound is 0
+    text: str  # effect of the fault and meaning of its value
+    duration: float = math.inf  # default duration, s
 
 
 _NO_VALUE = math.nan
-_INSTANT = 1e-3
-"""s"""
+_INSTANT = 1e-3  # s
 FAULT_KINDS = (
     FaultKind('drop_bytes', 0.002, 1.0, 'share of bytes on the serial line that are lost'),
     FaultKind('flip_bits', 0.002, 1.0, 'share of bytes on the serial line with one bit inverted'),
@@ -75,12 +70,9 @@ class Fault(NamedTuple):
     """A fault with start, duration and value."""
 
     name: str
-    at: float
-    """Start, s."""
-    duration: float = math.nan
-    """s; NaN: the default of the kind."""
-    value: float = math.nan
-    """NaN: the default of the kind."""
+    at: float  # start, s
+    duration: float = math.nan  # s; NaN: the default of the kind
+    value: float = math.nan  # NaN: the default of the kind
 
 
 def parse_fault(text: str) -> Fault:

@@ -36,8 +36,7 @@ from t3mpc_ros.simulation.sensors.imu import SimulatedImu
 from t3mpc_ros.simulation.sensors.range_sensor import NOT_CONVERTED, SimulatedRangeSensors
 from t3mpc_ros.simulation.world import cast_rays, clearance, grip_at, load_world
 
-_SAMPLE_STEPS = 5
-"""Integration steps (1 ms) between two samples of the sensors."""
+_SAMPLE_STEPS = 5  # integration steps (1 ms) between two samples of the sensors
 _ADC_FULL_SCALE = 20_000
 """Full scale of the battery measurement, mV: 5 V behind a voltage divider by four."""
 _ADC_COUNTS = 1024
@@ -80,19 +79,16 @@ class Plant:
         self._world = load_world(parameters.world)
         self._mounts = sensor_mounts(parameters.range_sensor)
         self._distances = np.full(len(RANGE_SENSORS), math.inf)
-        self._pending_steps = 0.0
-        """Integration steps still to run, a fraction of one."""
+        self._pending_steps = 0.0  # integration steps still to run, a fraction of one
         self._issued = [0.0, 0.0]
         """Pulses issued since boot with the fraction of the next, left first."""
         self._powered = False
         self._field_work = 0.0
         self._measured_at = 0
-        self.elapsed = 0.0
-        """True time since the start, s."""
+        self.elapsed = 0.0  # true time since the start, s
         self.stopped_at: float | None = None
         """Value of :attr:`elapsed` at the last motor pulse; None while the motors turn."""
-        self.imu_absent = False
-        """Whether the IMU does not respond."""
+        self.imu_absent = False  # whether the IMU does not respond
         self.battery_wire_broken = False
         """Whether the wire from the battery to its divider is broken."""
         self._build_drivetrain(parameters.motor, None)

@@ -32,8 +32,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS
 _POLL_PERIOD_NS = NANOSECONDS // 50
 _CONSOLE_POLL_PERIOD_NS = NANOSECONDS // 1000
 """Longest time between two updates of the emulator, and between two checks for a client."""
-_MAX_SLEEP = 0.1
-"""Longest interruption of the process that virtual time catches up with, s."""
+_MAX_SLEEP = 0.1  # longest interruption of the process that virtual time catches up with, s
 
 
 class PtyPortError(Exception):
@@ -173,8 +172,7 @@ class _ConsolePort:
         self._emulator = emulator
         self._port = port
         self._restart_on_open = restart_on_open
-        self.connected = False
-        """Whether a client has the port open."""
+        self.connected = False  # whether a client has the port open
 
     def update(self, now_ns: int) -> None:
         received = self._port.wait(0.0)

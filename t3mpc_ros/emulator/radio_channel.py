@@ -27,17 +27,14 @@ from typing import NamedTuple
 from t3mpc_ros.emulator.event_queue import MICROSECOND, EventQueue
 from t3mpc_ros.emulator.fault_injection import FaultInjection
 
-SETTLE_US = 130.0
-"""Transmitter settling time, standby to first bit."""
+SETTLE_US = 130.0  # transmitter settling time, standby to first bit
 _BITS_PER_US = (0.25, 1.0, 2.0)
-_OVERHEAD = 1 + 5 + 2
-"""Bytes of preamble, address and CRC."""
+_OVERHEAD = 1 + 5 + 2  # bytes of preamble, address and CRC
 _CONTROL_BITS = 9
 _DELAY_UNIT_US = 250.0
 _CAPTURE_SHARE = 0.5
 """Share of simultaneous acknowledgements of which one is received, the stronger one; assumed."""
-_LONGEST_NS = 2_000_000
-"""No packet is longer."""
+_LONGEST_NS = 2_000_000  # no packet is longer
 
 ExchangeCallback = Callable[[bool, int, bytes], None]
 """Called with: acknowledged, number of retransmissions, payload of the acknowledgement."""
@@ -92,8 +89,7 @@ class Medium:
 
     def __init__(self, now_ns: int = 0, seed: int = 1) -> None:
         self.events = EventQueue(now_ns)
-        self.channels: list[RadioChannel] = []
-        """Of all robots."""
+        self.channels: list[RadioChannel] = []  # of all robots
         self._generator = random.Random(f'capture {seed}')
         self._transmissions: list[Transmission] = []
 
@@ -143,8 +139,7 @@ class RadioChannel:
     ) -> None:
         self.medium = medium
         medium.channels.append(self)
-        self.robot = robot
-        """Configuration of the robot's transceiver, which follows its settings."""
+        self.robot = robot  # configuration of the robot's transceiver, which follows its settings
         self._advance_robot = advance_robot
         self._deliver = deliver
         self._faults = faults
@@ -200,8 +195,7 @@ class _Exchange:
         self._payload = payload
         self._radio = radio
         self._done = done
-        self._received: set[RadioChannel] = set()
-        """Channels whose robot has received the packet."""
+        self._received: set[RadioChannel] = set()  # channels whose robot has received the packet
         self._retransmissions = 0
 
     def transmit(self, delay_us: float) -> None:

@@ -26,8 +26,7 @@ from t3mpc_ros.emulator.plant import Plant
 from t3mpc_ros.radio.protocol.codec import decode_downlink
 from t3mpc_ros.radio.protocol.frames import PAYLOAD_LIMIT, Command, StatusFlag
 
-CELL_US = 3_400
-"""Time to erase and write one EEPROM cell of an AVR."""
+CELL_US = 3_400  # time to erase and write one EEPROM cell of an AVR
 UNPOWERED_US = 20_000
 """Longest time between two samples of the sensors while the motors have no power."""
 _LEFT, _RIGHT = 0, 1
@@ -99,8 +98,7 @@ class RobotBoard:
 
         ``reset_cause``: reset flags as in the MCUSR register of an AVR.
         """
-        self.now_us = 0
-        """Time since boot, without the wrap to 32 bits."""
+        self.now_us = 0  # time since boot, without the wrap to 32 bits
         self.sense()
         self._board.call('boot', reset_cause, 0)
         self._plant.boot(self._board.call('microsteps'))

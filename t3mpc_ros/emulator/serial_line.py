@@ -19,8 +19,7 @@ from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import FaultInjection
 from t3mpc_ros.geometry.types import NANOSECONDS
 
-BYTE_NS = 20_000
-"""Ten bits at 500 000 baud."""
+BYTE_NS = 20_000  # ten bits at 500 000 baud
 _SPLIT_NS = 2_000_000
 
 
@@ -43,8 +42,7 @@ class SerialLine:
         self._deliver = deliver
         self._byte_ns = byte_ns
         self._busy_until_ns = 0
-        self._held = b''
-        """Frame that the ``reorder`` fault sends after the next one."""
+        self._held = b''  # frame that the ``reorder`` fault sends after the next one
         self._generation = 0
 
     def clear(self) -> None:

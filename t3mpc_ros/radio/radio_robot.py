@@ -30,20 +30,13 @@ from t3mpc_ros.radio.link.port_actions import LinkState, PortAction
 from t3mpc_ros.radio.link.standstill_reasons import ANSWERS_AGAIN, ROBOT_SILENT, restarted
 from t3mpc_ros.radio.link.statistics import LinkQuality
 from t3mpc_ros.radio.link.telemetry import Telemetry
-from t3mpc_ros.robot import interface
+from t3mpc_ros.robot import command_limiter, interface
 from t3mpc_ros.robot.calibration import CalibrationParameters
-from t3mpc_ros.robot.command_limiter import (
-    SLIP_STOP_REASON,
-    CommandLimiter,
-    CommandLimiterParameters,
-    SlipMonitor,
-)
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
 
 _COASTING_DECELERATION = 0.5
 """Least deceleration of a robot whose motors lost their power, m/s², assumed."""
-_RESTART_WARNING_NS = 10 * NANOSECONDS
-"""Time for which a restart is reported."""
+_RESTART_WARNING_NS = 10 * NANOSECONDS  # time for which a restart is reported
 UNKNOWN_STATUS = interface.RobotStatus(
     enabled=False, moving=False, estop=False, timed_out=False, limited=False, imu_fault=True
 )
@@ -55,7 +48,9 @@ class RadioRobotParameters(Parameters):
     """Parameters of the real robot on the host."""
 
     geometry: WheelGeometry = group(WheelGeometry, inline=True)
-    limiter: CommandLimiterParameters = group(CommandLimiterParameters, inline=True)
+    limiter: command_limiter.CommandLimiterParameters = group(
+        command_limiter.CommandLimiterParameters, inline=True
+    )
     # The delay is that of the low-pass filter that the board sets.
     odometry: GyroOdometryParameters = group(GyroOdometryParameters, fixed=('gyro_delay',))
     link: LinkParameters = group(LinkParameters)
@@ -105,11 +100,10 @@ class RadioRobot(interface.RobotInterface):
         entropy: Callable[[int], bytes] = secrets.token_bytes,
     ) -> None:
         self._parameters = parameters
-        self.link = Link(parameters.link, key, entropy)
-        """Connection to the robot."""
-        self._limiter = CommandLimiter(parameters.limiter, parameters.geometry)
+        self.link = Link(parameters.link, key, entropy)  # connection to the robot
+        self._limiter = command_limiter.CommandLimiter(parameters.limiter, parameters.geometry)
         self._odometry = GyroOdometry(parameters.odometry, parameters.geometry)
-        self._slip_monitor = SlipMonitor()
+        self._slip_monitor = command_limiter.SlipMonitor()
         self._period_ns = round(NANOSECONDS / parameters.link.cycle_rate)
         self._ttl_ns = round(NANOSECONDS * parameters.link.ttl)
         self._next_ns = 0
@@ -120,10 +114,8 @@ class RadioRobot(interface.RobotInterface):
         self.unknown_travel = 0.0
         """Sum of the greatest path lengths that restarts in motion left unmeasured, m."""
         self._limited = False
-        self._silence = ''
-        """Reason of a stop for a robot that does not answer; empty when it does."""
-        self._expiry_ns = 0
-        """Time at which the robot stops by itself without another command."""
+        self._silence = ''  # reason of a stop for a robot that does not answer; empty when it does
+        self._expiry_ns = 0  # time at which the robot stops by itself without another command
         self._commanded = interface.ZERO_WHEEL_SPEEDS
         self._new_states: deque[interface.RobotState] = deque(maxlen=1024)
         self._state = self._initial_state()
@@ -181,7 +173,7 @@ class RadioRobot(interface.RobotInterface):
     def apply(self, command: interface.RobotCommand, now_ns: int) -> str:
         """Follow ``command`` from the next cycle on; return the reason for a rejection."""
         if self._slip_monitor.rejects(command, now_ns / NANOSECONDS):
-            return SLIP_STOP_REASON
+            return command_limiter.SLIP_STOP_REASON
         return self._limiter.accept(command, now_ns)
 
     def advance(self, now_ns: int) -> interface.RobotState:
@@ -277,7 +269,7 @@ class RadioRobot(interface.RobotInterface):
         slipping_for = self._odometry.slipping_for
         now = self._now_ns / NANOSECONDS
         if self._slip_monitor.update(slipping_for, self._parameters.slip_stop, now):
-            self._limiter.stop(SLIP_STOP_REASON, self._now_ns)
+            self._limiter.stop(command_limiter.SLIP_STOP_REASON, self._now_ns)
         self._state = self._make_state(telemetry)
         self._new_states.append(self._state)
 

@@ -28,10 +28,8 @@ from typing import NoReturn
 
 import serial
 
-BAUD_RATE = 500_000
-"""Exact on a 16 MHz AVR, and a standard rate of Linux."""
-_WRITE_TIMEOUT = 0.1
-"""s; a complete transaction takes 2 ms on the line"""
+BAUD_RATE = 500_000  # exact on a 16 MHz AVR, and a standard rate of Linux
+_WRITE_TIMEOUT = 0.1  # s; a complete transaction takes 2 ms on the line
 _PORT_ERRORS = (OSError, termios.error, ValueError, TypeError)
 
 
@@ -46,8 +44,7 @@ class PortError(Exception):
 
     def __init__(self, text: str, absent: bool) -> None:
         super().__init__(text)
-        self.absent = absent
-        """Whether the device does not exist, so that retries are cheap."""
+        self.absent = absent  # whether the device does not exist, so that retries are cheap
 
 
 class SerialPort:

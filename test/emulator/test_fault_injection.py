@@ -15,20 +15,17 @@
 
 import pytest
 
-from t3mpc_ros.emulator.fault_injection import (
-    FAULT_KINDS,
-    Fault,
-    FaultError,
-    FaultInjection,
-    check_fault,
-    parse_fault,
-)
+from t3mpc_ros.emulator import fault_injection
 
 
 def test_a_fault_is_written_as_name_time_duration_value():
-    assert parse_fault('jam:5:1.0') == Fault('jam', 5.0, 1.0, parse_fault('jam:5').value)
-    assert parse_fault('loss:5:inf:0.3') == Fault('loss', 5.0, float('inf'), 0.3)
-    assert parse_fault('robot_reset:2').duration == 0.5
+    assert fault_injection.parse_fault('jam:5:1.0') == fault_injection.Fault(
+        'jam', 5.0, 1.0, fault_injection.parse_fault('jam:5').value
+    )
+    assert fault_injection.parse_fault('loss:5:inf:0.3') == fault_injection.Fault(
+        'loss', 5.0, float('inf'), 0.3
+    )
+    assert fault_injection.parse_fault('robot_reset:2').duration == 0.5
 
 
 @pytest.mark.parametrize(
@@ -46,21 +43,21 @@ def test_a_fault_is_written_as_name_time_duration_value():
     ],
 )
 def test_an_invalid_fault_is_rejected_with_a_reason(text, words):
-    with pytest.raises(FaultError, match=words):
-        parse_fault(text)
+    with pytest.raises(fault_injection.FaultError, match=words):
+        fault_injection.parse_fault(text)
 
 
 def test_every_fault_has_valid_defaults():
-    for kind in FAULT_KINDS:
-        assert check_fault(Fault(kind.name, 0.0)).duration > 0.0
+    for kind in fault_injection.FAULT_KINDS:
+        assert fault_injection.check_fault(fault_injection.Fault(kind.name, 0.0)).duration > 0.0
 
 
 def test_of_two_faults_of_a_kind_the_later_one_holds():
     """A link that always loses a little gets much worse for a second, then is as before."""
     now_ns = 0
-    faults = FaultInjection(lambda: now_ns, seed=1)
+    faults = fault_injection.FaultInjection(lambda: now_ns, seed=1)
     for text in ('loss:1:10:0.1', 'loss:3:1:0.9', 'loss:20:1:0.5'):
-        faults.add(parse_fault(text), 0)
+        faults.add(fault_injection.parse_fault(text), 0)
     values = []
     for seconds in (0, 1, 2, 3, 3.5, 4, 5, 11, 20.5):
         now_ns = round(seconds * 1e9)

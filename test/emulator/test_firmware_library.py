@@ -20,11 +20,6 @@ import pytest
 
 from t3mpc_ros.cli import emulator as emulator_cli
 from t3mpc_ros.emulator import firmware_library
-from t3mpc_ros.emulator.firmware_library import (
-    CompilerMissingError,
-    FirmwareLibraryError,
-    compile_library,
-)
 
 SLOW_COMPILER = """#!/bin/sh
 while [ "$1" != -o ]; do shift; done
@@ -56,14 +51,16 @@ def test_without_compiler_the_command_names_what_to_install(monkeypatch, tmp_pat
     error = capsys.readouterr().err
     assert 'not found: cc, gcc, clang. Install one (sudo apt install gcc' in error
     monkeypatch.setenv('CC', 'no-such-compiler')
-    with pytest.raises(CompilerMissingError, match='not found: no-such-compiler'):
-        compile_library()
+    with pytest.raises(firmware_library.CompilerMissingError, match='not found: no-such-compiler'):
+        firmware_library.compile_library()
 
 
 def test_a_failing_compiler_is_quoted_and_leaves_nothing(monkeypatch, tmp_path, no_library):
     use_compiler(monkeypatch, tmp_path / 'cc', '#!/bin/sh\necho stdint.h: not found >&2\nexit 1\n')
-    with pytest.raises(FirmwareLibraryError, match=r'libc6-dev\): got\nstdint.h: not found'):
-        compile_library()
+    with pytest.raises(
+        firmware_library.FirmwareLibraryError, match=r'libc6-dev\): got\nstdint.h: not found'
+    ):
+        firmware_library.compile_library()
     assert [path for path in no_library.rglob('*') if path.is_file()] == []
 
 
@@ -72,21 +69,21 @@ def test_processes_that_start_together_never_load_half_a_library(
 ):
     use_compiler(monkeypatch, tmp_path / 'cc', SLOW_COMPILER)
     with ThreadPoolExecutor() as pool:
-        first = pool.submit(compile_library)
+        first = pool.submit(firmware_library.compile_library)
         while not list(no_library.rglob('*.so')):
             assert not first.done()
-        assert compile_library().read_text() == 'begin,end'
+        assert firmware_library.compile_library().read_text() == 'begin,end'
         assert first.result().read_text() == 'begin,end'
 
 
 def test_a_changed_source_is_compiled_again(monkeypatch, tmp_path):
     use_compiler(monkeypatch, tmp_path / 'cc', SLOW_COMPILER)
-    first = compile_library()
+    first = firmware_library.compile_library()
     copy = tmp_path / 'firmware'
     for part in ('core', 'host'):
         shutil.copytree(firmware_library.FIRMWARE / part, copy / part)
     monkeypatch.setattr(firmware_library, 'FIRMWARE', copy)
-    assert compile_library() == first
+    assert firmware_library.compile_library() == first
     with (copy / 'core' / 't3_robot.h').open('a') as header:
         header.write('\n')
-    assert compile_library() != first
+    assert firmware_library.compile_library() != first

@@ -24,10 +24,8 @@ from t3mpc_ros.emulator.emulator import StopTimeMonitor
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.radio.link.port_actions import LinkState
 
-SPEED = 10.0
-"""Both wheels at their maximum, rad/s."""
-REST = 0.45
-"""Maximum time to rest, s."""
+SPEED = 10.0  # both wheels at their maximum, rad/s
+REST = 0.45  # maximum time to rest, s
 
 
 def driving(seconds=1.5, **given):

@@ -31,10 +31,8 @@ from t3mpc_ros.radio.protocol.frames import Command, Poll, Refusal, Transmit
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 
 STEP = math.tau / 3200
-HALF_STEP = 0.035 * math.tau / 400
-"""m"""
-REST = 0.45
-"""s after the last executed command"""
+HALF_STEP = 0.035 * math.tau / 400  # m
+REST = 0.45  # s after the last executed command
 NEEDS_TOOLS = needing(*AVR)
 LONG_AVR = pytest.param('avr', marks=[NEEDS_TOOLS, pytest.mark.long])
 KEY = bytes(range(16))

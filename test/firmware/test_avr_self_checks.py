@@ -23,12 +23,9 @@ from t3mpc_ros.radio.protocol.framing import encode_frame
 
 pytestmark = needing(*AVR)
 
-LINE_RATE = 50_000
-"""Bytes per second."""
-TTL = 0.2
-"""s"""
-MCUSR, WDTCSR = 0x54, 0x60
-"""Data addresses of both chips."""
+LINE_RATE = 50_000  # bytes per second
+TTL = 0.2  # s
+MCUSR, WDTCSR = 0x54, 0x60  # data addresses of both chips
 WATCHDOG_RESET = WATCHDOG_RUNS = 8
 
 

@@ -21,61 +21,38 @@ import statistics
 from typing import Any
 
 import pytest
-from support.avr_boards import (
-    GAP,
-    ROBOT,
-    SETTINGS_ADDRESSES,
-    Boards,
-    build,
-    console_output,
-    cycle,
-    odometry_agrees,
-    request,
-    settings_record,
-)
+from support import avr_boards
 from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.radio.protocol import codec
+from t3mpc_ros.radio.protocol import codec, frames
 from t3mpc_ros.radio.protocol.authentication import Signer, key_check, session_key, sign_hello
-from t3mpc_ros.radio.protocol.frames import (
-    BUSY,
-    KEY_DAMAGED,
-    KEY_HELD,
-    NO_KEY,
-    OK,
-    Hello,
-    Info,
-    Key,
-    KeyState,
-    Ping,
-    Poll,
-)
 from t3mpc_ros.radio.protocol.framing import crc16, encode_frame
 
 pytestmark = needing(*AVR)
 
 KEY, OTHER = bytes(range(0x80, 0x90)), bytes(range(0x30, 0x40))
 KEY_ADDRESS, MARK_ADDRESS = 8, 26
-WRITING = 0.3
-"""Sufficient time to write a key, s: about 25 cells of 3.4 ms."""
+WRITING = 0.3  # sufficient time to write a key, s: about 25 cells of 3.4 ms
 HOST_NONCE = b'hostnonc'
 
 
-def begin_session(boards: Boards, key: bytes, gap: int = 20) -> Signer | None:
+def begin_session(boards: avr_boards.Boards, key: bytes, gap: int = 20) -> Signer | None:
     """Begin a signed session; return its signer, None if the robot rejects it."""
     host_us = round(boards.now_us)
     hello = sign_hello(key, boards.session, 0, host_us, HOST_NONCE)
-    info = boards.request(hello, Poll(0, 1, 2), gap)
-    assert isinstance(info, Info)
+    info = boards.request(hello, frames.Poll(0, 1, 2), gap)
+    assert isinstance(info, frames.Info)
     boards.seq = 0
-    boards.request(Poll(0, 0, 0))  # for its time: the first echo
+    boards.request(frames.Poll(0, 0, 0))  # for its time: the first echo
     if info.session != boards.session:
         return None
     return Signer(session_key(key, HOST_NONCE, info.nonce), host_us)
 
 
-def signed(boards: Boards, signer: Signer, left: int, right: int, gap: int = GAP) -> Any:
+def signed(
+    boards: avr_boards.Boards, signer: Signer, left: int, right: int, gap: int = avr_boards.GAP
+) -> Any:
     """Return the state after one signed command."""
     command = boards.command(left, right)
     stamped = command._replace(host_us=round(boards.now_us) % 2**32, tag=bytes(8))
@@ -86,20 +63,24 @@ def signed(boards: Boards, signer: Signer, left: int, right: int, gap: int = GAP
 
 
 @pytest.mark.long
-def test_a_key_from_the_console_makes_a_keyed_link(boards: Boards) -> None:
+def test_a_key_from_the_console_makes_a_keyed_link(boards: avr_boards.Boards) -> None:
     boards.start()
-    assert request(boards, Key(1)) == [KeyState(1, OK, NO_KEY, 0)]
+    assert avr_boards.request(boards, frames.Key(1)) == [
+        frames.KeyState(1, frames.OK, frames.NO_KEY, 0)
+    ]
     # The simulator writes a cell in 0.4 ms, the chip in 3.4 ms: soon after, it would be done.
-    assert request(boards, Key(2, KEY), 0.003) == []
-    assert request(boards, Key(3, OTHER), 0.0035) == [KeyState(3, BUSY, KEY_DAMAGED, 0)]
+    assert avr_boards.request(boards, frames.Key(2, KEY), 0.003) == []
+    assert avr_boards.request(boards, frames.Key(3, OTHER), 0.0035) == [
+        frames.KeyState(3, frames.BUSY, frames.KEY_DAMAGED, 0)
+    ]
     assert boards.hello().session == 0  # locked during the write
     begun = boards.now_us
     reply: list[Any] = []
     while not reply:
         boards.run(0.005)
-        reply = console_output(boards)
+        reply = avr_boards.console_output(boards)
     print(f'\nwritten and verified after {(boards.now_us - begun) / 1000 + 10:.0f} ms')
-    assert reply == [KeyState(2, OK, KEY_HELD, key_check(KEY))]
+    assert reply == [frames.KeyState(2, frames.OK, frames.KEY_HELD, key_check(KEY))]
     assert boards.eeprom(KEY_ADDRESS, 18) == KEY + crc16(KEY).to_bytes(2, 'little')
     assert boards.eeprom(MARK_ADDRESS, 1) == b'\xff'
     assert boards.hello().session == 0  # unsigned
@@ -112,19 +93,25 @@ def test_a_key_from_the_console_makes_a_keyed_link(boards: Boards) -> None:
         boards.run(0.015)
     assert late <= 1  # in one of some hundred phases an answer misses its packet
     assert min(boards.pulses()) > 100
-    assert request(boards, Key(4, OTHER)) == [KeyState(4, BUSY, KEY_HELD, key_check(KEY))]
-    boards.call('reset', ROBOT)
+    assert avr_boards.request(boards, frames.Key(4, OTHER)) == [
+        frames.KeyState(4, frames.BUSY, frames.KEY_HELD, key_check(KEY))
+    ]
+    boards.call('reset', avr_boards.ROBOT)
     boards.run(0.15)
-    assert request(boards, Key(5)) == [KeyState(5, OK, KEY_HELD, key_check(KEY))]
+    assert avr_boards.request(boards, frames.Key(5)) == [
+        frames.KeyState(5, frames.OK, frames.KEY_HELD, key_check(KEY))
+    ]
     assert begin_session(boards, KEY) is not None
-    assert request(boards, Key(6, bytes(16)), WRITING) == [KeyState(6, OK, NO_KEY, 0)]
+    assert avr_boards.request(boards, frames.Key(6, bytes(16)), WRITING) == [
+        frames.KeyState(6, frames.OK, frames.NO_KEY, 0)
+    ]
     assert boards.hello().session == boards.session
     assert boards.eeprom(KEY_ADDRESS, 18) == b'\xff' * 18
     assert boards.call('usb_overruns') == 0
 
 
 @pytest.mark.long
-def test_a_flood_on_the_console_does_not_delay_replies(boards: Boards) -> None:
+def test_a_flood_on_the_console_does_not_delay_replies(boards: avr_boards.Boards) -> None:
     """50 000 bytes per second, frames and noise, while the robot verifies tags and drives.
 
     The POLL fetches the reply to its own CMD; in one of several runs, one in a hundred was a cycle
@@ -135,7 +122,7 @@ def test_a_flood_on_the_console_does_not_delay_replies(boards: Boards) -> None:
     signer = begin_session(boards, KEY)
     assert signer is not None
     source = random.Random(1)
-    ping = encode_frame(codec.encode(Ping(1, b'ping')))
+    ping = encode_frame(codec.encode(frames.Ping(1, b'ping')))
     times, late = [], 0
     for number in range(40):
         flood = b''.join(
@@ -151,18 +138,18 @@ def test_a_flood_on_the_console_does_not_delay_replies(boards: Boards) -> None:
     print(f'\nflood: round trip {statistics.median(times):.2f} ms, {max(times):.2f} ms (longest)')
     assert max(times) <= 7.0
     assert late <= 1
-    assert boards.call('resets', ROBOT) == 0
+    assert boards.call('resets', avr_boards.ROBOT) == 0
     boards.run(0.1)  # of its buffer of 256 bytes the robot takes one frame in 2 ms
     for _ in range(2):  # they end the partial frame; the first may be lost with the flood
         boards.call('usb_write', b'\0', 1)
         boards.run(0.01)
-    while console_output(boards):
+    while avr_boards.console_output(boards):
         pass
-    (pong,) = request(boards, Ping(9, b'ping'))
+    (pong,) = avr_boards.request(boards, frames.Ping(9, b'ping'))
     print(f'console overruns: {pong.overruns} counted, {boards.call("usb_overruns")} bytes')
     assert pong.overruns > 0
     boards.run(0.4)
-    odometry_agrees(boards)
+    avr_boards.odometry_agrees(boards)
 
 
 # -- radio rates ----------------------------------------------------------------------------------
@@ -172,17 +159,17 @@ def test_a_flood_on_the_console_does_not_delay_replies(boards: Boards) -> None:
 @pytest.mark.parametrize('rate', ['250k', '1M', '2M'])
 def test_cycles_work_at_every_rate(rate: str) -> None:
     """The robot by its settings, the dongle by CFG; open and signed, with refreshes and losses."""
-    build()
+    avr_boards.build()
     parameters = LinkParameters(rate=rate)
     wanted, gap = parameters.configure(1), parameters.gap
-    boards = Boards()
-    for address in SETTINGS_ADDRESSES:
-        boards.store(address, settings_record(rate=rate))
+    boards = avr_boards.Boards()
+    for address in avr_boards.SETTINGS_ADDRESSES:
+        boards.store(address, avr_boards.settings_record(rate=rate))
     boards.run(0.13)
     assert boards.ask(wanted) == (*wanted, 1)
-    greeting = Hello(boards.session, 0)
-    assert boards.request(greeting, Poll(0, 0, 2), gap).session == boards.session
-    boards.request(Poll(0, 0, 0), None, gap)
+    greeting = frames.Hello(boards.session, 0)
+    assert boards.request(greeting, frames.Poll(0, 0, 2), gap).session == boards.session
+    boards.request(frames.Poll(0, 0, 0), None, gap)
     times, ages = [], []
     for phase in range(0, 4000, 160):
         begun = boards.now_us
@@ -198,7 +185,7 @@ def test_cycles_work_at_every_rate(rate: str) -> None:
     assert max(times) < 12.0
     assert max(ages) < 4000
     # A refresh concurrent with a packet costs at most one acknowledgement.
-    before = boards.radio(ROBOT).ack_damaged
+    before = boards.radio(avr_boards.ROBOT).ack_damaged
     boards.call('loss', 0.2, 0.2)
     for _ in range(120):
         command = boards.command()
@@ -206,21 +193,25 @@ def test_cycles_work_at_every_rate(rate: str) -> None:
         if result.second & 2:
             assert codec.decode_uplink(result.payload).seq == command.seq
         boards.run(0.005)
-    counts = boards.radio(ROBOT)
+    counts = boards.radio(avr_boards.ROBOT)
     assert counts.duplicates > 10
     assert counts.ack_damaged == before <= 1
     boards.call('loss', 0.0, 0.0)
     boards.request(boards.command(0, 0)._replace(flags=0), None, gap)
     boards.run(1.0)
-    assert request(boards, Key(1, KEY), WRITING)[0].rc == OK
-    signer = begin_session(boards, KEY, parameters.gap_after(Hello(1, 0, 0, bytes(8), bytes(8))))
+    assert avr_boards.request(boards, frames.Key(1, KEY), WRITING)[0].rc == frames.OK
+    signer = begin_session(
+        boards, KEY, parameters.gap_after(frames.Hello(1, 0, 0, bytes(8), bytes(8)))
+    )
     assert signer is not None
-    boards.request(Poll(0, 0, 0), None, gap)
+    boards.request(frames.Poll(0, 0, 0), None, gap)
     for _ in range(40):
         state = signed(boards, signer, 3000, 3000, gap)
         assert state.seq == boards.seq
         assert state.age != 0xFFFF
         boards.run(0.012)
-    assert cycle(boards, 0.01) is not None
-    assert boards.radio(ROBOT).queued_acks == boards.radio(ROBOT).overfull == 0
+    assert avr_boards.cycle(boards, 0.01) is not None
+    assert (
+        boards.radio(avr_boards.ROBOT).queued_acks == boards.radio(avr_boards.ROBOT).overfull == 0
+    )
     boards.close()

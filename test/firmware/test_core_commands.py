@@ -22,8 +22,7 @@ from support.long_tests import few_of
 from t3mpc_ros.radio.protocol.frames import SETTINGS_RECORD, RefusalReason
 from t3mpc_ros.radio.tool import eeprom_records
 
-PRESS, RELEASE = 5_200, 50_200
-"""Debounce times of the button and a period of the main loop, us."""
+PRESS, RELEASE = 5_200, 50_200  # debounce times of the button and a period of the main loop, us
 
 
 def test_nothing_moves_before_hello_and_enable(library):

@@ -331,8 +331,7 @@ def test_the_parameter_file_holds_the_calibration(found, tmp_path):
             assert parameters['wheel_radius'] == 0.0356
 
 
-ANOTHER = '12345e6789'
-"""Address of a robot that is not connected."""
+ANOTHER = '12345e6789'  # address of a robot that is not connected
 ROBOT_PORT = '--robot-port /dev/ttyACM0'
 
 

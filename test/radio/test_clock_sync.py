@@ -17,14 +17,9 @@ import numpy as np
 import pytest
 from support.long_tests import few_of
 
-from t3mpc_ros.radio.protocol.clock_sync import (
-    ClockModel,
-    CounterUnwrapper,
-    forward_delay_ns,
-    wrapped_difference,
-)
+from t3mpc_ros.radio.protocol import clock_sync
 
-TRAVEL_NS = forward_delay_ns(26, 14)
+TRAVEL_NS = clock_sync.forward_delay_ns(26, 14)
 
 
 def drive(seconds, skew, jitter, loss, seed=1, boot_us=0, model=None):
@@ -33,8 +28,8 @@ def drive(seconds, skew, jitter, loss, seed=1, boot_us=0, model=None):
     Every 20 ms the host sends; bytes come late by up to ``jitter`` seconds each way.
     """
     generator = np.random.default_rng(seed)
-    model = model or ClockModel()
-    time = CounterUnwrapper()
+    model = model or clock_sync.ClockModel()
+    time = clock_sync.CounterUnwrapper()
     model_errors, arrival_errors = [], []
     for cycle in range(round(seconds * 50)):
         there, back, drawn = generator.uniform(0.0, 1.0, 3)
@@ -78,7 +73,7 @@ def test_the_first_second_is_no_worse_than_arrival_stamps():
 
 def test_slow_transactions_do_not_bias_the_fit():
     """A port that sometimes delays bytes by 30 ms, one way only."""
-    model = ClockModel()
+    model = clock_sync.ClockModel()
     worst = 0.0
     for cycle in range(1000):
         there = 30_000_000 if cycle % 7 == 3 else 0
@@ -94,7 +89,7 @@ def test_slow_transactions_do_not_bias_the_fit():
 @pytest.mark.slow
 def test_a_drifting_resonator_is_tracked():
     """Samples older than ten seconds, with another rate, are dropped."""
-    model, robot_us = ClockModel(), 0
+    model, robot_us = clock_sync.ClockModel(), 0
     for cycle in range(1100):
         robot_us += 20_100 if cycle < 500 else 20_050
         sent = cycle * 20_000_000
@@ -104,7 +99,7 @@ def test_a_drifting_resonator_is_tracked():
 
 
 def test_a_model_without_samples_raises():
-    model = ClockModel()
+    model = clock_sync.ClockModel()
     assert not model.is_set
     with pytest.raises(ValueError, match='at least one transaction: got none'):
         model.to_host_ns(0)
@@ -117,7 +112,7 @@ def test_a_model_without_samples_raises():
 
 def test_epoch_times_keep_nanosecond_precision():
     origin = 1_800_000_000 * 10**9
-    near, far = ClockModel(), ClockModel()
+    near, far = clock_sync.ClockModel(), clock_sync.ClockModel()
     for cycle in range(100):
         sent = cycle * 20_000_000 + cycle * cycle % 7000
         for model, base in ((near, 0), (far, origin)):
@@ -127,12 +122,12 @@ def test_epoch_times_keep_nanosecond_precision():
 
 def test_forward_delay_of_a_command():
     """26 bytes at 20 us, 130 us twice, 185 us in the air: 965 us."""
-    assert forward_delay_ns(26, 14) == 965_000
-    assert forward_delay_ns(34, 22) == (34 * 20 + 260 + 249) * 1000
+    assert clock_sync.forward_delay_ns(26, 14) == 965_000
+    assert clock_sync.forward_delay_ns(34, 22) == (34 * 20 + 260 + 249) * 1000
 
 
 def test_counters_are_unwrapped():
-    counter = CounterUnwrapper()
+    counter = clock_sync.CounterUnwrapper()
     total = -5
     counter.add(total)
     generator = np.random.default_rng(2)
@@ -149,7 +144,7 @@ def test_counters_are_unwrapped():
 
 
 def test_wrapped_difference_is_the_shorter_one():
-    assert wrapped_difference(0xFFFFFFFF, 1) == 2
-    assert wrapped_difference(1, 0xFFFFFFFF) == -2
-    assert wrapped_difference(-(2**31), 2**31 - 1) == -1
-    assert wrapped_difference(5, 5) == 0
+    assert clock_sync.wrapped_difference(0xFFFFFFFF, 1) == 2
+    assert clock_sync.wrapped_difference(1, 0xFFFFFFFF) == -2
+    assert clock_sync.wrapped_difference(-(2**31), 2**31 - 1) == -1
+    assert clock_sync.wrapped_difference(5, 5) == 0

@@ -24,8 +24,7 @@ from support.long_tests import few_of
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.robot.interface import RobotCommand
 
-DEAD_TIME = 0.02
-"""Dead time that demo and launch file of the real robot configure, s."""
+DEAD_TIME = 0.02  # dead time that demo and launch file of the real robot configure, s
 
 
 class Controlled(RobotBench):

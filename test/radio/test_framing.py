@@ -19,53 +19,46 @@ import random
 
 import pytest
 
+from t3mpc_ros.radio.protocol import framing
 from t3mpc_ros.radio.protocol import framing as module
-from t3mpc_ros.radio.protocol.framing import (
-    FRAME_LIMIT,
-    FrameDecoder,
-    cobs_decode,
-    cobs_encode,
-    crc16,
-    encode_frame,
-)
 
 VECTORS = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
 
 
-def random_frame(source, longest=FRAME_LIMIT):
+def random_frame(source, longest=framing.FRAME_LIMIT):
     # 0 and 255 are the special cases of COBS.
     size = source.randint(1, longest)
     return bytes(source.choice((0, 255, source.randrange(256))) for _ in range(size))
 
 
 def test_crc_check_value_and_golden_vectors():
-    assert crc16(b'123456789') == 0x29B1
+    assert framing.crc16(b'123456789') == 0x29B1
     for row in VECTORS['crc16']:
-        assert crc16(bytes.fromhex(row['bytes'])) == row['crc']
+        assert framing.crc16(bytes.fromhex(row['bytes'])) == row['crc']
 
 
 def test_cobs_golden_vectors():
     for row in VECTORS['cobs']:
         data, encoded = bytes.fromhex(row['bytes']), bytes.fromhex(row['stuffed'])
-        assert cobs_encode(data) == encoded
-        assert cobs_decode(encoded) == data
+        assert framing.cobs_encode(data) == encoded
+        assert framing.cobs_decode(encoded) == data
     for row in VECTORS['wire']:
-        assert encode_frame(bytes.fromhex(row['bytes'])).hex() == row['wire']
+        assert framing.encode_frame(bytes.fromhex(row['bytes'])).hex() == row['wire']
 
 
 def test_cobs_adds_one_byte_removes_zeros_and_is_invertible():
     source = random.Random(2)
     for size in range(254):
         data = bytes(source.choice((0, source.randrange(256))) for _ in range(size))
-        encoded = cobs_encode(data)
+        encoded = framing.cobs_encode(data)
         assert len(encoded) == size + 1
         assert 0 not in encoded
-        assert cobs_decode(encoded) == data
+        assert framing.cobs_decode(encoded) == data
     with pytest.raises(ValueError, match='at most 254 bytes long: got 255'):
-        cobs_encode(bytes(255))
-    for frame in (b'', bytes(FRAME_LIMIT + 1)):
+        framing.cobs_encode(bytes(255))
+    for frame in (b'', bytes(framing.FRAME_LIMIT + 1)):
         with pytest.raises(ValueError, match=f'must have 1 to 78 bytes: got {len(frame)}'):
-            encode_frame(frame)
+            framing.encode_frame(frame)
 
 
 def test_only_valid_cobs_decodes():
@@ -73,50 +66,54 @@ def test_only_valid_cobs_decodes():
     decoded = 0
     for _ in range(20000):
         encoded = bytes(source.randint(0, 6) for _ in range(source.randint(0, 8)))
-        data = cobs_decode(encoded)
+        data = framing.cobs_decode(encoded)
         if data is not None:
             decoded += 1
-            assert cobs_encode(data) == encoded
+            assert framing.cobs_encode(data) == encoded
     assert decoded > 500
 
 
 def test_the_stream_may_be_split_anywhere():
     source = random.Random(4)
     sent = [random_frame(source) for _ in range(40)]
-    stream = b''.join(encode_frame(frame) for frame in sent)
+    stream = b''.join(framing.encode_frame(frame) for frame in sent)
     stream = stream[:500] + b'rubbish' + stream[500:1200] + b'\0\0\0' + stream[1200:]
-    whole = FrameDecoder()
+    whole = framing.FrameDecoder()
     expected = whole.feed(stream)
     assert len(expected) > 35
     for step in (1, 2, 3, 7, 64, 1000):
-        decoder = FrameDecoder()
+        decoder = framing.FrameDecoder()
         found = []
         for at in range(0, len(stream), step):
             found += decoder.feed(stream[at : at + step])
         assert found == expected
         assert decoder.counts == whole.counts
     for cut in range(0, len(stream), 3):
-        decoder = FrameDecoder()
+        decoder = framing.FrameDecoder()
         assert decoder.feed(stream[:cut]) + decoder.feed(stream[cut:]) == expected
 
 
 def test_zeros_in_a_row_are_no_errors():
-    decoder, frame = FrameDecoder(), encode_frame(b'abc')
+    decoder, frame = framing.FrameDecoder(), framing.encode_frame(b'abc')
     assert decoder.feed(b'\0\0' + frame + b'\0\0\0' + frame) == [b'abc', b'abc']
     assert decoder.counts == (2, 0, 0)
 
 
 def test_each_kind_of_error_is_counted_once():
-    good = encode_frame(b'good')
+    good = framing.encode_frame(b'good')
     for bad, counted in (
-        (cobs_encode(b'wrong' + b'\0\0') + b'\0', (0, 1, 0)),
-        (cobs_encode(b'\1\2') + b'\0', (0, 0, 1)),  # a CRC and nothing before it
+        (framing.cobs_encode(b'wrong' + b'\0\0') + b'\0', (0, 1, 0)),
+        (framing.cobs_encode(b'\1\2') + b'\0', (0, 0, 1)),  # a CRC and nothing before it
         (b'\x01\0', (0, 0, 1)),
         (b'\x09\x01\0', (0, 0, 1)),  # a run beyond the end
         (bytes([7]) * 500 + b'\0', (0, 0, 1)),
-        (cobs_encode(bytes(79) + crc16(bytes(79)).to_bytes(2, 'little')) + b'\0', (0, 0, 1)),
+        (
+            framing.cobs_encode(bytes(79) + framing.crc16(bytes(79)).to_bytes(2, 'little'))
+            + b'\0',
+            (0, 0, 1),
+        ),
     ):
-        decoder = FrameDecoder()
+        decoder = framing.FrameDecoder()
         assert decoder.feed(bad + good) == [b'good']
         assert decoder.counts == (counted[0] + 1, *counted[1:])
 
@@ -124,7 +121,7 @@ def test_each_kind_of_error_is_counted_once():
 def test_random_bytes_yield_no_frame_or_growth():
     """CRC-16 passes one in 65 536 valid COBS blocks; noise rarely is valid COBS."""
     source = random.Random(5)
-    decoder, found = FrameDecoder(), []
+    decoder, found = framing.FrameDecoder(), []
     for _ in range(200):
         found += decoder.feed(source.randbytes(1000))
         assert len(decoder._buffer) <= module._ENCODED_LIMIT
@@ -132,14 +129,14 @@ def test_random_bytes_yield_no_frame_or_growth():
     assert counts.frames == len(found) <= 1
     assert counts.crc_errors + counts.frame_errors > 700  # a zero every 256 bytes
     decoder.feed(b'\0')
-    assert decoder.feed(encode_frame(b'still here')) == [b'still here']
+    assert decoder.feed(framing.encode_frame(b'still here')) == [b'still here']
 
 
 def test_every_single_bit_flip_is_detected():
     source = random.Random(6)
     for _ in range(20):
-        wire = encode_frame(random_frame(source))
+        wire = framing.encode_frame(random_frame(source))
         for bit in range(8 * len(wire)):
             flipped = bytearray(wire)
             flipped[bit // 8] ^= 1 << bit % 8
-            assert FrameDecoder().feed(bytes(flipped) + b'\0') == []
+            assert framing.FrameDecoder().feed(bytes(flipped) + b'\0') == []

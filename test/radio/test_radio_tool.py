@@ -44,8 +44,7 @@ from t3mpc_ros.radio.tool.robot_info import LogEntry, LogKind, format_log
 
 KEY, OTHER = bytes(range(16)), bytes(range(1, 17))
 TURN = 3200
-KEY_ADDRESS = 8
-"""Of the key in the EEPROM."""
+KEY_ADDRESS = 8  # of the key in the EEPROM
 
 
 # -- key ------------------------------------------------------------------------------------------

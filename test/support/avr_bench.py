@@ -44,10 +44,8 @@ from t3mpc_ros.simulation.world import cast_rays, load_world
 START_NS = 5_000_000_000
 KEY_ADDRESS = 8
 BOOT_US = 130_000.0
-SLICE_US = 200.0
-"""Period at which the boards are polled."""
-PLANT_US = 5000.0
-"""Period of the plant and of its sensors."""
+SLICE_US = 200.0  # period at which the boards are polled
+PLANT_US = 5000.0  # period of the plant and of its sensors
 FIELDS = (
     'seq', 'ttl_from_us', 'session.id', 'counters.stale', 'ramp.speed', 'ramp.target', 'loaded_us',
     'longest_us',

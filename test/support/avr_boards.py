@@ -44,14 +44,10 @@ FIRMWARE = Path(__file__).parents[2] / 'firmware'
 BUILD = FIRMWARE / 'build'
 DONGLE, ROBOT = 0, 1
 CYCLES_PER_US = 16
-GAP = 6
-"""Gap between the exchanges of a transaction, in 250 us."""
-BATTERY, DIVIDER = 12_000, 4
-"""Supply, mV, and the divider before the converter."""
-SETTINGS_ADDRESSES = (40, 72)
-"""Cells of both copies."""
-IMU = (100, 200, 16384, 3000, 10, 20, -131)
-"""accel x, y, z, temperature, gyro x, y, z"""
+GAP = 6  # gap between the exchanges of a transaction, in 250 us
+BATTERY, DIVIDER = 12_000, 4  # supply, mV, and the divider before the converter
+SETTINGS_ADDRESSES = (40, 72)  # cells of both copies
+IMU = (100, 200, 16384, 3000, 10, 20, -131)  # accel x, y, z, temperature, gyro x, y, z
 
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     't3_sim_new': (c_void_p, (c_char_p, c_char_p, c_uint64)),

@@ -22,8 +22,7 @@ import numpy as np
 from support.tool_bench import START_NS, ToolBench
 from t3mpc_ros.robot.calibration import MARKS
 
-HAND_RATE = 3.0
-"""rad/s"""
+HAND_RATE = 3.0  # rad/s
 
 
 class Person:
@@ -33,8 +32,7 @@ class Person:
         self.bench = bench
         self.random = np.random.default_rng(seed)
         self.lines = []
-        self.answers = {}
-        """Answers by a part of the question, in place of the true ones."""
+        self.answers = {}  # answers by a part of the question, in place of the true ones
         self.moves = True
         self._mark = self.plant.pose
         self._turned = 0.0

@@ -29,11 +29,9 @@ from t3mpc_ros.robot.interface import RobotCommand
 
 MS = 1_000_000
 START_NS = 5_000_000_000
-TTL_AND_SLACK = 0.25
-"""s"""
+TTL_AND_SLACK = 0.25  # s
 
-STEP = math.tau / 3200
-"""Turn of a wheel by a microstep, rad."""
+STEP = math.tau / 3200  # turn of a wheel by a microstep, rad
 
 
 class Bench:
@@ -57,17 +55,13 @@ class Bench:
         self.wake_ns = self.now_ns
         self.wheels = None
         self.commanded_ns = 0
-        self.written = []
-        """Each write of the host, with its time."""
-        self.followed = []
-        """Each command that the robot has executed, with its time."""
+        self.written = []  # each write of the host, with its time
+        self.followed = []  # each command that the robot has executed, with its time
         self.problem = ('dongle is not there', True)
         """Why the port cannot be opened, and whether it is absent."""
-        self.opens = []
-        """Time of each attempt to open the port."""
+        self.opens = []  # time of each attempt to open the port
         self.closes = 0
-        self.link_states = []
-        """States of the link, in order."""
+        self.link_states = []  # states of the link, in order
         self.each = None
         self.emulator.board.on_command = self._record_command
 

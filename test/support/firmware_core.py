@@ -46,8 +46,7 @@ COUNTERS = (
 PACKET = 'kind', 'session', 'seq', 'what', 'ttl', 'left', 'right', 'value', 'echo_us', 'host_us'
 STEP = math.tau / 3200
 SESSION = 0x5A
-INFO_SIZE = 24
-"""Without a nonce."""
+INFO_SIZE = 24  # without a nonce
 USE_HELLO, USE_SESSION_KEY = b'\1', b'\2'
 ADDRESS = b'T3MPC'
 

@@ -20,12 +20,6 @@ from support.emulator_bench import MS, START_NS, Bench
 from support.firmware_core import CoreVerifier
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_downlink, decode_to_dongle, encode
-from t3mpc_ros.radio.protocol.frames import (
-    BOARD_PARAMETERS,
-    CommandFlag,
-    RefusalReason,
-    StatusFlag,
-)
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
 
 STEP = math.tau / 3200
@@ -56,7 +50,7 @@ class FakeRobot:
         self.verifier = CoreVerifier(self.key)
         self.booted_ns, self.clock_us = now_ns, clock_us
         self.steps = [float(steps[0]), float(steps[1])]
-        self.parameters = [parameter.default for parameter in BOARD_PARAMETERS]
+        self.parameters = [parameter.default for parameter in frames.BOARD_PARAMETERS]
         self.parameters[-1] = self.boots
         self.speeds = (0.0, 0.0)
         self.enabled = self.estop = self.expired = False
@@ -64,14 +58,13 @@ class FakeRobot:
         self.command_ns, self.until_ns = None, None
         self.reached_ns = now_ns
         self.answer = None
-        self.refusal = RefusalReason.NONE
+        self.refusal = frames.RefusalReason.NONE
         self.log = []
 
     def time_us(self, now_ns):
         return int((now_ns - self.booted_ns) / 1000 * (1.0 + self.skew) + self.clock_us) % WRAP
 
-    settings = frames.SETTINGS_GOOD
-    """State of the settings in INFO."""
+    settings = frames.SETTINGS_GOOD  # state of the settings in INFO
 
     def run_to(self, now_ns):
         end = now_ns if self.until_ns is None else min(max(self.until_ns, self.reached_ns), now_ns)
@@ -88,12 +81,12 @@ class FakeRobot:
         return self.steps[1] * STEP, self.steps[0] * STEP
 
     def status(self):
-        bits = StatusFlag(0)
-        bits |= StatusFlag.ENABLED if self.enabled else StatusFlag(0)
-        bits |= StatusFlag.MOVING if self.speeds != (0.0, 0.0) else StatusFlag(0)
-        bits |= StatusFlag.ESTOP if self.estop else StatusFlag(0)
-        bits |= StatusFlag.TTL_EXPIRED if self.expired else StatusFlag(0)
-        bits |= StatusFlag.NO_SESSION if not self.verifier.session else StatusFlag(0)
+        bits = frames.StatusFlag(0)
+        bits |= frames.StatusFlag.ENABLED if self.enabled else frames.StatusFlag(0)
+        bits |= frames.StatusFlag.MOVING if self.speeds != (0.0, 0.0) else frames.StatusFlag(0)
+        bits |= frames.StatusFlag.ESTOP if self.estop else frames.StatusFlag(0)
+        bits |= frames.StatusFlag.TTL_EXPIRED if self.expired else frames.StatusFlag(0)
+        bits |= frames.StatusFlag.NO_SESSION if not self.verifier.session else frames.StatusFlag(0)
         return bits
 
     def state(self, now_ns):
@@ -168,7 +161,7 @@ class FakeRobot:
             2,
             0,
             2,
-            len(BOARD_PARAMETERS),
+            len(frames.BOARD_PARAMETERS),
             200,
             16,
             self.refusal,
@@ -180,7 +173,7 @@ class FakeRobot:
         )
 
     def parameter(self, frame, rc):
-        row = BOARD_PARAMETERS[frame.id]
+        row = frames.BOARD_PARAMETERS[frame.id]
         value = self.parameters[frame.id]
         return frames.Param(
             self.verifier.session, frame.seq, frame.id, rc, value, row.low, row.high
@@ -193,24 +186,24 @@ class FakeRobot:
         self.answer = self.parameter(frame, rc)
 
     def follow(self, frame, now_ns):
-        if frame.flags & CommandFlag.ESTOP:
+        if frame.flags & frames.CommandFlag.ESTOP:
             self.estop, self.enabled, self.speeds = True, False, (0.0, 0.0)
             return
         if self.rejects_commands:
-            self.refusal = RefusalReason.SEQUENCE
+            self.refusal = frames.RefusalReason.SEQUENCE
             return
         ttl_ms = min(10 * frame.ttl, self.parameters[3])
         if (self.time_us(now_ns) - frame.echo_us) % WRAP >= 1000 * ttl_ms + 50_000:
-            self.refusal = RefusalReason.STALE
+            self.refusal = frames.RefusalReason.STALE
             return
         if self.last_seq is not None and not 0 < (frame.seq - self.last_seq) % 256 < 128:
             return
         self.last_seq = self.seq = frame.seq
         self.command_ns = now_ns
-        if frame.flags == CommandFlag.ESTOP_CLEAR and not self.button:
+        if frame.flags == frames.CommandFlag.ESTOP_CLEAR and not self.button:
             self.estop = False
         self.expired = False
-        self.enabled = bool(frame.flags & CommandFlag.ENABLE) and not self.estop
+        self.enabled = bool(frame.flags & frames.CommandFlag.ENABLE) and not self.estop
         wanted = (frame.left / 1000.0, frame.right / 1000.0) if self.enabled and ttl_ms else (0, 0)
         self.speeds = (float(wanted[0]), float(wanted[1]))
         self.until_ns = now_ns + ttl_ms * MS
@@ -235,8 +228,7 @@ class FakeDongle:
         self.jitter_ns = 0
         self.requests = []
         self.boot_delay_ns = 0
-        self.change = lambda reply: reply
-        """Returns what is sent in place of a reply."""
+        self.change = lambda reply: reply  # returns what is sent in place of a reply
         self.board, self.now_ns = robot, START_NS
         self.port_open, self.replies = True, []
         self.restart(0)

@@ -27,8 +27,7 @@ from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.transaction import TransactionResult
 from t3mpc_ros.radio.protocol import authentication, frames
 
-Entropy = Callable[[int], bytes]
-"""Returns a number of unpredictable bytes."""
+Entropy = Callable[[int], bytes]  # returns a number of unpredictable bytes
 
 _BYTE, _WORD = 0xFF, 0xFFFFFFFF
 _RETRY_NS = NANOSECONDS // 10
@@ -37,8 +36,7 @@ _REJECTED_RETRY_NS = NANOSECONDS
 BOOTS_ID = [parameter.name for parameter in frames.BOARD_PARAMETERS].index('boots')
 _BOOTS_READS = 4
 """Additional reads of the count of starts: of two robots with one address, both answer in turn."""
-_MAX_ATTEMPTS = 50
-"""Attempts for one parameter before a new HELLO."""
+_MAX_ATTEMPTS = 50  # attempts for one parameter before a new HELLO
 _RESULT_TEXTS = {
     frames.UNKNOWN: 'does not support it',
     frames.OUT_OF_RANGE: 'allows {low} to {high}',
@@ -144,16 +142,12 @@ class Handshake:
         self._session = session
         self._targets = parameters.robot.to_wire()
         self._absent, self._no_reply = absent, no_reply
-        self.state = LinkState.HELLO
-        """HELLO, INFO or PARAMS; RUN when the handshake is complete."""
-        self.reason = reason
-        """Reason why the handshake is not complete."""
+        self.state = LinkState.HELLO  # HELLO, INFO or PARAMS; RUN when the handshake is complete
+        self.reason = reason  # reason why the handshake is not complete
         self._pending: deque[tuple[int, int | None]] = deque()
         self._attempts = 0
-        self.info: frames.Info | None = None
-        """Identity of the robot, once the session has started."""
-        self.board_parameters: dict[int, int] = {}
-        """Board parameters as read back, by id."""
+        self.info: frames.Info | None = None  # identity of the robot, once the session has started
+        self.board_parameters: dict[int, int] = {}  # board parameters as read back, by id
 
     def next_request(self, now_ns: int) -> tuple[frames.Downlink, int]:
         """Return the payload to send now, and the frame to POLL after it."""

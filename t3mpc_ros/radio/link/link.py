@@ -44,28 +44,21 @@ _MAX_TIMEOUTS = 5
 _HANDSHAKE_STATES = (LinkState.HELLO, LinkState.INFO, LinkState.PARAMS)
 _GYRO_RANGE_ID = [parameter.name for parameter in frames.BOARD_PARAMETERS].index('gyro_range')
 
-_MIN_IDLE_NS = NANOSECONDS // 100
-"""Idle time before the next cycle that a request needs."""
-_REQUEST_DECIMATION = 10
-"""Without idle time, every tenth cycle is replaced by a request."""
+_MIN_IDLE_NS = NANOSECONDS // 100  # idle time before the next cycle that a request needs
+_REQUEST_DECIMATION = 10  # without idle time, every tenth cycle is replaced by a request
 _AUX_PERIOD_NS = _PING_PERIOD_NS = _BOOTS_PERIOD_NS = NANOSECONDS
-_ACTIVE_PING_TIMEOUT_NS = NANOSECONDS // 20
-"""Short, because the next command waits for it."""
+_ACTIVE_PING_TIMEOUT_NS = NANOSECONDS // 20  # short, because the next command waits for it
 _MAX_LOST_CYCLES = 100
 """Consecutive lost cycles before a new handshake: sequence numbers have eight bits, so from the
 128th on the robot would reject commands as old."""
 _REJECTED_TIMEOUT_NS = NANOSECONDS // 2
 _MIN_STOP_COMMANDS = 3
 """Standstill commands before the drives are disabled, if the robot then stands still."""
-_STOP_TIMEOUT_NS = NANOSECONDS
-"""Time after which the drives are disabled in any case."""
+_STOP_TIMEOUT_NS = NANOSECONDS  # time after which the drives are disabled in any case
 _DISABLE_COMMANDS = 5
-_MIN_BATTERY_VOLTAGE = 1.0
-"""V; no battery has less."""
-_CABLE_FIRMWARE = 2, 1
-"""First version of the firmware that drives over the cable."""
-_COLLISION_HOLD_NS = 5 * NANOSECONDS
-"""Standstill after two robots have answered."""
+_MIN_BATTERY_VOLTAGE = 1.0  # V; no battery has less
+_CABLE_FIRMWARE = 2, 1  # first version of the firmware that drives over the cable
+_COLLISION_HOLD_NS = 5 * NANOSECONDS  # standstill after two robots have answered
 _REFUSAL_QUERY_NS = NANOSECONDS // 10
 """Time without an accepted command after which AUX is requested for the reason, and again."""
 
@@ -87,8 +80,7 @@ class ActiveSession:
         self._arbiter = arbiter
         self._statistics = statistics
         self._period_ns = round(NANOSECONDS / parameters.cycle_rate)
-        self.due_ns = now_ns
-        """Time of the next cycle."""
+        self.due_ns = now_ns  # time of the next cycle
         self._aux_ns = self._ping_ns = self._boots_ns = now_ns
         self._counts_boots = counts_boots
         self._cycles = 0
@@ -255,13 +247,11 @@ class Link:
         self._transactions = TransactionLayer(self._statistics)
         self._arbiter = SetpointArbiter(parameters)
         self._decoder = TelemetryDecoder()
-        self.state = LinkState.CLOSED
-        """State of the connection."""
+        self.state = LinkState.CLOSED  # state of the connection
         self._reason = LinkState.CLOSED.value
         self._actions: list[PortAction] = []
         self._due_ns = 0
-        self._since_ns = 0
-        """Entry into PING or RUN."""
+        self._since_ns = 0  # entry into PING or RUN
         self._reopen_ns = _MIN_REOPEN_NS
         self._estop_ns = 0
         self._lost_session = 0
@@ -279,8 +269,7 @@ class Link:
         self.info: frames.Info | None = None
         """Identity of the robot; None before the first session."""
         self._board_parameters: dict[int, int] = {}
-        self.telemetry: Telemetry | None = None
-        """Newest measurement."""
+        self.telemetry: Telemetry | None = None  # newest measurement
         self._received_ns: int | None = None
         self._silence_ns = _silence_ns(parameters)
         self._longest_pause_ns = 3 * self._silence_ns // 4

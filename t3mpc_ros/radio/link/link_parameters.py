@@ -23,10 +23,8 @@ from t3mpc_ros.radio.protocol import frames
 _GAP_UNIT = 250e-6
 _GAPS = {'250k': 2.75e-3, '1M': 1.5e-3, '2M': 1.75e-3}
 """s; at 250k acknowledgements are long, at 2M the tag check takes longer than 1.5 ms."""
-_HELLO_GAP = 5e-3
-"""s; the robot computes four hashes at 16 MHz"""
-TTL_UNIT_NS = NANOSECONDS // 100
-"""Unit of the time to live of a command, ns."""
+_HELLO_GAP = 5e-3  # s; the robot computes four hashes at 16 MHz
+TTL_UNIT_NS = NANOSECONDS // 100  # unit of the time to live of a command, ns
 
 
 @dataclass(frozen=True)

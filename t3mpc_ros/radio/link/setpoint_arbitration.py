@@ -21,8 +21,7 @@ from t3mpc_ros.radio.link.link_parameters import TTL_UNIT_NS, LinkParameters
 from t3mpc_ros.radio.protocol.frames import CommandFlag
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS
 
-_RELEASE_TIMEOUT_NS = NANOSECONDS
-"""Maximum duration of ESTOP_CLEAR frames."""
+_RELEASE_TIMEOUT_NS = NANOSECONDS  # maximum duration of ESTOP_CLEAR frames
 _MIN_RELEASE_FRAMES = 3
 """Minimum number of ESTOP_CLEAR frames: the last status may be older than the stop."""
 
@@ -33,8 +32,7 @@ class Setpoint(NamedTuple):
     flags: CommandFlag
     left: int
     right: int
-    ttl: int
-    """Time to live, unit 10 ms: it ends with the command that the setpoint is made from."""
+    ttl: int  # time to live, unit 10 ms: it ends with the command that the setpoint is made from
 
 
 class SetpointArbiter:
@@ -48,8 +46,7 @@ class SetpointArbiter:
         self._wheels: WheelSpeeds | None = None
         self._until_ns = 0
         self._reason = reasons.NO_COMMAND
-        self.estop = ''
-        """Reason of the emergency stop latched on the host; empty if none is."""
+        self.estop = ''  # reason of the emergency stop latched on the host; empty if none is
         self._release_until_ns: int | None = None
         self._release_frames = 0
         self._button_held = False

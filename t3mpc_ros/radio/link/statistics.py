@@ -27,17 +27,12 @@ from t3mpc_ros.radio.link import standstill_reasons as reasons
 from t3mpc_ros.radio.protocol.frames import Aux, Pong
 from t3mpc_ros.radio.protocol.framing import FrameCounts
 
-_WINDOW_CYCLES = 500
-"""Window of the statistics: ten seconds at 50 Hz."""
-_MIN_CYCLES = 50
-"""Minimum number of cycles for a judgement."""
-LOSS_LIMIT = 0.05
-"""Loss rate above which the level is WARN."""
-ROUND_TRIP_LIMIT = 0.5
-"""Fraction of the period above which slow round trips cause WARN."""
+_WINDOW_CYCLES = 500  # window of the statistics: ten seconds at 50 Hz
+_MIN_CYCLES = 50  # minimum number of cycles for a judgement
+LOSS_LIMIT = 0.05  # loss rate above which the level is WARN
+ROUND_TRIP_LIMIT = 0.5  # fraction of the period above which slow round trips cause WARN
 _WRAP = 1 << 16
-RETRY_COUNTS = 16
-"""Number of retransmission counts: the radio chip counts to 15."""
+RETRY_COUNTS = 16  # number of retransmission counts: the radio chip counts to 15
 
 
 class DiagnosticLevel(IntEnum):
@@ -53,60 +48,41 @@ class Loss(Enum):
 
     NO_REPLY = 'no reply'
     """Between host and dongle: the cable damaged a frame, or the dongle did not answer."""
-    RADIO = 'radio'
-    """A packet was not acknowledged."""
-    ROBOT = 'robot'
-    """All packets were acknowledged, but no new state came with them."""
+    RADIO = 'radio'  # a packet was not acknowledged
+    ROBOT = 'robot'  # all packets were acknowledged, but no new state came with them
 
 
 class CableErrors(NamedTuple):
     """Damaged frames and lost bytes on the serial line, since the port was first opened."""
 
-    host: int = 0
-    """Counted by the host: frames from the dongle."""
-    dongle: int = 0
-    """Counted by the dongle: frames to it."""
+    host: int = 0  # counted by the host: frames from the dongle
+    dongle: int = 0  # counted by the dongle: frames to it
 
 
 class LinkQuality(NamedTuple):
     """Quality of the link; loss rate and round trips over the last 500 cycles."""
 
     level: DiagnosticLevel
-    text: str
-    """Reason of the level; empty for OK."""
-    cycles: int
-    """Since the port was first opened."""
-    lost: int
-    """Lost cycles since then."""
-    losses: Mapping[Loss, int]
-    """Lost cycles by hop."""
+    text: str  # reason of the level; empty for OK
+    cycles: int  # since the port was first opened
+    lost: int  # lost cycles since then
+    losses: Mapping[Loss, int]  # lost cycles by hop
     cable_errors: CableErrors
-    lost_share: float
-    """0 to 1; NaN before the first cycle, like the next two."""
-    round_trip_median: float
-    """s"""
-    round_trip_p99: float
-    """s"""
+    lost_share: float  # 0 to 1; NaN before the first cycle, like the next two
+    round_trip_median: float  # s
+    round_trip_p99: float  # s
     retransmissions: tuple[int, ...]
     """Number of packets with 0, 1, … 15 retransmissions, acknowledged or not."""
-    age: float
-    """Time since the last telemetry, s; inf before the first."""
-    robot_resets: int
-    """Since the port was first opened, like the next three."""
+    age: float  # time since the last telemetry, s; inf before the first
+    robot_resets: int  # since the port was first opened, like the next three
     dongle_resets: int
-    sessions: int
-    """Started, including the first."""
-    collisions: int
-    """Number of answers that showed a second robot with the same address."""
+    sessions: int  # started, including the first
+    collisions: int  # number of answers that showed a second robot with the same address
     port_failures: int
-    host: FrameCounts
-    """Frames received by the host."""
-    malformed: int
-    """Frames with valid CRC and invalid content."""
-    dongle: Pong | None
-    """Last PONG of the dongle."""
-    robot: Aux | None
-    """Last AUX of the robot."""
+    host: FrameCounts  # frames received by the host
+    malformed: int  # frames with valid CRC and invalid content
+    dongle: Pong | None  # last PONG of the dongle
+    robot: Aux | None  # last AUX of the robot
 
 
 class LinkStatistics:

@@ -28,35 +28,28 @@ _CLOCK_WINDOW_NS = 10 * NANOSECONDS
 """Silence between two sessions after which the samples of the clock are too old."""
 _MAX_STATE_AGE_US = 200_000
 """Maximum age of a STATE: without packets, the robot loads one twice as often."""
-_MAX_SPEED_INTERVAL = 0.5
-"""Maximum interval for a mean wheel speed, s."""
+_MAX_SPEED_INTERVAL = 0.5  # maximum interval for a mean wheel speed, s
 STEPS_PER_REV, MICROSTEPS, GYRO_RANGE = 200, 16, 500
 
 
 class Telemetry(NamedTuple):
     """One measurement of the robot, the source of a RobotState."""
 
-    stamp_ns: int
-    """Host time of the sample."""
-    angles: WheelAngles
-    """Continuous over wraps of the counters and restarts of the robot."""
-    wheels: WheelSpeeds
-    """Mean since the previous measurement."""
-    imu: ImuSample | None
-    """None when the sensor does not answer."""
+    stamp_ns: int  # host time of the sample
+    angles: WheelAngles  # continuous over wraps of the counters and restarts of the robot
+    wheels: WheelSpeeds  # mean since the previous measurement
+    imu: ImuSample | None  # none when the sensor does not answer
     ranges: tuple[float, ...]
     """m, in the order of RANGE_SENSORS: -inf too near, inf beyond, NaN not measured or faulty."""
     status: RobotStatus
-    raw: State
-    """The decoded frame."""
+    raw: State  # the decoded frame
 
 
 class CommandTiming(NamedTuple):
     """Transmission time of the CMD that a STATE answers, if it had no retransmission."""
 
     sent_ns: int
-    delay_ns: int
-    """Minimum delay to the robot: ``clock_sync.forward_delay_ns``."""
+    delay_ns: int  # minimum delay to the robot: ``clock_sync.forward_delay_ns``
 
 
 class TelemetryDecoder:

@@ -18,14 +18,8 @@ from typing import NamedTuple
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.radio.link.statistics import LinkStatistics
 from t3mpc_ros.radio.link.telemetry import CommandTiming
-from t3mpc_ros.radio.protocol import frames
+from t3mpc_ros.radio.protocol import codec, frames
 from t3mpc_ros.radio.protocol.clock_sync import BYTE_NS, forward_delay_ns
-from t3mpc_ros.radio.protocol.codec import (
-    decode_exchange_status,
-    decode_from_dongle,
-    decode_uplink,
-    encode,
-)
 from t3mpc_ros.radio.protocol.framing import FrameCounts, FrameDecoder, encode_frame
 
 _REPLY_TIMEOUT_NS = 50_000_000
@@ -42,10 +36,8 @@ class TransactionResult(NamedTuple):
 
     request: frames.Ping | frames.Configure | frames.Downlink
     """The request; for a transaction, its first payload."""
-    reply: frames.FromDongle | None
-    """Reply of the dongle; None after a timeout."""
-    uplink: frames.Uplink | None
-    """Answer of the robot; None if missing or malformed."""
+    reply: frames.FromDongle | None  # reply of the dongle; None after a timeout
+    uplink: frames.Uplink | None  # answer of the robot; None if missing or malformed
     sent_ns: int
     returned_ns: int
     timing: CommandTiming | None
@@ -80,8 +72,7 @@ class TransactionLayer:
         """Dongle clock (us) in its last reply, and when that was requested and read (host, ns)."""
         self.timeouts = 0
         """Number of requests without a reply since the last one, without those dropped as busy."""
-        self.over_cable = False
-        """Whether the robot itself replies, without a radio between."""
+        self.over_cable = False  # whether the robot itself replies, without a radio between
 
     @property
     def frame_counts(self) -> FrameCounts:
@@ -118,7 +109,7 @@ class TransactionLayer:
     ) -> bytes:
         """Return the bytes of a TX."""
         self._id = self._id + 1 & 0xFF
-        frame = frames.Transmit(self._id, gap, encode(first), encode(second))
+        frame = frames.Transmit(self._id, gap, codec.encode(first), codec.encode(second))
         return self._send(first, frame, _REPLY_TIMEOUT_NS, now_ns)
 
     def feed(self, data: bytes, now_ns: int) -> list[TransactionResult]:
@@ -126,7 +117,7 @@ class TransactionLayer:
         results = []
         for frame in self._decoder.feed(data):
             try:
-                reply = decode_from_dongle(frame)
+                reply = codec.decode_from_dongle(frame)
             except frames.FrameError:
                 self._statistics.malformed += 1
                 continue
@@ -155,7 +146,7 @@ class TransactionLayer:
         timeout_ns: int,
         now_ns: int,
     ) -> bytes:
-        wire = encode_frame(encode(frame))
+        wire = encode_frame(codec.encode(frame))
         self._pending = _PendingRequest(request, frame, now_ns, now_ns + timeout_ns, len(wire))
         return wire
 
@@ -167,14 +158,14 @@ class TransactionLayer:
             restarted = self._detect_restart(reply.time_us, pending.sent_ns, now_ns)
         elif isinstance(reply, frames.Result):
             restarted = self._detect_restart(reply.dongle_us, pending.sent_ns, now_ns)
-            first = decode_exchange_status(reply.first)
-            second = decode_exchange_status(reply.second)
+            first = codec.decode_exchange_status(reply.first)
+            second = codec.decode_exchange_status(reply.second)
             for status in (first, second):
                 if status.acknowledged or status.failed:
                     self._statistics.add_exchange(status.retransmissions)
             if reply.payload:
                 try:
-                    uplink = decode_uplink(reply.payload)
+                    uplink = codec.decode_uplink(reply.payload)
                 except frames.FrameError as error:
                     self._statistics.malformed += 1
                     if error.kind is frames.FrameErrorKind.VERSION:

@@ -28,22 +28,14 @@ from pathlib import Path
 import stat
 from typing import TypeVar
 
+from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import encode
-from t3mpc_ros.radio.protocol.frames import (
-    Action,
-    Command,
-    Hello,
-    ParamSet,
-)
 
-KEY_SIZE = 16
-"""bytes"""
-TAG_SIZE = 8
-"""bytes"""
-NONCE_SIZE = 8
-"""bytes"""
+KEY_SIZE = 16  # bytes
+TAG_SIZE = 8  # bytes
+NONCE_SIZE = 8  # bytes
 
-SignedFrame = Command | ParamSet | Action
+SignedFrame = frames.Command | frames.ParamSet | frames.Action
 """Frames that change the robot, signed under the session key."""
 
 _USE_HELLO, _USE_SESSION_KEY, _USE_CHECK = b'\x01', b'\x02', b'\x04'
@@ -52,7 +44,7 @@ _USE_HELLO, _USE_SESSION_KEY, _USE_CHECK = b'\x01', b'\x02', b'\x04'
 3 is the generation of nonces in the robot.
 """
 
-AnySignedFrame = TypeVar('AnySignedFrame', Command, ParamSet, Action)
+AnySignedFrame = TypeVar('AnySignedFrame', frames.Command, frames.ParamSet, frames.Action)
 _EMPTY_TAG = bytes(TAG_SIZE)
 
 
@@ -117,13 +109,13 @@ def session_key(key: bytes, host_nonce: bytes, robot_nonce: bytes) -> bytes:
     return siphash(key, nonces + b'\x00') + siphash(key, nonces + b'\x01')
 
 
-def sign_hello(key: bytes, session: int, seq: int, host_us: int, nonce: bytes) -> Hello:
+def sign_hello(key: bytes, session: int, seq: int, host_us: int, nonce: bytes) -> frames.Hello:
     """Return a HELLO signed under the long-term key."""
-    hello = Hello(session, seq, host_us, nonce)
+    hello = frames.Hello(session, seq, host_us, nonce)
     return hello._replace(tag=hello_tag(key, hello))
 
 
-def hello_tag(key: bytes, hello: Hello) -> bytes:
+def hello_tag(key: bytes, hello: frames.Hello) -> bytes:
     """Return the tag of a HELLO under the long-term key; the tag in the frame is ignored."""
     return siphash(key, _USE_HELLO + encode(hello._replace(tag=_EMPTY_TAG))[:-TAG_SIZE])
 
@@ -143,8 +135,7 @@ class Signer:
     def __init__(self, key: bytes, host_us: int) -> None:
         self._key = key
         self._last = host_us
-        self.epoch = 0
-        """Number of wraps of host_us since HELLO."""
+        self.epoch = 0  # number of wraps of host_us since HELLO
 
     def sign(self, frame: AnySignedFrame) -> AnySignedFrame:
         """Return the frame with its tag.

@@ -26,16 +26,14 @@ import numpy as np
 from t3mpc_ros.geometry.types import NANOSECONDS
 
 _WRAP = 1 << 32
-_MICROSECOND = 1000
-"""ns"""
+_MICROSECOND = 1000  # ns
 _WINDOW_NS = 10 * NANOSECONDS
 _MAX_SKEW = 0.02
 # Weight (s²) of the prior skew 0 against the measured samples: standard deviation of a sample
 # (0.2 ms) over that of resonators (0.5 %), squared. Negligible after a third of a second.
 _SKEW_PRIOR_WEIGHT = (0.2e-3 / 0.005) ** 2
 
-BYTE_NS = 20 * _MICROSECOND
-"""Duration of one byte on the serial line at 500 000 baud, ns."""
+BYTE_NS = 20 * _MICROSECOND  # duration of one byte on the serial line at 500 000 baud, ns
 
 
 def forward_delay_ns(wire_bytes: int, payload_bytes: int) -> int:
@@ -56,8 +54,7 @@ class CounterUnwrapper:
 
     def __init__(self) -> None:
         self._last: int | None = None
-        self.total = 0
-        """Sum of all differences since the first value."""
+        self.total = 0  # sum of all differences since the first value
 
     def add(self, value: int) -> int:
         """Return the total at the counter value ``value`` (signed or unsigned)."""
@@ -94,8 +91,7 @@ class ClockModel:
         self._samples.clear()
         self._origin_us = 0
         self._origin_ns = 0
-        self.skew = 0.0
-        """Relative excess of a robot second over a host second; 0 without samples."""
+        self.skew = 0.0  # relative excess of a robot second over a host second; 0 without samples
 
     @property
     def is_set(self) -> bool:

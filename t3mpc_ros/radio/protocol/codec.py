@@ -28,12 +28,9 @@ class ExchangeStatus(NamedTuple):
     """Result of the transmission of one radio payload."""
 
     acknowledged: bool
-    has_payload: bool
-    """Whether the acknowledgement carried a payload."""
-    failed: bool
-    """No transmission was acknowledged (MAX_RT)."""
-    skipped: bool
-    """Not transmitted, because the payload before it failed."""
+    has_payload: bool  # whether the acknowledgement carried a payload
+    failed: bool  # no transmission was acknowledged (MAX_RT)
+    skipped: bool  # not transmitted, because the payload before it failed
     retransmissions: int
 
 
@@ -139,8 +136,7 @@ def decode_from_board(data: bytes) -> frames.FromBoard:
 class _Field(NamedTuple):
     name: str
     code: str
-    low: int
-    """Lower bound of a number, like the next the upper one; both are the length of bytes."""
+    low: int  # lower bound of a number, like the next the upper one; both are the length of bytes
     high: int
 
     def check(self, kind: str, value: object) -> None:
@@ -218,8 +214,7 @@ class _Form:
         return self._kind(**values)
 
 
-_VARIABLE_FIELDS = ('first', 'second', 'payload')
-"""Fields of TX and RESULT with variable length."""
+_VARIABLE_FIELDS = ('first', 'second', 'payload')  # fields of TX and RESULT with variable length
 
 
 def _decode(data: bytes, table: dict[int, tuple[_Form, ...]]) -> Any:

@@ -21,8 +21,7 @@ from enum import Enum, IntEnum, IntFlag
 from typing import NamedTuple
 
 VERSION = 2
-PAYLOAD_LIMIT = 32
-"""Maximum radio payload, bytes; a longer one is rejected."""
+PAYLOAD_LIMIT = 32  # maximum radio payload, bytes; a longer one is rejected
 
 
 class FrameErrorKind(Enum):
@@ -67,40 +66,34 @@ class RefusalReason(IntEnum):
     """Why the robot refuses a payload, in INFO and AUX."""
 
     NONE = 0
-    VERSION = 1  # Another version of the protocol.
-    FORM = 2  # Unknown kind, wrong length, or a value out of range.
-    SETTINGS = 3  # HELLO: the robot has no valid settings.
-    KEY = 4  # HELLO: the key of the robot is damaged, or being written.
-    UNSIGNED = 5  # No tag, but the robot has a key.
-    SIGNED = 6  # A tag, but the robot has no key.
-    SESSION = 7  # No session, or not the current one.
-    TAG = 8  # Bad tag, or a replay.
-    SEQUENCE = 9  # CMD: repeated, or overtaken by a newer one.
-    STALE = 10  # CMD: its echo is too old.
+    VERSION = 1  # another version of the protocol
+    FORM = 2  # unknown kind, wrong length, or a value out of range
+    SETTINGS = 3  # HELLO: the robot has no valid settings
+    KEY = 4  # HELLO: the key of the robot is damaged, or being written
+    UNSIGNED = 5  # no tag, but the robot has a key
+    SIGNED = 6  # A tag, but the robot has no key
+    SESSION = 7  # no session, or not the current one
+    TAG = 8  # bad tag, or a replay
+    SEQUENCE = 9  # CMD: repeated, or overtaken by a newer one
+    STALE = 10  # CMD: its echo is too old
 
 
-STATE, AUX, INFO = 0, 1, 2
-"""Frame that a POLL fetches."""
+STATE, AUX, INFO = 0, 1, 2  # frame that a POLL fetches
 RESET_ODOMETRY, CLEAR_COUNTERS = 1, 2
 """Verbs of an ACTION; RESET_ODOMETRY is rejected while the robot moves."""
 OK, UNKNOWN, OUT_OF_RANGE, READ_ONLY, BUSY, FAILED = range(6)
 """Result codes of PARAM, ACK, KEY and RECORD; FAILED not in the first two."""
-NO_KEY, KEY_HELD, KEY_DAMAGED = range(3)
-"""State of the key in KEY from the robot."""
+NO_KEY, KEY_HELD, KEY_DAMAGED = range(3)  # state of the key in KEY from the robot
 SETTINGS_GOOD, SETTINGS_ONE_COPY, SETTINGS_MISSING, SETTINGS_DAMAGED = range(4)
 """State of a record of the robot. Without valid settings it accepts no session."""
 SETTINGS_OLD, CALIBRATION_DAMAGED = 4, 5
 """Settings of an older firmware; INFO and PONG: usable settings, but a damaged calibration."""
 SETTINGS_RECORD, CALIBRATION_RECORD, LOG_RECORD = range(3)
 """Record of a RECORD or STORE; the log can only be read."""
-PART_SIZE = 16
-"""Bytes of a part of a record."""
-RATES = ('250k', '1M', '2M')
-"""Air data rates, bit/s, by their number in CFG and in the settings."""
-POWERS = ('-18', '-12', '-6', '0')
-"""Output powers, dBm, likewise."""
-AGE_NONE = 0xFFFF
-"""Age in a STATE before the first CMD of a session."""
+PART_SIZE = 16  # bytes of a part of a record
+RATES = ('250k', '1M', '2M')  # air data rates, bit/s, by their number in CFG and in the settings
+POWERS = ('-18', '-12', '-6', '0')  # output powers, dBm, likewise
+AGE_NONE = 0xFFFF  # age in a STATE before the first CMD of a session
 
 
 # -- radio, downlink ------------------------------------------------------------------------------
@@ -112,13 +105,13 @@ class Command(NamedTuple):
     session: int
     seq: int
     flags: int
-    ttl: int  # Time to live, unit 10 ms; 0 stops.
+    ttl: int  # time to live, unit 10 ms; 0 stops
     left: int  # mrad/s
     right: int  # mrad/s
-    echo_us: int  # Robot time of the newest STATE that the host has: ``State.time_us``.
+    echo_us: int  # robot time of the newest STATE that the host has: ``State.time_us``
     host_us: int = 0
     """Host time, us, modulo 2**32; only on a keyed link, like that of the other frames."""
-    tag: bytes = b''  # 8 bytes on a keyed link, otherwise empty.
+    tag: bytes = b''  # 8 bytes on a keyed link, otherwise empty
 
 
 class ParamGet(NamedTuple):
@@ -146,7 +139,7 @@ class Hello(NamedTuple):
     session: int
     seq: int
     host_us: int = 0
-    nonce: bytes = b''  # 8 bytes on a keyed link.
+    nonce: bytes = b''  # 8 bytes on a keyed link
     tag: bytes = b''
 
 
@@ -175,17 +168,17 @@ class State(NamedTuple):
     """STATE: measurements of the robot, 32 bytes."""
 
     session: int
-    seq: int  # Of the last accepted CMD.
+    seq: int  # of the last accepted CMD
     status: int
-    time_us: int  # Robot time of the sample, modulo 2**32.
-    left: int  # Microsteps issued since boot, modulo 2**32 as int32.
+    time_us: int  # robot time of the sample, modulo 2**32
+    left: int  # microsteps issued since boot, modulo 2**32 as int32
     right: int
-    gyro_z: int  # MPU6050 register, like the next two.
+    gyro_z: int  # MPU6050 register, like the next two
     accel_x: int
     accel_y: int
     age: int
     """Time from the reception of the last CMD to the sample, unit 10 us; AGE_NONE without one."""
-    ranges: bytes  # One code for each of the eight distance sensors.
+    ranges: bytes  # one code for each of the eight distance sensors
 
 
 class Param(NamedTuple):
@@ -208,17 +201,16 @@ class Info(NamedTuple):
     protocol: int
     major: int
     minor: int
-    reset_cause: int  # MCUSR of the AVR.
-    parameters: int  # Number of board parameters.
+    reset_cause: int  # MCUSR of the AVR
+    parameters: int  # number of board parameters
     steps_per_rev: int
     microsteps: int
-    refusal: int  # RefusalReason of the newest refused payload.
+    refusal: int  # RefusalReason of the newest refused payload
     settings: int  # SETTINGS_GOOD, …
-    channel: int  # Like the address: in effect.
+    channel: int  # like the address: in effect
     address: bytes
-    build: int  # Digest of the sources and build settings of the firmware.
-    nonce: bytes = b''
-    """8 bytes from a keyed robot, zeros before its first HELLO; otherwise empty."""
+    build: int  # digest of the sources and build settings of the firmware
+    nonce: bytes = b''  # 8 bytes from a keyed robot, zeros before its first HELLO; otherwise empty
 
 
 class Ack(NamedTuple):
@@ -237,19 +229,19 @@ class Aux(NamedTuple):
     seq: int
     status: int
     battery: int  # mV
-    temperature: int  # MPU6050 register, like the next three.
+    temperature: int  # MPU6050 register, like the next three
     accel_z: int
     gyro_x: int
     gyro_y: int
-    received: int  # This and the following counters are modulo 2**16.
+    received: int  # this and the following counters are modulo 2**16
     duplicates: int
-    bad_session: int  # Frames of another session, with a bad tag, or replayed.
+    bad_session: int  # frames of another session, with a bad tag, or replayed
     stale: int
-    expired: int  # Number of TTL expiries.
+    expired: int  # number of TTL expiries
     bad_version: int
-    malformed: int  # Frames of unknown kind, of wrong length or with a value out of range.
-    refusal: int  # RefusalReason of the newest refused payload.
-    refused: bytes  # Its first 3 bytes: version and kind, session, seq.
+    malformed: int  # frames of unknown kind, of wrong length or with a value out of range
+    refusal: int  # RefusalReason of the newest refused payload
+    refused: bytes  # its first 3 bytes: version and kind, session, seq
 
 
 # -- USB ------------------------------------------------------------------------------------------
@@ -259,7 +251,7 @@ class Transmit(NamedTuple):
     """TX: transmit the first payload, wait ``gap``, transmit the second unless empty."""
 
     id: int
-    gap: int  # Unit 250 us.
+    gap: int  # unit 250 us
     first: bytes
     second: bytes = b''
 
@@ -270,20 +262,20 @@ class Result(NamedTuple):
     id: int
     first: int
     second: int
-    dongle_us: int  # Dongle time at completion, modulo 2**32.
-    payload: bytes = b''  # ACK payload of the last exchange that returned one.
+    dongle_us: int  # dongle time at completion, modulo 2**32
+    payload: bytes = b''  # ACK payload of the last exchange that returned one
 
 
 class Configure(NamedTuple):
     """CFG, host to dongle: configure the radio; without an address, read its configuration."""
 
     id: int
-    channel: int = 0  # 2400 MHz plus this.
+    channel: int = 0  # 2400 MHz plus this
     rate: int = 0  # 0: 250 kbit/s, 1: 1 Mbit/s, 2: 2 Mbit/s
     power: int = 0  # 0: -18 dBm, 1: -12, 2: -6, 3: 0
-    retry_delay: int = 0  # (This + 1) 250 us.
+    retry_delay: int = 0  # (This + 1) 250 us
     retries: int = 0
-    address: bytes = b''  # 5 bytes, lowest first.
+    address: bytes = b''  # 5 bytes, lowest first
 
 
 class Configured(NamedTuple):
@@ -296,14 +288,14 @@ class Configured(NamedTuple):
     retry_delay: int
     retries: int
     address: bytes
-    chip_ok: int  # 1: the radio chip answers and holds the configuration.
+    chip_ok: int  # 1: the radio chip answers and holds the configuration
 
 
 class Ping(NamedTuple):
     """PING: test the serial line; does not use the radio."""
 
     id: int
-    echo: bytes  # 4 arbitrary bytes, returned in PONG.
+    echo: bytes  # 4 arbitrary bytes, returned in PONG
 
 
 class Pong(NamedTuple):
@@ -320,28 +312,27 @@ class Pong(NamedTuple):
     frame_errors: int
     overruns: int
     reset_cause: int
-    settings: int  # State of the settings of a robot board; 0 from a dongle.
-    channel: int  # Of the radio, like the address.
+    settings: int  # state of the settings of a robot board; 0 from a dongle
+    channel: int  # of the radio, like the address
     address: bytes
-    build: int  # Digest of the sources and build settings of the firmware.
+    build: int  # digest of the sources and build settings of the firmware
 
 
-DONGLE_BUSY = 3
-"""Code of a Refusal: another transaction runs."""
+DONGLE_BUSY = 3  # code of a Refusal: another transaction runs
 
 
 class Refusal(NamedTuple):
     """ERR: the dongle rejects a frame."""
 
-    code: int  # 1: unknown kind, 2: malformed, 3: busy (DONGLE_BUSY).
-    argument: int  # First byte of the rejected frame; its id for code 3.
+    code: int  # 1: unknown kind, 2: malformed, 3: busy (DONGLE_BUSY)
+    argument: int  # first byte of the rejected frame; its id for code 3
 
 
 class Key(NamedTuple):
     """KEY, host to the USB of the robot board: store or erase the key; empty reads its state."""
 
     id: int
-    key: bytes = b''  # 16 bytes; all zero erases the key.
+    key: bytes = b''  # 16 bytes; all zero erases the key
 
 
 class KeyState(NamedTuple):
@@ -350,17 +341,17 @@ class KeyState(NamedTuple):
     id: int
     rc: int
     """OK; BUSY: moving, drivers on, or writing a key; FAILED: the EEPROM did not hold the key."""
-    state: int  # NO_KEY, KEY_HELD or KEY_DAMAGED.
-    check: int  # ``authentication.key_check`` of the stored key, else 0.
+    state: int  # NO_KEY, KEY_HELD or KEY_DAMAGED
+    check: int  # ``authentication.key_check`` of the stored key, else 0
 
 
 class Record(NamedTuple):
     """RECORD, host to the USB of the robot board: stage a part of a record; without data, read."""
 
     id: int
-    record: int  # SETTINGS_RECORD, CALIBRATION_RECORD or LOG_RECORD.
-    part: int  # From 0, each 16 bytes.
-    data: bytes = b''  # 16 bytes; what lies behind the end of the record is ignored.
+    record: int  # SETTINGS_RECORD, CALIBRATION_RECORD or LOG_RECORD
+    part: int  # from 0, each 16 bytes
+    data: bytes = b''  # 16 bytes; what lies behind the end of the record is ignored
 
 
 class Store(NamedTuple):
@@ -368,7 +359,7 @@ class Store(NamedTuple):
 
     id: int
     record: int
-    crc: int  # Of the whole record.
+    crc: int  # of the whole record
 
 
 class RecordPart(NamedTuple):
@@ -379,9 +370,9 @@ class RecordPart(NamedTuple):
     """OK; UNKNOWN: no such record or part, or other staged bytes; OUT_OF_RANGE; BUSY; FAILED."""
     record: int
     state: int  # SETTINGS_GOOD, …
-    size: int  # Bytes of the record.
+    size: int  # bytes of the record
     part: int
-    data: bytes  # 16 bytes, filled with zeros.
+    data: bytes  # 16 bytes, filled with zeros
 
 
 class Sense(NamedTuple):
@@ -394,9 +385,9 @@ class Samples(NamedTuple):
     """SENSE, robot board to host over its USB: raw samples of the converter and the MPU6050."""
 
     id: int
-    ranges: bytes  # 16 bytes: u16 counts of the eight distance sensors; 0xFFFF: not measured.
-    battery: int  # Count of the divider.
-    accel_x: int  # MPU6050 register, like the next five; all zero while it does not answer.
+    ranges: bytes  # 16 bytes: u16 counts of the eight distance sensors; 0xFFFF: not measured
+    battery: int  # count of the divider
+    accel_x: int  # MPU6050 register, like the next five; all zero while it does not answer
     accel_y: int
     accel_z: int
     gyro_x: int
@@ -408,8 +399,7 @@ Downlink = Command | ParamGet | ParamSet | Hello | Poll | Action
 Uplink = State | Param | Info | Ack | Aux
 ToDongle = Transmit | Configure | Ping
 FromDongle = Result | Configured | Pong | Refusal
-ToBoard = Ping | Key | Record | Store | Sense
-"""Over the USB of the robot board, like the next."""
+ToBoard = Ping | Key | Record | Store | Sense  # over the USB of the robot board, like the next
 FromBoard = Pong | KeyState | RecordPart | Samples | Refusal
 _REPLIES = {
     Ping: Pong, Configure: Configured, Transmit: Result,

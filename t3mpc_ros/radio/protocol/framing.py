@@ -21,8 +21,7 @@ DOI 10.1109/90.769765. CRC-16/IBM-3740: polynomial 0x1021, initial value 0xFFFF.
 from binascii import crc_hqx
 from typing import NamedTuple
 
-FRAME_LIMIT = 78
-"""Maximum length of a frame, bytes; a TX with two radio payloads has 68."""
+FRAME_LIMIT = 78  # maximum length of a frame, bytes; a TX with two radio payloads has 68
 
 _CRC_SIZE = 2
 _ENCODED_LIMIT = FRAME_LIMIT + _CRC_SIZE + 1
@@ -66,12 +65,9 @@ def encode_frame(frame: bytes) -> bytes:
 class FrameCounts(NamedTuple):
     """Counters of a frame decoder."""
 
-    frames: int
-    """Valid frames."""
-    crc_errors: int
-    """Valid COBS, wrong CRC."""
-    frame_errors: int
-    """Too long, too short, or invalid COBS."""
+    frames: int  # valid frames
+    crc_errors: int  # valid COBS, wrong CRC
+    frame_errors: int  # too long, too short, or invalid COBS
 
 
 class FrameDecoder:

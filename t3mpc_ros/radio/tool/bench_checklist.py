@@ -37,11 +37,9 @@ from t3mpc_ros.robot.sensor_conversions import GRAVITY, ImuParameters
 
 PASS, POOR, FAIL, SKIPPED = 'pass', 'poor', 'fail', 'skipped'
 SAMPLE_COUNT = 200
-_SAMPLE_PERIOD = 0.01
-"""s; two seconds in all"""
+_SAMPLE_PERIOD = 0.01  # s; two seconds in all
 _IMU = ImuParameters()
-_GRAVITY_TOLERANCE = 0.1
-"""g; offsets of ±0.05 and ±0.08 g (PS-MPU-6000A 3.4, 6.2)"""
+_GRAVITY_TOLERANCE = 0.1  # g; offsets of ±0.05 and ±0.08 g (PS-MPU-6000A 3.4, 6.2)
 _MAX_NOISE = 0.5
 """deg/s: ten times the noise of the data sheet (0.05); a hand on the robot exceeds it"""
 _WATCHDOG, _BROWN_OUT = 8, 4
@@ -50,13 +48,10 @@ _WATCHDOG, _BROWN_OUT = 8, 4
 class Check(NamedTuple):
     """A line of the report."""
 
-    step: int
-    """Row of the checklist in docs/robot.md; 0: not in it."""
+    step: int  # row of the checklist in docs/robot.md; 0: not in it
     name: str
-    verdict: str
-    """PASS, POOR (usable, with a remedy), FAIL or SKIPPED."""
-    value: str
-    """What was measured or answered."""
+    verdict: str  # PASS, POOR (usable, with a remedy), FAIL or SKIPPED
+    value: str  # what was measured or answered
     remedy: str = ''
 
 
@@ -136,11 +131,9 @@ class BoardFindings(NamedTuple):
 
     pong: Pong
     settings: StoredSettings
-    calibration: eeprom_records.Stored[Calibration]
-    """All None unless the robot holds one."""
+    calibration: eeprom_records.Stored[Calibration]  # all None unless the robot holds one
     log: tuple[LogEntry, ...]
-    samples: tuple[Samples, ...]
-    """At rest."""
+    samples: tuple[Samples, ...]  # at rest
 
 
 def examine_board() -> Script[BoardFindings]:

@@ -54,8 +54,7 @@ USB_STEPS = 'ranges', 'battery'
 Without a dongle, the step ``rest`` is one of them.
 """
 _REST_TIME = 10.0
-_RESTS = (4.0, 4.0)
-"""Before and after a turn, s."""
+_RESTS = (4.0, 4.0)  # before and after a turn, s
 _HAND_TIMEOUT = 120.0
 _SAMPLES = 20
 """Of the converter for each reading: one second, in which a distance sensor measures 26 times."""
@@ -156,12 +155,9 @@ class WizardOptions(NamedTuple):
     geometry: WheelGeometry = WheelGeometry()
     """Nominal wheels, which decide how far the robot drives."""
     steps: tuple[str, ...] = tuple(STEPS)
-    distance: float = 2.0
-    """Length of a straight run, m."""
-    turns: int = 10
-    """Whole turns on the spot, and by hand."""
-    speed: float = 4.0
-    """Of the wheels, rad/s."""
+    distance: float = 2.0  # length of a straight run, m
+    turns: int = 10  # whole turns on the spot, and by hand
+    speed: float = 4.0  # of the wheels, rad/s
     distances: tuple[float, ...] = (0.1, 0.15, 0.2, 0.3, 0.5, 0.8)
     """From the distance sensors to the board, m."""
 

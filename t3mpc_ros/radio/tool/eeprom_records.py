@@ -33,26 +33,14 @@ from t3mpc_ros.parameters.table import number_hint
 from t3mpc_ros.parameters.yaml_checks import YamlError, parameter_file, shortened
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.framing import crc16
-from t3mpc_ros.radio.tool.procedure import (
-    OLD_FIRMWARE,
-    Pause,
-    ProcedureError,
-    Request,
-    Script,
-    request_reply,
-    wait_for_board,
-)
+from t3mpc_ros.radio.tool import procedure
 from t3mpc_ros.robot.calibration import Calibration, DividerCorrection, Estimate, SharpCurve
 
-SENSORS = ('none', 'GP2Y0A21', 'GP2Y0A41')
-"""Types of a distance sensor."""
+SENSORS = ('none', 'GP2Y0A21', 'GP2Y0A41')  # types of a distance sensor
 SENSOR_COUNT = 8
-NOT_MEASURED = 0xFFFF
-"""Count of a sensor that the converter has not measured."""
-_SAMPLE_PERIOD = 0.05
-"""s; a distance sensor measures every 38 ms"""
-_WRITE_TIMEOUT = 2.0
-"""s; at most 174 EEPROM cells of 3.4 ms, and the load of the radio"""
+NOT_MEASURED = 0xFFFF  # count of a sensor that the converter has not measured
+_SAMPLE_PERIOD = 0.05  # s; a distance sensor measures every 38 ms
+_WRITE_TIMEOUT = 2.0  # s; at most 174 EEPROM cells of 3.4 ms, and the load of the radio
 _MAX_ATTEMPTS = 5
 _SETTINGS = struct.Struct('<BBH5sBBHBH8s')
 _SETTINGS_FORMAT, _CALIBRATION_FORMAT = 2, 1
@@ -64,23 +52,15 @@ _MILLIDEGREE = math.radians(1e-3)
 class RobotSettings(NamedTuple):
     """Settings of the robot; the defaults are those of a robot that was never set up."""
 
-    address: bytes = b'T3MPC'
-    """5 bytes that are not all equal, last transmitted byte first."""
-    channel: int = 82
-    """2400 MHz plus this, 0 to 125."""
-    rate: str = '1M'
-    """One of ``frames.RATES``."""
-    power: str = '0'
-    """One of ``frames.POWERS``."""
-    microsteps: int = 16
-    """Per full step, a power of two up to 256."""
-    steps_per_turn: int = 200
-    """Full steps of a turn of the wheel, 20 to 10000."""
-    invert_left: bool = False
-    """The motor is mounted or wired in reverse."""
+    address: bytes = b'T3MPC'  # 5 bytes that are not all equal, last transmitted byte first
+    channel: int = 82  # 2400 MHz plus this, 0 to 125
+    rate: str = '1M'  # one of ``frames.RATES``
+    power: str = '0'  # one of ``frames.POWERS``
+    microsteps: int = 16  # per full step, a power of two up to 256
+    steps_per_turn: int = 200  # full steps of a turn of the wheel, 20 to 10000
+    invert_left: bool = False  # the motor is mounted or wired in reverse
     invert_right: bool = False
-    divider: float = 4.0
-    """Battery voltage / voltage at the converter, 1 to 13."""
+    divider: float = 4.0  # battery voltage / voltage at the converter, 1 to 13
     battery_wired: bool = False
     """The battery is measured, so that 0 V (a broken wire) stops the robot."""
     sensors: tuple[str, ...] = SENSOR_COUNT * ('GP2Y0A21',)
@@ -94,10 +74,8 @@ Decoded = TypeVar('Decoded')
 class Stored(NamedTuple, Generic[Content]):
     """A record of the robot."""
 
-    state: int
-    """SETTINGS_GOOD, …"""
-    content: Content
-    """In effect; of the defaults unless :attr:`valid`."""
+    state: int  # SETTINGS_GOOD, …
+    content: Content  # in effect; of the defaults unless ``valid``
 
     @property
     def valid(self) -> bool:
@@ -109,7 +87,7 @@ class Stored(NamedTuple, Generic[Content]):
         try:
             return Stored(self.state, decode(self.content))
         except ValueError as error:
-            raise ProcedureError(
+            raise procedure.ProcedureError(
                 f'the robot holds a record that this host does not know ({error}): update the host'
             ) from error
 
@@ -282,17 +260,17 @@ def _encode_curve(name: str, curve: SharpCurve | None) -> bytes:
 # -- scripts --------------------------------------------------------------------------------------
 
 
-def read_calibration() -> Script[Calibration]:
+def read_calibration() -> procedure.Script[Calibration]:
     """Return the calibration of the robot, all None if it was never calibrated."""
     stored = yield from read_record(frames.CALIBRATION_RECORD)
     if stored.state == frames.SETTINGS_DAMAGED:
-        raise ProcedureError(
+        raise procedure.ProcedureError(
             'the calibration of the robot is damaged, so it accepts no session: write it again'
         )
     return stored.decoded(decode_calibration).content
 
 
-def write_calibration(calibration: Calibration) -> Script[Calibration]:
+def write_calibration(calibration: Calibration) -> procedure.Script[Calibration]:
     """Store a calibration in both copies; return what the robot now holds, rounded to its units.
 
     It replaces the old one completely: to change a value, write ``read_calibration()`` with it
@@ -303,9 +281,9 @@ def write_calibration(calibration: Calibration) -> Script[Calibration]:
     return decode_calibration((yield from write_record(frames.CALIBRATION_RECORD, body)))
 
 
-def read_samples() -> Script[frames.Samples]:
+def read_samples() -> procedure.Script[frames.Samples]:
     """Return the newest raw samples of distance sensors, battery and inertial sensor."""
-    return (yield from request_reply(frames.Sense(0), frames.Samples))
+    return (yield from procedure.request_reply(frames.Sense(0), frames.Samples))
 
 
 def range_counts(samples: frames.Samples) -> tuple[int, ...]:
@@ -313,43 +291,43 @@ def range_counts(samples: frames.Samples) -> tuple[int, ...]:
     return struct.unpack('<8H', samples.ranges)
 
 
-def read_counts(samples: int) -> Script[list[tuple[int, ...]]]:
+def read_counts(samples: int) -> procedure.Script[list[tuple[int, ...]]]:
     """Return samples of the raw counts: eight distance sensors and, last, the battery."""
-    yield from wait_for_board()
+    yield from procedure.wait_for_board()
     counts = []
     for _ in range(samples):
         sample = yield from read_samples()
         counts.append((*range_counts(sample), sample.battery))
-        yield Pause(_SAMPLE_PERIOD)
+        yield procedure.Pause(_SAMPLE_PERIOD)
     return counts
 
 
-def read_record(record: int) -> Script[Stored[bytes]]:
+def read_record(record: int) -> procedure.Script[Stored[bytes]]:
     """Return a record, after the board has answered."""
-    yield from wait_for_board()
+    yield from procedure.wait_for_board()
     return (yield from _read_parts(record))
 
 
-def write_record(record: int, body: bytes) -> Script[bytes]:
+def write_record(record: int, body: bytes) -> procedure.Script[bytes]:
     """Stage and store a record; return its content. A lost answer is harmless: it is read back."""
-    yield from wait_for_board()
+    yield from procedure.wait_for_board()
     for _ in range(_MAX_ATTEMPTS):
         for part, at in enumerate(range(0, len(body), frames.PART_SIZE)):
             data = body[at : at + frames.PART_SIZE].ljust(frames.PART_SIZE, b'\0')
             yield from request_part(frames.Record(0, record, part, data))
-        response = yield Request(frames.Store(0, record, crc16(body)), _WRITE_TIMEOUT)
+        response = yield procedure.Request(frames.Store(0, record, crc16(body)), _WRITE_TIMEOUT)
         if isinstance(response.reply, frames.RecordPart):
             check_stored(response.reply.rc)
         stored = yield from _read_parts(record)
         if stored.state == frames.SETTINGS_GOOD and stored.content == body:
             return body
-    raise ProcedureError('the robot does not confirm the record: is the cable good?')
+    raise procedure.ProcedureError('the robot does not confirm the record: is the cable good?')
 
 
 def check_stored(rc: int) -> None:
     """Raise ProcedureError for the answer of a robot that does not store a record or key."""
     if rc in _REASONS:
-        raise ProcedureError(_REASONS[rc])
+        raise procedure.ProcedureError(_REASONS[rc])
 
 
 _REASONS = {
@@ -365,7 +343,7 @@ _REASONS = {
 }
 
 
-def _read_parts(record: int) -> Script[Stored[bytes]]:
+def _read_parts(record: int) -> procedure.Script[Stored[bytes]]:
     first = yield from request_part(frames.Record(0, record, 0))
     body = first.data
     for part in range(1, -(-first.size // frames.PART_SIZE)):
@@ -373,11 +351,11 @@ def _read_parts(record: int) -> Script[Stored[bytes]]:
     return Stored(first.state, body[: first.size])
 
 
-def request_part(request: frames.Record) -> Script[frames.RecordPart]:
+def request_part(request: frames.Record) -> procedure.Script[frames.RecordPart]:
     """Return the answer to a RECORD, or raise ProcedureError."""
-    reply = yield from request_reply(request, frames.RecordPart)
+    reply = yield from procedure.request_reply(request, frames.RecordPart)
     if reply.rc != frames.OK:
-        raise ProcedureError(OLD_FIRMWARE)
+        raise procedure.ProcedureError(procedure.OLD_FIRMWARE)
     return reply
 
 
@@ -396,11 +374,9 @@ SETTINGS_TEXTS = (
 ADDRESS_SIZE = 5
 _CONFUSABLE = (0x00, 0x55, 0xAA, 0xFF)
 """Bytes that the receiver takes for noise or a preamble (nRF24L01+ data sheet 1.0, 7.3.2)."""
-_LINK = ('address', 'channel', 'rate')
-"""Settings that are link parameters of the host too."""
+_LINK = ('address', 'channel', 'rate')  # settings that are link parameters of the host too
 _KINDS = {int: 'a whole number', float: 'a number', bool: 'true or false', str: 'text in quotes'}
-_BOARD = '/robot_board'
-"""Name of no node: a node rejects parameters that it does not have."""
+_BOARD = '/robot_board'  # name of no node: a node rejects parameters that it does not have
 
 
 StoredSettings = Stored[RobotSettings]
@@ -428,7 +404,7 @@ def parse_address(text: object) -> bytes:
     return bytes.fromhex(text)
 
 
-def read_settings() -> Script[StoredSettings]:
+def read_settings() -> procedure.Script[StoredSettings]:
     """Return the settings of the robot."""
     stored = yield from read_record(frames.SETTINGS_RECORD)
     return stored.decoded(decode_settings)
@@ -449,7 +425,7 @@ def change_settings(
     return settings
 
 
-def write_settings(settings: RobotSettings) -> Script[StoredSettings]:
+def write_settings(settings: RobotSettings) -> procedure.Script[StoredSettings]:
     """Store settings in both copies; return what the robot holds."""
     body = yield from write_record(frames.SETTINGS_RECORD, encode_settings(settings))
     return StoredSettings(frames.SETTINGS_GOOD, decode_settings(body))

@@ -24,8 +24,7 @@ from t3mpc_ros.radio.tool import procedure
 from t3mpc_ros.radio.tool.eeprom_records import check_stored
 
 ERASE_KEY = bytes(KEY_SIZE)
-_WRITE_TIMEOUT = 1.0
-"""s; 25 EEPROM cells of 3.4 ms, and the load of the radio"""
+_WRITE_TIMEOUT = 1.0  # s; 25 EEPROM cells of 3.4 ms, and the load of the radio
 _MAX_ATTEMPTS = 5
 
 

@@ -27,13 +27,10 @@ from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.codec import decode_exchange_status, decode_uplink, encode
 from t3mpc_ros.radio.tool import procedure
 
-_REPLY_TIMEOUT = 0.25
-"""s; fifteen retransmissions at 250 kbit/s take 60 ms"""
+_REPLY_TIMEOUT = 0.25  # s; fifteen retransmissions at 250 kbit/s take 60 ms
 GOOD, POOR, BAD = 'good', 'poor', 'BAD'
-_MAX_USB_ROUND_TRIP = 5e-3
-"""s; PING and PONG take 0.7 ms on the line"""
-_MAX_MEAN_RETRIES = 0.5
-"""Mean retransmissions per packet above which the radio has no margin."""
+_MAX_USB_ROUND_TRIP = 5e-3  # s; PING and PONG take 0.7 ms on the line
+_MAX_MEAN_RETRIES = 0.5  # mean retransmissions per packet above which the radio has no margin
 _SEARCH = '{} t3mpc robot scan searches all channels; '
 _PROBLEMS = {
     frames.StatusFlag.ESTOP: 'its emergency stop is latched',
@@ -45,16 +42,12 @@ _PROBLEMS = {
 class LinkTestResult(NamedTuple):
     """Measurements of the link test."""
 
-    requests: int
-    """Number of PINGs, and of radio cycles."""
-    pings: tuple[float, ...]
-    """Round trips of the answered PINGs, s."""
-    cycles: tuple[float, ...]
-    """Round trips of the answered cycles, s."""
+    requests: int  # number of PINGs, and of radio cycles
+    pings: tuple[float, ...]  # round trips of the answered PINGs, s
+    cycles: tuple[float, ...]  # round trips of the answered cycles, s
     retransmissions: tuple[int, ...]
     """Number of acknowledged packets with 0, 1, … 15 retransmissions."""
-    line_errors: int
-    """Frames that reached the dongle damaged during the test."""
+    line_errors: int  # frames that reached the dongle damaged during the test
     state: frames.State | None
 
 
@@ -217,10 +210,8 @@ def _slow_trip(trips: tuple[float, ...]) -> float:
 
 
 CHANNELS = 126
-_MIN_PACKETS = 2
-"""Packets per channel, each with the retransmissions of the radio."""
-_PACKETS = 20
-"""Packets on a channel that answers."""
+_MIN_PACKETS = 2  # packets per channel, each with the retransmissions of the radio
+_PACKETS = 20  # packets on a channel that answers
 
 Progress = Callable[[int, int, str], None]
 """Receives the number of tested channels, the total, and the text of a new result."""
@@ -233,8 +224,7 @@ class ChannelResult(NamedTuple):
     rate: str
     answered: int
     packets: int
-    retransmissions: float
-    """Mean per answered packet."""
+    retransmissions: float  # mean per answered packet
 
 
 def scan_channels(

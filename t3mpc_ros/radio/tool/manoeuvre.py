@@ -33,34 +33,22 @@ from t3mpc_ros.radio.link.telemetry import Telemetry
 from t3mpc_ros.robot.calibration import Recording
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, WheelAngles
 
-_CONNECT_TIMEOUT = 15.0
-"""Timeout for the start of the dongle and the handshake, s."""
+_CONNECT_TIMEOUT = 15.0  # timeout for the start of the dongle and the handshake, s
 _PERIOD_NS = NANOSECONDS // 50
-_COMMAND_NS = NANOSECONDS // 4
-"""Time for which a command is followed."""
-_REPORT_DELAY_NS = NANOSECONDS
-"""A reason that lasts this long is reported."""
-_ACCELERATION = 8.0
-"""rad/s², both ways."""
-_FINAL_SPEED = 0.2
-"""Speed at the target, rad/s: 0.3 degrees per cycle."""
-_APPROACH_GAIN = 3.0
-"""Speed per remaining angle, 1/s."""
-_NOT_FOLLOWING_TIMEOUT = 1.0
-"""Time without following after which the manoeuvre fails, s."""
-_TIME_MARGIN = 15.0
-"""Additional time for acceleration and approach, s."""
-SETTLING_TIME = 0.3
-"""Standstill until the rotors have settled, s."""
-_POWER_ON_TIME = 1.5
-"""Time until the rotors have settled after the drivers were switched on, s."""
+_COMMAND_NS = NANOSECONDS // 4  # time for which a command is followed
+_REPORT_DELAY_NS = NANOSECONDS  # a reason that lasts this long is reported
+_ACCELERATION = 8.0  # rad/s², both ways
+_FINAL_SPEED = 0.2  # speed at the target, rad/s: 0.3 degrees per cycle
+_APPROACH_GAIN = 3.0  # speed per remaining angle, 1/s
+_NOT_FOLLOWING_TIMEOUT = 1.0  # time without following after which the manoeuvre fails, s
+_TIME_MARGIN = 15.0  # additional time for acceleration and approach, s
+SETTLING_TIME = 0.3  # standstill until the rotors have settled, s
+_POWER_ON_TIME = 1.5  # time until the rotors have settled after the drivers were switched on, s
 _TURNING_RATE, _RESTING_RATE = 0.1, 0.03
 """A turn by hand begins above the one and ends below the other, rad/s."""
-_TURN_MARGIN = 0.3
-"""Time before and after that belongs to the turn, s."""
+_TURN_MARGIN = 0.3  # time before and after that belongs to the turn, s
 NO_MOTION = WheelAngles(0.0, 0.0)
-_IDLE_OFF = 0.1
-"""Standstill after which the drivers are off for a turn by hand, s."""
+_IDLE_OFF = 0.1  # standstill after which the drivers are off for a turn by hand, s
 
 
 class Manoeuvre:
@@ -99,12 +87,9 @@ class Manoeuvre:
         self._finished = False
         self._newest: Telemetry | None = None
         self._samples: list[tuple[int, float, float, float]] = []
-        self._motion = [0, 0]
-        """Numbers of the first sample in motion, and of the first after it."""
-        self.seconds = 0.0
-        """Time since the start of the motion, s."""
-        self.error = ''
-        """Reason of a failure; empty on success."""
+        self._motion = [0, 0]  # numbers of the first sample in motion, and of the first after it
+        self.seconds = 0.0  # time since the start of the motion, s
+        self.error = ''  # reason of a failure; empty on success
 
     @property
     def done(self) -> bool:
@@ -323,8 +308,7 @@ class JogResult(NamedTuple):
 
     target: int
     counted: int
-    other: int
-    """Of the other wheel, expected to be 0."""
+    other: int  # of the other wheel, expected to be 0
     seconds: float
 
 

@@ -41,15 +41,12 @@ WRONG_BOARD = (
     'the USB port of the robot board; ls -l /dev/serial/by-id lists both'
 )
 OLD_FIRMWARE = 'the firmware of the robot does not know this request: make -C firmware flash'
-_PING_TIMEOUT = 0.1
-"""Timeout of a PING, s."""
-_MAX_PINGS = 50
-"""Five seconds; a board that was reset by opening its port starts within 2 s."""
+_PING_TIMEOUT = 0.1  # timeout of a PING, s
+_MAX_PINGS = 50  # five seconds; a board that was reset by opening its port starts within 2 s
 _REPLY_TIMEOUT = 0.3
 _MAX_ATTEMPTS = 5
 _BYTE = 0xFF
-_POLL_PERIOD = 0.05
-"""Period at which the runner polls for an interruption, s."""
+_POLL_PERIOD = 0.05  # period at which the runner polls for an interruption, s
 SHUTDOWN_TIMEOUT_NS = 3 * NANOSECONDS
 """Time for restoring a configuration or stopping the robot after an interruption."""
 
@@ -66,8 +63,7 @@ class Request(NamedTuple):
     """Send a frame, whose id the procedure sets, and wait for its reply."""
 
     frame: RequestFrame
-    timeout: float
-    """s"""
+    timeout: float  # s
 
 
 class Pause(NamedTuple):
@@ -79,8 +75,7 @@ class Pause(NamedTuple):
 class Response(NamedTuple):
     """Result of a request or a pause."""
 
-    reply: ReplyFrame | None
-    """None after a timeout or a pause."""
+    reply: ReplyFrame | None  # none after a timeout or a pause
     sent_ns: int
     returned_ns: int
 

@@ -27,8 +27,7 @@ from t3mpc_ros.radio.protocol.framing import crc16
 from t3mpc_ros.radio.tool import procedure
 from t3mpc_ros.radio.tool.eeprom_records import SETTINGS_TEXTS, request_part
 
-_REPLY_TIMEOUT = 0.25
-"""s"""
+_REPLY_TIMEOUT = 0.25  # s
 _MAX_ATTEMPTS = 20
 
 
@@ -175,14 +174,10 @@ _TEXTS: dict[int, str] = {
 class LogEntry(NamedTuple):
     """An entry of the log."""
 
-    number: int
-    """Counts all entries, modulo 2**32."""
-    kind: int
-    """A LogKind."""
-    uptime: int
-    """Time since the boot before, s."""
-    value: int
-    """Reset cause, millivolts, state or microseconds, by the kind."""
+    number: int  # counts all entries, modulo 2**32
+    kind: int  # a LogKind
+    uptime: int  # time since the boot before, s
+    value: int  # reset cause, millivolts, state or microseconds, by the kind
 
 
 def read_log() -> procedure.Script[tuple[LogEntry, ...]]:
