@@ -76,10 +76,7 @@ class Fault(NamedTuple):
 
 
 def parse_fault(text: str) -> Fault:
-    """Return the fault written as ``name:at[:for[:value]]``, ``loss:5:inf:0.3`` for example.
-
-    ``at`` (start) and ``for`` (duration) are in seconds.
-    """
+    """Return the fault written as ``name:at[:for[:value]]``, times in s: ``loss:5:inf:0.3``."""
     name, *numbers = text.split(':')
     if not 1 <= len(numbers) <= 3:
         raise FaultError(f'fault must be name:at[:for[:value]]: got {text!r}')

@@ -150,10 +150,7 @@ def load_library() -> ctypes.CDLL:
 
 
 def compile_library() -> Path:
-    """Return the path of the compiled core; compile it unless the cache holds it.
-
-    CompilerMissingError: there is no compiler; FirmwareLibraryError: it fails.
-    """
+    """Return the path of the core, compiled unless it is cached, or raise FirmwareLibraryError."""
     target = writable_directory(os.environ, f'firmware-{_digest()}') / 'libt3core.so'
     if not target.exists():
         _compile(target)

@@ -156,10 +156,7 @@ class Plant:
             self.stopped_at = self.elapsed
 
     def boot(self, microsteps: int) -> None:
-        """Reset both counters, and set the drivers to this number of microsteps per step.
-
-        A change of the microsteps also stops the wheels.
-        """
+        """Reset the counters, and set the microsteps per step; a change stops the wheels."""
         if microsteps != self._motor.microsteps:
             self._build_drivetrain(replace(self._motor, microsteps=microsteps), self._drivetrain)
         self._drivetrain.restart_board()

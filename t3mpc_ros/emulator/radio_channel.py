@@ -82,10 +82,7 @@ class Transmission(NamedTuple):
 
 
 class Medium:
-    """What transceivers in range of each other share: time, and who transmits when.
-
-    Emulators with one medium run together: whoever advances one of them advances all.
-    """
+    """What transceivers in range share: time, which all advance together, and who transmits."""
 
     def __init__(self, now_ns: int = 0, seed: int = 1) -> None:
         self.events = EventQueue(now_ns)

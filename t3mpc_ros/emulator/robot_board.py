@@ -94,10 +94,7 @@ class RobotBoard:
         self.boot(1)
 
     def boot(self, reset_cause: int) -> None:
-        """Boot: the RAM is cleared, writes to the EEPROM end where they are.
-
-        ``reset_cause``: reset flags as in the MCUSR register of an AVR.
-        """
+        """Boot with reset flags as in MCUSR: the RAM is cleared, writes to the EEPROM end."""
         self.now_us = 0  # time since boot, without the wrap to 32 bits
         self.sense()
         self._board.call('boot', reset_cause, 0)

@@ -159,17 +159,6 @@ def test_a_radio_with_another_configuration_gets_no_reply(changed):
     assert len(station.received) == ('retry_delay' in changed)
 
 
-def test_an_exchange_with_a_dead_chip_times_out():
-    station = Station()
-    station.write(Transmit(9, 6, CMD, POLL))
-    station.run(200)
-    station.chip_ok = False
-    station.run(200_000)
-    at, result = station.take_reply()
-    assert result[1:3] == (0x04, 0x08)
-    assert at == pytest.approx(150_000 + 270)
-
-
 def test_a_booting_dongle_ignores_input_and_ends_its_transaction():
     station = Station()
     station.write(Transmit(9, 6, CMD, POLL))

@@ -19,7 +19,6 @@ frames does not ask for is compared as well.
 
 from collections.abc import Iterator
 import ctypes
-import itertools
 import os
 import random
 import re
@@ -33,6 +32,8 @@ from support.missing_tools import find, needs
 from t3mpc_ros.radio.protocol.codec import encode
 from t3mpc_ros.radio.protocol.frames import CALIBRATION_RECORD, SETTINGS_RECORD, Key
 from t3mpc_ros.radio.tool import eeprom_records
+from t3mpc_ros.radio.tool.eeprom_records import RobotSettings
+from t3mpc_ros.robot.calibration import Calibration, DividerCorrection, SharpCurve
 
 HEADERS = '\n'.join(path.read_text() for path in sorted((core.FIRMWARE / 'core').glob('*.h')))
 STRUCTS = dict(re.findall(r'^struct (t3_\w+) \{\n(.*?)^\};', HEADERS, re.DOTALL | re.MULTILINE))
@@ -207,16 +208,15 @@ def test_a_new_session_begins_as_the_first_one(library, layout, key, seed):
     assert used.steps[0] == 0
 
 
-CURVE = eeprom_records.SharpCurve(0.3, 0.02, 0.05, 0.003)
-CALIBRATION = eeprom_records.Calibration(
-    divider=eeprom_records.DividerCorrection(0.05, -0.1, 0.02), curves=8 * (CURVE,)
+CALIBRATION = Calibration(
+    divider=DividerCorrection(0.05, -0.1, 0.02), curves=8 * (SharpCurve(0.3, 0.02, 0.05, 0.003),)
 )
 CHANGES = {
-    'divider': eeprom_records.RobotSettings(divider=7.5),
-    'direction': eeprom_records.RobotSettings(invert_left=True),
-    'steps': eeprom_records.RobotSettings(microsteps=32, steps_per_turn=400),
-    'radio': eeprom_records.RobotSettings(rate='250k', channel=7, address=b'12345'),
-    'sensors': eeprom_records.RobotSettings(sensors=('GP2Y0A41',) * 8),
+    'divider': RobotSettings(divider=7.5),
+    'direction': RobotSettings(invert_left=True),
+    'steps': RobotSettings(microsteps=32, steps_per_turn=400),
+    'radio': RobotSettings(rate='250k', channel=7, address=b'12345'),
+    'sensors': RobotSettings(sensors=('GP2Y0A41',) * 8),
     'calibration': CALIBRATION,
     'key': Key(2, core.KEY),
     'no key': Key(2, bytes(16)),
@@ -227,7 +227,7 @@ def change(robot, what):
     """Store a record or a key over USB."""
     if isinstance(what, Key):
         robot.console(encode(what))
-    elif isinstance(what, eeprom_records.Calibration):
+    elif isinstance(what, Calibration):
         robot.store(CALIBRATION_RECORD, eeprom_records.encode_calibration(what))
     else:
         robot.store(SETTINGS_RECORD, eeprom_records.encode_settings(what))
@@ -251,79 +251,3 @@ def test_stored_records_are_in_effect_as_after_a_boot(library, layout, what):
         each.run(200_000)
     copies = 'robot.settings.copies', 'robot.calibration.copies'
     assert not unlike(used, new, layout, (*TIMES, *copies, 'robot.reset_cause', 'robot.counters'))
-
-
-def test_a_released_emergency_stop_leaves_a_robot_at_rest(library, layout):
-    """Released, the robot is as after any command to stand, and the command before is gone."""
-    used, new = core.Robot(library), core.Robot(library)
-    for each in (used, new):
-        each.run(1000)
-        each.hello()
-        each.drive(4000, 4000, 300_000)
-    used.send(used.command(4000, 4000, flags=core.ESTOP))
-    used.run(1_000_000)
-    new.send(new.command(0, 0, flags=0))
-    new.run(1_000_000)
-    for each in (used, new):
-        each.send(each.command(0, 0, flags=core.CLEAR))
-        each.run(100_000)
-    assert not unlike(used, new, layout, ('robot.steps', 'robot.rest_us', 'console'))
-
-
-def pass_through(robot):
-    """Enter every state of the robot once, and leave it; return what was seen meanwhile."""
-    seen = []
-
-    def wait(us):
-        for _ in range(us // 20_000):
-            robot.run(20_000)
-            seen.append((robot.status, robot.speeds, robot.call('powered'), robot.call('levels')))
-
-    def drive(us, *speeds, **other):
-        for _ in range(us // 40_000):
-            robot.send(robot.command(*speeds, **other))
-            wait(40_000)
-
-    drive(400_000, 5000, 3000)
-    wait(1_200_000)  # it expires, rests, and is idle
-    drive(400_000, 30_000, 5000)  # scaled down
-    drive(400_000, 0, 0)
-    wait(400_000)
-    robot.send(robot.command(0, 0, flags=core.ESTOP))
-    wait(2_400_000)
-    robot.send(robot.command(0, 0, flags=core.CLEAR))
-    drive(200_000, 4000, -4000)
-    robot.call('press', True)
-    wait(400_000)
-    robot.call('press', False)
-    wait(400_000)
-    robot.send(robot.command(0, 0, flags=core.CLEAR))
-    for channel, count in ((8, 350), (8, 0xFFFF)):  # an empty battery, and none
-        robot.call('set_adc', channel, count)
-        drive(1_200_000, 4000, 4000)
-    for answers in (False, True):
-        robot.call('set_imu', answers, (ctypes.c_int16 * 7)())
-        drive(1_200_000, 1000, 1000)
-    robot.send(robot.command(0, 0, flags=0))
-    wait(4_000_000)
-    return seen
-
-
-def test_each_state_is_the_same_when_it_is_entered_again(library):
-    """A robot that had once been idle lost its power as soon as it came to rest again."""
-    robot = core.Robot(library)
-    robot.run(1_200_000)
-    robot.hello()
-    robot.set(core.IDLE_OFF, 600)
-    robot.run(-robot.now % 2_000_000)
-    first = pass_through(robot)
-    robot.run(-robot.now % 2_000_000)
-    assert pass_through(robot) == first
-    rests = [
-        after
-        for before, after in itertools.pairwise(first)
-        if any(before[1]) and not any(after[1]) and after[0] & core.ENABLED
-    ]
-    assert len(rests) >= 2
-    assert all(powered for _, _, powered, _ in rests)
-    assert not all(powered for _, _, powered, _ in first)

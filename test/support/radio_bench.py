@@ -81,13 +81,14 @@ class FakeRobot:
         return self.steps[1] * STEP, self.steps[0] * STEP
 
     def status(self):
-        bits = frames.StatusFlag(0)
-        bits |= frames.StatusFlag.ENABLED if self.enabled else frames.StatusFlag(0)
-        bits |= frames.StatusFlag.MOVING if self.speeds != (0.0, 0.0) else frames.StatusFlag(0)
-        bits |= frames.StatusFlag.ESTOP if self.estop else frames.StatusFlag(0)
-        bits |= frames.StatusFlag.TTL_EXPIRED if self.expired else frames.StatusFlag(0)
-        bits |= frames.StatusFlag.NO_SESSION if not self.verifier.session else frames.StatusFlag(0)
-        return bits
+        flags = {
+            frames.StatusFlag.ENABLED: self.enabled,
+            frames.StatusFlag.MOVING: self.speeds != (0.0, 0.0),
+            frames.StatusFlag.ESTOP: self.estop,
+            frames.StatusFlag.TTL_EXPIRED: self.expired,
+            frames.StatusFlag.NO_SESSION: not self.verifier.session,
+        }
+        return sum((flag for flag, is_set in flags.items() if is_set), frames.StatusFlag(0))
 
     def state(self, now_ns):
         self.run_to(now_ns)
@@ -96,19 +97,9 @@ class FakeRobot:
             age = min(round((now_ns - self.command_ns) / 10_000 * (1.0 + self.skew)), 0xFFFE)
         left, right = (signed32(math.floor(steps)) for steps in self.steps)
         ranges = bytes([0, 1, 20, 100, 160, 254, 255, 60])
-        return frames.State(
-            self.verifier.session,
-            self.seq,
-            self.status(),
-            self.time_us(now_ns),
-            left,
-            right,
-            655,
-            16384,
-            -8192,
-            age,
-            ranges,
-        )
+        session, status = self.verifier.session, self.status()
+        motion = self.time_us(now_ns), left, right, 655, 16384, -8192
+        return frames.State(session, self.seq, status, *motion, age, ranges)
 
     def receive(self, data, now_ns):
         """Process a packet."""
@@ -126,17 +117,9 @@ class FakeRobot:
             if frame.what == frames.INFO:
                 self.answer = self.info(frame.seq, now_ns)
             elif frame.what == frames.AUX:
-                counters = (1, 2, 3, 4, 5, 6, 7)
-                readings = (11100, 0, 0, 0, 0)
-                self.answer = frames.Aux(
-                    self.verifier.session,
-                    0,
-                    self.status(),
-                    *readings,
-                    *counters,
-                    self.refusal,
-                    bytes(3),
-                )
+                counts = 11100, 0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7
+                head = self.verifier.session, 0, self.status()
+                self.answer = frames.Aux(*head, *counts, self.refusal, bytes(3))
         elif isinstance(frame, frames.ParamGet):
             self.answer = self.parameter(frame, frames.OK)
         elif not (refusal := self.verifier.verify(frame)):
@@ -154,23 +137,9 @@ class FakeRobot:
             self.refusal = refusal
 
     def info(self, seq, now_ns):
-        return frames.Info(
-            self.verifier.session,
-            seq,
-            frames.VERSION,
-            2,
-            0,
-            2,
-            len(frames.BOARD_PARAMETERS),
-            200,
-            16,
-            self.refusal,
-            self.settings,
-            82,
-            b'T3MPC',
-            0,
-            self.verifier.nonce,
-        )
+        count, nonce = len(frames.BOARD_PARAMETERS), self.verifier.nonce
+        identity = frames.VERSION, 2, 0, 2, count, 200, 16, self.refusal, self.settings
+        return frames.Info(self.verifier.session, seq, *identity, 82, b'T3MPC', 0, nonce)
 
     def parameter(self, frame, rc):
         row = frames.BOARD_PARAMETERS[frame.id]
@@ -282,24 +251,9 @@ class FakeDongle:
 
     def reply(self, frame, now_ns):
         if isinstance(frame, frames.Ping):
-            chip = int(self.chip_ok)
-            clock = self.time_us(now_ns)
-            counts = self.decoder.counts[1:]
-            pong = frames.Pong(
-                frame.id,
-                frame.echo,
-                clock,
-                self.version,
-                2,
-                0,
-                chip,
-                *counts,
-                0,
-                2,
-                0,
-                *self.radio,
-                0,
-            )
+            state = self.time_us(now_ns), self.version, 2, 0, int(self.chip_ok)
+            counts = *self.decoder.counts[1:], 0, 2, 0
+            pong = frames.Pong(frame.id, frame.echo, *state, *counts, *self.radio, 0)
             return now_ns + MS, pong
         if isinstance(frame, frames.Configure):
             self.configured = True

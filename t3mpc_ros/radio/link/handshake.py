@@ -46,10 +46,7 @@ _RESULT_TEXTS = {
 
 
 class Session:
-    """Builds the frames of one session, signed if there is a key.
-
-    ``before`` is the number of the previous session, which is not used again; 0 without one.
-    """
+    """Builds the frames of one session, signed with a key; ``before`` is the last number, or 0."""
 
     def __init__(self, key: bytes, entropy: Entropy, before: int, now_ns: int) -> None:
         self._key = key

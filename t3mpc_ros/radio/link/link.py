@@ -113,10 +113,7 @@ class ActiveSession:
             self.due_ns = now_ns
 
     def next(self, now_ns: int, hold: bool) -> frames.Downlink | frames.Ping | None:
-        """Return the request to send now, if any; a POLL for STATE follows each payload.
-
-        ``hold``: command standstill, whatever the setpoint.
-        """
+        """Return the request to send now, if any, before a POLL; ``hold``: command standstill."""
         if now_ns < self.due_ns:
             return self._next_request(now_ns) if self.due_ns - now_ns >= _MIN_IDLE_NS else None
         # Late cycles are skipped.
@@ -202,10 +199,7 @@ class ActiveSession:
 
 
 def _silence_ns(parameters: LinkParameters) -> int:
-    """Return the time without an answer after which the robot is silent.
-
-    With slow cycles a single answer is a cycle old when the next command is due.
-    """
+    """Return the time without an answer until the robot is silent: the TTL, or two slow cycles."""
     return round(NANOSECONDS * max(parameters.ttl, 2.0 / parameters.cycle_rate))
 
 
@@ -372,10 +366,7 @@ class Link:
     # -- commands ---------------------------------------------------------------------------------
 
     def command(self, wheels: WheelSpeeds, until_ns: int) -> None:
-        """Follow finite wheel speeds (rad/s) until the next ones, or until ``until_ns``.
-
-        The robot follows them no longer, even if the host dies.
-        """
+        """Follow finite wheel speeds (rad/s) up to ``until_ns``, even if the host dies."""
         self._arbiter.command(wheels, until_ns)
 
     def stop(self, reason: str) -> None:
@@ -398,10 +389,7 @@ class Link:
     # -- port -------------------------------------------------------------------------------------
 
     def port_opened(self, now_ns: int, cable: bool = True) -> None:
-        """Report that the port is open.
-
-        ``cable``: if it is the USB port of a robot board, drive the robot over it.
-        """
+        """Report that the port is open; ``cable``: that of a robot board will do."""
         self._transactions.reset()
         self._cable_allowed = cable
         # The finding of the last attempt stays visible until there is a new one.

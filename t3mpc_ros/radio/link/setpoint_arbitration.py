@@ -36,10 +36,7 @@ class Setpoint(NamedTuple):
 
 
 class SetpointArbiter:
-    """Selects the setpoint from the newest wheel speeds and the emergency stop.
-
-    Which commands are followed, and for how long, is decided by the command limiter.
-    """
+    """Selects the setpoint from the newest wheel speeds and the emergency stop."""
 
     def __init__(self, parameters: LinkParameters) -> None:
         self._parameters = parameters

@@ -92,10 +92,7 @@ class TelemetryDecoder:
         )
 
     def configure(self, steps: int, gyro_range: int) -> None:
-        """Set the microsteps per revolution and the full scale of the gyro (deg/s).
-
-        ValueError: a count below 1, or a range that the MPU6050 lacks.
-        """
+        """Set microsteps per turn and gyro range (deg/s); ValueError: impossible ones."""
         if steps < 1:
             raise ValueError(f'steps per revolution must be at least 1: got {steps}')
         imu = ImuParameters(gyro_range=str(gyro_range))
@@ -106,10 +103,7 @@ class TelemetryDecoder:
             self._left, self._right = CounterUnwrapper(), CounterUnwrapper()
 
     def start_session(self, number: int, boots: int | None, now_ns: int) -> int:
-        """Decode the STATE frames of this session from now on; return the restarts before it.
-
-        ``boots`` is the number of starts that the robot has counted, None if it does not count.
-        """
+        """Decode this session from now on; return the restarts before it, by ``boots``."""
         before, self._boots = self._boots, boots
         self.two_robots = boots != before and boots in self._former_boots
         if before is not None:
@@ -131,10 +125,7 @@ class TelemetryDecoder:
     def decode(
         self, state: State, now_ns: int, timing: CommandTiming | None = None
     ) -> Telemetry | None:
-        """Return the measurement of a STATE.
-
-        None if it is of another session, or not newer than the last one.
-        """
+        """Return the measurement of a STATE; None: not of this session, or not newer."""
         if state.session != self._session:
             return None
         ahead_us = (

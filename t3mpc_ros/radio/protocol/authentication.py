@@ -127,10 +127,7 @@ def frame_tag(frame: SignedFrame, key: bytes, epoch: int) -> bytes:
 
 
 class Signer:
-    """Host end of a session: signs frames and counts the epoch.
-
-    ``host_us`` is that of the HELLO.
-    """
+    """Host end of a session from the ``host_us`` of its HELLO on: signs, counts the epoch."""
 
     def __init__(self, key: bytes, host_us: int) -> None:
         self._key = key

@@ -47,10 +47,7 @@ def forward_delay_ns(wire_bytes: int, payload_bytes: int) -> int:
 
 
 class CounterUnwrapper:
-    """Unwraps a 32-bit counter.
-
-    Consecutive values must differ by less than 2**31: 35 minutes of microseconds.
-    """
+    """Unwraps a 32-bit counter whose consecutive values differ by less than 2**31."""
 
     def __init__(self) -> None:
         self._last: int | None = None
@@ -76,10 +73,7 @@ def wrapped_difference(before: int, after: int) -> int:
 
 
 class ClockModel:
-    """Maps robot time to host time: a line fitted to the fast half of the last ten seconds.
-
-    Robot times are unwrapped microseconds (:class:`CounterUnwrapper`).
-    """
+    """Maps robot time (unwrapped us) to host time: a line through the fast half of ten seconds."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[int, int, int]] = deque()

@@ -35,10 +35,7 @@ class ExchangeStatus(NamedTuple):
 
 
 def decode_exchange_status(status: int) -> ExchangeStatus:
-    """Return the decoded status byte of a RESULT.
-
-    FrameError: bits contradict each other.
-    """
+    """Return the decoded status byte of a RESULT; FrameError: its bits contradict each other."""
     acknowledged, has_payload, failed, skipped = (bool(status & bit) for bit in (1, 2, 4, 8))
     retransmissions = status >> 4
     if (
@@ -60,10 +57,7 @@ def encode(
     | frames.ToBoard
     | frames.FromBoard,
 ) -> bytes:
-    """Return the bytes of a frame, without the CRC of the serial line.
-
-    FrameError: a value does not fit; the text names frame, field, bound and value.
-    """
+    """Return the bytes of a frame without CRC, or raise FrameError with field, bound and value."""
     # The last field shows whether the optional end (nonce, tag, address) is present.
     fixed = _LAYOUTS[type(frame)][-1 if frame[-1] != b'' else 0].pack(frame)
     if isinstance(frame, frames.Transmit):
@@ -76,10 +70,7 @@ def encode(
 
 
 def layout(frame: Any) -> tuple[str, tuple[tuple[str, int], ...]]:
-    """Return the name of a frame in docs/radio.md, and name and size (bytes) of its fixed fields.
-
-    The first byte comes before them.
-    """
+    """Return the name of a frame in docs/radio.md, and (name, size) of each fixed field."""
     form = _LAYOUTS[type(frame)][-1 if frame[-1] != b'' else 0]
     return form.name, form.field_sizes
 

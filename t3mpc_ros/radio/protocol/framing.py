@@ -53,10 +53,7 @@ def cobs_decode(encoded: bytes) -> bytes | None:
 
 
 def encode_frame(frame: bytes) -> bytes:
-    """Return the bytes of a frame on the serial line: COBS of frame and CRC, then a zero.
-
-    A frame has 1 to :data:`FRAME_LIMIT` bytes.
-    """
+    """Return a frame of up to 78 bytes as on the line: COBS of frame and CRC, then a zero."""
     if not 1 <= len(frame) <= FRAME_LIMIT:
         raise ValueError(f'frame must have 1 to {FRAME_LIMIT} bytes: got {len(frame)}')
     return cobs_encode(frame + crc16(frame).to_bytes(_CRC_SIZE, 'little')) + b'\0'

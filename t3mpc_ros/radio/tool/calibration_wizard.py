@@ -438,10 +438,7 @@ class CalibrationWizard:
     def _number(
         self, question: str, use: Callable[[float], None], default: float | None = None
     ) -> float:
-        """Return a number, asking until ``use`` accepts it; raise Skipped for ``skip``.
-
-        ``use`` raises CalibrationError for what another answer would correct.
-        """
+        """Return a number that ``use`` accepts (else CalibrationError), or raise Skipped."""
         while True:
             text = self._answer(f'  {question}').replace(',', '.')
             if text == _SKIP:

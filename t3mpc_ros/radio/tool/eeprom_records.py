@@ -413,11 +413,7 @@ def read_settings() -> procedure.Script[StoredSettings]:
 def change_settings(
     stored: StoredSettings, changes: Mapping[str, object], entropy: Callable[[int], bytes]
 ) -> RobotSettings:
-    """Return the settings with changes, by field name.
-
-    A robot without settings gets a random address, so that two robots never obey one host by
-    accident.
-    """
+    """Return settings with changes by name; a robot without any gets a random address."""
     settings = stored.content._replace(**changes)  # type: ignore[arg-type]
     if not stored.valid and 'address' not in changes:
         settings = settings._replace(address=draw_address(entropy))

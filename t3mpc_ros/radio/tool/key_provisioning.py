@@ -56,10 +56,7 @@ def read_key_state() -> procedure.Script[KeyState]:
 
 
 def write_key(key: bytes) -> procedure.Script[KeyState]:
-    """Store a key in the robot, or erase it (:data:`ERASE_KEY`); return the resulting state.
-
-    A lost answer is harmless: the state of the key is read back.
-    """
+    """Store or erase (:data:`ERASE_KEY`) the key; return its state, as read back."""
     yield from read_key_state()  # rejects a dongle, before the key is sent
     for _ in range(_MAX_ATTEMPTS):
         response = yield procedure.Request(Key(0, key), _WRITE_TIMEOUT)

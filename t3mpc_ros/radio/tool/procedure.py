@@ -114,10 +114,7 @@ class _PortTask(Protocol):
 
 
 class Procedure(Generic[Value]):
-    """Runs a script as a function of time and bytes.
-
-    The return value of the script becomes :attr:`result`, a ProcedureError :attr:`error`.
-    """
+    """Runs a script as a function of time and bytes, up to a :attr:`result` or :attr:`error`."""
 
     def __init__(self, script: Script[Value], decode: Callable[[bytes], ReplyFrame]) -> None:
         self._script = script
