@@ -15,6 +15,7 @@
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 import sys
 from typing import Any
@@ -117,46 +118,42 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _tune_tracking(options: argparse.Namespace) -> int:
+def _print_table(
+    options: argparse.Namespace,
+    measure: Callable[..., Any],
+    markdown: Callable[[Any], str],
+    numbers: Callable[[Any], object] = lambda found: found.rows,
+) -> int:
     from t3mpc_ros.evaluation.experiment import print_report
-    from t3mpc_ros.evaluation.patrol import path_tracking_page
-    from t3mpc_ros.evaluation.patrol.path_tracking import tune_trackers
 
     with shared_options.executor_of(options) as executor:
-        found = tune_trackers(executor, print_report)
-    shared_options.print_result(
-        options, lambda: path_tracking_page.tuning_markdown(found), lambda: found
-    )
+        found = measure(workers=executor, report=print_report)
+    shared_options.print_result(options, lambda: markdown(found), lambda: numbers(found))
     return 0
+
+
+def _tune_tracking(options: argparse.Namespace) -> int:
+    from t3mpc_ros.evaluation.patrol import path_tracking, path_tracking_page
+
+    tune, markdown = path_tracking.tune_trackers, path_tracking_page.tuning_markdown
+    return _print_table(options, tune, markdown, lambda found: found)
 
 
 def _safety(options: argparse.Namespace) -> int:
-    from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.patrol.safety_study import compare_safety, safety_table
 
     seconds = 60.0 * options.minutes
-    with shared_options.executor_of(options) as executor:
-        measured = compare_safety(
-            options.seeds, seconds, executor, print_report, planned=options.planned
-        )
-    shared_options.print_result(options, safety_table(measured).markdown, lambda: measured.rows)
-    return 0
+    measure = partial(compare_safety, options.seeds, seconds, planned=options.planned)
+    return _print_table(options, measure, lambda found: safety_table(found).markdown())
 
 
 def _compare_localizations(options: argparse.Namespace) -> int:
-    from t3mpc_ros.evaluation.experiment import print_report
-    from t3mpc_ros.evaluation.patrol.localization_study import (
-        LocalizationPlan,
-        compare_localizations,
-        markdown,
-    )
+    from t3mpc_ros.evaluation.patrol import localization_study as study
 
-    plan = LocalizationPlan(seeds=options.seeds, duration=60.0 * options.minutes)
+    plan = study.LocalizationPlan(seeds=options.seeds, duration=60.0 * options.minutes)
     runs = options.output / f'localization{RUNS}'
-    with shared_options.executor_of(options) as executor:
-        measured = compare_localizations(plan, runs, executor, print_report)
-    shared_options.print_result(options, lambda: markdown(plan, measured), lambda: measured.rows)
-    return 0
+    measure = partial(study.compare_localizations, plan, runs)
+    return _print_table(options, measure, partial(study.markdown, plan))
 
 
 _Study = tuple[Any, Any, Callable[..., Any]]
@@ -164,15 +161,11 @@ _Study = tuple[Any, Any, Callable[..., Any]]
 
 
 def _tracking(options: argparse.Namespace) -> _Study:
-    from t3mpc_ros.evaluation.patrol import path_tracking_page
-    from t3mpc_ros.evaluation.patrol.path_tracking import (
-        TRACKED_PATHS,
-        TrackingPlan,
-        compare_trackers,
-    )
+    from t3mpc_ros.evaluation.patrol import path_tracking, path_tracking_page
 
-    plan = TrackingPlan(paths=options.paths or tuple(TRACKED_PATHS), seeds=options.seeds)
-    return path_tracking_page, plan, compare_trackers
+    paths = options.paths or tuple(path_tracking.TRACKED_PATHS)
+    plan = path_tracking.TrackingPlan(paths=paths, seeds=options.seeds)
+    return path_tracking_page, plan, path_tracking.compare_trackers
 
 
 def _patrols(options: argparse.Namespace) -> _Study:

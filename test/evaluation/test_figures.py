@@ -116,27 +116,42 @@ SHOWCASE = FigureRuns(
 SIDES = ('right', 'left')
 
 
+UNKNOWN = np.diff(RUN.speeds, axis=0) / 0.1 - RUN['acceleration'][:-1]
+
+
+def assert_over_time(axis, i, shown, begin=0.0):
+    """Lines of an axis are those of a wheel by their labels, at the times where they are drawn."""
+    found = lines(axis)
+    for label, values in shown.items():
+        time, drawn = found[label]
+        assert drawn == pytest.approx(values[np.searchsorted(TIME, time + begin - 1e-6), i]), label
+
+
 @pytest.mark.parametrize(
-    ('draw', 'unit', 'shown'),
+    ('draw', 'unit', 'shown', 'zoomed'),
     [
-        (paper_figures.outputs, 'speed / rad/s', {'reference': 'reference', 'robot': 'speeds'}),
-        (paper_figures.control, 'u / rad/s²', {'_child': 'acceleration'}),
-        (paper_figures.estimates, 'rad/s²', {'estimate g': 'terms'}),
+        (
+            paper_figures.outputs,
+            'speed / rad/s',
+            {'reference': RUN.reference, 'robot': RUN.speeds},
+            {'measured': RUN['measured']},
+        ),
+        (
+            paper_figures.estimates,
+            'rad/s²',
+            {'estimate g': -RUN['terms'][:, 0], 'unknown, $\\dot\\chi - u$': UNKNOWN},
+            {},
+        ),
+        (paper_figures.control, 'u / rad/s²', {}, {}),
     ],
 )
-def test_a_run_and_its_switch(draw, unit, shown):
+def test_a_run_and_its_switch(draw, unit, shown, zoomed):
     axes = np.array(draw(SHOWCASE).axes).reshape(2, 2)
-    for i, row in enumerate(axes):
-        assert row[0].get_ylabel() == unit
-        assert title(row[0]).startswith(f'{SIDES[i]} wheel')
-        for axis in row:
-            found = {each.get_label(): each for each in axis.lines if len(each.get_xdata()) > 2}
-            for label, name in shown.items():
-                (line,) = (each for key, each in found.items() if key.startswith(label))
-                values = RUN[name]
-                values = -values[:, 0] if name == 'terms' else values
-                rows = np.searchsorted(TIME, line.get_xdata() - 1e-6)
-                assert line.get_ydata() == pytest.approx(values[rows, i])
+    for i, (whole, about) in enumerate(axes):
+        assert whole.get_ylabel() == unit
+        assert title(whole).startswith(f'{SIDES[i]} wheel')
+        assert_over_time(whole, i, shown)
+        assert_over_time(about, i, shown | zoomed)
     assert {axis.get_xlabel() for axis in axes[-1]} == {'time / s'}
     # The largest switch is in the middle of the second column.
     low, high = axes[0, 1].get_xlim()
@@ -144,37 +159,25 @@ def test_a_run_and_its_switch(draw, unit, shown):
     assert {*axes[0, 1].lines[0].get_xdata()} == {15.0}
 
 
-def test_measured_samples_and_the_true_unknown():
-    axes = np.array(paper_figures.outputs(SHOWCASE).axes).reshape(2, 2)
-    for i, axis in enumerate(axes[:, 1]):
-        time, values = lines(axis)['measured']
-        assert values == pytest.approx(RUN['measured'][np.searchsorted(TIME, time - 1e-6), i])
-    axes = np.array(paper_figures.estimates(SHOWCASE).axes).reshape(2, 2)
-    for i, axis in enumerate(axes[:, 0]):
-        time, values = lines(axis)['unknown, $\\dot\\chi - u$']
-        slope = np.diff(RUN.speeds[:, i]) / 0.1
-        assert values == pytest.approx(slope - RUN['acceleration'][:-1, i])
-        counted = time >= 3.0
-        miss = values + RUN['terms'][:-1, 0, i]
-        share = 1.0 - np.mean(miss[counted] ** 2) / np.var(values[counted])
-        assert f'{100 * share:.0f} % of the variance' in title(axis)
-
-
-def test_the_variation_of_u_is_that_of_its_wheel():
+def test_numbers_of_a_wheel_are_in_its_title():
     steep = np.cumsum(np.ones((TIME.size, 2)) * (1.0, 3.0), axis=0)
     run = replace(RUN, columns={**RUN.columns, 'acceleration': steep})
-    axes = np.array(paper_figures.control(replace(SHOWCASE, torque=run)).axes).reshape(2, 2)
-    for axis, rate in zip(axes[:, 0], (10, 30), strict=True):
-        assert f'varies by {rate} rad/s² a second' in title(axis)
+    controls = paper_figures.control(replace(SHOWCASE, torque=run)).axes[::2]
+    counted = TIME[:-1] >= 3.0
+    miss = np.mean((UNKNOWN + RUN['terms'][:-1, 0])[counted] ** 2, axis=0)
+    shares = 1.0 - miss / np.var(UNKNOWN[counted], axis=0)
+    estimates = paper_figures.estimates(SHOWCASE).axes[::2]
+    for i, (control, estimate) in enumerate(zip(controls, estimates, strict=True)):
+        assert f'varies by {(10, 30)[i]} rad/s² a second' in title(control)
+        assert control.lines[-1].get_ydata() == pytest.approx(steep[:, i])
+        assert f'{100 * shares[i]:.0f} % of the variance' in title(estimate)
 
 
-@pytest.mark.parametrize('run', [RUN, SERVO])
-def test_portraits_have_the_left_wheel_to_the_right(run):
-    figure = paper_figures.portrait(run)
-    for axis, name in zip(figure.axes, ('reference', 'robot'), strict=True):
-        values = run.reference if name == 'reference' else run.speeds
-        x, y = axis.lines[0].get_xydata()[0]
-        assert (x, y) == (values[0, 1], values[0, 0])
+def test_portraits_have_the_left_wheel_to_the_right():
+    figure = paper_figures.portrait(RUN)
+    drawn = {'reference': RUN.reference, 'robot': RUN.speeds}
+    for axis, (name, values) in zip(figure.axes, drawn.items(), strict=True):
+        assert (*axis.lines[0].get_xydata()[0],) == (*values[0, ::-1],)
         assert axis.get_xlabel() == 'left wheel / rad/s'
         assert title(axis) == name
     assert figure.axes[0].get_ylabel() == 'right wheel / rad/s'
@@ -199,15 +202,9 @@ def test_portraits_of_methods_name_the_run_and_its_rmse():
 
 
 def test_preview_is_compared_about_the_switch():
+    shown = {'with preview': SERVO.speeds, 'without preview': BLIND.speeds}
     for i, axis in enumerate(paper_figures.preview(SHOWCASE).axes):
-        shown = lines(axis)
-        for label, values in (
-            ('reference', SERVO.reference),
-            ('with preview', SERVO.speeds),
-            ('without preview', BLIND.speeds),
-        ):
-            time, drawn = shown[label]
-            assert drawn == pytest.approx(values[np.searchsorted(TIME, time + 15.0 - 1e-6), i])
+        assert_over_time(axis, i, {'reference': SERVO.reference, **shown}, begin=15.0)
         assert title(axis) == f'{SIDES[i]} wheel'
 
 

@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 from support.records import record_of
 
-from t3mpc_ros.evaluation import experiment
+from t3mpc_ros.evaluation import experiment, plotting
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.paper import study
@@ -96,10 +96,10 @@ def situations(extent):
 def test_the_full_study_has_each_run_once_the_quick_one_some(monkeypatch):
     monkeypatch.setattr(study, 'digest', lambda *_: '')  # keys of thousands of runs
     full, quick = study.chosen_extent(), study.chosen_extent(quick=True)
-    wanted = situations(full)
-    assert len(wanted) == len({*wanted})
-    assert {each[-1] for each in wanted} == {*HELD_OUT_SEEDS}
-    wanted = [each[:-1] for each in wanted if each[-1] == 101]
+    every = situations(full)
+    assert len(every) == len({*every})
+    assert {each[-1] for each in every} == {*HELD_OUT_SEEDS}
+    wanted = [each[:-1] for each in every if each[-1] == 101]
     assert {name for name, *_ in wanted} == {*METHODS}
     for drive in study.DRIVES:
         cases = [case for case in full.cases if (drive, case) != ('torque', 'dead time')]
@@ -117,7 +117,7 @@ def test_the_full_study_has_each_run_once_the_quick_one_some(monkeypatch):
                 expected |= {(0.04, 'mass +30 %'), (0.04, 'mass -30 %')}
             assert found == expected, (name, drive)
     found = {*situations(quick)}
-    assert found < {*situations(full)}
+    assert found < {*every}
     assert (len(quick.seeds), quick.duration) == (3, 26.0)
     for _, case, drives in INTENDED:  # what a part is meant for is in the quick one
         assert {(FULL, drive, 0.04, case, 101) for drive in drives} <= found
@@ -442,24 +442,18 @@ def test_the_path_on_the_floor_is_exact_for_lines_and_circles():
 
 
 @pytest.fixture(scope='module')
-def begun():
-    """Return the runs that were begun since it was cleared, none of them a simulation."""
-    found = []
-
-    def run(scenario, method):
-        found.append((scenario, method))
-        return fake_run(scenario, method)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment, 'run', run)
-        yield found
-
-
-@pytest.fixture(scope='module')
-def folder(tmp_path_factory, begun):
+def folder(tmp_path_factory):
+    """Return what is written of runs that were never simulated."""
     output = tmp_path_factory.mktemp('paper')
     (output / RUNS).write_text('{"run": "of before"}\n')
-    reproduce(output, quick=True, seeds=(101, 102), estimation_seeds=(1,), fresh=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(experiment, 'run', fake_run)
+        # A picture takes long; test_figures.py renders one as SVG.
+        file_of, picture = plotting.file_of, {'svg': b'<svg/>'}
+        patch.setattr(
+            plotting, 'file_of', lambda each, kind: picture.get(kind) or file_of(each, kind)
+        )
+        reproduce(output, quick=True, seeds=(101, 102), estimation_seeds=(1,), fresh=True)
     return output
 
 
