@@ -148,14 +148,14 @@ class PageData:
         return base64.b64encode(zlib.compress(b''.join(self.content), 6)).decode()
 
 
-def thinned(time: Array, value: Array, most: int = MAX_POINTS) -> tuple[Array, Array]:
+def thinned(time: Array, value: Array) -> tuple[Array, Array]:
     """Return the extremes of segments of a long line: the same picture from fewer points.
 
     A gap between two segments stays one.
     """
-    if time.size <= most:
+    if time.size <= MAX_POINTS:
         return time, value
-    stretch = -(-time.size // (most // 2))
+    stretch = -(-time.size // (MAX_POINTS // 2))
     starts = np.arange(0, time.size, stretch)
     low, high = np.fmin.reduceat(value, starts), np.fmax.reduceat(value, starts)
     return np.repeat(time[starts], 2), np.column_stack([low, high]).ravel()

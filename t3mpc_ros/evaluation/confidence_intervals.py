@@ -73,7 +73,7 @@ def interval(values: Values, confidence: float = 0.95) -> float:
     return float(student_quantile(n - 1, confidence) * np.std(values, ddof=1) / math.sqrt(n))
 
 
-def paired(a: Values, b: Values, confidence: float = 0.95) -> Difference:
+def paired(a: Values, b: Values) -> Difference:
     """Return how much larger ``a`` is than ``b``, value by value.
 
     What both have from a seed, an easy reference say, drops out of the difference. NaN, of a run
@@ -84,7 +84,7 @@ def paired(a: Values, b: Values, confidence: float = 0.95) -> Difference:
     first, second = (np.where(np.isnan(each), np.inf, each) for each in (a, b))
     with np.errstate(invalid='ignore'):
         differences = first - second
-        return Difference(mean(differences), interval(differences, confidence))
+        return Difference(mean(differences), interval(differences))
 
 
 def holm(p_values: Mapping[Key, float], level: float = 0.05) -> set[Key]:

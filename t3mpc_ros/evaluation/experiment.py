@@ -104,21 +104,19 @@ class ResultTable(Sequence[Row]):
         """Return the values of a column, each once, in the order of the rows."""
         return tuple(dict.fromkeys(self.values(column, **wanted)))
 
-    def difference(
-        self, metric: str, first: Row, second: Row, *, pair: str = 'seed'
-    ) -> Difference | None:
+    def difference(self, metric: str, first: Row, second: Row) -> Difference | None:
         """Return how much larger a metric is in the rows of ``first`` than in those of ``second``.
 
         Rows are paired by their seed; None where one of both was not measured.
         """
         one, other = (
-            {row[pair]: row[metric] for row in self.where(**wanted) if metric in row}
+            {row['seed']: row[metric] for row in self.where(**wanted) if metric in row}
             for wanted in (first, second)
         )
         if not (one and other):
             return None
         if one.keys() != other.keys():
-            raise ValueError(f'{metric} must be paired by {pair}: got {first} and {second}')
+            raise ValueError(f'{metric} must be paired by seed: got {first} and {second}')
         return paired(list(one.values()), [other[key] for key in one])
 
 

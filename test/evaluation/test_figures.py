@@ -33,7 +33,7 @@ from t3mpc_ros.evaluation import comparison_page, fault_page, plotting
 from t3mpc_ros.evaluation.api.chaos_generator import ChaosSolution
 from t3mpc_ros.evaluation.api.parameter_sweep import Sweep
 from t3mpc_ros.evaluation.api.single_run import RunResult
-from t3mpc_ros.evaluation.comparison import ComparisonPlan
+from t3mpc_ros.evaluation.comparison import ComparisonPlan, first_verdicts
 from t3mpc_ros.evaluation.confidence_intervals import interval
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL, methods_for
@@ -409,6 +409,8 @@ def test_differences_of_methods_are_coloured_by_their_verdict(caught):
         for seed, n in enumerate(0.0 * noise if shift is None else shift + noise)
     ]
     results = ResultTable(rows)
+    found = first_verdicts(plan, results)  # of the first metric: the other one never differs
+    assert [found[name, 'nominal'] for name in apart] == ['better', 'worse', 'inconclusive']
     page = comparison_page.page(plan, results)
     (axis,) = caught[0].axes
     assert [tick.get_text() for tick in axis.get_yticklabels()] == [*apart]

@@ -95,13 +95,10 @@ def simulate_figure_runs(extent: Extent, results: Results, workers: int | Execut
     shown = portrait_methods(results)
     wanted = [('torque', name) for name in shown]
     wanted += [('velocity', FULL), ('velocity', NO_PREVIEW)]
-    jobs = [
-        (
-            Scenario(PLANT_OF[drive], NOMINAL, seed, extent.duration, PAPER_NOISE),
-            methods(drive)[name],
-        )
-        for drive, name in wanted
-    ]
+    jobs = []
+    for drive, name in wanted:
+        scenario = Scenario(PLANT_OF[drive], NOMINAL, seed, extent.duration, PAPER_NOISE)
+        jobs.append((scenario, methods(drive)[name]))
     found = dict(zip(wanted, map_jobs(recorded_run, jobs, workers), strict=True))
     alone = simulate_open_loop(torque_robot(PAPER_NOISE, seed), SETTLE + extent.duration, seed)
     first = round(SETTLE / alone.period)
@@ -453,13 +450,10 @@ def colours_of(results: Results) -> dict[str, str]:
 
 def rmse_bars(results: Results) -> Any:
     """Return the RMSE with intervals of all methods at the paper's noise."""
-    shown = {
-        drive: sorted(
-            (row for row in results.compared(drive) if math.isfinite(row['rmse_mean'])),
-            key=lambda row: float(row['rmse_mean']),
-        )
-        for drive in results.drives
-    }
+    shown = {}
+    for drive in results.drives:
+        rows = [row for row in results.compared(drive) if math.isfinite(row['rmse_mean'])]
+        shown[drive] = sorted(rows, key=lambda row: float(row['rmse_mean']))
     colours = colours_of(results)
     longest = max(map(len, shown.values()))
     figure = plotting.new_figure(0.9 + len(shown) * (0.5 + 0.23 * longest))

@@ -329,10 +329,10 @@ PICTURES = (
 )
 
 
-def _panels(study: PatrolStudy, columns: int = 2) -> tuple[Any, list[tuple[Any, Row]]]:
+def _panels(study: PatrolStudy) -> tuple[Any, list[tuple[Any, Row]]]:
     """Return a figure, and an axis with its row for each patrol that is drawn."""
     drawn = [row for row in study.table if 'track' in row]
-    columns = min(columns, len(drawn))
+    columns = min(2, len(drawn))
     rows = -(-len(drawn) // columns)
     left, bottom, right, top = study.plan.arena
     figure = new_figure(0.4 + rows * (0.35 + 5.0 / columns * (top - bottom) / (right - left)))

@@ -91,8 +91,8 @@ def square_distances(a: Array, b: Array) -> Array:
 def nearest_apart(points: Array, count: int, apart: int) -> NDArray[np.int64]:
     """Return the nearest neighbour of each of the first ``count`` points among the same.
 
-    A neighbour is more than ``apart`` samples away in time (Theiler 1986: points of the same
-    piece of the path are no recurrence) and at a distance above zero; -1 where there is none.
+    It is more than ``apart`` samples away in time (Theiler 1986: points of the same piece of the
+    path are no recurrence) and at a distance above zero; -1 where there is none.
     """
     found = np.full(count, -1, dtype=np.int64)
     own = points[:count]
