@@ -103,10 +103,12 @@ def test_a_robot_whose_sensors_fail_rests_within_half_a_second(planned):
     assert row['after'] < 0.12
     assert row['driven'] > 0.1
     assert row['ended'] == 'too few range sensors work to drive on'
-    table = safety_study.safety_table(
-        ResultTable([{'controller': 'sensors silent', 'seed': 11, **row}])
-    )
-    assert f'{row["rest"]:.2f}' in table.markdown()
+    counts = {'controller': 'sensors silent', 'contacts': 2, 'contacts_seen': 0, 'places': 3}
+    table = safety_study.safety_table(ResultTable([{**row, **counts}]))
+    cells = dict(zip(table.head, table.rows[0], strict=True))
+    assert cells['rest after the fault, s'] == f'{row["rest"]:.2f}'
+    names = 'runs with contact', 'with what was seen', 'places touched'
+    assert [cells[name] for name in names] == ['1', '0', '3']
 
 
 def test_a_run_that_ends_before_the_sensors_fail_is_refused():
