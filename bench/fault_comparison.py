@@ -28,6 +28,7 @@ costs more than 15 % of the errors without it is not named on every seed.
 import argparse
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 import math
 from pathlib import Path
 import re
@@ -90,7 +91,7 @@ class Fault:
     events: Mapping[str, Any] = field(default_factory=dict)
     """Faults of the twin from :data:`BEGIN` on."""
     links: LinkFaults = NO_FAULTS
-    send: Send | None = None
+    send: Send = lambda link, k, state: [state]
     """What becomes of a report of the robot, with its number."""
     assumed: Mapping[str, object] = field(default_factory=dict)
     """Parameters of the controller."""
@@ -238,16 +239,14 @@ FAULTS: Mapping[str, Fault] = {
 class Link(ReportLink):
     """Reports that a fault changes."""
 
-    send_changed: Send
-
-    def __init__(self, *arguments: Any) -> None:
+    def __init__(self, changed: Send, *arguments: Any) -> None:
         super().__init__(*arguments)
-        self.k, self.kept = 0, None
+        self._changed, self.k, self.kept = changed, 0, None
 
     def send(self, state: RobotState) -> None:
         """Send what a fault makes of a report."""
         self.k += 1
-        for each in type(self).send_changed(self, self.k, state):
+        for each in self._changed(self, self.k, state):
             super().send(each)
 
 
@@ -333,11 +332,9 @@ def run_job(job: Job) -> Row:
     links = fault.links if isinstance(method, NodeMethod) else fault.forward_links or fault.links
     own = OwnParts(robot_parameters=fault.changes, events=events, links=links)
     scenario = Scenario('twin', 'nominal', job.seed, DURATION, own=own)
-    send = fault.send or (lambda link, k, state: [state])
-    kind = type('Faulty', (Link,), {'send_changed': send})
     if isinstance(method, NodeMethod):
         method = Watched(NodeMethod(job.controller, {**method.changes, **fault.assumed}))
-    with patch.object(loop, 'ReportLink', kind):
+    with patch.object(loop, 'ReportLink', partial(Link, fault.send)):
         numbers = measure(loop.run(scenario, method))
     said = method.made[0].said if isinstance(method, Watched) else []
     return {**job._asdict(), **numbers, 'said': said}
