@@ -151,31 +151,33 @@ def test_the_package_calls_its_functions_on_the_page():
 
 def _called(path, name):
     """Return whether the package uses a function outside itself."""
-    return any(
-        name in read
-        for file, (imported, parts) in _uses().items()
-        if file == path or (_dotted(path), name) in imported
-        for own, read in parts
-        if (file, own) != (path, name)
-    )
+    for file in sorted(_texts(), key=path.__ne__):  # most are used in their own file
+        if name in _texts()[file]:
+            imported, parts = _uses(file)
+            known = file == path or (_dotted(path), name) in imported
+            if known and any(name in read for own, read in parts if (file, own) != (path, name)):
+                return True
+    return False
 
 
 @cache
-def _uses():
-    """Return, for each file, what it imports, and the names that each of its parts reads."""
-    uses = {}
-    for source in (ROOT / 't3mpc_ros').rglob('*.py'):
-        file = str(source.relative_to(ROOT))
-        imported, parts = set(), []
-        for top in _tree(file).body:
-            nodes = list(ast.walk(top))
-            froms = [node for node in nodes if isinstance(node, ast.ImportFrom)]
-            imported |= {(each.module, one.name) for each in froms for one in each.names}
-            names = [node for node in nodes if isinstance(node, ast.Name)]
-            read = {node.id for node in names if isinstance(node.ctx, ast.Load)}
-            parts.append((getattr(top, 'name', None), read))
-        uses[file] = imported, parts
-    return uses
+def _texts():
+    files = (ROOT / 't3mpc_ros').rglob('*.py')
+    return {str(file.relative_to(ROOT)): file.read_text() for file in files}
+
+
+@cache
+def _uses(file):
+    """Return what a file imports, and the names that each of its parts reads."""
+    imported, parts = set(), []
+    for top in _tree(file).body:
+        nodes = list(ast.walk(top))
+        froms = [node for node in nodes if isinstance(node, ast.ImportFrom)]
+        imported |= {(each.module, one.name) for each in froms for one in each.names}
+        names = [node for node in nodes if isinstance(node, ast.Name)]
+        read = {node.id for node in names if isinstance(node.ctx, ast.Load)}
+        parts.append((getattr(top, 'name', None), read))
+    return imported, parts
 
 
 def test_the_page_of_parameters_is_up_to_date():

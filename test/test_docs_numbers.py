@@ -15,7 +15,6 @@
 
 from collections import Counter
 import csv
-from functools import cache
 import random
 import re
 
@@ -43,29 +42,19 @@ YAW = '†'
 """Mark of the cases whose number is that of the yaw rate."""
 
 
-@cache
-def _runs():
-    with (ROOT / 'docs' / 'results_runs.csv').open() as file:
-        return list(csv.DictReader(file))
-
-
-@cache
-def _values(robot, case, controller, metric):
-    """Return a metric of the runs of the file, in the order of their seeds."""
-    found = {
-        int(row['seed']): float(row[metric])
-        for row in _runs()
-        if (row['robot'], row['case'], row['controller']) == (robot, case, controller)
-    }
-    assert len(found) == 6, (robot, case, controller)
-    return [found[seed] for seed in sorted(found)]
+def _tables(text, head):
+    """Return the tables whose head begins with some columns, without marks: rows of cells."""
+    found = re.findall(rf'^\| {re.escape(head)}.*\n\|[-|]+\n((?:\|.*\n)+)', text, re.M)
+    return [
+        [[cell.strip(' *¹²') for cell in line.strip('|').split('|')] for line in rows.splitlines()]
+        for rows in found
+    ]
 
 
 def _table(text, head):
-    """Return the rows of the table that begins with some columns, its marks left out."""
-    (rows,) = re.findall(rf'^\| {re.escape(head)}.*\n\|[-|]+\n((?:\|.*\n)+)', text, re.M)
-    lines = [line.strip('|').split('|') for line in rows.splitlines()]
-    return [[cell.strip(' *¹²') for cell in line] for line in lines]
+    """Return the rows of the only such table."""
+    (rows,) = _tables(text, head)
+    return rows
 
 
 def _close(shown, value):
@@ -86,7 +75,7 @@ def test_the_table_of_the_stepper_robot_is_that_of_its_runs():
         metric = 'yaw_rate_settled' if YAW in name else 'settled'
         means = []
         for controller, cell in zip((FULL, *others), cells, strict=True):
-            values = _values('twin', case, controller, metric)
+            values = quantities.runs('twin', case, controller, metric)
             shown, half = cell.split(' ± ')
             assert _close(shown, mean(values)), (name, controller)
             assert _close(half, interval(values)), (name, controller)
@@ -106,7 +95,7 @@ def test_the_table_with_equal_means_is_that_of_its_runs():
     for name, *cells in rows:
         for (robot, case, metric), cell in zip(columns, cells, strict=True):
             if cell != '–':
-                assert _close(cell, mean(_values(robot, case, name, metric))), (name, case)
+                assert _close(cell, mean(quantities.runs(robot, case, name, metric))), (name, case)
 
 
 def test_the_table_of_the_papers_plant_is_that_of_its_command():
@@ -128,7 +117,7 @@ def test_the_table_of_the_papers_plant_is_that_of_its_command():
 
 
 def _mean(robot, case, controller, metric='overall'):
-    return mean(_values(robot, case, controller, metric))
+    return mean(quantities.runs(robot, case, controller, metric))
 
 
 def _worst_and_best_correction():
@@ -174,7 +163,7 @@ def test_the_numbers_of_the_readme_are_those_of_the_runs():
 def test_the_sentences_of_the_results_are_those_of_the_runs():
     text = ' '.join(RESULTS.split())
     names = FULL, 'computed torque + ramp'
-    values = [_values('torque', 'nominal', name, 'overall') for name in names]
+    values = [quantities.runs('torque', 'nominal', name, 'overall') for name in names]
     found = paired(values[1], values[0])
     assert f'({found.mean:.4f} ± {found.half:.4f})'.replace('-', '−') in text
     ratios = [
@@ -198,7 +187,7 @@ def test_the_sentences_of_the_results_are_those_of_the_runs():
 @pytest.mark.long
 def test_runs_of_the_file_made_anew_have_its_digits():
     """Eight of them, drawn; the file is as long as an hour of runs."""
-    for row in random.Random(33).sample(_runs(), 8):
+    for row in random.Random(33).sample(quantities.result_rows(), 8):
         scenario = Scenario(
             row['robot'],
             row['case'],
@@ -380,12 +369,3 @@ def test_a_path_of_the_samplings_made_anew_has_its_digits():
     shown = next(row[1:6] for row in table if row[0] == name)
     made = path_samplings.row(name, ('ours',))
     assert [made[i] for i in (1, 2, 4)] == [shown[i] for i in (1, 2, 4)]
-
-
-def _tables(text, head):
-    """Return the tables whose head begins with some columns, a list of cells a row."""
-    found = re.findall(rf'^\| {re.escape(head)}.*\n\|[-|]+\n((?:\|.*\n)+)', text, re.M)
-    return [
-        [[cell.strip(' *') for cell in line.strip('|').split('|')] for line in rows.splitlines()]
-        for rows in found
-    ]

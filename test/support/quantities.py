@@ -250,14 +250,20 @@ def record(name: str, row: str, column: str | int = 0, number: int = 0, table: s
 
 
 @cache
+def result_rows() -> list[dict[str, str]]:
+    """Return the rows of ``docs/results_runs.csv``."""
+    with (DOCS / 'results_runs.csv').open(encoding='utf-8') as file:
+        return list(csv.DictReader(file))
+
+
+@cache
 def runs(robot: str, case: str, method: str, metric: str = 'overall') -> tuple[float, ...]:
     """Return a metric of the runs of ``docs/results_runs.csv``, in the order of their seeds."""
-    with (DOCS / 'results_runs.csv').open(encoding='utf-8') as file:
-        found = {
-            int(row['seed']): float(row[metric])
-            for row in csv.DictReader(file)
-            if (row['robot'], row['case'], row['controller']) == (robot, case, method)
-        }
+    found = {
+        int(row['seed']): float(row[metric])
+        for row in result_rows()
+        if (row['robot'], row['case'], row['controller']) == (robot, case, method)
+    }
     assert len(found) == 6, (robot, case, method)
     return tuple(found[seed] for seed in sorted(found))
 
@@ -367,8 +373,13 @@ def pages() -> list[Path]:
     return [ROOT / 'README.md', *sorted(written)]
 
 
-def sources(page: Path) -> Iterator[tuple[Quantity, str]]:
-    """Yield each quantity of a page with what has it, ``stated``, or an empty string."""
+@cache
+def sources(page: Path) -> list[tuple[Quantity, str]]:
+    """Return each quantity of a page with what has it, ``stated``, or an empty string."""
+    return list(_sources(page))
+
+
+def _sources(page: Path) -> Iterator[tuple[Quantity, str]]:
     known = ledger().get(page.name, {})
     for one in quantities(page.read_text(encoding='utf-8')):
         entries = known.get('*', {}) | known.get(one.section, {})
@@ -392,7 +403,7 @@ def main() -> None:
     """Count the quantities of the pages, and list what is not compared."""
     shown, total = sys.argv[1:], Counter[str]()
     for page in pages():
-        found = list(sources(page))
+        found = sources(page)
         count = Counter(kind for _, kind in found)
         total += count
         print(f'{page.name:20} {len(found):4}', dict(count))
