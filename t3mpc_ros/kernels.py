@@ -43,31 +43,16 @@ def cache_directory(environment: Mapping[str, str], sources: Path = PACKAGE_DIRE
     The compiler's own cache checks only the file that contains a kernel: a cached kernel would
     keep calling an outdated version of a kernel in another file. The name of the folder therefore
     contains a fingerprint of every source file with a kernel.
-
-    Parameters
-    ----------
-    environment
-        The folder is below ``T3MPC_CACHE_DIR``, ``XDG_CACHE_HOME``, ``HOME`` or the temporary
-        folder: the first of them that is set and writable. An installed package is often
-        read-only, so nothing is written beside the sources.
-    sources
-        The folder whose ``*.py`` files are fingerprinted.
-
-    Raises
-    ------
-    OSError
-        No candidate is writable; the message names them all.
     """
     return writable_directory(environment, source_fingerprint(sources))
 
 
 def writable_directory(environment: Mapping[str, str], leaf: str) -> Path:
-    """Return a writable folder named ``leaf`` for compiled code: see :func:`cache_directory`.
+    """Return a writable folder named ``leaf`` for compiled code; OSError names all that are not.
 
-    Raises
-    ------
-    OSError
-        No candidate is writable; the message names them all.
+    It is below ``T3MPC_CACHE_DIR``, ``XDG_CACHE_HOME``, ``HOME`` or the temporary folder, the
+    first that is set and writable. An installed package is often read-only, so nothing is written
+    beside the sources.
     """
     tried = []
     for base in _base_directories(environment):

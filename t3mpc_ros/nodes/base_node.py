@@ -317,7 +317,12 @@ class BaseNode(Node, Generic[P]):
         """Return the parameters; ParameterError for a name meant for this node that it lacks."""
         from t3mpc_ros.nodes.arguments import Origin, parameter_origins  # once per process
 
-        overrides = _overrides(self)
+        # rclpy has no public access to the overrides: automatic declaration fails on an empty list
+        # and does not accept a descriptor afterwards.
+        overrides = {
+            name: () if given.value is None else given.value
+            for name, given in self._parameter_overrides.items()
+        }
         kind: type[P] = self.parameter_class
         own = accepted_names(kind)
         values = kind.from_dict({name: overrides[name] for name in overrides if name in own})
@@ -495,15 +500,6 @@ def parameter_descriptor(spec: ParameterSpec) -> ParameterDescriptor:
         high = 2**63 - 1 if spec.high is None else int(spec.high)
         descriptor.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
     return descriptor
-
-
-def _overrides(node: Node) -> dict[str, object]:
-    # rclpy has no public access to the overrides: automatic declaration fails on an empty list
-    # and does not accept a descriptor afterwards.
-    return {
-        name: (() if parameter.value is None else parameter.value)
-        for name, parameter in node._parameter_overrides.items()
-    }
 
 
 def accepted_names(table: type[Parameters]) -> frozenset[str]:

@@ -136,7 +136,9 @@ class PlayerNode(BaseNode[PlayerParameters]):
             'resume': PlaybackTimeline.resume,
             'toggle_paused': _toggle_paused,
             'seek': self._seek,
-            'play_next': self._play_next,
+            'play_next': lambda timeline, now_ns: timeline.play_next(
+                now_ns, self.parameters.play_next_count
+            ),
             'set_rate': self._set_rate,
         }
         for name, action in actions.items():
@@ -370,9 +372,6 @@ class PlayerNode(BaseNode[PlayerParameters]):
     def _seek_back(self, timeline: PlaybackTimeline, now_ns: int) -> str:
         target_ns = timeline.bag_time_ns(now_ns) - round(SEEK_BACK * NANOSECONDS)
         return timeline.seek(now_ns, max(target_ns, self._span[0]))
-
-    def _play_next(self, timeline: PlaybackTimeline, now_ns: int) -> str:
-        return timeline.play_next(now_ns, self.parameters.play_next_count)
 
     def _set_rate(self, timeline: PlaybackTimeline, now_ns: int) -> None:
         timeline.set_rate(now_ns, self.parameters.rate)

@@ -259,10 +259,7 @@ class Parameters:
     def specs(cls) -> tuple[ParameterSpec, ...]:
         """Return every parameter, groups included, in order of declaration.
 
-        Raises
-        ------
-        ParameterError
-            Two parameters of the table have the same name, or one name is a prefix of another.
+        ParameterError if two have the same name, or one name is a prefix of another.
         """
         return tuple(entry.spec for entry in _entries(cls))
 
@@ -282,11 +279,8 @@ class Parameters:
     def with_values(self, values: Mapping[str, object]) -> Self:
         """Return a copy with some values replaced, validated as a whole.
 
-        Raises
-        ------
-        ParameterError
-            An unknown name (with the nearest known one), a wrong type, a value out of range,
-            another value of a constant, or values that contradict.
+        ParameterError for an unknown name (with the nearest known one), a wrong type, a value out
+        of range, another value of a constant, or values that contradict.
         """
         known = {entry.spec.name: entry for entry in _entries(type(self))}
         checked: dict[tuple[str, ...], Value] = {}
