@@ -233,7 +233,7 @@ def test_the_strip_board_connects_what_the_schematic_connects(drawings, schemati
     nets = {}
     for name, part in (('U2', schematic.BUFFER), ('radio', schematic.RADIO)):
         for pins, net in part.nets().items():
-            for pin in _single_pins(pins):
+            for pin in pins.split():  # 3OE 4OE are two
                 nets.setdefault(net, set()).add(f'{name} {pin}')
     for pin, net in schematic.ADAPTER.nets().items():
         nets.setdefault(net, set()).add(f'wires {pin}')
@@ -253,11 +253,6 @@ def test_the_strip_board_connects_what_the_schematic_connects(drawings, schemati
         nets.setdefault(net, set()).add(pin)
     found = [group for group in drawings.connected() if group not in ({'U2 3Y'}, {'U2 4Y'})]
     assert sorted(map(sorted, found)) == sorted(map(sorted, nets.values()))
-
-
-def _single_pins(text):
-    """Return the pins of a name of the schematic: ``3OE 4OE`` are two."""
-    return text.split()
 
 
 def test_no_hole_of_the_strip_board_is_used_twice(drawings):

@@ -169,13 +169,6 @@ def test_every_subcommand_prints_the_version(words, capsys):
     assert capsys.readouterr().out == f't3mpc_ros {VERSION}\n'
 
 
-@pytest.mark.parametrize('words', COMMANDS)
-def test_unknown_options_of_subcommands_give_code_2(words):
-    with pytest.raises(SystemExit) as end:
-        main([*words.split(), '--no-such-option'])
-    assert end.value.code == 2
-
-
 def default_of(function, name):
     return signature(function).parameters[name].default
 
