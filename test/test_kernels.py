@@ -111,35 +111,6 @@ def test_fingerprint_depends_on_kernels_and_compiler_only(tmp_path, monkeypatch)
     assert len(seen) == 5
 
 
-@pytest.mark.slow
-def test_equal_sources_share_compiled_code_wherever_they_are(tmp_path):
-    """The compiler's cache is by path: each clone and each workspace compiled everything again."""
-    package = Path(__file__).resolve().parent.parent / 't3mpc_ros'
-    code = (
-        'import numpy as np, sys\n'
-        'from t3mpc_ros.fuzzy import inference\n'
-        'from t3mpc_ros.kernels import kernel\n'
-        'kernels = [k for k in vars(inference).values() if hasattr(k, "compiled")]\n'
-        'print(kernels[0].compiled.stats.cache_path)\n'
-    )
-    folders = []
-    for name in ('one', 'two'):
-        copy = tmp_path / name
-        shutil.copytree(package, copy / 't3mpc_ros')
-        if name == 'two':
-            with (copy / 't3mpc_ros' / '__init__.py').open('a') as text:
-                text.write('# no kernel\n')
-        output = subprocess.check_output(
-            [sys.executable, '-c', code],
-            cwd=copy,
-            env=dict(os.environ, T3MPC_CACHE_DIR=str(tmp_path), PYTHONPATH=str(copy)),
-            text=True,
-        )
-        folders.append(Path(output.strip()))
-    assert folders[0] == folders[1]
-    assert folders[0].is_relative_to(tmp_path)
-
-
 def test_an_unwritable_folder_is_skipped(tmp_path):
     blocked = tmp_path / 'file'
     blocked.write_text('a file, so no folder can be created below it')
@@ -179,19 +150,33 @@ def test_what_was_compiled_is_removed_and_nothing_else(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_read_only_package_still_compiles_and_caches(tmp_path):
-    """Numba's default cache beside the source fails for a read-only package.
+def test_equal_sources_share_compiled_code_wherever_they_are(tmp_path):
+    """The compiler's cache is by path: each clone and each workspace compiled everything again.
 
-    As root no folder is read-only, so the test checks that nothing is written beside the sources
-    and that the selected folder is used.
+    It is beside the source by default, which fails for a read-only package: nothing is there.
     """
     package = Path(__file__).resolve().parent.parent / 't3mpc_ros'
-    environment = dict(os.environ, T3MPC_CACHE_DIR=str(tmp_path))
     code = (
         'import numpy as np\n'
         'from t3mpc_ros.control.control_law import law_terms\n'
         'z = np.zeros(2); law_terms(z, z, z, z, z, 1.0, 1.0, 1.0, np.zeros((5, 2)), np.zeros(2))\n'
+        'print(law_terms.compiled.stats.cache_path)\n'
     )
-    subprocess.run([sys.executable, '-c', code], env=environment, check=True, cwd=package.parent)
-    assert list(tmp_path.rglob('*.nbc'))
-    assert not [path for path in package.rglob('*.nbc') if '__pycache__' in path.parts]
+    cache, copies, found = tmp_path / 'cache', [tmp_path / 'one', tmp_path / 'two'], []
+    for copy in copies:
+        shutil.copytree(package, copy / 't3mpc_ros', ignore=shutil.ignore_patterns('__pycache__'))
+        if copy != copies[0]:
+            with (copy / 't3mpc_ros' / '__init__.py').open('a') as text:
+                text.write('# no kernel\n')
+        output = subprocess.check_output(
+            [sys.executable, '-c', code],
+            cwd=copy,
+            env=dict(os.environ, T3MPC_CACHE_DIR=str(cache), PYTHONPATH=str(copy)),
+            text=True,
+        )
+        compiled = {path: path.stat().st_mtime_ns for path in cache.rglob('*.nbc')}
+        found.append((Path(output.strip()), compiled))
+    assert found[0] == found[1]
+    assert found[0][0].is_relative_to(cache)
+    assert found[0][1]
+    assert not [path for copy in copies for path in copy.rglob('*.nbc')]
