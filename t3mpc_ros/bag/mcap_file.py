@@ -31,18 +31,10 @@ import struct
 from typing import Any, BinaryIO, NamedTuple
 import zlib
 
+from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
@@ -169,7 +161,7 @@ def _record_name(opcode: int) -> str:
         return f'record of unknown type 0x{opcode:02x}'
 
 
-def chunk_data(chunk: Chunk) -> bytes:
+def chunk_data(chunk: records.Chunk) -> bytes:
     """Return the decompressed records of a chunk; raise :class:`RecordError` if it is damaged.
 
     Its checksum must be right, or without a checksum its size.
@@ -198,17 +190,17 @@ def read_summary(window: FileWindow) -> tuple[Summary, int] | None:
         return None
     summary = Summary()
     lists = {
-        ChunkIndex: summary.chunk_indexes,
-        AttachmentIndex: summary.attachment_indexes,
-        MetadataIndex: summary.metadata_indexes,
+        records.ChunkIndex: summary.chunk_indexes,
+        records.AttachmentIndex: summary.attachment_indexes,
+        records.MetadataIndex: summary.metadata_indexes,
     }
     try:
         for record in StreamReader(BytesIO(content), skip_magic=True).records:
-            if isinstance(record, Schema):
+            if isinstance(record, records.Schema):
                 summary.schemas[record.id] = record
-            elif isinstance(record, Channel):
+            elif isinstance(record, records.Channel):
                 summary.channels[record.id] = record
-            elif isinstance(record, Statistics):
+            elif isinstance(record, records.Statistics):
                 summary.statistics = record
             elif type(record) in lists:
                 lists[type(record)].append(record)
@@ -330,10 +322,10 @@ def _chunk_messages(
     window: FileWindow, index: Any, names: Mapping[int, str], start_ns: int, stop_ns: int
 ) -> list[SerializedMessage]:
     """Return the selected messages of one chunk."""
-    records = chunk_data(read_record(window, index.chunk_start_offset, Opcode.CHUNK)[0])
+    content = chunk_data(read_record(window, index.chunk_start_offset, Opcode.CHUNK)[0])
     found = []
-    data = records + bytes(_MESSAGE.size)
-    position, end = 0, len(records)
+    data = content + bytes(_MESSAGE.size)
+    position, end = 0, len(content)
     while position < end:
         opcode, length, channel, _, received_ns, published_ns = _MESSAGE.unpack_from(
             data, position
@@ -368,9 +360,9 @@ def read_mcap_file(path: Path) -> McapFile | None:
                 return None
             summary = found[0]
             items = [read_record(window, each.offset)[0] for each in summary.metadata_indexes]
-            records = {item.name: dict(item.metadata) for item in items}
-            records.pop('rosbag2', None)
-            return McapFile(path, summary, records)
+            tables = {item.name: dict(item.metadata) for item in items}
+            tables.pop('rosbag2', None)
+            return McapFile(path, summary, tables)
     except (OSError, RecordError, AttributeError):  # an offset may lead to another record
         return None
 
@@ -425,24 +417,21 @@ def message_loss_record(
     return table
 
 
-def message_losses(records: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, int]]:
-    """Return the number of missing messages by cause and topic.
-
-    ``records`` are the metadata records of a bag, by name.
-    """
+def message_losses(tables: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, int]]:
+    """Return the number of missing messages by cause and topic, by the records of a bag."""
     found: dict[str, dict[str, int]] = {cause: {} for cause in LOSS_CAUSES}
-    for key, count in records.get(LOSSES, {}).items():
+    for key, count in tables.get(LOSSES, {}).items():
         cause, _, topic = key.partition(' ')
         if topic and cause in found and count.isdecimal():
             found[cause][topic] = int(count)
     return found
 
 
-def message_loss_notes(records: Mapping[str, Mapping[str, str]]) -> list[str]:
+def message_loss_notes(tables: Mapping[str, Mapping[str, str]]) -> list[str]:
     """Return a sentence for each topic and cause of :func:`message_losses`."""
     return [
         f'{count} messages of {topic} are missing: {LOSS_CAUSES[cause]}.'
-        for cause, topics in message_losses(records).items()
+        for cause, topics in message_losses(tables).items()
         for topic, count in topics.items()
     ]
 

@@ -172,20 +172,13 @@ def _fit(u: Array, y: Array, step: float, shifts: int) -> ResponseFit | None:
     gain = float(seen @ y[shifts:] / (seen @ seen))
     independent = seen.size / correlation(y[shifts:] - gain * seen)
     delays = lags[:, np.newaxis] + step * np.arange(shifts)
-    fitting = delays[explained >= largest - _tolerance(largest, independent)]
+    # That of the likelihood of one parameter with so many independent errors, at 95 %.
+    degrees, tolerance = int(independent) - OFFSETS, math.inf
+    if degrees >= 1:
+        tolerance = (1.0 - largest) * student_quantile(degrees) ** 2 / degrees
+    fitting = delays[explained >= largest - tolerance]
     spread = float(fitting.min()), float(fitting.max())
     return ResponseFit(float(shift * step), lag, gain, largest, step, *spread)
-
-
-def _tolerance(explained: float, independent: float) -> float:
-    """Return by how much less a fit may explain that is as likely as the best one, at 95 %.
-
-    That of the likelihood of one parameter with so many independent errors.
-    """
-    degrees = int(independent) - OFFSETS
-    if degrees < 1:
-        return math.inf
-    return (1.0 - explained) * student_quantile(degrees) ** 2 / degrees
 
 
 def correlation(errors: Array) -> float:

@@ -166,9 +166,15 @@ def test_a_robot_of_another_make_is_identified(tmp_path, lag, dead_time):
         identify_bag(folder, ReportOptions())
 
 
-def test_the_drive_file_has_the_gain_by_the_rule(tmp_path):
-    tape = recorded(ramps(1, 2500), drive__lag=0.03, noise__variance=0.04)
-    drive, _ = identified(tape, tmp_path / 'bag')
+@pytest.fixture(scope='module')
+def driven():
+    return recorded(ramps(1, 3000), drive__lag=0.02, noise__variance=0.04)
+
+
+def test_the_drive_file_has_the_gain_by_the_rule(driven, tmp_path):
+    records = METADATA | {'/robot/controller': {'composition': 'body'}}
+    drive, kept = identified(Tape(records, driven.rows), tmp_path / 'bag')
+    assert kept == 'body', 'the recorded composition'
     for composition in ('paper', 'body'):
         text = drive_file(drive, composition, 'bag')
         values = yaml.safe_load(text)['/**/controller']['ros__parameters']
@@ -189,19 +195,7 @@ def test_the_drive_file_has_the_gain_by_the_rule(tmp_path):
         assert text.count('standard deviation') == 5
 
 
-def test_the_recorded_composition_is_kept(tmp_path):
-    wheels = ramps(1, 2500)
-    records = METADATA | {'/robot/controller': {'composition': 'body'}}
-    tape = recorded(wheels, metadata_records=records, drive__lag=0.02)
-    assert identified(tape, tmp_path / 'bag')[1] == 'body'
-
-
 # Bags that do not determine the drive
-
-
-@pytest.fixture(scope='module')
-def driven():
-    return recorded(ramps(1, 3000), drive__lag=0.02, noise__variance=0.04)
 
 
 def at_rest(driven):

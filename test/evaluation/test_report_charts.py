@@ -46,10 +46,10 @@ from t3mpc_ros.evaluation.bag_report.run_data import (
 )
 from t3mpc_ros.evaluation.bag_report.verdict import (
     KNOWN_PARAMETERS,
-    KNOWN_RESULT,
+    KNOWN_RMSE,
     MAX_RATIO,
     judge,
-    known_result,
+    known_rmse,
 )
 from t3mpc_ros.evaluation.charts import Plane
 from t3mpc_ros.evaluation.confidence_intervals import Difference
@@ -404,26 +404,25 @@ def test_the_reason_of_a_stop_is_of_its_time_and_of_the_robot(changes, name):
 
 
 def test_a_poor_run_is_far_worse_than_what_its_robot_reaches():
-    known = KNOWN_RESULT
     for ratio, label in ((0.99 * MAX_RATIO, 'Good run'), (1.01 * MAX_RATIO, 'Poor run')):
-        error = ratio * known.settled
+        error = ratio * KNOWN_RMSE
         run = replace(QUIET, motions=shifted(left=error), parameters=KNOWN_PARAMETERS)
         found = judge(run, find_incidents(run), **JUDGED)
         assert (found.label, found.sound) == (label, label == 'Good run')
-    assert f'{1.01 * MAX_RATIO:.0f} times the {known.settled:g} rad/s' in found.sentence
+    assert f'{1.01 * MAX_RATIO:.0f} times the {KNOWN_RMSE:g} rad/s' in found.sentence
 
 
 def test_a_recorded_demo_is_known_and_other_conditions_are_not():
     with open_bag(DEMO) as recording:
         records = recording.metadata_records
-    assert known_result(records) is KNOWN_RESULT
+    assert known_rmse(records) == KNOWN_RMSE
     for node, other in (
         ('sim_robot', {'mass_factor': '2.0'}), ('sim_robot', {'noise.variance': '0.05'}),
         ('sim_robot', {'faults.slippery': '0.3'}), ('sim_robot', {'world': 'room'}),
         ('sim_robot', {'noise.variance': 'much'}), ('reference_generator', {'source': 'path'}),
     ):  # fmt: skip
-        assert known_result({**records, node: {**records[node], **other}}) is None
-    assert known_result({}) is None
+        assert known_rmse({**records, node: {**records[node], **other}}) == math.inf
+    assert known_rmse({}) == math.inf
 
 
 @pytest.mark.parametrize(

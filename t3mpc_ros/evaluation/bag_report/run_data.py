@@ -214,7 +214,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     notes = [*choice.notes]
     oddities, damage = _oddities_of_bag(recording, choice)
     records = recording.metadata_records
-    geometry = _geometry(records, wanted, choice.ours, notes)
+    geometry = geometry_of(records, wanted, choice.ours, notes)
     columns = _columns(recording, topics.values())
     raw, doubts, untrusted = {}, list[str](), []
     for name, topic in topics.items():
@@ -551,7 +551,7 @@ def _switches(numbers: Mapping[str, Series], reference: Series | None) -> Array:
     return np.array(sorted(found), dtype=np.float64)
 
 
-def _geometry(
+def geometry_of(
     metadata_records: Mapping[str, Mapping[str, str]],
     wanted: ReportOptions,
     ours: bool,

@@ -379,12 +379,10 @@ def _rmse_text(run: Run, pair: tuple[float, float]) -> str:
     text = f'settled RMSE {format_pair(pair, [each.unit for each in run.channels])}'
     if worst > MAX_ERROR * _reference_size(run):
         text += f' on a reference of {_reference_size(run):.2g} {run.channels[0].unit}'
-    known = known_result(run.parameters)
-    if known is not None and worst > MAX_RATIO * known.settled:
-        times = worst / known.settled
+    if worst > MAX_RATIO * known_rmse(run.parameters):
         text += (
-            f', {times:.0f} times the {known.settled:g} rad/s that the {known.robot} is known to '
-            'reach under these conditions'
+            f', {worst / KNOWN_RMSE:.0f} times the {KNOWN_RMSE:g} rad/s that the digital twin is '
+            'known to reach under these conditions'
         )
     return text
 
@@ -399,13 +397,12 @@ def _error_finding(run: Run, counted: float, length: float) -> tuple[_Finding | 
     pair = settled_rmse(run)
     reached = _rmse_text(run, pair)
     worst = max(pair)
-    known = known_result(run.parameters)
     if not math.isfinite(worst):
         return _Finding(reached, 'No valid measurement', spoils=True), reached
     if worst > MAX_ERROR * _reference_size(run):
         text = f'the robot did not follow its reference: {reached}'
         return _Finding(text, 'Did not follow its reference', spoils=True), reached
-    if known is not None and worst > MAX_RATIO * known.settled:
+    if worst > MAX_RATIO * known_rmse(run.parameters):
         text = f'poor run: {reached}'
         return _Finding(text, 'Poor run', spoils=True), reached
     if counted < max(MIN_COUNTED * length, MIN_SECONDS):
@@ -423,10 +420,7 @@ def share_on_path(run: Run) -> float:
 def _path_finding(
     share: float, distance: Array | None, *, detours: bool
 ) -> tuple[_Finding | None, str]:
-    """Return what speaks against the path of a patrol, if anything, and how well it was driven.
-
-    detours : whether the robot makes detours
-    """
+    """Return what speaks against the path of a patrol, if anything, and how well it was driven."""
     within = f'within {1e3 * ON_PATH:g} mm of its path for'
     if distance is None:
         text = 'the robot did not follow its path: the bag holds no positions of both'
@@ -453,17 +447,9 @@ change it by a quarter (docs/results.md), a busy machine that loses no sample by
 (0.0215 rad/s in bench/frozen/demo.mcap); one that stalls, by 9 times."""
 
 
-class KnownResult(NamedTuple):
-    """A settled RMSE that a robot reaches."""
-
-    robot: str
-    """Its name in a sentence."""
-    settled: float
-    """The larger one of both wheels, rad/s."""
-
-
-KNOWN_RESULT = KnownResult('digital twin', 0.012)
-"""README.md: 60 s of scripts/demo, noise variance 0.04 (rad/s)²."""
+KNOWN_RMSE = 0.012
+"""What the digital twin reaches, settled, the larger one of both wheels, rad/s. README.md: 60 s of
+scripts/demo, noise variance 0.04 (rad/s)²."""
 KNOWN_PARAMETERS: Mapping[str, Mapping[str, str]] = {
     'sim_robot': {'drive.kind': 'stepper', 'world': ''},
     'reference_generator': {'source': 'signals', 'output': 'wheels'},
@@ -476,11 +462,8 @@ FREE = ('seed', 'noise.variance', 'drive.kind', 'world')
 """Parameters of the twin that may differ from their defaults, or are named."""
 
 
-def known_result(records: Mapping[str, Mapping[str, str]]) -> KnownResult | None:
-    """Return what the recorded robot is known to reach under these conditions, if anything.
-
-    ``records`` are the recorded parameters by node.
-    """
+def known_rmse(records: Mapping[str, Mapping[str, str]]) -> float:
+    """Return :data:`KNOWN_RMSE`, or infinity for other recorded parameters, by node."""
     twin = records.get('sim_robot', {})
     defaults = {  # as a recorder writes them
         name: str(list(value)) if isinstance(value, tuple) else str(value)
@@ -488,15 +471,15 @@ def known_result(records: Mapping[str, Mapping[str, str]]) -> KnownResult | None
     }
     for name, value in twin.items():
         if name in defaults and name not in FREE and value != defaults[name]:
-            return None
+            return math.inf
     try:
         if float(twin.get('noise.variance', '0')) > MAX_NOISE:
-            return None
+            return math.inf
     except ValueError:
-        return None
+        return math.inf
     same = all(
         records.get(node, {}).get(name) == value
         for node, values in KNOWN_PARAMETERS.items()
         for name, value in values.items()
     )
-    return KNOWN_RESULT if same else None
+    return KNOWN_RMSE if same else math.inf
