@@ -122,7 +122,11 @@ class QosProfile:
                 lifespan_ns=_duration_from_mapping(mapping['lifespan']),
                 liveliness_lease_ns=_duration_from_mapping(mapping['liveliness_lease_duration']),
                 avoid_ros_namespace_conventions=bool(mapping['avoid_ros_namespace_conventions']),
-                **{name: _policy_name(mapping[name], POLICIES[name]) for name in POLICIES},
+                **{
+                    name: known[value] if isinstance(value, int) else str(value)
+                    for name, known in POLICIES.items()
+                    for value in (mapping[name],)
+                },
             )
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise QosError(f'not a QoS profile: {error!r}') from error
@@ -225,7 +229,3 @@ def _duration_from_mapping(mapping: Mapping[str, Any]) -> int:
     if (seconds, nanoseconds) in _FOXY_UNLIMITED:
         return UNLIMITED
     return min(seconds * NANOSECONDS + nanoseconds, UNLIMITED)
-
-
-def _policy_name(value: Any, policies: tuple[str, ...]) -> str:
-    return policies[value] if isinstance(value, int) else str(value)

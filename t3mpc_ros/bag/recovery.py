@@ -13,7 +13,7 @@
 # limitations under the License.
 """Recovery of damaged MCAP files of any writer: whole chunks, and nothing that was not written."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 import shutil
@@ -154,7 +154,11 @@ class RecoveryResult:
         spans = [damage.span_ns for damage in damages if damage.span_ns is not None]
         if len(spans) < len(damages) or not all(file.ended for file in self.files):
             return None
-        return _union_length(spans) / NANOSECONDS
+        total, reached = 0, -1  # of overlapping spans only the union
+        for first, last in sorted(spans):
+            total += max(0, last - max(first, reached))
+            reached = max(reached, last)
+        return total / NANOSECONDS
 
     @property
     def topics(self) -> dict[str, TopicResult]:
@@ -167,16 +171,6 @@ class RecoveryResult:
                 total.unchecked += topic.unchecked
                 total.lost += topic.lost
         return dict(sorted(merged.items()))
-
-
-def _union_length(spans: Iterable[tuple[int, int]]) -> int:
-    """Return the length of the union of the spans."""
-    total = 0
-    reached = -1
-    for first, last in sorted(spans):
-        total += max(0, last - max(first, reached))
-        reached = max(reached, last)
-    return total
 
 
 # -- bags -----------------------------------------------------------------------------------------

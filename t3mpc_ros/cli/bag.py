@@ -36,7 +36,6 @@ from t3mpc_ros.cli.train import add_bag_options, run_bags
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, parse_assignments
 
 if TYPE_CHECKING:  # help and completion do without the libraries for bags, which load slowly
-    from t3mpc_ros.bag.qos import QosProfile
     from t3mpc_ros.bag.reader import BagReader
     from t3mpc_ros.bag.recovery import Damage, FileResult, RecoveryResult
     from t3mpc_ros.evaluation.process_replay.controller_replay import ControllerInputs
@@ -108,7 +107,12 @@ def _info(bag: 'BagReader') -> dict[str, Any]:
                 'name': topic.name,
                 'type_name': topic.type_name,
                 'message_count': topic.message_count,
-                'qos_profiles': [*dict.fromkeys(map(_qos_text, topic.offered_qos_profiles))],
+                'qos_profiles': [
+                    *dict.fromkeys(
+                        f'{each.reliability}, {each.durability}, {each.history} {each.depth}'
+                        for each in topic.offered_qos_profiles
+                    )
+                ],
             }
             for topic in bag.topics.values()
         ],
@@ -171,12 +175,6 @@ def _size(path: Path) -> int:
     """Return the size of a file, or of the files in a folder, in bytes."""
     files = path.iterdir() if path.is_dir() else [path]
     return sum(file.stat().st_size for file in files)
-
-
-def _qos_text(profile: 'QosProfile') -> str:
-    """Return reliability, durability, history and depth of a profile."""
-    policies = ', '.join([profile.reliability, profile.durability, profile.history])
-    return f'{policies} {profile.depth}'
 
 
 def _info_table(title: str, table: Mapping[str, str]) -> str:

@@ -313,15 +313,10 @@ def _all_blocks(blocks: Sequence[Block]) -> Iterator[Block]:
 def _template() -> Any:
     import jinja2  # a simulation does without pages
 
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    environment = jinja2.Environment(loader=loader, autoescape=True)
-    environment.globals['own'] = _own_file
+    folder = Path(__file__).parent
+    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(folder), autoescape=True)
+    environment.globals['own'] = lambda name: (folder / name).read_text(encoding='utf-8')
     return environment.get_template('report_page.html')
-
-
-@cache
-def _own_file(name: str) -> str:
-    return (Path(__file__).parent / name).read_text(encoding='utf-8')
 
 
 def progress_bar(

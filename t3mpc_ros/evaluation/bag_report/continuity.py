@@ -16,7 +16,6 @@
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.control.watchdog import FAR_BEYOND, TwistUnits
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, Pose, State
@@ -63,14 +62,6 @@ def parts(*times: Array) -> list[tuple[float, float]]:
     return [(low, high) for low, high in found if high > low]
 
 
-def within_gaps(time: Array, series: Array) -> NDArray[np.bool_]:
-    """Return which of ``time`` lie in a gap of the sorted ``series``, shape (n,)."""
-    inside = np.zeros(time.size, dtype=np.bool_)
-    for low, high in gaps(series):
-        inside |= (time > low) & (time < high)
-    return inside
-
-
 def pose_jumps(
     stamps: Array, positions: Array, speeds: Array, least: float = POSE_JUMP
 ) -> list[tuple[int, float]]:
@@ -86,12 +77,6 @@ def pose_jumps(
     allowed = np.where(rests, min(least, REST_JUMP), least)
     rows = np.flatnonzero(away > allowed + SPEED_MARGIN * fastest * intervals)
     return list(zip((rows + 1).tolist(), away[rows].tolist(), strict=True))
-
-
-def jumps_often(stamps: Array, positions: Array, speeds: Array) -> bool:
-    """Return whether the position jumps as if a topic held several robots."""
-    jumps = len(pose_jumps(stamps, positions, speeds, MIXED_STEP))
-    return jumps > max(MIN_JUMPS, MIXED_SHARE * stamps.size)
 
 
 def continuity_notes(

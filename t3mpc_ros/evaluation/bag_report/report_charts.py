@@ -487,10 +487,6 @@ class Section:
     path_caption: str = ''
     """Caption for a robot that follows a path; empty: the same."""
 
-    def caption_of(self, run: Run) -> str:
-        """Return the caption for a run."""
-        return self.path_caption if run.follows_path and self.path_caption else self.caption
-
 
 SECTIONS = (
     Section(

@@ -293,7 +293,9 @@ def _sections(
         if charts := [chart for section in group for chart in section.draw(run, figures)]:
             yield Heading(title or group[0].title)
             yield Group(charts, 'div', 'charts')
-            yield from (Paragraph(section.caption_of(run), 'quiet') for section in group)
+            for section in group:
+                of_path = section.path_caption if run.follows_path else ''
+                yield Paragraph(of_path or section.caption, 'quiet')
 
 
 def _timing(run: Run) -> list[Block]:

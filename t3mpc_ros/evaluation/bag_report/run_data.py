@@ -32,10 +32,13 @@ from t3mpc_ros.bag.reader import (
 from t3mpc_ros.control.controller import WHEELS
 from t3mpc_ros.evaluation.bag_report import diagnostic_history
 from t3mpc_ros.evaluation.bag_report.continuity import (
+    MIN_JUMPS,
+    MIXED_SHARE,
+    MIXED_STEP,
     continuity_notes,
     gaps,
-    jumps_often,
     other_units,
+    pose_jumps,
 )
 from t3mpc_ros.evaluation.bag_report.map_changes import RecordedChange, read_map_changes
 from t3mpc_ros.evaluation.process_replay.controller_replay import recompute_scalars
@@ -231,7 +234,7 @@ def load_run(recording: BagReader, wanted: ReportOptions | None = None) -> Run:
     numbers: dict[str, Series] = {}
     for name, table in {**raw, **scalars}.items():
         if name == SIGNALS:
-            time = clock.applies(table['received'])
+            time = clock.local(table['received']) + clock.lead  # for which they were sent
             numbers |= {key: Series(time, {'value': table[key]}) for key in SIGNAL_NAMES}
         elif name in SCALARS:
             numbers[name] = Series(clock.local(table['received']), {'value': table['value']})
@@ -391,10 +394,6 @@ class _Clock:
         """Return the stamp time of a receive time."""
         return received + np.interp(received, self._received, self._offset) - self.origin
 
-    def applies(self, received: Array) -> Array:
-        """Return the time for which the reference node sent a message received at that time."""
-        return self.local(received) + self.lead
-
 
 def _columns(recording: BagReader, topics: Iterable[str]) -> Mapping[str, TopicColumns]:
     """Return the topics that can be read at once; none where a message has another layout."""
@@ -447,7 +446,8 @@ def _read(
         times = table['received'], table['stamp']
         places = np.stack([table['x'], table['y']], axis=1)
         notes += continuity_notes(topic, *times, places, table['linear'])
-        often = jumps_often(table['stamp'], places, table['linear'])
+        jumps = pose_jumps(table['stamp'], places, table['linear'], MIXED_STEP)
+        often = len(jumps) > max(MIN_JUMPS, MIXED_SHARE * len(places))
         _mend_stamps(table, topic, notes, doubts)
         turned = [table.pop(key) for key in ('about x', 'about y')] + [table['z'], table['w']]
         blind = np.count_nonzero(~np.any(turned, axis=0))

@@ -20,7 +20,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.evaluation.bag_report.continuity import within_gaps
+from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.incidents import (
     BRAKING,
     Span,
@@ -71,7 +71,8 @@ def tracking_error(run: Run, measured: str) -> Series | None:
     if motion is None or reference is None:
         return None
     inside = (motion.time >= reference.time[0]) & (motion.time <= reference.time[-1])
-    inside &= ~within_gaps(motion.time, reference.time)
+    for low, high in gaps(reference.time):
+        inside &= (motion.time <= low) | (motion.time >= high)
     time = motion.time[inside]
     before = np.clip(np.searchsorted(reference.time, time, 'right') - 1, 0, None)
     following = np.minimum(before + 1, len(reference) - 1)
