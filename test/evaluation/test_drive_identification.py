@@ -17,7 +17,7 @@ import math
 
 import numpy as np
 import pytest
-from support.bag_messages import START, odometry_message, twist_message
+from support.bag_messages import START, serialised_odometry, serialised_twist
 from support.long_tests import few_of
 from support.training_runs import Tape
 from support.velocity_robot import VelocityRobot
@@ -83,11 +83,10 @@ def recorded(wheels, seed=1, metadata_records=METADATA, **parameters):
     tape = Tape(metadata_records)
     state = robot.advance(START)
     for speeds in wheels:
-        command = WheelSpeeds(*speeds.tolist())
-        tape.add(
-            '/odom', state.stamp_ns + 1000, odometry_message(state.stamp_ns, state.odometry.twist)
-        )
-        tape.add('/cmd_vel', state.stamp_ns, twist_message(twist_from_wheels(command, GEOMETRY)))
+        command, stamp_ns = WheelSpeeds(*speeds.tolist()), state.stamp_ns
+        twist = twist_from_wheels(command, GEOMETRY)
+        tape.add('/odom', stamp_ns + 1000, serialised_odometry(stamp_ns, state.odometry.twist))
+        tape.add('/cmd_vel', stamp_ns, serialised_twist(twist))
         state = robot.step(command)
     return tape
 
@@ -151,12 +150,12 @@ def test_a_robot_of_another_make_is_identified(tmp_path, lag, dead_time):
         if k % 40 == 0:
             twist = twist_from_wheels(WheelSpeeds(*wheels[k // 40].tolist()), geometry)
             robot.command(twist.linear, twist.angular)
-            tape.add('/cmd_vel', now, twist_message(twist))
+            tape.add('/cmd_vel', now, serialised_twist(twist))
         robot.advance(0.001)
         if k % 33 == 32:
             _, linear, angular = robot.odometry()
             state = State(now + 1_000_000, ORIGIN, BodyTwist(linear, angular))
-            tape.add('/odom', now + 1_500_000, odometry_message(state.stamp_ns, state.twist))
+            tape.add('/odom', now + 1_500_000, serialised_odometry(state.stamp_ns, state.twist))
     folder = tape.write(tmp_path / 'bag')
     drive, _ = identify_bag(folder, ReportOptions(wheel_radius=0.033, track=0.16))
     assert drive.mean_speeds

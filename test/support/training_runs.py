@@ -15,7 +15,7 @@
 
 import numpy as np
 
-from support.bag_messages import START, STORE
+from support.bag_messages import START, serialised
 from support.golden_bags import ControllerBag, RecordedController
 from t3mpc_ros.bag.writer import BagWriter
 from t3mpc_ros.control.controller import ControllerParameters
@@ -38,8 +38,7 @@ class Tape:
         self.rows = list(rows)
 
     def add(self, topic, received_ns, message):
-        data = bytes(STORE.serialize_cdr(message, message.__msgtype__))
-        self.rows.append((received_ns, topic, message.__msgtype__, data))
+        self.rows.append((received_ns, topic, message.__msgtype__, serialised(message)))
 
     def where(self, keep):
         """Return the messages for which ``keep(seconds, topic, count on its topic)`` is true."""
