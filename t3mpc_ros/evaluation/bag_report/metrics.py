@@ -141,8 +141,8 @@ class ReportMetrics:
     """Median time (s) from the receipt of odometry to that of the command."""
     latency_99: float
     """Its 99th percentile (s)."""
-    missing: float
-    """Share of missing odometry."""
+    missing: Mapping[str, float]
+    """Share of missing samples by relative topic name."""
     verdict: Verdict
     """What happened, and whether the numbers measure the controller."""
     incidents: Incidents
@@ -240,7 +240,7 @@ RUN_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics], float]], ...] = (
     ),
     ('odometry to command, median', 'ms', lambda found: 1e3 * found.latency),
     ('odometry to command, 99 % below', 'ms', lambda found: 1e3 * found.latency_99),
-    ('odometry missing', '%', lambda found: 100.0 * found.missing),
+    ('odometry missing', '%', lambda found: 100.0 * found.missing.get(ODOMETRY, math.nan)),
 )  # fmt: skip
 LINK_NUMBERS: tuple[tuple[str, str, Callable[[LinkMetrics], float]], ...] = (
     ('cycles answered', '%', lambda link: 100.0 * link.answered),
@@ -265,14 +265,14 @@ def compute_metrics(run: Run, report: Path, messages: int) -> ReportMetrics:
     delay = latencies(run)
     delays = np.array([math.nan]) if delay is None else delay['value']
     prompt = latencies(run, first=True)
-    timing = run.timing.get(ODOMETRY) if ODOMETRY not in run.untrusted else None
-    missing = math.nan if timing is None else timing.missing
+    valid = ((name, each) for name, each in run.timing.items() if name not in run.untrusted)
+    missing = {name: timing.missing for name, timing in valid}
     incidents = find_incidents(run)
     verdict = judge(
         run,
         incidents,
         counted=max(each.overall.seconds for each in wheels.values()),
-        missing=missing,
+        missing=missing.get(ODOMETRY, math.nan),
         latency_99=math.nan if prompt is None else float(np.percentile(prompt['value'], 99.0)),
     )
     distance = tracking_errors.path_distance(run)

@@ -81,6 +81,8 @@ class Verdict:
     """What else happened, in sentences."""
     sound: bool = True
     """Whether nothing speaks against the numbers."""
+    judged: bool = True
+    """Whether the bag holds a closed loop of this package, which can be judged."""
     slow: bool = False
     """Whether the machine was too slow, which explains what is wrong if anything is."""
     damaged: bool = False
@@ -178,6 +180,7 @@ def _verdict(
         'good',
         details=(*run.doubts, *([detail] if detail else [])),
         sound=judged and not spoilt,
+        judged=judged,
         slow=slow,
         damaged=damaged,
         on_path=on_path,
