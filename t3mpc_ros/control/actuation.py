@@ -137,8 +137,6 @@ class VelocityActuation:
         drive: str,
         period: float,
     ) -> None:
-        if not period > 0.0:
-            raise ValueError(f'period must be positive: got {period} s')
         self.speed_filter = SpeedKalmanFilter(filter_parameters, drive, period)
         state = self.speed_filter.state
         self.speeds = state.speeds  # estimated chi at the last measurement, rad/s, shape (2,)

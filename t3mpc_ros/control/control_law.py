@@ -32,11 +32,7 @@ from t3mpc_ros.fuzzy.estimator import (
 from t3mpc_ros.fuzzy.inference import FuzzyParameters, FuzzyTables
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
-from t3mpc_ros.mpc.predictive_controller import (
-    PredictiveController,
-    PredictiveParameters,
-    Signals,
-)
+from t3mpc_ros.mpc.predictive_controller import PredictiveController, PredictiveParameters, Signals
 from t3mpc_ros.parameters.table import Parameters, group, parameter
 
 TERM_NAMES = ('fuzzy', 'feedback', 'feedforward', 'compensator', 'predictive')
@@ -47,6 +43,9 @@ FRICTION_WEIGHTS = 'friction.coefficients'  # name of the weights of the frictio
 INERTIA_WEIGHTS = 'inertia.coefficients'  # name of the weights of the inertia term
 
 MAX_SMOOTHING = 100.0  # largest width epsilon of the compensator, rad/s
+
+CERTIFICATE_TIME = 0.5
+"""Time constant of the averages of the certificate, s: single differences are mostly noise."""
 
 TANH_GAP = 0.2785  # E14: the maximum of |x| - x tanh(x), rounded up (0.27846, at x = 0.6392)
 
@@ -160,8 +159,7 @@ class Nt3fsMpcParameters(Parameters):
     # The ratio of disturbance and noise sets the filter: the noise is that of the robot.
     speed_filter: SpeedFilterParameters = group(SpeedFilterParameters, fixed=('disturbance',))
     fuzzy: FuzzyParameters = group(
-        FuzzyParameters,
-        fixed=('centre_exponent', 'footprint_of_uncertainty', 'spread', 'slices'),
+        FuzzyParameters, fixed=('centre_exponent', 'footprint_of_uncertainty', 'spread', 'slices')
     )
     # The ball bounds the coefficients; the other modifications are for comparisons.
     adaptation: AdaptationParameters = group(
@@ -360,12 +358,9 @@ class Certificate:
     estimation error, g* - g plus disturbance, is within omega-bar. A negative margin shows a
     larger error, or a recent jump of the reference.
 
-    ``window`` is the time constant (s) of the averages: single differences are mostly measurement
-    noise.
     """
 
-    def __init__(self, window: float = 0.5) -> None:
-        self.window = window
+    def __init__(self) -> None:
         self.reset()
 
     def reset(self) -> None:
@@ -380,7 +375,7 @@ class Certificate:
         last, value = self.reading, 0.5 * squared_norm(errors)
         rate = (value - last.value) / dt if self._started and dt > 0.0 else 0.0
         allowed = lyapunov_rate_bound(errors, gain, bound, smoothing)
-        weight = min(1.0, dt / self.window)
+        weight = min(1.0, dt / CERTIFICATE_TIME)
         self._started = True
         self.reading = CertificateReading(
             value,
@@ -420,10 +415,7 @@ class Nt3fsMpcController:
         )
         self._certificate = Certificate()
         self._output = LawOutput(
-            np.zeros(2),
-            np.zeros(2),
-            np.zeros((len(TERM_NAMES), 2)),
-            np.zeros(2),
+            np.zeros(2), np.zeros(2), np.zeros((len(TERM_NAMES), 2)), np.zeros(2)
         )
         self.terms, self.command = self._output.terms, self._output.command
         """Terms of the last step, rows as in ``TERM_NAMES``, and their sum u, rad/s²."""

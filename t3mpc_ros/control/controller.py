@@ -29,11 +29,7 @@ from t3mpc_ros.control.actuation import (
     wheel_limits,
 )
 from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
-from t3mpc_ros.control.command_shaper import (
-    HIGHEST,
-    CommandShaper,
-    CommandShaperParameters,
-)
+from t3mpc_ros.control.command_shaper import HIGHEST, CommandShaper, CommandShaperParameters
 from t3mpc_ros.control.control_law import (
     MAX_SMOOTHING,
     TERM_NAMES,
@@ -66,12 +62,7 @@ from t3mpc_ros.geometry.kinematics import (
     twist_from_wheels,
     wheels_from_twist,
 )
-from t3mpc_ros.geometry.trajectory import (
-    Jump,
-    ReferenceTrajectory,
-    TrajectorySamples,
-    interpolate,
-)
+from t3mpc_ros.geometry.trajectory import Jump, ReferenceTrajectory, TrajectorySamples, interpolate
 from t3mpc_ros.geometry.types import (
     NANOSECONDS,
     ORIGIN,
@@ -206,11 +197,7 @@ class ControllerParameters(Nt3fsMpcParameters):
         """Return the parameters with the parts of the composition, and the gain that fits."""
         changes: dict[str, object] = {}
         if self.composition == 'body':
-            changes = {
-                'use_fuzzy': False,
-                'law.compensator': False,
-                'predictive.enabled': False,
-            }
+            changes = {'use_fuzzy': False, 'law.compensator': False, 'predictive.enabled': False}
         parts = self.with_values(changes)
         if parts.law.gain > 0.0:
             return parts
@@ -524,7 +511,12 @@ class Controller:
             self._clear_reference()
             if self.keep_out is not None:
                 self.keep_out.reset()
-        elif self.keep_out is not None and last is not None and self._is_elsewhere(odometry):
+        elif (
+            self.keep_out is not None
+            and last is not None
+            and odometry.is_finite()
+            and has_moved(self._place, odometry.pose, *POSE_JUMP)
+        ):  # a localisation has found the robot elsewhere
             self.keep_out.relocate()  # what it has marked was marked at another place
             self.drive_monitor.contact_monitor.restart(None)
         plan_ns, reason = self._sample_plan(odometry)
@@ -651,10 +643,6 @@ class Controller:
         if reason.moves and keep_out.ranges.is_blind(astern=astern):
             return Reason.TOO_FEW_RANGES
         return reason
-
-    def _is_elsewhere(self, odometry: State) -> bool:
-        """Return whether the pose has jumped: a localisation has found the robot elsewhere."""
-        return odometry.is_finite() and has_moved(self._place, odometry.pose, *POSE_JUMP)
 
     def _wait(self, odometry: State) -> tuple[BodyTwist, Status]:
         """Return the last command at an odometry that comes before the period has passed."""

@@ -199,8 +199,6 @@ class DeadTimeEstimator:
         mean_speeds: bool = True,
         friction: bool = False,
     ) -> None:
-        if not period > 0.0:
-            raise ValueError(f'period must be positive: got {period} s')
         self._configured = parameters.dead_time
         self.lateness = 0.0
         """Part of the estimate that is no dead time, s: commands are held longer than a period."""
@@ -281,12 +279,7 @@ class DeadTimeEstimator:
         :meth:`reset` instead.
         """
         return self._update(
-            self._state,
-            self._history,
-            self._drive,
-            contiguous(measured),
-            contiguous(command),
-            dt,
+            self._state, self._history, self._drive, contiguous(measured), contiguous(command), dt
         )
 
 

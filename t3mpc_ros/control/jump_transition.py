@@ -15,7 +15,7 @@
 
 from dataclasses import dataclass
 import math
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,14 +49,6 @@ class JumpTransitionParameters(Parameters):
         (1.0, 1e4),
         dynamic=True,
     )
-
-
-class RampLimit(Protocol):
-    """What limits the ramp of a jump."""
-
-    def accelerations(self, jump: Array) -> Array:
-        """Return the accelerations for a jump (rad/s), rad/s², shape (2,); NaN: the parameter."""
-        ...
 
 
 def in_one_direction(jump: Array, time: float) -> Array:
@@ -149,7 +141,7 @@ class JumpTransition:
         parameters: JumpTransitionParameters,
         lag: float,
         period: float,
-        limit: RampLimit | None = None,
+        limit: MotorLimit | CommandLimit | None = None,
     ) -> None:
         self.parameters = parameters
         self.limit = limit  # what limits the ramps of the next jumps

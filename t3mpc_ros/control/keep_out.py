@@ -252,12 +252,16 @@ class FreeSpaceMap:
         near: NDArray[np.bool_] = squares[0][:, None] + squares[1][None, :] <= radius**2
         return (spans[0], spans[1]), near
 
-    def surface(self, sensor: int, pose: Pose) -> tuple[float, float] | None:
-        """Return the surface (m) that a sensor of the robot at ``pose`` must see; None: none."""
+    def _face(self, sensor: int, pose: Pose) -> tuple[float, float, float]:
+        """Return place (m) and direction (rad) of the face of a sensor."""
         ahead, aside, direction = self._mounts[sensor].tolist()
         cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
         x, y = pose.x + cosine * ahead - sine * aside, pose.y + sine * ahead + cosine * aside
-        direction += pose.yaw
+        return x, y, pose.yaw + direction
+
+    def surface(self, sensor: int, pose: Pose) -> tuple[float, float] | None:
+        """Return the surface (m) that a sensor of the robot at ``pose`` must see; None: none."""
+        x, y, direction = self._face(sensor, pose)
         reach = SURELY_SEEN * self.parameters.range
         away = self._find_surface(self.grid, x, y, direction, reach)
         if away == math.inf:
@@ -266,8 +270,6 @@ class FreeSpaceMap:
 
     def add_reading(self, sensor: int, reading: float, pose: Pose) -> None:
         """Add a reading (m, REP 117) of a sensor of the robot at ``pose``."""
-        ahead, aside, direction = self._mounts[sensor].tolist()
-        cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
         parameters = self.parameters
         limit = parameters.range
         near = reading == -math.inf
@@ -276,9 +278,7 @@ class FreeSpaceMap:
         come = self._add_ray(
             self.grid,
             self.now,
-            pose.x + cosine * ahead - sine * aside,
-            pose.y + sine * ahead + cosine * aside,
-            pose.yaw + direction,
+            *self._face(sensor, pose),
             max(hit - error, 0.0),
             0.09 if near else (hit if reading < limit else -1.0),
             parameters.beam_half_width,
@@ -653,14 +653,12 @@ class KeepOut:
         oldest = self.map.now - self.parameters.map.memory
         self._find_nearest(self.map.grid, *pose, oldest, self._nearest, least)
 
-    def _is_near_touched(self, pose: Pose) -> bool:
-        return any(math.hypot(x - pose.x, y - pose.y) < TOUCHED_NEAR for x, y in self.touched)
-
     def _reshaped(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:
         """Return the permitted twist, or one that looks around."""
         self._update_nearest(pose, UNKNOWN)
         visited = self.map.now - self.map.last_come < NEW_FOR
-        self._cautious = visited or self.ranges.lost or self._is_near_touched(pose)
+        touches = any(math.dist(each, pose[:2]) < TOUCHED_NEAR for each in self.touched)
+        self._cautious = visited or self.ranges.lost or touches
         if self._targets:
             self.changed = True
             self.activity = Activity.LOOKING
@@ -789,13 +787,7 @@ class KeepOut:
 
 @kernel
 def find_nearest(
-    grid: MapGrid,
-    x: float,
-    y: float,
-    yaw: float,
-    oldest: float,
-    nearest: Array,
-    least: int,
+    grid: MapGrid, x: float, y: float, yaw: float, oldest: float, nearest: Array, least: int
 ) -> None:
     """Write the nearest unsafe cell of each sector.
 

@@ -21,14 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
-from t3mpc_ros.geometry.types import (
-    NANOSECONDS,
-    Array,
-    BodyTwist,
-    State,
-    difference,
-    has_jumped,
-)
+from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, State, difference, has_jumped
 
 MAX_DELAY, MAX_LEAD = 0.3, 0.05
 """Offset of odometry stamps from the node's clock beyond which the clocks differ, s."""
@@ -251,19 +244,18 @@ class InputMonitor:
         self._product = [0.0, 0.0]
 
     def update(
-        self,
-        odometry: State,
-        now_ns: int,
-        command: BodyTwist | None,
-        *,
-        following: bool = True,
+        self, odometry: State, now_ns: int, command: BodyTwist | None, *, following: bool = True
     ) -> None:
         """Add one odometry message and the command before it; None after a standstill command.
 
         ``following``: whether the robot follows commands, as far as is known.
         """
         elapsed = self.gaps.update(odometry.stamp_ns)
-        self._add_offset((now_ns - odometry.stamp_ns) / NANOSECONDS)
+        offset = (now_ns - odometry.stamp_ns) / NANOSECONDS
+        self.late += len(self._offsets) > 5 and offset > self._typical + LATE
+        self._offsets.append(offset)
+        if len(self._offsets) % 5 == 0:
+            self._typical = median(self._offsets)
         if elapsed is not None and self._last is not None:
             self._add_jump(self._last, odometry)
         self._last = odometry
@@ -293,12 +285,6 @@ class InputMonitor:
     def _interrupt(self) -> None:
         for response in self._responses:
             response.interrupt()
-
-    def _add_offset(self, offset: float) -> None:
-        self.late += len(self._offsets) > 5 and offset > self._typical + LATE
-        self._offsets.append(offset)
-        if len(self._offsets) % 5 == 0:
-            self._typical = median(self._offsets)
 
     def _watch_standstill(self, elapsed: float, command: BodyTwist, measured: BodyTwist) -> None:
         found = max(abs(value) / scale for value, scale in zip(measured, SCALES, strict=True))
@@ -351,7 +337,10 @@ class InputMonitor:
                 'a second publisher, other units than metres and radians, a localisation that '
                 'alternates between two places'
             )
-        opposite = [self._is_opposite(axis) for axis in (0, 1)]
+        opposite = [
+            power > SIGN_EXCITATION * scale**2 and product < OPPOSITE * power
+            for power, product, scale in zip(self._power, self._product, SCALES, strict=True)
+        ]
         for axis, name in enumerate(NAMES):
             if opposite[axis]:
                 found.append(
@@ -361,10 +350,6 @@ class InputMonitor:
         if not any(opposite) and self._follows:
             found += self._gain_warnings(geometry)
         return found
-
-    def _is_opposite(self, axis: int) -> bool:
-        power, product = self._power[axis], self._product[axis]
-        return power > SIGN_EXCITATION * SCALES[axis] ** 2 and product < OPPOSITE * power
 
     def _gain_warnings(self, geometry: WheelGeometry) -> list[str]:
         gains = [self.gain(axis) for axis in (0, 1)]

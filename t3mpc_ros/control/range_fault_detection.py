@@ -190,7 +190,7 @@ class RangeMonitor:
     def is_blind(self, *, astern: bool) -> bool:
         """Return whether too few sensors are left to drive ahead or astern."""
         looking = self._looking(astern)
-        return all(record.fault for record in looking) if looking else self._all_lost()
+        return bool(self._sensors) and all(each.fault for each in looking or self._sensors)
 
     def waits(self, *, astern: bool) -> bool:
         """Return whether no sensor that looks there has reported for so long that it brakes."""
@@ -224,6 +224,3 @@ class RangeMonitor:
     def _looking(self, astern: bool) -> list[SensorRecord]:
         sign = -1.0 if astern else 1.0
         return [record for record in self._sensors if sign * record.looks > LOOKS_ALONG]
-
-    def _all_lost(self) -> bool:
-        return bool(self._sensors) and all(record.fault for record in self._sensors)

@@ -79,8 +79,6 @@ class SpeedKalmanFilter:
     """
 
     def __init__(self, parameters: SpeedFilterParameters, drive: str, period: float) -> None:
-        if drive not in ('velocity', 'torque'):
-            raise ValueError(f"drive must be 'velocity' or 'torque': got {drive!r}")
         self.parameters = parameters
         velocity, lag = drive == 'velocity', parameters.lag
         transition = np.array([[1.0, period], [0.0, 1.0]])

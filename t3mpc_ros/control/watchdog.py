@@ -276,11 +276,11 @@ class TwistFactor:
         self._time = self._left = 0.0
         self._block = [[0.0, 0.0], [0.0, 0.0]]
 
-    def update(self, last: State, new: State) -> None:
-        """Compare the twists of two messages in a row with the change of the pose."""
+    def update(self, last: State, new: State, motion: tuple[float, float, float]) -> None:
+        """Compare the twists of two messages in a row with the motion between their poses."""
         elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
         self._time += elapsed
-        ahead, left, turn = motion_between(last.pose, new.pose)
+        ahead, left, turn = motion
         self._left += left
         for i, (block, by_pose) in enumerate(zip(self._block, (ahead, turn), strict=True)):
             by_twist = 0.5 * elapsed * (last.twist[i] + new.twist[i])
@@ -319,12 +319,6 @@ class TwistFactor:
         return factor, math.sqrt(rest / poses)
 
 
-def _was_set(last: State, new: State) -> bool:
-    """Return whether a robot whose twist is zero cannot have driven from one pose to the other."""
-    elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
-    return has_moved(last.pose, new.pose, *(2.0 * elapsed * speed for speed in UNKNOWN_TWIST))
-
-
 class TwistUnits:
     """Whether the twist of the odometry is far beyond the change of its pose, in either velocity.
 
@@ -338,13 +332,13 @@ class TwistUnits:
         """Twist and change of the pose in a message in which they contradict each other."""
         self._count = 0
 
-    def update(self, last: State, new: State) -> None:
-        """Compare the twist of a message with the change of the pose since the last one."""
+    def update(self, last: State, new: State) -> tuple[float, float, float]:
+        """Compare the twist of a message with the motion since the last one; return that."""
         # That of a camera which is slower than the wheels stays the same for a while.
         times = FAR_UNCHANGED if new.pose == last.pose else 1.0
         elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
-        ahead, _, turn = motion_between(last.pose, new.pose)
-        by_pose = ahead / elapsed, turn / elapsed
+        motion = motion_between(last.pose, new.pose)
+        by_pose = motion[0] / elapsed, motion[2] / elapsed
         if any(
             abs(twist) > FAR * abs(rate) + times * beyond
             for twist, rate, beyond in zip(new.twist, by_pose, FAR_BEYOND, strict=True)
@@ -357,6 +351,7 @@ class TwistUnits:
         elif any(abs(rate) > least for rate, least in zip(by_pose, UNITS_MOTION, strict=True)):
             self._count = max(self._count - 1, 0)
         self.wrong = self._count >= UNITS_COUNT or (self.wrong and self._count > 0)
+        return motion
 
 
 class OdometryTwist:
@@ -409,32 +404,29 @@ class OdometryTwist:
             if last is None:
                 self._factor.interrupt()
             else:
-                self._units.update(last, odometry)
-                self._factor.update(last, odometry)
+                self._factor.update(last, odometry, self._units.update(last, odometry))
         else:
             if last is None or self._anchor is None:
                 self._anchor = pose
-            elif _was_set(last, odometry):
-                # That of the next message: this one may be the only one so far off.
-                self._anchor = None
+            else:
+                elapsed = (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
+                farthest = (2.0 * elapsed * speed for speed in UNKNOWN_TWIST)
+                if has_moved(last.pose, pose, *farthest):  # it cannot have driven so far
+                    # That of the next message: this one may be the only one so far off.
+                    self._anchor = None
             if self._anchor is not None:
                 self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
         if self.missing or self._units.wrong:
             if last is None:  # across a restart the pose says nothing of the speed
                 return odometry._replace(twist=STANDSTILL)
-            return _differentiated(last, odometry)
+            elapsed = (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
+            ahead, _, turn = motion_between(last.pose, pose)
+            return odometry._replace(twist=BodyTwist(ahead / elapsed, turn / elapsed))
         factor = self._factor.value
         if factor == 1.0:
             return odometry
         linear, angular = odometry.twist
         return odometry._replace(twist=BodyTwist(linear / factor, angular / factor))
-
-
-def _differentiated(last: State, new: State) -> State:
-    """Return a state whose twist is the change of its pose."""
-    elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
-    ahead, _, turn = motion_between(last.pose, new.pose)
-    return new._replace(twist=BodyTwist(ahead / elapsed, turn / elapsed))
 
 
 EVIDENCE_WEIGHT = 20

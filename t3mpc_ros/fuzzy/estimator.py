@@ -189,8 +189,6 @@ class FuzzyEstimator:
         outputs: int = 2,
         inputs: int = 2,
     ) -> None:
-        if outputs < 1:
-            raise ValueError(f'outputs must be at least 1: got {outputs}')
         self.sets = build_sets(parameters, inputs)
         self.tables = FuzzyTables.of(self.sets, outputs)
         """Sets, basis and coefficients, for kernels."""
@@ -238,8 +236,6 @@ class FuzzyEstimator:
         The basis is that of the last :meth:`evaluate`; without one the coefficients do not change.
         Values that do not fit raise ValueError and change nothing.
         """
-        if not 0.0 <= dt < math.inf:
-            raise ValueError(f'dt must be finite and not negative: got {dt} s')
         values = np.ascontiguousarray(errors, dtype=np.float64)
         if self.adaptation.enabled and (
             values.shape != self._coefficients.shape[:1]

@@ -103,16 +103,6 @@ def make_machine(
     equally (at 2 exactly); with independent random weights their condition number is raised to the
     third power. This requires at least as many hidden as visible units.
     """
-    if shape.delta_lags < 1 or shape.move_lags < 1:
-        raise ValueError(f'shape must have at least one lag of each kind: got {shape}')
-    if shape.hidden < shape.visible:
-        raise ValueError(
-            f'hidden must be at least the {shape.visible} visible units: got {shape.hidden}'
-        )
-    if not (delta_scale > 0.0 and move_scale > 0.0 and spread > 0.0):
-        raise ValueError(
-            f'scales and spread must be positive: got {delta_scale}, {move_scale}, {spread}'
-        )
     square, _ = np.linalg.qr(generator.standard_normal((shape.hidden, shape.visible)))
     visible, hidden = shape.visible, shape.hidden
     return BoltzmannMachine(

@@ -23,12 +23,8 @@ from typing import ClassVar, NamedTuple, Self
 import numpy as np
 
 from t3mpc_ros.geometry.types import Array
-from t3mpc_ros.kernels import TypedKernel, kernel
-from t3mpc_ros.mpc.boltzmann_machine import (
-    LayerSizes,
-    make_machine,
-    reset_history,
-)
+from t3mpc_ros.kernels import TypedKernel, contiguous, kernel
+from t3mpc_ros.mpc.boltzmann_machine import LayerSizes, make_machine, reset_history
 from t3mpc_ros.mpc.predictor import (
     LearningConstants,
     Predictor,
@@ -133,10 +129,7 @@ class PredictiveParameters(Parameters):
 
     def check_consistency(self) -> None:
         """Raise :class:`ParameterError` for horizons or periods in the wrong order."""
-        for low, high in (
-            ('control_horizon', 'horizon'),
-            ('average', 'decimation'),
-        ):
+        for low, high in (('control_horizon', 'horizon'), ('average', 'decimation')):
             small, large = getattr(self, low), getattr(self, high)
             if small > large:
                 raise ParameterError(f'{low} must be at most {high} = {large}: got {small}')
@@ -431,8 +424,6 @@ class PredictiveController:
         feedback_gain: float,
         outputs: int = 2,
     ) -> None:
-        if not (period > 0.0 and outputs > 0):
-            raise ValueError(f'period and outputs must be positive: got {period}, {outputs}')
         self._timing = SampleTiming(period, parameters.decimation, parameters.average)
         self.span = span = self._timing.span  # predictive period T, s
         if parameters.move_lags * span < parameters.nominal.dead_time + span:
@@ -544,8 +535,6 @@ class PredictiveController:
 
     def notify_jump(self, jump: Array) -> None:
         """Add a known jump of the error (rad/s) at the :meth:`step` of this period."""
-        if np.shape(jump) != self.status.shape or not np.isfinite(jump).all():
-            raise ValueError(f'jump must be {self.status.size} finite numbers: got {jump}')
         self.signals.jumps[:] += jump
 
     def step(self, errors: Array, known_change: Array | None = None) -> Array:
@@ -554,23 +543,12 @@ class PredictiveController:
         known_change : known future jumps of delta, shape (n_p, outputs), rad/s: row j is the sum
             of the jumps between t + jT and t + (j+1)T. Each is added to Psi_free from its time on,
             and decays. Used only in steps that solve the quadratic program, see :attr:`due`.
-        Values that do not fit raise ValueError and change nothing.
         """
-        errors = np.ascontiguousarray(errors, dtype=np.float64)
-        if errors.shape != self.status.shape:
-            raise ValueError(f'errors must have shape {self.status.shape}: got {errors.shape}')
-        if self.due and known_change is not None:
-            rows, columns = self._no_change.shape
-            if np.shape(known_change) != (rows, columns) or not np.isfinite(known_change).all():
-                raise ValueError(
-                    f'known_change must be {rows} by {columns} finite numbers: got {known_change}'
-                )
-            known_change = np.ascontiguousarray(known_change, dtype=np.float64)
-        self.advance(errors, self._zeros, known_change)
+        self.advance(contiguous(errors), self._zeros, known_change)
         return self.signals.v.copy()
 
     def advance(self, speeds: Array, reference: Array, known_change: Array | None = None) -> None:
-        """Update ``signals`` like :meth:`step`, without shape checks."""
+        """Update ``signals`` like :meth:`step`; ValueError if an error is not finite."""
         timing, phase = self._timing, self.phase
         sampled = phase == 0 or phase > timing.decimation - timing.average
         if not self._accumulate_sample(
@@ -578,28 +556,24 @@ class PredictiveController:
         ):
             raise ValueError(f'errors must be finite: got {speeds - reference}')
         if phase == 0:
-            self._predictive_step(self._no_change if known_change is None else known_change)
+            if self._constants.dithered:
+                next_dither = self._generator.uniform(-1.0, 1.0, self.status.size)
+                self.signals.next_dither[:] = self.parameters.dither * next_dither
+            self._step_kernel(
+                self._wheels,
+                self.signals,
+                self.responses,
+                self._no_change if known_change is None else known_change,
+                self.samples,
+                self._constants,
+                self._learning,
+                self._work,
+            )
+            self.skill = self.signals.skills.copy()
+            self.samples += 1
         self.phase = (phase + 1) % timing.decimation
 
     @property
     def due(self) -> bool:
         """Whether the next :meth:`step` solves the quadratic program, with ``known_change``."""
         return self.phase == 0
-
-    def _predictive_step(self, change: Array) -> None:
-        """Process the sample of each output, and update its v_p."""
-        if self._constants.dithered:
-            next_dither = self._generator.uniform(-1.0, 1.0, self.status.size)
-            self.signals.next_dither[:] = self.parameters.dither * next_dither
-        self._step_kernel(
-            self._wheels,
-            self.signals,
-            self.responses,
-            change,
-            self.samples,
-            self._constants,
-            self._learning,
-            self._work,
-        )
-        self.skill = self.signals.skills.copy()
-        self.samples += 1

@@ -65,8 +65,6 @@ class Workspace(NamedTuple):
 
 def make_workspace(moves: int) -> Workspace:
     """Return the work space for ``moves`` (n_c) unknowns."""
-    if moves < 1:
-        raise ValueError(f'moves must be at least 1: got {moves}')
     square, row = (moves, moves), moves
     return Workspace(
         hessian=np.zeros(square),

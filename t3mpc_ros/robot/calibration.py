@@ -245,9 +245,7 @@ def check_straight_run(run: StraightRun) -> None:
 
 
 def estimate_track(
-    turns: Sequence[tuple[float, GyroTurn]],
-    radius: Estimate,
-    marks: MarkUncertainty = MARKS,
+    turns: Sequence[tuple[float, GyroTurn]], radius: Estimate, marks: MarkUncertainty = MARKS
 ) -> Estimate:
     r"""Return the distance between the wheels, 2b, in m, from turns on the spot.
 
@@ -403,11 +401,6 @@ def _rest(recording: Recording, part: slice, when: str) -> tuple[float, float]:
 # -- converter ------------------------------------------------------------------------------------
 
 
-def converter_voltage(count: float) -> float:
-    """Return the voltage at the converter of the board, V: the middle of the step of a count."""
-    return REFERENCE_VOLTAGE * (count + 0.5) / CONVERTER_COUNTS
-
-
 def nominal_battery_voltage(count: float, divider: float) -> float:
     """Return the battery voltage, V, as the board computes it without correction."""
     return REFERENCE_VOLTAGE * count / CONVERTER_COUNTS * divider
@@ -516,9 +509,11 @@ def _converter_readings(readings: Sequence[RangeReading]) -> tuple[Array, Array,
     """Return distance (m), mean voltage (V) and its variance (V²) of each reading."""
     step = REFERENCE_VOLTAGE / CONVERTER_COUNTS
     counts = [np.array(reading.counts, dtype=float) for reading in readings]
+    means = [float(np.mean(each)) for each in counts]
     return (
         np.array([reading.distance for reading in readings]),
-        np.array([converter_voltage(float(np.mean(each))) for each in counts]),
+        # The middle of the step of a count.
+        np.array([REFERENCE_VOLTAGE * (mean + 0.5) / CONVERTER_COUNTS for mean in means]),
         step**2 * np.array([np.var(each, ddof=1) / len(each) + 1.0 / 12.0 for each in counts]),
     )
 
@@ -595,18 +590,13 @@ def _least_squares(design: Array, y: Array, variances: float | Array) -> tuple[A
     x = np.linalg.lstsq(weighted, y * root, rcond=None)[0]
     chi_squared = float(np.sum(((y - design @ x) * root) ** 2))
     covariance = np.linalg.inv(weighted.T @ weighted)
-    covariance *= _birge_squared(chi_squared, len(y) - design.shape[1])
+    if (freedom := len(y) - design.shape[1]) > 0:
+        # Above 1 if the scatter has a probability below 5 %: the 95 % quantile of chi squared,
+        # Wilson and Hilferty (1931).
+        part = 2.0 / (9.0 * freedom)
+        if chi_squared > freedom * (1.0 - part + 1.645 * math.sqrt(part)) ** 3:
+            covariance *= max(1.0, chi_squared / freedom)
     return x.astype(np.float64), covariance.astype(np.float64)
-
-
-def _birge_squared(chi_squared: float, freedom: int) -> float:
-    """Return the factor on the variance: above 1 if the scatter has a probability below 5 %."""
-    if freedom < 1:
-        return 1.0
-    # 95 % quantile of chi squared, Wilson and Hilferty (1931).
-    part = 2.0 / (9.0 * freedom)
-    quantile = freedom * (1.0 - part + 1.645 * math.sqrt(part)) ** 3
-    return max(1.0, chi_squared / freedom) if chi_squared > quantile else 1.0
 
 
 # -- record ---------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Actuation: with both drives the plant is chi_(k+1) = chi_k + T (u_k + d_k)."""
+"""Actuation and its filter: with both drives the plant is chi_(k+1) = chi_k + T (u_k + d_k)."""
 
 import math
 
@@ -25,7 +25,11 @@ from t3mpc_ros.control.actuation import (
     limit_scale,
     wheel_limits,
 )
-from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
+from t3mpc_ros.control.speed_kalman_filter import (
+    SpeedFilterParameters,
+    SpeedKalmanFilter,
+    stationary_gain,
+)
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import BodyTwist, WheelSpeeds
 
@@ -192,13 +196,6 @@ def test_a_deadband_leaves_out_slow_commands(acceleration):
     assert np.array_equal(commands[~slow], wanted[~slow])
 
 
-def test_an_unknown_drive_or_period_is_rejected():
-    with pytest.raises(ValueError, match='drive must be'):
-        _drive(kind='warp')
-    with pytest.raises(ValueError, match='period must be positive: got 0'):
-        VelocityActuation(SpeedFilterParameters(), WIDE, WheelGeometry(), 'torque', 0.0)
-
-
 def test_a_scaled_command_keeps_its_curvature_and_the_limits():
     rng = np.random.default_rng(3)
     for _ in range(500):
@@ -229,3 +226,57 @@ def test_the_command_change_respects_the_acceleration_limits():
         assert np.max(np.abs(out - previous)) <= LIMITS.wheel_acceleration * 0.01 * (1 + 1e-9)
     assert limit_command(1e300, -1e300, np.zeros(2), limits, 0.01, out)
     assert np.isfinite(out).all()
+
+
+# -- Kalman filter of the wheel speeds ------------------------------------------------------------
+
+
+@pytest.mark.parametrize('drive', ['velocity', 'torque'])
+def test_the_filter_reduces_noise_and_finds_the_disturbance(drive):
+    parameters = SpeedFilterParameters(noise_variance=0.04, disturbance=10.0)
+    speed_filter = SpeedKalmanFilter(parameters, drive, 0.01)
+    rng = np.random.default_rng(6)
+    chi = np.zeros(2)
+    disturbance = np.array([4.0, -2.0])  # not in the model, rad/s²
+    raw, filtered, estimates = [], [], []
+    delayed = [np.zeros(2)] * 2
+    for k in range(2000):
+        command = 3.0 * np.array([math.sin(0.02 * k), math.cos(0.015 * k)])
+        if drive == 'velocity':
+            delayed = [delayed[1], command]  # dead time of one period
+            decay = math.exp(-0.01 / parameters.lag)
+            chi = decay * chi + (1 - decay) * (delayed[0] + parameters.lag * disturbance)
+        else:
+            chi = chi + 0.01 * (command + disturbance)
+        measured = chi + rng.normal(scale=0.2, size=2)
+        speed_filter.update(command, measured, 0.01, sent=True)
+        if k > 500:
+            raw.append(measured - chi)
+            filtered.append(speed_filter.state.speeds - chi)
+            estimates.append(speed_filter.state.disturbance.copy())
+    ratio = np.std(filtered) / np.std(raw)
+    assert ratio < 0.6
+    np.testing.assert_allclose(np.mean(estimates, axis=0), disturbance, atol=0.6)  # three sigma
+
+
+def test_the_gain_is_the_fixed_point_of_the_riccati_equation():
+    from scipy.linalg import solve_discrete_are
+
+    parameters = SpeedFilterParameters()
+    transition = np.array([[1.0, 0.01], [0.0, 1.0]])
+    process = np.diag([0.0, parameters.disturbance**2 * 0.01])
+    predicted = solve_discrete_are(
+        transition.T, np.array([[1.0], [0.0]]), process, np.array([[parameters.noise_variance]])
+    )
+    expected = predicted[:, 0] / (predicted[0, 0] + parameters.noise_variance)
+    np.testing.assert_allclose(stationary_gain(transition, parameters, 0.01), expected, rtol=1e-6)
+
+
+def test_without_noise_or_disabled_the_measurement_is_used():
+    for parameters in (
+        SpeedFilterParameters(enabled=False),
+        SpeedFilterParameters(noise_variance=0.0),
+    ):
+        speed_filter = SpeedKalmanFilter(parameters, 'torque', 0.01)
+        speed_filter.update(np.array([5.0, 5.0]), np.array([1.0, 2.0]), 0.01, sent=True)
+        np.testing.assert_allclose(speed_filter.state.speeds, [1.0, 2.0], rtol=1e-3)

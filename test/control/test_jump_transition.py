@@ -52,17 +52,6 @@ def test_the_reachable_reference_respects_the_acceleration(jump, known):
     assert np.max(np.abs(np.diff(reachable, axis=0))) <= A * T * (1 + 1e-9)
 
 
-@pytest.mark.parametrize('jump', [3.0, 10.0])
-def test_with_preview_the_squared_error_is_a_quarter(jump):
-    """J³/(12 a) instead of J³/(3 a): half before the jump, half after it."""
-    energy = []
-    for known in (40, 100):
-        r, reachable, _ = _transition(jump, known=known)
-        energy.append(T * np.sum((reachable - r)[:, 0] ** 2))
-    assert energy[0] == pytest.approx(jump**3 / (12.0 * A), rel=0.03)
-    assert energy[1] == pytest.approx(jump**3 / (3.0 * A) + 0.5 * T * jump**2, rel=0.05)
-
-
 @pytest.mark.parametrize('slopes', [(0.0, 0.0), (10.0, -8.0)])
 def test_no_reachable_path_has_a_smaller_squared_error(slopes):
     """Compare with a quadratic program over all speeds that change by at most a T per step."""

@@ -20,17 +20,8 @@ import pytest
 from support.long_tests import few_of
 
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
-from t3mpc_ros.control.keep_out import (
-    CAUTIOUS_SPEED,
-    OCCUPIED,
-    KeepOut,
-    KeepOutParameters,
-)
-from t3mpc_ros.control.range_fault_detection import (
-    NOTHING_SEEN,
-    RangeFault,
-    RangeMonitor,
-)
+from t3mpc_ros.control.keep_out import CAUTIOUS_SPEED, OCCUPIED, KeepOut, KeepOutParameters
+from t3mpc_ros.control.range_fault_detection import NOTHING_SEEN, RangeFault, RangeMonitor
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import advance_pose
@@ -163,8 +154,10 @@ def test_late_repeated_and_overtaken_readings():
 @pytest.mark.parametrize(('twist', 'sensor'), [(BodyTwist(0.2, 0.0), 0), (BodyTwist(0.0, 1.0), 5)])
 def test_a_sensor_that_freezes_in_motion_is_found(twist, sensor):
     drive = Drive(twist)
-    drive.run(1.0, _noisy(drive))
     noisy = _noisy(drive)
+    drive.run(1.0, noisy)
+    assert not drive.run(0.24, lambda one, time: 0.5).lost  # six equal readings are chance
+    drive.run(0.2, noisy)
     drive.run(2.0, lambda one, time: 0.35 if one == sensor else noisy(one, time))
     assert drive.monitor.faults() == {RANGE_SENSORS[sensor]: RangeFault.FROZEN}
     assert not drive.run(0.2, _noisy(drive)).lost
@@ -222,9 +215,15 @@ def test_a_sensor_that_sees_nothing_is_found_by_what_others_saw(sensor):
 
 @pytest.mark.compiled
 def test_sensors_that_all_see_nothing_are_named():
-    """Without their supply they read so: the robot drove at full speed into what it had seen."""
+    """Without their supply they read so: the robot drove at full speed into what it had seen.
+
+    Things that leave make no sensor blind: they are in the map where no ray has passed since.
+    """
     room = Room()
-    assert room.run(20.0) == {}
+    people = np.array([[-0.1, -0.5, 0.12], [-0.6, -0.2, 0.12]])
+    assert room.run(20.0, circles=people) == {}
+    for _ in range(40):
+        assert room.run(0.5) == {}
     found = room.run(20.0, blind=range(8))
     assert found == dict.fromkeys(RANGE_SENSORS, RangeFault.BLIND)
     assert 'all range sensors blind' in room.keep_out.ranges.problem()
@@ -249,15 +248,6 @@ def test_a_robot_that_sees_nothing_for_long_is_slow_and_says_so(noise):
     monitor.update(4000 * PERIOD_NS, Pose(x, 0.0, 0.0))
     assert not monitor.lost
     assert monitor.faults() == {}
-
-
-def test_things_that_leave_make_no_sensor_blind():
-    """What was there is still in the map where no ray has passed since."""
-    room = Room()
-    people = np.array([[-0.1, -0.5, 0.12], [-0.6, -0.2, 0.12]])
-    assert room.run(20.0, circles=people) == {}
-    for _ in range(40):
-        assert room.run(0.5) == {}
 
 
 @pytest.mark.compiled
@@ -316,6 +306,9 @@ def test_all_silent_brakes_stops_and_goes_on_by_itself():
     assert 'all range sensors silent' in robot.controller.problems()
     robot.run(4.0, fresh=False)
     assert robot.reasons[-1] is Reason.TOO_FEW_RANGES
+    robot.controller.enable(False)  # is said whatever the sensors say
+    assert robot.run(0.2, sensors=()).reasons[-1] is Reason.DISABLED
+    robot.controller.enable(True)
     robot.run_until_fast()
     assert robot.reasons[-1] is Reason.TRACKING
 
@@ -356,17 +349,3 @@ def test_rejected_readings_change_no_command():
                 assert not robot.controller.add_range(1, 5.0)
     assert one.speeds == other.speeds
     assert one.pose == other.pose
-
-
-def test_a_few_equal_readings_of_a_fast_robot_are_chance():
-    drive = Drive(BodyTwist(0.5, 0.0))
-    drive.run(1.0, _noisy(drive))
-    assert not drive.run(0.24, lambda sensor, time: 0.5).lost  # 12 cm, six readings
-    assert drive.run(0.4, lambda sensor, time: 0.5).lost
-
-
-def test_a_robot_that_is_disabled_says_so_whatever_its_sensors():
-    robot = KeptOut().run(0.6, sensors=())
-    assert robot.reasons[-1] is Reason.TOO_FEW_RANGES
-    robot.controller.enable(False)
-    assert robot.run(0.2, sensors=()).reasons[-1] is Reason.DISABLED

@@ -300,16 +300,9 @@ def test_adaptation_reduces_tracking_and_estimation_errors(kind):
     half = len(tracking) // 2
     assert _rms(tracking[half:]) < 0.4 * _rms(without[half:])
     assert _rms(estimation[half:]) < 0.4 * _rms(unknown[half:])
-
-
-@pytest.mark.compiled
-@pytest.mark.parametrize('noise', [0.2])
-def test_adaptation_still_helps_on_noisy_speeds(noise):
-    sets = Sets()
-    without, _ = _closed_loop(sets, AdaptationParameters(enabled=False), noise=noise)
-    tracking, _ = _closed_loop(sets, AdaptationParameters(), noise=noise)
-    half = len(tracking) // 2
-    assert _rms(tracking[half:]) < 0.5 * _rms(without[half:])
+    if kind == 'type3':  # also on noisy speeds
+        noisy, _ = _closed_loop(sets, AdaptationParameters(), noise=0.2)
+        assert _rms(noisy[half:]) < 0.5 * _rms(without[half:])
 
 
 @pytest.mark.compiled
@@ -417,13 +410,6 @@ def test_invalid_inputs_are_rejected_without_effect(wrong):
     np.testing.assert_array_equal(estimator.coefficients, alpha)
 
 
-@pytest.mark.parametrize('dt', [-0.01, math.nan])
-def test_an_invalid_duration_is_rejected(dt):
-    estimator = FuzzyEstimator(Sets(), AdaptationParameters())
-    with pytest.raises(ValueError, match='dt must be finite and not negative'):
-        estimator.adapt(np.zeros(2), dt)
-
-
 def test_invalid_coefficients_are_rejected():
     estimator = FuzzyEstimator(Sets(), AdaptationParameters())
     with pytest.raises(ValueError, match=r'coefficients must have shape \(2, 72\)'):
@@ -432,8 +418,6 @@ def test_invalid_coefficients_are_rejected():
     table[1, 3] = math.nan
     with pytest.raises(ValueError, match='coefficients must be finite: got 1 not'):
         estimator.coefficients = table
-    with pytest.raises(ValueError, match='outputs must be at least 1'):
-        FuzzyEstimator(Sets(), AdaptationParameters(), outputs=0)
 
 
 def test_non_contiguous_and_integer_inputs_are_accepted():

@@ -345,28 +345,19 @@ def test_type3_widths_are_powers_of_the_grade():
         np.testing.assert_allclose(lower, grade ** (1.0 / levels[place]), rtol=1e-12)
 
 
-def test_type3_footprint_decreases_with_the_level_to_zero():
-    footprint = np.diff(type3_widths(1.0, slice_levels(6)), axis=-1).ravel()
-    assert np.all(np.diff(footprint) < 0.0)
-    assert footprint[-1] == 0.0
+def test_defaults_are_derived():
+    """Sets cross at one half, the footprint is the mean of the type-3 ones, the fuzziness noise.
 
-
-def test_default_sets_cross_at_one_half():
+    The Gaussians have no 1/2 in the exponent: beta is sqrt(2) standard deviations.
+    """
     parameters = Sets()
-    half_spacing = 0.5 * (parameters.centre_high - parameters.centre_low) / (parameters.sets - 1)
-    assert np.exp(-((half_spacing / parameters.widths[0]) ** 2)) == pytest.approx(0.5, abs=0.002)
-
-
-def test_default_interval_footprint_is_the_type3_mean():
-    levels = slice_levels(Sets().slices)
+    assert parameters.input_fuzziness == pytest.approx(np.sqrt(2.0 * 0.04), abs=0.001)
+    levels = slice_levels(parameters.slices)
     half = 0.5 * np.diff(type3_widths(1.0, levels), axis=-1)[..., 0]
     mean = float(np.sum(levels * half) / np.sum(levels))
-    assert Sets().footprint_of_uncertainty == pytest.approx(mean, abs=0.005)
-
-
-def test_input_fuzziness_matches_the_noise_variance_0_04():
-    """The Gaussians have no 1/2 in the exponent: beta is sqrt(2) standard deviations."""
-    assert Sets().input_fuzziness == pytest.approx(np.sqrt(2.0 * 0.04), abs=0.001)
+    assert parameters.footprint_of_uncertainty == pytest.approx(mean, abs=0.005)
+    half_spacing = 0.5 * (parameters.centre_high - parameters.centre_low) / (parameters.sets - 1)
+    assert np.exp(-((half_spacing / parameters.widths[0]) ** 2)) == pytest.approx(0.5, abs=0.002)
 
 
 def test_kinds_differ_only_in_the_numbers_of_the_tables():

@@ -22,18 +22,10 @@ import numpy as np
 import pytest
 from support.properties import STATEFUL
 
-from t3mpc_ros.geometry.kinematics import (
-    WheelGeometry,
-    twist_from_wheels,
-    wheels_from_twist,
-)
+from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import BodyTwist, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.robot.command_limiter import (
-    CommandLimiter,
-    CommandLimiterParameters,
-    SlipMonitor,
-)
+from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParameters, SlipMonitor
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand
 
 MS = 1_000_000
