@@ -85,20 +85,12 @@ class LawParameters(Parameters):
 
 @dataclass(frozen=True)
 class FrictionTermParameters(Parameters):
-    """Adaptation of the Coulomb friction in the estimate g, E23.
+    """Adaptation of the Coulomb friction in the estimate g: the term phi_i^T s of E23.
 
-    Coulomb friction changes by twice its value within some tenths of a rad/s about standstill. The
-    Gaussian sets of (16)-(33), which must be wider than the noise of their inputs, smear this
-    change out, and the adaptation has to learn the friction anew after each change of direction.
-    It is linear in its own parameters, though, so g gets one more basis:
-
-        g_i = alpha_i^T Phi + phi_i^T s,    s_j = tanh(r_j/w),    d phi_i/dt = gamma_f s delta_i
-
-    This is (77)-(78) for another basis, with the same modifications. Both wheels have both
-    elements of s, because the inertia of the body couples them. V of (74) gets
-    |phi*_i - phi_i|²/(2 gamma_f) for each wheel; its derivative along (72)-(73) is (79) as before.
-    The friction is that at r, not at chi, whose noise would switch it; the difference is part of
-    omega.
+    s_j = tanh(r_j/w) of both wheels, because the inertia of the body couples them; adapted as by
+    (77)-(78). The friction is that at r, not at chi, whose noise would switch it; the difference
+    is
+    part of omega.
     """
 
     gamma: float = parameter(
@@ -116,15 +108,9 @@ class FrictionTermParameters(Parameters):
 
 @dataclass(frozen=True)
 class InertiaTermParameters(Parameters):
-    """Adaptation of the inertia in the estimate g, E24.
+    """Adaptation of the inertia in the estimate g: the term theta_i^T a of E24, a_j = r'_j/a_0.
 
-    A torque drive whose inertia is not the assumed one accelerates by another u: what is missing
-    is proportional to the acceleration that is asked for, which no function of the speeds (31) is.
-    g gets one more basis, as for the friction (E23):
-
-        g_i = ... + theta_i^T a,    a_j = r'_j/a_0,    d theta_i/dt = gamma_i a delta_i
-
-    with the r' of both wheels, because the inertia of the body couples them.
+    Both wheels have both elements of a, because the inertia of the body couples them.
     """
 
     gamma: float = parameter(

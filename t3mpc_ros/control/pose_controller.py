@@ -11,30 +11,21 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-r"""Pose loop: from the error of the pose to the twist that the control law of section 6 tracks.
+r"""Pose loop E22: from the error of the pose to the twist that the law of section 6 tracks.
 
 With the error of the reference pose in the frame of the robot, :math:`x_e` along, :math:`y_e`
-across and :math:`\theta_e` in yaw, and the reference twist :math:`(v_r, \omega_r)`, E22 is
+across and :math:`\theta_e` in yaw, and the reference twist :math:`(v_r, \omega_r)`,
 
 .. math::
 
     v = v_r \cos\theta_e + k_x x_e, \qquad
-    \omega = \omega_r + k_y v_r \frac{\sin\theta_e}{\theta_e} y_e + k_\theta \theta_e
+    \omega = \omega_r + k_y v_r \frac{\sin\theta_e}{\theta_e} y_e + k_\theta \theta_e + v_r z
 
-(Morin and Samson, Springer Handbook of Robotics, 2008, chapter 34, doi
-10.1007/978-3-540-30301-5_35; after Kanayama et al., ICRA 1990, doi 10.1109/ROBOT.1990.126006,
-whose :math:`\sin\theta_e` in place of the last term has a second equilibrium at half a turn).
-With :math:`V = \frac12 (x_e^2 + y_e^2 + \theta_e^2/k_y)` it gives
-:math:`\dot V = -k_x x_e^2 - (k_\theta/k_y)\,\theta_e^2 \le 0` for any reference twist.
-
-Wheels that differ by a share :math:`\delta` bend the path by :math:`d = \delta/(2b)`, which E22
-alone answers with an offset :math:`d/k_y`. An integral over the distance removes it,
-
-.. math:: \omega \mathrel{+}= v_r z, \qquad \dot z = k_i\,|v_r|\,y_e,
-
-which over the distance gives :math:`\lambda^3 + (k_\theta/|v_r|)\lambda^2 + k_y\lambda + k_i`:
-stable if and only if :math:`k_i |v_r| < k_y k_\theta` (Routh and Hurwitz). :math:`z` is
-bounded, and rests far from the reference: there it is a bounded disturbance of E22.
+(Morin and Samson, Springer Handbook of Robotics, 2008, chapter 34; after Kanayama et al., ICRA
+1990, doi 10.1109/ROBOT.1990.126006, whose :math:`\sin\theta_e` in place of the last term has a
+second equilibrium at half a turn). The integral :math:`\dot z = k_i\,|v_r|\,y_e` removes the
+offset of wheels that differ, which bend the path; it is bounded, and rests far from the
+reference.
 
 Far from its reference, after a detour, the robot drives to it (*rejoining*): it turns towards the
 velocity that closes the gap, and drives on as far as it faces it.

@@ -115,35 +115,6 @@ def test_kernel_equals_whole_array_reference(inputs, per_input, slices):
         )
 
 
-@pytest.mark.parametrize('fuzziness', [0.0, 0.283, 3.0])
-def test_type1_is_a_textbook_weighted_average(fuzziness):
-    """The textbook form: product of grades, weighted average of one constant per rule.
-
-    For the non-singleton fuzzifier the grade at the best match of input and set is
-    exp(-((U - o) beta / (beta² + beta_U²))²).
-    """
-    parameters = Sets(kind='type1', sets=4, input_fuzziness=fuzziness)
-    sets = build_sets(parameters)
-    rng = np.random.default_rng(5)
-    constants = rng.normal(size=(4, 4))
-    centres, beta = np.linspace(-10.0, 10.0, 4), parameters.widths[0]
-
-    def textbook(u1, u2):
-        total = weighted = 0.0
-        for h1, o1 in enumerate(centres):
-            for h2, o2 in enumerate(centres):
-                w = 1.0
-                for u, o in ((u1, o1), (u2, o2)):
-                    w *= math.exp(-(((u - o) * beta / (beta**2 + fuzziness**2)) ** 2))
-                total += w
-                weighted += w * constants[h1, h2]
-        return weighted / total
-
-    alpha = np.tile(constants.ravel(), 2)
-    for u in rng.uniform(-14.0, 14.0, (50, 2)):
-        assert alpha @ compute_basis(u, sets) == pytest.approx(textbook(*u), rel=1e-12)
-
-
 def test_interval_type2_is_a_nie_tan_system():
     """Nie-Tan: the mean of upper and lower firing is the weight of the rule's constant."""
     parameters = Sets(kind='interval_type2', footprint_of_uncertainty=0.4, input_fuzziness=0.0)
@@ -179,16 +150,6 @@ def test_type3_of_one_slice_at_level_one_is_type1():
         )
     assert gaps[0] == 0.0
     assert gaps[1] == pytest.approx(2.0 * gaps[2], rel=0.02)  # linear convergence
-
-
-def test_the_maxima_are_the_inputs_or_for_wide_ones_the_centres():
-    u = np.array([3.3, -7.1])
-    for fuzziness, tolerance in ((0.0, 0.0), (100.0, 1.0)):
-        sets = build_sets(Sets(input_fuzziness=fuzziness))
-        found = np.empty(sets.widths.shape)
-        fuzzify(u, sets.centres, sets.nonsingleton_gain, found)
-        limit = sets.centres if fuzziness else u[:, None]
-        assert np.abs(found - limit[:, :, None, None, None]).max() <= tolerance
 
 
 def test_fuzzification_maximises_the_product_of_input_and_set():
@@ -290,28 +251,6 @@ def test_far_outside_only_the_nearest_rule_counts(distance):
     phi = compute_basis(np.array([distance, distance]), sets).reshape(2, 9, 4)
     nearest = 8 if distance > 0.0 else 0
     np.testing.assert_allclose(phi[:, nearest].T, sets.shares, rtol=1e-12)
-
-
-def test_output_is_smooth_where_the_nearest_rule_changes():
-    """The largest firing strength is removed from the exponents, which must cause no kink.
-
-    A kink would make the second difference double when its step is halved.
-    """
-    sets = build_sets(Sets())
-    rng = np.random.default_rng(12)
-    alpha = rng.normal(size=sets.size)
-    places = [*itertools.product([-5.0, 5.0], repeat=2), (-5.0, 1.0), (30.0, 5.0)]
-    for place in np.concatenate([places, rng.uniform(-12.0, 12.0, (10, 2))]):
-        direction = rng.normal(size=2)
-        direction /= np.linalg.norm(direction)
-
-        def second(step, place=place, direction=direction):
-            values = [
-                alpha @ compute_basis(place + k * step * direction, sets) for k in (-1.0, 0.0, 1.0)
-            ]
-            return (values[0] - 2.0 * values[1] + values[2]) / step**2
-
-        assert second(2e-3) == pytest.approx(second(1e-3), rel=1e-3, abs=1e-6)
 
 
 def test_non_finite_inputs_are_rejected():

@@ -366,20 +366,6 @@ def test_initial_weights_have_orthogonal_rows():
         np.testing.assert_allclose(weights @ weights.T, spread**2 * np.eye(5), atol=1e-13)
 
 
-def test_small_signals_pass_linearly():
-    machine = _small_machine(spread=0.8)
-    generator = np.random.default_rng(2)
-    gaps = []
-    for size in (0.1, 0.05):
-        machine.lags[:] = size * generator.uniform(-1.0, 1.0, 5)
-        predict_error(machine)
-        weights = machine.visible_weights
-        linear = weights.T @ weights @ weights.T @ machine.lags / 8.0
-        gaps.append(np.max(np.abs(machine.mu1 - linear)) / np.max(np.abs(linear)))
-    assert gaps[0] < 2e-3
-    assert gaps[1] < 0.5 * gaps[0]  # the remainder is of second order
-
-
 def test_sigmoid_is_the_mean_of_a_hidden_unit():
     """E9: only at temperature 2 the passes (37), (39) are means of the distribution (41)."""
     machine = _small_machine(shape=LayerSizes(2, 2, 4), spread=1.5)
