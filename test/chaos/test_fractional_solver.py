@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Both fractional solvers against theory, and the running one against the full memory."""
+"""System (85), the sum of exponentials of its memory, and both fractional solvers, by theory."""
 
 from decimal import Decimal, localcontext
 import math
@@ -21,9 +21,11 @@ import pytest
 from scipy.integrate import quad
 from scipy.special import gammaln
 from support.equations import interval_weights, linear_decay_system, solve_full_memory
+from support.long_tests import few_of
 
 from t3mpc_ros.chaos.solver import FractionalSolver, mode_weights
-from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
+from t3mpc_ros.chaos.sum_of_exponentials import fit_sum_of_exponentials
+from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system, jacobian, right_hand_side
 
 ONE = np.ones(1)
 START = np.array([1.0, 1.0, 1.0, 1.0])
@@ -249,17 +251,147 @@ def test_a_diverging_solution_raises():
         solver.advance(1000)
 
 
+STATES = np.random.default_rng(3).normal(0.0, (10.0, 2.0, 4.0, 20.0), (20, 4))
+
+
+def slope_of(system, state):
+    out = np.full(system.size, np.nan)
+    right_hand_side(system.terms(), state, out)
+    return out
+
+
+def test_terms_are_those_of_equation_85_with_e6():
+    for y in STATES:
+        found = slope_of(hyperchaotic_system(), y)
+        np.testing.assert_allclose(found, hyperchaos(y), rtol=1e-13, atol=1e-11)
+
+
+def test_jacobian_is_the_derivative_of_the_slope():
+    # Central differences of a quadratic function are exact up to rounding.
+    system = hyperchaotic_system()
+    out = np.full((4, 4), np.nan)
+    for state in STATES:
+        jacobian(system.terms(), state, out)
+        for column in range(4):
+            shift = np.eye(4)[column]
+            difference = slope_of(system, state + shift) - slope_of(system, state - shift)
+            np.testing.assert_allclose(out[:, column], difference / 2.0, rtol=1e-9, atol=1e-9)
+        assert np.trace(out) == pytest.approx(-38.0)  # the rate at which volume contracts
+
+
+def test_repeated_terms_and_squares_are_added():
+    system = QuadraticSystem(
+        (1.0, 1.0),
+        linear=((0, 0, 1.0), (0, 0, 2.0)),
+        quadratic=((1, 0, 0, 3.0), (1, 0, 1, 1.0)),
+        constant=(0.5, -1.0),
+    )
+    state = np.array([2.0, 5.0])
+    np.testing.assert_allclose(slope_of(system, state), [0.5 + 6.0, -1.0 + 12.0 + 10.0])
+    out = np.empty((2, 2))
+    jacobian(system.terms(), state, out)
+    np.testing.assert_allclose(out, [[3.0, 0.0], [12.0 + 5.0, 2.0]])
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize('order', [0.98])
+def test_plus_sign_of_e6_is_chaotic_and_minus_sign_decays(order):
+    """The paper prints (85) with '- 5 y1 y3 25 y1'.
+
+    With minus the origin attracts every state; with plus, as in the original publication, the
+    states cover their full range.
+    """
+    # The range for q = 1 is sufficient to distinguish both cases for both orders.
+    for sign, alive in ((1.0, True), (-1.0, False)):
+        system = hyperchaotic_system(c=sign * 25.0, orders=(order,) * 4)
+        solver = FractionalSolver(system, 1e-3, np.ones(4))
+        solver.advance(8000)
+        late = np.array([solver.advance(10) for _ in range(400)])
+        if alive:
+            assert np.all(np.ptp(late, axis=0) > (30.0, 6.0, 3.0, 40.0))
+        else:
+            assert np.all(np.abs(late) < 1e-2)
+
+
+ORDERS = (0.05, 0.5, 0.98, 1.0 - 1e-9, 1.0)
+
+
+def relative_error(memory, order, time):
+    return memory.at(time) * math.gamma(order) * time ** (1.0 - order) - 1.0
+
+
+@pytest.mark.parametrize('order', ORDERS)
+@pytest.mark.parametrize('tolerance', few_of([1e-8, 1e-3, 1e-6, 1e-11]))
+def test_stated_error_bounds_the_error_on_a_dense_grid(order, tolerance):
+    memory = fit_sum_of_exponentials(order, 1e-3, 1e5, tolerance)
+    error = np.abs(relative_error(memory, order, np.geomspace(1e-3, 1e5, 40_009)))
+    assert memory.error <= tolerance
+    # 1e-14: at order 1 both errors are zero, apart from rounding here.
+    assert error.max() <= memory.error + 1e-14
+    if order in (0.5, 0.98):  # it is tight, with not far more modes than the tolerance requires
+        assert error.max() > 0.9 * memory.error
+        assert memory.error > 0.1 * tolerance
+    if order == 1.0:
+        assert memory.rates.tolist() == [memory.error] == [0.0]
+        assert memory.weights.tolist() == [1.0]
+    # Positive modes: the kernel is monotone.
+    assert (memory.weights > 0.0).all()
+    assert (memory.rates >= 0.0).all()
+    assert (np.diff(memory.rates) > 0.0).all()
+
+
+def test_kernel_tends_to_a_single_mode_as_the_order_tends_to_1():
+    """For q near 1 the weight s^-q is almost not integrable at s = 0.
+
+    Truncating the integral there, as for q = 0.5, would lose nearly the whole kernel; the lumped
+    slow mode represents it.
+    """
+    for distance in (1e-4, 1e-8, 1e-12):
+        memory = fit_sum_of_exponentials(1.0 - distance, 1e-3, 1e5, 1e-8)
+        assert memory.weights[0] == pytest.approx(1.0, abs=40.0 * distance)
+        assert memory.weights[1:].sum() < 40.0 * distance
+        assert memory.rates[0] < distance
+
+
+def test_number_of_modes_grows_like_the_logarithm_of_the_horizon():
+    sizes = [fit_sum_of_exponentials(0.98, 1e-3, 10.0**n, 1e-8).rates.size for n in (2, 4, 6, 8)]
+    growth = np.diff(sizes)
+    assert growth.max() - growth.min() <= 1
+    assert sizes[-1] < 70
+
+
+def test_error_grows_slowly_beyond_the_horizon():
+    memory = fit_sum_of_exponentials(0.98, 1e-3, 1e3, 1e-8)
+    assert abs(relative_error(memory, 0.98, np.array([1e4]))[0]) < 2e-7
+    assert abs(relative_error(memory, 0.98, np.array([1e5]))[0]) < 2e-5
+
+
 @pytest.mark.parametrize(
-    'call, name',
+    ('make', 'arguments', 'name'),
     [
-        (lambda: FractionalSolver(hyperchaotic_system(), 1e-3, ONE), 'initial'),
-        (lambda: FractionalSolver(hyperchaotic_system(), 1e-3, START * np.nan), 'initial'),
-        (lambda: FractionalSolver(hyperchaotic_system(), 0.0, START), 'shortest'),
-        (lambda: FractionalSolver(hyperchaotic_system(), 1e-3, START, tolerance=1.0), 'tolerance'),
-        (lambda: FractionalSolver(hyperchaotic_system(), 1e-3, START).advance(-1), 'steps'),
-        (lambda: FractionalSolver(hyperchaotic_system(), 1e-3, START).reset(ONE), 'initial'),
+        (FractionalSolver, (hyperchaotic_system(), 1e-3, ONE), 'initial'),
+        (FractionalSolver, (hyperchaotic_system(), 1e-3, START * np.nan), 'initial'),
+        (FractionalSolver, (hyperchaotic_system(), 0.0, START), 'shortest'),
+        (FractionalSolver(hyperchaotic_system(), 1e-3, START).advance, (-1,), 'steps'),
+        (FractionalSolver(hyperchaotic_system(), 1e-3, START).reset, (ONE,), 'initial'),
+        (hyperchaotic_system, (35.0, 4.0, 25.0, 5.0, 100.0, (0.98,)), 'orders must be four'),
+        (QuadraticSystem, ((), ()), 'orders'),
+        (QuadraticSystem, ((0.0,), ()), 'orders'),
+        (QuadraticSystem, ((1.2,), ()), 'orders'),
+        (QuadraticSystem, ((1.0,), ((0, 1, 1.0),)), 'states'),
+        (QuadraticSystem, ((1.0,), ((0, -1, 1.0),)), 'states'),
+        (QuadraticSystem, ((1.0,), ((0, 0, np.nan),)), 'gains'),
+        (QuadraticSystem, ((1.0,), (), ((0, 0, 1, 1.0),)), 'states'),
+        (QuadraticSystem, ((1.0,), (), (), (1.0, 2.0)), 'constant'),
+        (QuadraticSystem, ((1.0,), (), (), (np.inf,)), 'constant'),
+        (fit_sum_of_exponentials, (math.nan, 1e-3, 1.0, 1e-8), 'order'),
+        (fit_sum_of_exponentials, (1.1, 1e-3, 1.0, 1e-8), 'order'),
+        (fit_sum_of_exponentials, (0.9, 0.0, 1.0, 1e-8), 'lags'),
+        (fit_sum_of_exponentials, (0.9, 1.0, 1.0, 1e-8), 'lags'),
+        (fit_sum_of_exponentials, (0.9, 1e-3, math.inf, 1e-8), 'lags'),
+        (fit_sum_of_exponentials, (0.9, 1e-3, 1.0, 1e-14), 'tolerance'),
     ],
 )
-def test_arguments_out_of_range_are_rejected_by_name(call, name):
+def test_arguments_out_of_range_are_rejected_by_name(make, arguments, name):
     with pytest.raises(ValueError, match=name):
-        call()
+        make(*arguments)

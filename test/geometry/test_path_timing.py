@@ -232,14 +232,6 @@ def test_start_pose_is_left_at_rest():
     assert path.linear[0] == path.angular[0] == 0.0
 
 
-@pytest.mark.parametrize(
-    ('points', 'words'),
-    [
-        ([[0.0, 0.0], [math.nan, 1.0]], 'point 1 is'),
-        ([[0.0, 0.0, 0.0]], 'shape'),
-        ([[1.0, 1.0], [1.0, 1.0005]], '2 mm'),
-    ],
-)
-def test_impossible_paths_are_rejected(points, words):
-    with pytest.raises(PathError, match=words):
-        time_path(np.array(points), MotionLimits(), GEOMETRY)
+def test_a_path_of_one_place_is_rejected():
+    with pytest.raises(PathError, match='2 mm'):
+        time_path(np.array([[1.0, 1.0], [1.0, 1.0005]]), MotionLimits(), GEOMETRY)

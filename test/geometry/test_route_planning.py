@@ -109,28 +109,6 @@ def test_a_route_leads_around_a_box_at_its_distance():
     assert (np.diff(times) > -2.0 * SIZE * (1.0 + NEAR_COST)).all()
 
 
-@pytest.mark.compiled
-def test_there_and_back_take_the_same_time():
-    generator = np.random.default_rng(5)
-    cells = floor()
-    for x, y in generator.uniform([-1.5, -1.0], [1.5, 1.0], (6, 2)):
-        box(cells, x, y, 0.08, 0.08)
-    planner = planner_of(cells)
-    places = planner_places(planner, generator)
-    for one, other in zip(places, places[1:], strict=False):
-        planner.spread(one)
-        there = planner.arrival(np.array([other]))[0]
-        planner.spread(other)
-        assert planner.arrival(np.array([one]))[0] == pytest.approx(there, rel=0.05, abs=0.05)
-
-
-def planner_places(planner, generator):
-    """Return ten places far from every obstacle."""
-    drawn = generator.uniform([-1.7, -1.2], [1.7, 1.2], (200, 2))
-    free = drawn[planner.wall_distance(drawn) > DISTANCE + 0.12]
-    return [tuple(each) for each in free[:10].tolist()]
-
-
 def test_what_is_walled_in_has_no_route():
     cells = box(box(floor(), 1.0, 0.0, 0.5, 0.5), 1.0, 0.0, 0.45, 0.45, state=0)
     planner = planner_of(cells)

@@ -188,30 +188,6 @@ def test_an_unknown_start_is_found():
 
 
 @pytest.mark.compiled
-def test_a_robot_that_is_carried_is_lost_and_found_again():
-    localizer, drive = driven(20.0)
-    drive.carry(2.5)
-    states = set()
-    for _ in range(25):
-        follow(localizer, drive, 1.0)
-        states.add(localizer.state)
-    assert states - {Localization.LOCALIZED}
-    assert localizer.state is Localization.LOCALIZED
-    assert error(localizer, drive)[0] < 0.05
-
-
-@pytest.mark.long
-@pytest.mark.compiled
-def test_without_recovery_a_carried_robot_stays_lost():
-    """The recovery is what finds it: without random particles nothing does."""
-    localizer, drive = make_localizer(recovery_alpha_slow=0.0), Drive()
-    follow(localizer, drive, 20.0)
-    drive.carry(2.5)
-    follow(localizer, drive, 60.0)
-    assert localizer.state is Localization.LOST
-
-
-@pytest.mark.compiled
 def test_a_pose_that_is_given_is_taken():
     localizer, drive = make_localizer(set_initial_pose=False), Drive(start=on_ellipse(1.0))
     follow(localizer, drive, 1.0)
@@ -335,25 +311,6 @@ def test_readings_of_another_time_are_not_used(late):
         assert set(localizer._pending) == {0}
 
 
-@pytest.mark.compiled
-def test_bad_inputs_change_nothing():
-    localizer, drive = make_localizer(), Drive()
-    for sensor in EVERY.tolist():
-        localizer.add_range(sensor, 0.3)  # before any odometry
-    follow(localizer, drive, 5.0)
-    result = localizer.result
-    assert not localizer.add_odometry(drive.stamp_ns, Pose(math.nan, 0.0, 0.0))
-    assert localizer.result is result
-    assert rms(follow(localizer, drive, 10.0))[0] < 0.03
-
-
-def test_silent_sensors_leave_odometry_and_growing_covariance():
-    localizer, drive = driven(5.0, drift=0.0)
-    before = np.trace(localizer.result.covariance[:2, :2])
-    follow(localizer, drive, 20.0, loss=1.0)
-    assert np.trace(localizer.result.covariance[:2, :2]) > 2.0 * before
-
-
 def test_odometry_alone_leaves_the_spread_of_all_particles():
     """That of the particles within 0.3 m of each other is smaller, and does not grow."""
     localizer = make_localizer()
@@ -386,12 +343,6 @@ def test_a_pose_by_odometry_alone_is_noticed_and_ends(reading):
     stamp_ns += 10_000_000_000
     localizer.add_odometry(stamp_ns, ORIGIN)
     assert not localizer.silent, 'there was no odometry meanwhile'
-
-
-@pytest.mark.compiled
-def test_readings_that_are_lost_cost_little():
-    errors = follow(make_localizer(), Drive(seed=5), 15.0, loss=0.5)
-    assert rms(errors[20:])[0] < 0.03
 
 
 @pytest.mark.compiled
@@ -492,11 +443,15 @@ def test_no_change_excuses_readings_where_a_place_was_just_found():
 
 @pytest.mark.compiled
 @pytest.mark.parametrize('way', few_of([4.4, 1.0, 1.4]))
-def test_what_a_carried_robot_finds_is_withdrawn(way):
+def test_a_carried_robot_is_found_and_what_it_saw_is_withdrawn(way):
     """Until it knows that it is lost, the map seems to have changed: up to four false events."""
     localizer, drive = driven(20.0)
     drive.carry(way)
-    follow(localizer, drive, 30.0)
+    states = set()
+    for _ in range(30):
+        follow(localizer, drive, 1.0)
+        states.add(localizer.state)
+    assert Localization.LOST in states
     assert localizer.state is Localization.LOCALIZED
     assert error(localizer, drive)[0] < 0.05
     assert localizer.changes.changes
@@ -624,6 +579,9 @@ def test_impossible_readings_are_no_readings(impossible):
     poses = []
     for reading in ((), (impossible,)):
         localizer, drive = make_localizer(), Drive()
+        for each in reading:
+            localizer.add_range(0, 0.3)  # before any odometry
+            assert not localizer.add_odometry(0, Pose(each, 0.0, math.nan))
         for _ in range(100):
             drive.step()
             for sensor in range(2):

@@ -11,20 +11,17 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Map of a localisation: rays against those of the world, distances against their definition."""
+"""Map of a localisation and its files: against the rays of the world, and map_saver."""
 
 import math
 
 import numpy as np
 import pytest
+import yaml
 
-from t3mpc_ros.localization.occupancy_map import (
-    MapError,
-    load_grid,
-    map_of_grid,
-    map_of_world,
-    trace_ray,
-)
+from t3mpc_ros.geometry.arena import OccupancyGrid
+from t3mpc_ros.geometry.map_file import MapError, load_map, save_map
+from t3mpc_ros.localization.occupancy_map import load_grid, map_of_grid, map_of_world, trace_ray
 from t3mpc_ros.simulation.world import cast_ray, load_world
 
 REACH = 1.0
@@ -166,3 +163,28 @@ def test_a_truncated_image_is_rejected(tmp_path):
         image.write_bytes(whole[:kept])
         with pytest.raises(MapError, match='map.pgm'):
             load_grid(path)
+
+
+CELLS = np.array([[-1, 0, 100], [0, 0, 100]], dtype=np.int8)
+
+
+def test_a_map_is_read_as_it_was_written(tmp_path):
+    path = tmp_path / 'room.yaml'
+    save_map(path, OccupancyGrid(CELLS, 0.02, -1.24, 0.56))
+    read = load_map(path)
+    assert np.array_equal(read.cells, CELLS)
+    assert read[1:] == (0.02, -1.24, 0.56)
+    text = yaml.safe_load(path.read_text())
+    assert (text['image'], text['mode'], text['negate']) == ('room.pgm', 'trinary', 0)
+    assert (text['occupied_thresh'], text['free_thresh']) == (0.65, 0.196)
+    image = (tmp_path / 'room.pgm').read_bytes()
+    # The first row of the image is the one with the largest y.
+    assert image == b'P5\n3 2\n255\n' + bytes([254, 254, 0, 205, 254, 0])
+
+
+def test_a_map_that_cannot_be_written_is_an_error(tmp_path):
+    grid = OccupancyGrid(CELLS, 0.02, 0.0, 0.0)
+    with pytest.raises(MapError, match='must end in .yaml'):
+        save_map(tmp_path / 'room.pgm', grid)
+    with pytest.raises(MapError, match='none.room.pgm cannot be written'):
+        save_map(tmp_path / 'none' / 'room.yaml', grid)

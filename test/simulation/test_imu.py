@@ -134,13 +134,6 @@ def test_low_pass_is_independent_of_the_step():
     assert ends[2] == pytest.approx(ends[0], abs=1e-12)
 
 
-def test_gyro_noise_at_100_hz_matches_the_data_sheet():
-    """The data sheet gives 0.05 deg/s rms; its density gives 0.0547 behind two poles."""
-    noise = np.std(rates(sensor(gyro_drift=0.0, low_pass='2', gyro_range='250'), 20000))
-    assert noise == pytest.approx(0.05, rel=0.15)
-    assert noise == pytest.approx(0.005 * math.sqrt(math.tau * 98.0 / 0.643594 / 8.0), rel=0.02)
-
-
 def test_accelerometer_noise_follows_its_density():
     imu, still = sensor(), settled()
     found = np.array([imu.measure(still, 0.01)[1:] for _ in range(20000)])

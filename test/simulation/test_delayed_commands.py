@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Transport delay: commands are delayed, reordered or lost, but never changed or duplicated."""
+"""Commands that are delayed, reordered or lost, but never changed or duplicated."""
 
 from collections import Counter
 import math
@@ -23,6 +23,8 @@ from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.robot.interface import RobotCommand
 from t3mpc_ros.simulation import digital_twin
 from t3mpc_ros.simulation.digital_twin import CAPACITY, TransportDelay
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
+from t3mpc_ros.simulation.plant_robot import LinkDelay, PlantRobot
 
 MS = 1_000_000
 
@@ -166,3 +168,62 @@ def test_full_queue_drops_the_oldest(monkeypatch):
         (one,) = transport.arrived(instant)  # each at its own instant
         came.append(one)
     assert sorted(one.stamp_ns for one in came) == list(range(100, 150))
+
+
+PERIOD = 10 * MS
+
+
+class NotingPlant:
+    """Notes the command of each step, and the configurations."""
+
+    wheels = (0.0, 0.0)
+
+    def __init__(self):
+        self.commands, self.configured = [], []
+
+    def configure(self, parameters):
+        self.configured.append((len(self.commands), parameters))
+
+    def run(self, command, count):
+        self.commands += [command[0]] * count
+
+    def measure(self, dt):
+        return 0.0, 0.0
+
+
+@pytest.mark.parametrize(
+    'link, latency',
+    [
+        (LinkDelay(), 0),
+        (LinkDelay(), 3 * MS),
+        (LinkDelay(0.0, 0.02), 4 * MS),
+        (LinkDelay(0.02, 0.1, 0.2, 0.3, 0.9), 9 * MS),
+    ],
+)
+def test_each_step_obeys_the_newest_command_that_has_arrived(link, latency):
+    """A clock that was thought to jump back once dropped all commands under way."""
+    periods, plant = 120, NotingPlant()
+    robot = PlantRobot(plant, PaperRobotParameters(), link=link, seed=3)
+    generator, sent = np.random.default_rng((3, 4)), []
+    for k in range(periods):
+        state = robot.advance(k * PERIOD)
+        now_ns = state.stamp_ns + latency
+        robot.apply(RobotCommand(WheelSpeeds(k + 1.0, 0.0), state.stamp_ns), now_ns)
+        lost, late = generator.random(2)
+        faulty = link.begin * 1e9 <= now_ns < link.end * 1e9
+        if not (faulty and lost < link.loss):
+            sent.append((now_ns + faulty * 1e9 * (link.delay + late * link.jitter), k + 1.0))
+    robot.advance(periods * PERIOD)
+    expected = [
+        max((command for arrival, command in sent if arrival <= step * MS + 1), default=0.0)
+        for step in range(10 * periods)
+    ]
+    assert plant.commands == expected
+
+
+def test_the_robot_changes_at_its_instant():
+    plant, changed = NotingPlant(), PaperRobotParameters.from_dict({'mass_factor': 1.3})
+    robot = PlantRobot(plant, PaperRobotParameters(), changed, 5 * PERIOD)
+    for k in range(9):
+        robot.advance(k * PERIOD)
+    assert plant.configured == [(50, changed)]
