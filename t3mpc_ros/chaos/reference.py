@@ -23,13 +23,12 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.switching import SwitchingParameters, SwitchingSchedule
 from t3mpc_ros.chaos.system import hyperchaotic_system
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
-from t3mpc_ros.geometry.types import BodyTwist, WheelSpeeds
+from t3mpc_ros.geometry.types import Array, BodyTwist, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
 
@@ -122,7 +121,7 @@ class ReferenceParameters(Parameters):
             self.memory_tolerance,
         )
 
-    def initial_state(self, seed: int) -> NDArray[np.float64]:
+    def initial_state(self, seed: int) -> Array:
         """Return the initial state of a seed of any length, shape (4,)."""
         if seed < 0:
             raise ValueError('seed must not be negative')  # without its value, which is secret
@@ -236,7 +235,7 @@ class ChaoticReference:
         x = elapsed / self._parameters.ramp
         return x * x * (3.0 - 2.0 * x), 6.0 * x * (1.0 - x) / self._parameters.ramp
 
-    def _wheels(self, outputs: NDArray[np.float64]) -> WheelSpeeds:
+    def _wheels(self, outputs: Array) -> WheelSpeeds:
         """Return the wheel speeds, or their rates, of the two outputs; a linear map."""
         first, second = outputs.tolist()
         if self._parameters.output == 'wheels':

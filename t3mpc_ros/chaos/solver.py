@@ -43,14 +43,14 @@ are two numbers per mode and state, independent of the number of steps.
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from t3mpc_ros.chaos.sum_of_exponentials import exp, expm1, fit_sum_of_exponentials
 from t3mpc_ros.chaos.system import QuadraticSystem, Terms, right_hand_side
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 
 
-def mode_weights(decay: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def mode_weights(decay: Array) -> tuple[Array, Array]:
     r"""Return the weights of the older and the newer slope in a mode's advance over one step.
 
     .. math:: \phi_o(a) = \int_0^1 e^{-a u} u\,du = \frac{1 - (1 + a) e^{-a}}{a^2}, \qquad
@@ -78,14 +78,14 @@ def mode_weights(decay: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArr
 def advance_solution(
     steps: int,
     terms: Terms,
-    local: NDArray[np.float64],
-    decays: NDArray[np.float64],
-    older: NDArray[np.float64],
-    newer: NDArray[np.float64],
-    rates: NDArray[np.float64],
-    initial: NDArray[np.float64],
-    modes: NDArray[np.float64],
-    vectors: NDArray[np.float64],
+    local: Array,
+    decays: Array,
+    older: Array,
+    newer: Array,
+    rates: Array,
+    initial: Array,
+    modes: Array,
+    vectors: Array,
 ) -> None:
     """Advance the solution by ``steps`` steps, in place and without allocation.
 
@@ -146,7 +146,7 @@ class FractionalSolver:
         self,
         system: QuadraticSystem,
         step: float,
-        initial: NDArray[np.float64],
+        initial: Array,
         horizon: float = 1e5,
         tolerance: float = 1e-8,
     ) -> None:
@@ -178,10 +178,10 @@ class FractionalSolver:
         self._orders = np.array(system.orders)
         self._initial = np.zeros(system.size)
         self._modes = np.empty(shape)
-        self._vectors: NDArray[np.float64] = np.empty((6, system.size))
+        self._vectors: Array = np.empty((6, system.size))
         self.reset(initial)
 
-    def reset(self, initial: NDArray[np.float64] | None = None) -> None:
+    def reset(self, initial: Array | None = None) -> None:
         """Reset to time zero with an empty memory, to another initial state if one is given."""
         if initial is not None:
             if np.shape(initial) != self._initial.shape:
@@ -204,12 +204,12 @@ class FractionalSolver:
         return self._steps * self.step
 
     @property
-    def state(self) -> NDArray[np.float64]:
+    def state(self) -> Array:
         """A copy of y, shape (d,)."""
         return np.array(self._vectors[0])
 
     @property
-    def rate(self) -> NDArray[np.float64]:
+    def rate(self) -> Array:
         r"""A copy of dy/dt (1/s), shape (d,); NaN at time zero unless the order is 1.
 
         It is the derivative of the Volterra equation, not of order q: with the newest step's
@@ -222,7 +222,7 @@ class FractionalSolver:
         """
         return np.array(self._vectors[2])
 
-    def advance(self, steps: int = 1) -> NDArray[np.float64]:
+    def advance(self, steps: int = 1) -> Array:
         """Advance by ``steps`` steps and return a copy of the new state, shape (d,).
 
         FloatingPointError: the step is too long, or the solution grows without bound.

@@ -44,7 +44,8 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
-from numpy.typing import NDArray
+
+from t3mpc_ros.geometry.types import Array
 
 exp, expm1 = (np.vectorize(each, otypes=[np.float64]) for each in (math.exp, math.expm1))
 """Of the C library. Those of NumPy differ in the last bit between kinds of processors, and within
@@ -55,14 +56,14 @@ seconds one bit makes another reference of a seed."""
 class SumOfExponentials:
     """k(t) as a sum of weight * exp(-rate * t), with its measured error."""
 
-    rates: NDArray[np.float64]
+    rates: Array
     """Shape (m,), 1/s, ascending and not negative."""
-    weights: NDArray[np.float64]
+    weights: Array
     """Shape (m,), s^(q-1), positive."""
     error: float
     """Bound of abs(sum/k - 1) for shortest <= t <= horizon."""
 
-    def at(self, time: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, time: Array) -> Array:
         """Return the sum at each of the times (s)."""
         return np.exp(-np.multiply.outer(time, self.rates)) @ self.weights
 
@@ -135,11 +136,7 @@ def _sample_kernel(
 
 
 def _measure_error(
-    order: float,
-    shortest: float,
-    horizon: float,
-    rates: NDArray[np.float64],
-    weights: NDArray[np.float64],
+    order: float, shortest: float, horizon: float, rates: Array, weights: Array
 ) -> float:
     """Return the largest relative error on a fine grid, with a margin for between its points.
 

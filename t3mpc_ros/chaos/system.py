@@ -20,21 +20,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 
 
 class Terms(NamedTuple):
     """Non-zero terms of the right-hand side of a quadratic system, as arrays for kernels."""
 
-    constant: NDArray[np.float64]
+    constant: Array
     """Shape (d,), 1/s to the order q, as all gains here."""
     linear_index: NDArray[np.int64]
     """Shape (l, 2): equation, state."""
-    linear_gain: NDArray[np.float64]
+    linear_gain: Array
     """Shape (l,)."""
     quadratic_index: NDArray[np.int64]
     """Shape (p, 3): equation, first state, second state."""
-    quadratic_gain: NDArray[np.float64]
+    quadratic_gain: Array
     """Shape (p,)."""
 
 
@@ -90,7 +91,7 @@ class QuadraticSystem:
 
 
 @kernel
-def right_hand_side(terms: Terms, state: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+def right_hand_side(terms: Terms, state: Array, out: Array) -> None:
     """Write the right-hand side D^q y at ``state`` into ``out``.
 
     state, out : shape (d,); ``out`` is overwritten and must not be ``state``
@@ -108,7 +109,7 @@ def right_hand_side(terms: Terms, state: NDArray[np.float64], out: NDArray[np.fl
 
 
 @kernel
-def jacobian(terms: Terms, state: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+def jacobian(terms: Terms, state: Array, out: Array) -> None:
     """Write the derivative of the right-hand side at ``state`` into ``out``.
 
     state : shape (d,)

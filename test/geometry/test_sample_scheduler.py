@@ -43,6 +43,10 @@ def test_a_sample_is_due_exactly_at_its_stamp():
     assert scheduler.due(10 * MS - 1) == []
     assert scheduler.due(10 * MS) == [10 * MS]
     assert scheduler.due(10 * MS) == []
+    # Of 2/60 s, rounded down to whole nanoseconds, the quotient is less than 2.
+    scheduler = SampleScheduler(60.0)
+    for stamp in (round(n * 1e9 / 60.0) for n in range(60)):
+        assert scheduler.due(stamp) == [stamp]
 
 
 def test_a_late_timer_catches_up_by_at_most_one_burst():
