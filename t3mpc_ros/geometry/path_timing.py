@@ -176,15 +176,6 @@ class PathTiming:
             **shares, radius=geometry.wheel_radius, half_separation=geometry.half_separation
         )
         self._period = period
-        self._curve = _CurveBuilder(start)
-        self._nodes = np.empty((0, 3))
-        """x, y, yaw of the nodes from the first one planned."""
-        self._squares = np.zeros(1)
-        """b at the nodes of the plan."""
-        self._dropped = 0
-        """Number of nodes before the first one that is kept."""
-        self._place, self._elapsed = 0, 0.0
-        """Interval between two nodes, and time since its beginning, s."""
         self._changes = (
             limits.linear_acceleration * period,
             limits.angular_acceleration * period,
@@ -192,15 +183,8 @@ class PathTiming:
         )
         """Largest changes in a period: of v, of omega, of the speed of each wheel on the floor."""
         self._half = geometry.half_separation
-        self._twist = STANDSTILL
-        self.rate = 1.0
-        """Rate at which the time of the plan passed in the last period."""
         self._sample = np.empty(3)
-        self._ended = False
-        self._renew = False
-        """Whether the rest of the plan is that of a path that no longer leads there."""
-        self._pose = start
-        """Last pose returned."""
+        self.begin_at(start)
 
     @property
     def needs_points(self) -> bool:
@@ -257,13 +241,21 @@ class PathTiming:
     def _stop(self) -> int:
         return stopping_node(self._nodes, self._limits, self._place + 1, self._squares)
 
-    def begin_at(self, pose: Pose) -> None:
-        """Rest at a pose, and forget the path."""
+    def begin_at(self, pose: Pose | None) -> None:
+        """Rest at a pose, or where the path will begin, and forget the path."""
         self._pose, self._twist = pose, STANDSTILL
+        """Last pose and twist returned."""
         self._curve = _CurveBuilder(pose)
         self._nodes, self._squares = np.empty((0, 3)), np.zeros(1)
-        self._dropped, self._place, self._elapsed, self.rate = 0, 0, 0.0, 1.0
+        """x, y, yaw of the nodes from the first one planned; b at those of the plan."""
+        self._dropped = 0
+        """Number of nodes before the first one that is kept."""
+        self._place, self._elapsed = 0, 0.0
+        """Interval between two nodes, and time since its beginning, s."""
+        self.rate = 1.0
+        """Rate at which the time of the plan passed in the last period."""
         self._ended = self._renew = False
+        """The latter: whether the rest of the plan is that of a path that now leads elsewhere."""
 
     def cut(self) -> PathEnd:
         """Remove the rest of the path from where the robot can stop; return where that is.
