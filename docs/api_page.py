@@ -63,7 +63,7 @@ def with_api(page):
                 lines += _members(documented, public, made=title == TAKEN)
     lines += ['', '## Environment of Gymnasium, from `t3mpc_ros.gym`']
     for name in ENVIRONMENT:
-        documented = package[f'evaluation.api.tracking_env.{name}']
+        documented = package[f'gym.{name}']
         lines += ['', f'### `{name}`', '', *_markdown(documented)]
     return page[: page.index(MARK)] + '\n'.join(lines) + '\n'
 

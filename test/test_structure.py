@@ -45,7 +45,7 @@ PACKAGES = {
     'atomic_file': set(),
     'version': set(),
     'script_error': set(),
-    'gym': {'missing_library', 'evaluation'},
+    'gym': CORE | {'missing_library', 'script_error', 'evaluation'},
     'geometry': {'parameters', 'kernels'},
     'chaos': BASE,
     'fuzzy': BASE,
@@ -76,7 +76,7 @@ LIBRARIES = {
     'radio': {'serial'},
     'bag': {'mcap', 'rosbags', 'yaml'},
     'evaluation': {'matplotlib', 'PIL', 'yaml', 'cma', 'casadi', 'jinja2', 'tqdm', 'daqp'}
-    | {'pyarrow', 'distributed', 'gymnasium', 'cloudpickle'},
+    | {'pyarrow', 'distributed', 'cloudpickle'},
     'nodes': {'yaml'},
     'cli': {'yaml', 'shtab'},
     'gym': {'gymnasium'},

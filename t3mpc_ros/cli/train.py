@@ -78,10 +78,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def run_bags(options: argparse.Namespace) -> None:
-    """Write the model of ``options.bags`` and print its skill.
-
-    Raises as :func:`run`.
-    """
+    """Write the model of ``options.bags`` and print its skill."""
     from t3mpc_ros.bag.model_file import save_model
     from t3mpc_ros.evaluation.training.trained_models import fit_bags
 

@@ -14,20 +14,11 @@
 """``t3mpc tune``: tunes the compared methods, or identifies the drive of a robot from a bag."""
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.cli import shared_options
 from t3mpc_ros.parameters.command_line import bounded_int
-
-if TYPE_CHECKING:
-    from concurrent.futures import Executor
-
-    from t3mpc_ros.evaluation.tuning.search_space import MethodDefinition
-    from t3mpc_ros.evaluation.tuning.tuned_parameter_file import TunedParameters
-
 
 DRIVES = {'torque': 'torque', 'servo': 'velocity'}
 """Drives of the paper's plant by robot."""
@@ -68,56 +59,44 @@ def add_parser(commands: shared_options.Commands) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Tune every method, or identify the drive in a bag; print the result."""
+    if options.robot not in (None, TWIN, *DRIVES):
+        _identify(options)
+        return
+    from t3mpc_ros.evaluation.experiment import print_report
     from t3mpc_ros.evaluation.methods import (
         further_definitions,
         method_definitions,
         require_libraries,
     )
+    from t3mpc_ros.evaluation.tuning import tune_methods
+    from t3mpc_ros.evaluation.tuning.tuned_parameter_file import TuningBudget
     from t3mpc_ros.parameters.table import find_names
 
-    if options.robot not in (None, TWIN, *DRIVES):
-        _identify(options)
-        return
     known = [*method_definitions(), *further_definitions()]
     names = find_names('method', options.methods, [method.name for method in known])
     methods = [method for method in known if method.name in names or not names]
     require_libraries(method.name for method in methods)
+    drives = [DRIVES[options.robot]] if options.robot in DRIVES else list(DRIVES.values())
+    if options.robot is None:  # those of which a method is
+        drives = [each for each in drives if any(each in method.start for method in methods)]
     with shared_options.executor_of(options) as executor:
-        store = _tuned(options, methods, executor)
+        how = (executor, options.output or OUTPUT, print_report)
+        if options.robot == TWIN:
+            store = tune_methods.tune_twin(
+                tune_methods.twin_definitions(methods),
+                options.evaluations or TWIN_EVALUATIONS,
+                *how,
+                resume=options.resume,
+            )
+        else:
+            store = tune_methods.tune_methods(
+                methods,
+                drives,
+                TuningBudget(options.evaluations or EVALUATIONS),
+                *how,
+                resume=options.resume,
+            )
     shared_options.print_result(options, store.table, store.to_dict)
-
-
-def _tuned(
-    options: argparse.Namespace, methods: 'Sequence[MethodDefinition]', executor: 'int | Executor'
-) -> 'TunedParameters':
-    """Return the parameters after tuning on the chosen robots."""
-    from t3mpc_ros.evaluation.experiment import print_report
-
-    output = options.output or OUTPUT
-    if options.robot == TWIN:
-        from t3mpc_ros.evaluation.tuning.tune_methods import tune_twin, twin_definitions
-
-        return tune_twin(
-            twin_definitions(methods),
-            options.evaluations or TWIN_EVALUATIONS,
-            executor,
-            output,
-            print_report,
-            resume=options.resume,
-        )
-    from t3mpc_ros.evaluation.tuning.tune_methods import tune_methods
-    from t3mpc_ros.evaluation.tuning.tuned_parameter_file import TuningBudget
-
-    drives = [DRIVES[options.robot]] if options.robot else list(DRIVES.values())
-    return tune_methods(
-        methods,
-        [drive for drive in drives if options.robot or any(drive in m.start for m in methods)],
-        TuningBudget(options.evaluations or EVALUATIONS),
-        executor,
-        output,
-        print_report,
-        resume=options.resume,
-    )
 
 
 def _identify(options: argparse.Namespace) -> None:

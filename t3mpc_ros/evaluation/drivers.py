@@ -230,16 +230,28 @@ class MethodDriver:
             self._update_dead_time(self._dead_time, measured, elapsed)
         self._observed, self._observed_ns = k, state.stamp_ns
         self._yaw = state.odometry.pose.yaw
-        self._elapsed = elapsed
-        return self._observation(k, measured, elapsed)
+        self._elapsed, seam = elapsed, self._actuation
+        seam.observe(measured, elapsed * self._model.period)
+        now, following, future = self._reference.at(k, self._late)
+        return Observation(
+            seam.predicted,
+            seam.disturbance,
+            now,
+            following,
+            seam.command,
+            future,
+            elapsed,
+            self._late,
+            self._yaw_rate,
+        )
 
     def command_for(self, acceleration: Array) -> RobotCommand:
         """Return the command that an acceleration (rad/s²), chosen for the observation, makes."""
         asked, cut = self._limited_torque(acceleration)
         if not np.isfinite(asked).all():
             return RobotCommand(WheelSpeeds(math.nan, math.nan), self._observed_ns)
-        elapsed_s = self._elapsed * self._model.period
-        self._acceleration = self._actuation.send_acceleration(asked, elapsed_s)
+        elapsed = self._elapsed * self._model.period
+        self._acceleration = self._actuation.send_acceleration(asked, elapsed)
         self._limited = self._actuation.limited or cut
         if self._controller is not None:
             self._controller.applied(self._acceleration, limited=self._limited)
@@ -294,23 +306,6 @@ class MethodDriver:
         if abs(periods - self._late) > DEAD_TIME_HYSTERESIS:
             self._late = round(periods)
             self._actuation.set_dead_time(self._late * period)
-
-    def _observation(self, k: int, measured: Array, elapsed: int) -> Observation:
-        """Return what the method gets for the speeds (rad/s) measured in period ``k``."""
-        seam = self._actuation
-        seam.observe(measured, elapsed * self._model.period)
-        now, following, future = self._reference.at(k, self._late)
-        return Observation(
-            seam.predicted,
-            seam.disturbance,
-            now,
-            following,
-            seam.command,
-            future,
-            elapsed,
-            self._late,
-            self._yaw_rate,
-        )
 
     def _limited_torque(self, asked: Array) -> tuple[Array, bool]:
         """Return accelerations that a torque drive can give, and whether they were cut."""

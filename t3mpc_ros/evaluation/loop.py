@@ -79,10 +79,9 @@ def run(scenario: Scenario, method: Method) -> Record:
 
     Equal arguments give equal records, bit for bit.
     """
-    reference, steps = scenario.reference(), scenario.steps
-    known = steps + round(LEAD * RATE)
-    if len(reference.speeds) < known:
-        raise ValueError(f'reference must have at least {known} rows: got {len(reference.speeds)}')
+    known, rows = scenario.steps + round(LEAD * RATE), len(scenario.reference().speeds)
+    if rows < known:
+        raise ValueError(f'reference must have at least {known} rows: got {rows}')
     driver = method.driver(scenario)
     return with_scenario(run_loop(scenario_reports(scenario, driver), driver), scenario)
 

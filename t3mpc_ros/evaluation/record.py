@@ -314,15 +314,13 @@ class MeasuredRun:
         if 'twist' not in self.record.columns:
             return None
         right, left = self.record.reference.T
-        wheel = WheelSpeeds(1.0, 0.0)
-        per_difference = twist_from_wheels(wheel, self.record.geometry).angular
+        per_difference = twist_from_wheels(WheelSpeeds(1.0, 0.0), self.record.geometry).angular
         error: Array = self.record['twist'][:, 1] - per_difference * (right - left)
         return error
 
     def drift(self) -> float | None:
         """Return the difference of the angles turned, rad."""
-        rate = self.yaw_rate_error
-        if rate is None:
+        if (rate := self.yaw_rate_error) is None:
             return None
         turned = 0.5 * (rate[1:] + rate[:-1]) * np.diff(self.record.time)
         return abs(float(np.sum(turned[self.counted[1:]])))

@@ -284,25 +284,6 @@ def test_jump_cost_equals_theory_with_and_without_preview(size):
 
 
 @pytest.mark.parametrize('drive', DRIVES)
-def test_move_time_sets_the_symmetric_smoothing_filter(drive):
-    """Gain 1/(1 + (w t)²(1 + (w lag)²)) with the servo, 1/(1 + (w t)⁴) with the integrator."""
-    rate, move_time = 12.0, 0.05
-    time = PERIOD * np.arange(460 + AHEAD + 1)
-    reference = np.column_stack((np.cos(rate * time), np.sin(rate * time)))
-    speeds, *_ = _run(_make(LinearMpcPreview, drive, move_time=move_time), drive, reference)
-    late = slice(200, 460)
-    gains = [np.mean(np.sum(wave[late] * reference[late], 1)) for wave in (speeds, reference)]
-    turned = reference[:, ::-1] * [1.0, -1.0]
-    gain = gains[0] / gains[1]
-    through = (rate * move_time) ** 2 * (1.0 + (rate * LAG) ** 2)
-    if drive == 'torque':
-        through = (rate * move_time) ** 4
-    assert gain == pytest.approx(1.0 / (1.0 + through), rel=0.02)
-    # No delay: nothing of the quadrature is left.
-    assert abs(np.mean(np.sum(speeds[late] * turned[late], 1))) < 0.02
-
-
-@pytest.mark.parametrize('drive', DRIVES)
 @pytest.mark.parametrize('kind', EVERY)
 def test_bounds_are_never_left(kind, drive):
     baseline = _make(kind, drive, robot={}, move_time=0.003)
@@ -410,27 +391,6 @@ def test_convolution_of_moves_and_loads_is_the_wheel_itself(drive):
     speeds, *_ = _run(baseline, drive, _wander(300), lambda chi: next(now), seen)
     assert np.abs(speeds).max() > 3.0
     assert max(missed) < 2e-3  # what of the responses is cut off
-
-
-def test_known_loads_are_compensated_by_a_shift_of_the_command():
-    """Friction that is known, and therefore not fed forward again, changes nothing but that."""
-    reference = 2.0 * np.sin(0.05 * np.arange(100))[:, None] * [1.0, -0.5]
-    rough = _make(DynamicMatrixPreview, 'velocity', robot={})
-    smooth = _make(DynamicMatrixPreview, 'velocity')
-    loads = WheelLoads(_knowledge('velocity', {}))
-    first = loads(reference[1])
-    commands = np.array([-LAG * first, np.zeros(2)])
-    for k in range(55):
-        load = loads(reference[k + 1])
-        future = reference[k : k + AHEAD]
-        for i, (baseline, seen) in enumerate(((rough, load), (smooth, np.zeros(2)))):
-            observation = Observation(
-                reference[k], seen, reference[k], reference[k + 1], commands[i].copy(), future
-            )
-            u = baseline.step(observation)
-            commands[i] = reference[k] + PERIOD * u / (1.0 - KEPT)
-        assert commands[0] + LAG * load == pytest.approx(commands[1], abs=2e-4)
-    assert np.abs(commands).max() > 0.5
 
 
 def test_dynamic_matrix_and_state_space_agree_on_a_true_model():

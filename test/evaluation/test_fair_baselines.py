@@ -60,12 +60,10 @@ from t3mpc_ros.evaluation.methods import (
     FULL_WRONG,
     LMS,
     OFFSET_FREE,
-    PAPER_PARTS,
     RAMP,
     SHAPED,
     SHAPED_IN_TIME,
     default_methods,
-    methods,
     methods_for,
 )
 from t3mpc_ros.evaluation.record import SETTLED, measure
@@ -493,17 +491,3 @@ def test_a_table_says_how_many_seeds_and_what_each_method_knows():
     assert {'commit', 'machine'} <= {*written['origin']}
     runs = written['cases']['nominal']['methods'][FULL]['runs']
     assert [each['seed'] for each in runs] == [201, 202]
-
-
-@pytest.mark.long
-def test_full_on_the_torque_drive_states_what_it_knows():
-    known = methods_for('torque')
-    full, paper = known[FULL], known[PAPER_PARTS]
-    assert next(iter(known)) == FULL
-    assert not full.parameters.predictive.enabled
-    assert paper.parameters == methods('torque')[FULL].parameters
-    model = Scenario('torque', 'nominal', 1).nominal_model()
-    assert 'nominal friction' in full(model).knowledge
-    assert 'nominal friction' not in paper(model).knowledge
-    assert {FULL, PAPER_PARTS} <= {*default_methods('torque')}
-    assert 'full with MPC' not in default_methods('torque')

@@ -16,8 +16,6 @@
 ``bench/parameter_search.py`` looks at thousands of points; here are a few of them.
 """
 
-from itertools import islice
-
 import numpy as np
 import pytest
 
@@ -68,10 +66,3 @@ def test_the_search_covers_all_dynamic_values_up_to_the_bounds():
     for point in drawn:
         for spec in SPECS:
             spec.check(point.get(spec.name, spec.default))
-
-
-@pytest.mark.long
-def test_random_points_are_no_worse_than_feed_forward():
-    alone = sum(len(values_of(spec)) for spec in SPECS)
-    drawn = islice(points(BODY, alone + 60, 7), alone, None)
-    assert [judged for judged in map(judge, drawn) if judged.bad] == []

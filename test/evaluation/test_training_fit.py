@@ -42,7 +42,6 @@ from t3mpc_ros.evaluation.training.fit import (
     TrainingError,
     estimate_move_effect,
     explained,
-    feedback_slope,
     fit_coefficients,
     fit_predictor,
     load_training_data,
@@ -231,7 +230,9 @@ def test_blocks_are_the_run_cut_to_pieces_of_their_own(replayed):
 
 def test_the_effect_of_v_p_is_that_of_the_loop(run, sampled):
     """A lasting v_p leaves v_p over the slope of all that works against a small error."""
-    expected = 1.0 / feedback_slope(run.controller.parameters)
+    parameters = run.controller.parameters
+    law = parameters.law
+    expected = 1.0 / (law.gain + parameters.compensated_bound / law.smoothing)
     for z in range(2):
         errors, moves = (np.ascontiguousarray(table[::-1, z]) for table in sampled)
         found = estimate_move_effect(errors, moves, 4, 4, 5)

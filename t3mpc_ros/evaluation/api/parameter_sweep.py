@@ -51,7 +51,6 @@ from t3mpc_ros.evaluation.record import METRICS, SETTLED, Metric, measure
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, columns_of
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
 from t3mpc_ros.evaluation.run_digest import digest
-from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.script_error import ScriptError
@@ -60,6 +59,7 @@ from t3mpc_ros.simulation.fault_injection import FaultSchedule
 ROBOT = 'robot.'
 """Prefix of a parameter of the true robot."""
 OF_SETTING = ('noise', 'duration')
+REMEDY = '; every controller gets every parameter: sweep each with its own, into one output'
 RUN, ERROR = 'run', 'error'
 """Columns: digest of all that determines a run, and why it has no numbers; '' with them."""
 COLUMNS = {
@@ -207,19 +207,15 @@ def sweep(
     ScriptError
         As for :func:`simulate`, or because every run failed.
     """
-    setting = {
-        'plant': plant,
-        'reference': reference,
-        'noise': noise,
-        'faults': faults,
-        'duration': duration,
-    }
+    setting = {'plant': plant, 'reference': reference, 'noise': noise, 'faults': faults}
+    setting['duration'] = duration
     runs = make_runs(controllers, parameters, checked_seeds(seeds), cases, setting)
-    path = _checked_path(output)
     report = print_report if progress else None
-    if path is None:
+    path = None
+    if output is None:
         rows = list(run_experiment(runs, numbers_or_error, executor, report=report))
     else:
+        path = result_tables.writable(output, result_tables.PARQUET)
         rows = _run_to_file(path, runs, executor, report)
     if all(map(has_failed, rows)):
         raise ScriptError(f'every run failed: {rows[0][ERROR]}')
@@ -238,7 +234,12 @@ def make_runs(
     Seed by seed, so that an estimate of the time left holds. ``setting`` has the arguments of
     :func:`own_scenario` that no parameter sweeps.
     """
-    combinations = [(values, _scenario(setting, values)) for values in _combinations(parameters)]
+    combinations = []
+    for values in _combinations(parameters):
+        swept = {name: values[name] for name in OF_SETTING if name in values}
+        true = {k.removeprefix(ROBOT): v for k, v in values.items() if k.startswith(ROBOT)}
+        scenario = own_scenario(**{**setting, **swept}, robot_parameters=true)
+        combinations.append((values, scenario))
     chosen = chosen_cases(cases, combinations[0][1])
     prepared, given = [], as_controllers(controllers)
     check_names([controller.name for controller in given])
@@ -250,7 +251,10 @@ def make_runs(
                 method = source.method(scenario.robot)
                 check_method(method, scenario, chosen)
             except ValueError as error:
-                raise ScriptError(_refusal(controller.name, values, len(given), error)) from None
+                # A grid with holes compares nothing, and a wrong name would cost a night.
+                what = ', '.join([controller.name, *(f'{k} {v}' for k, v in values.items())])
+                remedy = REMEDY if len(given) > 1 else ''
+                raise ScriptError(f'no run was begun: {what}: {error}{remedy}') from None
             prepared.append((controller.name, values, scenario, method))
     origin = provenance()
     runs = []
@@ -273,23 +277,6 @@ def make_runs(
     if len({run.key for run in runs}) < len(runs):
         raise ScriptError('controllers and values must differ: got two runs that are the same')
     return runs
-
-
-def _refusal(name: str, values: Row, controllers: int, error: ValueError) -> str:
-    """Return why no run of a sweep is begun.
-
-    A grid with holes compares nothing, and a wrong name would cost the runs of a night.
-    """
-    combination = ', '.join([name, *(f'{key} {value}' for key, value in values.items())])
-    remedy = '; every controller gets every parameter: sweep each with its own, into one output'
-    return f'no run was begun: {combination}: {error}{remedy if controllers > 1 else ""}'
-
-
-def _scenario(setting: Mapping[str, Any], values: Row) -> Scenario:
-    """Return one run with swept values of the setting and of the true robot."""
-    swept = {name: values[name] for name in OF_SETTING if name in values}
-    robot = {k.removeprefix(ROBOT): v for k, v in values.items() if k.startswith(ROBOT)}
-    return own_scenario(**{**setting, **swept}, robot_parameters=robot)
 
 
 def reference_text(reference: Any) -> str:
@@ -374,16 +361,6 @@ def cluster(address: str, timeout: float = 10.0) -> Iterator[Executor]:
 # -- file -----------------------------------------------------------------------------------------
 
 
-def _checked_path(output: str | os.PathLike[str] | None) -> Path | None:
-    """Return the path; a missing library is an error before the runs, not after them."""
-    if output is None:
-        return None
-    path = result_tables.writable(output, result_tables.PARQUET)
-    import pyarrow.parquet  # noqa: F401
-
-    return path
-
-
 def _run_to_file(
     path: Path, runs: Sequence[Run], workers: Any, report: Report | None
 ) -> list[Row]:
@@ -411,11 +388,11 @@ def _run_to_file(
 
 def _read(path: Path) -> dict[str, Row]:
     """Return the rows of a file by their digest."""
-    if not path.exists():
-        return {}
-    import pyarrow
+    # Here, so that a missing library is an error before the runs.
     import pyarrow.parquet
 
+    if not path.exists():
+        return {}
     try:
         rows = pyarrow.parquet.read_table(path).to_pylist()
     except (pyarrow.ArrowException, OSError) as error:

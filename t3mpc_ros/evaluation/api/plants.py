@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 import math
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -214,27 +214,22 @@ class StateSpace:
 
     @one_sentence
     def __post_init__(self) -> None:
-        size = self.matrices()[0].shape[0]
-        for name, shape in (('A', (size, size)), ('B', (size, 2)), ('C', (2, size))):
-            found = np.shape(getattr(self, name))
-            if found != shape:
-                raise ScriptError(f'{name} must have the shape {shape}: got {found}')
         self.simulation()
-
-    def matrices(self) -> tuple[Array, Array, Array]:
-        """Return A, B and C as arrays of two dimensions."""
-        found = tuple(
-            numbers(name, getattr(self, name), 'of a matrix') for name in ('A', 'B', 'C')
-        )
-        for name, matrix in zip('ABC', found, strict=True):
-            if matrix.ndim != 2:
-                raise ScriptError(f'{name} must be a matrix: got the shape {matrix.shape}')
-        return found[0], found[1], found[2]
 
     def simulation(self) -> 'OwnSimulation':
         """Return the plant at its start."""
-        a, b, output = self.matrices()
+        a, b, output = (numbers(name, getattr(self, name), 'of a matrix') for name in 'ABC')
+        for name, matrix in zip('ABC', (a, b, output), strict=True):
+            if matrix.ndim != 2:
+                raise ScriptError(f'{name} must be a matrix: got the shape {matrix.shape}')
         size = len(a)
+        for name, matrix, shape in (
+            ('A', a, (size, size)),
+            ('B', b, (size, 2)),
+            ('C', output, (2, size)),
+        ):
+            if matrix.shape != shape:
+                raise ScriptError(f'{name} must have the shape {shape}: got {matrix.shape}')
         both = np.zeros((size + 2, size + 2))
         both[:size] = np.hstack([a, b]) * plant_parameters(self).step
         held = matrix_exponential(both)
@@ -336,23 +331,21 @@ class NoiseLaw:
 
     def simulation(self, seed: int) -> 'LawNoise':
         """Return the noise of a run."""
-        return LawNoise(self, seed)
+        return LawNoise(self.draw, np.random.default_rng((seed, 5)))
 
 
-class LawNoise:
-    """Noise drawn by a law."""
+class LawNoise(NamedTuple):
+    """Noise of a run, drawn by a law."""
 
-    def __init__(self, law: NoiseLaw, seed: int) -> None:
-        self._law = law
-        self._generator = np.random.default_rng((seed, 5))
+    draw: Callable[[np.random.Generator, float, Array], Any]
+    generator: np.random.Generator
 
     def measure(self, wheels: WheelSpeeds, time: float) -> WheelSpeeds:
         """Return wheel speeds (rad/s) with noise at a time (s)."""
         time, true = round(time, 9), np.array(wheels)  # a law may compare the time
         try:
-            noise = np.asarray(
-                self._law.draw(self._generator, time, read_only(true)), dtype=np.float64
-            )
+            drawn = self.draw(self.generator, time, read_only(true))
+            noise = np.asarray(drawn, dtype=np.float64)
         except Exception as error:
             raise ScriptError(
                 f'the noise law raised {described(error)}, at {time:.2f} s'

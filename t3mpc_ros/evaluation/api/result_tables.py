@@ -17,6 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
+from io import BytesIO
 import os
 from pathlib import Path
 import sys
@@ -139,10 +140,9 @@ def write_parquet(
     table = arrow_table(columns)
     texts = {**provenance(), **(details or {})}
     table = table.replace_schema_metadata({name: str(text) for name, text in texts.items()})
-    # A reader of an interrupted write finds the old file or none, never half of one.
-    part = target.with_name(f'{target.name}.part')
-    pyarrow.parquet.write_table(table, part)
-    part.replace(target)
+    content = BytesIO()
+    pyarrow.parquet.write_table(table, content)
+    write_atomically(target, content.getvalue())
     return target
 
 

@@ -56,8 +56,6 @@ from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule, load
 
 Settings = Mapping[str, Any]
 FILE_SEPARATOR = '.py:'
-OWN_KNOWLEDGE = 'Observation of each step; NominalModel by an argument model'
-"""What a controller of one's own knows."""
 MODEL = 'model'
 """Name of the argument of a class that gets the :class:`NominalModel`."""
 _CLASS_DATA: WeakKeyDictionary[type, dict[str, tuple[object, bytes]]] = WeakKeyDictionary()
@@ -311,7 +309,7 @@ class OwnMethod:
 
     def knowledge(self, scenario: Scenario) -> str:
         """Return what it knows."""
-        return OWN_KNOWLEDGE
+        return f'Observation of each step; NominalModel by an argument {MODEL}'
 
     def _instance(self, kind: type, settings: Settings, nominal_model: NominalModel) -> Any:
         _check_class_data(kind)
@@ -370,41 +368,37 @@ class OwnController(BaselineController):
         self.preview = bool(getattr(made, 'preview', False))  # type: ignore[misc]
         self._name, self._step = name, step
         self._applied = getattr(made, 'applied', None)
-        self._period = nominal_model.period
         self._steps = 0
 
     def step(self, observation: Observation) -> Array:
         """Return u, rad/s², shape (2,)."""
+        at = f'at {self._steps * self._nominal_model.period:.2f} s'
         try:
             asked = self._step(_kept(observation))
         except Exception as error:
-            text = f'{self._name} raised {described(error)}, at {self._time():.2f} s'
+            text = f'{self._name} raised {described(error)}, {at}'
             raise ScriptError(f'{text}{_remedy(error, observation)}') from None
-        if not (
-            isinstance(asked, np.ndarray) and asked.shape == (2,) and asked.dtype.kind in 'fiu'
-        ):
+        what = ''
+        if not isinstance(asked, np.ndarray):
             what = repr(asked)
-            if isinstance(asked, np.ndarray):
-                what = f'shape {asked.shape} of {asked.dtype}'
+        elif asked.shape != (2,) or asked.dtype.kind not in 'fiu':
+            what = f'shape {asked.shape} of {asked.dtype}'
+        if what:
             raise ScriptError(
                 f'{self._name} must return a numpy array of shape (2,), the accelerations of the '
-                f'right and the left wheel in rad/s²: got {what} at {self._time():.2f} s'
+                f'right and the left wheel in rad/s²: got {what} {at}'
             )
         if not np.isfinite(asked).all():
             raise ScriptError(
-                f'{self._name} must return finite accelerations: got {asked.tolist()} at '
-                f'{self._time():.2f} s'
+                f'{self._name} must return finite accelerations: got {asked.tolist()} {at}'
             )
         self._steps += observation.elapsed
-        return asked.astype(np.float64)
+        return np.asarray(asked, dtype=np.float64).copy()
 
     def applied(self, acceleration: Array, *, limited: bool) -> None:
         """Pass on the u that the limits let through, where the controller has ``applied``."""
         if self._applied is not None:
             self._applied(read_only(acceleration.copy()), limited=limited)
-
-    def _time(self) -> float:
-        return self._steps * self._period
 
 
 def _remedy(error: Exception, observation: Observation) -> str:
@@ -450,7 +444,21 @@ def own_scenario(
     ``robot_parameters`` are changes of the true robot by name, unknown to all methods; ``gyro`` as
     of :class:`Scenario`. ValueError: wrong use, an unknown name, or a number out of range.
     """
-    robot, own, text = _robot_of(plant)
+    own_plant = plant if isinstance(plant, OdePlant | StateSpace) else None
+    own = plant if isinstance(plant, Robot) else None
+    if isinstance(plant, str):
+        (robot,) = find_names('plant', [plant], ROBOTS)
+        text = KINDS[robot].text
+    elif own is not None:
+        robot, text = 'servo', 'Your robot'
+    elif own_plant is not None:
+        robot = 'torque' if own_plant.drive == 'torque' else 'servo'
+        own, text = own_plant.robot, f'Your plant ({own_plant.name})'
+    else:
+        raise ScriptError(
+            f'plant must be {", ".join(ROBOTS)}, a Robot, an OdePlant or a StateSpace: got '
+            f'{type(plant).__name__} {plant!r}'
+        )
     if isinstance(noise, bool) or not isinstance(noise, int | float | NoiseLaw):
         raise ScriptError(
             'noise must be a variance in (rad/s)² or a NoiseLaw: got '
@@ -460,7 +468,6 @@ def own_scenario(
         raise ScriptError(f'duration must be a number of seconds: got {duration!r}')
     law = noise if isinstance(noise, NoiseLaw) else None
     variance = noise.variance if isinstance(noise, NoiseLaw) else float(noise)
-    own_plant = plant if isinstance(plant, OdePlant | StateSpace) else None
     if own_plant is not None:
         law = law or gaussian_noise(variance)
         if robot_parameters:
@@ -473,10 +480,19 @@ def own_scenario(
         geometry = WheelGeometry() if own is None else own.plant_parameters().geometry
         course, text = sampled(reference, duration, geometry), f'{text}, your reference'
     links = faults if isinstance(faults, LinkFaults) else None
+    events: Sequence[FaultEvent] = ()
+    if faults is not None and links is None:
+        if robot != 'twin':
+            raise ScriptError(
+                'faults must be LinkFaults on a robot other than the twin: got '
+                f'{type(faults).__name__}'
+            )
+        schedule = faults if isinstance(faults, FaultSchedule) else load_schedule(faults)
+        events = schedule.events
     parts = OwnParts(
         reference=course,
         links=links,
-        events=_events_of(faults, robot) if links is None else (),
+        events=events,
         noise=law,
         nominal=None if own is None else own.plant_parameters(KINDS[robot].drive),
         limits=None if own is None else own.limits(),
@@ -487,31 +503,3 @@ def own_scenario(
     found = Scenario(robot, case, seed, duration, variance, gyro, parts)
     found.true_robot()  # a wrong parameter of the robot is an error before the runs
     return found
-
-
-def _robot_of(plant: Any) -> tuple[str, Robot | None, str]:
-    """Return the robot whose methods and metrics apply, a robot of one's own, and what it is."""
-    if isinstance(plant, str):
-        (name,) = find_names('plant', [plant], ROBOTS)
-        return name, None, KINDS[name].text
-    if isinstance(plant, Robot):
-        return 'servo', plant, 'Your robot'
-    if isinstance(plant, OdePlant | StateSpace):
-        robot = 'torque' if plant.drive == 'torque' else 'servo'
-        return robot, plant.robot, f'Your plant ({plant.name})'
-    raise ScriptError(
-        f'plant must be {", ".join(ROBOTS)}, a Robot, an OdePlant or a StateSpace: got '
-        f'{type(plant).__name__} {plant!r}'
-    )
-
-
-def _events_of(faults: Any, robot: str) -> tuple[FaultEvent, ...]:
-    if faults is None:
-        return ()
-    if robot != 'twin':
-        raise ScriptError(
-            'faults must be LinkFaults on a robot other than the twin: got '
-            f'{type(faults).__name__}'
-        )
-    schedule = faults if isinstance(faults, FaultSchedule) else load_schedule(faults)
-    return schedule.events

@@ -35,7 +35,6 @@ from t3mpc_ros.parameters.table import find_names, nearest_hint
 from t3mpc_ros.script_error import ScriptError
 from t3mpc_ros.simulation.fault_injection import FaultSchedule
 
-SIDES = ('right', 'left')
 DIVERGED = 'diverged'
 
 
@@ -78,12 +77,11 @@ class RunResult(ShownAsTables):
 
         On the twin the time counts from the end of its standstill of 1.5 s.
         """
-        none: Array = np.zeros(0)
         length = float(self.columns['time'][-1]) - self.record.start
         if not 0.0 <= after <= length:
             raise ScriptError(f'after must be from 0 to {length:g} s: got {after:g}')
         begin = after + self.record.start
-        return rms(self.error[some_rows(self.columns['time'], none, begin)])
+        return rms(self.error[some_rows(self.columns['time'], np.zeros(0), begin)])
 
     def table(self) -> str:
         """Return the metrics as a Markdown table."""
@@ -188,15 +186,10 @@ def divergence(record: Record) -> str:
 
 
 def _columns(record: Record) -> dict[str, Array]:
-    names = {
-        'reference': 'reference',
-        'measured': 'measured',
-        'speed': 'speeds',
-        'command': 'sent',
-    }
     found = {'time': record.time}
-    for name, column in names.items():
-        found |= {f'{name}_{side}': record[column][:, i] for i, side in enumerate(SIDES)}
+    for name in ('reference', 'measured', 'speed', 'command'):
+        values = record[{'speed': 'speeds', 'command': 'sent'}.get(name, name)]
+        found |= {f'{name}_right': values[:, 0], f'{name}_left': values[:, 1]}
     if 'truth' in record.columns:
         found |= {name: record['truth'][:, i] for i, name in enumerate(('x', 'y', 'yaw'))}
     return found

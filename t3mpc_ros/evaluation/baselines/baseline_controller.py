@@ -91,34 +91,23 @@ JUMP = 0.3
 """A change of r in one period (rad/s), beyond the change before it, that is a jump."""
 
 
-def future_jump(future: Array, j: int, period: float) -> tuple[Array, Array] | None:
-    """Return the jump before row ``j`` of a known future and the slope after it, if there is one.
-
-    future : r at the control periods, rad/s, shape (n, 2); 0 < j < n - 1
-    period : s
-
-    The jump (rad/s) is what exceeds the change before it, the slope is in rad/s²; shape (2,) each.
-    After a change that exceeds :data:`JUMP` itself nothing is a jump.
-    """
-    before = future[j - 1] - future[j - 2] if j > 1 else np.zeros(2)
-    jump = future[j] - future[j - 1] - before
-    if np.max(np.abs(jump)) <= JUMP or np.max(np.abs(before)) > JUMP:
-        return None
-    return jump, (future[j + 1] - future[j]) / period
-
-
 def announce_jumps(
     transition: JumpTransition, future: Array, effect: int, announced: int, period: float
 ) -> int:
     """Announce the jumps of a known future that begins in period ``effect``; return up to where.
 
     Those up to period ``announced`` are announced already. Lost measurements or a longer dead time
-    reveal several periods at once.
+    reveal several periods at once. A jump is what exceeds the change before it; after a change
+    that exceeds :data:`JUMP` itself nothing is one.
     """
     period_ns, last = round(period * NANOSECONDS), effect + len(future) - 2
     for instant in range(max(announced, effect) + 1, last + 1):
-        if found := future_jump(future, instant - effect, period):
-            transition.announce(instant * period_ns, *found)
+        j = instant - effect
+        before = future[j - 1] - future[j - 2] if j > 1 else np.zeros(2)
+        jump = future[j] - future[j - 1] - before
+        if np.max(np.abs(jump)) > JUMP and np.max(np.abs(before)) <= JUMP:
+            slope = (future[j + 1] - future[j]) / period
+            transition.announce(instant * period_ns, jump, slope)
     return max(announced, last)
 
 

@@ -314,7 +314,11 @@ def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -
             f'the run must hold at least {MIN_EXCITATION:g} s with known errors and v_p, and of '
             f'these {JUDGED * timing.span:g} s without a gap: got {duration:.1f} s'
         )
-    loop = replace(predictive.nominal, feedback_gain=min(feedback_slope(parameters), 100.0))
+    # The small-signal gain of the control law, 1/s: K, and the slope of (81)-(82).
+    law, slope = parameters.law, parameters.law.gain
+    if law.compensator:
+        slope += parameters.compensated_bound / law.smoothing
+    loop = replace(predictive.nominal, feedback_gain=min(slope, 100.0))
     middle = max(predictive.horizon // 2, 1)
     nominal = nominal_step_response(loop, timing, middle)[-1]
     runs = _newest_first(errors, moves)
@@ -347,7 +351,6 @@ def fit_predictor(parameters: Nt3fsMpcParameters, errors: Array, moves: Array) -
 
 
 def _machine(parameters: PredictiveParameters, generator: np.random.Generator) -> BoltzmannMachine:
-    """Return a machine with initial weights."""
     shape = LayerSizes(parameters.delta_lags, parameters.move_lags, parameters.hidden)
     scales = parameters.delta_scale, parameters.move_scale
     return make_machine(shape, *scales, parameters.spread, generator)
@@ -373,12 +376,6 @@ def _newest_first(errors: Array, moves: Array) -> Segment:
         (np.ascontiguousarray(errors[::-1, z]), np.ascontiguousarray(moves[::-1, z]))
         for z in range(errors.shape[1])
     ]
-
-
-def feedback_slope(parameters: Nt3fsMpcParameters) -> float:
-    """Return the small-signal gain of the control law, 1/s: K, and the slope of (81)-(82)."""
-    law = parameters.law
-    return law.gain + (parameters.compensated_bound / law.smoothing if law.compensator else 0.0)
 
 
 def skills(

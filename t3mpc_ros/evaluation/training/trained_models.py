@@ -285,18 +285,14 @@ def _warnings(folds: Sequence[Fold]) -> list[str]:
 
 def _origin(bags: Sequence[Mapping[str, object]], folds: Sequence[Fold]) -> dict[str, object]:
     """Return the provenance for the header of the model file."""
-    worth: dict[str, object] = {
-        'folds': len(folds),
-        'explained': _both([fold.explained for fold in folds]),
-    }
+    found = {'explained': [fold.explained for fold in folds]}
     if folds[0].skills:
-        worth['skill'] = _both([fold.skills[FITTED] for fold in folds])
+        found['skill'] = [fold.skills[FITTED] for fold in folds]
+    worth: dict[str, object] = {'folds': len(folds)}
+    for name, values in found.items():
+        mean, spread = np.round(mean_and_spread(values), 4).tolist()
+        worth[name] = {'mean': mean, 'spread': spread}
     return {'bags': list(bags), 'program': provenance(), 'cross_validation': worth}
-
-
-def _both(values: Sequence[Array]) -> dict[str, list[float] | list[list[float]]]:
-    mean, spread = mean_and_spread(values)
-    return {'mean': np.round(mean, 4).tolist(), 'spread': np.round(spread, 4).tolist()}
 
 
 def origin_of(folder: Path) -> dict[str, object]:
@@ -403,13 +399,11 @@ def _skill_table(drive: str, record: Record) -> Table:
 
 def training_data_of(record: Record, parameters: ProposedParameters) -> TrainingData:
     """Return a simulated run in the form of training data from a bag."""
-    begins = np.zeros(record.time.size, dtype=np.bool_)
-    begins[0] = True
     return TrainingData(
         errors=-record['terms'][:, TERM_NAMES.index('feedback')] / parameters.law.gain,
         moves=record['terms'][:, TERM_NAMES.index('predictive')],
         speeds=record['estimated'],
         unexplained=record['unexplained'],
         limited=record['limited'].astype(np.bool_),
-        begins=begins,
+        begins=np.arange(record.time.size) == 0,
     )

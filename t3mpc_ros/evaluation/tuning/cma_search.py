@@ -73,11 +73,6 @@ class SearchResult(NamedTuple):
     history: tuple[Evaluation, ...]
     """Every evaluation in order; the first is the start."""
 
-    @property
-    def start_value(self) -> float:
-        """The objective where the search began."""
-        return self.history[0].value
-
 
 def search_best(
     objective: Objective,

@@ -50,11 +50,6 @@ class SearchRange:
     high: float
     log: bool = True
 
-    def ends(self, *, whole: bool) -> tuple[float, float]:
-        """Return what p = 0 and p = 1 stand for, before exp where the range is logarithmic."""
-        low, high = (self.low - 0.5, self.high + 0.5) if whole else (self.low, self.high)
-        return (math.log(low), math.log(high)) if self.log else (float(low), float(high))
-
 
 class SearchSpace:
     """The tuned parameters of one table, as the unit cube; coordinates are in order of ``ranges``.
@@ -78,9 +73,12 @@ class SearchSpace:
             for bound in (each.low, each.high):
                 spec.check(spec.kind(bound))
         self._whole = [specs[each.name].kind is int for each in self.ranges]
-        self._ends = [
-            each.ends(whole=whole) for each, whole in zip(self.ranges, self._whole, strict=True)
-        ]
+        self._ends: list[tuple[float, float]] = []
+        """What p = 0 and p = 1 stand for, before exp where the range is logarithmic."""
+        for each, whole in zip(self.ranges, self._whole, strict=True):
+            low, high = (each.low - 0.5, each.high + 0.5) if whole else (each.low, each.high)
+            ends = (math.log(low), math.log(high)) if each.log else (float(low), float(high))
+            self._ends.append(ends)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -188,7 +188,7 @@ def tune_methods(
                     about=_about(method, drive, budget),
                 )
             if math.isfinite(found.value):
-                first = found.start_value
+                first = found.history[0].value
                 store[method.name, drive] = TunedEntry(
                     values=method.start[drive].with_values(found.values).to_dict(),
                     tuned=method.space.names,

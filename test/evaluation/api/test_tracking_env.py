@@ -29,7 +29,7 @@ gymnasium = pytest.importorskip('gymnasium')
 
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 
-from t3mpc_ros.evaluation.api.tracking_env import (  # noqa: E402
+from t3mpc_ros.gym import (  # noqa: E402
     ACCELERATION,
     SIZE,
     TrackingEnv,

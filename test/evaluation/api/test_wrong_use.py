@@ -29,6 +29,14 @@ import t3mpc_ros as t3
 SHORT = {'plant': 'servo', 'duration': 1.0}
 
 
+def run(controller='feed-forward', **setting):
+    return t3.simulate(controller, **{**SHORT, **setting})
+
+
+def compare(controllers, **setting):
+    return t3.compare(controllers, **{**SHORT, **setting})
+
+
 def returns_list(observation):
     return [1.0, 2.0]
 
@@ -88,165 +96,135 @@ def write_bytes(content):
     return path
 
 
-WRONG = {
-    'one number for seeds': (
-        lambda: t3.compare('feed-forward', seeds=5, **SHORT),
+WRONG = [
+    (
+        lambda: compare('feed-forward', seeds=5),
         r'seeds must be a list of them, such as \[1\] or range\(1, 6\): got 5',
     ),
-    'a file without a name in it': (
-        lambda: t3.simulate('mine.py', **SHORT),
-        'mine.py must be followed by what to take of it: mine.py:NAME',
-    ),
-    'no system': (lambda: t3.chaos(system=3), 'system must be a QuadraticSystem: got 3'),
-    'no weight': (
+    (lambda: run('mine.py'), 'mine.py must be followed by what to take of it: mine.py:NAME'),
+    (lambda: t3.chaos(system=3), 'system must be a QuadraticSystem: got 3'),
+    (
         lambda: t3.fuzzy('x').fit([[0.0]], [1.0], ridge=float('nan')),
         'ridge must be at least 0: got nan',
     ),
-    'folder of a file': (
+    (
         lambda: finished().to_csv('/nowhere/at/all.csv'),
         'all.csv cannot be written: give a file in a folder that exists',
     ),
-    'picture of another kind': (
-        lambda: finished().plot('run.gif'),
-        'path must end in .png, .pdf, .svg: got run.gif',
-    ),
-    'fast reference': (
-        lambda: t3.simulate(reference=lambda time: (0.0, -1e9), plant='servo', duration=4.0),
+    (lambda: finished().plot('run.gif'), 'path must end in .png, .pdf, .svg: got run.gif'),
+    (
+        lambda: run(reference=lambda time: (0.0, -1e9)),
         r'reference must be from -200 to 200 rad/s, .* got 1e\+09 rad/s',
     ),
-    'complex numbers': (
-        lambda: t3.simulate(reference=np.ones((9, 2), complex), plant='servo', duration=4.0),
+    (
+        lambda: run(reference=np.ones((9, 2), complex)),
         'reference must be real numbers: got complex ones',
     ),
-    'binary reference': (
-        lambda: t3.simulate(reference=write_bytes(b'\xff\x00\x80'), plant='servo', duration=4.0),
+    (
+        lambda: run(reference=write_bytes(b'\xff\x00\x80')),
         'bytes.csv must be a CSV file: got one that is no text in UTF-8',
     ),
-    'list for a name': (lambda: t3.fuzzy(['x']), r"inputs must be names, each once: got \['x'\]"),
-    'tolerance of the generator': (lambda: t3.chaos(rtol=0.0), 'rtol must be from 1e-06 to 1'),
-    'list for array': (
-        lambda: t3.simulate(returns_list, **SHORT),
+    (lambda: t3.fuzzy(['x']), r"inputs must be names, each once: got \['x'\]"),
+    (lambda: t3.chaos(rtol=0.0), 'rtol must be from 1e-06 to 1'),
+    (
+        lambda: run(returns_list),
         r'returns_list must return a numpy array of shape \(2,\), .* got \[1.0, 2.0\] at 0.00 s',
     ),
-    'wrong shape': (
-        lambda: t3.simulate(returns_three, **SHORT),
+    (
+        lambda: run(returns_three),
         r'must return a numpy array of shape \(2,\), .* got shape \(3,\)',
     ),
-    'NaN': (
-        lambda: t3.simulate(returns_nan, **SHORT),
+    (
+        lambda: run(returns_nan),
         r'returns_nan must return finite accelerations: got \[nan, nan\] at 0.00 s',
     ),
-    'a controller that raises': (
-        lambda: t3.simulate(raises, **SHORT),
+    (
+        lambda: run(raises),
         r'raises raised ZeroDivisionError \(.*zero\) in raises\(\), test_wrong_use.py line \d+',
     ),
-    'a reference that raises': (
-        lambda: t3.simulate(reference=lambda time: 1.0 / 0.0, plant='servo', duration=4.0),
+    (
+        lambda: run(reference=lambda time: 1.0 / 0.0),
         r'reference raised ZeroDivisionError \(.*zero\) in .*, test_wrong_use.py line \d+',
     ),
-    'an observation that is changed': (
-        lambda: t3.simulate(changes_what_it_sees, **SHORT),
+    (
+        lambda: run(changes_what_it_sees),
         r'read-only\) in .*, at 0.00 s; change a copy, such as observation.speeds.copy\(\)',
     ),
-    'a preview that was not asked for': (
-        lambda: t3.simulate(lambda seen: seen.future[0], **SHORT),
+    (
+        lambda: run(lambda seen: seen.future[0]),
         'observation.future is None without preview = True in the class',
     ),
-    'array of another kind': (
-        lambda: t3.simulate(lambda seen: np.array([1j, 2j]), **SHORT),
+    (
+        lambda: run(lambda seen: np.array([1j, 2j])),
         r'array of shape \(2,\), .* got shape \(2,\) of complex128 at 0.00 s',
     ),
-    'misspelt column': (
+    (
         lambda: finished()['sped_right'],
         "column must be one of time, .* got 'sped_right'; did you mean speed_right",
     ),
-    'CSV by another name': (lambda: finished().to_csv('a.xlsx'), 'must end in .csv: got a.xlsx'),
-    'Parquet by another name': (
-        lambda: finished().to_parquet('a.csv'),
-        'path must end in .parquet: got a.csv',
-    ),
-    'page by another name': (
-        lambda: compared().to_html('a.pdf'),
-        'path must end in .html: got a.pdf',
-    ),
-    'generator by another name': (
-        lambda: t3.chaos(tspan=(0.0, 0.1)).to_csv('a.txt'),
-        'path must end in .csv: got a.txt',
-    ),
-    'times outside of a run': (
-        lambda: finished().rmse(after=-1.0),
-        'after must be from 0 to 3.99 s: got -1',
-    ),
-    'controller of a comparison': (
-        lambda: compared().values(NoStep),
-        'controller must be one of feed-forward: got NoStep',
-    ),
-    'a plant that diverges': (
-        lambda: t3.simulate(
+    (lambda: finished().to_csv('a.xlsx'), 'must end in .csv: got a.xlsx'),
+    (lambda: finished().to_parquet('a.csv'), 'path must end in .parquet: got a.csv'),
+    (lambda: compared().to_html('a.pdf'), 'path must end in .html: got a.pdf'),
+    (lambda: t3.chaos(tspan=(0.0, 0.1)).to_csv('a.txt'), 'path must end in .csv: got a.txt'),
+    (lambda: finished().rmse(after=-1.0), 'after must be from 0 to 3.99 s: got -1'),
+    (lambda: compared().values(NoStep), 'controller must be one of feed-forward: got NoStep'),
+    (
+        lambda: run(
             'PI + feed-forward', plant=t3.OdePlant(unstable, initial=[1.0, 1.0]), duration=1.0
         ),
         r'run of PI \+ feed-forward diverged at 0.0\d s: the last finite wheel speeds were',
     ),
-    'a plant of wrong shape': (
+    (
         lambda: t3.OdePlant(wrong_states),
         r'wrong_states must return 2 numbers, one for each state: got the shape \(3,\)',
     ),
-    'initial state of wrong shape': (
+    (
         lambda: t3.OdePlant(unstable, initial=[1.0, 1.0, 1.0]),
         r'initial must have the shape \(2,\): got \(3,\)',
     ),
-    'case of a plant of its own': (
-        lambda: t3.simulate(plant=t3.OdePlant(unstable), case='friction x3'),
+    (
+        lambda: run(plant=t3.OdePlant(unstable), case='friction x3'),
         'case must be one of nominal: got friction x3',
     ),
-    'unknown controller': (lambda: t3.simulate('ful'), 'did you mean full'),
-    'unknown plant': (lambda: t3.simulate(plant='twn'), 'plant must be .* did you mean twin'),
-    'unknown case': (lambda: t3.simulate(case='nominl'), 'did you mean nominal'),
-    'unknown parameter': (
-        lambda: t3.simulate(t3.Controller('full', {'law.gian': 2.0}), **SHORT),
-        'did you mean law.gain',
-    ),
-    'no step': (lambda: t3.simulate(NoStep, **SHORT), 'class NoStep must have a method step'),
-    'no controller': (lambda: t3.simulate(3, **SHORT), 'controller must be a name, .* got int 3'),
-    'arguments of a class': (
-        lambda: t3.simulate(WrongArguments, **SHORT),
+    (lambda: run('ful'), 'did you mean full'),
+    (lambda: run(plant='twn'), 'plant must be .* did you mean twin'),
+    (lambda: run(case='nominl'), 'did you mean nominal'),
+    (lambda: run(t3.Controller('full', {'law.gian': 2.0})), 'did you mean law.gain'),
+    (lambda: run(NoStep), 'class NoStep must have a method step'),
+    (lambda: run(3), 'controller must be a name, .* got int 3'),
+    (
+        lambda: run(WrongArguments),
         "WrongArguments cannot be made: TypeError .*missing 1 required .*'gain'",
     ),
-    'reference of wrong shape': (
-        lambda: t3.simulate(reference=np.zeros((2, 50)), **SHORT),
+    (
+        lambda: run(reference=np.zeros((2, 50))),
         r'reference must have the shape \(n, 2\), .* got \(2, 50\)',
     ),
-    'ragged reference': (
-        lambda: t3.simulate(reference=[[1.0, 2.0], [3.0]], **SHORT),
+    (
+        lambda: run(reference=[[1.0, 2.0], [3.0]]),
         r'reference must be numbers of the shape \(n, 2\): got list',
     ),
-    'reference with NaN': (
-        lambda: t3.simulate(reference=np.full((50, 2), np.nan), **SHORT),
+    (
+        lambda: run(reference=np.full((50, 2), np.nan)),
         r'reference must be finite: got nan at \[0, 0\]',
     ),
-    'missing file': (
-        lambda: t3.simulate(reference='no.csv', **SHORT),
-        'no.csv cannot be read: No such file',
-    ),
-    'noise': (lambda: t3.simulate(noise='0.1'), 'noise must be a variance .* got str'),
-    'seed': (lambda: t3.simulate(seed=1.5), 'seed must be a whole number .* got 1.5'),
-    'duration': (lambda: t3.simulate(duration='1'), "duration must be a number .* got '1'"),
-    'function that cannot be sent': (
-        lambda: t3.compare(lambda o: np.zeros(2), seeds=[1, 2], executor=2, **SHORT),
+    (lambda: run(reference='no.csv'), 'no.csv cannot be read: No such file'),
+    (lambda: run(noise='0.1'), 'noise must be a variance .* got str'),
+    (lambda: run(seed=1.5), 'seed must be a whole number .* got 1.5'),
+    (lambda: run(duration='1'), "duration must be a number .* got '1'"),
+    (
+        lambda: compare(lambda o: np.zeros(2), seeds=[1, 2], executor=2),
         'top level of a file to be sent to other processes; use executor=1',
     ),
-    'executor': (lambda: t3.compare('full', seeds=[1], executor='x'), 'executor must be None'),
-    'missing bag': (lambda: t3.read_bag('no_bag'), 'there is no bag no_bag'),
-    'order of the derivatives': (lambda: t3.chaos(1.2), 'alpha must be above 0 and at most 1'),
-    'shape of the state': (lambda: t3.chaos(y0=[1, 2]), r'y0 must have the shape \(4,\)'),
-    'fuzzy input': (
-        lambda: t3.fuzzy('x').evaluate({'y': 1.0}),
-        'inputs must be x: got y',
-    ),
-}
+    (lambda: compare('full', seeds=[1], executor='x'), 'executor must be None'),
+    (lambda: t3.read_bag('no_bag'), 'there is no bag no_bag'),
+    (lambda: t3.chaos(1.2), 'alpha must be above 0 and at most 1'),
+    (lambda: t3.chaos(y0=[1, 2]), r'y0 must have the shape \(4,\)'),
+    (lambda: t3.fuzzy('x').evaluate({'y': 1.0}), 'inputs must be x: got y'),
+]
 
 
-@pytest.mark.parametrize('call, text', WRONG.values(), ids=WRONG)
+@pytest.mark.parametrize('call, text', WRONG, ids=[text for _, text in WRONG])
 def test_wrong_use_is_one_sentence(call, text):
     with pytest.raises(t3.ScriptError, match=text) as caught:
         call()
