@@ -79,9 +79,7 @@ class ProposedController(BaselineController):
         self._period = nominal_model.period
         self._period_ns = round(nominal_model.period * NANOSECONDS)
         self._tracker = deepcopy(_template(table, nominal_model))
-        self._random = table.predictive.seed if table.random_predictor else None
-        if self._random is not None:
-            self._randomize_predictor(self._random)
+        self._randomize_predictor()
         self.estimate_dead_time = table.estimate_dead_time
         self.inertia_error = table.inertia_error
         self._loads = WheelLoads(nominal_model) if table.nominal_loads else None
@@ -102,8 +100,7 @@ class ProposedController(BaselineController):
     def set_weights(self, weights: Mapping[str, Array]) -> None:
         """Begin with another run's; random output weights stay random."""
         self._tracker.law.set_weights(weights)
-        if self._random is not None:
-            self._randomize_predictor(self._random)
+        self._randomize_predictor()
 
     def step(self, observation: Observation) -> Array:
         """Return u (rad/s²) of (66)-(67) on the reference with its switches crossed."""
@@ -142,10 +139,12 @@ class ProposedController(BaselineController):
         """Take note of the u that the drive's limits let through."""
         self._tracker.law.set_applied(acceleration, saturated=limited)
 
-    def _randomize_predictor(self, seed: int) -> None:
-        """Set random output weights with the magnitude of the pretrained ones."""
-        predictive = self._tracker.law.predictive
-        predictive.set_weights(random_output_weights(predictive.get_weights(), seed))
+    def _randomize_predictor(self) -> None:
+        """If so specified, set random output weights with the magnitude of the pretrained ones."""
+        predictive, table = self._tracker.law.predictive, self.parameters
+        if table.random_predictor:
+            drawn = random_output_weights(predictive.get_weights(), table.predictive.seed)
+            predictive.set_weights(drawn)
 
 
 def random_output_weights(weights: Mapping[str, Array], seed: int) -> dict[str, Array]:

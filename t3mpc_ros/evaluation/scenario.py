@@ -241,9 +241,13 @@ class Scenario:
     def nominal_model(self) -> NominalModel:
         """Return the model that every method gets; with a torque drive nothing is limited."""
         robot = self.kind.assumed_robot(self)
-        acceleration = math.inf
-        if self.kind.drive == 'velocity':
-            acceleration = isotropic_acceleration(self.limits, robot.geometry)
+        geometry, limits, acceleration = robot.geometry, self.limits, math.inf
+        if self.kind.drive == 'velocity':  # what both wheels may have at once, in any direction
+            straight = limits.linear_acceleration / geometry.wheel_radius
+            turning = (
+                limits.angular_acceleration * geometry.half_separation / geometry.wheel_radius
+            )
+            acceleration = min(straight, turning, limits.wheel_acceleration)
         return NominalModel(self.kind.drive, 1.0 / RATE, robot.drive.lag, acceleration, robot)
 
     def true_robot(self) -> PaperRobotParameters:
@@ -474,10 +478,3 @@ def sampled_speeds(speeds: Array) -> SampledReference:
     slope = np.gradient(speeds, axis=0) * RATE
     none = np.zeros(count, dtype=np.int64)
     return SampledReference(np.arange(count) / RATE, speeds, slope, none, none.astype(np.bool_))
-
-
-def isotropic_acceleration(limits: LimitParameters, geometry: WheelGeometry) -> float:
-    """Return the acceleration (rad/s²) that both wheels may have at once, in any direction."""
-    straight = limits.linear_acceleration / geometry.wheel_radius
-    turning = limits.angular_acceleration * geometry.half_separation / geometry.wheel_radius
-    return min(straight, turning, limits.wheel_acceleration)

@@ -49,14 +49,14 @@ class BagColumns(Mapping[str, Mapping[str, Array]]):
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).expanduser()
         """The bag."""
-        from t3mpc_ros.bag.reader import open_bag
+        from t3mpc_ros.bag.reader import open_bag  # the interface is there without its libraries
 
         with open_bag(self.path) as bag:
             self.types = {name: topic.type_name for name, topic in bag.topics.items()}
             """Type of each topic by name."""
             self.duration = bag.duration
             """s between the first and the last message."""
-        self._columns: dict[str, dict[str, Array]] = {}
+        self._columns: dict[str, FieldColumns] = {}
 
     @one_sentence
     def __getitem__(self, topic: str) -> Mapping[str, Array]:
@@ -65,7 +65,8 @@ class BagColumns(Mapping[str, Mapping[str, Array]]):
             hint = nearest_hint(topic, self.types)
             raise ScriptError(f'{topic} is not in {self.path}{hint}; its topics: {self._names()}')
         if topic not in self._columns:
-            self._columns[topic] = FieldColumns(topic, _read(self.path, topic))
+            self._columns[topic] = FieldColumns(_read(self.path, topic))
+            self._columns[topic].topic = topic
         return self._columns[topic]
 
     def __contains__(self, topic: object) -> bool:
@@ -87,19 +88,16 @@ class BagColumns(Mapping[str, Mapping[str, Array]]):
 class FieldColumns(dict[str, Array]):
     """Columns of one topic by field; an unknown field is an error that names the nearest one."""
 
-    def __init__(self, topic: str, columns: Mapping[str, Array]) -> None:
-        super().__init__(columns)
-        self._topic = topic
+    topic = ''
 
     def __missing__(self, field: str) -> Array:
-        hint = nearest_hint(field, self)
-        raise ScriptError(f'{self._topic} has no field {field}{hint}')
+        raise ScriptError(f'{self.topic} has no field {field}{nearest_hint(field, self)}')
 
 
 def _read(path: Path, topic: str) -> dict[str, Array]:
-    rows: list[dict[str, Any]] = []
-    from t3mpc_ros.bag.reader import open_bag  # the interface is there without its libraries
+    from t3mpc_ros.bag.reader import open_bag
 
+    rows: list[dict[str, Any]] = []
     with open_bag(path) as bag:
         for received, message in bag.messages(topic):
             row: dict[str, Any] = {RECEIVED: received}

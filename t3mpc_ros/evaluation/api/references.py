@@ -128,13 +128,23 @@ def sampled(source: Any, duration: float, geometry: WheelGeometry) -> SampledRef
     elif callable(source):
         speeds = np.array([_row(source, t) for t in time.tolist()])
     else:
-        speeds = _held(numbers('reference', source, '(n, 2)'), rows)
+        given = numbers('reference', source, '(n, 2)')
+        if given.ndim != 2 or given.shape[1] != 2 or len(given) < 2:
+            raise ScriptError(
+                'reference must have the shape (n, 2), n >= 2: right and left wheel speed in '
+                f'rad/s, {RATE:g} rows a second: got {given.shape}'
+            )
+        speeds = given[np.minimum(np.arange(rows), len(given) - 1)]  # the last row is held
     if (fastest := np.max(np.abs(speeds))) > MAX_SPEED:
         raise ScriptError(
             f'reference must be from {-MAX_SPEED:g} to {MAX_SPEED:g} rad/s, the highest '
             f'wheel speed that a robot may have: got {fastest:.4g} rad/s'
         )
-    switched = jumps(speeds)
+    # A row jumps that leaves the line of the two rows before by a switch's change.
+    change = np.zeros_like(speeds)
+    change[2:] = speeds[2:] - 2.0 * speeds[1:-1] + speeds[:-2]
+    switched: NDArray[np.bool_] = np.max(np.abs(change), axis=1) > JUMP
+    switched[1:] &= ~switched[:-1]  # the row after a jump leaves the line of the jump
     modes = np.cumsum(switched, dtype=np.int64)
     return SampledReference(time, speeds, _slopes(speeds, switched), modes, switched)
 
@@ -160,16 +170,6 @@ def numbers(name: str, given: Any, shape: str) -> Array:
 def _short(given: Any) -> str:
     text = repr(given)
     return text if len(text) <= 60 else f'{text[:57]}...'
-
-
-def _held(speeds: Array, rows: int) -> Array:
-    """Return an array of wheel speeds, with its last row repeated to the end."""
-    if speeds.ndim != 2 or speeds.shape[1] != 2 or len(speeds) < 2:
-        raise ScriptError(
-            'reference must have the shape (n, 2), n >= 2: right and left wheel speed in rad/s, '
-            f'{RATE:g} rows a second: got {speeds.shape}'
-        )
-    return speeds[np.minimum(np.arange(rows), len(speeds) - 1)]
 
 
 def _row(function: Callable[[float], Any], time: float) -> Array:
@@ -223,15 +223,6 @@ def _wheels(twists: Array, geometry: WheelGeometry) -> Array:
     linear, angular = twists.T
     half = geometry.half_separation
     return np.column_stack(wheel_speeds(linear, angular, geometry.wheel_radius, half))
-
-
-def jumps(speeds: Array) -> NDArray[np.bool_]:
-    """Return which rows jump: they leave the line of the two rows before by a switch's change."""
-    change = np.zeros_like(speeds)
-    change[2:] = speeds[2:] - 2.0 * speeds[1:-1] + speeds[:-2]
-    found: NDArray[np.bool_] = np.max(np.abs(change), axis=1) > JUMP
-    found[1:] &= ~found[:-1]  # the row after a jump leaves the line of the jump
-    return found
 
 
 def _slopes(speeds: Array, switched: NDArray[np.bool_]) -> Array:

@@ -34,7 +34,7 @@ a loop.
 
 from dataclasses import dataclass
 import math
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -92,45 +92,33 @@ class DynamicMatrixParameters(
     moves: int = with_default(DynamicMatrixPreviewParameters, 'moves', 12)
 
 
-class Responses(NamedTuple):
-    """Step responses of a wheel 1, 2, ... periods after a unit step, until settled."""
-
-    steps: Array
-    """s_j, to the command c, (rad/s)/(rad/s)."""
-    loads: Array
-    """h_j, to an acceleration that acts on the wheel, (rad/s)/(rad/s²)."""
-
-
 def identify_step_responses(
     model: predictive_baseline.WheelModel, inner_gain: float, least: int
-) -> Responses:
-    """Return the step responses of a wheel from two simulations of ``model``.
+) -> tuple[Array, Array]:
+    """Return the step responses of a wheel from two simulations of ``model``, until settled.
 
-    ``inner_gain`` is K0 of the loop that is closed around it first, 1/s, 0 when it settles by
-    itself; at least ``least`` periods are recorded.
+    s_j, to the command c, (rad/s)/(rad/s), and h_j, to an acceleration that acts on the wheel,
+    (rad/s)/(rad/s²), 1, 2, ... periods after a unit step. ``inner_gain`` is K0 of the loop that is
+    closed around it first, 1/s, 0 when it settles by itself; at least ``least`` periods.
     """
-    runs: list[list[float]] = []
-    for command, load in ((1.0, 0.0), (0.0, 1.0)):
-        speed, run = 0.0, []
-        for _ in range(MAX_RESPONSE_LENGTH):
+    responses = np.empty((2, MAX_RESPONSE_LENGTH))
+    for response, (command, load) in zip(responses, ((1.0, 0.0), (0.0, 1.0)), strict=True):
+        speed = 0.0
+        for k in range(MAX_RESPONSE_LENGTH):
             u = inner_gain * (command - speed) if inner_gain > 0.0 else command
-            speed = model.pole * speed + model.push * u + model.give * load
-            run.append(speed)
-        runs.append(run)
-    steps, loads = np.array(runs)
-    last = 0
-    settled = bool(np.isfinite(steps).all())
-    if settled:
+            response[k] = speed = model.pole * speed + model.push * u + model.give * load
+    steps, loads = responses
+    last = MAX_RESPONSE_LENGTH
+    if np.isfinite(steps).all():
         away = np.flatnonzero(np.abs(steps - steps[-1]) > SETTLED * abs(steps[-1]))
         last = int(away[-1]) if away.size else 0
-        settled = last < 0.9 * MAX_RESPONSE_LENGTH
-    if not settled:
+    if last >= 0.9 * MAX_RESPONSE_LENGTH:
         raise ValueError(
             f'step response must settle within {MAX_RESPONSE_LENGTH} periods: '
             f'inner_gain is {inner_gain}'
         )
     length = max(least, last + 2)
-    return Responses(steps[:length].copy(), loads[:length].copy())
+    return steps[:length].copy(), loads[:length].copy()
 
 
 class DynamicMatrix(predictive_baseline.PredictiveBaseline):
@@ -146,9 +134,10 @@ class DynamicMatrix(predictive_baseline.PredictiveBaseline):
         n = table.horizon
         self.responses = identify_step_responses(model, self._inner_gain, n + 1)
         """Step responses of the wheel model."""
-        self._static = float(self.responses.loads[-1])
+        steps, loads = self.responses
+        self._static = float(loads[-1])
         """Steady speed (rad/s) by which a wheel misses its set point per rad/s² on it."""
-        self._response = predictive_baseline.response_matrix(self.responses.steps[:n], table.moves)
+        self._response = predictive_baseline.response_matrix(steps[:n], table.moves)
         weight = (table.move_time / period) ** 2
         self._reach = nominal_model.acceleration * period
         if self._inner_gain and self.preview:

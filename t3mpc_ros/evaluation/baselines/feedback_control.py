@@ -245,22 +245,18 @@ class DisturbanceRejection(FeedbackBaseline[DisturbanceRejectionParameters]):
 
     def feedback(self, observation: Observation, feedforward: Array, error: Array) -> Array:
         """Return u, rad/s², shape (2,)."""
-        table = self.parameters
-        self._observe(observation.speeds)
-        speed, load = self.observed
-        error = error + (1.0 - table.shared_speed) * (speed - observation.speeds)
-        load = load + table.shared_disturbance * (observation.unexplained - load)
-        return np.asarray((feedforward - table.gain * error - load) / self.input_gain)
-
-    def _observe(self, speeds: Array) -> None:
-        """Predict by the u that was applied, and correct by the measured speeds."""
+        table, speeds = self.parameters, observation.speeds
         if self._predicted_reference is None:
             self.observed = np.stack([speeds, np.zeros(2)])
-            return
-        speed, disturbance = self.observed
-        speed = speed + self._period * (self.input_gain * self._applied + disturbance)
-        surprise = np.outer(self._gains, speeds - speed)
-        self.observed = np.stack([speed, disturbance]) + surprise
+        else:  # predict by the u that was applied, and correct by the measured speeds
+            speed, load = self.observed
+            speed = speed + self._period * (self.input_gain * self._applied + load)
+            surprise = np.outer(self._gains, speeds - speed)
+            self.observed = np.stack([speed, load]) + surprise
+        speed, load = self.observed
+        error = error + (1.0 - table.shared_speed) * (speed - speeds)
+        load = load + table.shared_disturbance * (observation.unexplained - load)
+        return np.asarray((feedforward - table.gain * error - load) / self.input_gain)
 
 
 @dataclass(frozen=True)

@@ -262,7 +262,6 @@ def fit_bags(
 
 
 def _warnings(folds: Sequence[Fold]) -> list[str]:
-    """Return warnings about the use of the model."""
     found = []
     if folds[0].skills:
         fitted, nominal = (

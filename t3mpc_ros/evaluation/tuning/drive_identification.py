@@ -18,7 +18,6 @@ The model, and the fit of dead time and lag, are those of
 over the period before, whichever fits better.
 """
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 import math
 from pathlib import Path
@@ -94,17 +93,14 @@ def identify_bag(folder: Path, options: ReportOptions) -> tuple[IdentifiedDrive,
     with open_bag(folder) as recording:
         run = load_run(recording, options)
         records = recording.metadata_records
-    composition = _recorded_composition(records)
-    return identify_drive(run), composition
-
-
-def _recorded_composition(records: Mapping[str, Mapping[str, str]]) -> str:
-    for title, table in records.items():
-        if title.rpartition('/')[2] in ('controller', 'composed'):
-            for key, value in table.items():
-                if key.rpartition('.')[2] == 'composition' and value in ('body', 'paper'):
-                    return value
-    return 'paper'
+    recorded = [
+        value
+        for title, table in records.items()
+        if title.rpartition('/')[2] in ('controller', 'composed')
+        for key, value in table.items()
+        if key.rpartition('.')[2] == 'composition' and value in ('body', 'paper')
+    ]
+    return identify_drive(run), next(iter(recorded), 'paper')
 
 
 def identify_drive(run: Run) -> IdentifiedDrive:
@@ -185,6 +181,7 @@ def _identified(
             )
         estimates.append(Estimate(max(value, MIN_LAG if i == LAG else 0.0), spread))
     power = float(((best.data.measured.T - best.data.measured.mean(axis=1)) ** 2).sum())
+    rate, whole = 1.0 / period, float(round(1.0 / period))
     return IdentifiedDrive(
         dead_time=estimates[DEAD_TIME],
         lag=estimates[LAG],
@@ -192,7 +189,7 @@ def _identified(
         mean_speeds=best.data.window > 0.0,
         explained=1.0 - best.cost / power,
         duration=duration,
-        rate=_rounded_rate(1.0 / period),
+        rate=whole if abs(rate - whole) <= 0.01 * rate else round(rate, 2),
         geometry=geometry,
     )
 
@@ -207,12 +204,6 @@ def _white_variance(errors: Array) -> Estimate:
     value = float((second**2).mean()) / 6.0
     relative = math.sqrt(2.0 * (1.0 + 8.0 / 9.0 + 1.0 / 18.0) / second.size)
     return Estimate(value, math.hypot(relative * value, dead_time_estimator.MIN_NOISE_VARIANCE))
-
-
-def _rounded_rate(rate: float) -> float:
-    """Return the rate, a whole number if it is within 1 % of one."""
-    whole = float(round(rate))
-    return whole if abs(rate - whole) <= 0.01 * rate else round(rate, 2)
 
 
 def fitting_parameters(

@@ -19,7 +19,7 @@ one, on which the baselines have the gyro.
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import BrokenExecutor, Executor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
 from functools import partial
 import math
@@ -187,19 +187,19 @@ def tune_methods(
                     resume=resume,
                     about=_about(method, drive, budget),
                 )
-            if math.isfinite(found.value):
-                first = found.history[0].value
-                store[method.name, drive] = TunedEntry(
-                    values=method.start[drive].with_values(found.values).to_dict(),
-                    tuned=method.space.names,
-                    objective=found.value,
-                    start_objective=first if math.isfinite(first) else None,
-                    budget=budget,
-                    version=VERSION,
-                )
-                store.save(path)
-            else:
+            if not math.isfinite(found.value):
                 failed.append(f'{method.name}, {drive}')
+                continue
+            first = found.history[0].value
+            store[method.name, drive] = TunedEntry(
+                values=method.start[drive].with_values(found.values).to_dict(),
+                tuned=method.space.names,
+                objective=found.value,
+                start_objective=first if math.isfinite(first) else None,
+                budget=budget,
+                version=VERSION,
+            )
+            store.save(path)
     if failed:
         raise RuntimeError(f'no settings gave a finite objective: {"; ".join(failed)}')
     return store
@@ -238,18 +238,14 @@ def _objective(
     start = method.start[drive]
 
     def objective(points: Sequence[Values]) -> list[float]:
-        objectives = [math.inf] * len(points)
         candidates: dict[int, Parameters] = {}
         for i, values in enumerate(points):
-            try:
+            # Some are in range each, but do not fit together: as bad as can be.
+            with suppress(ParameterError):
                 candidates[i] = start.with_values(values)
-            except ParameterError:
-                continue  # each in range, but they do not fit together: as bad as can be
-        if candidates:
-            found = evaluate(method, drive, list(candidates.values()))
-            for i, value in zip(candidates, found, strict=True):
-                objectives[i] = value
-        return objectives
+        found = evaluate(method, drive, [*candidates.values()]) if candidates else ()
+        objectives = dict(zip(candidates, found, strict=True))
+        return [objectives.get(i, math.inf) for i in range(len(points))]
 
     return objective
 
