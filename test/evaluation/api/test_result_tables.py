@@ -28,10 +28,10 @@ from t3mpc_ros.evaluation.reporting import html_page
 
 SHORT = {'plant': 'servo', 'duration': 4.0}
 MAKERS = {
-    'run': partial(t3.simulate, 'full'),
+    'run': partial(t3.simulate, 'feed-forward'),
     'comparison': partial(
         t3.compare,
-        ['full', 'PI + feed-forward'],
+        ['feed-forward', 'PI + feed-forward'],
         seeds=[1, 2],
         cases=['nominal', 'friction x3'],
         executor=1,
@@ -111,7 +111,7 @@ def test_the_latex_of_a_comparison_is_a_table_for_a_paper():
     """It had twelve columns, one of them with 130 characters, and no label."""
     comparison = made('comparison')
     text = comparison.to_latex('nominal', label='tab:mine', caption='Mine & others')
-    assert r'method & settled, rad/s & settled $-$ full & verdict \\' in text
+    assert r'method & settled, rad/s & settled $-$ feed-forward & verdict \\' in text
     assert text.splitlines()[2:4] == [r'  \caption{Mine \& others}', r'  \label{tab:mine}']
     chosen = comparison.to_latex('nominal', columns=['verdict', 'variation', 'verdict'])
     assert r'method & verdict & variation, rad/s$^3$ & verdict \\' in chosen
@@ -142,15 +142,20 @@ def test_the_metric_of_a_result_is_by_default_the_settled_one():
     comparison, swept = made('comparison'), made('sweep')
     for shown in (swept.table(), swept.to_latex()):
         assert 'settled, rad/s' in shown
-    assert comparison.values('full') == comparison.values('full', 'settled')
-    heading = comparison.values('full', 'with switches')
-    assert heading == comparison.values(t3.Controller('full'), 'overall')
+    assert comparison.values('feed-forward') == comparison.values('feed-forward', 'settled')
+    heading = comparison.values('feed-forward', 'with switches')
+    assert heading == comparison.values(t3.Controller('feed-forward'), 'overall')
     assert comparison.difference('PI + feed-forward').mean == pytest.approx(
-        np.subtract(comparison.values('PI + feed-forward'), comparison.values('full')).mean()
+        np.subtract(
+            comparison.values('PI + feed-forward'), comparison.values('feed-forward')
+        ).mean()
     )
     (axis,) = comparison.plot(case='friction x3').axes
     assert axis.get_xlabel() == 'settled / (rad/s)'
-    assert [each.get_text() for each in axis.get_yticklabels()] == ['full', 'PI + feed-forward']
+    assert [each.get_text() for each in axis.get_yticklabels()] == [
+        'feed-forward',
+        'PI + feed-forward',
+    ]
 
 
 def test_one_case_or_metric_is_chosen_by_its_name():
