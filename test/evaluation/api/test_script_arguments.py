@@ -31,7 +31,7 @@ import t3mpc_ros as t3
 
 pytestmark = pytest.mark.slow
 
-SHORT = {'plant': 'servo', 'duration': 2.0}
+SHORT = {'plant': 'servo', 'duration': 1.0}
 PI = 'PI + feed-forward'
 SUBMITTED = []
 
@@ -105,7 +105,7 @@ def seen(value):
     return value
 
 
-LINKS = t3.LinkFaults(0.2, (0.01, 0.03), 0.2, (0.0, 0.02), 0.2, 1.5)
+LINKS = t3.LinkFaults(0.2, (0.01, 0.03), 0.2, (0.0, 0.02), 0.2, 0.7)
 BLOCK = t3.FaultEvent(2.5, 'wheel_blocked', 'right', 0.5)
 SIMULATED = {
     'reference': wave, 'plant': 'torque', 'noise': 0.0, 'faults': LINKS, 'duration': 3.0,
@@ -220,7 +220,7 @@ TABLE = {
 }  # fmt: skip
 METHODS = {
     'rmse': (
-        lambda **given: run().rmse(**given), t3.RunResult.rmse, {'after': 0.5}, {'after': 1.0},
+        lambda **given: run().rmse(**given), t3.RunResult.rmse, {'after': 0.25}, {'after': 0.5},
     ),
     'plot of a run': (
         lambda **given: run().plot(**given), t3.RunResult.plot, {}, {'path': 'new.png'},
