@@ -425,7 +425,7 @@ def test_estimator_gets_every_measurement_once_in_order(robot, monkeypatch):
     assert_equal_records(record, expected)
 
 
-def test_method_and_estimator_know_how_many_measurements_were_lost(monkeypatch):
+def test_method_and_estimator_know_of_lost_measurements(monkeypatch):
     monkeypatch.setattr(drivers, 'VelocityActuation', NotingActuation)
     scenario = Scenario('servo', 'dropouts', 2, 10.0)
     record, method = noted(Noting, scenario)
