@@ -22,42 +22,112 @@ from support.training_runs import START, STEP, TrainingRun
 from t3mpc_ros.bag.model_file import load_model, read_model
 from t3mpc_ros.cli.bag import program_parser
 from t3mpc_ros.control.controller import Controller
+from t3mpc_ros.evaluation.drivers import MethodSpec
+from t3mpc_ros.evaluation.loop import run
+from t3mpc_ros.evaluation.methods import FULL, methods
+from t3mpc_ros.evaluation.proposed_method import ProposedController
+from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
 from t3mpc_ros.evaluation.training import trained_models
+from t3mpc_ros.evaluation.training.fit import (
+    TrainingData,
+    explained,
+    fit_coefficients,
+    fit_predictor,
+    periods,
+    skills,
+    stretches,
+)
 from t3mpc_ros.evaluation.training.trained_models import (
     fit_bags,
     mean_and_spread,
     spread_text,
+    training_data_of,
 )
 
 pytestmark = pytest.mark.slow
 
-SECONDS, DITHER = 18.0, 4.0
+SECONDS, LONG, DITHER = 18.0, 30.0, 4.0
 RECORDED = (21, 22, 23)
 
 
-def lossy_bag(seed, folder):
-    """Return a bag as a busy machine records it: late by turns, some commands not."""
-    tape = TrainingRun(seed, SECONDS, **{'predictive.dither': DITHER}).tape
+def lossy(tape, seed, seconds):
+    """Return the messages as a busy machine records them: late by turns, some commands not."""
     rng = np.random.default_rng(seed)
     kept = tape.where(lambda t, topic, i: topic != '/cmd_vel' or rng.random() > 0.002)
-    late = rng.exponential(5e5, round(SECONDS * 1e9 / STEP) + 2).astype(int).tolist()
+    late = rng.exponential(5e5, round(seconds * 1e9 / STEP) + 2).astype(int).tolist()
     kept.rows = [(row[0] + late[(row[0] - START) // STEP], *row[1:]) for row in kept.rows]
-    return kept.write(folder / f'run{seed}' / 'bag')
+    return kept
+
+
+def recorded_bags(folder, seconds, seeds=RECORDED):
+    loops = {seed: TrainingRun(seed, seconds, **{'predictive.dither': DITHER}) for seed in seeds}
+    return [
+        lossy(loop.tape, seed, seconds).write(folder / f'run{seed}' / 'bag')
+        for seed, loop in loops.items()
+    ]
 
 
 @pytest.fixture(scope='module')
-def bag(tmp_path_factory):
-    return lossy_bag(RECORDED[0], tmp_path_factory.mktemp('one'))
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp('recorded')
 
 
 @pytest.fixture(scope='module')
-def bags(bag, tmp_path_factory):
-    return [bag, *(lossy_bag(seed, tmp_path_factory.mktemp('more')) for seed in RECORDED[1:])]
+def bag(folder):
+    return recorded_bags(folder, SECONDS, RECORDED[:1])[0]
+
+
+@pytest.fixture(scope='module')
+def bags(bag, folder):
+    return [bag, *recorded_bags(folder, SECONDS, RECORDED[1:])]
 
 
 @pytest.fixture(scope='module')
 def model(bags):
     return fit_bags(bags)
+
+
+def simulated_run(seed):
+    parameters = methods('velocity')[FULL].parameters.with_values({'predictive.dither': DITHER})
+    scenario = Scenario('servo', 'nominal', seed, LONG)
+    return training_data_of(
+        run(scenario, MethodSpec('full', ProposedController, parameters)), parameters
+    )
+
+
+@pytest.mark.long
+def test_three_recorded_bags_train_as_well_as_three_simulations(tmp_path):
+    """The same training data, the runs once rebuilt from lossy bags and once known exactly.
+
+    Judged on simulated runs that neither has seen: skill within 5 %, and as much explained.
+    """
+    model = fit_bags(recorded_bags(tmp_path, LONG))
+    parameters = model.parameters
+    predictive = parameters.predictive
+    lab = TrainingData.joined([simulated_run(seed) for seed in PRETRAINING_SEEDS])
+    exact = fit_predictor(parameters, *periods(lab, predictive, parameters.rate)).weights
+    prefix = 'predictive.'
+    recorded = {
+        name.removeprefix(prefix): values
+        for name, values in model.learnt.items()
+        if name.startswith(prefix)
+    }
+    nominal = Controller(parameters).law.predictive.get_weights()
+    coefficients = fit_coefficients(parameters, lab), model.learnt['fuzzy.coefficients']
+    found, shares = [], []
+    for seed in HELD_OUT_SEEDS[:3]:
+        judge = simulated_run(seed)
+        parts = stretches(*periods(judge, predictive, parameters.rate))
+        found.append([skills(predictive, 0.05, w, parts) for w in (exact, recorded, nominal)])
+        shares.append([explained(parameters, each, judge) for each in coefficients])
+    of_lab, of_bags, of_nominal = np.mean(found, axis=0)
+    assert of_lab.min() > 0.5
+    assert np.all(of_bags > 0.95 * of_lab)
+    assert np.all(of_bags < 1.05 * of_lab)
+    assert np.all(of_nominal < 0.3 * of_lab)
+    lab_share, bag_share = np.mean(shares, axis=0)
+    assert lab_share.min() > 0.4
+    assert np.all(bag_share > 0.9 * lab_share)
 
 
 def program(*arguments):
