@@ -18,7 +18,6 @@ twin, and the values of its sensors are applied to the pins of the robot board.
 """
 
 from contextlib import contextmanager
-from ctypes import c_uint8, c_uint64
 from functools import cache
 import math
 import subprocess
@@ -195,9 +194,8 @@ class AvrEmulator:
 
     def take_console(self):
         """Return the bytes that the console has sent, with the current time."""
-        data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
-        count = self.boards.call('usb_read', data, at, 4096)
-        return [(self.now_ns, bytes(data[:count]))] if count else []
+        data, _ = self.boards.received('usb_read')
+        return [(self.now_ns, data)] if data else []
 
     def run_to(self, now_ns):
         self.run_until(now_ns)
@@ -226,12 +224,10 @@ class AvrEmulator:
 
     def _read(self):
         """Forward whole frames, like the emulator."""
-        for byte in self.boards.read_bytes():
-            self._piece += byte
-            if byte == b'\0':
-                piece, self._piece = self._piece, b''
-                if self.now_ns >= self._dongle_ready_ns:
-                    self._to_host.send(piece)
+        *pieces, self._piece = (self._piece + self.boards.received()[0]).split(b'\0')
+        for piece in pieces:
+            if self.now_ns >= self._dongle_ready_ns:
+                self._to_host.send(piece + b'\0')
 
     def _deliver(self, data):
         if self.port_open:

@@ -198,22 +198,18 @@ class Boards:
     def write(self, data: bytes) -> None:
         self.call('write', data, len(data))
 
+    def received(self, line: str = 'read') -> tuple[bytes, list[float]]:
+        """Return the received bytes of the dongle or, ``usb_read``, of the console; times (us)."""
+        data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
+        count = self.call(line, data, at, 4096)
+        return bytes(data[:count]), [at[i] / CYCLES_PER_US for i in range(count)]
+
     def read(self) -> list[tuple[bytes, float]]:
         """Return the received frames, each with the time (us) of its last byte."""
-        data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
-        count = self.call('read', data, at, 4096)
         frames = []
-        for i in range(count):
-            frames += [
-                (f, at[i] / CYCLES_PER_US) for f in self.splitter.feed(bytes(data[i : i + 1]))
-            ]
+        for byte, time_us in zip(*self.received(), strict=True):
+            frames += [(frame, time_us) for frame in self.splitter.feed(bytes([byte]))]
         return frames
-
-    def read_bytes(self) -> list[bytes]:
-        """Return the received bytes, one by one."""
-        data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
-        count = self.call('read', data, at, 4096)
-        return [bytes(data[i : i + 1]) for i in range(count)]
 
     def wait(self, limit_us: float = 20000.0) -> tuple[bytes, float] | None:
         """Return the next frame with the time of its last byte; None after the limit."""
@@ -335,9 +331,8 @@ def booted(seed: int = 1, erased: bool = False) -> Iterator[Boards]:
 
 def console_output(boards: Boards) -> list[Any]:
     """Return the frames that the USB console of the robot has sent."""
-    data, at = (c_uint8 * 4096)(), (c_uint64 * 4096)()
-    count = boards.call('usb_read', data, at, 4096)
-    return [codec.decode_from_board(frame) for frame in FrameDecoder().feed(bytes(data[:count]))]
+    data, _ = boards.received('usb_read')
+    return [codec.decode_from_board(frame) for frame in FrameDecoder().feed(data)]
 
 
 def request(boards: Boards, frame: Any, seconds: float = 0.005) -> list[Any]:
