@@ -185,7 +185,7 @@ class Kernel(Generic[P, R]):
 
     def __reduce__(self) -> str:
         """Return how it is copied and pickled: by its name, without the code."""
-        return self.__name__  # type: ignore[attr-defined]
+        return self.__name__  # type: ignore[attr-defined, no-any-return]
 
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:

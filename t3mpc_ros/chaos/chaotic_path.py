@@ -172,7 +172,8 @@ class PortraitPath:
     def _evened(self, states: Array) -> Array:
         """Return the distribution functions at states of shape (n, 4)."""
         scaled = (states[:, None, :] - self._centres) / self._widths
-        return 0.5 + 0.5 * np.tanh(0.5 * scaled).mean(axis=1)
+        found: Array = 0.5 + 0.5 * np.tanh(0.5 * scaled).mean(axis=1)
+        return found
 
     def _next_points(self) -> Array:
         """Return evenly spaced points along the next piece of the portraits."""
@@ -196,7 +197,8 @@ class PortraitPath:
         if mode.blend < 1.0:
             before = _mirror(values[self._pair(mode.previous)], self._mirrored_before)
             place = mode.blend * place + (1.0 - mode.blend) * before
-        return self.arena.from_unit_square(place[None])[0]
+        found: Array = self.arena.from_unit_square(place[None])[0]
+        return found
 
     def _pair(self, mode: int) -> list[int]:
         return [number - 1 for number in self._pairs[mode]]

@@ -255,11 +255,13 @@ class PathPlan:
     def _freshness(self, points: Array) -> Array:
         """Return the cost of places (m): a way leads over floor that was not visited for long."""
         last = self._visited[tuple(self._cells(points))]
-        return FRESH_COST * last / max(float(self._visited.max()), 1e-9)
+        found: Array = FRESH_COST * last / max(float(self._visited.max()), 1e-9)
+        return found
 
     def _cells(self, points: Array) -> NDArray[np.int64]:
         cells = np.floor((points - self._low) / CELL).astype(np.int64)
-        return np.clip(cells, 0, np.array(self._visited.shape) - 1).T
+        found: NDArray[np.int64] = np.clip(cells, 0, np.array(self._visited.shape) - 1).T
+        return found
 
     def forget(self, count: int) -> None:
         """Remove the first points, which have been passed."""
@@ -446,7 +448,8 @@ class PathPlan:
         return True
 
     def _direction(self) -> Array:
-        return self.points[-1] - self.points[max(len(self.points) - BACK, 0)]
+        found: Array = self.points[-1] - self.points[max(len(self.points) - BACK, 0)]
+        return found
 
     def _append_smoothly(
         self,
@@ -507,7 +510,8 @@ def keeps_off(distances: Array, least: float) -> NDArray[np.bool_]:
 def alignments(vectors: Array, direction: Array) -> Array:
     """Return the cosines of the angles between vectors, shape (n, 2), and a direction."""
     sizes = np.maximum(np.hypot(*vectors.T) * math.hypot(*direction), 1e-9)
-    return vectors @ direction / sizes
+    found: Array = vectors @ direction / sizes
+    return found
 
 
 class _Look:

@@ -240,7 +240,8 @@ class SmoothedPath:
         share = (share * share * (3.0 - 2.0 * share))[:, None]
         rows = np.arange(len(given))
         blend = (1.0 - share) * curves[lower, rows] + share * curves[lower + 1, rows]
-        return blend[MARGIN:-MARGIN]
+        found: Array = blend[MARGIN:-MARGIN]
+        return found
 
 
 def local_times(curves: Array, limits: MotionLimits, geometry: WheelGeometry) -> Array:
@@ -274,10 +275,11 @@ def join_curve(begin: PathEnd, end: PathEnd) -> Array:
         left = np.array([-ahead[1], ahead[0]])
         conditions += [np.array(pose[:2]), chord * ahead, chord * chord * bend * left]
     share = np.linspace(0.0, 1.0, max(2, math.ceil(chord / SPACING)) + 1)[1:, None]
-    return sum(
+    curve: Array = sum(
         np.polynomial.polynomial.polyval(share, each) * condition
         for each, condition in zip(_HERMITE, conditions, strict=True)
     )
+    return curve
 
 
 _HERMITE = (
@@ -306,7 +308,8 @@ def _end_at(points: Array, index: int) -> PathEnd:
 def _window(width: float) -> Array:
     reach = math.ceil(REACH * width / SPACING)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) * SPACING / width) ** 2)
-    return weights / weights.sum()
+    found: Array = weights / weights.sum()
+    return found
 
 
 def _convolved(points: Array, window: Array) -> Array:

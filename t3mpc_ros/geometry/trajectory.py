@@ -156,7 +156,8 @@ class ReferenceTrajectory:
 @kernel
 def is_jump(samples: Array, index: int, jump: Array) -> bool:
     """Return whether the slope up to a sample is that of a jump."""
-    return abs(samples[index, 2]) > jump[0] or abs(samples[index, 3]) > jump[1]
+    beyond: bool = abs(samples[index, 2]) > jump[0] or abs(samples[index, 3]) > jump[1]
+    return beyond
 
 
 @kernel

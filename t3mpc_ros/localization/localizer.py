@@ -508,7 +508,8 @@ class Localizer:
         assert self.result is not None
         found = np.empty((beams.reading.size, 3))
         explain_readings(np.array(self.result.pose), self._field, beams, self._model, found)
-        return found[found[:, 0] != 0.0]
+        fitting: Array = found[found[:, 0] != 0.0]
+        return fitting
 
 
 def followed(share: float, fits: Array) -> float:

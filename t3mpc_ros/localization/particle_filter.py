@@ -299,7 +299,8 @@ class ParticleFilter:
         self._weigh(poses, logarithms, self._field, beams, self._search_model)
         cumulative = np.cumsum(np.exp(logarithms - logarithms.max()))
         comb = cumulative[-1] * (np.arange(count) + self._generator.random()) / count
-        return poses[np.minimum(np.searchsorted(cumulative, comb), len(poses) - 1)]
+        found: Array = poses[np.minimum(np.searchsorted(cumulative, comb), len(poses) - 1)]
+        return found
 
     def _bins(self, poses: Array) -> NDArray[np.int64]:
         """Return the number of the bin of each pose, shape (n,), from 0 on."""

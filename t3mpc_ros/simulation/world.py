@@ -324,7 +324,8 @@ def _without(rows: Array, others: Array) -> Array:
     """Return the rows that are none of the others; the same array where there are no others."""
     if not len(others):
         return rows
-    return rows[~(rows[:, None, :] == others[None, :, :]).all(axis=2).any(axis=1)]
+    found: Array = rows[~(rows[:, None, :] == others[None, :, :]).all(axis=2).any(axis=1)]
+    return found
 
 
 def _wall(read: dict[str, Any], where: str) -> Iterator[tuple[float, ...]]:
