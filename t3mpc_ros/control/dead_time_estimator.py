@@ -116,6 +116,13 @@ MIN_NOISE_VARIANCE = 0.01
 NOISE_MAX_COUNT = 4000.0
 """Number of measured speeds in the estimate of the variance of the innovation."""
 
+WHITE_MEDIAN = 0.954
+"""Median of the change between two samples of white noise, in its standard deviation."""
+CHANGE_STEP = 0.01  # relative step by which the median of the changes follows each of them
+LOUD = 2.0
+"""Factor of the variance of the innovation above which noise, by the change of the error from one
+measurement to the next, is larger than assumed: a wrong dead time or load changes it slowly."""
+
 EVIDENCE = np.dtype(
     (
         np.record,
@@ -138,6 +145,8 @@ ESTIMATE = np.dtype(
             ('configured', 'f8'),  # s
             ('noise_ratio', 'f8'),  # variance of the innovation / noise variance
             ('noise_count', 'f8'),  # weight of that ratio, in measured speeds
+            ('change', 'f8'),  # median change of the error between two measurements, rad/s
+            ('last_error', 'f8', 2),  # of the dead time in question, rad/s
             ('rate', 'f8'),  # change of the speeds, held for a while, rad/s²
             ('disturbed', '?'),
             ('quiet_time', 'f8'),  # without evidence of a disturbance, s
@@ -212,6 +221,7 @@ class DeadTimeEstimator:
         estimate.dead_time, estimate.deviation = prior, PRIOR_DEVIATION
         estimate.configured = prior
         estimate.noise_ratio, estimate.noise_count = NOISE_PRIOR_RATIO, NOISE_PRIOR_COUNT
+        estimate.change = WHITE_MEDIAN * math.sqrt(variance)
         grid = GRID_STEP * np.arange(GRID_SIZE)
         estimate.accepted.costs = NOISE_PRIOR_RATIO * ((grid - prior) / PRIOR_DEVIATION) ** 2
         estimate.covariance = FRICTION_DEVIATION**2, 0.0, FRICTION_DEVIATION**2
@@ -259,7 +269,7 @@ class DeadTimeEstimator:
         Data that is not accepted yet is discarded, and a disturbance has ended.
         """
         for name in (
-            *('offset', 'error', 'window', 'block', 'pending'),
+            *('offset', 'error', 'last_error', 'window', 'block', 'pending'),
             *('rate', 'disturbed', 'quiet_time', 'block_disturbed'),
         ):
             self._state[name] = 0
@@ -407,8 +417,16 @@ def add_evidence(estimate: Any, noise_variance: float, dt: float) -> None:
     clip = CLIP * estimate.noise_ratio
     nis = 0.0
     for i in range(2):
-        newer, older = errors[i, g], errors[i, g + 1]
-        nis += min((newer + weight * (older - newer)) ** 2 / innovation_variance, clip)
+        error = errors[i, g] + weight * (errors[i, g + 1] - errors[i, g])
+        nis += min(error**2 / innovation_variance, clip)
+        larger = abs(error - estimate.last_error[i]) > estimate.change
+        estimate.change *= 1.0 + CHANGE_STEP if larger else 1.0 / (1.0 + CHANGE_STEP)
+        estimate.last_error[i] = error
+    noise = (estimate.change / WHITE_MEDIAN) ** 2 / noise_variance
+    if noise > LOUD * estimate.noise_ratio:
+        # All blocks would be disturbed, and the few others make an estimate that seems certain.
+        estimate.noise_ratio, estimate.noise_count = noise, NOISE_PRIOR_COUNT
+        set_estimate(estimate)
     scale(estimate.window, math.exp(-dt / WINDOW_TIME))
     in_window, in_block = estimate.window.costs, estimate.block.costs
     for g in range(GRID_SIZE):

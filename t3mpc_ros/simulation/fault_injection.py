@@ -123,7 +123,10 @@ class ScheduleError(ScriptError):
 class FaultEvent:
     """One entry of a schedule: a value of a fault for a time interval.
 
-    ScheduleError: the fault does not exist, or value or time is out of range.
+    Raises
+    ------
+    ScheduleError
+        The fault does not exist, or value or time is out of range.
     """
 
     at: float
@@ -167,7 +170,14 @@ class FaultSchedule:
     An event is active from its start up to, but not including, its end. Of several events of one
     fault the one with the latest start applies; when it ends, the next one that is still active
     applies, and finally the dynamic value. Of two with the same start the later in the list
-    applies. ``name`` is for messages.
+    applies.
+
+    Parameters
+    ----------
+    events
+        In any order.
+    name
+        Name of the schedule, for messages.
     """
 
     def __init__(self, events: Iterable[FaultEvent] = (), name: str = '') -> None:
@@ -188,7 +198,12 @@ class FaultSchedule:
         """Return the faults that are active ``elapsed`` seconds after the start of the robot.
 
         Faults without an active event are as in ``dynamic``. The result depends on the arguments
-        alone, not on earlier calls. ValueError: ``elapsed`` is not finite.
+        alone, not on earlier calls.
+
+        Raises
+        ------
+        ValueError
+            ``elapsed`` is not a number, or infinite.
         """
         if not self._since <= elapsed < self._until:
             self._evaluate(elapsed)

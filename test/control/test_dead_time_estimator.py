@@ -23,6 +23,7 @@ from support.long_tests import few_of
 from t3mpc_ros.control.dead_time_estimator import (
     IDENTIFIED_DEVIATION,
     MAX_DEAD_TIME,
+    MIN_NOISE_VARIANCE,
     PRIOR_DEVIATION,
     USED_DIFFERENCE,
     DeadTimeEstimator,
@@ -199,6 +200,21 @@ def test_constant_commands_identify_nothing(speed):
     assert not estimator.estimate.disturbed
     assert estimator.standard_deviation > 0.6 * PRIOR_DEVIATION
     assert abs(estimator.dead_time - 0.01) < 1e-9
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize('assumed, variance', [(0.0, 0.04), (0.04, 0.2)])
+def test_more_noise_than_assumed_is_learnt(assumed, variance):
+    """All was disturbed then, but for some blocks whose estimate was adopted as certain."""
+    others = []
+    for seed in range(6):
+        drive = simulate(smooth_commands(30.0, seed, 2.0), 0.01, seed, noise_variance=variance)
+        estimator, record = run(drive, noise_variance=assumed)
+        learnt = estimator.estimate.noise_ratio * max(assumed, MIN_NOISE_VARIANCE)
+        assert learnt == pytest.approx(variance, rel=0.15)
+        assert not record[at(10.0) :, 2].any()
+        others.append(np.mean(record[:, 3] != 0.01))
+    assert np.mean(others) < 0.1
 
 
 @pytest.mark.compiled

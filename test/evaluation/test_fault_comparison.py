@@ -65,23 +65,33 @@ def test_commands_that_are_lost_are_named(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    'name',
+    'name, bound',
     few_of(
         [
-            'no twist in the odometry',  # its errors were five times those of an open loop
-            'twist of the odometry + 10 %',
-            'rate set to 200, odometry has 100 Hz',
-            'shaper for another robot',
-            'lag 20 ms assumed, none',
-            'noise 0.04 (rad/s)², none assumed',
-        ]
+            ('no twist in the odometry', 1.3),  # its errors were five times those of an open loop
+            ('noise 0.04 (rad/s)², none assumed', 1.3),
+            ('twist of the odometry + 10 %', 1.3),
+            ('rate set to 200, odometry has 100 Hz', 1.3),
+            ('shaper for another robot', 1.3),
+            ('lag 20 ms assumed, none', 1.5),
+        ],
+        2,
     ),
 )
-def test_contradicted_assumptions_cost_little(name, monkeypatch):
+def test_contradicted_assumptions_cost_little(name, bound, monkeypatch):
     """They cost up to four times the settled error without them."""
     monkeypatch.setattr(fault_comparison, 'DURATION', 16.0)
     wrong, exact = (run_job(Job(each, FULL, 2003))['settled'] for each in (name, 'none'))
-    assert wrong < 1.25 * exact
+    assert wrong < bound * exact
+
+
+@pytest.mark.long
+def test_more_noise_than_assumed_costs_little():
+    """An estimate from the few blocks that fitted cost up to six times the settled error."""
+    name = 'noise 0.04 (rad/s)², none assumed'
+    for seed in (2001, 2004):
+        wrong, exact = (run_job(Job(each, FULL, seed))['settled'] for each in (name, 'none'))
+        assert wrong < 1.15 * exact
 
 
 @pytest.mark.parametrize(

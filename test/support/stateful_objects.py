@@ -629,7 +629,14 @@ FRESH = {
                 kept=below(
                     '._state',
                     (
-                        *('.dead_time', '.deviation', '.noise_ratio', '.noise_count', '.support'),
+                        *(
+                            '.dead_time',
+                            '.deviation',
+                            '.noise_ratio',
+                            '.noise_count',
+                            '.support',
+                            '.change',
+                        ),
                         *('.friction', '.covariance', '.accepted', '.recent', '.rejected'),
                     ),
                 ),
