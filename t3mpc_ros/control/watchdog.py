@@ -332,12 +332,11 @@ class TwistUnits:
         """Twist and change of the pose in a message in which they contradict each other."""
         self._count = 0
 
-    def update(self, last: State, new: State) -> tuple[float, float, float]:
-        """Compare the twist of a message with the motion since the last one; return that."""
+    def update(self, last: State, new: State, motion: tuple[float, float, float]) -> None:
+        """Compare the twist of a message with the motion since the last one."""
         # That of a camera which is slower than the wheels stays the same for a while.
         times = FAR_UNCHANGED if new.pose == last.pose else 1.0
         elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
-        motion = motion_between(last.pose, new.pose)
         by_pose = motion[0] / elapsed, motion[2] / elapsed
         if any(
             abs(twist) > FAR * abs(rate) + times * beyond
@@ -351,7 +350,6 @@ class TwistUnits:
         elif any(abs(rate) > least for rate, least in zip(by_pose, UNITS_MOTION, strict=True)):
             self._count = max(self._count - 1, 0)
         self.wrong = self._count >= UNITS_COUNT or (self.wrong and self._count > 0)
-        return motion
 
 
 class OdometryTwist:
@@ -399,12 +397,14 @@ class OdometryTwist:
         pose, last, self._last = odometry.pose, self._last, odometry
         if last is None or restart or odometry.stamp_ns <= last.stamp_ns:
             last = None
+        motion = None if last is None else motion_between(last.pose, pose)
         if odometry.twist != (0.0, 0.0):
             self.missing, self._anchor, self.known = False, None, True
-            if last is None:
+            if last is None or motion is None:
                 self._factor.interrupt()
             else:
-                self._factor.update(last, odometry, self._units.update(last, odometry))
+                self._units.update(last, odometry, motion)
+                self._factor.update(last, odometry, motion)
         else:
             if last is None or self._anchor is None:
                 self._anchor = pose
@@ -417,10 +417,10 @@ class OdometryTwist:
             if self._anchor is not None:
                 self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
         if self.missing or self._units.wrong:
-            if last is None:  # across a restart the pose says nothing of the speed
+            if last is None or motion is None:  # the pose says nothing of the speed: a restart
                 return odometry._replace(twist=STANDSTILL)
             elapsed = (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
-            ahead, _, turn = motion_between(last.pose, pose)
+            ahead, _, turn = motion
             return odometry._replace(twist=BodyTwist(ahead / elapsed, turn / elapsed))
         factor = self._factor.value
         if factor == 1.0:

@@ -296,7 +296,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         if stamp and stamp in self._path_stamps:
             return  # both subscriptions receive it
         self._path_stamps.append(stamp)
-        with self._input('path'):
+        with self._input('path', PathError, struct.error):
             points = self._own_points(
                 conversions.frame_from_serialized(message), conversions.points_from_path(message)
             )
@@ -309,12 +309,12 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
                 self._source.replace(points)
 
     @contextmanager
-    def _input(self, topic: str) -> Iterator[None]:
-        """Take a message in the ``with`` block, which raises ValueError for one to refuse."""
+    def _input(self, topic: str, *refusals: type[Exception]) -> Iterator[None]:
+        """Take a message in the ``with`` block, which raises a refusal for one to ignore."""
         try:
             yield
             self._refused.pop(topic, None)
-        except (ValueError, struct.error) as error:  # a PathError among them
+        except refusals as error:
             self._rejected += 1
             self._refused[topic] = self.steady_ns(), f'the last {topic} is ignored: {error}'
             self.get_logger().warning(f'{topic} is ignored: {error}')
@@ -339,15 +339,16 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
         raise PathError(f'its frame is {frame}, and no transform from it to {own} is known')
 
     def _on_map(self, message: OccupancyGrid, info: dict[str, Any]) -> None:
-        with self._input('keep_out/map'):
+        grid = None
+        with self._input('keep_out/map', ValueError):
             grid = conversions.grid_from_occupancy(message)
-            if self._planned is not None:
-                self._mapped = True
-                self._planned.set_map(grid)
+        if grid is not None and self._planned is not None:
+            self._mapped = True
+            self._planned.set_map(grid)
 
     def _on_goal(self, message: PoseStamped, info: dict[str, Any]) -> None:
         place = np.array([[message.pose.position.x, message.pose.position.y]])
-        with self._input('goal_pose'):
+        with self._input('goal_pose', PathError):
             x, y = self._own_points(message.header.frame_id, place)[0].tolist()
             if self._planned is None:
                 raise PathError('no odom yet: send it again when the robot has reported its pose')
@@ -356,7 +357,7 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             self._planned.go_to((x, y))
 
     def _on_suspected(self, message: PoseArray, info: dict[str, Any]) -> None:
-        with self._input('map_changes/suspected'):
+        with self._input('map_changes/suspected', PathError):
             points = conversions.points_from_poses(message.poses)
             places = self._own_points(message.header.frame_id, points)
             if self._planned is not None:

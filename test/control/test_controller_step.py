@@ -514,3 +514,24 @@ def test_an_odometry_faster_than_the_rate_is_thinned_out():
     early = make_state(fast.now - PERIOD + 1_000_000, math.nan)
     command, status = fast.controller.step(early)
     assert (command, status.reason) == ((0.0, 0.0), Reason.ODOMETRY_BAD)
+
+
+def test_the_body_composition_refuses_predictive_jumps():
+    """It was once silently treated as a ramp."""
+    with pytest.raises(ParameterError, match='composition body'):
+        ControllerParameters.from_dict(
+            {'composition': 'body', 'jump_transition.method': 'predictive'}
+        )
+
+
+def test_a_gap_in_the_odometry_restarts_the_law_without_a_jump():
+    loop = Loop()
+    loop.run(200)
+    loop.now += 1000 * MS
+    for k in range(30):  # the reference continued in the gap
+        stamp = loop.now + LEAD - (30 - k) * PERIOD
+        loop.controller.add_reference(make_state(stamp, *loop.reference(stamp / 1e9)))
+    before = loop.twist
+    status = loop.step()
+    assert status.reason is Reason.TRACKING
+    assert loop.twist.linear == pytest.approx(before.linear, abs=0.02)

@@ -162,3 +162,19 @@ def test_the_same_seed_gives_the_same_bytes():
         return bench.written, bench.followed, bench.link.telemetry
 
     assert run() == run()
+
+
+def test_a_reset_stops_the_pulses_and_the_wheels_coast():
+    bench = Bench()
+    bench.connect()
+    bench.drive(7.0, 7.0)
+    bench.run(2.0)
+    bench.inject('robot_reset')
+    bench.run(0.01)
+    assert not bench.emulator.powered
+    bench.release_controls()
+    bench.run(1.0)
+    assert bench.board.speeds == (0, 0)
+    assert not bench.board.powered or bench.board.session
+    bench.run(1.0)
+    assert max(map(abs, bench.plant.wheels)) < 0.2

@@ -64,25 +64,30 @@ def test_commands_that_are_lost_are_named(monkeypatch):
     assert run_job(Job('none', FULL, 2001))['said'] == []
 
 
+LATE = 'rate set to 200, odometry has 100 Hz', 'lag 20 ms assumed, none'
+"""Found too late on the gentle reference of this seed: 1.26 and 1.41 times the error."""
+
+
 @pytest.mark.parametrize(
-    'name, bound',
+    'name',
     few_of(
         [
-            ('no twist in the odometry', 1.3),  # its errors were five times those of an open loop
-            ('noise 0.04 (rad/s)², none assumed', 1.3),
-            ('twist of the odometry + 10 %', 1.3),
-            ('rate set to 200, odometry has 100 Hz', 1.3),
-            ('shaper for another robot', 1.3),
-            ('lag 20 ms assumed, none', 1.5),
+            'no twist in the odometry',  # its errors were five times those of an open loop
+            'noise 0.04 (rad/s)², none assumed',
+            'twist of the odometry + 10 %',
+            'shaper for another robot',
+            *LATE,
         ],
         2,
     ),
 )
-def test_contradicted_assumptions_cost_little(name, bound, monkeypatch):
+def test_contradicted_assumptions_cost_little(name, monkeypatch, request):
     """They cost up to four times the settled error without them."""
+    if name in LATE:
+        request.applymarker(pytest.mark.xfail(strict=True))
     monkeypatch.setattr(fault_comparison, 'DURATION', 16.0)
     wrong, exact = (run_job(Job(each, FULL, 2003))['settled'] for each in (name, 'none'))
-    assert wrong < bound * exact
+    assert wrong < 1.25 * exact
 
 
 @pytest.mark.long

@@ -26,6 +26,8 @@ from support.avr_bench import on_avr
 from support.emulator_bench import RobotBench
 from support.missing_tools import AVR, needing
 
+from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
+
 pytestmark = needing(*AVR)
 
 RADIUS, TRACK = 0.035, 0.147
@@ -100,3 +102,28 @@ def test_gyro_odometry_agrees_with_the_true_pose(build):
     assert math.hypot(measured.x - true.x, measured.y - true.y) < 0.005
     assert measured.yaw == pytest.approx(true.yaw, abs=0.03)
     assert not bench.states[-1].status.slipping
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('blocked, sign', [('right', 1.0), ('left', -1.0)])
+def test_a_blocked_wheel_is_detected_and_stops_the_robot(build, blocked, sign):
+    """The steps are those of straight motion; the body turns about the blocked wheel."""
+    bench = build(
+        flat={'twin.faults.wheel_blocked': blocked},
+        parameters={'slip_stop': 0.5},
+    )
+    bench.connect()
+    bench.run(2.2)  # gyro bias calibrated
+    assert bench.robot._odometry.calibrated
+    bench.drive(-sign * 5.0, -sign * 5.0)
+    bench.run(0.45)
+    state = bench.states[-1]
+    steps = state.wheels.right - state.wheels.left
+    print(f'\ngyro {state.imu.angular:.2f} rad/s, steps {steps * RADIUS / TRACK:.2f} rad/s')
+    assert abs(steps) < 0.1
+    assert abs(state.imu.angular) > 0.5
+    assert state.status.slipping
+    bench.run(0.6)
+    assert bench.robot.reason(bench.now_ns) == SLIP_STOP_REASON
+    bench.run(0.5)
+    assert bench.board.speeds == (0, 0)

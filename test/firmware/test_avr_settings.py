@@ -25,11 +25,13 @@ from support.avr_boards import (
     SETTINGS_ADDRESSES,
     Boards,
     booted,
+    build,
     drive,
     request,
     settings_record,
 )
 from support.firmware_core import run_make
+from support.long_tests import few_of
 from support.missing_tools import AVR, needing
 
 from t3mpc_ros.radio.protocol import frames
@@ -144,3 +146,42 @@ def test_both_boards_report_their_build(boards: Boards) -> None:
     assert isinstance(reply, frames.Pong)
     assert {info.build, pong.build, reply.build} == {int(number, 16)}
     assert (reply.channel, reply.address) == (82, b'T3MPC')
+
+
+@pytest.mark.parametrize(
+    'cuts', few_of([[0.002, WRITING], [0.001, 0.002, 0.003, 0.005, 0.008, 0.012, WRITING]])
+)
+def test_power_loss_during_a_write_leaves_no_mixture(cuts: list[float]) -> None:
+    """Power fails at several times: the old settings or the new ones, in both places."""
+    build()
+    seen = set()
+    for cut in cuts:
+        boards = Boards()
+        boards.start()
+        store(boards, NEW, cut)
+        boards.call('reset', ROBOT)
+        boards.run(0.15)
+        state, found = read(boards)
+        assert state in (frames.SETTINGS_GOOD, frames.SETTINGS_ONE_COPY)
+        assert found in (RobotSettings(), NEW)
+        seen.add(found)
+        tune(boards, found.channel, found.address)
+        assert boards.hello().session == boards.session
+        boards.run(WRITING)
+        copy = copy_of(found)
+        assert [boards.eeprom(at, len(copy)) for at in SETTINGS_ADDRESSES] == [copy, copy]
+        boards.close()
+    assert len(seen) == 2
+
+
+def test_damaged_settings_lock_the_robot(boards: Boards) -> None:
+    """It once fell back to 16 microsteps: double speed with jumpers for 8."""
+    for at in SETTINGS_ADDRESSES:
+        damaged = bytearray(settings_record(82, 8))
+        damaged[2] ^= 0x18
+        boards.store(at, bytes(damaged))
+    boards.run(0.13)
+    assert boards.hello().session == 0
+    assert drive(boards, 0.3, 4000, 4000).status == frames.StatusFlag.NO_SESSION
+    assert boards.pulses() == (0, 0)
+    assert read_info(boards).settings == frames.SETTINGS_DAMAGED

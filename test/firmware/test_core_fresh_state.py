@@ -251,3 +251,20 @@ def test_stored_records_are_in_effect_as_after_a_boot(library, layout, what):
         each.run(200_000)
     copies = 'robot.settings.copies', 'robot.calibration.copies'
     assert not unlike(used, new, layout, (*TIMES, *copies, 'robot.reset_cause', 'robot.counters'))
+
+
+def test_a_released_emergency_stop_leaves_a_robot_at_rest(library, layout):
+    """Released, the robot is as after any command to stand, and the command before is gone."""
+    used, new = core.Robot(library), core.Robot(library)
+    for each in (used, new):
+        each.run(1000)
+        each.hello()
+        each.drive(4000, 4000, 300_000)
+    used.send(used.command(4000, 4000, flags=core.ESTOP))
+    used.run(1_000_000)
+    new.send(new.command(0, 0, flags=0))
+    new.run(1_000_000)
+    for each in (used, new):
+        each.send(each.command(0, 0, flags=core.CLEAR))
+        each.run(100_000)
+    assert not unlike(used, new, layout, ('robot.steps', 'robot.rest_us', 'console'))

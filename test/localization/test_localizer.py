@@ -151,8 +151,8 @@ def rms(values):
 @pytest.mark.compiled
 def test_a_known_start_is_tracked_while_the_odometry_drifts():
     localizer, drive = make_localizer(), Drive()
-    away, turned = rms(follow(localizer, drive, 30.0)[40:])
-    assert abs(wrap_angle(drive.odometry.yaw + 0.5 * math.pi - drive.truth.yaw)) > 0.1
+    away, turned = rms(follow(localizer, drive, 60.0)[40:])
+    assert abs(wrap_angle(drive.odometry.yaw + 0.5 * math.pi - drive.truth.yaw)) > 0.2
     assert away < 0.025
     assert turned < math.radians(1.7)
     assert localizer.state is Localization.LOCALIZED

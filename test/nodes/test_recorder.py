@@ -25,12 +25,15 @@ from nav_msgs.msg import Odometry
 import pytest
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Int32, Int64MultiArray, String
-from std_srvs.srv import Trigger
+from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import (
     LATCHED,
+    CommandSource,
     diagnostic_level,
     odometry,
+    reason,
     record,
+    twist,
 )
 from support.waiting import wait_for_acknowledgement
 
@@ -433,3 +436,29 @@ def test_a_bag_holds_the_fingerprint_of_a_secret_seed_only(harness, tmp_path, so
 def test_secret_seed_excludes_a_given_seed(harness):
     with pytest.raises(ParameterError, match='seed must be 0 with secret_seed: got 7'):
         harness.add(ReferenceGeneratorNode, secret_seed=True, seed=7)
+
+
+def test_an_e_stop_of_the_own_robot_starts_a_snapshot(harness, tmp_path):
+    recorder = record(harness, tmp_path, 'odom', 'cmd_vel', namespace='a')
+    robots = [harness.add(SimRobotNode, namespace=name) for name in ('a', 'b')]
+    drivers = [CommandSource(harness, f'{name}/cmd_vel') for name in ('a', 'b')]
+    for source in drivers:
+        source.message = twist(0.1)
+    for name in ('a', 'b'):
+        harness.spin_until(
+            lambda name=name: any(s.level == OK for s in harness.statuses(f'{name}/sim_robot'))
+        )
+    harness.call(SetBool, 'b/e_stop', data=True)
+    harness.spin_until(lambda: harness.statuses('b/sim_robot')[-1].level == ERROR)
+    assert not recorder._snapshots.busy
+    assert values(recorder)['snapshots'] == 0, 'only the own robot starts a snapshot'
+    harness.call(SetBool, 'a/e_stop', data=True)
+    harness.spin_until(lambda: values(recorder)['snapshots'] == 1)
+    harness.remove(recorder)
+    (folder,) = snapshots(tmp_path)
+    assert '_a-sim-robot-emergency-stop' in folder.name
+    with open_bag(folder) as recording:
+        assert recording.topics['/a/odom'].message_count > 50
+        assert recording.topics['/a/cmd_vel'].message_count > 10
+        status = recording.metadata_records['snapshot']['reason']
+    assert status == f'a/sim_robot: {reason(robots[0])}'

@@ -38,6 +38,7 @@ from t3mpc_ros.radio.protocol.frames import CommandFlag, RefusalReason
 GOLDEN = json.loads((Path(__file__).parents[1] / 'golden' / 'radio_vectors.json').read_text())
 VECTORS = GOLDEN['authentication']
 KEY = bytes(range(100, 116))
+ALIEN = bytes(range(101, 117))
 COMMAND = frames.Command(9, 1, CommandFlag.ENABLE, 20, 3000, 3000, 0)
 SAMPLES = (
     COMMAND,
@@ -210,3 +211,39 @@ def test_a_path_without_a_key_file_is_rejected(tmp_path):
     for name in (tmp_path / 'fifo', tmp_path, '/dev/zero', tmp_path / 'nothing', '~no_such/key'):
         with pytest.raises(KeyFileError, match='must be a regular file|cannot be read: '):
             read_key(Path(name))
+
+
+def test_a_frame_from_before_a_wrap_is_rejected_after_it():
+    signer, verifier = meet(host_us=0xFFFFFF00)
+    late = signer.sign(COMMAND._replace(host_us=0xFFFFFFFE))
+    assert not verifier.verify(signer.sign(COMMAND._replace(host_us=3)))
+    assert verifier.verify(late)
+    # The robot tests only the next epoch for it.
+    assert not verifier.verify(signer.sign(COMMAND._replace(host_us=4)))
+
+
+def test_replays_from_an_earlier_session_are_rejected():
+    """Session numbers and times may repeat: each HELLO leads to a new robot nonce."""
+    signer, verifier = meet()
+    recorded = [signer.sign(COMMAND._replace(host_us=2000 + step)) for step in range(20)]
+    for frame in recorded:
+        assert not verifier.verify(frame)
+    hello = sign_hello(KEY, 9, 0, 1000, b'HOSTHOST')
+    meet(verifier=verifier, nonces=(b'NEWHOST.', b'NEWROBOT'))
+    for frame in recorded:
+        assert verifier.verify(frame)
+    # Nor after a replay of the HELLO: the session key of the new session is unknown.
+    assert not verifier.begin_session(hello, b'THIRDROB')
+    for frame in recorded:
+        assert verifier.verify(frame)
+
+
+def test_a_tag_is_bound_to_its_kind_and_session():
+    signer, _ = meet()
+    signed = [signer.sign(frame._replace(host_us=10 + at)) for at, frame in enumerate(SAMPLES)]
+    assert len({frame.tag for frame in signed}) == 3
+    for key in (KEY, ALIEN, session_key(KEY, b'HOSTHOST', b'OTHERROB')):
+        for frame in signed:
+            for epoch in (0, 1):
+                if (key, epoch) != (session_key(KEY, b'HOSTHOST', b'ROBOTROB'), 0):
+                    assert frame_tag(frame, key, epoch) != frame.tag

@@ -228,3 +228,24 @@ def test_an_inconsistent_result_is_rejected():
     # Sixteen retransmission counts for each status: acknowledged, with payload, failed, none;
     # skipped has one.
     assert good == 4 * 16 + 1
+
+
+@pytest.mark.parametrize('decode', list(UNIONS))
+def test_random_bytes_are_rejected_or_decoded_completely(decode):
+    source = random.Random(11)
+    whole = [codec.encode(some(kind, source)) for kind in get_args(UNIONS[decode])]
+    decoded = 0
+    for _ in range(4000):
+        data = source.randbytes(source.randint(0, 80))
+        if source.random() < 0.8:
+            frame = source.choice(whole)
+            # Half of them with a valid length and valid first bytes.
+            size = source.choice((len(data), len(frame)))
+            data = (frame[: source.randint(1, 4)] + source.randbytes(80))[:size]
+        try:
+            frame = decode(data)
+        except FrameError:
+            continue
+        decoded += 1
+        assert codec.encode(frame) == data
+    assert decoded > 10

@@ -31,6 +31,20 @@ def random_frame(source, longest=framing.FRAME_LIMIT):
     return bytes(source.choice((0, 255, source.randrange(256))) for _ in range(size))
 
 
+def damage(wire, source):
+    """Return the bytes of a frame with one random damage."""
+    at = source.randrange(len(wire))
+    match source.randrange(4):
+        case 0:
+            return wire[:at] + bytes([wire[at] ^ 1 << source.randrange(8)]) + wire[at + 1 :]
+        case 1:
+            return wire[:at] + wire[at + 1 :]
+        case 2:
+            return wire[:at] + source.randbytes(source.randint(1, 5)) + wire[at:]
+        case _:
+            return wire[:at] + wire[at : at + 1] + wire[at:]
+
+
 def test_crc_check_value_and_golden_vectors():
     assert framing.crc16(b'123456789') == 0x29B1
     for row in VECTORS['crc16']:
@@ -140,3 +154,28 @@ def test_every_single_bit_flip_is_detected():
             flipped = bytearray(wire)
             flipped[bit // 8] ^= 1 << bit % 8
             assert framing.FrameDecoder().feed(bytes(flipped) + b'\0') == []
+
+
+@pytest.mark.slow
+def test_damaged_frames_never_pass_and_the_decoder_recovers():
+    """A damaged frame may destroy the next one (lost zero), never the one after that."""
+    source = random.Random(7)
+    decoder = framing.FrameDecoder()
+    wrong = damaged = neighbours = 0
+    after_good = False
+    for number in range(20000):
+        # Unique by number: a frame from another round is wrong.
+        frame = number.to_bytes(4, 'little') + random_frame(source, 30)
+        hit = source.random() < 0.6
+        wire = damage(framing.encode_frame(frame), source) if hit else framing.encode_frame(frame)
+        found = decoder.feed(wire)
+        damaged += hit
+        wrong += sum(one != frame for one in found)
+        if not hit:
+            neighbours += frame not in found
+            assert frame in found or not after_good
+        after_good = not hit
+    assert damaged > 11000
+    # The CRC passes one in 65 536; there are 12 000 damaged frames.
+    assert wrong <= 2
+    assert neighbours < 0.1 * damaged

@@ -27,7 +27,7 @@ from t3mpc_ros.radio.link.handshake import Session
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.link.port_actions import LinkState
 from t3mpc_ros.radio.link.setpoint_arbitration import SetpointArbiter
-from t3mpc_ros.radio.link.statistics import LinkStatistics
+from t3mpc_ros.radio.link.statistics import DiagnosticLevel, LinkStatistics
 from t3mpc_ros.radio.link.telemetry import CommandTiming, TelemetryDecoder
 from t3mpc_ros.radio.link.transaction import TransactionLayer
 from t3mpc_ros.radio.protocol import frames
@@ -741,3 +741,75 @@ def test_invalid_link_parameters_are_rejected():
     slow = LinkParameters(rate='250k')
     assert (slow.gap, slow.configure(1).retry_delay, slow.configure(1).rate) == (11, 5, 0)
     assert (LinkParameters().gap, LinkParameters().configure(1).rate) == (6, 1)
+
+
+def test_a_jam_stops_the_robot_and_the_link_recovers(bench):
+    bench.dongle.jam_until_ns = bench.now_ns + 1000 * MS
+    bench.run(0.22)
+    bench.robot.run_to(bench.now_ns)
+    assert bench.robot.speeds == (0.0, 0.0)
+    assert bench.robot.expired
+    bench.run(0.28)
+    assert 'does not answer' in bench.link.reason(bench.now_ns)
+    quality = bench.link.quality(bench.now_ns)
+    assert quality.level is DiagnosticLevel.ERROR
+    assert 'no telemetry for 0.5' in quality.text
+    session = bench.robot.verifier.session
+    bench.run(0.5)
+    assert bench.run(1.0, lambda: moving(bench)) < 0.05
+    assert bench.robot.verifier.session == session
+    quality = bench.link.quality(bench.now_ns)
+    assert 45 <= quality.lost <= 52
+    assert quality.level is DiagnosticLevel.WARN
+    assert 'of the cycles are lost' in quality.text
+
+
+def test_an_emergency_stop_survives_a_jammed_link(bench):
+    bench.dongle.jam_until_ns = bench.now_ns + 300 * MS
+    bench.link.latch_estop('asked for')
+    bench.run(0.4)
+    assert bench.robot.estop
+
+
+def test_a_restart_during_shutdown_starts_no_session(bench):
+    bench.link.shut_down()
+    bench.robot.boot(bench.now_ns)
+    bench.robot.log.clear()
+    bench.run(1.5, lambda: bench.link.state is LinkState.DONE)
+    assert not any(isinstance(frame, frames.Hello) for _, frame in bench.robot.log)
+
+
+def test_another_host_on_the_robot_is_detected():
+    bench = LinkBench()
+    bench.connect()
+    ours = bench.robot.verifier.session
+    theirs = ours % 255 + 1
+    bench.robot.receive(bytes([0x24, theirs, 0, 0]), bench.now_ns)
+    bench.run(0.05, lambda: not running(bench))
+    assert bench.link.reason(bench.now_ns) == 'the robot has lost its session'
+    bench.run(1.0, lambda: running(bench))
+    assert bench.robot.verifier.session not in (0, ours)
+
+
+def test_unplugged_and_plugged_in_again(bench):
+    bench.run(1.0)
+    start = bench.link.telemetry.angles.right
+    for away in (0.05, 0.7, 13.0):
+        bench.unplug()
+        closes = bench.closes
+        opened = len(bench.opens)
+        bench.run(0.02)
+        # With the next cycle: while the dead device is open, it reappears under another name.
+        assert bench.closes == closes + 1
+        bench.problem = ('dongle is not there', True)
+        bench.run(away)
+        assert bench.link.reason(bench.now_ns) == 'dongle is not there'
+        assert len(bench.opens) - opened <= 5 * away + 2
+        bench.plug()
+        assert bench.run(2.0, lambda: moving(bench)) < 1.0
+    quality = bench.link.quality(bench.now_ns)
+    assert quality.port_failures == 3
+    assert quality.robot_resets == 0
+    bench.run(0.5)
+    assert bench.link.telemetry.angles.right > start
+    assert bench.link.telemetry.angles.right == pytest.approx(bench.robot.angles[0], abs=0.15)

@@ -28,7 +28,7 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
 from t3mpc_ros.radio.protocol.codec import decode_from_dongle
-from t3mpc_ros.radio.protocol.frames import CommandFlag
+from t3mpc_ros.radio.protocol.frames import CommandFlag, StatusFlag
 from t3mpc_ros.radio.protocol.framing import FrameDecoder
 from t3mpc_ros.radio.tool import (
     eeprom_records,
@@ -165,9 +165,10 @@ def host_of(settings):
     return LinkParameters.from_dict(content['/**']['ros__parameters']['link'])
 
 
+@pytest.mark.slow
 def test_a_new_robot_gets_a_random_address_and_keeps_it():
     addresses = set()
-    for seed in range(3):
+    for seed in range(20):
         bench = ToolBench(erased=True)
         assert bench.at_robot(eeprom_records.read_settings()).state == frames.SETTINGS_MISSING
         settings = write(bench, seed)
@@ -176,7 +177,7 @@ def test_a_new_robot_gets_a_random_address_and_keeps_it():
         changed = write(bench, seed + 100, channel=100, microsteps=8)
         assert changed == settings._replace(channel=100, microsteps=8)
         assert bench.at_robot(eeprom_records.read_settings()).content == changed
-    assert len(addresses) == 3
+    assert len(addresses) == 20
 
 
 def test_drawn_addresses_are_receivable_and_no_numbers():
@@ -529,3 +530,41 @@ def test_jog_reports_a_robot_that_does_not_answer():
     assert 'does not answer' in task.error
     assert reported == [task.error]
     assert task.result is None
+
+
+@pytest.mark.slow
+def test_each_of_two_robots_follows_its_own_host_only():
+    """Both receive every packet of the dongle; before they are set up, neither moves."""
+    benches = [ToolBench(erased=True) for _ in range(2)]
+    for bench in benches:
+        bench.jog(manoeuvre.LEFT, 0.2)
+        assert bench.board.counters == (0, 0)
+    hosts = [host_of(write(bench, seed)) for seed, bench in enumerate(benches)]
+    for number, host in enumerate(hosts):
+        before = [bench.board.counters for bench in benches]
+        for bench in benches:
+            bench.jog(manoeuvre.LEFT, 0.2, link=host)
+        moved = [bench.board.counters != old for bench, old in zip(benches, before, strict=True)]
+        assert moved == [number == 0, number == 1]
+
+
+def test_unplugging_the_dongle_ends_the_jog_and_stops_the_robot():
+    bench = ToolBench()
+
+    def pull(bench):
+        if bench.board.counters[1] > 1000 and bench.emulator.port_open:
+            bench.emulator.inject('close_port', 1000.0)
+
+    bench.each = pull
+    task, _ = bench.jog(manoeuvre.RIGHT, 5.0)
+    assert 'not there' in task.error
+    bench.emulator.run_to(bench.now_ns + 1_000_000_000)
+    assert bench.board.speeds == (0, 0)
+    assert bench.board.status & StatusFlag.TTL_EXPIRED
+
+
+def test_settings_survive_a_restart_of_the_robot():
+    bench = ToolBench(erased=True)
+    settings = write(bench)
+    bench.emulator.restart_robot()
+    assert bench.at_robot(eeprom_records.read_settings()).content == settings

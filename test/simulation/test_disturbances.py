@@ -75,20 +75,20 @@ def test_disturbance_never_exceeds_its_bound():
 def test_disturbance_reaches_its_bound_on_each_wheel():
     parameters = with_constants(DisturbanceParameters, walk_share=0.0)(bound=1.0)
     disturbance = Disturbance(parameters, np.random.default_rng(3))
-    torques = np.array([disturbance.torque(0.05 * tick) for tick in range(3000)])
-    assert np.abs(torques).max(axis=0) == pytest.approx([1.0, 1.0], abs=0.1)
+    torques = np.array([disturbance.torque(0.05 * tick) for tick in range(8000)])
+    assert np.abs(torques).max(axis=0) == pytest.approx([1.0, 1.0], abs=0.05)
     assert abs(np.corrcoef(torques.T)[0, 1]) < 0.9
 
 
 def test_random_walk_spreads_with_the_square_root_of_time():
     parameters = DisturbanceParameters(walk_rate=0.1)
     ends = []
-    for seed in range(200):
+    for seed in range(400):
         disturbance = Disturbance(parameters, np.random.default_rng(seed))
         for _ in range(100):
             disturbance.draw(0.01)
         ends.append(disturbance.walk.copy())
-    assert np.std(ends) == pytest.approx(0.1, rel=0.12)
+    assert np.std(ends) == pytest.approx(0.1, rel=0.1)
 
 
 def test_reflection_is_bounded_and_continuous():
@@ -245,8 +245,8 @@ def test_no_parameter_shifts_the_numbers_of_a_channel(table):
     usual, tried = drive(make(parameters)), 0
     assert len(usual) >= (5 if make is DigitalTwin else 2)
     for spec in table.specs():
-        for changed in itertools.islice(alternatives(parameters, spec), 2):
+        for changed in itertools.islice(alternatives(parameters, spec), 3):
             if not spec.name.startswith(OTHER_EVENTS):
                 tried += 1
                 assert drive(make(changed)) == usual, spec.name
-    assert tried > 30
+    assert tried > 50

@@ -17,7 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from t3mpc_ros.control.watchdog import FAR_BEYOND, TwistUnits
+from t3mpc_ros.control.watchdog import FAR_BEYOND, TwistUnits, motion_between
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, Pose, State
 
 MIN_GAP = 2.0
@@ -108,7 +108,7 @@ def other_units(stamps: Array, poses: Array, twists: Array) -> str:
     states = (State(int(stamp), Pose(*pose), BodyTwist(*twist)) for stamp, pose, twist in rows)
     for last, new in pairwise(states):
         if new.stamp_ns > last.stamp_ns:
-            units.update(last, new)
+            units.update(last, new, motion_between(last.pose, new.pose))
         if units.wrong:
             return units.example
     return ''
