@@ -201,9 +201,14 @@ def seed_range(text: str) -> tuple[int, ...]:
 
 def new_folder(text: str) -> Path:
     """Return the path of a folder that exists or can be made."""
-    if Path(text).is_file():
-        raise argparse.ArgumentTypeError(f'must be a folder, or the path of a new one: got {text}')
-    return Path(text)
+    path = Path(text)
+    for each in (path, *path.parents):
+        if each.is_file():
+            raise argparse.ArgumentTypeError(
+                f'must be a folder, or the path of a new one: got {text}'
+                + (f', and {each} is a file' if each != path else '')
+            )
+    return path
 
 
 def uncounted_seeds(text: str) -> tuple[int, ...]:

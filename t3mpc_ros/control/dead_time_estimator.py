@@ -145,7 +145,9 @@ ESTIMATE = np.dtype(
             ('configured', 'f8'),  # s
             ('noise_ratio', 'f8'),  # variance of the innovation / noise variance
             ('noise_count', 'f8'),  # weight of that ratio, in measured speeds
-            ('change', 'f8'),  # median change of the error between two measurements, rad/s
+            # Median change of the error from one measurement to the next, not below that of the
+            # assumed noise, rad/s.
+            ('change', 'f8'),
             ('last_error', 'f8', 2),  # of the dead time in question, rad/s
             ('rate', 'f8'),  # change of the speeds, held for a while, rad/s²
             ('disturbed', '?'),
@@ -221,7 +223,6 @@ class DeadTimeEstimator:
         estimate.dead_time, estimate.deviation = prior, PRIOR_DEVIATION
         estimate.configured = prior
         estimate.noise_ratio, estimate.noise_count = NOISE_PRIOR_RATIO, NOISE_PRIOR_COUNT
-        estimate.change = WHITE_MEDIAN * math.sqrt(variance)
         grid = GRID_STEP * np.arange(GRID_SIZE)
         estimate.accepted.costs = NOISE_PRIOR_RATIO * ((grid - prior) / PRIOR_DEVIATION) ** 2
         estimate.covariance = FRICTION_DEVIATION**2, 0.0, FRICTION_DEVIATION**2
@@ -422,6 +423,7 @@ def add_evidence(estimate: Any, noise_variance: float, dt: float) -> None:
         larger = abs(error - estimate.last_error[i]) > estimate.change
         estimate.change *= 1.0 + CHANGE_STEP if larger else 1.0 / (1.0 + CHANGE_STEP)
         estimate.last_error[i] = error
+    estimate.change = max(estimate.change, WHITE_MEDIAN * math.sqrt(noise_variance))
     noise = (estimate.change / WHITE_MEDIAN) ** 2 / noise_variance
     if noise > LOUD * estimate.noise_ratio:
         # All blocks would be disturbed, and the few others make an estimate that seems certain.

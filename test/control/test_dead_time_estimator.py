@@ -217,6 +217,16 @@ def test_more_noise_than_assumed_is_learnt(assumed, variance):
     assert np.mean(others) < 0.1
 
 
+def test_noise_is_learnt_as_fast_after_an_exact_standstill():
+    """Nothing changes while the robot stands; the median was ever smaller, and 0 after 6 min."""
+    drive = simulate(smooth_commands(20.0, 1, 2.0), 0.01, 1)
+    still = np.zeros((at(400.0), 2))
+    command, measured = (np.vstack([still, each]) for each in (drive.command, drive.measured))
+    estimator, record = run(Drive(command, measured), noise_variance=0.0)
+    assert estimator.estimate.noise_ratio * MIN_NOISE_VARIANCE == pytest.approx(0.04, rel=0.15)
+    assert record[at(402.0) :, 2].mean() < 0.1
+
+
 @pytest.mark.compiled
 @pytest.mark.parametrize('duration', [1.0, 4.0])
 def test_late_commands_leave_no_trace(duration):
