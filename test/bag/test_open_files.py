@@ -327,7 +327,6 @@ def test_every_file_is_closed(tmp_path):
     for scenario in SCENARIOS:
         folder = tmp_path / scenario.__name__
         folder.mkdir()
-        # Not settrace, which would end the measurement of coverage in this process.
         threading.setprofile(note)
         sys.setprofile(note)
         try:
