@@ -39,6 +39,8 @@ USAGE_ERROR = 2
 """Exit code for an unusable parameter, parameter file or command line."""
 MAX_DOMAIN = 232
 """Largest domain: the ports of DDS end there."""
+PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+"""Variable with the settings of Fast DDS, which goes on without a word if the file is missing."""
 
 
 def main(name: str, stop: StopSignal) -> NoReturn:
@@ -192,16 +194,19 @@ def check_environment() -> None:
 
 
 def environment_problem(environment: Mapping[str, str]) -> str:
-    """Return what is wrong with ``ROS_DOMAIN_ID`` or ``RMW_IMPLEMENTATION``; '' if nothing is."""
+    """Return what is wrong with the domain, the middleware or its profile; '' if nothing is."""
     text = environment.get('ROS_DOMAIN_ID', '')
     if text and not (text.isdecimal() and int(text) <= MAX_DOMAIN):
         return f'ROS_DOMAIN_ID must be a whole number from 0 to {MAX_DOMAIN}: got {text}'
+    profile = environment.get(PROFILES)
+    wanted = environment.get('RMW_IMPLEMENTATION')
+    if profile and 'fastrtps' in (wanted or 'fastrtps') and not Path(profile).is_file():
+        return f'{PROFILES} must be an existing file, with its whole path: got {profile}'
     # The index of ROS packages; where a wheel is used without a set-up, that of its environment.
     prefixes = (environment.get('AMENT_PREFIX_PATH') or sys.prefix).split(os.pathsep)
     index = Path('share', 'ament_index', 'resource_index', 'rmw_typesupport')
     names = {path.name for prefix in prefixes for path in Path(prefix, index).glob('rmw_*')}
     known = sorted(names - {'rmw_implementation'})
-    wanted = environment.get('RMW_IMPLEMENTATION')
     if not wanted or not known or wanted in known:
         return ''
     return f'RMW_IMPLEMENTATION must be one that is installed, {", ".join(known)}: got {wanted}'

@@ -211,6 +211,18 @@ def test_a_domain_that_cannot_be_is_named(text):
     assert not environment_problem({})
 
 
+def test_a_profile_that_does_not_exist_is_named(tmp_path):
+    """Fast DDS ignored it, and the robot hesitated whenever somebody subscribed."""
+    name = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+    for path in (f'{tmp_path}', f'{tmp_path}/none.xml'):
+        found = environment_problem({name: path})
+        assert found == f'{name} must be an existing file, with its whole path: got {path}'
+        other = environment_problem({name: path, 'RMW_IMPLEMENTATION': 'rmw_zenoh_cpp'})
+        assert name not in other  # which has no such profiles
+    assert not environment_problem({name: __file__})
+    assert not environment_problem({name: ''})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize('words, code', [(['sim_robot'], 2), (['t3mpc', 'topic', 'list'], 1)])
 def test_a_middleware_that_is_not_installed_is_named(words, code):
