@@ -222,6 +222,18 @@ def torn(lost):
     )
 
 
+def in_millimetres(driven):
+    """The pose is in metres, the twist in millimetres per second."""
+    tape, poses = Tape(METADATA), [(0.0, 0.0, 0.0)]
+    for k in range(3000):
+        stamp_ns, speed = START + k * 10_000_000, 0.15 + 0.1 * math.sin(0.02 * k)
+        poses.append((poses[-1][0] + 0.01 * speed, 0.0, 0.0))
+        twist = BodyTwist(1000.0 * speed, 0.0)
+        tape.add('/odom', stamp_ns + 1000, serialised_odometry(stamp_ns, twist, poses[-1]))
+        tape.add('/cmd_vel', stamp_ns, serialised_twist(BodyTwist(speed, 0.0)))
+    return tape
+
+
 def without(lost):
     return lambda tape: tape.where(lambda seconds, topic, _: topic != lost)
 
@@ -237,6 +249,7 @@ def without(lost):
         pytest.param(
             slow, r'deviation of the .* at most \d+\.\d ms: got \d+\.\d ms', marks=pytest.mark.long
         ),
+        (in_millimetres, 'twist of /odom cannot be in m/s and rad/s: .*Correct the units'),
         (without('/odom'), 'cmd_vel and odom: no odom$'),
         (without('/cmd_vel'), 'cmd_vel and odom: no cmd_vel$'),
     ],

@@ -108,6 +108,8 @@ def identify_drive(run: Run) -> IdentifiedDrive:
     for name in (COMMAND, ODOMETRY):
         if name not in run.motions or len(run.motions[name]) < 3:
             raise IdentificationError(f'the bag must hold {COMMAND} and {ODOMETRY}: no {name}')
+    if ODOMETRY in run.untrusted:
+        raise IdentificationError('. '.join(text for item in run.damage.items() for text in item))
     if run.geometry is None:
         raise IdentificationError(
             'the wheel speeds need the wheel radius and separation, which the bag does not hold: '
