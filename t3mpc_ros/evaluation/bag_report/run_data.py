@@ -492,9 +492,10 @@ def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str], doubts: 
     if leaps := np.flatnonzero((steps < -JUMP) | (steps > waits + JUMP)).tolist():
         table['stamp'] = received
         notes.append(
-            f'The stamps of {topic} leap {len(leaps)} times, first by {steps[leaps[0]]:.1f} s at '
-            f'{received[leaps[0]]:.1f} s: a clock was set; its messages were placed by receive '
-            'time.'
+            f'The stamps of {topic} leap by {steps[leaps[0]]:.1f} s at '
+            f'{received[leaps[0]]:.1f} s'
+            f'{f", and {len(leaps) - 1} times later" if len(leaps) > 1 else ""}: a clock was set; '
+            'its messages were placed by receive time.'
         )
     if late := np.count_nonzero((steps < 0.0) & (steps >= -JUMP)):
         notes.append(f'{late} messages of {topic} were out of order; they were sorted.')
