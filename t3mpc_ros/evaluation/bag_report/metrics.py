@@ -202,9 +202,12 @@ class ReportMetrics:
         ]
 
     def summary(self) -> str:
-        """Return the main numbers in one line."""
-        numbers = '; '.join(f'{title} {number}' for number, title in self.numbers())
-        return f'{numbers}: {self.report}'
+        """Return the main numbers, a line each, and where the report is."""
+        rows = [(title, number) for number, title in self.numbers()]
+        width = max(len(title) for title, _ in rows)
+        return '\n'.join(
+            [*(f'  {title:{width}}  {number}' for title, number in rows), f'{self.report}']
+        )
 
 
 PATH_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics], float]], ...] = (
