@@ -131,7 +131,7 @@ def vectors() -> object:
 
 
 SEEDS = 4
-"""Of the 20 held-out seeds of the paper's results; all of them are in docs/results_tables.md, to
+"""Of the 20 held-out seeds of the paper's results; twelve are in docs/results_tables.md, to
 the digits that are printed there."""
 RESULTS: dict[str, Callable[[], object]] = {
     'vectors': vectors,
