@@ -264,7 +264,7 @@ def _calibrate(options: argparse.Namespace, stop: StopSignal) -> int:
 def _doctor(options: argparse.Namespace, stop: StopSignal) -> int:
     # Imported here: the other commands need no page.
     from t3mpc_ros.cli import robot_doctor
-    from t3mpc_ros.radio.tool.bench_checklist import FAIL
+    from t3mpc_ros.radio.tool.link_test import FAIL
 
     command_line.check_writable(options.report)
     check_two_ports(options.port, options.robot_port)

@@ -25,18 +25,13 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool import link_test, manoeuvre, procedure
 from t3mpc_ros.radio.tool.bench_checklist import (
     DRIVEN,
-    FAIL,
-    PASS,
-    POOR,
     QUESTIONS,
-    SKIPPED,
-    Check,
     Question,
     check_board,
     check_builds,
-    check_link,
     examine_board,
 )
+from t3mpc_ros.radio.tool.link_test import FAIL, PASS, POOR, SKIPPED, Check
 from t3mpc_ros.radio.tool.procedure import DONGLE, ROBOT_BOARD, Board, ProcedureError, Script
 
 Value = TypeVar('Value')
@@ -80,7 +75,7 @@ def run_doctor(
     if dongle is not None:
         result = run(link_test.run_link_test(parameters, options.count), 'link', DONGLE)
         if result is not None:
-            add(check_link(result, parameters))
+            add(link_test.evaluate(result, parameters))
     if options.drive:
         _drive(options, parameters, key, answer, interrupted, add)
     else:

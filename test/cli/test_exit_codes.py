@@ -30,9 +30,8 @@ from t3mpc_ros.cli.main import main
 from t3mpc_ros.cli.process_group import ProcessError, ProcessGroup
 from t3mpc_ros.emulator.fault_injection import FaultError
 from t3mpc_ros.radio.protocol import frames
-from t3mpc_ros.radio.tool.bench_checklist import FAIL, PASS, SKIPPED, Check
 from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, StoredSettings, settings_file
-from t3mpc_ros.radio.tool.link_test import BAD, GOOD, POOR, ReportRow
+from t3mpc_ros.radio.tool.link_test import FAIL, PASS, POOR, SKIPPED, Check
 from t3mpc_ros.radio.tool.procedure import ProcedureError
 
 RUN = 'radio.tool.procedure.run_script'
@@ -55,7 +54,7 @@ def stored(state=frames.SETTINGS_GOOD, **changes):
 
 
 def rated(*verdicts):
-    rows = [ReportRow('a', '1', verdict, 'remedy') for verdict in verdicts]
+    rows = [Check(2, 'a', verdict, '1', 'remedy') for verdict in verdicts]
     return {RUN: 'result', 'radio.tool.link_test.evaluate': rows}
 
 
@@ -121,9 +120,9 @@ CASES = [
     *((f'robot {words}', {RUN: ProcedureError('no board')}, 2, 'no board') for words in ROBOT),
     *((f'robot {words}', {RUN: Interruption()}, 130, 'interrupted') for words in ROBOT),
     ('robot scan --port p', {RUN: Interruption('not restored')}, 130, 'interrupted: not restor'),
-    ('robot ping --port p', rated(GOOD), 0, 'good'),
-    ('robot ping --port p', rated(GOOD, POOR), 0, 'try: remedy'),
-    ('robot ping --port p', rated(GOOD, BAD), 1, 'BAD'),
+    ('robot ping --port p', rated(PASS), 0, 'pass'),
+    ('robot ping --port p', rated(PASS, POOR), 0, 'try: remedy'),
+    ('robot ping --port p', rated(PASS, FAIL), 1, 'fail'),
     ('robot scan --port p', answered(True), 0, 'advice'),
     ('robot scan --port p', answered(False), 1, 'advice'),
     ('robot setup --port p', stored(), 0, 'settings stored in both copies'),

@@ -27,18 +27,14 @@ from t3mpc_ros.evaluation.api.error_messages import sentence
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import Pong, Samples
-from t3mpc_ros.radio.tool import link_test, procedure
+from t3mpc_ros.radio.tool import procedure
 from t3mpc_ros.radio.tool.bench_checklist import (
-    FAIL,
-    PASS,
-    POOR,
-    SKIPPED,
     BoardFindings,
     check_board,
     check_builds,
-    check_link,
 )
 from t3mpc_ros.radio.tool.eeprom_records import RobotSettings, Stored
+from t3mpc_ros.radio.tool.link_test import FAIL, PASS, POOR, SKIPPED, Check
 from t3mpc_ros.radio.tool.procedure import ProcedureError
 from t3mpc_ros.radio.tool.robot_info import LogEntry, LogKind
 from t3mpc_ros.robot.calibration import Calibration, DividerCorrection
@@ -122,13 +118,9 @@ def test_builds_of_both_boards_are_compared():
     assert check_builds(None, PONG).verdict == SKIPPED
 
 
-def test_a_poor_line_does_not_pass(monkeypatch):
+def test_a_poor_line_does_not_pass():
     """It said *pass*, and in the same line *poor, try: …*."""
-    rows = [link_test.ReportRow('cable', '3', link_test.POOR, 'another cable')]
-    monkeypatch.setattr(link_test, 'evaluate', lambda *given: rows)
-    (check,) = check_link(None, PARAMETERS)
-    assert check.verdict == POOR
-    shown = cli.format_check(check)
+    shown = cli.format_check(Check(2, 'cable', POOR, '3', 'another cable'))
     assert 'poor     cable: 3\n' in shown
     assert 'try: another cable' in shown
     assert 'pass' not in shown

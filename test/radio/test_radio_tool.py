@@ -246,7 +246,7 @@ def ping(bench, count):
 def test_a_good_link_is_good_in_every_row():
     bench = ToolBench()
     seen, rows = ping(bench, 100)
-    assert [row.verdict for row in rows.values()] == [link_test.GOOD] * 6
+    assert [row.verdict for row in rows.values()] == [link_test.PASS] * 6
     assert len(seen.pings) == len(seen.cycles) == 100
     assert seen.retransmissions[0] == 200
     assert max(seen.cycles) < 0.01
@@ -261,7 +261,7 @@ def test_losses_cause_retransmissions_and_a_bad_verdict():
     seen, rows = ping(bench, 300)
     assert len(seen.cycles) / 300 == pytest.approx(1 - (1 - 0.6**2) ** 4, abs=0.07)
     assert seen.retransmissions[1] > 40
-    assert rows['robot answers by radio'].verdict == link_test.BAD
+    assert rows['robot answers by radio'].verdict == link_test.FAIL
     assert rows['retransmissions per packet'].verdict == link_test.POOR
     text = link_test.format_report([*rows.values()])
     assert '10 uF' in text
@@ -282,21 +282,21 @@ MEASURED = link_test.LinkTestResult(100, 100 * (1e-3,), 100 * (5e-3,), (200, *15
     'changes, row, verdict, remedy',
     [
         ({'pings': 100 * (16e-3,)}, 'dongle answers over USB', link_test.POOR, 'latency timer'),
-        ({'pings': 90 * (1e-3,)}, 'dongle answers over USB', link_test.BAD, 'another cable'),
+        ({'pings': 90 * (1e-3,)}, 'dongle answers over USB', link_test.FAIL, 'another cable'),
         ({'line_errors': 3}, 'frames damaged on the cable', link_test.POOR, 'another cable'),
         ({'cycles': 97 * (5e-3,)}, 'robot answers by radio', link_test.POOR, '10 uF'),
-        ({'cycles': ()}, 'robot answers by radio', link_test.BAD, 't3mpc robot scan'),
+        ({'cycles': ()}, 'robot answers by radio', link_test.FAIL, 't3mpc robot scan'),
         ({'cycles': 100 * (16e-3,)}, 'round trip to the robot', link_test.POOR, 'half a period'),
-        ({'cycles': 100 * (21e-3,)}, 'round trip to the robot', link_test.BAD, 'cycle_rate'),
+        ({'cycles': 100 * (21e-3,)}, 'round trip to the robot', link_test.FAIL, 'cycle_rate'),
     ],
 )
 def test_each_measurement_has_a_verdict_and_a_remedy(changes, row, verdict, remedy):
     rows = link_test.evaluate(MEASURED._replace(**changes), LinkParameters())
-    assert {each.name: each.verdict for each in rows if each.verdict != link_test.GOOD} == {
+    assert {each.name: each.verdict for each in rows if each.verdict != link_test.PASS} == {
         row: verdict
     }
     assert remedy in link_test.format_report(rows)
-    assert link_test.is_usable(rows) == (verdict != link_test.BAD)
+    assert link_test.is_usable(rows) == (verdict != link_test.FAIL)
 
 
 def test_the_wrong_port_and_a_dead_chip_are_reported():

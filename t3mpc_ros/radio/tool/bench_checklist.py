@@ -22,8 +22,9 @@ import numpy as np
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.frames import CALIBRATION_RECORD, Pong, Samples
-from t3mpc_ros.radio.tool import eeprom_records, link_test
+from t3mpc_ros.radio.tool import eeprom_records
 from t3mpc_ros.radio.tool.eeprom_records import SETTINGS_TEXTS, StoredSettings, read_settings
+from t3mpc_ros.radio.tool.link_test import FAIL, PASS, SKIPPED, Check
 from t3mpc_ros.radio.tool.procedure import Pause, Script, wait_for_board
 from t3mpc_ros.radio.tool.robot_info import LogEntry, LogKind, read_log
 from t3mpc_ros.robot.calibration import (
@@ -35,7 +36,6 @@ from t3mpc_ros.robot.calibration import (
 )
 from t3mpc_ros.robot.sensor_conversions import GRAVITY, ImuParameters
 
-PASS, POOR, FAIL, SKIPPED = 'pass', 'poor', 'fail', 'skipped'
 SAMPLE_COUNT = 200
 _SAMPLE_PERIOD = 0.01  # s; two seconds in all
 _IMU = ImuParameters()
@@ -43,16 +43,6 @@ _GRAVITY_TOLERANCE = 0.1  # g; offsets of ±0.05 and ±0.08 g (PS-MPU-6000A 3.4,
 _MAX_NOISE = 0.5
 """deg/s: ten times the noise of the data sheet (0.05); a hand on the robot exceeds it"""
 _WATCHDOG, _BROWN_OUT = 8, 4
-
-
-class Check(NamedTuple):
-    """A line of the report."""
-
-    step: int  # row of the checklist in docs/robot.md; 0: not in it
-    name: str
-    verdict: str  # PASS, POOR (usable, with a remedy), FAIL or SKIPPED
-    value: str  # what was measured or answered
-    remedy: str = ''
 
 
 class Question(NamedTuple):
@@ -148,15 +138,6 @@ def examine_board() -> Script[BoardFindings]:
         samples.append((yield from eeprom_records.read_samples()))
         yield Pause(_SAMPLE_PERIOD)
     return BoardFindings(pong, settings, calibration, log, tuple(samples))
-
-
-def check_link(result: link_test.LinkTestResult, parameters: LinkParameters) -> list[Check]:
-    """Return the rows of the link test."""
-    verdicts = {link_test.GOOD: PASS, link_test.POOR: POOR, link_test.BAD: FAIL}
-    return [
-        Check(2, row.name, verdicts[row.verdict], row.value, row.remedy)
-        for row in link_test.evaluate(result, parameters)
-    ]
 
 
 def check_builds(dongle: Pong | None, robot: Pong | None) -> Check:

@@ -28,7 +28,7 @@ from t3mpc_ros.radio.protocol.codec import decode_exchange_status, decode_uplink
 from t3mpc_ros.radio.tool import procedure
 
 _REPLY_TIMEOUT = 0.25  # s; fifteen retransmissions at 250 kbit/s take 60 ms
-GOOD, POOR, BAD = 'good', 'poor', 'BAD'
+PASS, POOR, FAIL, SKIPPED = 'pass', 'poor', 'fail', 'skipped'
 _MAX_USB_ROUND_TRIP = 5e-3  # s; PING and PONG take 0.7 ms on the line
 _MAX_MEAN_RETRIES = 0.5  # mean retransmissions per packet above which the radio has no margin
 _SEARCH = '{} t3mpc robot scan searches all channels; '
@@ -51,12 +51,13 @@ class LinkTestResult(NamedTuple):
     state: frames.State | None
 
 
-class ReportRow(NamedTuple):
-    """Row of the report."""
+class Check(NamedTuple):
+    """A line of a report."""
 
+    step: int  # row of the checklist in docs/robot.md; 0: not in it
     name: str
-    value: str
-    verdict: str
+    verdict: str  # PASS, POOR (usable, with a remedy), FAIL or SKIPPED
+    value: str  # what was measured or answered
     remedy: str = ''
 
 
@@ -117,32 +118,35 @@ def _line_errors(pong: frames.Pong) -> int:
 # -- report ---------------------------------------------------------------------------------------
 
 
-def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[ReportRow]:
+def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[Check]:
     """Return the report: each measurement with a verdict and a remedy."""
     requests, pings, cycles = result.requests, result.pings, result.cycles
     lost = 1.0 - len(cycles) / requests
     absent = reasons.robot_absent(parameters.address, parameters.channel)
     rows = [
-        ReportRow(
+        Check(
+            2,
             'dongle answers over USB',
-            f'{len(pings)} of {requests}{", " if pings else ""}{_format_trips(pings)}',
             _verdict(
                 len(pings) == requests and _slow_trip(pings) <= _MAX_USB_ROUND_TRIP,
                 len(pings) >= requests * (1.0 - LOSS_LIMIT),
             ),
+            f'{len(pings)} of {requests}{", " if pings else ""}{_format_trips(pings)}',
             'the latency timer of an FTDI chip at 1 ms (docs/radio.md), another cable, no hub, '
             'less load on the computer',
         ),
-        ReportRow(
+        Check(
+            2,
             'frames damaged on the cable',
-            str(result.line_errors),
             _verdict(not result.line_errors),
+            str(result.line_errors),
             'another cable, another USB port, no hub',
         ),
-        ReportRow(
+        Check(
+            2,
             'robot answers by radio',
-            f'{len(cycles)} of {requests}',
             _verdict(lost <= LOSS_LIMIT / 5, lost <= LOSS_LIMIT),
+            f'{len(cycles)} of {requests}',
             ('' if cycles else _SEARCH.format(absent))
             + 'more than 0.2 m between the radios, antennas upright and free; 10 uF and 100 nF at '
             'both radio chips; another channel (t3mpc robot scan lists them); --set power=…; '
@@ -154,16 +158,18 @@ def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[ReportR
         mean = sum(k * count for k, count in enumerate(retries)) / max(sum(retries), 1)
         slow, period = _slow_trip(cycles), 1.0 / parameters.cycle_rate
         rows += [
-            ReportRow(
+            Check(
+                2,
                 'retransmissions per packet',
-                ', '.join(f'{number}: {count}' for number, count in enumerate(retries) if count),
                 _verdict(mean <= _MAX_MEAN_RETRIES),
+                ', '.join(f'{number}: {count}' for number, count in enumerate(retries) if count),
                 'as for the answers by radio: most packets are retransmitted',
             ),
-            ReportRow(
+            Check(
+                2,
                 'round trip to the robot',
-                _format_trips(cycles),
                 _verdict(slow <= ROUND_TRIP_LIMIT * period, slow <= period),
+                _format_trips(cycles),
                 f'half a period is {500.0 * period:g} ms: a lower --set cycle_rate, or the '
                 'latency timer of the serial port at 1 ms (docs/radio.md)',
             ),
@@ -171,26 +177,26 @@ def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[ReportR
     if (state := result.state) is not None:
         found = [text for bit, text in _PROBLEMS.items() if frames.StatusFlag(state.status) & bit]
         session = f'in session {state.session}' if state.session else 'in no session'
-        rows.append(ReportRow('robot', session, _verdict(not found), '; '.join(found)))
+        rows.append(Check(2, 'robot', _verdict(not found), session, '; '.join(found)))
     return rows
 
 
 def _verdict(good: bool, usable: bool = True) -> str:
-    return BAD if not usable else GOOD if good else POOR
+    return FAIL if not usable else PASS if good else POOR
 
 
-def is_usable(rows: list[ReportRow]) -> bool:
+def is_usable(rows: list[Check]) -> bool:
     """Return whether the link is good enough to drive the robot."""
-    return all(row.verdict != BAD for row in rows)
+    return all(row.verdict != FAIL for row in rows)
 
 
-def format_report(rows: list[ReportRow]) -> str:
+def format_report(rows: list[Check]) -> str:
     """Return the report as text."""
-    name, width = (max(len(row[column]) for row in rows) for column in (0, 1))
+    name, width = (max(len(str(row[column])) for row in rows) for column in (1, 3))
     lines = []
     for row in rows:
         lines.append(f'{row.name:<{name}}  {row.value:<{width}}  {row.verdict}')
-        if row.verdict != GOOD:
+        if row.verdict != PASS:
             lines.append(f'  try: {row.remedy}')
     return '\n'.join(lines)
 
