@@ -33,8 +33,8 @@ without having seen anything in between: it sees nothing at all. One may be old.
 so far from each other, of those that any sensor has missed while none has seen anything: none
 does."""
 NOTHING_SEEN = 3.0
-"""Way (m) without a reading of anything after which it is in doubt whether any sensor sees, as it
-is before the first one: without their supply Sharp sensors read "nothing in range"."""
+"""Way (m) without a reading of anything after which it is in doubt whether any sensor sees:
+without their supply Sharp sensors read "nothing in range"."""
 BRAKES = 0.4  # share of the time-out after which the robot brakes
 LEAP = 0.1
 """Change of the pose (m) within a step that is no motion: the robot was carried, or found."""
@@ -130,9 +130,8 @@ class RangeMonitor:
         self._pose: Pose | None = None
         self._missed: list[tuple[float, float]] = []
         """Surfaces that were missed since any sensor saw something, m."""
-        self._way, self._way_from = math.inf, ORIGIN
-        """Way since then (m), in steps beyond the noise of a pose, and the end of the last one;
-        inf before any sensor has seen anything."""
+        self._way, self._way_from = 0.0, ORIGIN
+        """Way since then (m), in steps beyond the noise of a pose, and the end of the last one."""
 
     def accept(self, sensor: int, reading: float, stamp_ns: int | None) -> bool:
         """Return whether a reading (m, REP 117) is to be used; one without a stamp has None."""
@@ -211,9 +210,8 @@ class RangeMonitor:
         """Return which sensors are lost, and why; '' if all work."""
         found = self.faults()
         if not found and self._way > NOTHING_SEEN:
-            since = 'yet' if self._way == math.inf else f'for {self._way:.0f} m'
             return (
-                f'no range sensor has seen anything {since}, the robot drives '
+                f'no range sensor has seen anything for {self._way:.0f} m, the robot drives '
                 'slowly: look at their supply and cables, unless nothing is near'
             )
         if not found:

@@ -173,9 +173,7 @@ def test_a_sensor_that_freezes_in_motion_is_found(twist, sensor):
 )
 def test_constant_readings_that_are_no_fault(twist, readings):
     """The last: along a wall near enough that the noise is below the step of the reading."""
-    drive = Drive(twist)
-    drive.run(0.04)
-    assert not drive.run(5.0, readings).lost
+    assert not Drive(twist).run(5.0, readings).lost
 
 
 class Room:
@@ -237,7 +235,6 @@ def test_sensors_that_all_see_nothing_are_named():
 def test_a_robot_that_sees_nothing_for_long_is_slow_and_says_so(noise):
     """In the open it may be right; one that stands has not driven, whatever its pose's noise."""
     monitor, generator = _monitor(), np.random.default_rng(3)
-    monitor.accept(3, 0.5, 0)
     for k in range(4000):
         x = 0.003 * max(k - 2000, 0) + noise * generator.standard_normal()
         for sensor in range(8):
@@ -251,17 +248,6 @@ def test_a_robot_that_sees_nothing_for_long_is_slow_and_says_so(noise):
     monitor.update(4000 * PERIOD_NS, Pose(x, 0.0, 0.0))
     assert not monitor.lost
     assert monitor.faults() == {}
-
-
-def test_before_anything_is_seen_the_robot_is_slow_and_says_so():
-    """Without their supply sensors see nothing: it drove 3 m at 0.36 m/s, and touched walls."""
-    robot = KeptOut().run(12.0)
-    assert 0.1 < max(robot.speeds) < CAUTIOUS_SPEED + 0.01
-    assert 'no range sensor has seen anything yet' in ' '.join(robot.controller.problems())
-    robot.run_until_fast()
-    assert 'range sensor' not in ' '.join(robot.controller.problems())
-    robot.controller.reset()
-    assert max(robot.run(6.0).speeds[-500:]) < CAUTIOUS_SPEED + 0.01
 
 
 @pytest.mark.compiled
@@ -300,13 +286,8 @@ class KeptOut:
         return self
 
     def run_until_fast(self):
-        """Drive on until the robot is fast: it looks around first, and now and then.
-
-        Something is astern, so that its sensors have seen something.
-        """
-        self.run(0.05)
-        self.controller.add_range(4, 0.7, self.k * PERIOD_NS)
-        while self.speeds[-1] < 0.25:
+        """Drive on until the robot is fast: it looks around first, and now and then."""
+        while not self.speeds or self.speeds[-1] < 0.25:
             assert self.run(0.05).k < 4000
         return len(self.speeds)
 
