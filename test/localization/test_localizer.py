@@ -663,7 +663,7 @@ def test_a_slip_is_no_drift(angle):
 
 @functools.cache
 def turned_after_slip(angle):
-    localizer, drive = driven(20.0, drift=0.0)
+    localizer, drive = driven(60.0, drift=0.0)
     drive.odometry = moved_pose(drive.odometry, (0.0, 0.0, angle))
     turned_too_far(localizer, drive, 10.0)
     return turned_too_far(localizer, drive, 10.0)
