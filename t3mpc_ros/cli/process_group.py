@@ -32,7 +32,7 @@ import sysconfig
 import time
 from typing import Self
 
-from t3mpc_ros.nodes.node_main import provide_log_directory
+from t3mpc_ros.nodes.node_main import PROFILES, provide_log_directory, uses_fast_dds
 from t3mpc_ros.parent_process import end_with_parent
 
 READY_TIMEOUT = 1200.0
@@ -305,11 +305,10 @@ class PrivateGraph:
         environment.setdefault('RCUTILS_COLORIZED_OUTPUT', '0')
         environment['ROS_DOMAIN_ID'] = str(self.domain)
         environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-        environment.pop('FASTRTPS_DEFAULT_PROFILES_FILE', None)
-        if 'fastrtps' in environment.get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp'):
+        environment.pop(PROFILES, None)
+        if uses_fast_dds(environment):
             environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'SYSTEM_DEFAULT'
-            profile = str(installed_file(_LOOPBACK_PROFILE))
-            environment['FASTRTPS_DEFAULT_PROFILES_FILE'] = profile
+            environment[PROFILES] = str(installed_file(_LOOPBACK_PROFILE))
         return environment
 
     def close(self) -> None:

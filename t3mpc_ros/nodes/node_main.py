@@ -199,17 +199,22 @@ def environment_problem(environment: Mapping[str, str]) -> str:
     if text and not (text.isdecimal() and int(text) <= MAX_DOMAIN):
         return f'ROS_DOMAIN_ID must be a whole number from 0 to {MAX_DOMAIN}: got {text}'
     profile = environment.get(PROFILES)
-    wanted = environment.get('RMW_IMPLEMENTATION')
-    if profile and 'fastrtps' in (wanted or 'fastrtps') and not Path(profile).is_file():
+    if profile and uses_fast_dds(environment) and not Path(profile).is_file():
         return f'{PROFILES} must be an existing file, with its whole path: got {profile}'
     # The index of ROS packages; where a wheel is used without a set-up, that of its environment.
     prefixes = (environment.get('AMENT_PREFIX_PATH') or sys.prefix).split(os.pathsep)
     index = Path('share', 'ament_index', 'resource_index', 'rmw_typesupport')
     names = {path.name for prefix in prefixes for path in Path(prefix, index).glob('rmw_*')}
     known = sorted(names - {'rmw_implementation'})
+    wanted = environment.get('RMW_IMPLEMENTATION')
     if not wanted or not known or wanted in known:
         return ''
     return f'RMW_IMPLEMENTATION must be one that is installed, {", ".join(known)}: got {wanted}'
+
+
+def uses_fast_dds(environment: Mapping[str, str]) -> bool:
+    """Return whether the middleware is Fast DDS, as it is by default."""
+    return 'fastrtps' in (environment.get('RMW_IMPLEMENTATION') or 'rmw_fastrtps_cpp')
 
 
 def provide_log_directory(environment: MutableMapping[str, str]) -> None:

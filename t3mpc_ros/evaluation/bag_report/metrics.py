@@ -205,9 +205,8 @@ class ReportMetrics:
         """Return the main numbers, a line each, and where the report is."""
         rows = [(title, number) for number, title in self.numbers()]
         width = max(len(title) for title, _ in rows)
-        return '\n'.join(
-            [*(f'  {title:{width}}  {number}' for title, number in rows), f'{self.report}']
-        )
+        lines = [f'  {title:{width}}  {number}' for title, number in rows]
+        return '\n'.join([*lines, str(self.report)])
 
 
 PATH_NUMBERS: tuple[tuple[str, str, Callable[[ReportMetrics], float]], ...] = (

@@ -29,6 +29,7 @@ from t3mpc_ros.radio.tool import procedure
 
 _REPLY_TIMEOUT = 0.25  # s; fifteen retransmissions at 250 kbit/s take 60 ms
 PASS, POOR, FAIL, SKIPPED = 'pass', 'poor', 'fail', 'skipped'
+STEP = 2  # row of the link test in the checklist of docs/robot.md
 _MAX_USB_ROUND_TRIP = 5e-3  # s; PING and PONG take 0.7 ms on the line
 _MAX_MEAN_RETRIES = 0.5  # mean retransmissions per packet above which the radio has no margin
 _SEARCH = '{} t3mpc robot scan searches all channels; '
@@ -125,7 +126,7 @@ def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[Check]:
     absent = reasons.robot_absent(parameters.address, parameters.channel)
     rows = [
         Check(
-            2,
+            STEP,
             'dongle answers over USB',
             _verdict(
                 len(pings) == requests and _slow_trip(pings) <= _MAX_USB_ROUND_TRIP,
@@ -136,14 +137,14 @@ def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[Check]:
             'less load on the computer',
         ),
         Check(
-            2,
+            STEP,
             'frames damaged on the cable',
             _verdict(not result.line_errors),
             str(result.line_errors),
             'another cable, another USB port, no hub',
         ),
         Check(
-            2,
+            STEP,
             'robot answers by radio',
             _verdict(lost <= LOSS_LIMIT / 5, lost <= LOSS_LIMIT),
             f'{len(cycles)} of {requests}',
@@ -159,14 +160,14 @@ def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[Check]:
         slow, period = _slow_trip(cycles), 1.0 / parameters.cycle_rate
         rows += [
             Check(
-                2,
+                STEP,
                 'retransmissions per packet',
                 _verdict(mean <= _MAX_MEAN_RETRIES),
                 ', '.join(f'{number}: {count}' for number, count in enumerate(retries) if count),
                 'as for the answers by radio: most packets are retransmitted',
             ),
             Check(
-                2,
+                STEP,
                 'round trip to the robot',
                 _verdict(slow <= ROUND_TRIP_LIMIT * period, slow <= period),
                 _format_trips(cycles),
@@ -177,7 +178,7 @@ def evaluate(result: LinkTestResult, parameters: LinkParameters) -> list[Check]:
     if (state := result.state) is not None:
         found = [text for bit, text in _PROBLEMS.items() if frames.StatusFlag(state.status) & bit]
         session = f'in session {state.session}' if state.session else 'in no session'
-        rows.append(Check(2, 'robot', _verdict(not found), session, '; '.join(found)))
+        rows.append(Check(STEP, 'robot', _verdict(not found), session, '; '.join(found)))
     return rows
 
 
@@ -192,7 +193,8 @@ def is_usable(rows: list[Check]) -> bool:
 
 def format_report(rows: list[Check]) -> str:
     """Return the report as text."""
-    name, width = (max(len(str(row[column])) for row in rows) for column in (1, 3))
+    name = max(len(row.name) for row in rows)
+    width = max(len(row.value) for row in rows)
     lines = []
     for row in rows:
         lines.append(f'{row.name:<{name}}  {row.value:<{width}}  {row.verdict}')
