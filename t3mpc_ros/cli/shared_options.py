@@ -203,7 +203,7 @@ def new_folder(text: str) -> Path:
     """Return the path of a folder that exists or can be made."""
     path = Path(text)
     for each in (path, *path.parents):
-        if each.is_file():
+        if each.exists() and not each.is_dir():
             raise argparse.ArgumentTypeError(
                 f'must be a folder, or the path of a new one: got {text}'
                 + (f', and {each} is a file' if each != path else '')

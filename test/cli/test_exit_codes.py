@@ -202,6 +202,7 @@ CASES = [
             'demo --duration 0': 'must be from 1 to 86400 seconds: got 0',
             'demo --output key': 'must be a folder, or the path of a new one: got key',
             'demo --output key/a/b': 'of a new one: got key/a/b, and key is a file',
+            'demo --output /dev/null/a': 'got /dev/null/a, and /dev/null is a file',
             'demo --loss 1': 'must be from 0 to below 1: got 1',
             'estimation --gain x': "invalid number value: 'x'",
             'paper --seeds 3': 'must be A-B, as in 1-3, or 3-3 for one',

@@ -197,6 +197,12 @@ ODD_BAGS = {
         ('The stamps of /odom leap by -100.0 s at 8.0',),
         True,
     ),
+    'robot clock set back and forward again': (
+        lambda: changed('/odom', lambda i, t, m: restamped(m, -100.0 * (8.0 < t < 9.0))),
+        'Good run',
+        ('The stamps of /odom leap by -100.0 s at 8.0 s, the first of 2 leaps: a clock was set',),
+        True,
+    ),
     'robot clock set forward': (
         lambda: changed('/odom', lambda i, t, m: restamped(m, 1e6 * (t > 8.0))),
         'Good run',

@@ -494,7 +494,7 @@ def _mend_stamps(table: dict[str, Array], topic: str, notes: list[str], doubts: 
         notes.append(
             f'The stamps of {topic} leap by {steps[leaps[0]]:.1f} s at '
             f'{received[leaps[0]]:.1f} s'
-            f'{f", and {len(leaps) - 1} times later" if len(leaps) > 1 else ""}: a clock was set; '
+            f'{f", the first of {len(leaps)} leaps" if len(leaps) > 1 else ""}: a clock was set; '
             'its messages were placed by receive time.'
         )
     if late := np.count_nonzero((steps < 0.0) & (steps >= -JUMP)):
