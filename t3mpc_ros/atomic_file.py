@@ -65,6 +65,14 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         file.write(content.encode() if isinstance(content, str) else content)
 
 
+def check_new_folder(path: Path) -> None:
+    """Raise ValueError unless ``path`` is a folder, or one can be made there."""
+    for each in (path, *path.parents):
+        if each.exists() and not each.is_dir():
+            why = '' if each == path else f', and {each} is a file'
+            raise ValueError(f'must be a folder, or the path of a new one: got {path}{why}')
+
+
 def sync_folder(folder: Path) -> None:
     """Write the names in a folder to the disk: a power failure may lose a new file without it."""
     handle = os.open(folder, os.O_RDONLY)

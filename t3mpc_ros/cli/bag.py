@@ -28,6 +28,7 @@ from t3mpc_ros.cli.shared_options import (
     RemovedOption,
     add_json,
     add_topic_options,
+    new_folder,
     print_result,
     report_options,
     run_command,
@@ -214,7 +215,9 @@ def _add_recover(commands: Commands) -> None:
     )
     parser.add_argument('bag', type=Path, metavar='FILE', help='an MCAP file, or a folder of such')
     parser.add_argument(
-        '--output', type=Path, help='new or empty folder (default: FILE_recovered beside FILE)'
+        '--output',
+        type=new_folder,
+        help='new or empty folder (default: FILE_recovered beside FILE)',
     )
     add_json(parser, 'write what was kept and lost')
     parser.set_defaults(run=_run_recover)
@@ -338,7 +341,7 @@ def _add_report(commands: Commands) -> None:
     )
     add = parser.add_argument
     add('bags', type=Path, nargs='+', metavar='BAG', help='folder of a bag, or its one file')
-    add('--output', type=Path, help='folder for the report (default: beside it)')
+    add('--output', type=new_folder, help='folder for the report (default: beside it)')
     add_topic_options(parser)
     text = 'what the robot was to follow: odometry or a twist'
     add('--reference', default='', metavar='TOPIC', help=text)
@@ -411,7 +414,7 @@ def _add_replay(commands: Commands) -> None:
     )
     add = parser.add_argument
     add('bag', type=Path, metavar='BAG', help='folder of the bag, or its file')
-    add('--output', type=Path, metavar='DIR', help='write a bag of what was computed')
+    add('--output', type=new_folder, metavar='DIR', help='write a bag of what was computed')
     add('--method', action=RemovedOption, nargs='?', help=argparse.SUPPRESS)
     add_input_options(parser)
     add_json(parser, 'write speed and comparison')

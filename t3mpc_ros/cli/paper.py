@@ -38,7 +38,11 @@ def add_parser(commands: shared_options.Commands) -> None:
         text='20, quick: 2',
     )
     shared_options.add_workers(parser)
-    add('--output', type=Path, help='folder (default runs/paper, or runs/paper-quick)')
+    add(
+        '--output',
+        type=shared_options.new_folder,
+        help='folder (default runs/paper, or runs/paper-quick)',
+    )
     shared_options.add_json(parser, 'also write the results')
     add('--fresh', action='store_true', help='discard the runs that the folder holds')
     parser.set_defaults(run=run)

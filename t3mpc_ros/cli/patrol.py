@@ -83,7 +83,12 @@ def add_parser(commands: shared_options.Commands) -> None:
     )
     shared_options.add_workers(parser)
     shared_options.add_json(parser, 'also write every run')
-    add('--output', type=Path, default=OUTPUT, help=f'folder of the page (default {OUTPUT})')
+    add(
+        '--output',
+        type=shared_options.new_folder,
+        default=OUTPUT,
+        help=f'folder of the page (default {OUTPUT})',
+    )
     parser.set_defaults(run=run)
 
 

@@ -23,7 +23,7 @@ import select
 import sys
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from t3mpc_ros.atomic_file import write_atomically
+from t3mpc_ros.atomic_file import check_new_folder, write_atomically
 from t3mpc_ros.evaluation.api.error_messages import sentence
 from t3mpc_ros.parameters.command_line import bounded_float, bounded_int, check_writable
 from t3mpc_ros.parameters.table import ParameterError
@@ -201,13 +201,12 @@ def seed_range(text: str) -> tuple[int, ...]:
 
 def new_folder(text: str) -> Path:
     """Return the path of a folder that exists or can be made."""
-    path = Path(text)
-    for each in (path, *path.parents):
-        if each.exists() and not each.is_dir():
-            raise argparse.ArgumentTypeError(
-                f'must be a folder, or the path of a new one: got {text}'
-                + (f', and {each} is a file' if each != path else '')
-            )
+    if not text:
+        raise argparse.ArgumentTypeError("must name a folder, . for this one: got ''")
+    try:
+        check_new_folder(path := Path(text))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
     return path
 
 

@@ -107,9 +107,10 @@ UNEXPLAINED, EXCITED_BLOCKS = 0.8, 8
 """Share of that change which the turn does not make, from which commands are lost or late, and
 number of blocks from which it is known. Rotors that ring leave up to 0.64 in nine of ten moments
 of a patrol, 0.9 with 10 % of the commands lost; a loss of 30 % leaves 1.3 in half of them."""
-ROUGH, CALM_BLOCKS = 0.003, 10
+ROUGH, CALM_BLOCKS = 0.004, 10
 """Standard deviation of the turn beyond E20 (rad/s of a wheel) from which it is rough, and number
-of calm blocks from which it is known. Microsteps leave up to 0.0028."""
+of calm blocks from which it is known. Microsteps leave up to 0.0037, 10 % of the commands lost
+0.006 and more."""
 WATCHED_QUANTILE = 0.2
 """Quantile of the blocks that counts: in most of them nothing else disturbs the turn."""
 RINGING, RINGING_MEMORY = 0.04, 0.98

@@ -27,6 +27,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from std_srvs.srv import Trigger
 
+from t3mpc_ros.atomic_file import check_new_folder
 from t3mpc_ros.bag.mcap_file import LOSSES, Attachment, message_loss_record
 from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions, UnknownTypeError
 from t3mpc_ros.bag.recording import SEED_RECORD, RecordingMetadata, RecordingParameters
@@ -69,10 +70,10 @@ class RecorderNode(BaseNode[RecordingParameters]):
         super().__init__('recorder', **options)
         parameters = self.parameters
         self._folder = Path(parameters.uri or f'bag_{datetime.now():%Y_%m_%d-%H_%M_%S}').resolve()
-        if self._folder.is_file():
-            raise ParameterError(
-                f'storage.uri must be a folder, or the path of a new one: got file {self._folder}'
-            )
+        try:
+            check_new_folder(self._folder)
+        except ValueError as error:
+            raise ParameterError(f'storage.uri {error}') from None
         self._metadata = RecordingMetadata(
             parameters.attachments,
             parameters.max_attachment_size,

@@ -16,6 +16,7 @@
 from contextlib import nullcontext
 import os
 from pathlib import Path
+import shlex
 import signal
 import sys
 from types import SimpleNamespace
@@ -202,6 +203,9 @@ CASES = [
             'demo --duration 0': 'must be from 1 to 86400 seconds: got 0',
             'demo --output key': 'must be a folder, or the path of a new one: got key',
             'demo --output key/a/b': 'of a new one: got key/a/b, and key is a file',
+            "demo --output ''": "must name a folder, . for this one: got ''",
+            'bag report b --output key/a': 'got key/a, and key is a file',
+            'patrol --output key': 'of a new one: got key',
             'demo --output /dev/null/a': 'got /dev/null/a, and /dev/null is a file',
             'demo --loss 1': 'must be from 0 to below 1: got 1',
             'estimation --gain x': "invalid number value: 'x'",
@@ -254,7 +258,7 @@ def test_the_exit_code_says_how_it_ended(
     for name, result in instead.items():
         replace(monkeypatch, f't3mpc_ros.{name}', result)
     try:
-        found = main(words.split())
+        found = main(shlex.split(words))
     except SystemExit as end:
         found = end.code
     shown = capsys.readouterr()

@@ -405,6 +405,14 @@ def test_lost_commands_and_a_rough_yaw_rate_are_named():
         assert each.correction.response_problem() == ''
 
 
+def test_microsteps_are_no_rough_yaw_rate():
+    """In one half minute of three an exact robot had a rough yaw rate, of at most 0.0037 rad/s."""
+    body = Body(exact)
+    for rough, named in ((0.0037, False), (0.0045, True)):
+        body.correction._state.watched[:, 1] = rough
+        assert ('is rough' in body.correction.response_problem()) is named
+
+
 @pytest.mark.parametrize('noise', [0.1])
 def test_noise_of_the_yaw_is_no_scale_of_the_gyro(noise):
     """A patrol by the map turned 4 % too far after 200 s: corrections of its pose are noise.

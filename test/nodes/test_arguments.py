@@ -127,7 +127,7 @@ INVALID = [
     ('player', '--ros-args -p storage.uris:=["/nowhere"]', 'player: there is no bag /nowhere'),
     ('recorder', '--ros-args --params-file MISSING', 'MISSING', 'cannot be read'),
     ('recorder', '--ros-args --params-file BROKEN', 'BROKEN', 'is not YAML'),
-    ('recorder', '--ros-args -p storage.uri:=FILE/bag', 'FILE/bag'),
+    ('recorder', '--ros-args -p storage.uri:=FILE/bag', 'must be a folder', 'FILE is a file'),
     ('recorder', '--ros-args -p storage.uri:=FILE', 'storage.uri must be a folder', 'FILE'),
 ]
 """Executable, arguments, and the words of the one line that it prints."""
