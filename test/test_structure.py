@@ -60,7 +60,7 @@ PACKAGES = {
     'evaluation': CORE
     | {'localization', 'page', 'atomic_file', 'stop_signal', 'parent_process', 'missing_library'}
     | {'script_error'},
-    'nodes': CORE | {'radio', 'localization', 'stop_signal', 'missing_library'},
+    'nodes': CORE | {'radio', 'localization', 'atomic_file', 'stop_signal', 'missing_library'},
     'cli': CORE
     | {'radio', 'atomic_file', 'stop_signal', 'parent_process', 'missing_library'}
     | {'emulator', 'evaluation', 'nodes', 'view'},
