@@ -25,7 +25,8 @@ import math
 import numpy as np
 
 from t3mpc_ros.evaluation.confidence_intervals import mean
-from t3mpc_ros.evaluation.patrol.path_trackers import (
+from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS, PatrolScenario, run_patrol
+from t3mpc_ros.evaluation.patrol.pure_pursuit import (
     SPACING,
     PathTracker,
     PurePursuitParameters,
@@ -33,8 +34,7 @@ from t3mpc_ros.evaluation.patrol.path_trackers import (
     RegulatedParameters,
     TwistLimiter,
 )
-from t3mpc_ros.evaluation.patrol.path_tracking import errors_of
-from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS, PatrolScenario, run_patrol
+from t3mpc_ros.evaluation.patrol.tracking_study import errors_of
 from t3mpc_ros.evaluation.record import RATE
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_smoothing import SmoothedPath

@@ -48,12 +48,12 @@ from t3mpc_ros.evaluation.patrol.patrol_run import (
     run_patrol,
 )
 from t3mpc_ros.evaluation.record import Record
-from t3mpc_ros.evaluation.run_digest import digest
+from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, State
 from t3mpc_ros.localization.change_detection import Change
 from t3mpc_ros.localization.localizer import Localizer
 from t3mpc_ros.robot.description import sensor_mounts
-from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import WORLDS_FOLDER, MovingDisc, World, cast_rays, load_world
 
 OFFICE = """

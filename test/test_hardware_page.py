@@ -25,7 +25,7 @@ import pytest
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
-from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / 'docs' / 'hardware.md'

@@ -25,7 +25,7 @@ import numba
 import numpy as np
 import pytest
 
-from t3mpc_ros.control.command_shaper import row_at
+from t3mpc_ros.control.input_shaper import row_at
 from t3mpc_ros.kernels import (
     TypedKernel,
     cache_directory,

@@ -180,9 +180,9 @@ def _compile_robots() -> None:
 
     from t3mpc_ros.chaos.reference import ChaoticReference, ReferenceParameters
     from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
-    from t3mpc_ros.control.command_shaper import CommandShaper
     from t3mpc_ros.control.controller import StepperControllerParameters
     from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
+    from t3mpc_ros.control.input_shaper import InputShaper
     from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters
     from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters, SpeedKalmanFilter
     from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
@@ -194,7 +194,7 @@ def _compile_robots() -> None:
     SpeedKalmanFilter(controller.speed_filter, 'velocity', 0.01).update(
         zero, zero, 0.01, sent=True
     )
-    CommandShaper(controller.command_shaper, 0.01).step(zero, 0.01)
+    InputShaper(controller.command_shaper, 0.01).step(zero, 0.01)
     DeadTimeEstimator(SpeedFilterParameters(), 0.01).step(zero, zero, 0.01)
     BodyCorrection(BodyCorrectionParameters(), 0.04, 0.1, 0.01).step(
         0.0, 0.01, zero, zero, zero, 0.0

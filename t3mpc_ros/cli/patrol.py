@@ -138,9 +138,9 @@ def _print_table(
 
 
 def _tune_tracking(options: argparse.Namespace) -> int:
-    from t3mpc_ros.evaluation.patrol import path_tracking, path_tracking_page
+    from t3mpc_ros.evaluation.patrol import tracking_page, tracking_study
 
-    tune, markdown = path_tracking.tune_trackers, path_tracking_page.tuning_markdown
+    tune, markdown = tracking_study.tune_trackers, tracking_page.tuning_markdown
     return _print_table(options, tune, markdown, lambda found: found)
 
 
@@ -166,11 +166,11 @@ _Study = tuple[Any, Any, Callable[..., Any]]
 
 
 def _tracking(options: argparse.Namespace) -> _Study:
-    from t3mpc_ros.evaluation.patrol import path_tracking, path_tracking_page
+    from t3mpc_ros.evaluation.patrol import tracking_page, tracking_study
 
-    paths = options.paths or tuple(path_tracking.TRACKED_PATHS)
-    plan = path_tracking.TrackingPlan(paths=paths, seeds=options.seeds)
-    return path_tracking_page, plan, path_tracking.compare_trackers
+    paths = options.paths or tuple(tracking_study.TRACKED_PATHS)
+    plan = tracking_study.TrackingPlan(paths=paths, seeds=options.seeds)
+    return tracking_page, plan, tracking_study.compare_trackers
 
 
 def _patrols(options: argparse.Namespace) -> _Study:

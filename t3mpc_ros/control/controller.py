@@ -29,7 +29,6 @@ from t3mpc_ros.control.actuation import (
     wheel_limits,
 )
 from t3mpc_ros.control.body_correction import BodyCorrection, BodyCorrectionParameters
-from t3mpc_ros.control.command_shaper import HIGHEST, CommandShaper, CommandShaperParameters
 from t3mpc_ros.control.control_law import (
     MAX_SMOOTHING,
     TERM_NAMES,
@@ -42,6 +41,7 @@ from t3mpc_ros.control.control_law import (
     servo_gain,
 )
 from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
+from t3mpc_ros.control.input_shaper import HIGHEST, InputShaper, InputShaperParameters
 from t3mpc_ros.control.jump_transition import CommandLimit, JumpTransition, MotorLimit
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
@@ -144,8 +144,8 @@ class ControllerParameters(Nt3fsMpcParameters):
     watchdog: WatchdogParameters = group(WatchdogParameters)
     # Wheels of steppers follow whatever the friction; bags without the parameter had no such term.
     friction: FrictionTermParameters = group(FrictionTermParameters, gamma=0.0)
-    command_shaper: CommandShaperParameters = group(
-        CommandShaperParameters, straight_frequency=0.0, turning_frequency=0.0
+    command_shaper: InputShaperParameters = group(
+        InputShaperParameters, straight_frequency=0.0, turning_frequency=0.0
     )
     body: BodyCorrectionParameters = group(BodyCorrectionParameters, fixed=('max_correction',))
     pose: PoseLoopParameters = group(PoseLoopParameters)
@@ -216,7 +216,7 @@ class StepperControllerParameters(ControllerParameters):
     speed_filter: SpeedFilterParameters = group(
         SpeedFilterParameters, fixed=('disturbance',), lag=0.003
     )
-    command_shaper: CommandShaperParameters = group(CommandShaperParameters)
+    command_shaper: InputShaperParameters = group(InputShaperParameters)
 
 
 WHEELS = ('right', 'left')
@@ -321,7 +321,7 @@ class Controller:
 
     def _begin(self) -> None:
         """Begin without odometry, and with the dead time of the parameters."""
-        self._shaper = CommandShaper(self.parameters.command_shaper, self._period)
+        self._shaper = InputShaper(self.parameters.command_shaper, self._period)
         self._turning_frequency = self.parameters.command_shaper.turning_frequency
         """Frequency for which the commands are shaped, Hz."""
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
@@ -755,7 +755,7 @@ class Controller:
         configured = self.parameters.command_shaper
         factor = found / configured.turning_frequency
         straight = min(factor * configured.straight_frequency, HIGHEST)
-        self._shaper.retune(CommandShaperParameters(straight, found))
+        self._shaper.retune(InputShaperParameters(straight, found))
 
     def _follow_pose(self, odometry: State, begin: Array, end: Array, elapsed: float) -> None:
         """Change the plan from ``begin`` to ``end`` (rad/s) by pose loop and keep-out."""

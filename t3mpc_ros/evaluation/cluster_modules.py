@@ -89,7 +89,7 @@ class ModuleCarrier(Executor):
     """The executor of a cluster, whose workers get the modules of one's own with each job."""
 
     def __init__(self, executor: Executor) -> None:
-        from t3mpc_ros.evaluation.run_digest import source_digest  # it imports this module
+        from t3mpc_ros.evaluation.run_key import source_digest  # it imports this module
 
         self._executor = executor
         self._sources, self._package = own_sources(), source_digest()
@@ -108,7 +108,7 @@ def run_carried(package: str, sources: Sources, job: bytes) -> Any:
 
     ``package`` is the digest of the sources of this package: others give other numbers.
     """
-    from t3mpc_ros.evaluation.run_digest import source_digest
+    from t3mpc_ros.evaluation.run_key import source_digest
 
     if source_digest() != package:
         raise ScriptError(

@@ -19,7 +19,7 @@ from functools import cache
 from importlib import import_module
 from typing import TypeVar
 
-from t3mpc_ros.control.command_shaper import CommandShaperParameters
+from t3mpc_ros.control.input_shaper import InputShaperParameters
 from t3mpc_ros.evaluation.baselines import feedback_control
 from t3mpc_ros.evaluation.baselines.adaptive_fuzzy import AdaptiveIntervalType2, AdaptiveType1
 from t3mpc_ros.evaluation.baselines.baseline_controller import BaselineController
@@ -244,7 +244,7 @@ def further_definitions() -> list[MethodDefinition]:
 
 def feed_forward_on_the_twin(table: type[FeedForwardParameters]) -> FeedForwardParameters:
     """Return the parameters of a feed-forward with the shaper of the node and its dead time."""
-    shaper = CommandShaperParameters()
+    shaper = InputShaperParameters()
     return table(advance=TWIN_ADVANCE, estimate_dead_time=True, command_shaper=shaper)
 
 

@@ -51,7 +51,7 @@ from t3mpc_ros.nodes.base_node import NO_CLOCK, OK, WARN, BaseNode, MatchingSubs
 from t3mpc_ros.nodes.conversions import FrameParameters
 from t3mpc_ros.parameters.table import ParameterError, group, parameter
 from t3mpc_ros.robot.description import sensor_mounts
-from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import WorldError, load_world
 
 TRANSFORM_PERIOD = 0.1

@@ -47,7 +47,7 @@ from t3mpc_ros.radio.protocol.authentication import KeyFileError, read_key
 from t3mpc_ros.radio.radio_robot import RadioRobot, RadioRobotParameters
 from t3mpc_ros.radio.serial_port import PortError, SerialPort, find_ports
 from t3mpc_ros.robot.interface import RobotState
-from t3mpc_ros.robot.sensor_conversions import (
+from t3mpc_ros.robot.sensor_parameters import (
     BatteryParameters,
     ImuParameters,
     RangeSensorParameters,

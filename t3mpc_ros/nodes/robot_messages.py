@@ -27,7 +27,7 @@ from t3mpc_ros.parameters.table import parameter
 from t3mpc_ros.robot.command_limiter import SLIP_STOP_REASON
 from t3mpc_ros.robot.description import FrameNames
 from t3mpc_ros.robot.interface import BatteryReading, ImuSample, RobotState
-from t3mpc_ros.robot.sensor_conversions import (
+from t3mpc_ros.robot.sensor_parameters import (
     GRAVITY,
     BatteryParameters,
     ImuParameters,

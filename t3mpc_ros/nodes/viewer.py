@@ -57,7 +57,7 @@ from t3mpc_ros.nodes.node_main import own_context
 from t3mpc_ros.nodes.qos import PolledCallbackGroup, full_name, take_with_info
 from t3mpc_ros.nodes.remote_parameters import ParameterWatch, RemoteParameters, plain_value
 from t3mpc_ros.robot.description import sensor_mounts
-from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import world_outline
 
 PERIOD = 0.05

@@ -26,7 +26,7 @@ import numpy as np
 
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import RANGE_SENSORS, Array
-from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 
 _TYRE_WIDTH = 0.02  # m
 _SENSOR_SIZE = '0.013 0.037 0.013'  # m: depth, width and height of the GP2Y0A21YK0F

@@ -154,20 +154,20 @@ COMPARE = {
 }
 PATROL = {
     f'evaluation.patrol.{name}_page.{function}': result
-    for name in ('patrol', 'path_tracking')
+    for name in ('patrol', 'tracking_study')
     for function, result in (('markdown', ''), ('record', {}), ('page', ''))
 } | {
     'evaluation.plotting.write_pictures': {},
     'evaluation.patrol.patrol_comparison.compare_patrols': SimpleNamespace(
         table=SimpleNamespace(keys=())
     ),
-    'evaluation.patrol.path_tracking.compare_trackers': SimpleNamespace(
+    'evaluation.patrol.tracking_study.compare_trackers': SimpleNamespace(
         table=SimpleNamespace(keys=())
     ),
-    'evaluation.patrol.path_tracking.tune_trackers': {},
+    'evaluation.patrol.tracking_study.tune_trackers': {},
     'evaluation.patrol.safety_study.compare_safety': SimpleNamespace(rows=[]),
     'evaluation.patrol.safety_study.safety_table': SimpleNamespace(markdown=str),
-    'evaluation.patrol.path_tracking_page.tuning_markdown': '',
+    'evaluation.patrol.tracking_page.tuning_markdown': '',
     'evaluation.patrol.localization_study.compare_localizations': SimpleNamespace(rows=[]),
     'evaluation.patrol.localization_study.markdown': '',
 }

@@ -21,7 +21,7 @@ import pytest
 from t3mpc_ros.evaluation import cluster_modules
 from t3mpc_ros.evaluation.api.script_parts import FileController
 from t3mpc_ros.evaluation.cluster_modules import SourceText, own_sources, run_carried
-from t3mpc_ros.evaluation.run_digest import source_digest
+from t3mpc_ros.evaluation.run_key import source_digest
 from t3mpc_ros.script_error import ScriptError
 
 NAMES = ('carried', 'carried.law', 'carried_helper')

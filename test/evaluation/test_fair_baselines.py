@@ -27,7 +27,7 @@ import pytest
 from scipy.stats import ttest_rel
 from support.long_tests import few_of
 
-from t3mpc_ros.control.command_shaper import CommandShaperParameters
+from t3mpc_ros.control.input_shaper import InputShaperParameters
 from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
 from t3mpc_ros.evaluation.baselines.feed_forward import (
@@ -72,7 +72,7 @@ from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 T = 0.01
 PI = 'PI + feed-forward'
-SHAPER = CommandShaperParameters()
+SHAPER = InputShaperParameters()
 
 
 def servo(lag=0.003):

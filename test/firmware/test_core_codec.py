@@ -24,7 +24,7 @@ from support.long_tests import few_of
 
 from t3mpc_ros.radio.protocol.authentication import siphash
 from t3mpc_ros.radio.protocol.framing import FrameDecoder, encode_frame
-from t3mpc_ros.robot.sensor_conversions import encode_range
+from t3mpc_ros.robot.sensor_parameters import encode_range
 from t3mpc_ros.simulation.sensors import range_sensor
 
 COMMAND = bytes.fromhex('215a0701140088133cf615cd5b07')

@@ -19,7 +19,7 @@ import struct
 import pytest
 from support import firmware_core as core
 
-from t3mpc_ros.robot.sensor_conversions import encode_range
+from t3mpc_ros.robot.sensor_parameters import encode_range
 from t3mpc_ros.simulation.sensors import range_sensor
 
 BOUNDS = {

@@ -24,7 +24,7 @@ from t3mpc_ros.localization.change_detection import ChangeDetector, ChangeKind, 
 from t3mpc_ros.localization.occupancy_map import map_of_world
 from t3mpc_ros.localization.range_model import Beams, RangeModel, RangeModelParameters
 from t3mpc_ros.robot.description import sensor_mounts
-from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import cast_rays, parse_world
 
 MOUNTS = sensor_mounts(RangeSensorParameters())

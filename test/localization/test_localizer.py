@@ -40,7 +40,7 @@ from t3mpc_ros.localization.occupancy_map import map_of_world
 from t3mpc_ros.localization.particle_filter import moved_pose, odometry_motion
 from t3mpc_ros.localization.range_model import Beams
 from t3mpc_ros.robot.description import sensor_mounts
-from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import cast_rays, parse_world
 
 MOUNTS = sensor_mounts(RangeSensorParameters())

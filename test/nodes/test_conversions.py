@@ -38,7 +38,7 @@ from t3mpc_ros.robot.interface import (
     RobotStatus,
     WheelAngles,
 )
-from t3mpc_ros.robot.sensor_conversions import (
+from t3mpc_ros.robot.sensor_parameters import (
     BatteryParameters,
     ImuParameters,
     RangeSensorParameters,

@@ -24,7 +24,7 @@ from support.long_tests import few_of
 from t3mpc_ros.geometry.types import RANGE_SENSORS, Pose, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.interface import RobotCommand
-from t3mpc_ros.robot.sensor_conversions import ImuParameters
+from t3mpc_ros.robot.sensor_parameters import ImuParameters
 from t3mpc_ros.simulation.digital_twin import (
     BROWN_OUT_REASON,
     DigitalTwin,

@@ -20,7 +20,7 @@ import pytest
 from support.constants import split_constants
 from support.long_tests import few_of
 
-from t3mpc_ros.robot.sensor_conversions import GRAVITY
+from t3mpc_ros.robot.sensor_parameters import GRAVITY
 from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters, low_pass
 
 IDEAL = {

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from t3mpc_ros.parameters.table import ParameterError
-from t3mpc_ros.robot.sensor_conversions import (
+from t3mpc_ros.robot.sensor_parameters import (
     BEYOND,
     FAULT,
     NOT_MEASURED,

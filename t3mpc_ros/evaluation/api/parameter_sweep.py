@@ -50,7 +50,7 @@ from t3mpc_ros.evaluation.experiment import (
 from t3mpc_ros.evaluation.record import METRICS, SETTLED, Metric, measure
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, columns_of
 from t3mpc_ros.evaluation.result_file import ResultFile, Row
-from t3mpc_ros.evaluation.run_digest import digest
+from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.parameters.provenance import provenance
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.script_error import ScriptError

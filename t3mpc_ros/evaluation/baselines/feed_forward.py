@@ -20,7 +20,7 @@ drive the command is the acceleration u = r' of the same reachable reference; it
 not controlled, and drifts with every disturbance.
 
 What feedback and learning are worth is the difference to this method. With the frequencies of a
-:mod:`t3mpc_ros.control.command_shaper` the command does not excite the rotors, and with
+:mod:`t3mpc_ros.control.input_shaper` the command does not excite the rotors, and with
 ``estimate_dead_time`` it is ahead by the estimated dead time: what the controller of the node does
 on a robot whose body is as assumed. :class:`LmsBodyCorrection` adds the simplest correction of a
 body that is not: two gains by least mean squares.
@@ -31,7 +31,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParameters
+from t3mpc_ros.control.input_shaper import InputShaper, InputShaperParameters
 from t3mpc_ros.control.jump_transition import JumpTransitionParameters
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
@@ -58,8 +58,8 @@ class FeedForwardParameters(Parameters):
         False, 'whether the dead time of a velocity drive is estimated, and the estimate used'
     )
     jump_transition: JumpTransitionParameters = group(JumpTransitionParameters)
-    command_shaper: CommandShaperParameters = group(
-        CommandShaperParameters, straight_frequency=0.0, turning_frequency=0.0
+    command_shaper: InputShaperParameters = group(
+        InputShaperParameters, straight_frequency=0.0, turning_frequency=0.0
     )
 
 
@@ -78,7 +78,7 @@ class FeedForward(BaselineController):
         self._period = nominal_model.period
         advance = table.advance or nominal_model.lag + 0.5 * self._period
         whole, self._part = divmod(0.0 if self._torque else advance / self._period, 1.0)
-        shaper = CommandShaper(table.command_shaper, self._period)
+        shaper = InputShaper(table.command_shaper, self._period)
         self._shaper = shaper if shaper.lead_ns else None
         self.known = ('frequencies of the rotors',) if self._shaper else ()
         ahead = int(whole) + round(shaper.lead_ns / NANOSECONDS / self._period)

@@ -27,7 +27,7 @@ from t3mpc_ros.evaluation.paper import paper_figures, study
 from t3mpc_ros.evaluation.paper.claims import VERDICTS, Claim, all_claims, markdown
 from t3mpc_ros.evaluation.paper.paper_tables import Results, all_tables, csv_columns
 from t3mpc_ros.evaluation.plotting import write_pictures
-from t3mpc_ros.evaluation.run_digest import source_digest
+from t3mpc_ros.evaluation.run_key import source_digest
 from t3mpc_ros.parameters.provenance import machine, provenance
 from t3mpc_ros.version import VERSION
 

@@ -25,7 +25,7 @@ from t3mpc_ros.evaluation.experiment import Run
 from t3mpc_ros.evaluation.methods import STAGES as METHOD_STAGES
 from t3mpc_ros.evaluation.methods import methods
 from t3mpc_ros.evaluation.record import START, Record
-from t3mpc_ros.evaluation.run_digest import digest
+from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, KINDS, PLANT_OF, Scenario, held_out
 
 DRIVES = ('torque', 'velocity')

@@ -42,14 +42,14 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import (
 )
 from t3mpc_ros.evaluation.record import Record
 from t3mpc_ros.evaluation.result_file import Row
-from t3mpc_ros.evaluation.run_digest import digest
+from t3mpc_ros.evaluation.run_key import digest
 from t3mpc_ros.geometry.arena import Arena
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.path_timing import PathTiming
 from t3mpc_ros.geometry.types import ORIGIN, Array
 from t3mpc_ros.parameters.table import find_names
 from t3mpc_ros.robot.description import ray_ends, sensor_mounts
-from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.world import World, parse_world
 
 OURS = 'portraits (85)'

@@ -37,7 +37,7 @@ from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.keep_out import Activity
 from t3mpc_ros.evaluation.loop import reports_of, run_loop
-from t3mpc_ros.evaluation.patrol.path_trackers import PathTracker
+from t3mpc_ros.evaluation.patrol.pure_pursuit import PathTracker
 from t3mpc_ros.evaluation.record import ON_PATH, RATE, Record, stamp_of
 from t3mpc_ros.evaluation.scenario import KINDS, LEAD
 from t3mpc_ros.geometry.arena import Arena
@@ -62,7 +62,7 @@ from t3mpc_ros.localization.localizer import (
 from t3mpc_ros.localization.occupancy_map import map_of_world
 from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
-from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.plant_robot import Signals
 from t3mpc_ros.simulation.world import MovingDisc, load_world

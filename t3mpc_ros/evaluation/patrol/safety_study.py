@@ -36,7 +36,7 @@ from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.geometry.types import Array, State
 from t3mpc_ros.robot.description import sensor_mounts
-from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters
+from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
 from t3mpc_ros.simulation.world import MovingDisc, World, cast_rays, clearance, parse_world
 

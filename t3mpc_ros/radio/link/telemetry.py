@@ -20,7 +20,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.radio.protocol.clock_sync import ClockModel, CounterUnwrapper, wrapped_difference
 from t3mpc_ros.radio.protocol.frames import AGE_NONE, State, StatusFlag
 from t3mpc_ros.robot.interface import ImuSample, RobotStatus, WheelAngles
-from t3mpc_ros.robot.sensor_conversions import ImuParameters, decode_range
+from t3mpc_ros.robot.sensor_parameters import ImuParameters, decode_range
 
 _MAX_COUNTED_RESTARTS = 1000
 """Difference of two counts of starts above which one of them was lost: one restart is certain."""

@@ -34,7 +34,7 @@ from t3mpc_ros.robot.calibration import (
     Calibration,
     nominal_battery_voltage,
 )
-from t3mpc_ros.robot.sensor_conversions import GRAVITY, ImuParameters
+from t3mpc_ros.robot.sensor_parameters import GRAVITY, ImuParameters
 
 SAMPLE_COUNT = 200
 _SAMPLE_PERIOD = 0.01  # s; two seconds in all

@@ -20,7 +20,7 @@ from typing import ClassVar
 
 from t3mpc_ros.parameters.table import ParameterError, parameter
 from t3mpc_ros.robot.interface import BatteryReading
-from t3mpc_ros.robot.sensor_conversions import BatteryParameters
+from t3mpc_ros.robot.sensor_parameters import BatteryParameters
 
 # Charge (1) and open-circuit voltage (V) of a Li-ion (NMC) cell: rounded from the discharges at
 # C/32 and C/20 of Molicel P42A and Samsung 40T cells in Sunil et al. (IEEE Transactions on

@@ -23,7 +23,7 @@ from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import parameter
 from t3mpc_ros.robot.interface import ImuSample
-from t3mpc_ros.robot.sensor_conversions import GRAVITY, IMU_DATA_SHEET, ImuParameters
+from t3mpc_ros.robot.sensor_parameters import GRAVITY, IMU_DATA_SHEET, ImuParameters
 
 _LOWEST, _HIGHEST = -32768.0, 32767.0
 _DEGREE = math.pi / 180.0

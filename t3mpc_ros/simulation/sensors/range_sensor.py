@@ -34,7 +34,7 @@ import numpy as np
 
 from t3mpc_ros.geometry.types import RANGE_SENSORS
 from t3mpc_ros.parameters.table import parameter
-from t3mpc_ros.robot.sensor_conversions import RangeSensorParameters, decode_range, encode_range
+from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters, decode_range, encode_range
 
 # Least squares through figure 2, in relative errors.
 _SLOPE, _SHIFT, _FLOOR = 0.282, 0.0257, 0.061  # V m, m, V: from 10 to 80 cm

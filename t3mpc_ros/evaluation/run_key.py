@@ -57,7 +57,7 @@ _IRRELEVANT_SOURCES = (
     'evaluation/process_replay/', 'evaluation/comparison',
     'evaluation/fault_page.py', 'evaluation/plotting.py', 'evaluation/reporting.py',
     'evaluation/result_file.py', 'evaluation/paper/',
-    'evaluation/patrol/patrol_page.py', 'evaluation/patrol/path_tracking_page.py',
+    'evaluation/patrol/patrol_page.py', 'evaluation/patrol/tracking_page.py',
 )  # fmt: skip
 
 

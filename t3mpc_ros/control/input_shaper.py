@@ -39,7 +39,7 @@ HIGHEST = 1000.0  # largest frequency, Hz
 
 
 @dataclass(frozen=True)
-class CommandShaperParameters(Parameters):
+class InputShaperParameters(Parameters):
     """Frequencies that the command does not excite."""
 
     straight_frequency: float = parameter(
@@ -68,14 +68,14 @@ class CommandShaperParameters(Parameters):
         )
 
 
-class CommandShaper:
+class InputShaper:
     """Shapes the reference of both wheels; it needs the reference :attr:`lead` in advance.
 
     parameters : frequencies; both 0: the reference is unchanged and the lead is 0
     period : control period, s
     """
 
-    def __init__(self, parameters: CommandShaperParameters, period: float) -> None:
+    def __init__(self, parameters: InputShaperParameters, period: float) -> None:
         self._period = period
         self._delays = np.array(parameters.delays) / period
         latest = float(self._delays.max())
@@ -86,7 +86,7 @@ class CommandShaper:
         self.reference: Array = np.zeros(2)  # shaped reference at the instant, rad/s, shape (2,)
         self.rate: Array = np.zeros(2)  # its derivative until one period later, rad/s², shape (2,)
 
-    def retune(self, parameters: CommandShaperParameters) -> None:
+    def retune(self, parameters: InputShaperParameters) -> None:
         """Use other frequencies; lower ones as far as the lead allows, which is kept."""
         most = max(self._ahead - 1.0, 0.0)
         self._delays[:] = np.minimum(np.array(parameters.delays) / self._period, most)

@@ -25,14 +25,14 @@ from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.experiment import ResultTable
-from t3mpc_ros.evaluation.patrol import path_tracking_page
-from t3mpc_ros.evaluation.patrol.path_trackers import (
+from t3mpc_ros.evaluation.patrol import tracking_page
+from t3mpc_ros.evaluation.patrol.pure_pursuit import (
     PurePursuitParameters,
     Pursuit,
     RegulatedParameters,
     pursuit_curvature,
 )
-from t3mpc_ros.evaluation.patrol.path_tracking import (
+from t3mpc_ros.evaluation.patrol.tracking_study import (
     METHODS,
     OURS,
     TRACKED_PATHS,
@@ -202,9 +202,7 @@ def test_the_verdict_is_that_of_paired_seeds(baseline, verdict):
         for seed, error in enumerate(errors)
     ]  # fmt: skip
     plan = TrackingPlan(('square',), (0, 1, 2), tuple(times))
-    text = path_tracking_page.path_table(
-        TrackingStudy(plan, ResultTable(rows)), 'square'
-    ).markdown()
+    text = tracking_page.path_table(TrackingStudy(plan, ResultTable(rows)), 'square').markdown()
     (row,) = (line for line in text.splitlines() if line.startswith('| pure pursuit'))
     assert row.endswith(f'| {verdict} |')
     assert 'arrived in 0 of 3' in row

@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Data-sheet conversions of IMU, range sensors and battery, with the parameters they need.
+"""Parameters of IMU, range sensors and battery by their data sheets, and the byte of a distance.
 
 The driver of the real robot and the simulation share them; the errors of the sensors are
 parameters of the simulation alone (:mod:`t3mpc_ros.simulation.sensors`). Figures of the MPU6050

@@ -21,7 +21,8 @@ import numpy as np
 
 from t3mpc_ros.evaluation import reporting
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
-from t3mpc_ros.evaluation.patrol.path_tracking import (
+from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
+from t3mpc_ros.evaluation.patrol.tracking_study import (
     ARRIVED,
     OURS,
     TRACKED_PATHS,
@@ -29,7 +30,6 @@ from t3mpc_ros.evaluation.patrol.path_tracking import (
     TrackingPlan,
     TrackingStudy,
 )
-from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
 from t3mpc_ros.evaluation.plotting import TitledDrawing, new_figure
 from t3mpc_ros.version import VERSION
 
@@ -134,7 +134,7 @@ def page(study: TrackingStudy, drawn: Mapping[str, bytes]) -> str:
 
 
 def tuning_markdown(found: Mapping[str, Sequence[tuple[str, float]]]) -> str:
-    """Return the choices of :func:`.path_tracking.tune_trackers` as tables in Markdown."""
+    """Return the choices of :func:`.tracking_study.tune_trackers` as tables in Markdown."""
     tables = [
         reporting.Table(
             f'{name}, seeds {TUNING_SEEDS[0]} to {TUNING_SEEDS[-1]}',

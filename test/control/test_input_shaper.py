@@ -18,17 +18,17 @@ import math
 import numpy as np
 import pytest
 
-from t3mpc_ros.control.command_shaper import CommandShaper, CommandShaperParameters
+from t3mpc_ros.control.input_shaper import InputShaper, InputShaperParameters
 from t3mpc_ros.simulation.digital_twin import DigitalTwinParameters
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
 
 PERIOD = 0.01
-PARAMETERS = CommandShaperParameters()
+PARAMETERS = InputShaperParameters()
 
 
 def shaped(function, steps, parameters=PARAMETERS, gaps=()):
     """Return the shaped reference at the times k PERIOD of a function of time, shape (n, 2)."""
-    shaper = CommandShaper(parameters, PERIOD)
+    shaper = InputShaper(parameters, PERIOD)
     lead = shaper.lead_ns / 1e9
     shaper.reset(function(0.0))
     result, elapsed = [], PERIOD
@@ -73,7 +73,7 @@ def test_the_frequency_of_a_mode_is_cancelled(sign):
 
 
 def test_another_frequency_is_cancelled_after_it_was_found():
-    shaper = CommandShaper(CommandShaperParameters(6.0, 4.0), PERIOD)
+    shaper = InputShaper(InputShaperParameters(6.0, 4.0), PERIOD)
     shaper.retune(PARAMETERS)
     lead, values = shaper.lead_ns / 1e9, []
     for k in range(300):
@@ -106,8 +106,8 @@ def test_an_oscillator_rests_after_a_shaped_ramp():
 
 def test_slopes_and_limits_are_preserved():
     """Straight lines pass unchanged, without delay; no speed or slope exceeds the input's."""
-    none = CommandShaperParameters(straight_frequency=0.0, turning_frequency=0.0)
-    assert CommandShaper(none, PERIOD).lead_ns == 0
+    none = InputShaperParameters(straight_frequency=0.0, turning_frequency=0.0)
+    assert InputShaper(none, PERIOD).lead_ns == 0
     line = shaped(lambda t: np.array([3.0 * t, 1.0 - 2.0 * t]), 100)
     times = PERIOD * np.arange(100)
     expected = np.stack([3.0 * times, 1.0 - 2.0 * times], axis=1)
@@ -139,7 +139,7 @@ def test_a_start_in_motion_is_no_step(speeds):
 
     Started with the wheels exchanged, the shaper would have turned the robot the other way first.
     """
-    shaper = CommandShaper(PARAMETERS, PERIOD)
+    shaper = InputShaper(PARAMETERS, PERIOD)
     shaper.reset(np.array(speeds))
     for _ in range(30):
         shaper.step(np.array(speeds), PERIOD)
