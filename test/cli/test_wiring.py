@@ -154,7 +154,7 @@ COMPARE = {
 }
 PATROL = {
     f'evaluation.patrol.{name}_page.{function}': result
-    for name in ('patrol', 'tracking_study')
+    for name in ('patrol', 'tracking')
     for function, result in (('markdown', ''), ('record', {}), ('page', ''))
 } | {
     'evaluation.plotting.write_pictures': {},
