@@ -256,6 +256,9 @@ class InputMonitor:
         self._offsets.append(offset)
         if len(self._offsets) % 5 == 0:
             self._typical = median(self._offsets)
+        if not odometry.is_finite():
+            self._interrupt()
+            return
         if elapsed is not None and self._last is not None:
             self._add_jump(self._last, odometry)
         self._last = odometry

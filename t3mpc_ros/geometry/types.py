@@ -77,6 +77,11 @@ class WheelSpeeds(NamedTuple):
     """rad/s"""
 
 
+LARGEST = 1e9
+"""Sum of the magnitudes of a state from which it is no measurement: of 1e308 m, differences and
+squares are infinite."""
+
+
 class State(NamedTuple):
     """Pose and twist at one instant: measured, true or reference."""
 
@@ -85,12 +90,9 @@ class State(NamedTuple):
     twist: BodyTwist
 
     def is_finite(self) -> bool:
-        """Return whether every number is finite."""
+        """Return whether every number is finite, and none beyond :data:`LARGEST`."""
         (x, y, yaw), (linear, angular) = self.pose, self.twist
-        # A finite sum has finite terms; the sum of huge terms may overflow, so check them singly.
-        return math.isfinite(x + y + yaw + linear + angular) or all(
-            map(math.isfinite, (*self.pose, *self.twist))
-        )
+        return abs(x) + abs(y) + abs(yaw) + abs(linear) + abs(angular) < LARGEST
 
 
 ORIGIN = Pose(0.0, 0.0, 0.0)

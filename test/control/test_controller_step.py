@@ -35,7 +35,7 @@ from t3mpc_ros.control.controller import (
 from t3mpc_ros.control.jump_transition import JumpTransitionParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
-from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State, WheelSpeeds
+from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
 
 MS = 1_000_000
@@ -137,6 +137,7 @@ def test_a_missing_reference_stops_the_robot_despite_preview():
     [
         (math.nan, True, Reason.ODOMETRY_BAD),
         (-math.inf, True, Reason.ODOMETRY_BAD),
+        (1e307, True, Reason.ODOMETRY_BAD),
         (3.0, True, Reason.DIVERGING),  # 86 rad/s at the wheels
         (0.1, False, Reason.DISABLED),
     ],
@@ -155,6 +156,23 @@ def test_a_reason_to_stop_stops_the_robot_until_it_has_passed(speed, enabled, re
     assert statuses[-1].reason is Reason.TRACKING
     assert all(np.isfinite(status.applied).all() for status in statuses)
     assert np.isfinite(loop.controller.law.fuzzy.coefficients).all()
+
+
+@pytest.mark.parametrize('huge', [1e10, 1e200, 1e307, 1e308])
+def test_no_huge_number_makes_a_command_that_is_not_finite(huge):
+    """A reference of 1e307 m/s once made a NaN, a pose of 1e308 m each later step an exception."""
+    for pose_loop in (False, True):
+        loop = Loop(**{'pose.enabled': pose_loop})
+        loop.run(50)
+        loop.controller.add_reference(make_state(loop.now + LEAD - PERIOD, huge, -huge))
+        loop.run(50)
+        for x, yaw in ((huge, 0.0), (-huge, 0.0), (0.0, huge), (0.0, -huge)):
+            state = make_state(loop.now, 0.1, 0.0)
+            status = loop.step(state._replace(pose=Pose(x, 0.0, yaw)))
+            assert status.reason is Reason.ODOMETRY_BAD
+            assert loop.twist == BodyTwist(0.0, 0.0)
+        assert loop.run(60)[-1].reason is Reason.TRACKING
+        assert np.isfinite(loop.twist).all()
 
 
 def _assert_no_jump_after_a_gap(loop):
