@@ -276,6 +276,7 @@ class WatchedDriver(NodeDriver):
             simulated_time=False,
             tolerated_gap=0.5 * parameters.watchdog.odometry_timeout,
             geometry=parameters.geometry,
+            response_time=controller.response_time,
         )
         texts += controller.problems()
         if controller.status.reason is not Reason.TRACKING:

@@ -333,6 +333,8 @@ class Controller:
         self.disturbed = False
         """Whether the response is disturbed, so that nothing is learned from it."""
         self._disturbed_for = 0.0
+        self._late_reference_for = 0.0
+        """Time for which the reference did not reach the instant that is commanded, s."""
         self._before_disturbance: tuple[Any, Any] | None = None
         self._snapshots: deque[tuple[Any, Any]] = deque(maxlen=SNAPSHOT_COUNT)
         """Weights, oldest first."""
@@ -354,6 +356,14 @@ class Controller:
     def law(self) -> Nt3fsMpcController:
         """The control law with its weights."""
         return self._tracker.law
+
+    @property
+    def response_time(self) -> float | None:
+        """Most time from a command to its effect in the odometry, s; None: not estimated."""
+        if not self.parameters.estimate_dead_time:
+            return None
+        lag = self.parameters.speed_filter.lag
+        return self._dead_time + lag + 4.0 * self.dead_time.standard_deviation
 
     @property
     def gain(self) -> float:
@@ -385,6 +395,7 @@ class Controller:
                 'the response to the commands is disturbed, nothing is learnt from it: commands '
                 'or odometry are late, or the dead time has changed'
             )
+        found.append(self._reference_problem())
         frequency = self.parameters.command_shaper.turning_frequency
         if self._turning_frequency != frequency:
             found.append(
@@ -539,6 +550,7 @@ class Controller:
         actuation = self.actuation
         dt = self._period if elapsed is None else (stamp - step_ns) / NANOSECONDS
         self._watch_interval(dt)
+        self._watch_reference(stamp, dt)
         if self.status.reason is Reason.PAUSED and not self._response.responsive:
             # Commands go on as before the pause: nothing is learnt until the robot responds.
             actuation.reset(speeds)
@@ -740,6 +752,27 @@ class Controller:
             advance = [time / -math.expm1(-time / lag) for time in (held, period)]
             self._longer_hold_ns = round((advance[0] - advance[1]) * NANOSECONDS)
             self.dead_time.lateness = 0.5 * (held - period)
+
+    def _watch_reference(self, stamp_ns: int, elapsed: float) -> None:
+        """Add up the time for which commands follow a reference that had ended before."""
+        newest_ns = self._trajectory.newest_ns
+        if newest_ns is None or newest_ns < stamp_ns + self._dead_time_ns:
+            self._late_reference_for += elapsed
+        else:  # one that is late at times is late
+            self._late_reference_for = max(self._late_reference_for - 0.25 * elapsed, 0.0)
+
+    def _reference_problem(self) -> str:
+        """Return by how much the reference is too late to be followed, or nothing."""
+        newest_ns, stamp_ns = self._trajectory.newest_ns, self._last_stamp_ns
+        if self._late_reference_for <= REPORTED_DISTURBANCE or newest_ns is None:
+            return ''
+        lead = (newest_ns - (stamp_ns or 0)) / NANOSECONDS
+        side = 'behind' if lead < 0.0 else 'ahead of'
+        return (
+            f'the newest reference is stamped {abs(lead):.3f} s {side} odom, and the robot '
+            f'responds after {self._dead_time:.3f} s: it follows late; raise the lead of the '
+            'reference (lead of reference_generator, 0.4 s), or synchronise the clocks'
+        )
 
     def _check_shaper(self) -> None:
         """Shape the commands for the frequency at which the robot turns out to oscillate.

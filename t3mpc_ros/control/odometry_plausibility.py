@@ -23,8 +23,12 @@ import numpy as np
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, State, difference, has_jumped
 
-MAX_DELAY, MAX_LEAD = 0.3, 0.05
-"""Offset of odometry stamps from the node's clock beyond which the clocks differ, s."""
+MAX_DELAY, MAX_LEAD = 0.3, 0.01
+"""Offset of odometry stamps from the node's clock beyond which the clocks differ, s: a message
+takes time, and clocks that are synchronised differ by less than the second."""
+MAX_AGE_BEYOND_RESPONSE = 0.02
+"""Offset beyond the response time from which the clocks differ, s: a message cannot be on its way
+for longer than a command, the response of the robot and the message together."""
 MAX_SIMULATED_OFFSET = 5.0
 """The same with simulated time, which may pass many times faster than messages travel, s."""
 NO_STAMP = 1e8  # offset of a stamp that is no time of today, s: three years
@@ -307,11 +311,17 @@ class InputMonitor:
         return self._responses[axis].gain()
 
     def warnings(
-        self, *, simulated_time: bool, tolerated_gap: float, geometry: WheelGeometry
+        self,
+        *,
+        simulated_time: bool,
+        tolerated_gap: float,
+        geometry: WheelGeometry,
+        response_time: float | None = None,
     ) -> list[str]:
         """Return what does not fit, with the likely cause.
 
-        ``tolerated_gap`` (s) is not reported; ``geometry`` is what the robot is assumed to have.
+        ``tolerated_gap`` (s) is not reported; ``geometry`` is what the robot is assumed to have;
+        ``response_time``: most time from a command to its effect in a message, s, None: unknown.
         """
         found = []
         offset = self.offset
@@ -327,6 +337,16 @@ class InputMonitor:
                 remedy = 'its driver sets no header.stamp, or use_sim_time differs'
             found.append(
                 f'odom is stamped {abs(offset):.3g} s {side} the clock of this node: {remedy}'
+            )
+        elif (
+            not simulated_time
+            and response_time is not None
+            and offset > response_time + MAX_AGE_BEYOND_RESPONSE
+        ):
+            found.append(
+                f'odom is stamped {offset:.3g} s behind the clock of this node, but shows the '
+                f'response of the robot within {response_time:.3g} s of a command: synchronise '
+                'the clocks'
             )
         rate = self.gaps.rate
         if rate and abs(rate / self._rate - 1.0) > RATE_TOLERANCE:

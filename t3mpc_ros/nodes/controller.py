@@ -471,6 +471,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
             simulated_time=simulated,
             tolerated_gap=0.5 * self.parameters.watchdog.odometry_timeout,
             geometry=self.parameters.geometry,
+            response_time=self._controller.response_time,
         )
         ignored = self._controller.ignored_odometry
         if ignored > self._reported_ignored:

@@ -158,6 +158,23 @@ def test_a_reason_to_stop_stops_the_robot_until_it_has_passed(speed, enabled, re
     assert np.isfinite(loop.controller.law.fuzzy.coefficients).all()
 
 
+@pytest.mark.parametrize(
+    'lead_ms, words', [(400, ''), (20, ''), (0, '0.000 s ahead of'), (-100, '0.100 s behind')]
+)
+def test_a_reference_that_is_followed_late_is_named(lead_ms, words):
+    """With stamps 0.1 s late the error was 64 times as large, and nothing was said."""
+    controller = Controller(ControllerParameters())
+    twist = BodyTwist(0.0, 0.0)
+    for k in range(300):
+        controller.add_reference(make_state(k * PERIOD + lead_ms * MS, 0.1, 0.5))
+        twist, _ = controller.step(State(k * PERIOD, ORIGIN, twist))
+    found = [each for each in controller.problems() if 'newest reference' in each]
+    assert bool(found) == bool(words)
+    assert all(f'is stamped {words} odom' in each for each in found)
+    controller.reset()
+    assert controller.problems() == []
+
+
 @pytest.mark.parametrize('huge', [1e10, 1e200, 1e307, 1e308])
 def test_no_huge_number_makes_a_command_that_is_not_finite(huge):
     """A reference of 1e307 m/s once made a NaN, a pose of 1e308 m each later step an exception."""

@@ -173,6 +173,37 @@ def test_what_does_not_fit_is_named(robot, words):
         assert drive.warnings(simulated=True) == []
 
 
+@pytest.mark.parametrize(
+    'offset, response, words',
+    [
+        (0.2, 0.1, 'odom is stamped 0.2 s behind the clock of this node, but shows the response'),
+        (0.2, 0.19, ''),  # as long as a command and the message may be on their way
+        (0.2, None, ''),
+        (-0.03, 0.1, 'odom is stamped 0.03 s ahead of the clock'),
+        (-0.005, 0.1, ''),
+    ],
+)
+def test_no_message_travels_longer_than_the_robot_responds(offset, response, words):
+    """Stamps 0.2 s behind the clock made an error of 0.8 rad/s, and nothing was said."""
+    drive = Drive(offset=offset)
+    drive.run(3.0)
+    found = drive.monitor.warnings(
+        simulated_time=False, tolerated_gap=0.1, geometry=GEOMETRY, response_time=response
+    )
+    assert bool(found) == bool(words)
+    assert all(each.startswith(words) for each in found)
+
+
+def test_a_number_that_is_not_finite_blinds_no_check():
+    """After one NaN, no sign and no gain was ever known again."""
+    drive = Drive(gains=(1.0, -1.0))
+    drive.run(5.0)
+    stamp = drive._time * 1_000_000 + 1
+    wrong = State(stamp, Pose(*drive.pose), BodyTwist(math.nan, math.nan))
+    drive.monitor.update(wrong, stamp, BodyTwist(0.1, 0.1))
+    assert any('opposite sign' in each for each in drive.run(30.0))
+
+
 def test_a_robot_at_its_limit_is_no_wrong_geometry():
     (warning,) = [each for each in Drive(limit=0.08).run(60.0) if 'linear' in each]
     assert 'the limits of the robot are below those here' in warning
