@@ -76,7 +76,7 @@ def test_a_typed_kernel_takes_a_fraction_after_an_integer():
 def test_a_typed_kernel_is_copied_and_pickled_after_a_call():
     """Studies copy controllers, and send them to other processes; compiled code cannot be sent."""
     typed = TypedKernel(row_at)
-    rows = np.array([[1.0], [3.0]])
+    rows = np.array([[1.0, 0.0, 0.0], [3.0, 0.0, 1.0]])
     assert typed(rows, 0, 0.5) == 2.0
     for other in (deepcopy(typed), pickle.loads(pickle.dumps(typed))):
         assert other(rows, 0, 0.25) == 1.5

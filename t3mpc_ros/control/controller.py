@@ -41,7 +41,7 @@ from t3mpc_ros.control.control_law import (
     servo_gain,
 )
 from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
-from t3mpc_ros.control.input_shaper import HIGHEST, InputShaper, InputShaperParameters
+from t3mpc_ros.control.input_shaper import EARLY, HIGHEST, InputShaper, InputShaperParameters
 from t3mpc_ros.control.jump_transition import CommandLimit, JumpTransition, MotorLimit
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
@@ -104,12 +104,11 @@ MAX_MISSED = 20  # largest number of periods without a step through which a ramp
 REPORTED_DEAD_TIME, REPORTED_DISTURBANCE = 0.008, 1.0
 """Difference of the dead time from the configured one, and duration of a disturbed response, that
 are reported, s."""
-INTERVALS, OTHER_RATE = 21, 0.2
+INTERVALS, OTHER_RATE = 21, 0.02
 """Number of intervals between steps whose median is the time for which commands are held, and its
 relative difference from the period from which that counts."""
 OTHER_FREQUENCY = 1.5
 """Ratio of the measured frequency of the rotors to the one in use from which it is used."""
-EARLY = 0.6  # share of the period before which an odometry is too early for a step
 
 POSE_JUMP = 0.25, 0.5  # change of the pose (m, rad) from one message to the next that is no motion
 SNAPSHOT_PERIOD = 0.25  # time between two snapshots of the weights, s
@@ -1036,14 +1035,18 @@ class SwitchingTracker:
     ) -> tuple[Array, Array]:
         """Return reachable reference (rad/s) and its rate (rad/s²) at ``now_ns``, shape (2,).
 
-        The ramps of jumps go on through the periods without a step, ``dt`` s since the last one.
+        The ramps of jumps go on through the time without a step, ``dt`` s since the last one.
         """
-        transition = self.transition
+        transition, share = self.transition, 1.0
         if transition.count:
-            for missed in range(min(round(dt / self._period), MAX_MISSED) - 1, 0, -1):
+            whole, part = divmod(min(round(dt / self._period, 6), MAX_MISSED), 1.0)
+            for missed in range(math.ceil(whole + part) - 1, 0, -1):
                 missed_ns = now_ns - round(missed * self._period * NANOSECONDS)
-                transition.step(missed_ns, reference, reference)
-        transition.step(now_ns, reference, reference_next)
+                jumps = -transition.future_jumps(missed_ns, self._period, 1)[0]
+                share = part if missed == whole else 1.0
+                transition.step(missed_ns, reference, reference + jumps, share)
+            share = part if whole == 0.0 else 1.0
+        transition.step(now_ns, reference, reference_next, share)
         return transition.reachable, transition.rate
 
     def _step_predictive(

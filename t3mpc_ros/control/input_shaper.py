@@ -36,6 +36,7 @@ from t3mpc_ros.kernels import kernel
 from t3mpc_ros.parameters.table import Parameters, parameter
 
 HIGHEST = 1000.0  # largest frequency, Hz
+EARLY = 0.6  # share of the period before which an odometry is too early for a step
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,8 @@ class InputShaper:
         self._ahead = math.ceil(latest - 1e-9) + 1 if latest > 0.0 else 0
         self.lead_ns = round(self._ahead * period * NANOSECONDS)
         """Time by which the reference of :meth:`step` is ahead of the shaped one, ns."""
-        self._planned: Array = np.zeros((2 * self._ahead + 2, 2))
+        self._planned: Array = np.zeros((math.ceil(2 * self._ahead / EARLY) + 2, 3))
+        self.reset(np.zeros(2))
         self.reference: Array = np.zeros(2)  # shaped reference at the instant, rad/s, shape (2,)
         self.rate: Array = np.zeros(2)  # its derivative until one period later, rad/s², shape (2,)
 
@@ -95,17 +97,17 @@ class InputShaper:
         """Start at wheel speeds (rad/s), shape (2,), held up to now and for the lead."""
         self._planned[:, 0] = 0.5 * (speeds[0] + speeds[1])
         self._planned[:, 1] = 0.5 * (speeds[0] - speeds[1])
+        self._planned[:, 2] = np.arange(len(self._planned))
 
     def step(self, planned: Array, elapsed: float) -> None:
         """Update the shaped reference by the reachable one (rad/s) one lead later.
 
-        Over a gap, ``elapsed`` s since the last step, the reference is interpolated.
+        Between steps, ``elapsed`` s apart, the reference is interpolated.
         """
-        count = min(max(round(elapsed / self._period), 1), len(self._planned))
         shape(
             self._planned,
             planned,
-            count,
+            round(elapsed / self._period, 6),  # 1 at regular stamps, in whole nanoseconds
             self._ahead,
             self._delays,
             self._period,
@@ -118,7 +120,7 @@ class InputShaper:
 def shape(
     rows: Array,
     planned: Array,
-    count: int,
+    elapsed: float,
     ahead: int,
     delays: Array,
     period: float,
@@ -127,16 +129,14 @@ def shape(
 ) -> None:
     """Append a row, and write the shaped reference (rad/s) and its rate of change (rad/s²).
 
-    ``rows``, shape (2 ahead + 2, 2), are newest first: mean of the wheels, half their difference.
-    Those of ``count`` periods without a step are interpolated; ``delays`` are the d in periods.
+    ``rows``, shape (n, 3), are newest first: mean of the wheels, half their difference, age.
+    Ages, the ``delays`` d and the time ``elapsed`` since the last row are in periods.
     """
-    newest = (0.5 * (planned[0] + planned[1]), 0.5 * (planned[0] - planned[1]))
-    for i in range(2):
-        before = rows[0, i]
-        for j in range(rows.shape[0] - 1, count - 1, -1):
-            rows[j, i] = rows[j - count, i]
-        for j in range(count):
-            rows[j, i] = newest[i] + (before - newest[i]) * j / count
+    for j in range(rows.shape[0] - 1, 0, -1):
+        rows[j, 0], rows[j, 1] = rows[j - 1, 0], rows[j - 1, 1]
+        rows[j, 2] = rows[j - 1, 2] + elapsed
+    rows[0, 0] = 0.5 * (planned[0] + planned[1])
+    rows[0, 1] = 0.5 * (planned[0] - planned[1])
     mean, half = shaped_row(rows, float(ahead), delays)
     reference[0], reference[1] = mean + half, mean - half
     mean, half = shaped_row(rows, ahead - 1.0, delays)
@@ -145,16 +145,18 @@ def shape(
 
 
 @kernel
-def shaped_row(rows: Array, position: float, delays: Array) -> tuple[float, float]:
-    """Return the shaped columns of ``rows`` at a position between two rows."""
-    mean = row_at(rows, 0, position - delays[0]) + row_at(rows, 0, position + delays[0])
-    half = row_at(rows, 1, position - delays[1]) + row_at(rows, 1, position + delays[1])
+def shaped_row(rows: Array, age: float, delays: Array) -> tuple[float, float]:
+    """Return the shaped columns of ``rows`` at an age."""
+    mean = row_at(rows, 0, age - delays[0]) + row_at(rows, 0, age + delays[0])
+    half = row_at(rows, 1, age - delays[1]) + row_at(rows, 1, age + delays[1])
     return 0.5 * mean, 0.5 * half
 
 
 @kernel
-def row_at(rows: Array, column: int, position: float) -> float:
-    """Return a column of ``rows`` at a position between two rows, linearly interpolated."""
-    first = min(max(int(math.floor(position)), 0), rows.shape[0] - 2)
-    fraction = position - first
+def row_at(rows: Array, column: int, age: float) -> float:
+    """Return a column of ``rows`` at an age, linearly interpolated between two rows."""
+    first = 0
+    while first < rows.shape[0] - 2 and rows[first + 1, 2] <= age:
+        first += 1
+    fraction = (age - rows[first, 2]) / (rows[first + 1, 2] - rows[first, 2])
     return float((1.0 - fraction) * rows[first, column] + fraction * rows[first + 1, column])

@@ -150,7 +150,7 @@ class JumpTransition:
         self.count = 0  # number of unfinished transitions; without one rbar is r
         rows, instants = np.zeros((4, 8, 2)), np.zeros(8, dtype=np.int64)
         self._transitions = Transitions._make((*rows, instants, np.zeros(8, dtype=np.bool_)))
-        self.plan = Plan(*np.zeros((6, 2)))  # results of the last step
+        self.plan = Plan(*np.zeros((7, 2)))  # results of the last step
         self.reachable, self.rate = self.plan[:2]
         self._step_transitions = TypedKernel(step_transitions)
 
@@ -206,10 +206,13 @@ class JumpTransition:
                 known.instants[k] = instant_ns
                 known.passed[k] = True
 
-    def step(self, now_ns: int, reference: Array, reference_next: Array) -> None:
+    def step(
+        self, now_ns: int, reference: Array, reference_next: Array, share: float = 1.0
+    ) -> None:
         """Update :attr:`plan` for the period that starts when the next command takes effect.
 
         reference, reference_next : r then and one period later, with its jumps, rad/s, shape (2,)
+        share : time since the last step, in periods, at most 1
         """
         self.count = self._step_transitions(
             self._transitions,
@@ -218,6 +221,7 @@ class JumpTransition:
             contiguous(reference),
             contiguous(reference_next),
             self._period,
+            share,
             self._lag,
             self.parameters.acceleration,
             self.plan,
@@ -240,7 +244,8 @@ class Plan(NamedTuple):
 
     reachable: Array  # rbar now
     rate: Array  # its derivative until the next step, rad/s²
-    response: Array  # response of the servo to the commanded parts of all jumps
+    response: Array  # response of the servo to the commanded parts of all jumps, one period later
+    response_now: Array  # the same now
     passed: Array  # sum of the jumps that r has made
     offset: Array  # h now
     offset_next: Array  # h one period later
@@ -254,6 +259,7 @@ def step_transitions(
     reference: Array,
     reference_next: Array,
     period: float,
+    share: float,
     lag: float,
     acceleration: float,
     plan: Plan,
@@ -262,13 +268,16 @@ def step_transitions(
     jumps, instants, passed = transitions.jumps, transitions.instants, transitions.passed
     if count > 0:
         keep = math.exp(-period / lag) if lag > 0.0 else 0.0
+        kept = math.exp(-share * period / lag) if lag > 0.0 else 0.0
         until_ns = now_ns + round(period * NANOSECONDS)
         # The command precedes the response of the servo; and the sampled r jumps within the
         # period before the instant, on average in its middle.
         lead = period * (keep / (1.0 - keep) + 0.5)
         mark_passed(transitions, count, plan, now_ns)
         for i in range(2):
-            plan.offset[i] = plan.response[i] - plan.passed[i]
+            before = (1.0 - share) * plan.response_now[i] + share * plan.response[i]
+            plan.response_now[i] = before
+            plan.offset[i] = before - plan.passed[i]
             rise = reference_next[i] - reference[i]
             for k in range(count):
                 if not passed[k] and until_ns >= instants[k]:
@@ -276,12 +285,14 @@ def step_transitions(
             commanded = 0.0
             for k in range(count):
                 left = (instants[k] - now_ns) / NANOSECONDS - lead
-                advance(transitions, k, i, left, rise / period, period, acceleration)
+                advance(transitions, k, i, left, rise / period, period, share, acceleration)
                 commanded += transitions.covered[k, i]
-            plan.response[i] += (1.0 - keep) * (commanded - plan.response[i])
-        mark_passed(transitions, count, plan, until_ns)
-        for i in range(2):
-            plan.offset_next[i] = plan.response[i] - plan.passed[i]
+            plan.response[i] += (1.0 - kept) * (commanded - plan.response[i])
+            passed_next = plan.passed[i]
+            for k in range(count):
+                if not passed[k] and until_ns >= instants[k]:
+                    passed_next += jumps[k, i]
+            plan.offset_next[i] = plan.response[i] - passed_next
         # After 30 lags the remaining response is below rounding.
         over_ns = now_ns - round(30.0 * lag * NANOSECONDS)
         count = remove_finished(transitions, count, plan, over_ns)
@@ -313,9 +324,10 @@ def advance(
     left: float,
     slope: float,
     period: float,
+    share: float,
     acceleration: float,
 ) -> None:
-    """Advance the ramp of jump ``k`` and wheel ``i`` by one period after its start.
+    """Advance the ramp of jump ``k`` and wheel ``i`` by a share of a period after its start.
 
     ``left`` (s): time until the jump, less the lead of the command; ``slope``: r' without the jump
     """
@@ -332,7 +344,7 @@ def advance(
         before = max(acceleration - sign * slope, 0.2 * acceleration)
     fraction = math.sqrt(before) / (math.sqrt(before) + math.sqrt(after))
     # The first step is a fraction of a period: the ramp starts at its instant, not at a sample.
-    time = min(fraction * size / before - left + period, period)
+    time = min(fraction * size / before - left + period, share * period)
     if time > 0.0:
         transitions.covered[k, i] += sign * min(before * time, abs(rest))
 
@@ -349,6 +361,7 @@ def remove_finished(transitions: Transitions, count: int, plan: Plan, over_ns: i
         for i in range(2):
             if done:
                 plan.response[i] -= jumps[k, i]
+                plan.response_now[i] -= jumps[k, i]
                 plan.passed[i] -= jumps[k, i]
             else:
                 jumps[kept, i], slopes[kept, i] = jumps[k, i], slopes[k, i]

@@ -133,6 +133,37 @@ def test_a_lost_step_is_bridged():
     np.testing.assert_allclose(bridged[known], whole[known], atol=2e-3)
 
 
+@pytest.mark.parametrize('interval', [0.6, 0.77, 1.2, 1.45])
+@pytest.mark.parametrize('jitter', [0.0, 0.2])
+def test_steps_of_any_interval_are_shaped_alike(interval, jitter):
+    """Intervals were rounded to whole periods: at 80 Hz for 100 Hz the error was four times."""
+
+    def smooth(time):
+        return np.array([math.sin(8.0 * time), math.cos(6.0 * time)])
+
+    shaper, random = InputShaper(PARAMETERS, PERIOD), np.random.default_rng(1)
+    lead, time, found, times = shaper.lead_ns / 1e9, 0.0, [], []
+    for _ in range(150):
+        elapsed = PERIOD * max(interval + jitter * random.uniform(-1.0, 1.0), 0.6)
+        time += elapsed
+        shaper.step(smooth(time + lead), elapsed)
+        found.append([*shaper.reference, *shaper.rate])
+        times.append(time)
+    exact = [0.25 / PARAMETERS.straight_frequency, 0.25 / PARAMETERS.turning_frequency]
+    wheels = np.array([[1.0, 1.0], [1.0, -1.0]])
+    for (right, left, *rate), now in list(zip(found, times, strict=True))[30:]:
+        parts = [
+            [
+                0.5 * share @ (smooth(at + d) + smooth(at - d))
+                for share, d in zip(0.5 * wheels, exact, strict=True)
+            ]
+            for at in (now, now + PERIOD)
+        ]
+        reference, later = (wheels @ part for part in parts)
+        np.testing.assert_allclose((right, left), reference, atol=3e-3)
+        np.testing.assert_allclose(rate, (later - reference) / PERIOD, atol=0.15)
+
+
 @pytest.mark.parametrize('speeds', [(3.0, 3.0), (2.0, -1.0)])
 def test_a_start_in_motion_is_no_step(speeds):
     """The controller is enabled while the robot drives a curve: the curve goes on.

@@ -18,6 +18,7 @@ import math
 import numpy as np
 import pytest
 
+from t3mpc_ros.control.controller import ControllerParameters, SwitchingTracker
 from t3mpc_ros.control.jump_transition import JumpTransition, JumpTransitionParameters, MotorLimit
 
 T = 0.01
@@ -104,6 +105,33 @@ def test_with_servo_lag_the_command_respects_the_acceleration():
     assert np.max(np.abs(np.diff(commands, axis=0))) <= A * T * (1 + 1e-9)
     energy = T * np.sum((reachable - r)[:, 0] ** 2)
     assert energy == pytest.approx(6.0**3 / (12.0 * A), rel=0.05)
+
+
+@pytest.mark.parametrize('interval', [0.62, 0.9, 1.3, 2.4])
+@pytest.mark.parametrize('lag', [0.003, 0.02])
+def test_a_ramp_is_the_same_whatever_the_interval(interval, lag):
+    """Steps of 0.62 of a period went on by a whole one: the ramp was 1.6 times too steep."""
+
+    def reachable(interval):
+        parameters = ControllerParameters.from_dict(
+            {'speed_filter.lag': lag, 'jump_transition.acceleration': A, 'law.gain': 0.0}
+        )
+        tracker = SwitchingTracker(parameters.resolved(), 'velocity')
+        tracker.transition.announce(100 * NS, np.array([6.0, -3.0]), np.zeros(2))
+        times = np.arange(0.0, 200.0, interval)
+        found = []
+        for time in times:
+            r = [np.array([6.0, -3.0]) if at >= 100.0 else np.zeros(2) for at in (time, time + 1)]
+            found.append(tracker.plan(round(time * NS), *r, interval * T)[0].copy())
+        assert tracker.transition.count == 0
+        return times, np.array(found)
+
+    times, regular = reachable(1.0)
+    others, found = reachable(interval)
+    for i in range(2):
+        expected = np.interp(others, times, regular[:, i])
+        np.testing.assert_allclose(found[:, i], expected, atol=0.55 * A * T)
+        assert np.sqrt(np.mean((found[:, i] - expected) ** 2)) < 0.08 * A * T
 
 
 def test_two_transitions_may_overlap():

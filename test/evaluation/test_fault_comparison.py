@@ -90,6 +90,15 @@ def test_contradicted_assumptions_cost_little(name, monkeypatch, request):
     assert wrong < 1.25 * exact
 
 
+@pytest.mark.parametrize('rate', [85.0, 118.0, 62.0, 150.0])
+def test_a_rate_that_is_not_that_of_the_odometry_costs_little(rate, monkeypatch):
+    """Steps counted as whole periods: four times the settled error, unnamed below 20 %."""
+    monkeypatch.setattr(fault_comparison, 'DURATION', 10.0)
+    monkeypatch.setitem(FAULTS, 'rate', Fault(assumed={'rate': rate}))
+    wrong, exact = (run_job(Job(each, FULL, 2003))['settled'] for each in ('rate', 'none'))
+    assert wrong < 1.2 * exact
+
+
 @pytest.mark.long
 def test_more_noise_than_assumed_costs_little():
     """An estimate from the few blocks that fitted cost up to six times the settled error."""
