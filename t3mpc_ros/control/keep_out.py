@@ -51,7 +51,16 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.range_fault_detection import RangeMonitor
 from t3mpc_ros.geometry.arena import OCCUPIED_PERCENT, Obstacles, OccupancyGrid
-from t3mpc_ros.geometry.types import STANDSTILL, Array, BodyTwist, Pose, has_moved, wrap_angle
+from t3mpc_ros.geometry.kinematics import advance_pose
+from t3mpc_ros.geometry.types import (
+    ORIGIN,
+    STANDSTILL,
+    Array,
+    BodyTwist,
+    Pose,
+    has_moved,
+    wrap_angle,
+)
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import ParameterError, Parameters, group, parameter
 
@@ -565,6 +574,7 @@ class KeepOut:
         self.touched: list[tuple[float, float]] = []
         """Where the robot was when it touched something that it cannot see, m."""
         self._trail: deque[Pose] = deque(maxlen=TRAIL_LENGTH)  # the way that the robot came
+        self._thing = ORIGIN  # where that is which it touched last
         self._retreat_time = 0.0  # time left to back off, s
 
     def add_reading(
@@ -602,10 +612,14 @@ class KeepOut:
             return STANDSTILL
         if self.retreats:
             return self._back_off(pose, elapsed)
-        if wanted.linear > 0.0 and has_moved(
-            self._trail[-1] if self._trail else None, pose, TRAIL_SPACING, math.inf
+        measured = self.ranges.pose  # what stops or shoves the robot, no prediction knows
+        last = self._trail[-1] if self._trail else None
+        if (
+            wanted.linear > 0.0
+            and measured is not None
+            and has_moved(last, measured, TRAIL_SPACING, math.inf)
         ):
-            self._trail.append(pose)
+            self._trail.append(measured)
         return self._reshaped(wanted, pose, elapsed)
 
     @property
@@ -619,6 +633,7 @@ class KeepOut:
             pose, -1.0 if astern else 1.0, self.parameters.distance - RETREAT_MARGIN - 0.005
         )
         self.touched.append((pose.x, pose.y))
+        self._thing = advance_pose(pose, BodyTwist(self.parameters.distance, 0.0), 1.0)
         self._targets.clear()
         self._retreat_time = 0.0 if astern else RETREAT_TIME
 
@@ -629,7 +644,9 @@ class KeepOut:
         while self._trail:
             x, y = self._trail[-1].x - pose.x, self._trail[-1].y - pose.y
             gap = wrap_angle(math.atan2(y, x) - pose.yaw - math.pi)
-            if math.hypot(x, y) > TRAIL_SPACING:
+            # A robot that was shoved may have the end of its way between it and the thing.
+            away = x * (pose.x - self._thing.x) + y * (pose.y - self._thing.y) > 0.0
+            if away and math.hypot(x, y) > TRAIL_SPACING:
                 break
             self._trail.pop()
         if not self._trail:

@@ -127,7 +127,8 @@ class RangeMonitor:
         """Forget all readings."""
         self._sensors = [SensorRecord(mount) for mount in self._mounts]
         self._now_ns: int | None = None
-        self._pose: Pose | None = None
+        self.pose: Pose | None = None
+        """The pose of the last odometry."""
         self._missed: list[tuple[float, float]] = []
         """Surfaces that were missed since any sensor saw something, m."""
         self._way, self._way_from = 0.0, ORIGIN
@@ -167,7 +168,7 @@ class RangeMonitor:
 
     def update(self, now_ns: int, pose: Pose) -> None:
         """Decide about each sensor at an odometry."""
-        last, self._pose, self._now_ns = self._pose, pose, now_ns
+        last, self.pose, self._now_ns = self.pose, pose, now_ns
         if last is not None and math.hypot(pose.x - last.x, pose.y - last.y) < LEAP:
             x, y = pose.x - last.x, pose.y - last.y
             cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)

@@ -282,6 +282,41 @@ def test_a_held_robot_backs_off_and_does_not_touch_again():
         assert each[0][2] < 0.15
 
 
+SHOVED = [
+    pytest.param((-0.06, 0.0, 0.0), id='back'),
+    pytest.param((-0.045, -0.04, 1.1), id='back and aside, and turned'),
+]
+
+
+@pytest.mark.compiled
+@pytest.mark.parametrize('shove', SHOVED)
+def test_a_shoved_robot_backs_off_from_what_it_touched(shove):
+    """Predicted poses ran ahead of one that was held: it turned by half a turn, and pushed."""
+    keep_out = _seen()
+    begin = Pose(0.3, 0.0, 0.0)
+    for k in range(60):
+        x = min(0.007 * k, 0.3)
+        y = 0.1 * math.cos(x / 0.3 * math.pi / 2.0) if shove[1] else 0.0
+        for sensor in range(8):
+            keep_out.ranges.accept(sensor, 0.5 + 0.001 * (k % 7), None)
+        keep_out.ranges.update(10_000_000 * k, Pose(x, y, 0.0))
+        ahead = 0.02 * (k // 3 % 3)  # of a held robot, commands and predictions come and go
+        keep_out.step(BodyTwist(0.2, 0.0), Pose(x + ahead, y, 0.0), PERIOD)
+    keep_out.touch(begin, astern=False)
+    x, y, yaw = shove
+    pose = Pose(begin.x + x, begin.y + y, yaw)
+    thing = begin.x + 0.125, begin.y
+    away = math.dist(pose[:2], thing)
+    for _ in range(1000):
+        last = math.dist(pose[:2], thing)
+        twist = keep_out.step(STANDSTILL, pose, PERIOD)
+        if not keep_out.retreats:
+            break
+        pose = advance_pose(pose, twist, PERIOD)
+        assert yaw or abs(pose.yaw) < 0.1
+        assert math.dist(pose[:2], thing) > last - 1e-3
+    assert math.dist(pose[:2], thing) > away + 0.04
+
 @pytest.mark.compiled
 def test_a_robot_does_not_back_off_into_what_it_sees():
     robot = Touching(0.35, side=0.8)
