@@ -22,7 +22,7 @@ path leads to a place that was not visited for long. With a low battery it leads
 place, and on from there when the battery is charged.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import math
 from typing import ClassVar, NamedTuple
@@ -443,7 +443,7 @@ class PathPlan:
         back = self._planner.route((float(path[joint, 0]), float(path[joint, 1])), begin)
         if back is None:
             return False
-        visited = np.array(places[: len(parts)])
+        visited = places[: len(parts)]
         self._append_smoothly(np.vstack([*parts, back]), path, joint, fixed, visited, miss)
         return True
 
@@ -457,12 +457,12 @@ class PathPlan:
         path: Array,
         joint: int,
         fixed: int,
-        places: Array = _NOWHERE,
+        places: Sequence[tuple[float, float]] = (),
         miss: float = MISS,
     ) -> None:
         """Append a route to a point of the given path and the next ones, its corners rounded.
 
-        places, miss : on the route, shape (n, 2), and how far it may pass them, m
+        places, miss : on the route, and how far it may pass them, m
         """
         before = min(RAMP, len(self.points) - max(fixed, 1))
         after = path[joint + 1 : joint + 1 + RAMP]
@@ -470,16 +470,30 @@ class PathPlan:
         self._append(route, np.zeros(len(route), dtype=np.int64))
         self._append(after, joint + 1 + np.arange(1, RAMP + 1))
         # Smoothing moves points towards each other where the path turns back.
-        points, numbers = self._smoothed(self.points[kept:], places, miss), self._next[kept:]
+        passed = [(*each, miss) for each in places]
+        # The last points of the plan are smoothed again, and may lead to these:
+        if self.goal is not None and self._leads_there:
+            passed.append((*self.goal, GOAL_MISS))
+        if self._last_view is not None:
+            passed.append((*self._last_view, MISS))
+        points, numbers = self._smoothed(self.points[kept:], passed), self._next[kept:]
         lengths = lengths_along(points)
         points = resample(points, SPACING, round)
         even = np.interp(np.linspace(0.0, lengths[-1], len(points)), lengths, numbers)
         self.points = np.vstack([self.points[:kept], points])
         self._next = np.concatenate([self._next[:kept], even.astype(np.int64)])
 
-    def _smoothed(self, points: Array, places: Array, miss: float) -> Array:
-        """Return points with their corners rounded, as wide as the obstacles permit."""
+    def _smoothed(self, points: Array, places: list[tuple[float, float, float]]) -> Array:
+        """Return points with their corners rounded, as wide as obstacles and places permit.
+
+        places : x, y, and how far the points may pass each if they do not do so already, m
+        """
         planner = self._planner
+
+        def passes(points: Array) -> Array:
+            return np.array([np.hypot(*(points - each[:2]).T).min() for each in places])
+
+        most = np.maximum([each[2] for each in places], passes(points))
         least = np.minimum(planner.wall_distance(points), planner.distance) - CUT
         along = np.arange(len(points))
         share = np.clip(np.minimum(along, along[::-1]) / RAMP, 0.0, 1.0)[:, None]
@@ -492,8 +506,7 @@ class PathPlan:
                 [np.convolve(axis, window / window.sum(), 'valid') for axis in padded.T]
             )
             rounded: Array = (1.0 - share) * points + share * smooth
-            missed = max((np.hypot(*(rounded - each).T).min() for each in places), default=0.0)
-            if missed <= miss and (planner.wall_distance(rounded) >= least).all():
+            if (passes(rounded) <= most).all() and (planner.wall_distance(rounded) >= least).all():
                 return rounded
         return points
 

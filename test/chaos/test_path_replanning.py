@@ -20,7 +20,13 @@ import numpy as np
 import pytest
 from support.long_tests import few_of
 
-from t3mpc_ros.chaos.path_replanning import FAR_AWAY, PATIENCE, PlannedPath, PlanParameters
+from t3mpc_ros.chaos.path_replanning import (
+    FAR_AWAY,
+    GOAL_MISS,
+    PATIENCE,
+    PlannedPath,
+    PlanParameters,
+)
 from t3mpc_ros.chaos.pose_reference import PathReferenceParameters
 from t3mpc_ros.chaos.secret_random import SecretRandom
 from t3mpc_ros.geometry.arena import Arena, OccupancyGrid
@@ -320,6 +326,20 @@ def test_it_leads_to_a_goal_and_waits_for_a_way_to_one_without():
     room.occupied &= ~ring
     rows = drive(path, room, 40.0)
     assert np.hypot(*(rows[:, :2] - (-1.0, -0.6)).T).min() < 0.15
+
+
+def test_what_is_planned_after_a_goal_does_not_lead_past_it():
+    """The last half metre of the plan is smoothed again: it passed a goal by 0.1 m, as visited."""
+    goal = (-1.35, 1.0)
+    room = Room()
+    room.seen[:] = True
+    path = planned(revisit_distance=0.0)
+    path.go_to(goal)
+    path.set_map(room.grid())
+    assert path.plan.goal_point is not None
+    path.plan.truncate(path.plan.goal_point + 6)
+    path.plan.extend(path._fed, path._time)
+    assert np.hypot(*(path.plan.points - goal).T).min() < GOAL_MISS + 0.001
 
 
 def test_a_thing_in_the_way_does_not_make_it_forget_a_goal():
