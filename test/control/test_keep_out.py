@@ -317,6 +317,7 @@ def test_a_shoved_robot_backs_off_from_what_it_touched(shove):
         assert math.dist(pose[:2], thing) > last - 1e-3
     assert math.dist(pose[:2], thing) > away + 0.04
 
+
 @pytest.mark.compiled
 def test_a_robot_does_not_back_off_into_what_it_sees():
     robot = Touching(0.35, side=0.8)
