@@ -496,6 +496,110 @@ def test_messages_that_are_missing_are_not_compared():
     assert not twist.replaced
 
 
+def turning(time):
+    return 0.1 + 0.08 * math.sin(2.5 * time), 0.7 + 0.5 * math.sin(0.9 * time)
+
+
+def delayed(steps):
+    def changed(k, pose, history):
+        return history[max(k - steps, 0)]
+
+    return changed
+
+
+WRONG = {
+    'offset': (lambda k, pose, h: (h[k][0] + 0.01, h[k][1] + 0.05), 'velocity is +0.0'),
+    'one velocity too large': (
+        lambda k, pose, h: (1.1 * h[k][0], h[k][1]),
+        'linear velocity is 1.',
+    ),
+    'one period late': (delayed(1), 's behind'),
+    '50 ms late': (delayed(5), '0.05'),
+    'of every fifth message': (lambda k, pose, h: h[k - k % 5], 's behind'),
+    'of every second message': (
+        lambda k, pose, h: h[k] if k % 2 else (0.0, 0.0),
+        'does not follow',
+    ),
+    'of the world': (
+        lambda k, pose, h: (h[k][0] * math.cos(pose.yaw), h[k][1]),
+        'does not follow',
+    ),
+    'no yaw rate': (lambda k, pose, h: (h[k][0], 0.0), 'angular velocity is'),
+    'reversed': (lambda k, pose, h: (-h[k][0], -h[k][1]), 'linear velocity is -'),
+}
+
+
+def contradicted(changed, *, seed=1, seconds=20.0, noise=(0.005, 0.06), moved=None):
+    """Return twist monitor and the errors of the used twists, of a drive with a false twist."""
+    generator, twist, errors = np.random.default_rng(seed), OdometryTwist(), []
+    pose, history = START, []
+    for k in range(round(100 * seconds)):
+        history.append(turning(0.01 * k))
+        pose = advance_pose(pose, BodyTwist(*history[-1]), 0.01)
+        given = np.array(changed(k, pose, history))
+        given = given + noise * generator.standard_normal(2) * (given != 0.0)
+        seen = pose if moved is None else moved(k, pose, generator)
+        used = twist.measured(
+            State(k * 10 * MS, seen, BodyTwist(*given.tolist())), restart=k == 0
+        ).twist
+        errors.append(np.array(used) - history[-1])
+    return twist, np.array(errors)
+
+
+@pytest.mark.parametrize('fault', WRONG)
+@pytest.mark.parametrize('seed', range(3))
+def test_a_twist_that_the_pose_contradicts_is_replaced(fault, seed):
+    """Dead time and gains were learnt from it: up to 107 times the error of a simple method."""
+    changed, text = WRONG[fault]
+    twist, errors = contradicted(changed, seed=seed)
+    assert text in twist.problem()
+    assert twist.problem().startswith('the twist in odom is wrong: its ')
+    assert np.abs(errors[-500:]).max(axis=0) == pytest.approx([0.0, 0.0], abs=0.01)
+
+
+SEEN = {
+    'as it is': lambda k, pose, generator: pose,
+    '100 ms later': lambda k, pose, generator: pose,
+    'noise': lambda k, pose, generator: Pose(
+        *(np.array(pose) + generator.standard_normal(3) * (0.005, 0.005, 0.01)).tolist()
+    ),
+    'ten times a second': None,
+    'corrected twice a second': lambda k, pose, generator: Pose(
+        pose.x + 0.008 * (k // 50 % 2), pose.y - 0.01 * (k // 50 % 3), pose.yaw + 0.02 * (k // 100)
+    ),
+    'of a gyro with 3 % and a bias': lambda k, pose, generator: pose._replace(
+        yaw=1.03 * pose.yaw + 0.0005 * k
+    ),
+}
+
+
+@pytest.mark.parametrize('seen', SEEN)
+@pytest.mark.parametrize('seed', range(3))
+def test_a_pose_that_is_late_or_rough_replaces_no_twist(seen, seed):
+    """Of the two the earlier and the smoother one is used, and gyros are left to the body."""
+    poses, change = [], SEEN[seen]
+
+    def moved(k, pose, generator):
+        poses.append(pose)
+        if change is None:
+            return poses[k - k % 10]
+        late = 10 if seen.startswith('100 ms') else 0
+        return change(k, poses[max(k - late, 0)], generator)
+
+    twist, _ = contradicted(delayed(0), seed=seed, seconds=30.0, moved=moved)
+    assert not twist.replaced
+    assert twist.problem() == ''
+
+
+def test_a_twist_that_was_wrong_is_used_again():
+    """After ten seconds of driving in which it fits."""
+    twist, errors = contradicted(
+        lambda k, pose, h: (h[k][0] + 0.02 * (k < 1000), h[k][1]), seconds=60.0
+    )
+    assert np.abs(errors[500:1000]).max() < 0.01
+    assert not twist.replaced
+
+
 @pytest.mark.parametrize('kind', ['curves', 'creeping'])
 @pytest.mark.parametrize('seed', range(2))
 def test_noise_of_a_pose_is_no_contact(kind, seed):
