@@ -292,7 +292,8 @@ class WatchedDriver(NodeDriver):
         odometry, status = state.odometry, self._controller.status
         known = None if self._controller.odometry_twist.replaced else self._command
         following = status.reason is Reason.TRACKING
-        self._monitor.update(odometry, self._now_ns, known, following=following)
+        if not self._controller.doubts_odometry:
+            self._monitor.update(odometry, self._now_ns, known, following=following)
         self._command = self._controller.actuation.twist if status.reason.moves else None
         return command
 

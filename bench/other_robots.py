@@ -147,9 +147,8 @@ class Ours:
 
     def on_odometry(self, state: State, now_ns: int) -> BodyTwist | None:
         """Return the command of a step."""
-        ignored = self.core.ignored_odometry
         command, _ = self.core.step(state)
-        if self.core.ignored_odometry == ignored:
+        if self.core.odometry_used:
             self._received_ns, self._stamp_ns = now_ns, state.stamp_ns
         return command
 

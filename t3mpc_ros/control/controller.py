@@ -347,8 +347,8 @@ class Controller:
         )
         """Pauses of the commands."""
         self.odometry_twist = OdometryTwist()  # whether the odometry has a twist
-        self.ignored_odometry = 0
-        """Number of messages that were ignored: repeated, or overtaken by a later one."""
+        self.odometry_used = True
+        """Whether the last message was used: not repeated or overtaken, and its stamp no leap."""
         self.status = self._make_status(0, Reason.NO_ODOMETRY)
 
     @property
@@ -368,6 +368,16 @@ class Controller:
     def gain(self) -> float:
         """Feedback gain K in use, 1/s."""
         return self._tracker.parameters.law.gain
+
+    @property
+    def doubts_odometry(self) -> bool:
+        """Whether the stamp of the last message leaps: the next one tells whether it is true."""
+        return self._watchdog.doubted_ns is not None
+
+    @property
+    def ignored_odometry(self) -> int:
+        """Number of messages that were ignored: repeated, overtaken, or with a refuted stamp."""
+        return self._watchdog.ignored
 
     def problems(self) -> list[str]:
         """Return what does not fit in odometry and response, each with its remedy."""
@@ -494,13 +504,14 @@ class Controller:
 
         odometry : state of the robot. A message with the stamp of the last one, or with one that
             is older by no more than the time-out, is counted and changes nothing, but that it
-            stops a disabled robot. One that comes before 0.6 of a period has passed changes
-            nothing either: the odometry is faster than ``rate``. A message that is not finite,
-            older than that or too late stops the robot, with the reason in the status.
+            stops a disabled robot. So does one whose stamp is further than the time-out from the
+            last one; if the next one follows it, that is a restart, and an older stamp stops the
+            robot. One that comes before 0.6 of a period has passed changes nothing either: the
+            odometry is faster than ``rate``. A message that is not finite stops the robot.
         """
         stamp = odometry.stamp_ns
-        if self._watchdog.is_out_of_order(stamp):
-            self.ignored_odometry += 1
+        self.odometry_used = not self._watchdog.ignores(stamp)
+        if not self.odometry_used:
             if not self._watchdog.enabled:
                 self._stop()
                 self.status = self._make_status(stamp, Reason.DISABLED, self.status.error)
@@ -530,8 +541,6 @@ class Controller:
             self.keep_out.relocate()  # what it has marked was marked at another place
             self.drive_monitor.contact_monitor.restart(None)
         plan_ns, reason = self._sample_plan(odometry)
-        if reason.moves and restarted:
-            reason = Reason.ODOMETRY_RESTARTED
         if elapsed is None or not reason.moves:
             self.drive_monitor.begin()
         if reason.moves:

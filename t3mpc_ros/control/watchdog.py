@@ -150,7 +150,13 @@ class InputWatchdog:
         """Clear all stamps; the robot may move after the next valid odometry and reference."""
         self._odometry_ns: int | None = None
         self._reference_ns: int | None = None
+        self.doubted_ns: int | None = None
+        """Stamp of the last message if it leaps, until the next one confirms or refutes it."""
+        self.ignored = 0
+        """Number of messages that were ignored: repeated, overtaken, or with a refuted stamp."""
+        self._silent = False  # whether the odometry has timed out since the last message
         self._reference_pending = False
+        self._restarted = False  # whether no reference has arrived since the stamps went back
         self._hold_until_ns: int | None = None
         self._diverged = 0.0, 0.0
         """Wheel speed and error of the last state that was diverging, rad/s."""
@@ -163,6 +169,26 @@ class InputWatchdog:
         """Whether an odometry is the last one again, or was overtaken by it on the way."""
         last, timeout = self._odometry_ns, self._parameters.odometry_timeout
         return last is not None and is_out_of_order(stamp_ns, last, timeout)
+
+    def ignores(self, stamp_ns: int) -> bool:
+        """Whether an odometry changes nothing: out of order, or its stamp alone leaps.
+
+        A stamp beyond the time-out of the last one may be wrong, unless there was a silence. The
+        next message confirms it if it follows it: messages are missing, or the clock was set.
+        """
+        last, doubted, self.doubted_ns = self._odometry_ns, self.doubted_ns, None
+        timeout_ns = self._parameters.odometry_timeout * NANOSECONDS
+        leaps = last is not None and not self._silent and abs(stamp_ns - last) > timeout_ns
+        self._silent = False
+        if leaps and doubted is not None and 0 < stamp_ns - doubted <= timeout_ns:
+            return False
+        self.ignored += doubted is not None
+        if leaps:
+            self.doubted_ns = stamp_ns
+            return True
+        ignored = self.is_out_of_order(stamp_ns)
+        self.ignored += ignored
+        return ignored
 
     def elapsed(self, stamp_ns: int) -> float | None:
         """Return the time since the previous odometry, s; None if integration must restart.
@@ -177,6 +203,7 @@ class InputWatchdog:
             if elapsed < 0.0:
                 self._reference_ns = None
                 self._hold_until_ns = None
+                self._restarted = True
             return None
         return elapsed
 
@@ -195,13 +222,15 @@ class InputWatchdog:
             return Reason.DISABLED
         if not finite:
             return Reason.ODOMETRY_BAD
+        missing = Reason.ODOMETRY_RESTARTED if self._restarted else Reason.NO_REFERENCE
         if self._reference_ns is None:
-            return Reason.NO_REFERENCE
+            return missing
         age = (stamp_ns - self._reference_ns) / NANOSECONDS
         if age > self._parameters.reference_timeout:
             return Reason.REFERENCE_STALE
         if not known:
-            return Reason.NO_REFERENCE
+            return missing
+        self._restarted = False
         if speed > self._parameters.speed_bound or error > self._parameters.error_bound:
             self._hold_until_ns = stamp_ns + round(self._parameters.hold_time * NANOSECONDS)
             self._diverged = speed, error
@@ -222,9 +251,9 @@ class InputWatchdog:
 
     def odometry_timed_out(self, last_received_ns: int | None, now_ns: int) -> bool:
         """Whether the odometry is older than the time-out; both times are from one clock."""
-        if last_received_ns is None:
-            return True
-        return now_ns - last_received_ns > self._parameters.odometry_timeout * NANOSECONDS
+        timeout_ns = self._parameters.odometry_timeout * NANOSECONDS
+        self._silent = last_received_ns is None or now_ns - last_received_ns > timeout_ns
+        return self._silent
 
 
 MOVED, TURNED = 0.01, 0.05

@@ -257,9 +257,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         measured = conversions.state_from_odometry(message)
         if not self._steps:
             self._odometry_frame = conversions.frame_from_serialized(message)
-        ignored = self._controller.ignored_odometry
         command, status = self._controller.step(measured)
-        if self._controller.ignored_odometry == ignored or self._last_odometry_ns is None:
+        if self._controller.odometry_used or self._last_odometry_ns is None:
             self._last_odometry_ns = self.steady_ns()
             # Stamps are ahead of their receipt by a constant, but for the time on the way.
             self._received_ns, self._stamp_ns = self.now_ns(), measured.stamp_ns
@@ -267,7 +266,8 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         # Poses alone are differentiated, which says little about a gain.
         known = None if self._controller.odometry_twist.replaced else self._last_command
         following = status.reason is Reason.TRACKING
-        self._input_monitor.update(measured, self.now_ns(), known, following=following)
+        if not self._controller.doubts_odometry:
+            self._input_monitor.update(measured, self.now_ns(), known, following=following)
         self._last_command = command if status.reason.moves else None
         self._publish_journal(self._journal.step(measured.stamp_ns))
         self._initial_odometry.republish(message)
@@ -476,8 +476,10 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         ignored = self._controller.ignored_odometry
         if ignored > self._reported_ignored:
             found.append(
-                f'{ignored - self._reported_ignored} messages of odom were ignored: repeated, or '
-                'overtaken by later ones; one publisher only, with increasing stamps'
+                f'{ignored - self._reported_ignored} messages of odom were ignored: repeated, '
+                'overtaken by later ones, or one stamp was further from the others than '
+                f'watchdog.odometry_timeout ({self.parameters.watchdog.odometry_timeout:g} s); '
+                'one publisher only, with increasing stamps'
             )
         self._reported_ignored = ignored
         if stopped := self._stops.unreported(self.steady_ns()):

@@ -198,6 +198,8 @@ def _assert_no_jump_after_a_gap(loop):
         stamp = loop.now + LEAD - (30 - k) * PERIOD
         loop.controller.add_reference(make_state(stamp, *loop.reference(stamp / 1e9)))
     before = loop.twist
+    loop.step()  # this stamp is not believed before the next one confirms it
+    assert loop.twist == before
     status = loop.step()
     assert status.reason is Reason.TRACKING
     assert loop.twist.linear == pytest.approx(before.linear, abs=0.02)
@@ -208,9 +210,43 @@ def test_a_gap_or_a_jump_back_in_the_odometry_restarts_the_law():
     loop.run(200)
     loop.now = 0  # the robot, or the simulated clock, has restarted
     statuses = loop.run(200)
-    assert statuses[0].reason is not Reason.TRACKING
+    assert [status.reason for status in statuses[1:10]] == [Reason.ODOMETRY_RESTARTED] * 9
     assert statuses[-1].reason is Reason.TRACKING
     _assert_no_jump_after_a_gap(loop)
+
+
+@pytest.mark.parametrize('leap', [-2000, -10_000, 300, 10_000, None])
+def test_one_message_whose_stamp_leaps_changes_nothing(leap):
+    """It was a restart: the reference was cleared, and the robot stood for 0.4 s."""
+    loop, exact = Loop(), Loop()
+    for each in (loop, exact):
+        each.run(200)
+    stamp = 0 if leap is None else loop.now + leap * MS
+    for k in range(3):
+        status = loop.controller.status
+        found = loop.controller.step(State(stamp, ORIGIN, loop.twist))
+        assert found == (loop.twist, status)
+        assert loop.controller.doubts_odometry
+        assert not loop.controller.odometry_used
+        assert loop.controller.ignored_odometry == k
+        assert loop.step().reason is Reason.TRACKING
+        exact.step()
+        assert loop.twist == exact.twist
+        assert loop.controller.odometry_used
+        assert loop.controller.ignored_odometry == k + 1
+
+
+@pytest.mark.parametrize('leap', [-1500, 300])
+def test_a_stamp_after_a_silence_is_believed_at_once(leap):
+    """The time-out of the node has stopped the robot, so that messages are missing indeed."""
+    loop = Loop()
+    loop.run(200)
+    assert loop.controller.check_odometry(0, 201 * MS)
+    loop.now += leap * MS
+    loop.step()
+    assert loop.controller.odometry_used
+    assert loop.controller.ignored_odometry == 0
+    assert loop.controller.status.stamp_ns == loop.now - PERIOD
 
 
 @pytest.mark.parametrize('lag, composition', [(0.003, 'body'), (0.1, 'paper')])

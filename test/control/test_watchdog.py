@@ -63,7 +63,7 @@ class WatchdogMachine(RuleBasedStateMachine):
         super().__init__()
         self.watchdog = InputWatchdog(WatchdogParameters())
         self.last = self.reference = self.held_until = None
-        self.now, self.pending, self.enabled = 600_000, False, True
+        self.now, self.pending, self.enabled, self.restarted = 600_000, False, True, False
 
     @rule(on=st.sampled_from((True, True, False)))
     def enable(self, on):
@@ -73,7 +73,7 @@ class WatchdogMachine(RuleBasedStateMachine):
     def reset(self):
         self.watchdog.reset()
         self.last = self.reference = self.held_until = None
-        self.pending = False
+        self.pending = self.restarted = False
 
     @rule(
         referenced=st.booleans(),
@@ -129,6 +129,7 @@ class WatchdogMachine(RuleBasedStateMachine):
         assert elapsed == (gap / 1000 if gap is not None and 0 <= gap <= 200 else None)
         if gap is not None and gap < 0:
             self.reference = self.held_until = None
+            self.restarted = True
         self.now = self.last = now
         assert _decide(self.watchdog, now, **facts) is self.reason(**facts)
 
@@ -139,12 +140,14 @@ class WatchdogMachine(RuleBasedStateMachine):
             return Reason.DISABLED
         if not finite:
             return Reason.ODOMETRY_BAD
+        missing = Reason.ODOMETRY_RESTARTED if self.restarted else Reason.NO_REFERENCE
         if self.reference is None:
-            return Reason.NO_REFERENCE
+            return missing
         if self.now - self.reference > 150:
             return Reason.REFERENCE_STALE
         if not known:
-            return Reason.NO_REFERENCE
+            return missing
+        self.restarted = False
         if speed > 40.0 or error > 25.0:
             self.held_until = self.now + 500
         if self.held_until is not None and self.now <= self.held_until:

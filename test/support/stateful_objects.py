@@ -46,7 +46,7 @@ from t3mpc_ros.control.pose_controller import (
     PoseLoopParameters,
 )
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters, SpeedKalmanFilter
-from t3mpc_ros.control.watchdog import ResponseMonitor, WatchdogParameters
+from t3mpc_ros.control.watchdog import InputWatchdog, ResponseMonitor, WatchdogParameters
 from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultInjection
 from t3mpc_ros.emulator.plant import Plant
@@ -683,8 +683,9 @@ FRESH = {
                 kept=(
                     *all_of(
                         make_controller(ControllerParameters)(),
-                        *('_tracker', 'actuation', '_moving', 'status'),
+                        *('_tracker', 'actuation', '_moving', 'status', '_watchdog'),
                     ),
+                    *below('._watchdog', all_of(InputWatchdog(WatchdogParameters()), '_silent')),
                     *below('._tracker.law', (*ALPHA, *below('.predictive', MACHINE))),
                 ),
                 continued=below('._tracker.law.predictive', SKILL),
