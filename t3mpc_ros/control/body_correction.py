@@ -190,10 +190,12 @@ class BodyMemory(Structure):
     authority: float  # share of the correction that is in use
     rest_sum: float  # sum of what E20 does not explain of a step, and of its square
     rest_square: float
+    rest_product: float  # sum of its product with the change of w_c in the period
     change_square: float  # sum of the squared changes of w_c in a period
     largest_change: float
     slowest: float  # least speed of a wheel
     steps: int
+    roughness: float  # least deviation of the turn in a calm block, if that is rough
     rings: int  # number of blocks in which the rotors ring still
     chain: int  # number of steps since a gap, at most 2; of the last two steps:
     last_achieved: float
@@ -207,13 +209,25 @@ class BodyMemory(Structure):
     ring_acceleration: float
 
 
-WATCH = 'rest_sum', 'rest_square', 'change_square', 'largest_change', 'slowest', 'steps'
+WATCH = (
+    *('rest_sum', 'rest_square', 'rest_product', 'change_square'),
+    *('largest_change', 'slowest', 'steps'),
+)
 """Fields of the present block that :func:`watch_block` uses."""
 DRIVE = (
     *('started', 'yaw_error', 'commands', 'above', 'below'),
     *('block_time', 'achieved_sum', 'square_sum', 'rise', 'linked', 'spoilt'),
     *('before_achieved', 'last_achieved', 'last_rest'),
-    *(*WATCH, 'rings', 'chain', 'ring_count', 'ring_error', 'ring_product', 'ring_acceleration'),
+    *(
+        *WATCH,
+        'roughness',
+        'rings',
+        'chain',
+        'ring_count',
+        'ring_error',
+        'ring_product',
+        'ring_acceleration',
+    ),
 )
 """Fields of the memory that belong to one drive."""
 SKILL = 'raw_power', 'error_power', 'residual_power', 'command_power', 'authority'
@@ -553,6 +567,7 @@ def add_to_block(
     memory.change_square += change * change
     memory.rest_sum += rest
     memory.rest_square += rest * rest
+    memory.rest_product += rest * change
     memory.steps += 1
     memory.achieved_sum += achieved * elapsed
     memory.square_sum += 0.5 * (right * right + left * left) * elapsed
@@ -565,7 +580,7 @@ def clear_block(state: BodyState) -> None:
     """Begin another block."""
     memory = state.memory[0]
     memory.block_time = memory.achieved_sum = memory.square_sum = memory.rise = 0.0
-    memory.rest_sum = memory.rest_square = memory.change_square = 0.0
+    memory.rest_sum = memory.rest_square = memory.rest_product = memory.change_square = 0.0
     memory.largest_change = memory.slowest = 0.0
     memory.steps = 0
     memory.spoilt = False
@@ -576,7 +591,8 @@ def clear_block(state: BodyState) -> None:
 def watch_block(state: BodyState) -> None:
     """Add what the block says of the response: unexplained share, and roughness if it is calm.
 
-    The share says nothing where the changes are below the roughness, as of a pose with noise.
+    The share says nothing where the changes are below the roughness, as of a pose with noise. It
+    is what no delay explains: blocks as long as half a swing do not tell tau from k_w.
     """
     memory, watched = state.memory[0], state.watched
     least = math.inf
@@ -589,9 +605,15 @@ def watch_block(state: BodyState) -> None:
     variance = max(memory.rest_square / steps - (memory.rest_sum / steps) ** 2, 0.0)
     change, rough = memory.change_square / steps, math.sqrt(variance)
     small = memory.largest_change < max(CALM_CHANGE, CALM_SHARE * rough)
-    watched[0, 0] = variance / change if change > max(EXCITED, noise) else math.nan
+    if change > max(EXCITED, noise):
+        timed = (memory.rest_product / steps) ** 2 / change
+        watched[0, 0] = max(variance - timed, 0.0) / change
+    else:
+        watched[0, 0] = math.nan
     calm = small and memory.slowest > CALM_SPEED and memory.rings == 0
     watched[0, 1] = rough if calm else math.nan
+    least = min(least, rough) if calm else least
+    memory.roughness = least if ROUGH < least < math.inf else 0.0
     memory.rings = max(memory.rings - 1, 0) if small else RINGING_BLOCKS
     memory.ring_count *= RINGING_MEMORY
     memory.ring_error *= RINGING_MEMORY
@@ -637,7 +659,7 @@ def learn_block(constants: BodyConstants, state: BodyState) -> None:
         return
     for j in range(ROWS):
         covariance[j, j] += WALK[j] * WALK[j] * time
-    noise = NOISE * NOISE + (SLOPE_NOISE * row[DELAY]) ** 2
+    noise = NOISE * NOISE + (SLOPE_NOISE * row[DELAY]) ** 2 + memory.roughness**2 / memory.steps
     variance = spread(row, covariance, gain) + noise
     score = residual / math.sqrt(variance)
     sudden = abs(score) > SUDDEN

@@ -429,6 +429,31 @@ def test_noise_of_the_yaw_is_no_scale_of_the_gyro(noise):
     assert 'scale of the gyro' not in body.correction.problem()
 
 
+@pytest.mark.parametrize('seed', [1, 4, 5])
+def test_noise_of_the_gyro_is_neither_bias_nor_geometry(seed):
+    """With 0.1 rad/s in each sample the robot was corrected by noise: 3.5 times the error."""
+    body = Body(exact, noise=0.3, seed=seed)
+    errors = []
+    for _ in range(30):
+        errors.append(body.run(1.0))
+        assert body.correction.problem() == ''
+    assert rms(np.concatenate(errors) - uncorrected(30.0)) < 0.006
+    assert 'is rough' in body.correction.response_problem()
+
+
+def test_a_swing_of_two_blocks_is_no_lost_command():
+    """Blocks of half a swing take 5 % more turn for a delay: it "does not follow the changes"."""
+    body = Body(lambda right, left: 1.05 * exact(right, left))
+
+    def swing(k):
+        half = 2.0 * math.sin(4.0 * math.pi * k * PERIOD)
+        return np.array([2.0 + half, 2.0 - half])
+
+    body.reference = swing
+    body.run(15.0)
+    assert body.correction.response_problem() == ''
+
+
 @pytest.mark.parametrize('scale', [-1.0, 2.0, 5.0])
 def test_no_scale_of_a_gyro_leaves_the_bounds(scale):
     """With the largest tolerance and a scale of 2 the bias once was 1e12 rad/s."""
