@@ -69,6 +69,8 @@ Cells = NDArray[np.int8]
 UNKNOWN, FREE, OCCUPIED, KNOWN = 0, 1, 2, 3
 """States of a cell; KNOWN is an obstacle of the world file, or one that the robot has touched: no
 ray clears it."""
+NOBODY, SEVERAL = -2, -1
+"""Who marked an occupied cell, in place of one sensor: several, of what stays there."""
 NEAREST_TRUSTED = 0.08
 """Distance from the face of a sensor below which a ray neither clears nor marks: a Sharp sensor
 reads 13 cm for an object at 3 cm."""
@@ -143,6 +145,7 @@ class MapGrid(NamedTuple):
     cells: Cells  # state of each cell, shape (n, n), row by y
     cleared: Cells  # rays that passed over an occupied cell, shape (n, n)
     seen: NDArray[np.float32]  # when a cell was last seen to be free, s, shape (n, n)
+    author: Cells  # the sensor that marked an occupied cell, or one of these, shape (n, n)
     low: float  # coordinate of the first edge, m
     size: float  # side of a cell, m
 
@@ -174,6 +177,7 @@ class FreeSpaceMap:
             np.zeros((count, count), dtype=np.int8),
             np.zeros((count, count), dtype=np.int8),
             np.zeros((count, count), dtype=np.float32),
+            np.zeros((count, count), dtype=np.int8),
             low,
             parameters.resolution,
         )
@@ -190,6 +194,7 @@ class FreeSpaceMap:
         self.grid.cells[:] = UNKNOWN
         self.grid.cleared[:] = 0
         self.grid.seen[:] = 0.0
+        self.grid.author[:] = NOBODY
         low, size = self.grid.low, self.grid.size
         count = len(self.grid.cells)
         spacing = 0.5 * size
@@ -291,6 +296,7 @@ class FreeSpaceMap:
             max(hit - error, 0.0),
             0.09 if near else (hit if reading < limit else -1.0),
             parameters.beam_half_width,
+            sensor,
         )
         if come:
             self.last_come = self.now
@@ -321,7 +327,8 @@ def has_obstacle(cells: Cells, row: int, column: int, reach: int) -> bool:
 def find_surface(grid: MapGrid, x: float, y: float, direction: float, reach: float) -> float:
     """Return the distance (m) of a surface that was seen across a ray, at most ``reach``; inf.
 
-    Walls of a world file and what the robot has touched are not counted: nobody has seen them.
+    Walls of a world file and what the robot has touched are not counted: nobody has seen them. A
+    sensor that sees what is not there, and who has walked by, leave what one sensor has marked.
     """
     count, step = grid.cells.shape[0], 0.5 * grid.size
     cosine, sine = math.cos(direction), math.sin(direction)
@@ -338,7 +345,7 @@ def find_surface(grid: MapGrid, x: float, y: float, direction: float, reach: flo
             )
             if not (0 <= column < count and 0 <= row < count):
                 break
-            if grid.cells[row, column] == OCCUPIED:
+            if grid.cells[row, column] == OCCUPIED and grid.author[row, column] == SEVERAL:
                 found = along * step
                 break
         nearest, farthest = min(nearest, found), max(farthest, found)
@@ -355,6 +362,7 @@ def add_ray(
     free: float,
     hit: float,
     half_width: float,
+    sensor: int,
 ) -> bool:
     """Mark the cells along a ray as free up to ``free`` m, and the one at ``hit`` m as occupied.
 
@@ -400,6 +408,12 @@ def add_ray(
     come = has_come(grid, now - NEW_FOR, row, column, int(NEW_APART / size))
     if come and hit < NEW_WITHIN:
         forget_around(grid, now - JUST_SEEN, row, column, int(NEW_EXTENT / size))
+    if grid.cells[row, column] != OCCUPIED:
+        grid.author[row, column] = sensor
+        if come and grid.seen[row, column] < now - NEW_FOR:
+            grid.seen[row, column] = now  # it has come now: nothing near it is old for that
+    elif grid.author[row, column] != sensor and grid.seen[row, column] < now - NEW_FOR:
+        grid.author[row, column] = SEVERAL
     grid.cells[row, column] = OCCUPIED
     grid.cleared[row, column] = 0
     return come
@@ -431,6 +445,7 @@ def forget_around(grid: MapGrid, since: float, row: int, column: int, reach: int
                 continue
             if grid.cells[up, right] == FREE:
                 grid.cells[up, right] = UNKNOWN
+                grid.seen[up, right] = since  # until now: what comes there next has come
 
 
 @dataclass(frozen=True)
@@ -583,12 +598,10 @@ class KeepOut:
         """Add a reading (m, REP 117) of a sensor; return whether it is possible and new."""
         if not self.ranges.accept(sensor, reading, stamp_ns):
             return False
-        if reading == math.inf:
-            if (surface := self.map.surface(sensor, pose)) is not None:
-                self.ranges.miss(sensor, surface)
-            if not self.ranges.sees(sensor):
-                return True
-        self.map.add_reading(sensor, reading, pose)
+        if reading == math.inf and (surface := self.map.surface(sensor, pose)) is not None:
+            self.ranges.miss(sensor, surface)
+        if self.ranges.sees(sensor, reading):
+            self.map.add_reading(sensor, reading, pose)
         return True
 
     def step(self, wanted: BodyTwist, pose: Pose, elapsed: float) -> BodyTwist:

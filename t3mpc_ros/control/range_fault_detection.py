@@ -13,10 +13,19 @@
 # limitations under the License.
 """Which range sensors can be relied on: they report in time, plausibly, and see that they move."""
 
+from collections import deque
 import enum
 import math
 
-from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, RANGE_SENSORS, Array, Pose, wrap_angle
+from t3mpc_ros.geometry.types import (
+    NANOSECONDS,
+    ORIGIN,
+    RANGE_SENSORS,
+    Array,
+    Pose,
+    has_moved,
+    wrap_angle,
+)
 
 LOOKS_ALONG = 0.7
 """Cosine of the direction of a sensor from which on it looks along the motion of the robot."""
@@ -27,11 +36,16 @@ FROZEN_MOTION, FROZEN_TURN = 0.08, 0.8
 """Motion along its beam (m), or turn (rad), during which a sensor must not read one distance. Its
 noise of 10 mV changes a reading beyond 0.25 m even of a robot that stands, but not a nearer one of
 a robot that drives along a wall: that moves no face along its beam."""
-MISSES, MISSES_APART = 4, 0.3
+STEADY, STEADY_TURN, ON_THE_SPOT = 0.06, 2.0, 0.05
+"""Band (m) that readings must leave while the robot turns on the spot by such an angle (rad), and
+distance (m) up to which it does so: six times the noise of 10 mm of a cable before a sensor. Of
+walls that a robot of 0.22 m has room to turn between, those of a square change a reading by 0.07 m
+within half of that angle; who walks around it in step with its 1.2 rad/s runs."""
+MISSES, MISSES_APART, MISSES_WITHIN = 4, 0.3, 120.0
 """Number of surfaces, so far (m) from the one before, that a sensor has not seen and the map has,
-without having seen anything in between: it sees nothing at all. One may be old. The same number,
-so far from each other, of those that any sensor has missed while none has seen anything: none
-does."""
+without having seen anything in between, and within such a time (s): it sees nothing at all. One
+may be old. The same number, so far from each other, of those that any sensor has missed while none
+has seen anything: none does."""
 NOTHING_SEEN = 3.0
 """Way (m) without a reading of anything after which it is in doubt whether any sensor sees:
 without their supply Sharp sensors read "nothing in range"."""
@@ -48,7 +62,10 @@ class RangeFault(enum.Enum):
     REPEATED = 'repeated: no newer stamps'
     IMPOSSIBLE = 'impossible: not a number, negative or beyond its range'
     FROZEN = 'frozen: one distance while the robot moves'
-    BLIND = 'blind: nothing in range where something was seen before'
+    BLIND = (
+        'blind: nothing in range where something was seen before; it works again when it sees '
+        'anything, a hand before it say'
+    )
 
 
 class SensorRecord:
@@ -69,44 +86,67 @@ class SensorRecord:
         self._reading = math.nan
         self._repeats = 0
         self._along = self._turn = 0.0
-        self._misses = 0
+        self._low = self._high = math.nan  # band of the readings of a robot that turns, m
+        self._spot: Pose | None = None  # where it has been since then
+        self._angle = self._least = self._most = 0.0  # and its angle then, and the extremes, rad
+        self._steady: float | None = None  # middle of the band that they did not leave, m
+        self._misses: deque[int] = deque()  # stamps of the odometry
         self._missed: tuple[float, float] | None = None  # the last surface that it has not seen, m
 
     def add(self, reading: float) -> None:
         """Add a valid reading."""
         self.pending = True
         if reading != math.inf:
-            self._misses, self._missed = 0, None
+            self._missed = None
+            self._misses.clear()
+        if self._steady is not None and not abs(reading - self._steady) <= STEADY:
+            self._steady = None
+        low, high = min(self._low, reading), max(self._high, reading)
+        if high - low <= STEADY:
+            self._low, self._high = low, high
+        else:
+            self._low, self._high, self._spot = reading, reading, None
         if reading == self._reading:
             self._repeats += 1
             return
         self._reading, self._repeats, self._along, self._turn = reading, 0, 0.0, 0.0
 
-    def miss(self, surface: tuple[float, float]) -> None:
+    def miss(self, surface: tuple[float, float], now_ns: int) -> None:
         """Count a surface (m) that the map has and it does not see."""
         if self._missed is None or math.dist(self._missed, surface) > MISSES_APART:
             self._missed = surface
-            self._misses += 1
+            self._misses.append(now_ns)
 
     def move(self, forward: float, left: float, turn: float) -> None:
         """Add a motion of the robot in its frame (m, rad)."""
         ahead, aside, around = self._share
         self._along += ahead * forward + aside * left + around * turn
         self._turn += turn
+        self._angle += turn
+        self._least, self._most = min(self._least, self._angle), max(self._most, self._angle)
 
-    def update(self, now_ns: int, timeout: float) -> None:
-        """Decide about the sensor at the stamp of an odometry."""
+    def update(self, now_ns: int, pose: Pose, timeout: float) -> None:
+        """Decide about the sensor at an odometry."""
         if self.pending:
             self.pending, self.received_ns, self.cause = False, now_ns, RangeFault.SILENT
         elapsed = math.inf if self.received_ns is None else now_ns - self.received_ns
         self.age = elapsed / NANOSECONDS
         moved = abs(self._along) > FROZEN_MOTION or abs(self._turn) > FROZEN_TURN
+        if has_moved(self._spot, pose, ON_THE_SPOT, math.inf):
+            self._spot, self._low, self._high = pose, self._reading, self._reading
+            self._angle = self._least = self._most = 0.0
+        if self._most - self._least > STEADY_TURN:
+            self._steady = 0.5 * (self._low + self._high)
+        while self._misses and now_ns - self._misses[0] > MISSES_WITHIN * NANOSECONDS:
+            self._misses.popleft()
         self.fault = None
         if self.age > timeout:
             self.fault = self.cause
-        elif moved and self._repeats >= REPEATS and math.isfinite(self._reading):
+        elif self._steady is not None or (
+            moved and self._repeats >= REPEATS and math.isfinite(self._reading)
+        ):
             self.fault = RangeFault.FROZEN
-        elif self._misses >= MISSES:
+        elif len(self._misses) >= MISSES:
             self.fault = RangeFault.BLIND
 
 
@@ -158,13 +198,16 @@ class RangeMonitor:
 
     def miss(self, sensor: int, surface: tuple[float, float]) -> None:
         """Note that a sensor reads "nothing in range" where the map has a surface (m)."""
-        self._sensors[sensor].miss(surface)
+        self._sensors[sensor].miss(surface, self._now_ns or 0)
         if all(math.dist(surface, each) > MISSES_APART for each in self._missed):
             self._missed.append(surface)
 
-    def sees(self, sensor: int) -> bool:
-        """Return whether "nothing in range" of a sensor says that nothing is there."""
-        return self._sensors[sensor].fault is not RangeFault.BLIND
+    def sees(self, sensor: int, reading: float) -> bool:
+        """Return whether a reading says where something is, or that nothing is."""
+        fault = self._sensors[sensor].fault
+        return fault is not RangeFault.FROZEN and (
+            reading != math.inf or fault is not RangeFault.BLIND
+        )
 
     def update(self, now_ns: int, pose: Pose) -> None:
         """Decide about each sensor at an odometry."""
@@ -179,7 +222,7 @@ class RangeMonitor:
         if step > LEAP:
             self._way, self._way_from = self._way + min(step, 2.0 * LEAP), pose
         for record in self._sensors:
-            record.update(now_ns, self._timeout)
+            record.update(now_ns, pose, self._timeout)
             if len(self._missed) >= MISSES and record.fault is None:
                 record.fault = RangeFault.BLIND
 

@@ -406,6 +406,15 @@ def test_one_who_walks_on_takes_the_unseen_floor_along():
     assert not floor.is_free(0.38 - 0.08, 0.05 + 0.15)
 
 
+def test_one_who_walks_alongside_has_come_all_the_time():
+    """What the walk had left made the newest hit old: the robot was fast, and touched a leg."""
+    floor = Floor()
+    for k in range(60):
+        floor.map.now += 0.1
+        floor.map.add_reading(2, 0.3, Pose(0.02 * k, 0.0, 0.0))
+        assert floor.map.now - floor.map.last_come < NEW_FOR
+
+
 def test_a_thing_that_stays_has_come_only_once():
     floor = Floor()
     floor.hit(0.4)

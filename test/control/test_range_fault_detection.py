@@ -62,7 +62,7 @@ class Drive:
 
 def _noisy(drive):
     """Return readings of a robot amid things: another one each time."""
-    return lambda sensor, time: 0.3 + 0.005 * int(drive.noise.integers(-5, 5))
+    return lambda sensor, time: 0.3 + 0.01 * int(drive.noise.integers(-5, 5))
 
 
 def test_before_the_first_reading_every_sensor_is_silent():
@@ -176,6 +176,54 @@ def test_constant_readings_that_are_no_fault(twist, readings):
     assert not Drive(twist).run(5.0, readings).lost
 
 
+def test_a_sensor_that_freezes_with_noise_is_found_on_the_spot():
+    """A cable before it: seven healthy sensors were named in its place, and the robot stood."""
+    drive = Drive(BodyTwist(0.0, 1.2))
+    noisy = _noisy(drive)
+
+    def cable(sensor, time):
+        return 0.45 + 0.01 * drive.noise.standard_normal() if sensor == 2 else noisy(sensor, time)
+
+    frozen = {'left_front': RangeFault.FROZEN}
+    assert drive.run(2.5, cable).faults() == frozen
+    drive.twist = BodyTwist(0.3, 0.0)
+    for _ in range(20):
+        assert drive.run(0.2, cable).faults() == frozen
+    assert not drive.run(0.2, noisy).lost
+
+
+@pytest.mark.parametrize('kind', ['stands', 'is followed', 'turns in a narrow place'])
+def test_readings_that_stay_similar_are_no_fault(kind):
+    """The second: by somebody at 0.42 m behind it, on straights and on arcs."""
+    twist = {'stands': STANDSTILL, 'is followed': BodyTwist(0.2, 0.5)}.get(kind)
+    drive = Drive(twist or BodyTwist(0.0, 1.2))
+    square = 0.17 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]])
+    walls, far = np.column_stack([square[:-1], square[1:]]), np.empty(8)
+
+    def readings(sensor, time):
+        noise = 0.004 * drive.noise.standard_normal()
+        if twist is not None:
+            return 0.42 + noise
+        cast_rays(*drive.pose, MOUNTS, np.arange(8), walls, NO_CIRCLES, far)
+        return float(far[sensor]) + noise
+
+    for _ in range(40):
+        assert drive.run(0.25, readings).faults() == {}
+
+
+def test_a_frozen_sensor_marks_no_floor():
+    keep_out = KeepOut(KeepOutParameters(), BodyTwist(0.3, 2.0))
+    for k in range(100):
+        pose = Pose(0.0, 0.0, 0.05 * k)
+        if k == 60:
+            assert keep_out.ranges.faults() == {'left_front': RangeFault.FROZEN}
+            cells = keep_out.map.grid.cells.copy()
+        for sensor in range(8) if k < 60 else [2]:
+            keep_out.add_reading(sensor, 0.45 + 0.01 * (k % 3) if sensor == 2 else math.inf, pose)
+        keep_out.ranges.update(4 * k * PERIOD_NS, pose)
+    assert np.array_equal(keep_out.map.grid.cells, cells)
+
+
 class Room:
     """A keep-out on an exact robot that circles in a corner of a square room."""
 
@@ -189,6 +237,7 @@ class Room:
         far, which = np.empty(8), np.arange(8)
         for _ in range(round(seconds / 0.04)):
             self.k += 4
+            self.keep_out.map.now += 0.04
             self.pose = advance_pose(self.pose, BodyTwist(0.1, 0.5), 0.04)
             cast_rays(*self.pose, MOUNTS, which, self.walls, circles, far)
             for sensor, distance in enumerate(far):
@@ -229,6 +278,39 @@ def test_sensors_that_all_see_nothing_are_named():
     assert 'all range sensors blind' in room.keep_out.ranges.problem()
     assert room.keep_out.ranges.is_blind(astern=False)
     assert room.run(20.0) == {}  # they see again
+
+
+def test_who_walks_by_leaves_no_surface_that_another_must_see():
+    """Cells along a walk of two metres were five surfaces: healthy sensors were called blind."""
+    keep_out = KeepOut(KeepOutParameters(), BodyTwist(0.3, 2.0))
+    for k in range(100):  # somebody walks along
+        keep_out.map.now += 0.04
+        keep_out.add_reading(2, 0.35, Pose(0.02 * k, 0.0, 0.0))
+    for k in range(100):  # and is gone
+        pose = Pose(0.1 + 0.02 * k, 0.0, math.pi)
+        keep_out.add_reading(6, math.inf, pose)
+        keep_out.ranges.update(4 * k * PERIOD_NS, pose)
+        assert RangeFault.BLIND not in keep_out.ranges.faults().values()
+
+
+def test_what_a_sensor_missed_long_ago_does_not_count():
+    """Four things that left in an hour made a sensor blind that had nothing to see."""
+    monitor = _monitor()
+    for k in range(4):
+        monitor.update(k * 1_000_000_000, ORIGIN)
+        monitor.accept(0, 0.5, None)
+        monitor.accept(3, math.inf, None)
+        monitor.miss(3, (float(k), 0.0))
+    monitor.update(4_000_000_000, ORIGIN)
+    assert monitor.faults()['left_back'] is RangeFault.BLIND
+    assert 'a hand before it' in monitor.problem()
+    for k in (0, 40, 80, 120, 160, 200):
+        now = (1000 + k) * 1_000_000_000
+        monitor.accept(0, 0.5, None)
+        monitor.accept(3, math.inf, None)
+        monitor.update(now, ORIGIN)
+        assert 'left_back' not in monitor.faults()
+        monitor.miss(3, (float(k), 1.0))
 
 
 @pytest.mark.parametrize('noise', [0.0, 0.003])
