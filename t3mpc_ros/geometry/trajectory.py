@@ -113,6 +113,17 @@ class ReferenceTrajectory:
             self._add_jump(last)
         return True
 
+    def holds(self, sample: State) -> bool:
+        """Whether the same twist is already known at the stamp of a sample."""
+        stamps, samples, bounds, _ = self.buffer
+        first, end = bounds.tolist()
+        if self.newest_ns is None or sample.stamp_ns > self.newest_ns:
+            return False
+        i = first + int(np.searchsorted(stamps[first:end], sample.stamp_ns))
+        return bool(stamps[i] == sample.stamp_ns) and sample.twist == tuple(
+            samples[i, :2].tolist()
+        )
+
     def pop_jumps(self) -> list[Jump]:
         """Return the jumps added since the last call, oldest first."""
         jumps, self._jumps = self._jumps, []

@@ -236,6 +236,22 @@ def test_one_message_whose_stamp_leaps_changes_nothing(leap):
         assert loop.controller.ignored_odometry == k + 1
 
 
+def test_a_horizon_that_is_sent_again_changes_nothing():
+    """Its jumps were withdrawn and not announced again: up to 1.7 times the error."""
+
+    def reference(t):
+        return (0.1 if t % 1.0 < 0.5 else 0.2), (0.5 if t % 0.7 < 0.3 else -0.5)
+
+    whole, again = ServoLoop(reference), ServoLoop(reference)
+    for k in range(300):
+        for loop in (whole, again) if k == 0 else (again,) if k % 5 == 0 else ():
+            for stamp in range(loop.now, loop.now + LEAD, PERIOD):
+                assert loop.controller.add_reference(make_state(stamp, *reference(stamp / 1e9)))
+        for loop in (whole, again):
+            assert loop.step().reason is Reason.TRACKING
+        assert again.twist == whole.twist
+
+
 @pytest.mark.parametrize('leap', [-1500, 300])
 def test_a_stamp_after_a_silence_is_believed_at_once(leap):
     """The time-out of the node has stopped the robot, so that messages are missing indeed."""
