@@ -45,7 +45,7 @@ def test_each_fault_fits_the_robot_and_the_controller():
         ('rate set to 50, odometry has 100 Hz', 'odom has 100 Hz, but rate is 50 Hz', 2001),
         ('shaper for another robot', 'the robot oscillates in yaw with', 2005),
         ('lag 20 ms assumed, none', 'too early for a speed_filter.lag of 0.02 s', 2003),
-        ('disturbance x10', 'the yaw rate of odom is rough by', 2001),
+        ('disturbance x10', 'the yaw rate of odom is rough by', 2003),
     ],
 )
 def test_a_fault_reaches_the_controller_and_is_named(name, words, seed, monkeypatch):
