@@ -36,6 +36,7 @@ from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
+from t3mpc_ros.geometry.trajectory import REFERENCE_SAMPLES
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, wrap_angle
 from t3mpc_ros.parameters.table import ParameterError, Parameters, parameter
 
@@ -146,7 +147,7 @@ def follow_pose(error: PoseError, twist: BodyTwist, parameters: PoseLoopParamete
 class PoseReference:
     """Poses of the reference at their stamps, interpolated; the newest ones are kept."""
 
-    def __init__(self, capacity: int = 512) -> None:
+    def __init__(self, capacity: int = REFERENCE_SAMPLES) -> None:
         self._capacity = capacity
         self._stamps: list[int] = []
         self._poses: list[Pose] = []

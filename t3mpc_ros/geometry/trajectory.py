@@ -23,6 +23,9 @@ from t3mpc_ros.kernels import TypedKernel, kernel
 
 Stamps = NDArray[np.int64]
 
+REFERENCE_SAMPLES = 2048
+"""Number of the newest samples of the reference that are kept: ten seconds at 200 Hz."""
+
 
 class TrajectoryPoint(NamedTuple):
     """Reference at one instant."""
@@ -63,7 +66,7 @@ class ReferenceTrajectory:
     steps at the later sample, and the rate in between is zero.
     """
 
-    def __init__(self, jump: BodyTwist, capacity: int = 512) -> None:
+    def __init__(self, jump: BodyTwist, capacity: int = REFERENCE_SAMPLES) -> None:
         self.capacity = capacity
         """Maximum number of samples."""
         self._write_sample = TypedKernel(write_sample)

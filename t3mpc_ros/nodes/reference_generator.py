@@ -46,6 +46,7 @@ from t3mpc_ros.geometry.kinematics import WheelGeometry, advance_pose, points_fr
 from t3mpc_ros.geometry.path_file import load_path
 from t3mpc_ros.geometry.path_timing import PathError, check_points
 from t3mpc_ros.geometry.sample_scheduler import SampleScheduler
+from t3mpc_ros.geometry.trajectory import REFERENCE_SAMPLES
 from t3mpc_ros.geometry.types import (
     NANOSECONDS,
     ORIGIN,
@@ -121,8 +122,14 @@ class ReferenceGeneratorParameters(PathReferenceParameters):
         return self.secret_seed or (self.source == 'portrait' and self.seed == 0)
 
     def check_consistency(self) -> None:
-        """Raise :class:`ParameterError` if both a secret and a public seed are set."""
+        """Raise :class:`ParameterError` for two seeds, or more samples than controllers keep."""
         super().check_consistency()
+        if self.lead * self.rate > 0.95 * REFERENCE_SAMPLES:
+            raise ParameterError(
+                f'lead must be at most {0.95 * REFERENCE_SAMPLES / self.rate:.3g} s at a rate of '
+                f'{self.rate:g} Hz, because a controller keeps {REFERENCE_SAMPLES} samples of the '
+                f'reference: got {self.lead:g} s'
+            )
         if self.secret_seed and self.seed:
             raise ParameterError(f'seed must be 0 with secret_seed: got {self.seed}')
 
