@@ -435,7 +435,7 @@ def test_a_bag_holds_the_fingerprint_of_a_secret_seed_only(harness, tmp_path, so
 
 def test_secret_seed_excludes_a_given_seed(harness):
     with pytest.raises(ParameterError, match='lead must be at most 0.973 s at a rate of 2000 Hz'):
-        ReferenceGeneratorParameters.from_dict({'lead': 1.0, 'rate': 2000.0})
+        harness.add(ReferenceGeneratorNode, lead=1.0, rate=2000.0)
     with pytest.raises(ParameterError, match='seed must be 0 with secret_seed: got 7'):
         harness.add(ReferenceGeneratorNode, secret_seed=True, seed=7)
 
