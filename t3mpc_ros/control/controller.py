@@ -764,7 +764,6 @@ class Controller:
             advance = [time / -math.expm1(-time / lag) for time in (held, period)]
             self._longer_hold_ns = round((advance[0] - advance[1]) * NANOSECONDS)
             self.dead_time.lateness = 0.5 * (held - period)
-        self.dead_time.lateness += self.odometry_twist.lateness
 
     def _watch_reference(self, stamp_ns: int, elapsed: float) -> None:
         """Add up the time for which commands follow a reference that had ended before."""

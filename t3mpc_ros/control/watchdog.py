@@ -553,48 +553,6 @@ class TwistUnits:
         self.wrong = self._count >= UNITS_COUNT or (self.wrong and self._count > 0)
 
 
-HELD_MOST, HELD_MEMORY = 0.25, 0.97
-"""Longest time for which a robot that drives may have one pose (s); share of the longest time of
-late that is kept with each other pose."""
-LATENESS_SHARE = 0.1  # share by which the lateness of the speeds follows each new pose
-
-
-class PoseSpeeds:
-    """Speeds by the pose, that of a camera for example, which stays the same in some messages."""
-
-    def __init__(self) -> None:
-        self.held = 0.0  # longest time of late for which the pose stayed the same, s
-        self.lateness = 0.0
-        """Time by which the speeds are later than those of a pose that is new each time, s."""
-        self.holds = False  # whether it is so as a rule
-        self._from: State | None = None
-        self._speeds = STANDSTILL
-
-    def update(self, new: State, elapsed: float | None) -> BodyTwist:
-        """Return the speeds, ``elapsed`` s after the last message; None: it is the first one."""
-        last = self._from
-        if elapsed is None or last is None:
-            self._from, self._speeds = new, STANDSTILL
-            return STANDSTILL
-        time = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
-        # Not at single messages: a robot that creeps in steps of its pose has moved meanwhile.
-        self.holds = self.lateness > 0.5 * elapsed
-        if new.pose == last.pose:
-            if not self.holds or time > self.held - 0.5 * elapsed:
-                self._speeds = STANDSTILL
-            return self._speeds
-        if time < HELD_MOST:
-            self.held = max(HELD_MEMORY * self.held, time)
-            self.lateness += LATENESS_SHARE * (time - elapsed - self.lateness)
-        else:  # it stood
-            time = self.held
-        if not self.holds:
-            time = elapsed
-        ahead, _, turn = motion_between(last.pose, new.pose)
-        self._from, self._speeds = new, BodyTwist(ahead / time, turn / time)
-        return self._speeds
-
-
 class OdometryTwist:
     """The twist of the odometry, or what the change of its pose says where it cannot be right.
 
@@ -606,7 +564,6 @@ class OdometryTwist:
         """Whether the odometry has no twist: speeds are differences of its pose."""
         self.known = False  # whether it ever had one
         self._fit = TwistFit()
-        self._by_pose = PoseSpeeds()
         self._units = TwistUnits()
         self._anchor: Pose | None = None
         """Pose of the first message with a twist of zero since the last other one."""
@@ -618,18 +575,10 @@ class OdometryTwist:
         fit = self._fit
         return self.missing or self._units.wrong or fit.factor != 1.0 or bool(fit.wrong)
 
-    @property
-    def lateness(self) -> float:
-        """Time by which speeds by a held pose are late, s."""
-        replaced = self.missing or self._units.wrong
-        return self._by_pose.lateness if replaced and self._by_pose.holds else 0.0
-
     def problem(self) -> str:
         """Return what is wrong with the twist, and the remedy; '' if nothing is."""
         if self.missing:
-            by_pose = self._by_pose
-            held = f', each of which lasts for {by_pose.held:.2g} s' if by_pose.holds else ''
-            return f'odom has no twist: its poses are differentiated{held}; publish the twist'
+            return 'odom has no twist: its poses are differentiated; publish the twist'
         if self._units.wrong:
             return (
                 f'the twist in odom cannot be in m/s and rad/s: {self._units.example}; its poses '
@@ -657,16 +606,15 @@ class OdometryTwist:
         if last is None or restart or odometry.stamp_ns <= last.stamp_ns:
             last = None
         motion = None if last is None else motion_between(last.pose, pose)
-        elapsed = None if last is None else (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
-        by_pose = self._by_pose.update(odometry, elapsed)
         if odometry.twist != (0.0, 0.0):
             self.missing, self._anchor, self.known = False, None, True
             if last is not None and motion is not None:
                 self._units.update(last, odometry, motion)
         else:
-            if last is None or elapsed is None or self._anchor is None:
+            if last is None or self._anchor is None:
                 self._anchor = pose
             else:
+                elapsed = (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
                 farthest = (2.0 * elapsed * speed for speed in UNKNOWN_TWIST)
                 if has_moved(last.pose, pose, *farthest):  # it cannot have driven so far
                     # That of the next message: this one may be the only one so far off.
@@ -681,11 +629,16 @@ class OdometryTwist:
         if not any(replaces) and self._fit.wrong:
             replaces = self._fit.uses_pose
         if any(replaces):
-            if last is None:  # the pose says nothing of the speed: a restart
+            if last is None or motion is None:  # the pose says nothing of the speed: a restart
                 return odometry._replace(twist=STANDSTILL)
-            used = zip(replaces, by_pose, odometry.twist, strict=True)
+            elapsed = (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
+            ahead, _, turn = motion
+            linear, angular = odometry.twist
             return odometry._replace(
-                twist=BodyTwist(*(speed if by_it else given for by_it, speed, given in used))
+                twist=BodyTwist(
+                    ahead / elapsed if replaces[0] else linear,
+                    turn / elapsed if replaces[1] else angular,
+                )
             )
         factor = self._fit.factor
         if factor == 1.0:

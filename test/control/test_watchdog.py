@@ -319,20 +319,6 @@ def test_a_message_that_is_not_finite_keeps_the_twist_missing():
     assert found[7:20] + found[21:] == pytest.approx([0.2] * 22)
 
 
-@pytest.mark.parametrize('hold', [1, 3, 5])
-def test_poses_that_are_held_are_differentiated_over_the_hold(hold):
-    """Speeds were zero and five times the true one by turns: *free the wheels*."""
-    twist, found = OdometryTwist(), []
-    for k in range(400):
-        way = 0.002 * (min(k, 300) // hold * hold)
-        state = State(k * 10 * MS, Pose(way, 0.0, 0.0), STANDSTILL)
-        found.append(twist.measured(state, restart=k == 0).twist)
-    assert np.array(found[50:300]) == pytest.approx(np.array([[0.2, 0.0]] * 250))
-    assert found[300 + 2 * hold :] == [STANDSTILL] * (100 - 2 * hold)
-    assert twist.lateness == pytest.approx(0.01 * (hold - 1), abs=1e-4)
-    assert ('each of which lasts for' in twist.problem()) == (hold > 1)
-
-
 START, ASIDE, FAR = Pose(0.0, 0.0, 0.0), Pose(0.02, 0.0, 0.0), Pose(0.5, 0.2, 0.0)
 
 
