@@ -64,8 +64,8 @@ def test_commands_that_are_lost_are_named(monkeypatch):
     assert run_job(Job('none', FULL, 2001))['said'] == []
 
 
-LATE = 'rate set to 200, odometry has 100 Hz', 'lag 20 ms assumed, none'
-"""Found too late on the gentle reference of this seed: 1.26 and 1.41 times the error."""
+LATE = ('lag 20 ms assumed, none',)
+"""Found too late on the gentle reference of this seed: 1.41 times the error."""
 
 
 @pytest.mark.parametrize(
@@ -76,6 +76,7 @@ LATE = 'rate set to 200, odometry has 100 Hz', 'lag 20 ms assumed, none'
             'noise 0.04 (rad/s)², none assumed',
             'twist of the odometry + 10 %',
             'shaper for another robot',
+            'rate set to 200, odometry has 100 Hz',
             *LATE,
         ],
         2,
