@@ -154,7 +154,7 @@ def test_huge_numbers_stop_the_robot_without_a_crash(harness):
     for value in (1e19, 1e160, 1e200, 1.7e308):
         bench.publish_reference(seconds=0.0)
         bench.publish_odometry()
-        assert diagnostic_level(bench.controller) != ERROR, 'it tracks; such references are ignored'
+        assert diagnostic_level(bench.controller) != ERROR, 'such references are ignored'
         bad = odometry(bench.stamp_ns + 1, value, value)
         bad.pose.pose.position.x = bad.pose.pose.orientation.y = value
         steps = diagnostic(bench.controller, 'steps')
