@@ -195,7 +195,6 @@ class BodyMemory(Structure):
     largest_change: float
     slowest: float  # least speed of a wheel
     steps: int
-    roughness: float  # least deviation of the turn in a calm block, if that is rough
     rings: int  # number of blocks in which the rotors ring still
     chain: int  # number of steps since a gap, at most 2; of the last two steps:
     last_achieved: float
@@ -218,16 +217,7 @@ DRIVE = (
     *('started', 'yaw_error', 'commands', 'above', 'below'),
     *('block_time', 'achieved_sum', 'square_sum', 'rise', 'linked', 'spoilt'),
     *('before_achieved', 'last_achieved', 'last_rest'),
-    *(
-        *WATCH,
-        'roughness',
-        'rings',
-        'chain',
-        'ring_count',
-        'ring_error',
-        'ring_product',
-        'ring_acceleration',
-    ),
+    *(*WATCH, 'rings', 'chain', 'ring_count', 'ring_error', 'ring_product', 'ring_acceleration'),
 )
 """Fields of the memory that belong to one drive."""
 SKILL = 'raw_power', 'error_power', 'residual_power', 'command_power', 'authority'
@@ -512,9 +502,9 @@ def correct_body(
             memory.chain = 0
     memory.yaw, memory.started, memory.last_reference = yaw, True, turning
     if memory.block_time >= BLOCK - 0.5 * period:
-        watch_block(state)
+        rough = watch_block(state)
         if memory.square_sum > STANDSTILL_SPEED**2 * memory.block_time:
-            learn_block(constants, state)
+            learn_block(constants, state, rough)
         clear_block(state)
     mean, half = 0.5 * (planned[0] + planned[1]), 0.5 * (planned[0] - planned[1])
     bound = constants.bound
@@ -588,8 +578,10 @@ def clear_block(state: BodyState) -> None:
 
 
 @kernel
-def watch_block(state: BodyState) -> None:
+def watch_block(state: BodyState) -> float:
     """Add what the block says of the response: unexplained share, and roughness if it is calm.
+
+    Return the least roughness of the blocks (rad/s), 0 if none is known or that is usual.
 
     The share says nothing where the changes are below the roughness, as of a pose with noise. It
     is what no delay explains: blocks as long as half a swing do not tell tau from k_w.
@@ -613,12 +605,12 @@ def watch_block(state: BodyState) -> None:
     calm = small and memory.slowest > CALM_SPEED and memory.rings == 0
     watched[0, 1] = rough if calm else math.nan
     least = min(least, rough) if calm else least
-    memory.roughness = least if ROUGH < least < math.inf else 0.0
     memory.rings = max(memory.rings - 1, 0) if small else RINGING_BLOCKS
     memory.ring_count *= RINGING_MEMORY
     memory.ring_error *= RINGING_MEMORY
     memory.ring_product *= RINGING_MEMORY
     memory.ring_acceleration *= RINGING_MEMORY
+    return least if ROUGH < least < math.inf else 0.0
 
 
 @kernel
@@ -630,10 +622,11 @@ def write_gain_row(mean: float, half: float, row: Array) -> None:
 
 
 @kernel
-def learn_block(constants: BodyConstants, state: BodyState) -> None:
+def learn_block(constants: BodyConstants, state: BodyState, rough: float) -> None:
     """Update the skill, then the estimate by the means of a block: a step of a Kalman filter.
 
     A sudden innovation is not learnt, and counts for no skill; if it lasts, the bias has jumped.
+    ``rough``: noise of the turn in a step beyond that of any robot, rad/s.
     """
     memory, covariance = state.memory[0], state.covariance
     row, gain = state.work[0], state.work[1]
@@ -659,7 +652,7 @@ def learn_block(constants: BodyConstants, state: BodyState) -> None:
         return
     for j in range(ROWS):
         covariance[j, j] += WALK[j] * WALK[j] * time
-    noise = NOISE * NOISE + (SLOPE_NOISE * row[DELAY]) ** 2 + memory.roughness**2 / memory.steps
+    noise = NOISE * NOISE + (SLOPE_NOISE * row[DELAY]) ** 2 + rough**2 / memory.steps
     variance = spread(row, covariance, gain) + noise
     score = residual / math.sqrt(variance)
     sudden = abs(score) > SUDDEN

@@ -1052,13 +1052,14 @@ class SwitchingTracker:
         """
         transition, share = self.transition, 1.0
         if transition.count:
-            whole, part = divmod(min(round(dt / self._period, 6), MAX_MISSED), 1.0)
-            for missed in range(math.ceil(whole + part) - 1, 0, -1):
-                missed_ns = now_ns - round(missed * self._period * NANOSECONDS)
+            periods = min(round(dt / self._period, 6), MAX_MISSED)
+            missed = max(math.ceil(periods) - 1, 0)
+            share = periods - missed  # of a period, until the first step; the others have a whole
+            for k in range(missed, 0, -1):
+                missed_ns = now_ns - round(k * self._period * NANOSECONDS)
                 jumps = -transition.future_jumps(missed_ns, self._period, 1)[0]
-                share = part if missed == whole else 1.0
                 transition.step(missed_ns, reference, reference + jumps, share)
-            share = part if whole == 0.0 else 1.0
+                share = 1.0
         transition.step(now_ns, reference, reference_next, share)
         return transition.reachable, transition.rate
 

@@ -278,20 +278,17 @@ def step_transitions(
             before = (1.0 - share) * plan.response_now[i] + share * plan.response[i]
             plan.response_now[i] = before
             plan.offset[i] = before - plan.passed[i]
-            rise = reference_next[i] - reference[i]
+            rise, passed_next = reference_next[i] - reference[i], plan.passed[i]
             for k in range(count):
                 if not passed[k] and until_ns >= instants[k]:
                     rise -= jumps[k, i]
+                    passed_next += jumps[k, i]
             commanded = 0.0
             for k in range(count):
                 left = (instants[k] - now_ns) / NANOSECONDS - lead
                 advance(transitions, k, i, left, rise / period, period, share, acceleration)
                 commanded += transitions.covered[k, i]
             plan.response[i] += (1.0 - kept) * (commanded - plan.response[i])
-            passed_next = plan.passed[i]
-            for k in range(count):
-                if not passed[k] and until_ns >= instants[k]:
-                    passed_next += jumps[k, i]
             plan.offset_next[i] = plan.response[i] - passed_next
         # After 30 lags the remaining response is below rounding.
         over_ns = now_ns - round(30.0 * lag * NANOSECONDS)

@@ -25,7 +25,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, State, diffe
 
 MAX_DELAY, MAX_LEAD = 0.3, 0.01
 """Offset of odometry stamps from the node's clock beyond which the clocks differ, s: a message
-takes time, and clocks that are synchronised differ by less than the second."""
+takes time, and clocks that are synchronised differ by less than the latter."""
 MAX_AGE_BEYOND_RESPONSE = 0.02
 """Offset beyond the response time from which the clocks differ, s: a message cannot be on its way
 for longer than a command, the response of the robot and the message together."""

@@ -248,7 +248,10 @@ class InputWatchdog:
         )
 
     def odometry_timed_out(self, last_received_ns: int | None, now_ns: int) -> bool:
-        """Whether the odometry is older than the time-out; both times are from one clock."""
+        """Whether the odometry is older than the time-out; both times are from one clock.
+
+        If so, the stamp of the next message is believed: :meth:`ignores` has no doubt after it.
+        """
         timeout_ns = self._parameters.odometry_timeout * NANOSECONDS
         self._silent = last_received_ns is None or now_ns - last_received_ns > timeout_ns
         return self._silent

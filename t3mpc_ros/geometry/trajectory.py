@@ -118,10 +118,10 @@ class ReferenceTrajectory:
 
     def holds(self, sample: State) -> bool:
         """Whether the same twist is already known at the stamp of a sample."""
-        stamps, samples, bounds, _ = self.buffer
-        first, end = bounds.tolist()
         if self.newest_ns is None or sample.stamp_ns > self.newest_ns:
             return False
+        stamps, samples, bounds, _ = self.buffer
+        first, end = bounds.tolist()
         i = first + int(np.searchsorted(stamps[first:end], sample.stamp_ns))
         return bool(stamps[i] == sample.stamp_ns) and sample.twist == tuple(
             samples[i, :2].tolist()
