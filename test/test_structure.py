@@ -43,6 +43,7 @@ PACKAGES = {
     'parent_process': set(),
     'missing_library': set(),
     'atomic_file': set(),
+    'model_file': {'parameters', 'atomic_file'},
     'version': set(),
     'script_error': set(),
     'gym': CORE | {'missing_library', 'script_error', 'evaluation'},
@@ -51,7 +52,7 @@ PACKAGES = {
     'fuzzy': BASE,
     'mpc': BASE,
     'robot': BASE,
-    'bag': BASE | {'atomic_file'},
+    'bag': BASE | {'atomic_file', 'model_file'},
     'control': BASE | {'fuzzy', 'mpc'},
     'simulation': BASE | {'robot', 'script_error'},
     'radio': BASE | {'robot'},
@@ -59,10 +60,11 @@ PACKAGES = {
     'emulator': BASE | {'robot', 'simulation', 'radio'},
     'evaluation': CORE
     | {'localization', 'page', 'atomic_file', 'stop_signal', 'parent_process', 'missing_library'}
-    | {'script_error'},
-    'nodes': CORE | {'radio', 'localization', 'atomic_file', 'stop_signal', 'missing_library'},
+    | {'script_error', 'model_file'},
+    'nodes': CORE
+    | {'radio', 'localization', 'atomic_file', 'model_file', 'stop_signal', 'missing_library'},
     'cli': CORE
-    | {'radio', 'atomic_file', 'stop_signal', 'parent_process', 'missing_library'}
+    | {'radio', 'atomic_file', 'model_file', 'stop_signal', 'parent_process', 'missing_library'}
     | {'emulator', 'evaluation', 'nodes', 'view'},
     'page': set(),
     'view': {'page'},

@@ -392,7 +392,7 @@ def _add_animate(commands: Commands) -> None:
 
 
 def _run_animate(options: argparse.Namespace) -> None:
-    from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions, animate_bag
+    from t3mpc_ros.evaluation.bag_report.animation_file import AnimationOptions, animate_bag
     from t3mpc_ros.evaluation.topic_roles import ReportOptions
 
     chosen = AnimationOptions(
@@ -434,9 +434,9 @@ def add_input_options(parser: argparse.ArgumentParser) -> None:
 
 def _changed_inputs(options: argparse.Namespace) -> tuple['ControllerInputs', dict[str, object]]:
     """Return the inputs of the recorded controller, and the parameters that are to change."""
-    from t3mpc_ros.bag.model_file import load_model
     from t3mpc_ros.control.controller import ControllerParameters
     from t3mpc_ros.evaluation.process_replay.controller_replay import load_inputs
+    from t3mpc_ros.model_file import load_model
 
     changes = parse_assignments(ControllerParameters, options.parameters)
     model = load_model(options.model) if options.model else None

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.evaluation import reporting
+from t3mpc_ros.evaluation import html_page, reporting
 from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.tool import link_test, manoeuvre, procedure
 from t3mpc_ros.radio.tool.bench_checklist import (
@@ -143,16 +143,16 @@ def _write(checks: Sequence[Check], path: Path) -> None:
         ]
         for check in checks
     ]
-    blocks: list[reporting.Block] = [
-        reporting.VerdictBox(headline, failed, kind),
-        reporting.Tiles([(str(count), verdict) for verdict, count in counts.items()]),
+    blocks: list[html_page.Block] = [
+        html_page.VerdictBox(headline, failed, kind),
+        html_page.Tiles([(str(count), verdict) for verdict, count in counts.items()]),
         reporting.Table(
             '', ['check', 'verdict', 'step', 'found', 'remedy'], rows, text=5, wrap=True
         ),
     ]
     print(headline, flush=True)
     data = path.with_suffix('.json')
-    page = reporting.html_page('Bench checklist of the robot', blocks)
+    page = html_page.html_page('Bench checklist of the robot', blocks)
     numbers = reporting.strict_json([check._asdict() for check in checks])
     write_atomically(path, page)
     write_atomically(data, numbers)

@@ -58,14 +58,14 @@ def add_bag_options(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Write the model and print its skill."""
-    from t3mpc_ros.bag.model_file import save_model
+    from t3mpc_ros.model_file import save_model
 
     if options.bags:
         if options.robot != 'servo':
             raise ValueError(f'robot must be servo for bags: got {options.robot}')
         run_bags(options)
         return
-    from t3mpc_ros.evaluation.training.trained_models import assess, fit_simulated_runs, origin
+    from t3mpc_ros.evaluation.training.train_models import assess, fit_simulated_runs, origin
 
     if options.keep_predictor:
         raise ValueError('--keep-predictor is for bags')
@@ -79,8 +79,8 @@ def run(options: argparse.Namespace) -> None:
 
 def run_bags(options: argparse.Namespace) -> None:
     """Write the model of ``options.bags`` and print its skill."""
-    from t3mpc_ros.bag.model_file import save_model
-    from t3mpc_ros.evaluation.training.trained_models import fit_bags
+    from t3mpc_ros.evaluation.training.train_models import fit_bags
+    from t3mpc_ros.model_file import save_model
 
     check_writable(options.output)
     model = fit_bags(options.bags, keep_predictor=options.keep_predictor, count=options.folds)

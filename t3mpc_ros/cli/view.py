@@ -61,7 +61,7 @@ def _view(options: argparse.Namespace) -> None:
 
     with StopSignal() as stop:
         if options.bag is not None:
-            from t3mpc_ros.cli.bag_view import recorded_run
+            from t3mpc_ros.cli.bag_on_live_page import recorded_run
 
             print(f'reading {options.bag}', file=sys.stderr, flush=True)
             shown = recorded_run(options.bag, options.namespace or None)

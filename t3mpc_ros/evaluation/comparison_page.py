@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation import reporting
+from t3mpc_ros.evaluation import html_page
 from t3mpc_ros.evaluation.cases import CASES, NOMINAL
 from t3mpc_ros.evaluation.comparison import (
     BETTER,
@@ -50,7 +50,7 @@ from t3mpc_ros.version import VERSION
 
 def verdict_box(
     plan: ComparisonPlan, results: ResultTable, judged: Mapping[tuple[str, str], str]
-) -> reporting.VerdictBox:
+) -> html_page.VerdictBox:
     """Return in one sentence how the first method does beside the one it is compared with."""
     case = plan.cases[0]
     own = next((each for each in plan.methods if each != plan.against), plan.against)
@@ -65,7 +65,7 @@ def verdict_box(
     counts = [
         f'{other}: {judged[own, other]}.' for other in plan.cases[1:] if (own, other) in judged
     ]
-    return reporting.VerdictBox(
+    return html_page.VerdictBox(
         f'{metric.heading.capitalize()} error ({metric.unit}): {text}'
         f'{f": {verdict}" if verdict else ""}.',
         [f'{case}, {len(plan.seeds)} seeds of {plan.scenario.duration:g} s.', *counts],
@@ -76,7 +76,7 @@ def verdict_box(
 def page(plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | None = None) -> str:
     """Return the page as self-contained HTML."""
     judged = first_verdicts(plan, results)
-    blocks: list[reporting.Block] = [verdict_box(plan, results, judged)]
+    blocks: list[html_page.Block] = [verdict_box(plan, results, judged)]
     figures: Mapping[str, Callable[[ComparisonPlan, ResultTable, str], Any]] = {
         f'Difference from {plan.against}, left is better; 95 % intervals are of each by itself, '
         'verdicts are stricter because there are many': _draw_differences,
@@ -84,18 +84,18 @@ def page(plan: ComparisonPlan, results: ResultTable, step_times: StepTimes | Non
         'Every seed, and the mean': draw_seeds,
     }
     for case in plan.cases:
-        blocks.append(reporting.Heading(case))
+        blocks.append(html_page.Heading(case))
         for caption, draw in figures.items():
             if figure := drawing(partial(draw, plan, results), case):
                 blocks.append(
-                    reporting.Picture(f'{caption}: {case}', file_of(figure, 'svg'), caption)
+                    html_page.Picture(f'{caption}: {case}', file_of(figure, 'svg'), caption)
                 )
             if draw is _draw_differences and case == plan.cases[0]:
                 summary = summary_table(plan, results, judged, step_times)
-                blocks += [reporting.Contents(), reporting.Paragraph(description(plan)), summary]
+                blocks += [html_page.Contents(), html_page.Paragraph(description(plan)), summary]
         blocks.append(case_table(plan, results, case))
-    blocks += [reporting.Heading('What the methods know'), knowledge_table(plan)]
-    return reporting.html_page(f'Comparison of methods: {plan.scenario.robot}', blocks)
+    blocks += [html_page.Heading('What the methods know'), knowledge_table(plan)]
+    return html_page.html_page(f'Comparison of methods: {plan.scenario.robot}', blocks)
 
 
 def record(

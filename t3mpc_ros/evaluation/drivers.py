@@ -53,7 +53,7 @@ from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, Array, State, WheelSpe
 from t3mpc_ros.parameters.table import Parameters
 from t3mpc_ros.robot.interface import ZERO_WHEEL_SPEEDS, RobotCommand, RobotState
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
-from t3mpc_ros.simulation.plant_robot import Signals
+from t3mpc_ros.simulation.plant_adapter import Signals
 
 
 class NodeDriver:

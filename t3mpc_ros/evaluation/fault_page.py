@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation import reporting
+from t3mpc_ros.evaluation import html_page, reporting
 from t3mpc_ros.evaluation.fault_study import ALLOWED, BEGIN, DURATION, ODOMETRY_WRONG
 from t3mpc_ros.evaluation.plotting import (
     COLOURS,
@@ -161,25 +161,25 @@ def _place(metres: float, angle: float) -> str:
 
 def page(rows: Sequence[Row]) -> str:
     """Return the page as self-contained HTML."""
-    blocks: list[reporting.Block] = [_verdict(rows)]
+    blocks: list[html_page.Block] = [_verdict(rows)]
     for number, (title, chosen) in enumerate(by_course(rows)):
         worst = max(chosen, key=lambda row: row['during'])
         seen = (
             f'{title}: error of the wheels before, during and after each fault; the largest '
             f'during one is {worst["during"]:.2f} rad/s, of {worst["name"]}.'
         )
-        blocks.append(reporting.Heading(title))
+        blocks.append(html_page.Heading(title))
         if figure := drawing(_draw_errors, chosen):
-            blocks.append(reporting.Picture(seen, file_of(figure, 'svg'), seen))
+            blocks.append(html_page.Picture(seen, file_of(figure, 'svg'), seen))
         if number == 0:
-            blocks.append(reporting.Contents())
+            blocks.append(html_page.Contents())
         cells = [[cell.replace('`', '').replace('**', '') for cell in table_row(row)]
                  for row in chosen]  # fmt: skip
         blocks.append(reporting.Table('', TABLE_HEAD, cells, text=len(TABLE_HEAD), wrap=True))
-    return reporting.html_page('Fault study of the closed loop', blocks)
+    return html_page.html_page('Fault study of the closed loop', blocks)
 
 
-def _verdict(rows: Sequence[Row]) -> reporting.VerdictBox:
+def _verdict(rows: Sequence[Row]) -> html_page.VerdictBox:
     """Return how many faults end in which way."""
     count = Counter(row['verdict'] for row in rows)
     reasons = [f'{count[kind]} {text}.' for kind, text in _ENDINGS.items() if count[kind]]
@@ -187,17 +187,17 @@ def _verdict(rows: Sequence[Row]) -> reporting.VerdictBox:
         reasons.append(f'Not detected by robot or controller: {", ".join(names)}.')
     if count['unbounded']:
         beyond = '; '.join(map(_run_name, [row for row in rows if row['verdict'] == 'unbounded']))
-        return reporting.VerdictBox(f'Not every fault stays bounded: {beyond}', reasons, 'bad')
+        return html_page.VerdictBox(f'Not every fault stays bounded: {beyond}', reasons, 'bad')
     lost = [row for row in rows if ODOMETRY_WRONG in row['undetected']]
     if not lost:
-        return reporting.VerdictBox('Every fault stays bounded', reasons, 'good')
+        return html_page.VerdictBox('Every fault stays bounded', reasons, 'good')
     worst = max(lost, key=lambda row: row['odometry_after'][0])
     headline = (
         f'Every fault stays within the limits, but the odometry is wrong at the end of '
         f'{len(lost)} of {len(rows)} runs, by up to {_place(*worst["odometry_after"])} '
         f'({_run_name(worst)})'
     )
-    return reporting.VerdictBox(headline, reasons, 'open')
+    return html_page.VerdictBox(headline, reasons, 'open')
 
 
 def _run_name(row: Row) -> str:

@@ -31,7 +31,7 @@ from t3mpc_ros.evaluation.record import RATE, Record, broken_off, stamp_of, swit
 from t3mpc_ros.evaluation.scenario import LEAD, Scenario
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
-from t3mpc_ros.simulation.plant_robot import Signals, SimulatedRobot
+from t3mpc_ros.simulation.plant_adapter import Signals, SimulatedRobot
 
 Loop = Generator[RobotState, RobotCommand, Record]
 """Closed loop that yields reports and takes commands."""

@@ -11,13 +11,11 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Shared parts of all reports: page, table, progress line, JSON and number formats."""
+"""Results as tables, CSV, JSON and numbers; progress line, and sections of pages."""
 
-import base64
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 import csv
 from dataclasses import dataclass, replace
-from functools import cache
 import html
 from importlib import import_module
 from importlib.util import find_spec
@@ -25,7 +23,6 @@ import io
 import json
 import math
 from pathlib import Path
-import re
 import sys
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -33,9 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.atomic_file import write_atomically
-from t3mpc_ros.evaluation.charts import Chart, PageData, Plane, Timeline
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
-from t3mpc_ros.page.assets import page_file
 from t3mpc_ros.parameters.table import find_names
 
 if TYPE_CHECKING:
@@ -171,152 +166,6 @@ def _latex_row(cells: Sequence[str], bold: bool = False) -> str:
     if bold:
         written[0] = rf'\textbf{{{written[0]}}}'
     return f'    {" & ".join(written)} ' + r'\\'
-
-
-@dataclass(frozen=True, slots=True)
-class Heading:
-    """Title of what follows."""
-
-    text: str
-    mark: Mark | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Paragraph:
-    """A paragraph; its kind is '' or ``quiet``."""
-
-    text: str
-    kind: str = ''
-
-
-@dataclass(frozen=True, slots=True)
-class VerdictBox:
-    """What a page says first; its kind is ``good``, ``open``, ``bad`` or ``apart``."""
-
-    headline: str
-    reasons: Sequence[str]
-    kind: str
-    subject: str = ''
-    """What it is about, where a page has several verdicts."""
-
-
-@dataclass(frozen=True, slots=True)
-class Contents:
-    """Links to the headings of the page, then what the cursor of its charts shows."""
-
-
-@dataclass(frozen=True, slots=True)
-class Tiles:
-    """Main figures, each with what it is."""
-
-    items: Sequence[tuple[str, str]]
-
-
-@dataclass(frozen=True, slots=True)
-class Items:
-    """A list of the kind ``notes``, or ``side`` for one of two columns."""
-
-    items: Sequence[Sequence[str | Mark]]
-    kind: str = 'notes'
-    title: str = ''
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """An SVG file, contained in the page: sharp at every size, and on paper."""
-
-    title: str
-    svg: bytes
-    caption: str = ''
-
-    @property
-    def base64(self) -> str:
-        """The file in the alphabet of a data URL."""
-        return base64.b64encode(self.svg).decode()
-
-
-@dataclass(frozen=True, slots=True)
-class Details:
-    """Blocks below a line of summary, which opens and closes them."""
-
-    summary: str
-    blocks: 'Sequence[Block]'
-    opened: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Group:
-    """Blocks in one element."""
-
-    blocks: 'Sequence[Block]'
-    tag: str = 'section'
-    kind: str = ''
-
-
-Block = (
-    Table
-    | Heading
-    | Paragraph
-    | VerdictBox
-    | Contents
-    | Tiles
-    | Items
-    | Picture
-    | Details
-    | Group
-    | Chart
-    | Plane
-    | Timeline
-)
-
-
-def html_page(title: str, blocks: Sequence[Block]) -> str:
-    """Return a page that loads nothing from anywhere."""
-    every = list(_all_blocks(blocks))
-    headings = [each for each in every if isinstance(each, Heading)]
-    slugs = [re.sub(r'[^a-z0-9]+', '-', each.text.lower()).strip('-') for each in headings]
-    anchors = {id(each): f'{slugs[i]}-{i + 1}' for i, each in enumerate(headings)}
-    found = PageData()
-    content: dict[str, dict[str, object]] = {'charts': {}, 'planes': {}}
-    for i, each in enumerate(every, 1):
-        if isinstance(each, Chart):
-            anchors[id(each)] = f'chart-{i}'
-            content['charts'][f'chart-{i}'] = found.chart(each)
-        elif isinstance(each, Plane):
-            anchors[id(each)] = f'plane-{i}'
-            content['planes'][f'plane-{i}'] = found.plane(each)
-    events = [event for each in every if isinstance(each, Timeline) for event in each.events]
-    data = {**content, 'columns': found.columns, 'events': events, 'packed': found.packed()}
-    drawn = any(content.values())
-    written: str = _template().render(
-        title=title,
-        blocks=blocks,
-        headings=headings,
-        anchor=lambda block: anchors[id(block)],
-        files=page_file,
-        # A closing tag in a string would end the script.
-        data=json.dumps(finite(data), separators=(',', ':')).replace('<', '\\u003c')
-        if drawn
-        else '',
-    )
-    return written
-
-
-def _all_blocks(blocks: Sequence[Block]) -> Iterator[Block]:
-    for block in blocks:
-        yield block
-        if isinstance(block, Details | Group):
-            yield from _all_blocks(block.blocks)
-
-
-@cache
-def _template() -> Any:
-    import jinja2  # a simulation does without pages
-
-    folder = Path(__file__).parent
-    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(folder), autoescape=True)
-    environment.globals['own'] = lambda name: (folder / name).read_text(encoding='utf-8')
-    return environment.get_template('report_page.html')
 
 
 def progress_bar(

@@ -53,10 +53,10 @@ def digest(*parts: Any) -> str:
 # Sources that only display, record or select. All others, and the tuned values, make stored runs
 # invalid: a needless repetition is better than an outdated result.
 _IRRELEVANT_SOURCES = (
-    'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'evaluation/bag_report/',
-    'evaluation/process_replay/', 'evaluation/comparison',
-    'evaluation/fault_page.py', 'evaluation/plotting.py', 'evaluation/reporting.py',
-    'evaluation/result_file.py', 'evaluation/paper/',
+    'nodes/', 'bag/', 'radio/', 'emulator/', 'cli/', 'view/', 'page/', 'model_file.py',
+    'evaluation/bag_report/', 'evaluation/process_replay/', 'evaluation/comparison',
+    'evaluation/fault_page.py', 'evaluation/html_page.py', 'evaluation/plotting.py',
+    'evaluation/reporting.py', 'evaluation/result_file.py', 'evaluation/paper/',
     'evaluation/patrol/patrol_page.py', 'evaluation/patrol/tracking_page.py',
 )  # fmt: skip
 

@@ -32,7 +32,7 @@ from t3mpc_ros.evaluation.record import PLANT_WINDOW, RATE, ROBOT_WINDOW, stamp_
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError, find_names
-from t3mpc_ros.simulation import plant_robot
+from t3mpc_ros.simulation import plant_adapter
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule, load_schedule
 from t3mpc_ros.simulation.plant.disturbances import MeasurementNoise
@@ -98,7 +98,7 @@ class SampledReference:
 class PlantSource(Protocol):
     """A plant of a script, as plain data."""
 
-    def simulation(self) -> plant_robot.Plant:
+    def simulation(self) -> plant_adapter.Plant:
         """Return the plant at its start, without noise."""
 
 
@@ -254,7 +254,7 @@ class Scenario:
         """Return the true robot, as it is when the run begins."""
         return self.kind.true_robot(self).with_values(self.own.robot_parameters)
 
-    def simulation(self) -> plant_robot.SimulatedRobot:
+    def simulation(self) -> plant_adapter.SimulatedRobot:
         """Return the robot of a new run."""
         return self.kind.simulation(self)
 
@@ -316,25 +316,25 @@ class RobotKind:
             }
         )
 
-    def simulation(self, scenario: Scenario) -> plant_robot.SimulatedRobot:
+    def simulation(self, scenario: Scenario) -> plant_adapter.SimulatedRobot:
         """Return the robot of a new run."""
         parameters, own = scenario.true_robot(), scenario.own
-        plant: plant_robot.Plant
+        plant: plant_adapter.Plant
         if own.noise is None:
             plant = PaperPlant(parameters)
         else:
             quiet = parameters.with_values({'noise.variance': 0.0})
             inner = PaperPlant(quiet) if own.plant is None else own.plant.simulation()
-            plant = plant_robot.NoisyPlant(inner, own.noise.simulation(parameters.seed))
+            plant = plant_adapter.NoisyPlant(inner, own.noise.simulation(parameters.seed))
         later = scenario.parts.later.get(scenario.robot)
         links = scenario.links
         least, most = links.command_delay
-        return plant_robot.PlantRobot(
+        return plant_adapter.PlantRobot(
             plant,
             parameters,
             parameters.with_values(later) if later else None,
             stamp_of(round(0.5 * scenario.steps)),
-            plant_robot.LinkDelay(
+            plant_adapter.LinkDelay(
                 least, most - least, links.command_loss, *links.span(scenario.duration)
             ),
             scenario.seed,
@@ -413,7 +413,7 @@ class TwinKind(RobotKind):
             {'noise.variance': float(scenario.noise), **scenario.parts.changes}
         )
 
-    def simulation(self, scenario: Scenario) -> plant_robot.SimulatedRobot:
+    def simulation(self, scenario: Scenario) -> plant_adapter.SimulatedRobot:
         """Return the robot of a new run."""
         parameters = scenario.true_robot()
         assert isinstance(parameters, DigitalTwinParameters)

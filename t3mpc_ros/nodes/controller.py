@@ -29,7 +29,6 @@ from std_msgs.msg import Float64, Int64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from t3mpc_ros.bag.controller_journal import Journal, parameters_to_json
-from t3mpc_ros.bag.model_file import ModelError, find_model, load_model, save_model
 from t3mpc_ros.control.controller import (
     SCALAR_NAMES,
     Controller,
@@ -40,6 +39,7 @@ from t3mpc_ros.control.odometry_plausibility import NAMES, InputMonitor
 from t3mpc_ros.control.watchdog import TRIALS, Reason, StopHistory
 from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, STANDSTILL, BodyTwist
+from t3mpc_ros.model_file import ModelError, find_model, load_model, save_model
 from t3mpc_ros.nodes import conversions, qos
 from t3mpc_ros.nodes.base_node import (
     ADAPT_PERIOD,

@@ -30,7 +30,8 @@ from std_srvs.srv import Trigger
 from t3mpc_ros.atomic_file import check_new_folder
 from t3mpc_ros.bag.mcap_file import LOSSES, Attachment, message_loss_record
 from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions, UnknownTypeError
-from t3mpc_ros.bag.recording import SEED_RECORD, RecordingMetadata, RecordingParameters
+from t3mpc_ros.bag.recording_metadata import SEED_RECORD, RecordingMetadata
+from t3mpc_ros.bag.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.snapshot import (
     CircularMessageCache,
     DiagnosticsMonitor,

@@ -52,7 +52,7 @@ from t3mpc_ros.simulation.plant.paper_plant import (
     PaperRobotParameters,
 )
 from t3mpc_ros.simulation.plant.stepper_motor import StepperMotorParameters
-from t3mpc_ros.simulation.plant_robot import Signals
+from t3mpc_ros.simulation.plant_adapter import Signals
 from t3mpc_ros.simulation.sensors.battery import SimulatedBattery, SimulatedBatteryParameters
 from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters
 from t3mpc_ros.simulation.sensors.range_sensor import (

@@ -35,13 +35,13 @@ from t3mpc_ros.bag import writer as writer_module
 from t3mpc_ros.bag.mcap_file import Attachment, has_mcap_magic, read_mcap_file
 from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions
 from t3mpc_ros.bag.metadata import BagMetadata, read_origin, write_metadata
-from t3mpc_ros.bag.model_file import ModelError, load_model, save_model
 from t3mpc_ros.bag.player import MergedReader, PlaybackParameters, PlaybackTimeline, ReadAheadQueue
 from t3mpc_ros.bag.qos import QosError, read_qos_overrides
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.bag.recovery import recover_bag
 from t3mpc_ros.bag.writer import SYNC_PERIOD_NS, BagWriter, read_attachment
 from t3mpc_ros.evaluation.result_file import ResultFile
+from t3mpc_ros.model_file import ModelError, load_model, save_model
 from t3mpc_ros.radio.protocol.authentication import read_key
 from t3mpc_ros.radio.serial_port import PortError, SerialPort
 from t3mpc_ros.radio.tool.key_provisioning import create_key_file

@@ -35,7 +35,7 @@ from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.player import PlaybackParameters
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.recording import RecordingParameters
+from t3mpc_ros.bag.recording_parameters import RecordingParameters
 from t3mpc_ros.bag.snapshot import (
     REPORT_TIMEOUT_NS,
     CircularMessageCache,

@@ -34,13 +34,13 @@ from t3mpc_ros.cli.main import main
 from t3mpc_ros.evaluation import comparison
 from t3mpc_ros.evaluation.api.comparison_runs import compare
 from t3mpc_ros.evaluation.api.parameter_sweep import sweep
-from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions
+from t3mpc_ros.evaluation.bag_report.animation_file import AnimationOptions
 from t3mpc_ros.evaluation.open_loop_estimation import compare as compare_estimators
 from t3mpc_ros.evaluation.paper.study import chosen_extent
 from t3mpc_ros.evaluation.patrol.patrol_comparison import PatrolPlan
 from t3mpc_ros.evaluation.process_replay import replay_comparison
 from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances
-from t3mpc_ros.evaluation.training.trained_models import fit_bags
+from t3mpc_ros.evaluation.training.train_models import fit_bags
 from t3mpc_ros.radio.tool.calibration_wizard import WizardOptions
 from t3mpc_ros.robot.calibration import MARKS
 from t3mpc_ros.version import VERSION

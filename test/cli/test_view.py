@@ -21,7 +21,7 @@ import pytest
 from support.page_data import read_all
 
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.cli.bag_view import recorded_run
+from t3mpc_ros.cli.bag_on_live_page import recorded_run
 from t3mpc_ros.evaluation.bag_report.incidents import Incidents
 from t3mpc_ros.evaluation.bag_report.run_data import load_run
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
@@ -71,7 +71,7 @@ def test_banner_and_switches_are_those_of_the_report(shown):
 def test_the_banner_has_the_kind_and_the_words_of_the_verdict(found, kind, monkeypatch):
     verdict = Verdict('It was stopped.', 'Stopped', found, 'Release it.')
     metrics = SimpleNamespace(verdict=verdict, incidents=Incidents())
-    monkeypatch.setattr('t3mpc_ros.cli.bag_view.compute_metrics', lambda *_: metrics)
+    monkeypatch.setattr('t3mpc_ros.cli.bag_on_live_page.compute_metrics', lambda *_: metrics)
     banner = read_all(recorded_run(GOLDEN))[0]['facts']['banner']
     assert (banner['kind'], banner['headline']) == (kind, verdict.sentence)
     assert banner['detail'].endswith(verdict.remedy)

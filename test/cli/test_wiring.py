@@ -183,10 +183,10 @@ MODEL = SimpleNamespace(
     text='', learnt={}, parameters=SimpleNamespace(to_dict=dict), origin={}, to_dict=dict
 )
 TRAIN = {
-    'evaluation.training.trained_models.fit_simulated_runs': ({}, MODEL),
-    'evaluation.training.trained_models.assess': '',
-    'evaluation.training.trained_models.fit_bags': MODEL,
-    'bag.model_file.save_model': None,
+    'evaluation.training.train_models.fit_simulated_runs': ({}, MODEL),
+    'evaluation.training.train_models.assess': '',
+    'evaluation.training.train_models.fit_bags': MODEL,
+    'model_file.save_model': None,
 }
 OF_BAGS = {
     'bag': {'fit_bags.folders.1': 'bag'},
@@ -203,7 +203,7 @@ FAULTS = {
 REPLAYED = SimpleNamespace(steps=100, parameters=SimpleNamespace(rate=100.0))
 OUTCOME = SimpleNamespace(table=text, same=True, to_dict=dict)
 REPLAY = {
-    'bag.model_file.load_model': {'w': np.ones(1)},
+    'model_file.load_model': {'w': np.ones(1)},
     'evaluation.process_replay.controller_replay.load_inputs': 'inputs',
     'evaluation.process_replay.controller_replay.make_controllers': [],
     'evaluation.process_replay.controller_replay.replay_controller': REPLAYED,
@@ -216,13 +216,13 @@ REPORT = SimpleNamespace(verdict=SimpleNamespace(text=text), summary=text, to_di
 BAG = {
     'evaluation.bag_report.report_page.write_report': REPORT,
     'evaluation.bag_report.run_comparison.write_comparison': ('there', 'text', {}),
-    'evaluation.bag_report.animation.animate_bag': Path('page.md'),
+    'evaluation.bag_report.animation_file.animate_bag': Path('page.md'),
     'bag.recovery.recover_bag': lambda output, **_: RecoveryResult(output, ()),
 }
 VIEW = {
     'nodes.viewer.view_node': context(SimpleNamespace(spin=lambda stop: None, command=print)),
     'view.server.PageServer': context(SimpleNamespace(url='http://page')),
-    'cli.bag_view.recorded_run': 'run',
+    'cli.bag_on_live_page.recorded_run': 'run',
     'cli.live_page_recording.RunRecorder': SimpleNamespace(close=lambda: None),
 }
 GRAPH = MagicMock()

@@ -474,8 +474,8 @@ def test_the_certificate_holds_along_a_noise_free_run():
 
 
 def test_the_weights_survive_saving_and_loading(tmp_path, monkeypatch):
-    from t3mpc_ros.bag import model_file
-    from t3mpc_ros.bag.model_file import ModelError, load_model, save_model
+    from t3mpc_ros import model_file
+    from t3mpc_ros.model_file import ModelError, load_model, save_model
 
     def reference(t):
         return np.array([2.0 * math.sin(t), 1.0]), np.array([2.0 * math.cos(t), 0.0])

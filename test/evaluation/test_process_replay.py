@@ -40,7 +40,6 @@ from t3mpc_ros.bag.controller_journal import (
     parameters_from_json,
 )
 from t3mpc_ros.bag.message_definitions import BagError
-from t3mpc_ros.bag.model_file import save_model
 from t3mpc_ros.bag.reader import open_bag, read_columns
 from t3mpc_ros.bag.writer import BagWriter, DataError
 from t3mpc_ros.cli.bag import program_parser
@@ -66,6 +65,7 @@ from t3mpc_ros.evaluation.process_replay.replay_comparison import (
 )
 from t3mpc_ros.evaluation.topic_roles import SCALARS, ReportOptions, choose_topics, find_topics
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State
+from t3mpc_ros.model_file import save_model
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.simulation.world import load_world
 

@@ -33,7 +33,7 @@ from support.bag_messages import (
 from support.page_data import read_all
 from support.recorded_stories import STORIES, TWIN, Story
 
-from t3mpc_ros.cli.bag_view import recorded_run
+from t3mpc_ros.cli.bag_on_live_page import recorded_run
 from t3mpc_ros.cli.main import main as t3mpc
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import cause_of
 from t3mpc_ros.evaluation.bag_report.report_page import write_report

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 from support.training_runs import START, STEP, TrainingRun
 
-from t3mpc_ros.bag.model_file import load_model, read_model
 from t3mpc_ros.cli.bag import program_parser
 from t3mpc_ros.control.controller import Controller
 from t3mpc_ros.evaluation.drivers import MethodSpec
@@ -27,7 +26,7 @@ from t3mpc_ros.evaluation.loop import run
 from t3mpc_ros.evaluation.methods import FULL, methods
 from t3mpc_ros.evaluation.proposed_method import ProposedController
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
-from t3mpc_ros.evaluation.training import trained_models
+from t3mpc_ros.evaluation.training import train_models
 from t3mpc_ros.evaluation.training.fit import (
     TrainingData,
     explained,
@@ -37,12 +36,13 @@ from t3mpc_ros.evaluation.training.fit import (
     skills,
     stretches,
 )
-from t3mpc_ros.evaluation.training.trained_models import (
+from t3mpc_ros.evaluation.training.train_models import (
     fit_bags,
     mean_and_spread,
     spread_text,
     training_data_of,
 )
+from t3mpc_ros.model_file import load_model, read_model
 
 pytestmark = pytest.mark.slow
 
@@ -142,10 +142,10 @@ def test_the_model_file_is_loaded_and_says_where_it_is_from(
     path, asked = tmp_path / 'model.npz', []
     assert 'cross-validated in 3 folds: each bag' in model.text
     monkeypatch.setattr(
-        trained_models, 'fit_bags', lambda folders, **how: asked.append((folders, how)) or model
+        train_models, 'fit_bags', lambda folders, **how: asked.append((folders, how)) or model
     )
     assert program('train', *bags, '--output', path) == 0
-    assert asked == [(bags, {'keep_predictor': False, 'count': trained_models.FOLDS})]
+    assert asked == [(bags, {'keep_predictor': False, 'count': train_models.FOLDS})]
     said = capsys.readouterr().out
     assert model.text in said
     assert f'saved {path}' in said

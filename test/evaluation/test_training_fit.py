@@ -21,22 +21,15 @@ import pytest
 from support.checkout import ROOT
 from support.training_runs import GEOMETRY, TrainingRun
 
-from t3mpc_ros.bag import model_file
+from t3mpc_ros import model_file
 from t3mpc_ros.bag.message_definitions import BagError
-from t3mpc_ros.bag.model_file import (
-    ModelError,
-    find_model,
-    load_model,
-    read_model,
-    save_model,
-)
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.proposed_method import ProposedParameters
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
-from t3mpc_ros.evaluation.training import trained_models
+from t3mpc_ros.evaluation.training import train_models
 from t3mpc_ros.evaluation.training.fit import (
     TrainingData,
     TrainingError,
@@ -49,8 +42,15 @@ from t3mpc_ros.evaluation.training.fit import (
     skills,
     stretches,
 )
-from t3mpc_ros.evaluation.training.trained_models import blocks, fit_bags
+from t3mpc_ros.evaluation.training.train_models import blocks, fit_bags
 from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
+from t3mpc_ros.model_file import (
+    ModelError,
+    find_model,
+    load_model,
+    read_model,
+    save_model,
+)
 from t3mpc_ros.mpc.boltzmann_machine import (
     LayerSizes,
     make_machine,
@@ -484,7 +484,7 @@ def test_dither_moves_v_p_by_itself_and_keeps_its_bound():
 def test_training_on_the_command_line(tmp_path, monkeypatch, capsys):
     path = tmp_path / 'model.npz'
     # Runs of 12 s are enough to show that the model makes the first seconds better.
-    monkeypatch.setattr(trained_models, 'Scenario', lambda *a: Scenario(*a[:3], 12.0, noise=a[4]))
+    monkeypatch.setattr(train_models, 'Scenario', lambda *a: Scenario(*a[:3], 12.0, noise=a[4]))
     assert main(['train', '--robot', 'servo', '--seeds', '101-102', '--output', str(path)]) == 0
     said = capsys.readouterr().out
     loaded = load_model(path)

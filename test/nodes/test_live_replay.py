@@ -20,9 +20,8 @@ from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import ControllerHarness, diagnostic, odometry, reason
 
 from t3mpc_ros.bag.controller_journal import Event
-from t3mpc_ros.bag.model_file import save_model
 from t3mpc_ros.bag.reader import open_bag
-from t3mpc_ros.bag.recording import RecordingParameters
+from t3mpc_ros.bag.recording_parameters import RecordingParameters
 from t3mpc_ros.control.controller import Controller, ControllerParameters
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.process_replay.controller_replay import (
@@ -32,6 +31,7 @@ from t3mpc_ros.evaluation.process_replay.controller_replay import (
 )
 from t3mpc_ros.evaluation.process_replay.replay_comparison import Tolerances, compare
 from t3mpc_ros.geometry.types import NANOSECONDS
+from t3mpc_ros.model_file import save_model
 from t3mpc_ros.nodes.controller import ControllerNode
 from t3mpc_ros.nodes.recorder import RecorderNode
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode

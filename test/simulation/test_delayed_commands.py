@@ -24,7 +24,7 @@ from t3mpc_ros.robot.interface import RobotCommand
 from t3mpc_ros.simulation import digital_twin
 from t3mpc_ros.simulation.digital_twin import CAPACITY, TransportDelay
 from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
-from t3mpc_ros.simulation.plant_robot import LinkDelay, PlantRobot
+from t3mpc_ros.simulation.plant_adapter import LinkDelay, PlantRobot
 
 MS = 1_000_000
 

@@ -27,7 +27,6 @@ import zlib
 import numpy as np
 
 from t3mpc_ros.bag.controller_journal import Journal
-from t3mpc_ros.bag.model_file import load_model
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, StepperControllerParameters
 from t3mpc_ros.evaluation.process_replay.controller_replay import CONTROLLER, FIELDS, output_row
 from t3mpc_ros.evaluation.process_replay.replay_writer import (
@@ -44,6 +43,7 @@ from t3mpc_ros.evaluation.scenario import LEAD, Scenario, noisy_twin
 from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, REFERENCE
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import NANOSECONDS, ORIGIN, STANDSTILL, BodyTwist, State, WheelSpeeds
+from t3mpc_ros.model_file import load_model
 from t3mpc_ros.robot.interface import RobotCommand
 from t3mpc_ros.simulation.digital_twin import DigitalTwin
 from t3mpc_ros.simulation.fault_injection import FaultEvent, FaultSchedule

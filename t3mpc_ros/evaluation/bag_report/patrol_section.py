@@ -22,6 +22,7 @@ from t3mpc_ros.evaluation.bag_report.continuity import gaps
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.bag_report.tracking_errors import on_reference_frame
 from t3mpc_ros.evaluation.charts import Chart, Line
+from t3mpc_ros.evaluation.html_page import Block, Heading, Paragraph
 from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     SHARES,
     SHORTEST,
@@ -31,7 +32,7 @@ from t3mpc_ros.evaluation.patrol.patrol_metrics import (
     visits,
 )
 from t3mpc_ros.evaluation.patrol.predictability import HORIZONS
-from t3mpc_ros.evaluation.reporting import Block, Heading, Paragraph, Table
+from t3mpc_ros.evaluation.reporting import Table
 from t3mpc_ros.evaluation.topic_roles import REFERENCE, TRUTH
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.simulation.world import recorded_world

@@ -39,9 +39,7 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import errors_of
 from t3mpc_ros.evaluation.bag_report.verdict import Verdict
 from t3mpc_ros.evaluation.charts import Timeline
 from t3mpc_ros.evaluation.drive_response import ResponseFit
-from t3mpc_ros.evaluation.record import ROBOT_WINDOW, START, counted_from, spans_of
-from t3mpc_ros.evaluation.reporting import (
-    EMPTY_CELL,
+from t3mpc_ros.evaluation.html_page import (
     Block,
     Contents,
     Details,
@@ -49,12 +47,12 @@ from t3mpc_ros.evaluation.reporting import (
     Heading,
     Items,
     Paragraph,
-    Table,
     Tiles,
     VerdictBox,
-    format_number,
     html_page,
 )
+from t3mpc_ros.evaluation.record import ROBOT_WINDOW, START, counted_from, spans_of
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, format_number
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     ODOMETRY,

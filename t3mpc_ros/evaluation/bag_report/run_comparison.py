@@ -42,19 +42,17 @@ from t3mpc_ros.evaluation.bag_report.tracking_errors import (
 )
 from t3mpc_ros.evaluation.charts import Chart, Curve, Plane
 from t3mpc_ros.evaluation.confidence_intervals import Difference, interval, rms
-from t3mpc_ros.evaluation.reporting import (
-    EMPTY_CELL,
+from t3mpc_ros.evaluation.html_page import (
     Block,
     Contents,
     Group,
     Heading,
     Items,
     Paragraph,
-    Table,
     VerdictBox,
-    format_number,
     html_page,
 )
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, format_number
 from t3mpc_ros.evaluation.topic_roles import (
     COMMAND,
     REFERENCE,

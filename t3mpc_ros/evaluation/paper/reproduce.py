@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from t3mpc_ros.evaluation import open_loop_estimation, reporting
+from t3mpc_ros.evaluation import html_page, open_loop_estimation, reporting
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, measured_run, run_experiment
 from t3mpc_ros.evaluation.methods import EXACT_MODEL, methods
 from t3mpc_ros.evaluation.paper import paper_figures, study
@@ -349,14 +349,14 @@ def page(title: str, origin: str, material: ExhibitData, pictures: Mapping[str, 
         _exhibit(each, material, pictures)
         for each in sorted(EXHIBITS, key=lambda each: each.stem != HEADLINE)
     )
-    return reporting.html_page(
+    return html_page.html_page(
         title,
         [
-            reporting.Paragraph(origin, 'quiet'),
-            reporting.VerdictBox(f'Claims: {counted(material.claims)}.', [], 'apart'),
+            html_page.Paragraph(origin, 'quiet'),
+            html_page.VerdictBox(f'Claims: {counted(material.claims)}.', [], 'apart'),
             headline,
-            reporting.Contents(),
-            reporting.Heading('Claims'),
+            html_page.Contents(),
+            html_page.Heading('Claims'),
             _claims('What this project claims', material.claims, 'ours'),
             _claims('What the paper claims', material.claims, 'paper'),
             *others,
@@ -370,16 +370,16 @@ def counted(claims: Sequence[Claim]) -> str:
     return ', '.join(f'{verdicts.count(kind)} {kind}' for kind in VERDICTS)
 
 
-def _claims(title: str, claims: Sequence[Claim], origin: str) -> reporting.Details:
+def _claims(title: str, claims: Sequence[Claim], origin: str) -> html_page.Details:
     chosen = [claim for claim in claims if claim.origin == origin]
     rows = [(claim.text, claim.found, reporting.verdict_mark(claim.verdict)) for claim in chosen]
     table = reporting.Table('', ('claim', 'found', ''), rows, text=3, wrap=True)
-    return reporting.Details(f'{title}: {counted(chosen)}', [table], opened=True)
+    return html_page.Details(f'{title}: {counted(chosen)}', [table], opened=True)
 
 
 def _exhibit(
     exhibit: Exhibit, material: ExhibitData, pictures: Mapping[str, bytes]
-) -> reporting.Group:
+) -> html_page.Group:
     claims = exhibit.decided_by(material.claims)
     found: list[Sequence[str | reporting.Mark]] = [
         (f'{claim.text}: {claim.found}', reporting.verdict_mark(claim.verdict)) for claim in claims
@@ -387,19 +387,19 @@ def _exhibit(
     if not found:
         found = [(exhibit.finding(material) if exhibit.finding else exhibit.caption,)]
     sides = [
-        reporting.Items([(exhibit.paper,)], 'side', 'The paper'),
-        reporting.Items(found, 'side', 'Found here'),
+        html_page.Items([(exhibit.paper,)], 'side', 'The paper'),
+        html_page.Items(found, 'side', 'Found here'),
     ]
-    blocks: list[reporting.Block] = [
-        reporting.Heading(exhibit.title, reporting.verdict_mark(exhibit.mark(material.claims))),
-        reporting.Group(sides, 'div', 'sides'),
+    blocks: list[html_page.Block] = [
+        html_page.Heading(exhibit.title, reporting.verdict_mark(exhibit.mark(material.claims))),
+        html_page.Group(sides, 'div', 'sides'),
     ]
     if figure := pictures.get(exhibit.stem):
-        blocks.append(reporting.Picture(exhibit.title, figure, exhibit.caption))
+        blocks.append(html_page.Picture(exhibit.title, figure, exhibit.caption))
     elif exhibit.stem:
-        blocks.append(reporting.Paragraph('Left out: nothing of it was measured.', 'quiet'))
+        blocks.append(html_page.Paragraph('Left out: nothing of it was measured.', 'quiet'))
     shown = material.tables.get(exhibit.tables, ())
     blocks += shown[:2]
     if more := shown[2:]:
-        blocks.append(reporting.Details(f'{len(more)} more tables', more))
-    return reporting.Group(blocks)
+        blocks.append(html_page.Details(f'{len(more)} more tables', more))
+    return html_page.Group(blocks)

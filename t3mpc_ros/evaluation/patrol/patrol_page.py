@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from t3mpc_ros.evaluation import reporting
+from t3mpc_ros.evaluation import html_page, reporting
 from t3mpc_ros.evaluation.confidence_intervals import (
     Difference,
     format_interval,
@@ -375,17 +375,17 @@ def markdown(study: PatrolStudy) -> str:
 
 def page(study: PatrolStudy, drawn: Mapping[str, bytes]) -> str:
     """Return the page as self-contained HTML, with pictures by their stems."""
-    shown = {each.stem: [reporting.Picture(each.title, drawn[each.stem], each.title)]
+    shown = {each.stem: [html_page.Picture(each.title, drawn[each.stem], each.title)]
              for each in PICTURES if each.stem in drawn}  # fmt: skip
-    blocks: list[reporting.Block] = [*shown.get('coverage', ()), reporting.Contents()]
-    blocks.append(reporting.Paragraph(description(study.plan)))
+    blocks: list[html_page.Block] = [*shown.get('coverage', ()), html_page.Contents()]
+    blocks.append(html_page.Paragraph(description(study.plan)))
     if claims(study):
-        blocks += [reporting.Heading('Does our path do what it should?'), claims_table(study)]
-    blocks += [reporting.Heading('Coverage'), coverage_table(study), *shown.get('heat_maps', ())]
-    blocks += [reporting.Heading('Predictability'), surprise_table(study)]
-    blocks += [*shown.get('predictability', ()), reporting.Paragraph(EXPLANATION, 'quiet')]
-    blocks += [reporting.Heading('Paths'), *shown.get('paths', ())]
-    return reporting.html_page('Patrols compared', blocks)
+        blocks += [html_page.Heading('Does our path do what it should?'), claims_table(study)]
+    blocks += [html_page.Heading('Coverage'), coverage_table(study), *shown.get('heat_maps', ())]
+    blocks += [html_page.Heading('Predictability'), surprise_table(study)]
+    blocks += [*shown.get('predictability', ()), html_page.Paragraph(EXPLANATION, 'quiet')]
+    blocks += [html_page.Heading('Paths'), *shown.get('paths', ())]
+    return html_page.html_page('Patrols compared', blocks)
 
 
 def record(study: PatrolStudy) -> dict[str, Any]:

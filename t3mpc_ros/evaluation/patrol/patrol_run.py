@@ -64,7 +64,7 @@ from t3mpc_ros.robot.description import sensor_mounts
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
 from t3mpc_ros.robot.sensor_parameters import RangeSensorParameters
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
-from t3mpc_ros.simulation.plant_robot import Signals
+from t3mpc_ros.simulation.plant_adapter import Signals
 from t3mpc_ros.simulation.world import MovingDisc, load_world
 
 START = KINDS['twin'].start

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation import reporting
+from t3mpc_ros.evaluation import html_page, reporting
 from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval, mean
 from t3mpc_ros.evaluation.patrol.patrol_run import LIMITS
 from t3mpc_ros.evaluation.patrol.tracking_study import (
@@ -121,16 +121,16 @@ def markdown(study: TrackingStudy) -> str:
 
 def page(study: TrackingStudy, drawn: Mapping[str, bytes]) -> str:
     """Return the page as self-contained HTML, with the pictures by their stems."""
-    blocks: list[reporting.Block] = [
-        reporting.Contents(),
-        reporting.Paragraph(description(study.plan)),
+    blocks: list[html_page.Block] = [
+        html_page.Contents(),
+        html_page.Paragraph(description(study.plan)),
     ]
     if 'tracks' in drawn:
-        blocks.append(reporting.Picture(PICTURES[0].title, drawn['tracks'], PICTURES[0].title))
+        blocks.append(html_page.Picture(PICTURES[0].title, drawn['tracks'], PICTURES[0].title))
     for path in study.plan.paths:
-        blocks += [reporting.Heading(path.capitalize()), path_table(study, path)]
-    blocks.append(reporting.Paragraph(EXPLANATION, 'quiet'))
-    return reporting.html_page('Path tracking compared', blocks)
+        blocks += [html_page.Heading(path.capitalize()), path_table(study, path)]
+    blocks.append(html_page.Paragraph(EXPLANATION, 'quiet'))
+    return html_page.html_page('Path tracking compared', blocks)
 
 
 def tuning_markdown(found: Mapping[str, Sequence[tuple[str, float]]]) -> str:

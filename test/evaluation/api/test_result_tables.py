@@ -24,7 +24,7 @@ import pytest
 
 import t3mpc_ros as t3
 from t3mpc_ros.evaluation.comparison import markdown
-from t3mpc_ros.evaluation.reporting import html_page
+from t3mpc_ros.evaluation.html_page import html_page
 
 SHORT = {'plant': 'servo', 'duration': 4.0}
 MAKERS = {

@@ -25,8 +25,12 @@ from support.long_tests import few_of
 
 from t3mpc_ros.bag.reader import open_bag
 from t3mpc_ros.cli.bag import main
-from t3mpc_ros.evaluation.bag_report import animation
-from t3mpc_ros.evaluation.bag_report.animation import AnimationOptions, RangeReadings, animate_bag
+from t3mpc_ros.evaluation.bag_report import animation_file
+from t3mpc_ros.evaluation.bag_report.animation_file import (
+    AnimationOptions,
+    RangeReadings,
+    animate_bag,
+)
 from t3mpc_ros.evaluation.bag_report.run_data import Series, load_run
 from t3mpc_ros.evaluation.bag_report.tracking_errors import tracking_error
 from t3mpc_ros.evaluation.topic_roles import ODOMETRY, REFERENCE, TRUTH
@@ -61,12 +65,12 @@ def figures(monkeypatch):
     """Return the figures that are made for animations, as a list that grows."""
     made = []
 
-    class Kept(animation.Figure):
+    class Kept(animation_file.Figure):
         def __init__(self, *arguments, **named):
             super().__init__(*arguments, **named)
             made.append(self)
 
-    monkeypatch.setattr(animation, 'Figure', Kept)
+    monkeypatch.setattr(animation_file, 'Figure', Kept)
     return made
 
 
@@ -76,7 +80,7 @@ def test_the_panels_show_the_quantities_of_their_titles(figures, tmp_path, monke
         run = load_run(recording)
     motions = {REFERENCE: run.motions[REFERENCE], TRUTH: run.motions[ODOMETRY]}
     run = replace(run, motions=motions, receipts={TRUTH: run.receipts[ODOMETRY]})
-    monkeypatch.setattr(animation, 'load_run', lambda *_: run)
+    monkeypatch.setattr(animation_file, 'load_run', lambda *_: run)
     options = AnimationOptions(start=4.0, duration=2.0, rate=2.0, width=300)
     animate_bag(GOLDEN, tmp_path / 'x.gif', options)
     floor, *panels = figures[-1].axes
@@ -121,9 +125,9 @@ def test_the_floor_shows_the_robot_its_way_and_what_it_sees(
         'odd', np.array([[-1.0, -0.5, 2.0, -0.6]]), np.array([[1.5, 1.5, 0.2]]), np.empty((0, 4)),
         np.empty((0, 5)),
     )  # fmt: skip
-    monkeypatch.setattr(animation, 'load_run', lambda *_: run)
-    monkeypatch.setattr(animation, 'read_ranges', lambda *_: ranges)
-    monkeypatch.setattr(animation, 'recorded_world', lambda *_: world)
+    monkeypatch.setattr(animation_file, 'load_run', lambda *_: run)
+    monkeypatch.setattr(animation_file, 'read_ranges', lambda *_: ranges)
+    monkeypatch.setattr(animation_file, 'recorded_world', lambda *_: world)
     chosen = AnimationOptions(start=1.0, duration=2.0, rate=1.0, width=200)
     animate_bag(GOLDEN, tmp_path / 'x.gif', chosen)
     floor = figures[-1].axes[0]
@@ -148,7 +152,7 @@ def test_the_floor_shows_the_robot_its_way_and_what_it_sees(
         assert line == pytest.approx(np.column_stack([wanted['x'], wanted['y']])[driven])
     else:
         # From the robot, as far as the wanted speeds lead, turning right.
-        assert len(line) == pytest.approx(animation.AHEAD / 0.05, abs=1)
+        assert len(line) == pytest.approx(animation_file.AHEAD / 0.05, abs=1)
         assert line[0] == pytest.approx(at[:2])
         steps = np.diff(line, axis=0)
         turns = -0.05 * (0.8 + 0.1 * 0.05 * np.arange(len(steps)))
