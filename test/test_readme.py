@@ -13,8 +13,8 @@
 # limitations under the License.
 """Every command of the pages works from a shell, in the order of its page.
 
-Blocks marked ``console`` are run: those of the README and the tutorial by every check, those of
-the other pages as long tests. All are parsed by the program that they start, as are the commands
+Blocks marked ``console`` are run: those of the README by every check, those of the other pages as
+long tests. All are parsed by the program that they start, as are the commands
 in the text and in blocks marked ``sh``: these need tools of ROS or apt, hardware, or many minutes.
 """
 
@@ -36,6 +36,7 @@ import yaml
 
 from t3mpc_ros.cli import bag, emulator, robot
 from t3mpc_ros.cli.main import _parser
+from t3mpc_ros.evaluation.api.script_parts import Controller
 from t3mpc_ros.nodes.arguments import unknown_arguments
 from t3mpc_ros.nodes.registry import NODES, parameter_class
 
@@ -126,7 +127,7 @@ SHORTENED = {
 }
 """Commands with additional arguments; those with Ctrl-C run until they are stopped."""
 
-FIRST = ('README.md', 'docs/tutorial.md')
+FIRST = ('README.md',)
 """Pages whose commands every check runs."""
 PAGES = ['README.md', *sorted(f'docs/{path.name}' for path in (ROOT / 'docs').glob('*.md'))]
 
@@ -310,13 +311,17 @@ def _own_controller():
 
 
 def test_the_controller_of_the_tutorial_runs(tmp_path):
-    """Its table comes from the command of the tutorial, which another test runs."""
+    """The commands of the page, which a long test runs, name it and a setting that it has."""
     script = tmp_path / 'my_controller.py'
     script.write_text(_own_controller())
     done = run([sys.executable, script], 240.0)
     assert done.returncode == 0, done.stderr
     (error,) = re.findall(r'^\| with switches \| ([0-9.]+) \| rad/s \|$', done.stdout, re.M)
     assert float(error) < 0.5
+    for command in (OWN, SWEEP):
+        name, setting = re.findall(r'my_controller(\.py:\w+)(?:.*? --set (\w+)=)?', command)[0]
+        settings = {setting: 10.0} if setting else {}
+        Controller(f'{script.with_suffix("")}{name}', settings).method('servo')
 
 
 @pytest.fixture(scope='module')

@@ -352,6 +352,7 @@ TABLE = {
             '--noise 0.01': {'run_plan.plan.scenario.noise': 0.01},
             '--cases nominal disturbance': {'run_plan.plan.cases': ('nominal', 'disturbance')},
             '--methods DMC': {'run_plan.plan.methods': ('DMC', 'step')},
+            '--html new.html': {'files': 'new.html'},
             '--reference speeds.csv': {'run_plan.plan.scenario.own.reference.rate': OWN_RATE},
         },
     ),

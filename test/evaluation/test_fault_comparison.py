@@ -13,6 +13,8 @@
 # limitations under the License.
 """The table of faults and wrong assumptions: each can be run, and what is said names it."""
 
+from functools import cache
+
 import pytest
 from support.long_tests import few_of
 
@@ -64,6 +66,14 @@ def test_commands_that_are_lost_are_named(monkeypatch):
     assert run_job(Job('none', FULL, 2001))['said'] == []
 
 
+@cache
+def settled(name, duration):
+    """Return the settled error of a run, made once: several are compared with that of no fault."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fault_comparison, 'DURATION', duration)
+        return run_job(Job(name, FULL, 2003))['settled']
+
+
 LATE = ('lag 20 ms assumed, none',)
 """Found too late on the gentle reference of this seed: 1.41 times the error."""
 
@@ -82,22 +92,19 @@ LATE = ('lag 20 ms assumed, none',)
         2,
     ),
 )
-def test_contradicted_assumptions_cost_little(name, monkeypatch, request):
+def test_contradicted_assumptions_cost_little(name, request):
     """They cost up to four times the settled error without them."""
     if name in LATE:
         request.applymarker(pytest.mark.xfail(strict=True))
-    monkeypatch.setattr(fault_comparison, 'DURATION', 16.0)
-    wrong, exact = (run_job(Job(each, FULL, 2003))['settled'] for each in (name, 'none'))
-    assert wrong < 1.25 * exact
+    assert settled(name, 16.0) < 1.25 * settled('none', 16.0)
 
 
 @pytest.mark.parametrize('rate', [85.0, 118.0, 62.0, 150.0])
 def test_a_rate_that_is_not_that_of_the_odometry_costs_little(rate, monkeypatch):
     """Steps counted as whole periods: four times the settled error, unnamed below 20 %."""
-    monkeypatch.setattr(fault_comparison, 'DURATION', 10.0)
-    monkeypatch.setitem(FAULTS, 'rate', Fault(assumed={'rate': rate}))
-    wrong, exact = (run_job(Job(each, FULL, 2003))['settled'] for each in ('rate', 'none'))
-    assert wrong < 1.2 * exact
+    name = f'rate {rate}'
+    monkeypatch.setitem(FAULTS, name, Fault(assumed={'rate': rate}))
+    assert settled(name, 10.0) < 1.2 * settled('none', 10.0)
 
 
 @pytest.mark.long
