@@ -90,6 +90,9 @@ def _part(text):
     return int(number), int(count)
 
 
+COUNTED_LATER = os.environ.get('T3MPC_COUNTED_LATER', '').split()
+"""Folders whose tests .ci/coverage repeats without the compiler: traced once, in that run."""
+
 MARKS = ('ros', 'timed', 'slow', 'long')
 """Marks by which a run selects."""
 
@@ -144,6 +147,9 @@ def pytest_collection_modifyitems(config, items):
         marks = {mark.name for mark in item.iter_markers()} & {*MARKS}
         if not certain <= marks <= possible:
             raise pytest.UsageError(f'{item.nodeid}: its file must name its marks, mark.NAME')
+        repeated = item.path.parent.name in COUNTED_LATER and 'ros' not in marks
+        if repeated and not item.get_closest_marker('compiled'):
+            item.add_marker('no_cover')
     ranks = {name: rank for rank, name in enumerate(FIRST)}
     items.sort(key=lambda item: ranks.get(item.path.name, len(FIRST)))
     if config.option.part:

@@ -136,9 +136,10 @@ def check(checkout, plan, *arguments):
         pytest.param([], [*STAGES, 'pytest', 'pytest'], CASES + LATER, marks=pytest.mark.long),
         (['--quick'], STAGES, CASES[1::3]),
         (['-k', 'some test'], STAGES, CASES[:1]),
+        (['--tests', '-k', 'some test'], ['pytest'], CASES[5:7]),
         (['--long', '2/7'], ['pytest', 'pytest'], LATER[:1]),
     ],
-    ids=['all', 'quick', 'arguments', 'long'],
+    ids=['all', 'quick', 'arguments', 'tests', 'long'],
 )
 @pytest.mark.slow
 def test_every_stage_runs_and_the_exit_code_says_what_remains(arguments, stages, cases, checkout):

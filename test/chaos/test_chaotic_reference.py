@@ -47,6 +47,7 @@ def states_of(run):
     return np.array([sample.states for sample in run])
 
 
+@pytest.mark.compiled
 def test_a_seed_is_the_same_reference_on_every_processor():
     """NumPy's exponentials differ by processor: seed 1 was another signal after five seconds."""
     run = samples(4000, seed=1)

@@ -418,6 +418,7 @@ def test_with_one_sensor_lost_the_robot_drives_slowly(lost):
     assert Reason.TOO_FEW_RANGES not in robot.reasons[begin:]
 
 
+@pytest.mark.compiled
 def test_rejected_readings_change_no_command():
     """A replay has only those that were used: its commands must be those of the run."""
     one, other = KeptOut(), KeptOut()
