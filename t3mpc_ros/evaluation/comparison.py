@@ -14,6 +14,7 @@
 """Comparison of methods: a plan of cases, methods and seeds, its experiment, and its tables."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 import math
 import statistics
@@ -31,11 +32,10 @@ from t3mpc_ros.evaluation.confidence_intervals import (
 )
 from t3mpc_ros.evaluation.drivers import MethodSpec
 from t3mpc_ros.evaluation.experiment import Report, ResultTable, Run, run_experiment
-from t3mpc_ros.evaluation.loop import ComparedMethod, Driver, Method, run
+from t3mpc_ros.evaluation.loop import ComparedMethod, scenario_reports
 from t3mpc_ros.evaluation.methods import FEED_FORWARD, FULL, MODEL_ERROR
 from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table
 from t3mpc_ros.evaluation.scenario import LEAD, PRETRAINING_SEEDS, TUNING_SEEDS, Scenario
-from t3mpc_ros.robot.interface import RobotCommand, RobotState
 
 QUICK_SEEDS = tuple(range(201, 207))
 """Default seeds: none of them was used for tuning, or is in a table of the paper's results."""
@@ -102,32 +102,17 @@ def step_times(plan: ComparisonPlan, clock_ns: Callable[[], int]) -> StepTimes:
     for name, method in plan.methods.items():
         if isinstance(method, MethodSpec):
             method = replace(method, pretrained=False)
-        timed = TimedMethod(method, clock_ns)
-        run(scenario, timed)
-        found[name] = 1e-3 * statistics.median(timed.taken_ns)
+        driver = method.driver(scenario)
+        loop, taken_ns = scenario_reports(scenario, driver), []
+        report = next(loop)
+        with suppress(StopIteration):
+            while True:
+                begin = clock_ns()
+                command = driver.step(report)
+                taken_ns.append(clock_ns() - begin)
+                report = loop.send(command)
+        found[name] = 1e-3 * statistics.median(taken_ns)
     return found
-
-
-class TimedMethod:
-    """A method whose driver is asked how long each step takes."""
-
-    def __init__(self, method: Method, clock_ns: Callable[[], int]) -> None:
-        self.name, self._method, self._clock_ns = method.name, method, clock_ns
-        self.taken_ns: list[int] = []
-
-    def driver(self, scenario: Scenario) -> Driver:
-        """Return a new driver."""
-        driver = self._method.driver(scenario)
-        step = driver.step
-
-        def timed_step(state: RobotState) -> RobotCommand:
-            begin = self._clock_ns()
-            command = step(state)
-            self.taken_ns.append(self._clock_ns() - begin)
-            return command
-
-        driver.step = timed_step  # type: ignore[method-assign]
-        return driver
 
 
 def run_plan(plan: ComparisonPlan, workers: Any = 1, report: Report | None = None) -> ResultTable:

@@ -124,7 +124,7 @@ def time_to_return(record: Record, undisturbed_run: Record, end: float) -> float
     It has recovered if from then on to the end it is at most :data:`ALLOWED` times the error of
     the run without the fault, in the same time or before the fault, whichever is larger.
     """
-    errors = record.speeds - record.reference, undisturbed_run.speeds - undisturbed_run.reference
+    errors = record.error, undisturbed_run.error
     usual = rms(errors[1][undisturbed_run.rows(SETTLED, BEGIN)])
     last = float(record.time[-1])
     for wait in np.arange(0.0, last - REST - end, 0.5).tolist():
@@ -136,7 +136,7 @@ def time_to_return(record: Record, undisturbed_run: Record, end: float) -> float
 
 def wheel_error(record: Record, begin: float, end: float) -> float:
     """Return the error (rad/s) of the rotors from ``begin`` to ``end`` (s)."""
-    return rms((record.speeds - record.reference)[record.rows(begin, end)])
+    return rms(record.error[record.rows(begin, end)])
 
 
 def _odometry_error(record: Record, time: float) -> list[float]:

@@ -103,13 +103,9 @@ class Comparison(ShownAsTables):
 
         None for the first controller itself.
         """
-        first = self._chosen(controller, case)
-        second = {**first, 'controller': self.plan.against}
-        return (
-            None
-            if first == second
-            else self.results.difference(find_metric(metric).name, first, second)
-        )
+        chosen = self._chosen(controller, case)
+        of = chosen['case'], chosen['controller'], find_metric(metric)
+        return comparison.difference(self.plan, self.results, *of)
 
     def _chosen(self, controller: Any, case: str) -> dict[str, str]:
         """Return the names of a controller, given as to :func:`compare`, and of a case."""

@@ -25,13 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from t3mpc_ros.evaluation.api import result_tables
-from t3mpc_ros.evaluation.api.comparison_runs import (
-    check_names,
-    checked_seeds,
-    chosen_cases,
-    find_metric,
-)
+from t3mpc_ros.evaluation.api import comparison_runs, result_tables
 from t3mpc_ros.evaluation.api.error_messages import one_sentence, sentence
 from t3mpc_ros.evaluation.api.plants import NoiseLaw
 from t3mpc_ros.evaluation.api.script_parts import as_controllers, check_method, own_scenario
@@ -102,7 +96,7 @@ class Sweep(result_tables.ShownAsTables):
         return self.columns
 
     def _tables(self, chosen: str | None = None) -> list[Table]:
-        metric = find_metric(chosen or SETTLED.name)
+        metric = comparison_runs.find_metric(chosen or SETTLED.name)
         names = ('controller', *self.parameters, 'case')
         lines: list[tuple[str, ...]] = []
         notes: list[str] = []
@@ -128,7 +122,7 @@ class Sweep(result_tables.ShownAsTables):
         is given.
         """
         (name,) = find_names('parameter', [parameter], self.parameters)
-        wanted = find_metric(metric)
+        wanted = comparison_runs.find_metric(metric)
         if not any(wanted.name in row for row in self.rows):
             known = sorted(set().union(*self.rows) & {each.name for each in METRICS})
             raise ScriptError(f'metric must be one of {", ".join(known)}: got {wanted.name}')
@@ -209,7 +203,7 @@ def sweep(
     """
     setting = {'plant': plant, 'reference': reference, 'noise': noise, 'faults': faults}
     setting['duration'] = duration
-    runs = make_runs(controllers, parameters, checked_seeds(seeds), cases, setting)
+    runs = make_runs(controllers, parameters, comparison_runs.checked_seeds(seeds), cases, setting)
     report = print_report if progress else None
     path = None
     if output is None:
@@ -240,9 +234,9 @@ def make_runs(
         true = {k.removeprefix(ROBOT): v for k, v in values.items() if k.startswith(ROBOT)}
         scenario = own_scenario(**{**setting, **swept}, robot_parameters=true)
         combinations.append((values, scenario))
-    chosen = chosen_cases(cases, combinations[0][1])
+    chosen = comparison_runs.chosen_cases(cases, combinations[0][1])
     prepared, given = [], as_controllers(controllers)
-    check_names([controller.name for controller in given])
+    comparison_runs.check_names([controller.name for controller in given])
     for controller in given:
         for values, scenario in combinations:
             own = {k: v for k, v in values.items() if not (k in OF_SETTING or k.startswith(ROBOT))}

@@ -244,45 +244,45 @@ _CHARGE = 'Charge the battery.'
 OVERLOADED = 'The machine was overloaded'
 END_PROGRAMS = 'End other programs, or use a faster machine, and repeat the run.'
 PATTERNS = (
+    Pattern('emergency stop was released', 'Waiting after an e-stop', 'Command it again.'),
     Pattern(
-        'emergency stop was released', 'Waiting after an e-stop', 'Command it again.',
-    ),
-    Pattern(
-        'emergency stop', 'E-stop',
+        'emergency stop',
+        'E-stop',
         'When the way is clear, release it with the service e_stop; the robot then waits for a '
         'new command.',
     ),
     Pattern(
-        'gyro and steps disagree', 'Slip stop: a wheel slips, is blocked, or has lost steps',
+        'gyro and steps disagree',
+        'Slip stop: a wheel slips, is blocked, or has lost steps',
         'Free the wheels, then command no motion for 0.5 s.',
     ),
     Pattern('brown-out', 'Brown-out: the board restarted', _CHARGE),
     Pattern('below its cut-off', 'Battery below its cut-off', _CHARGE),
     Pattern(
-        'robot does not answer', 'The robot did not answer',
+        'robot does not answer',
+        'The robot did not answer',
         'See that it is on, in range and on the same channel.',
     ),
     Pattern(
-        'no command reached the robot', 'No command reached the robot',
+        'no command reached the robot',
+        'No command reached the robot',
         'Move the dongle nearer to it, or change the channel.',
     ),
-    Pattern(
-        'dongle', 'The dongle did not answer', 'See its cable and its port.',
-    ),
+    Pattern('dongle', 'The dongle did not answer', 'See its cable and its port.'),
     Pattern('the last command has expired', 'No command', 'See why the controller fell silent.'),
     Pattern('no command', 'No command', 'See why the controller fell silent.'),
     Pattern('disabled by request', 'Controller disabled', 'Enable it with ~/enable.'),
     Pattern(
-        'reference is stale', 'Reference too old',
-        'See why the reference generator fell silent.',
+        'reference is stale', 'Reference too old', 'See why the reference generator fell silent.'
     ),
     Pattern('no reference yet', 'No reference', 'Start a reference generator.'),
     Pattern(
-        'odom is too old', 'Odometry too old',
+        'odom is too old',
+        'Odometry too old',
         'See the processor, the network and the clocks of the computers.',
     ),
     Pattern(
-        'odom is from the future', 'Odometry from the future', 'Set the clocks of the computers.',
+        'odom is from the future', 'Odometry from the future', 'Set the clocks of the computers.'
     ),
     Pattern('no odometry', 'No odometry', 'See why the robot fell silent.'),
     Pattern(
@@ -293,21 +293,18 @@ PATTERNS = (
     Pattern('state is diverging', 'The state diverged', 'See the wheels and the parameters.'),
     Pattern('odometry has restarted', 'Odometry restarted', 'See why the robot restarted.'),
     Pattern(
-        'does not follow commands', 'The robot did not follow its commands',
+        'does not follow commands',
+        'The robot did not follow its commands',
         'See its drives and its supply.',
     ),
     Pattern('battery is low', 'Battery low', _CHARGE, stops=False),
     Pattern(
-        'inertial sensor does not answer', 'Inertial sensor silent', 'See its wiring.',
-        stops=False,
+        'inertial sensor does not answer', 'Inertial sensor silent', 'See its wiring.', stops=False
     ),
-    Pattern(
-        SLIP, 'A wheel slipped', 'See the floor, the tyres and the load.',
-        stops=False,
-    ),
+    Pattern(SLIP, 'A wheel slipped', 'See the floor, the tyres and the load.', stops=False),
     Pattern('processor overloaded', OVERLOADED, END_PROGRAMS, stops=False),
     Pattern('real-time factor', OVERLOADED, END_PROGRAMS, stops=False),
-)  # fmt: skip
+)
 """Of two that a text contains the earlier one is meant."""
 
 

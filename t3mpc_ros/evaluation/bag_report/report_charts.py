@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from t3mpc_ros.control.control_law import TERM_NAMES
 from t3mpc_ros.control.controller import WHEELS
+from t3mpc_ros.evaluation.bag_report import tracking_errors
 from t3mpc_ros.evaluation.bag_report.continuity import gaps, pose_jumps
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import COUNTED
 from t3mpc_ros.evaluation.bag_report.metrics import (
@@ -34,13 +35,6 @@ from t3mpc_ros.evaluation.bag_report.metrics import (
 )
 from t3mpc_ros.evaluation.bag_report.patrol_section import followed_reference
 from t3mpc_ros.evaluation.bag_report.run_data import SIGNAL_NAMES, Run, Series
-from t3mpc_ros.evaluation.bag_report.tracking_errors import (
-    driven,
-    driven_and_settled,
-    odometry_sets,
-    path_distance,
-    tracking_error,
-)
 from t3mpc_ros.evaluation.charts import Chart, Curve, Line, LineStyle, Plane, thinned
 from t3mpc_ros.evaluation.drive_response import ResponseFit, busiest, predicted
 from t3mpc_ros.evaluation.reporting import format_number
@@ -114,7 +108,7 @@ def tracking(run: Run, metrics: ReportMetrics) -> Shown:
 
 def distance(run: Run, metrics: ReportMetrics) -> Shown:
     """Yield the distance from the path over time, of a robot that follows one."""
-    series = path_distance(run)
+    series = tracking_errors.path_distance(run)
     if not is_long(series):
         return
     row = int(np.argmax(series['value']))
@@ -123,7 +117,7 @@ def distance(run: Run, metrics: ReportMetrics) -> Shown:
         f'{format_number(1e3 * metrics.path_error_99)} mm; the largest distance is '
         f'{format_number(1e3 * float(series["value"][row]))} mm at {series.time[row]:.1f} s.'
     )
-    if sets := odometry_sets(run):
+    if sets := tracking_errors.odometry_sets(run):
         more = f' and {len(sets) - 5} more' if len(sets) > 5 else ''
         times = ', '.join(f'{time:.1f}' for time in sets[:5])
         seen += (
@@ -136,11 +130,11 @@ def distance(run: Run, metrics: ReportMetrics) -> Shown:
 def error(run: Run, metrics: ReportMetrics) -> Shown:
     """Yield the tracking error of both channels over time, of a robot that follows speeds."""
     known = run.motion is not None and not run.follows_path
-    series = tracking_error(run, run.measured) if known else None
+    series = tracking_errors.tracking_error(run, run.measured) if known else None
     if not is_long(series):
         return
-    moving = driven(series.time, run)
-    calm = driven_and_settled(series.time, run)
+    moving = tracking_errors.driven(series.time, run)
+    calm = tracking_errors.driven_and_settled(series.time, run)
     lines, seen = [], []
     for wheel, (name, title, _, unit) in zip(WHEELS, run.channels, strict=True):
         found, text = metrics.wheels[name], UNMEASURED

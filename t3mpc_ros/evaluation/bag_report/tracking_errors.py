@@ -20,14 +20,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from t3mpc_ros.evaluation.bag_report import incidents
 from t3mpc_ros.evaluation.bag_report.continuity import gaps
-from t3mpc_ros.evaluation.bag_report.incidents import (
-    BRAKING,
-    Span,
-    driving,
-    find_jumps,
-    find_stops,
-)
 from t3mpc_ros.evaluation.bag_report.run_data import Run, Series
 from t3mpc_ros.evaluation.confidence_intervals import rms
 from t3mpc_ros.evaluation.record import ROBOT_WINDOW, counted_from, counted_rows
@@ -85,9 +79,9 @@ def tracking_error(run: Run, measured: str) -> Series | None:
     return Series(time, errors)
 
 
-def counted_span(time: Array, run: Run) -> Span:
+def counted_span(time: Array, run: Run) -> incidents.Span:
     """Return from when to when errors at ``time`` (s) count; (inf, -inf) if they never do."""
-    first, last = driving(run)
+    first, last = incidents.driving(run)
     if not time.size or not first < last:
         return math.inf, -math.inf
     last = min(last, float(time[-1]))
@@ -100,11 +94,11 @@ def driven(time: Array, run: Run) -> NDArray[np.bool_]:
     Each stop is left out, from :data:`BRAKING` s before standstill to the end of the settling
     after it.
     """
-    stops = [(stop.start - BRAKING, stop.end) for stop in find_stops(run)]
+    stops = [(stop.start - incidents.BRAKING, stop.end) for stop in incidents.find_stops(run)]
     return counted_rows(time, run.switches, *counted_span(time, run)) & apart_from(time, stops)
 
 
-def apart_from(time: Array, spans: Sequence[Span]) -> NDArray[np.bool_]:
+def apart_from(time: Array, spans: Sequence[incidents.Span]) -> NDArray[np.bool_]:
     """Return which instants are in no span, nor in the time in which a robot settles after it."""
     away = np.ones(time.size, dtype=np.bool_)
     for start, end in spans:
@@ -142,7 +136,7 @@ def odometry_sets(run: Run) -> list[float]:
     if truth is None or odometry is None or 'localizer' in run.parameters:
         return []
     found = []
-    for jump in find_jumps(run):
+    for jump in incidents.find_jumps(run):
         if jump.name != ODOMETRY or not truth.time[0] < jump.time < truth.time[-1]:
             continue
         row = int(np.searchsorted(odometry.time, jump.time))
@@ -194,7 +188,7 @@ def path_distance(run: Run) -> Series | None:
     motion = on_reference_frame(run)
     if motion is None:
         return None
-    motion = motion.between(*driving(run)).between(
+    motion = motion.between(*incidents.driving(run)).between(
         float(reference.time[0]), float(reference.time[-1])
     )
     away = np.hypot(
@@ -205,7 +199,7 @@ def path_distance(run: Run) -> Series | None:
 
 
 def settled_rmse(
-    run: Run, until: float = math.inf, spared: Sequence[Span] = ()
+    run: Run, until: float = math.inf, spared: Sequence[incidents.Span] = ()
 ) -> tuple[float, float]:
     """Return the settled RMSE of both channels while driven, up to a time, apart from some spans.
 
