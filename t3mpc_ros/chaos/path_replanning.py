@@ -93,6 +93,10 @@ VIEW_DISTANCE, VIEW_DEPTH = 0.8, 0.15
 nearest place, m."""
 VIEW_END = 0.3
 """Last part of the line of sight, m: what the map has there is what is in doubt."""
+NOWHERE_TIME, FOLLOWS = 20.0, 0.35
+"""Time without a way anywhere after which the robot is boxed in (s): several maps, and the things
+that keep it there may be people; and its angle to the reference (rad) above which it does not
+follow, and has not seen what a look was to show."""
 OLD_SHARE = 0.9
 """Age of the places that are revisited, as a share of the greatest age."""
 
@@ -596,6 +600,12 @@ class PlannedPath:
         self._looked = False
         """Whether it has looked around since it came to rest."""
         self._unseeable: list[_Unseeable] = []
+        self._leads_nowhere = False
+        """Whether the last map leaves no way from where the reference rests."""
+        self._nowhere = 0.0
+        """Time of that since the reference moved, s."""
+        self._observed = 0.0
+        """When the robot was observed last, s."""
         self._seen = 0
         """Points of the plan that lead over floor that has been seen."""
         self.charging = False
@@ -624,6 +634,7 @@ class PlannedPath:
         self._rested = self._rested + self._period if resting else 0.0
         if not resting:
             self._looked = False
+            self._nowhere = 0.0
         return self._pose, twist
 
     def _begin_at(self, pose: Pose) -> None:
@@ -633,8 +644,11 @@ class PlannedPath:
 
     def observe(self, pose: Pose) -> None:
         """Begin anew where the robot is, when it has not come near the reference for long."""
+        elapsed, self._observed = self._time - self._observed, self._time
         if math.hypot(pose.x - self._pose.x, pose.y - self._pose.y) < FAR_AWAY:
             self._near_time = self._time
+            if self._leads_nowhere and abs(wrap_angle(pose.yaw - self._pose.yaw)) < FOLLOWS:
+                self._nowhere += elapsed
         elif self._time - self._near_time > PATIENCE:
             self._near_time = self._time
             self.plan.begin_at(pose)
@@ -666,6 +680,11 @@ class PlannedPath:
         return True
 
     @property
+    def boxed_in(self) -> bool:
+        """Whether the robot has had nowhere to go for :data:`NOWHERE_TIME`."""
+        return self._nowhere >= NOWHERE_TIME
+
+    @property
     def battery_silence(self) -> float:
         """Time without a voltage, s."""
         return self._time - self._voltage_time
@@ -690,6 +709,11 @@ class PlannedPath:
         self.plan.lead_by(self._contradictions, self._fed, self._time)
         self.plan.extend(self._fed, self._time)
         goes_on = self._feed()
+        self._leads_nowhere = (
+            self._rested > REST
+            and self._fed >= len(self.plan.points)
+            and not self.at_charging_place
+        )
         if self._look is not None:
             if self._seen >= self._fed + SEEN:
                 del self._look.directions[:-1]

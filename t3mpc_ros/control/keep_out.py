@@ -78,6 +78,7 @@ STANDING_ROOM = 0.12  # radius of the floor that is free because the robot stand
 MEMORY = 60.0  # default time after which floor that was seen to be free counts as unseen, s
 MARGIN = 25  # cells of unknown floor around what is published
 ENDING = 5.0  # rest of that time with which floor is published as unseen, s
+CONFIRMED_WITHIN = 0.06  # distance between two readings of one surface, m: three cells
 SURELY_SEEN = 0.7  # share of its range up to which a sensor sees every surface across its beam
 SURFACE_HALF_WIDTH, SURFACE_DEPTH = 0.04, 0.1
 """Half the width of what surely is across a beam, and its largest depth, m."""
@@ -281,6 +282,14 @@ class FreeSpaceMap:
         if away == math.inf:
             return None
         return x + away * math.cos(direction), y + away * math.sin(direction)
+
+    def has_confirmed(self, sensor: int, reading: float, pose: Pose) -> bool:
+        """Return whether another sensor has seen something where a reading (m) says it is."""
+        x, y, direction = self._face(sensor, pose)
+        x, y = x + reading * math.cos(direction), y + reading * math.sin(direction)
+        window, near = self._near(x, y, CONFIRMED_WITHIN)
+        others = self.grid.author[window] != sensor
+        return bool((near & others & (self.grid.cells[window] >= OCCUPIED)).any())
 
     def add_reading(self, sensor: int, reading: float, pose: Pose) -> None:
         """Add a reading (m, REP 117) of a sensor of the robot at ``pose``."""
@@ -600,6 +609,8 @@ class KeepOut:
             return False
         if reading == math.inf and (surface := self.map.surface(sensor, pose)) is not None:
             self.ranges.miss(sensor, surface)
+        if self.ranges.suspects(sensor) and self.map.has_confirmed(sensor, reading, pose):
+            self.ranges.confirm(sensor)
         if self.ranges.sees(sensor, reading):
             self.map.add_reading(sensor, reading, pose)
         return True

@@ -41,6 +41,9 @@ STEADY, STEADY_TURN, ON_THE_SPOT = 0.06, 2.0, 0.05
 distance (m) up to which it does so: six times the noise of 10 mm of a cable before a sensor. Of
 walls that a robot of 0.22 m has room to turn between, those of a square change a reading by 0.07 m
 within half of that angle; who walks around it in step with its 1.2 rad/s runs."""
+SUSPECT = 0.9
+"""Share of a turn from which on a sensor that reads one distance is compared with the others: two
+of its readings before the whole turn at 2 rad/s."""
 MISSES, MISSES_APART, MISSES_WITHIN = 4, 0.3, 120.0
 """Number of surfaces, so far (m) from the one before, that a sensor has not seen and the map has,
 without having seen anything in between, and within such a time (s): it sees nothing at all. One
@@ -110,6 +113,17 @@ class SensorRecord:
             self._repeats += 1
             return
         self._reading, self._repeats, self._along, self._turn = reading, 0, 0.0, 0.0
+
+    @property
+    def suspect(self) -> bool:
+        """Whether it reads one distance while the robot turns, as it also does in a round room."""
+        repeats = self._repeats >= REPEATS and abs(self._turn) > SUSPECT * FROZEN_TURN
+        steady = self._most - self._least > SUSPECT * STEADY_TURN
+        return self.fault is None and math.isfinite(self._reading) and (repeats or steady)
+
+    def confirm(self) -> None:
+        """Another sensor has seen what it reads: the turn counts from now on."""
+        self._spot, self._turn = None, 0.0
 
     def miss(self, surface: tuple[float, float], now_ns: int) -> None:
         """Count a surface (m) that the map has and it does not see."""
@@ -195,6 +209,14 @@ class RangeMonitor:
             self._missed.clear()
             self._way = 0.0
         return True
+
+    def suspects(self, sensor: int) -> bool:
+        """Return whether the next decision may be that a sensor is frozen; see confirm."""
+        return self._sensors[sensor].suspect
+
+    def confirm(self, sensor: int) -> None:
+        """Note that another sensor has seen what this one reads."""
+        self._sensors[sensor].confirm()
 
     def miss(self, sensor: int, surface: tuple[float, float]) -> None:
         """Note that a sensor reads "nothing in range" where the map has a surface (m)."""

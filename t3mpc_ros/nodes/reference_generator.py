@@ -30,7 +30,7 @@ from sensor_msgs.msg import BatteryState
 from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from t3mpc_ros.chaos.path_replanning import PlannedPath
+from t3mpc_ros.chaos.path_replanning import NOWHERE_TIME, PlannedPath
 from t3mpc_ros.chaos.pose_reference import (
     GivenPathSource,
     PathClock,
@@ -492,6 +492,13 @@ class ReferenceGeneratorNode(BaseNode[ReferenceGeneratorParameters]):
             found.append(
                 f'no way to the {name} at ({goal[0]:.2f}, {goal[1]:.2f}) m is known: it is '
                 'outside of the map or behind what is in it; the robot drives on and looks again'
+            )
+        if planned.boxed_in:
+            distance = self.parameters.plan.distance
+            found.append(
+                f'the robot is boxed in: for {NOWHERE_TIME:.0f} s and more no way that keeps '
+                f'plan.distance ({distance:g} m) from obstacles has led on; clear a passage of '
+                f'{2.0 * distance:.2g} m, or set the robot down elsewhere'
             )
         if charging.min_voltage and (silence := planned.battery_silence) >= BATTERY_TIMEOUT:
             effect = 'does not leave' if planned.charging else 'does not go to'

@@ -23,6 +23,7 @@ from support.long_tests import few_of
 from t3mpc_ros.chaos.path_replanning import (
     FAR_AWAY,
     GOAL_MISS,
+    NOWHERE_TIME,
     PATIENCE,
     PlannedPath,
     PlanParameters,
@@ -482,6 +483,32 @@ def test_a_robot_that_is_walled_in_rests_until_it_is_free():
     assert length(drive(path, room, 10.0)) < 0.5
     room.occupied &= ~ring
     assert length(drive(path, room, 30.0)) > 3.0
+
+
+def test_a_robot_that_has_nowhere_to_go_is_boxed_in():
+    """It stood between two chairs for ever, and nothing said so; a look is no way out."""
+    room = Room()
+    ring = room.near(0.0, 0.0, 0.45) & ~room.near(0.0, 0.0, 0.3)
+    room.occupied |= ring
+    path = planned()
+    drive(path, room, 0.9 * NOWHERE_TIME)
+    assert not path.boxed_in
+    drive(path, room, NOWHERE_TIME)
+    assert path.boxed_in
+    room.occupied &= ~ring
+    drive(path, room, 5.0)
+    assert not path.boxed_in
+
+
+def test_a_robot_that_does_not_turn_to_look_is_not_boxed_in():
+    """Its controller is disabled, say: what the looks were to show is not seen."""
+    room, path = Room(half_angle=0.1), planned()
+    for k in range(round(3.0 * NOWHERE_TIME / PERIOD)):
+        if k % MAP_PERIOD == 0:
+            path.set_map(room.grid())
+        path.advance()
+        path.observe(Pose(0.0, 0.0, 2.0))
+        assert not path.boxed_in
 
 
 @pytest.mark.parametrize('direction', few_of([1.0, -1.5, 2.5]))

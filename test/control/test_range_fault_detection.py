@@ -211,6 +211,27 @@ def test_readings_that_stay_similar_are_no_fault(kind):
         assert drive.run(0.25, readings).faults() == {}
 
 
+@pytest.mark.parametrize('radius', [0.3, 0.5, 0.85])
+@pytest.mark.parametrize('aside', [0.0, 0.06])
+def test_in_a_round_room_no_sensor_is_frozen(radius, aside):
+    """They read one distance while the robot turns: all eight were frozen, and the robot stood."""
+    angles = np.linspace(0.0, math.tau, 25)
+    corners = radius * np.column_stack([np.cos(angles), np.sin(angles)]) + [aside, 0.0]
+    walls, far = np.column_stack([corners[:-1], corners[1:]]), np.empty(8)
+    keep_out = KeepOut(KeepOutParameters(), BodyTwist(0.3, 2.0))
+    noise = np.random.default_rng(7)
+    for k in range(150):
+        keep_out.map.now += 0.04
+        pose = Pose(0.0, 0.0, 0.048 * k)
+        cast_rays(*pose, MOUNTS, np.arange(8), walls, NO_CIRCLES, far)
+        # The noise of a near reading is less than its step.
+        steps = 1000.0 * far + np.where(far < 0.25, 0.0, 15.0 * far**2) * noise.standard_normal(8)
+        for sensor, reading in enumerate(np.round(steps) / 1000.0):
+            keep_out.add_reading(sensor, float(reading) if reading < 0.8 else math.inf, pose)
+        keep_out.ranges.update(4 * (k + 1) * PERIOD_NS, pose)
+        assert keep_out.ranges.faults() == {}
+
+
 def test_a_frozen_sensor_marks_no_floor():
     keep_out = KeepOut(KeepOutParameters(), BodyTwist(0.3, 2.0))
     for k in range(100):
