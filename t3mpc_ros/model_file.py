@@ -22,8 +22,7 @@ import zipfile
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
-from t3mpc_ros.version import VERSION
+from t3mpc_ros.version import PACKAGE_DIRECTORY, VERSION
 
 FORMAT = 1
 """Version of the format; incremented if the meaning of an array changes."""

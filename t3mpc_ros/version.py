@@ -11,6 +11,9 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Version of the package."""
+"""Version of the package, and the folder it is in."""
+
+from pathlib import Path
 
 VERSION = '0.2.0'
+PACKAGE_DIRECTORY = Path(__file__).resolve().parent

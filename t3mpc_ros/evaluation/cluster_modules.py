@@ -31,8 +31,8 @@ from threading import RLock
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.script_error import ScriptError
+from t3mpc_ros.version import PACKAGE_DIRECTORY
 
 
 class SourceText(NamedTuple):

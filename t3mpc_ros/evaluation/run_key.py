@@ -33,8 +33,7 @@ from typing import Any
 import numpy as np
 
 from t3mpc_ros.evaluation.cluster_modules import is_own, own_text
-from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
-from t3mpc_ros.version import VERSION
+from t3mpc_ros.version import PACKAGE_DIRECTORY, VERSION
 
 DATA = (bool, int, float, complex, str, list, tuple, dict)
 """Kinds of data that a function may use by a name; arrays, too."""

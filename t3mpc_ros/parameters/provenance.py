@@ -19,9 +19,7 @@ from pathlib import Path
 import platform
 import subprocess
 
-from t3mpc_ros.version import VERSION
-
-PACKAGE_DIRECTORY = Path(__file__).resolve().parents[1]
+from t3mpc_ros.version import PACKAGE_DIRECTORY, VERSION
 
 
 def provenance(package: Path = PACKAGE_DIRECTORY) -> dict[str, str]:

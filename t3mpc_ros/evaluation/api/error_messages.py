@@ -22,8 +22,8 @@ from typing import ParamSpec, TypeVar
 
 from t3mpc_ros.atomic_file import NO_ROOM
 from t3mpc_ros.missing_library import remedy
-from t3mpc_ros.parameters.provenance import PACKAGE_DIRECTORY
 from t3mpc_ros.script_error import ScriptError
+from t3mpc_ros.version import PACKAGE_DIRECTORY
 
 P = ParamSpec('P')
 R = TypeVar('R')
