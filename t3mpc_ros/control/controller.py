@@ -44,12 +44,12 @@ from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
 from t3mpc_ros.control.input_shaper import EARLY, HIGHEST, InputShaper, InputShaperParameters
 from t3mpc_ros.control.jump_transition import CommandLimit, JumpTransition, MotorLimit
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
+from t3mpc_ros.control.odometry_repair import OdometryTwist
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import (
     DriveMonitor,
     InputWatchdog,
-    OdometryTwist,
     Reason,
     ResponseMonitor,
     WatchdogParameters,
@@ -764,6 +764,7 @@ class Controller:
             advance = [time / -math.expm1(-time / lag) for time in (held, period)]
             self._longer_hold_ns = round((advance[0] - advance[1]) * NANOSECONDS)
             self.dead_time.lateness = 0.5 * (held - period)
+        self.dead_time.lateness += self.odometry_twist.lateness
 
     def _watch_reference(self, stamp_ns: int, elapsed: float) -> None:
         """Add up the time for which commands follow a reference that had ended before."""

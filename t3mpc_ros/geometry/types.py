@@ -110,6 +110,14 @@ def difference(one: Pose, other: Pose) -> tuple[float, float]:
     return math.dist(one[:2], other[:2]), abs(wrap_angle(other.yaw - one.yaw))
 
 
+def motion_between(last: Pose, new: Pose) -> tuple[float, float, float]:
+    """Return the way ahead and to the left (m) between two poses, and the turn (rad)."""
+    turn = wrap_angle(new.yaw - last.yaw)
+    middle = last.yaw + 0.5 * turn
+    x, y, cosine, sine = new.x - last.x, new.y - last.y, math.cos(middle), math.sin(middle)
+    return cosine * x + sine * y, cosine * y - sine * x, turn
+
+
 def has_moved(start: Pose | None, pose: Pose, distance: float, angle: float) -> bool:
     """Return whether a pose is farther than a distance (m) or an angle (rad) from the start."""
     return start is None or (

@@ -35,7 +35,6 @@ from t3mpc_ros.control.watchdog import (
     ContactMonitor,
     DriveMonitor,
     InputWatchdog,
-    OdometryTwist,
     Reason,
     ResponseMonitor,
     StopHistory,
@@ -306,199 +305,6 @@ def test_the_decision_is_that_of_the_whole_window(steps):
         window = [*window, (right, left)][-5:]
 
 
-def test_a_message_that_is_not_finite_keeps_the_twist_missing():
-    """One bad message once made the controller look for a twist again, for a centimetre."""
-    twist = OdometryTwist()
-    found = []
-    for k in range(30):
-        at = Pose(math.nan if k == 20 else 0.002 * k, 0.0, 0.0)
-        measured = twist.measured(State(k * 10 * MS, at, STANDSTILL), restart=k == 0)
-        found.append(measured.twist.linear)
-    assert found[:6] == [0.0] * 6
-    assert found[20] == 0.0
-    assert found[7:20] + found[21:] == pytest.approx([0.2] * 22)
-
-
-START, ASIDE, FAR = Pose(0.0, 0.0, 0.0), Pose(0.02, 0.0, 0.0), Pose(0.5, 0.2, 0.0)
-
-
-@pytest.mark.parametrize(
-    ('poses', 'restart'),
-    [
-        ([place] * 5 + [START] * 5, None)  # it was set at rest
-        for place in (ASIDE, FAR, Pose(0.0, 0.0, 2.9))
-    ]
-    + [([FAR] * 5 + [START] * 5, 5)]  # or in a gap
-    + [([START] * 5 + [Pose(0.0105, 0.0, 0.0)] + [Pose(0.001, 0.0, 0.0)] * 5, None)],  # far off
-)
-def test_a_pose_that_is_set_is_no_twist_that_is_missing(poses, restart):
-    """After ``reset_odometry`` 'odom has no twist' was said, and 'state is diverging'."""
-    twist = OdometryTwist()
-    for k, pose in enumerate(poses):
-        state = State(k * 10 * MS, pose, STANDSTILL)
-        assert twist.measured(state, restart=k in (0, restart)) == state
-    assert not twist.problem()
-
-
-# -- a twist that does not fit to the pose --------------------------------------------------------
-
-
-def twists_of(
-    motion, *, factors=(1.0, 1.0), noise=0.0, seconds=20.0, seed=1, moved=lambda k, pose: pose
-):
-    """Return twist monitor and used twists of a drive; ``motion``: twist by time (s)."""
-    generator, twist, used = np.random.default_rng(seed), OdometryTwist(), []
-    x = y = yaw = 0.0
-    before = np.zeros(2)
-    for k in range(round(100 * seconds)):
-        true = np.array(motion(0.01 * k))
-        linear, angular = 0.5 * (before + true) * (0.01 if k else 0.0)
-        middle = yaw + 0.5 * angular
-        x, y = x + linear * math.cos(middle), y + linear * math.sin(middle)
-        yaw, before = yaw + angular, true
-        measured = true * factors + noise * generator.standard_normal(2)
-        state = State(k * 10 * MS, moved(k, Pose(x, y, yaw)), BodyTwist(*measured.tolist()))
-        used.append(twist.measured(state, restart=k == 0).twist)
-    return twist, np.array(used)
-
-
-def winding(time):
-    return 0.15 + 0.1 * math.sin(1.3 * time), 1.2 * math.sin(0.9 * time)
-
-
-DRIVES = {
-    'winding': winding,
-    'straight': lambda time: (0.2, 0.0),
-    'on the spot': lambda time: (0.0, 1.0),
-    'to and fro': lambda time: (0.2 * math.sin(2.0 * time), 0.0),
-}
-
-
-@pytest.mark.parametrize('factor', [0.5, 0.94, 1.06])
-@pytest.mark.parametrize('drive', ['winding', 'to and fro'])
-def test_a_twist_of_another_scale_is_divided_by_it(drive, factor):
-    """A twist 10 % too large made the settled error 1.5 times that of a simple method."""
-    twist, used = twists_of(DRIVES[drive], factors=(factor, factor), noise=0.005)
-    assert f'{factor:.2f}'[:3] in twist.problem()
-    true = np.array([DRIVES[drive](0.01 * k) for k in range(len(used))])
-    assert np.abs(used[500:] - true[500:]).mean() < 0.01
-    assert np.abs(used[:250] / factor - true[:250]).mean() < 0.01  # before it is known
-
-
-@pytest.mark.parametrize('drive', list(DRIVES))
-@pytest.mark.parametrize('seed', range(2))
-def test_a_twist_that_fits_is_used_as_it_is(drive, seed):
-    twist, _ = twists_of(DRIVES[drive], noise=0.02, seed=seed, seconds=30.0)
-    assert not twist.replaced
-    assert twist.problem() == ''
-
-
-def _corrected(k, pose):
-    ahead = 0.02 * math.sin(0.5 * math.tau * k / 100.0)
-    there = ahead * math.cos(pose.yaw), ahead * math.sin(pose.yaw)
-    return Pose(pose.x + there[0], pose.y + there[1], pose.yaw)
-
-
-MOVED = {
-    'by up to a fifth of the way, forward and back': _corrected,
-    'by a jump': lambda k, pose: pose._replace(x=pose.x + (k >= 600)),
-    'by a jump, twice a second': lambda k, pose: pose._replace(x=pose.x + 0.15 * (k // 50)),
-    # In the frame of its pose the robot then goes aside: 1.058, and six times the error.
-    'by its yaw': lambda k, pose: pose._replace(yaw=pose.yaw - 0.5 * (k >= 600)),
-    'by half a turn': lambda k, pose: pose._replace(yaw=pose.yaw + 1.5 * (k >= 600)),
-}
-
-
-@pytest.mark.parametrize('moved', MOVED)
-@pytest.mark.parametrize('drive', ['winding', 'straight'])
-def test_a_pose_that_a_localisation_moves_is_no_factor(drive, moved):
-    twist, _ = twists_of(DRIVES[drive], noise=0.005, moved=MOVED[moved], seconds=30.0)
-    assert not twist.replaced
-
-
-def test_a_factor_of_the_yaw_rate_alone_is_left():
-    """Gyro and wheels differ on a robot whose geometry is wrong: the body correction learns it."""
-    for drive in ('winding', 'on the spot'):
-        twist, _ = twists_of(DRIVES[drive], factors=(1.0, 1.1))
-        assert not twist.replaced
-
-
-@pytest.mark.parametrize('step', [-0.09, 0.09])
-@pytest.mark.parametrize('speed', [0.01, 0.03])
-def test_a_slow_robot_whose_pose_is_set_has_no_factor(speed, step):
-    """Its speed was taken for up to thirteen times what it was, in the state *tracking*."""
-    _, used = twists_of(
-        lambda time: (speed, 0.0),
-        seconds=60.0,
-        moved=lambda k, pose: Pose(pose.x + step * (k >= 600), pose.y, pose.yaw),
-    )
-    assert (used[:, 0] == speed).all()
-
-
-@pytest.mark.parametrize(
-    ('drive', 'factors'),
-    [
-        ('winding', (1000.0, 1.0)),
-        ('winding', (1.0, 57.3)),
-        ('to and fro', (1000.0, 57.3)),
-        ('to and fro', (100.0, 100.0)),
-    ],
-)
-def test_a_twist_in_other_units_is_replaced_by_the_pose(drive, factors):
-    """The robot jerked: *diverging* and *tracking* took turns, and nothing told why."""
-    twist, used = twists_of(DRIVES[drive], factors=factors, noise=0.005)
-    assert 'cannot be in m/s and rad/s' in twist.problem()
-    true = np.array([DRIVES[drive](0.01 * k) for k in range(len(used))])
-    assert np.abs(used[300:] - true[300:]).max() < 0.03
-
-
-@pytest.mark.parametrize('rate', [4, 20])
-def test_a_fast_robot_with_a_slow_camera_has_its_own_twist(rate):
-    """The pose is that of the last picture; in the next one it has moved far."""
-    held = []
-
-    def seen(k, pose):
-        if k % rate == 0:
-            held[:] = [pose]
-        return held[0]
-
-    twist, used = twists_of(lambda time: (2.0, 3.0 * math.sin(time)), moved=seen, noise=0.05)
-    assert not twist.replaced
-    assert np.abs(used[:, 0] - 2.0).max() < 0.3
-
-
-def straight(count, factor, restart=(), missing=lambda k: False):
-    """Return twist monitor and used speeds at 0.2 m/s, with ``factor(k)`` times the twist."""
-    twist, found = OdometryTwist(), []
-    for k in range(count):
-        if not missing(k):
-            state = State(k * 10 * MS, Pose(0.002 * k, 0.0, 0.0), BodyTwist(0.2 * factor(k), 0.0))
-            found.append(twist.measured(state, restart=k == 0 or k in restart).twist.linear)
-    return twist, found
-
-
-def test_a_twist_in_other_units_is_not_used_after_a_gap():
-    """The first message after each gap had its twist of 200 m/s: the robot stopped for 0.5 s."""
-    _, found = straight(100, lambda k: 1000.0, restart=(50,))
-    assert found[50] == 0.0
-    assert found[51:] == pytest.approx([0.2] * 49)
-
-
-def test_a_twist_that_is_repaired_is_used_again():
-    twist, found = straight(2000, lambda k: 1000.0 if k < 500 else 1.0)
-    assert found[12:] == pytest.approx([0.2] * len(found[12:]))
-    assert not twist.replaced
-    twist, found = straight(9000, lambda k: 1.2 if k < 1500 else 1.0)
-    assert [found[1000], found[-1]] == pytest.approx([0.2, 0.2])
-    assert not twist.replaced
-
-
-def test_messages_that_are_missing_are_not_compared():
-    """Across a gap twist and pose say nothing of each other."""
-    twist, _ = straight(2000, lambda k: 1.0, range(0, 2000, 20), lambda k: k % 20 >= 2)
-    assert not twist.replaced
-
-
 @pytest.mark.parametrize('kind', ['curves', 'creeping'])
 @pytest.mark.parametrize('seed', range(2))
 def test_noise_of_a_pose_is_no_contact(kind, seed):
@@ -508,7 +314,7 @@ def test_noise_of_a_pose_is_no_contact(kind, seed):
     every half a second: it backed off once.
     """
     generator, monitor = np.random.default_rng(seed), ContactMonitor()
-    pose, now, lag = START, STANDSTILL, 0.1 if kind == 'curves' else 0.06
+    pose, now, lag = Pose(0.0, 0.0, 0.0), STANDSTILL, 0.1 if kind == 'curves' else 0.06
     for k in range(15_000):
         restless = float(generator.normal(0.0, 0.15))
         command = BodyTwist(0.075 * (1.0 - math.cos(0.13 * k)), 0.1)

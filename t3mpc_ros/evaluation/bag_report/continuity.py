@@ -17,8 +17,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from t3mpc_ros.control.watchdog import FAR_BEYOND, TwistUnits, motion_between
-from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, Pose, State
+from t3mpc_ros.control.odometry_repair import FAR_BEYOND, TwistUnits
+from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, Pose, State, motion_between
 
 MIN_GAP = 2.0
 """Least time without a message that is a gap, s."""

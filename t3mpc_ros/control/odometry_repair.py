@@ -1,0 +1,475 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""What is wrong with the twist of the odometry, and what is used in its place."""
+
+import math
+
+import numpy as np
+
+from t3mpc_ros.geometry.types import (
+    JUMP,
+    NANOSECONDS,
+    STANDSTILL,
+    UNKNOWN_TWIST,
+    BodyTwist,
+    Pose,
+    State,
+    has_moved,
+    motion_between,
+)
+
+MOVED, TURNED = 0.01, 0.05
+"""Change of the pose (m, rad) with a twist of zero after which the odometry has no twist."""
+FIT_FILTER, FIT_ROW, FIT_MEMORY = 0.1, 0.2, 10.0
+"""Time constant of both stages of the filter of twist and pose, time between two comparisons, and
+their memory, s."""
+FIT_SETTLING, FIT_ROWS = 0.6, 8
+"""Time after which the filter has forgotten an interruption (s); comparisons that are needed."""
+FIT_GAP, FIT_INTERVALS = 5.0, 0.05
+"""Interval between two messages, as a multiple of the usual one, that is a gap; share by which the
+usual one follows each of them."""
+FIT_MOTION = 0.02, 0.1
+"""Velocity by the pose (m/s, rad/s), either of them, of a robot that moves."""
+FIT_SPIN, FIT_SPIN_BEYOND = 2.0, (0.05, 0.5)
+"""Twist, as a multiple of the rate of the pose, and excess (m/s, rad/s) of wheels that spin."""
+FIT_NOISE = 0.0005, 0.005  # least noise of a comparison, m/s and rad/s
+FIT_PRIOR = (10.0, 0.1, 0.003), (10.0, 0.1, 0.05, 1.0)
+"""Standard deviation before any comparison of factor less 1, lag (s) and offset of each velocity;
+of the angular one also that of its share of the linear one, rad/m: wheels of unequal radii."""
+FIT_VARIANCE = 2.0  # variance of a fit over that with independent comparisons
+ALONE = (
+    1.5  # square that a factor alone leaves, over that of the whole fit, up to which it is used
+)
+TWIST_CERTAIN, LATE_CERTAIN = 4.0, 3.3
+"""Standard deviations of a deviation between twist and pose that counts."""
+TWIST_TOLERANCE, OFFSET_TOLERANCE = 0.05, 0.004
+"""Deviation of the factor of the linear velocity from 1, and its offset (m/s), that count."""
+ANGULAR_FACTORS = 0.5, 2.0
+"""Factors of the angular velocity beyond which no wheels, gyro or slip explain them."""
+LATE, LATE_PERIODS = 0.005, 0.6
+"""Time by which the linear velocity is behind the pose that counts: s, and share of the interval
+of the messages, as the mean over two of them is half of it late."""
+UNLIKE, ROUGH = (0.1, 0.6), 0.3
+"""Share of the velocity that factor, lag and offset do not explain from which they are no true
+description of a twist that is certainly wrong, and from which it is wrong without them; the same
+share of its changes from one message to the next."""
+POSE_NOISE = 0.005, 0.05
+"""Noise of differences of the pose (m/s, rad/s) which the twist may not undercut: it is that of
+wheels with 0.04 (rad/s)²."""
+SIDEWAYS = 0.2
+"""Share of the way by which a pose may go aside: the cosine of such an angle is tolerable."""
+FAR, FAR_BEYOND, FAR_UNCHANGED = 5.0, (1.0, 5.0), 4.0
+"""A twist (m/s, rad/s) contradicts the change of the pose from this multiple of it and this excess
+on: 0.001 m/s in millimetres, 0.1 rad/s in degrees are found, wheels that slip are not. Where the
+pose stays the same, the excess is so many times larger."""
+UNITS_COUNT, UNITS_MOST, UNITS_MOTION = 10, 100, (0.02, 0.15)
+"""Messages that contradict, more than others, from which the units are wrong; the most that
+count; and the velocities by the pose (m/s, rad/s) of a message that counts as another one."""
+
+
+class VelocityFit:
+    """What a velocity of the twist is beside the change of the pose, by least squares.
+
+    twist = factor * rate - lag * change of the rate + offset + share * rate of the way
+    """
+
+    def __init__(self, prior: tuple[float, ...], least_noise: float) -> None:
+        self._precision = np.array(prior) ** -2.0
+        self._normal = np.zeros((len(prior), len(prior)))
+        self._product = np.zeros(len(prior))
+        self._square = self._apart = 0.0
+        self._least, self._noise = least_noise**2, least_noise**2
+        self._rough = [0.0, 0.0]
+        self.rows = 0.0
+        self.values = [1.0] + [0.0] * (len(prior) - 1)
+        """Factor, lag (s), offset, share."""
+        self.deviations = [math.inf] * len(prior)
+
+    def add(self, row: list[float], twist: float, rough: list[float]) -> None:
+        """Add a comparison; ``rough``: squared noise of twist and rate of the pose."""
+        kept, each = 1.0 - FIT_ROW / FIT_MEMORY, np.array(row)
+        self.rows = kept * self.rows + 1.0
+        self._normal = kept * self._normal + each[:, np.newaxis] * each
+        self._product = kept * self._product + twist * each
+        self._square = kept * self._square + twist**2
+        self._apart = kept * self._apart + (twist - row[0]) ** 2
+        self._rough = [kept * old + new for old, new in zip(self._rough, rough, strict=True)]
+        if self.rows < FIT_ROWS:
+            return
+        # It is 1 times the rate where nothing is known.
+        rest = self._product - self._normal[:, 0]
+        inverse = np.linalg.inv(self._normal + np.diag(self._noise * self._precision))
+        values = inverse @ rest
+        square = self._apart - 2.0 * values @ rest + values @ self._normal @ values
+        self._noise = max(float(square) / (self.rows - values.size), self._least)
+        self.deviations = np.sqrt(FIT_VARIANCE * self._noise * inverse.diagonal()).tolist()
+        values[0] += 1.0
+        self.values = values.tolist()
+        # A factor alone is known much better, where it explains the twist as well.
+        motion, product = float(self._normal[0, 0]), float(self._product[0])
+        if not motion:
+            return
+        rest_alone = (self._square - product**2 / motion) / (self.rows - 1.0)
+        if rest_alone < ALONE * self._noise:
+            self.values[0] = product / motion
+            self.deviations[0] = math.sqrt(FIT_VARIANCE * max(rest_alone, self._least) / motion)
+
+    def is_certain(self, index: int, times: float) -> bool:
+        """Whether a value is not the one of a twist that fits."""
+        return abs(self.values[index] - (index == 0)) > times * self.deviations[index]
+
+    @property
+    def motion(self) -> float:
+        """Mean square of the rate of the pose."""
+        return float(self._normal[0, 0]) / max(self.rows, 1.0)
+
+    @property
+    def unexplained(self) -> float:
+        """Mean square of what the fit does not explain."""
+        return self._noise
+
+    @property
+    def roughness(self) -> float:
+        """Mean square of the noise of the twist."""
+        return self._rough[0] / max(self.rows, 1.0)
+
+    def prefers_pose(self, least: float) -> bool:
+        """Whether the noise of the rate of the pose is less than what is wrong with the twist."""
+        twist, pose = self._rough
+        return pose < twist + self._apart + self.rows * least**2
+
+
+class TwistFit:
+    """Whether the twist of the odometry is what the pose in the same messages says.
+
+    Both come from the same robot at the same time. A factor of both velocities is a wrong radius
+    or unit in its driver. Where only the yaw rates differ, gyro or separation of the wheels may be
+    wrong, and nothing is decided unless they differ beyond that. Of two signals of which one is
+    late the earlier one is right: neither can be of the future.
+    """
+
+    def __init__(self) -> None:
+        self.factor = 1.0  # of both velocities, in use; 1 unless it is certainly another one
+        self.wrong = ''
+        """What is wrong with the twist otherwise; '' if nothing is."""
+        self.uses_pose = [False, False]
+        """Whether a velocity is then that by the pose."""
+        self._late = False  # whether it was at the last comparison
+        self._fits = [
+            VelocityFit(prior, noise) for prior, noise in zip(FIT_PRIOR, FIT_NOISE, strict=True)
+        ]
+        self._aside = self._interval = 0.0
+        self._age = 0.0  # driving time since something was wrong, s
+        self.interrupt()
+
+    def interrupt(self) -> None:
+        """Forget the newest messages: some are missing."""
+        self._stages: list[list[float]] = []
+        self._last: list[float] = []
+        self._from: State | None = None
+
+    def update(self, new: State) -> None:
+        """Compare the twist of a message with the motion since the last one."""
+        last, self._from = self._from, new
+        if last is None:
+            return
+        elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
+        if new.pose == last.pose:  # the robot stands, or a camera holds it for a while
+            self._from = last
+            if elapsed > FIT_SETTLING:
+                self.interrupt()
+            return
+        if new.pose.yaw == last.pose.yaw and abs(new.twist.angular) > FIT_MOTION[1]:
+            self.interrupt()  # a yaw that is frozen, or coarse, says nothing of the way either
+            return
+        ahead, left, turn = (each / elapsed for each in motion_between(last.pose, new.pose))
+        given = [ahead, turn, new.twist.linear, new.twist.angular, left]
+        apart = [abs(given[i] - given[i + 2]) for i in range(2)]
+        typical = min(self._interval or elapsed, 2.0 * elapsed)
+        self._interval = typical + FIT_INTERVALS * (elapsed - typical)
+        if elapsed > FIT_GAP * typical or any(
+            apart[i] > FAR_BEYOND[i] or apart[i] * elapsed > JUMP[i] for i in range(2)
+        ):  # A pose that was set, or messages are missing.
+            self.interrupt()
+            return
+        if not self._stages:
+            self._stages, self._last = [[each, each] for each in given], given
+            self._time = 0.0
+            self._begin_row()
+            return
+        share = -math.expm1(-elapsed / FIT_FILTER)
+        for stages, each in zip(self._stages, given, strict=True):
+            stages[0] += share * (each - stages[0])
+            stages[1] += share * (stages[0] - stages[1])
+        # Means: a pose that is updated with 10 Hz has a ripple in step with the comparisons.
+        for sums, stages in zip(self._sums, self._stages, strict=True):
+            sums[0] += elapsed * stages[0]
+            sums[1] += elapsed * stages[1]
+        for i in range(4):
+            self._rough[i] += 0.5 * (given[i] - self._last[i]) ** 2
+        self._last = given
+        self._time += elapsed
+        self._since += elapsed
+        self._count += 1
+        if self._since < FIT_ROW:
+            return
+        if self._time > FIT_SETTLING:
+            self._add_row()
+        self._begin_row()
+
+    def _begin_row(self) -> None:
+        self._since, self._count = 0.0, 0
+        self._sums = [[0.0, 0.0] for _ in range(5)]
+        self._rough = [0.0] * 4
+
+    def _add_row(self) -> None:
+        means = [[each / self._since for each in sums] for sums in self._sums]
+        rates, twists = ([abs(each[1]) for each in part] for part in (means[:2], means[2:4]))
+        if all(rates[i] < FIT_MOTION[i] for i in range(2)) or any(
+            twists[i] > FIT_SPIN * rates[i] + FIT_SPIN_BEYOND[i] for i in range(2)
+        ):  # It stands, or something holds it, and its wheels spin.
+            return
+        for i, fit in enumerate(self._fits):
+            first, rate = means[i]
+            row = [rate, (rate - first) / FIT_FILTER, 1.0, means[0][1]][: len(fit.values)]
+            rough = [self._rough[i + 2] / self._count, self._rough[i] / self._count]
+            fit.add(row, means[i + 2][1], rough)
+        kept = 1.0 - FIT_ROW / FIT_MEMORY
+        self._aside = kept * self._aside + means[4][1] ** 2
+        self._age += FIT_ROW
+        if self._fits[0].rows >= FIT_ROWS:
+            wrong, factor = self._find()
+            if wrong or factor != 1.0 or self._age > FIT_MEMORY:
+                self.wrong, self.factor, self._age = wrong, factor, 0.0
+            self.uses_pose = [
+                bool(self.wrong) and fit.prefers_pose(least)
+                for fit, least in zip(self._fits, POSE_NOISE, strict=True)
+            ]
+            self.wrong = self.wrong if any(self.uses_pose) else ''
+
+    def _find(self) -> tuple[str, float]:
+        """Return what is wrong with the twist, or the factor of both velocities."""
+        linear, angular = self._fits
+        factor, lag, offset = linear.values
+        turns, (least, most) = angular.values[0], ANGULAR_FACTORS
+        way = max(linear.motion, FIT_MOTION[0] ** 2)
+        scaled = abs(factor - 1.0) > TWIST_TOLERANCE and linear.is_certain(0, TWIST_CERTAIN)
+        shifted = abs(offset) > OFFSET_TOLERANCE and linear.is_certain(2, TWIST_CERTAIN)
+        late = lag > max(LATE, LATE_PERIODS * self._interval)
+        late = late and linear.is_certain(1, LATE_CERTAIN)
+        late, self._late = late and self._late, late  # twice: of many decisions one may be wrong
+        follows = linear.unexplained < UNLIKE[0] ** 2 * way and linear.roughness < ROUGH**2 * way
+        wrong, common = '', 1.0
+        # After the yaw was set, the robot goes aside by its pose, and its way ahead is shorter.
+        if self._aside > SIDEWAYS**2 * linear.rows * linear.motion:
+            pass
+        elif linear.unexplained > UNLIKE[1] ** 2 * way or (
+            not follows and (scaled or shifted or late)
+        ):
+            wrong = 'its linear velocity does not follow'
+        elif late:
+            wrong = f'its linear velocity is {lag:.3f} s behind'
+        elif shifted:
+            wrong = f'its linear velocity is {offset:+.3f} m/s off'
+        elif scaled and factor > 0.0 and self._is_common(factor):
+            common = factor
+        elif scaled:
+            wrong = f'its linear velocity is {factor:.3f} times'
+        if not wrong and not least < turns < most and angular.is_certain(0, TWIST_CERTAIN):
+            wrong = f'its angular velocity is {turns:.3f} times'
+        if wrong and any(f.prefers_pose(n) for f, n in zip(self._fits, POSE_NOISE, strict=True)):
+            return wrong, 1.0
+        return '', common
+
+    def _is_common(self, factor: float) -> bool:
+        """Whether the angular velocity has the factor of the linear one, as far as is known."""
+        linear, angular = self._fits
+        half, uncertain = 0.5 * abs(factor - 1.0), TWIST_CERTAIN * angular.deviations[0]
+        known = uncertain < half or angular.motion < FIT_MOTION[1] ** 2
+        known = known or self.factor != 1.0 or not linear.prefers_pose(POSE_NOISE[0])
+        return known and abs(angular.values[0] - factor) < half + uncertain
+
+
+class TwistUnits:
+    """Whether the twist of the odometry is far beyond the change of its pose, in either velocity.
+
+    So it is in degrees or millimetres per second. A robot at rest agrees with any unit: such a
+    twist is found while the robot moves, however little, before it is taken to diverge.
+    """
+
+    def __init__(self) -> None:
+        self.wrong = False
+        self.example = ''
+        """Twist and change of the pose in a message in which they contradict each other."""
+        self._count = 0
+
+    def update(self, last: State, new: State, motion: tuple[float, float, float]) -> None:
+        """Compare the twist of a message with the motion since the last one."""
+        # That of a camera which is slower than the wheels stays the same for a while.
+        times = FAR_UNCHANGED if new.pose == last.pose else 1.0
+        elapsed = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
+        by_pose = motion[0] / elapsed, motion[2] / elapsed
+        if any(
+            abs(twist) > FAR * abs(rate) + times * beyond
+            for twist, rate, beyond in zip(new.twist, by_pose, FAR_BEYOND, strict=True)
+        ):
+            self._count = min(self._count + 1, UNITS_MOST)
+            self.example = (
+                f'{new.twist.linear:.3g} m/s and {new.twist.angular:.3g} rad/s, where its pose '
+                f'says {by_pose[0]:.3g} and {by_pose[1]:.3g}'
+            )
+        elif any(abs(rate) > least for rate, least in zip(by_pose, UNITS_MOTION, strict=True)):
+            self._count = max(self._count - 1, 0)
+        self.wrong = self._count >= UNITS_COUNT or (self.wrong and self._count > 0)
+
+
+HELD_MOST, HELD_MEMORY = 0.25, 0.97
+"""Longest time for which a robot that drives may have one pose (s); share of the longest time of
+late that is kept with each other pose."""
+LATENESS_SHARE = 0.1  # share by which the lateness of the speeds follows each new pose
+
+
+class PoseSpeeds:
+    """Speeds by the pose, that of a camera for example, which stays the same in some messages."""
+
+    def __init__(self) -> None:
+        self.held = 0.0  # longest time of late for which the pose stayed the same, s
+        self.lateness = 0.0
+        """Time by which the speeds are later than those of a pose that is new each time, s."""
+        self.holds = False  # whether it is so as a rule
+        self._from: State | None = None
+        self._speeds = STANDSTILL
+
+    def update(self, new: State, elapsed: float | None) -> BodyTwist:
+        """Return the speeds, ``elapsed`` s after the last message; None: it is the first one."""
+        last = self._from
+        if elapsed is None or last is None:
+            self._from, self._speeds = new, STANDSTILL
+            return STANDSTILL
+        time = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
+        # Not at single messages: a robot that creeps in steps of its pose has moved meanwhile.
+        self.holds = self.lateness > 0.5 * elapsed
+        if new.pose == last.pose:
+            if not self.holds or time > self.held - 0.5 * elapsed:
+                self._speeds = STANDSTILL
+            return self._speeds
+        if time < HELD_MOST:
+            self.held = max(HELD_MEMORY * self.held, time)
+            self.lateness += LATENESS_SHARE * (time - elapsed - self.lateness)
+        else:  # it stood
+            time = self.held
+        if not self.holds:
+            time = elapsed
+        ahead, _, turn = motion_between(last.pose, new.pose)
+        self._from, self._speeds = new, BodyTwist(ahead / time, turn / time)
+        return self._speeds
+
+
+class OdometryTwist:
+    """The twist of the odometry, or what the change of its pose says where it cannot be right.
+
+    Some robots publish a pose only. Their twist of zero would be a robot that does not follow.
+    """
+
+    def __init__(self) -> None:
+        self.missing = False
+        """Whether the odometry has no twist: speeds are differences of its pose."""
+        self.known = False  # whether it ever had one
+        self._fit = TwistFit()
+        self._by_pose = PoseSpeeds()
+        self._units = TwistUnits()
+        self._anchor: Pose | None = None
+        """Pose of the first message with a twist of zero since the last other one."""
+        self._last: State | None = None
+
+    @property
+    def replaced(self) -> bool:
+        """Whether the twist that is used is not the one that was received."""
+        fit = self._fit
+        return self.missing or self._units.wrong or fit.factor != 1.0 or bool(fit.wrong)
+
+    @property
+    def lateness(self) -> float:
+        """Time by which speeds by a held pose are late, s."""
+        replaced = self.missing or self._units.wrong
+        return self._by_pose.lateness if replaced and self._by_pose.holds else 0.0
+
+    def problem(self) -> str:
+        """Return what is wrong with the twist, and the remedy; '' if nothing is."""
+        if self.missing:
+            by_pose = self._by_pose
+            held = f', each of which lasts for {by_pose.held:.2g} s' if by_pose.holds else ''
+            return f'odom has no twist: its poses are differentiated{held}; publish the twist'
+        if self._units.wrong:
+            return (
+                f'the twist in odom cannot be in m/s and rad/s: {self._units.example}; its poses '
+                'are differentiated: correct the units in the driver of the robot, or see why its '
+                'wheels spin'
+            )
+        if self._fit.wrong:
+            return (
+                f'the twist in odom is wrong: {self._fit.wrong} the change of its pose, which is '
+                'used in its place: correct the velocities in the driver of the robot, or see why '
+                'its wheels spin'
+            )
+        if self._fit.factor == 1.0:
+            return ''
+        return (
+            f'the twist in odom is {self._fit.factor:.3f} times the change of its pose, it is '
+            'divided by that: correct radius or units of the wheels in the driver of the robot'
+        )
+
+    def measured(self, odometry: State, *, restart: bool) -> State:
+        """Return an odometry with its twist; a ``restart`` follows no message before it."""
+        if not odometry.is_finite():
+            return odometry
+        pose, last, self._last = odometry.pose, self._last, odometry
+        if last is None or restart or odometry.stamp_ns <= last.stamp_ns:
+            last = None
+        motion = None if last is None else motion_between(last.pose, pose)
+        elapsed = None if last is None else (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
+        by_pose = self._by_pose.update(odometry, elapsed)
+        if odometry.twist != (0.0, 0.0):
+            self.missing, self._anchor, self.known = False, None, True
+            if last is not None and motion is not None:
+                self._units.update(last, odometry, motion)
+        else:
+            if last is None or elapsed is None or self._anchor is None:
+                self._anchor = pose
+            else:
+                farthest = (2.0 * elapsed * speed for speed in UNKNOWN_TWIST)
+                if has_moved(last.pose, pose, *farthest):  # it cannot have driven so far
+                    # That of the next message: this one may be the only one so far off.
+                    self._anchor = None
+            if self._anchor is not None:
+                self.missing = self.missing or has_moved(self._anchor, pose, MOVED, TURNED)
+        if last is None or motion is None or self.missing or self._units.wrong:
+            self._fit.interrupt()
+        elif self.known:
+            self._fit.update(odometry)
+        replaces = [self.missing or self._units.wrong] * 2
+        if not any(replaces) and self._fit.wrong:
+            replaces = self._fit.uses_pose
+        if any(replaces):
+            if last is None:  # the pose says nothing of the speed: a restart
+                return odometry._replace(twist=STANDSTILL)
+            used = zip(replaces, by_pose, odometry.twist, strict=True)
+            return odometry._replace(
+                twist=BodyTwist(*(speed if by_it else given for by_it, speed, given in used))
+            )
+        factor = self._fit.factor
+        if factor == 1.0:
+            return odometry
+        linear, angular = odometry.twist
+        return odometry._replace(twist=BodyTwist(linear / factor, angular / factor))

@@ -1,0 +1,336 @@
+# Copyright 2026 The t3mpc_ros developers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""The twist of the odometry beside the change of its pose: what is found, replaced, and left."""
+
+import math
+
+import numpy as np
+import pytest
+
+from t3mpc_ros.control.odometry_repair import OdometryTwist
+from t3mpc_ros.geometry.kinematics import advance_pose
+from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist, Pose, State
+
+MS = 1_000_000
+
+
+def test_a_message_that_is_not_finite_keeps_the_twist_missing():
+    """One bad message once made the controller look for a twist again, for a centimetre."""
+    twist = OdometryTwist()
+    found = []
+    for k in range(30):
+        at = Pose(math.nan if k == 20 else 0.002 * k, 0.0, 0.0)
+        measured = twist.measured(State(k * 10 * MS, at, STANDSTILL), restart=k == 0)
+        found.append(measured.twist.linear)
+    assert found[:6] == [0.0] * 6
+    assert found[20] == 0.0
+    assert found[7:20] + found[21:] == pytest.approx([0.2] * 22)
+
+
+@pytest.mark.parametrize('hold', [1, 3, 5])
+def test_poses_that_are_held_are_differentiated_over_the_hold(hold):
+    """Speeds were zero and five times the true one by turns: *free the wheels*."""
+    twist, found = OdometryTwist(), []
+    for k in range(400):
+        way = 0.002 * (min(k, 300) // hold * hold)
+        state = State(k * 10 * MS, Pose(way, 0.0, 0.0), STANDSTILL)
+        found.append(twist.measured(state, restart=k == 0).twist)
+    assert np.array(found[50:300]) == pytest.approx(np.array([[0.2, 0.0]] * 250))
+    assert found[300 + 2 * hold :] == [STANDSTILL] * (100 - 2 * hold)
+    assert twist.lateness == pytest.approx(0.01 * (hold - 1), abs=1e-4)
+    assert ('each of which lasts for' in twist.problem()) == (hold > 1)
+
+
+START, ASIDE, FAR = Pose(0.0, 0.0, 0.0), Pose(0.02, 0.0, 0.0), Pose(0.5, 0.2, 0.0)
+
+
+@pytest.mark.parametrize(
+    ('poses', 'restart'),
+    [
+        ([place] * 5 + [START] * 5, None)  # it was set at rest
+        for place in (ASIDE, FAR, Pose(0.0, 0.0, 2.9))
+    ]
+    + [([FAR] * 5 + [START] * 5, 5)]  # or in a gap
+    + [([START] * 5 + [Pose(0.0105, 0.0, 0.0)] + [Pose(0.001, 0.0, 0.0)] * 5, None)],  # far off
+)
+def test_a_pose_that_is_set_is_no_twist_that_is_missing(poses, restart):
+    """After ``reset_odometry`` 'odom has no twist' was said, and 'state is diverging'."""
+    twist = OdometryTwist()
+    for k, pose in enumerate(poses):
+        state = State(k * 10 * MS, pose, STANDSTILL)
+        assert twist.measured(state, restart=k in (0, restart)) == state
+    assert not twist.problem()
+
+
+# -- a twist that does not fit to the pose --------------------------------------------------------
+
+
+def twists_of(
+    motion, *, factors=(1.0, 1.0), noise=0.0, seconds=20.0, seed=1, moved=lambda k, pose: pose
+):
+    """Return twist monitor and used twists of a drive; ``motion``: twist by time (s)."""
+    generator, twist, used = np.random.default_rng(seed), OdometryTwist(), []
+    x = y = yaw = 0.0
+    before = np.zeros(2)
+    for k in range(round(100 * seconds)):
+        true = np.array(motion(0.01 * k))
+        linear, angular = 0.5 * (before + true) * (0.01 if k else 0.0)
+        middle = yaw + 0.5 * angular
+        x, y = x + linear * math.cos(middle), y + linear * math.sin(middle)
+        yaw, before = yaw + angular, true
+        measured = true * factors + noise * generator.standard_normal(2)
+        state = State(k * 10 * MS, moved(k, Pose(x, y, yaw)), BodyTwist(*measured.tolist()))
+        used.append(twist.measured(state, restart=k == 0).twist)
+    return twist, np.array(used)
+
+
+def winding(time):
+    return 0.15 + 0.1 * math.sin(1.3 * time), 1.2 * math.sin(0.9 * time)
+
+
+DRIVES = {
+    'winding': winding,
+    'straight': lambda time: (0.2, 0.0),
+    'on the spot': lambda time: (0.0, 1.0),
+    'to and fro': lambda time: (0.2 * math.sin(2.0 * time), 0.0),
+}
+
+
+@pytest.mark.parametrize('factor', [0.5, 0.94, 1.06])
+@pytest.mark.parametrize('drive', ['winding', 'to and fro'])
+def test_a_twist_of_another_scale_is_divided_by_it(drive, factor):
+    """A twist 10 % too large made the settled error 1.5 times that of a simple method."""
+    twist, used = twists_of(DRIVES[drive], factors=(factor, factor), noise=0.005)
+    assert f'{factor:.2f}'[:3] in twist.problem()
+    true = np.array([DRIVES[drive](0.01 * k) for k in range(len(used))])
+    assert np.abs(used[500:] - true[500:]).mean() < 0.01
+    assert np.abs(used[:150] / factor - true[:150]).mean() < 0.01  # before it is known
+
+
+@pytest.mark.parametrize('drive', list(DRIVES))
+@pytest.mark.parametrize('seed', range(2))
+def test_a_twist_that_fits_is_used_as_it_is(drive, seed):
+    twist, _ = twists_of(DRIVES[drive], noise=0.02, seed=seed, seconds=30.0)
+    assert not twist.replaced
+    assert twist.problem() == ''
+
+
+def _corrected(k, pose):
+    ahead = 0.02 * math.sin(0.5 * math.tau * k / 100.0)
+    there = ahead * math.cos(pose.yaw), ahead * math.sin(pose.yaw)
+    return Pose(pose.x + there[0], pose.y + there[1], pose.yaw)
+
+
+MOVED = {
+    'by up to a fifth of the way, forward and back': _corrected,
+    'by a jump': lambda k, pose: pose._replace(x=pose.x + (k >= 600)),
+    'by a jump, twice a second': lambda k, pose: pose._replace(x=pose.x + 0.15 * (k // 50)),
+    # In the frame of its pose the robot then goes aside: 1.058, and six times the error.
+    'by its yaw': lambda k, pose: pose._replace(yaw=pose.yaw - 0.5 * (k >= 600)),
+    'by half a turn': lambda k, pose: pose._replace(yaw=pose.yaw + 1.5 * (k >= 600)),
+}
+
+
+@pytest.mark.parametrize('moved', MOVED)
+@pytest.mark.parametrize('drive', ['winding', 'straight'])
+def test_a_pose_that_a_localisation_moves_is_no_factor(drive, moved):
+    twist, _ = twists_of(DRIVES[drive], noise=0.005, moved=MOVED[moved], seconds=30.0)
+    assert not twist.replaced
+
+
+def test_a_factor_of_the_yaw_rate_alone_is_left():
+    """Gyro and wheels differ on a robot whose geometry is wrong: the body correction learns it."""
+    for drive in ('winding', 'on the spot'):
+        twist, _ = twists_of(DRIVES[drive], factors=(1.0, 1.1))
+        assert not twist.replaced
+
+
+@pytest.mark.parametrize('step', [-0.09, 0.09])
+@pytest.mark.parametrize('speed', [0.01, 0.03])
+def test_a_slow_robot_whose_pose_is_set_has_no_factor(speed, step):
+    """Its speed was taken for up to thirteen times what it was, in the state *tracking*."""
+    _, used = twists_of(
+        lambda time: (speed, 0.0),
+        seconds=60.0,
+        moved=lambda k, pose: Pose(pose.x + step * (k >= 600), pose.y, pose.yaw),
+    )
+    assert (used[:, 0] == speed).all()
+
+
+@pytest.mark.parametrize(
+    ('drive', 'factors'),
+    [
+        ('winding', (1000.0, 1.0)),
+        ('winding', (1.0, 57.3)),
+        ('to and fro', (1000.0, 57.3)),
+        ('to and fro', (100.0, 100.0)),
+    ],
+)
+def test_a_twist_in_other_units_is_replaced_by_the_pose(drive, factors):
+    """The robot jerked: *diverging* and *tracking* took turns, and nothing told why."""
+    twist, used = twists_of(DRIVES[drive], factors=factors, noise=0.005)
+    assert 'cannot be in m/s and rad/s' in twist.problem()
+    true = np.array([DRIVES[drive](0.01 * k) for k in range(len(used))])
+    assert np.abs(used[300:] - true[300:]).max() < 0.03
+
+
+@pytest.mark.parametrize('rate', [4, 20])
+def test_a_fast_robot_with_a_slow_camera_has_its_own_twist(rate):
+    """The pose is that of the last picture; in the next one it has moved far."""
+    held = []
+
+    def seen(k, pose):
+        if k % rate == 0:
+            held[:] = [pose]
+        return held[0]
+
+    twist, used = twists_of(lambda time: (2.0, 3.0 * math.sin(time)), moved=seen, noise=0.05)
+    assert not twist.replaced
+    assert np.abs(used[:, 0] - 2.0).max() < 0.3
+
+
+def straight(count, factor, restart=(), missing=lambda k: False):
+    """Return twist monitor and used speeds at 0.2 m/s, with ``factor(k)`` times the twist."""
+    twist, found = OdometryTwist(), []
+    for k in range(count):
+        if not missing(k):
+            state = State(k * 10 * MS, Pose(0.002 * k, 0.0, 0.0), BodyTwist(0.2 * factor(k), 0.0))
+            found.append(twist.measured(state, restart=k == 0 or k in restart).twist.linear)
+    return twist, found
+
+
+def test_a_twist_in_other_units_is_not_used_after_a_gap():
+    """The first message after each gap had its twist of 200 m/s: the robot stopped for 0.5 s."""
+    _, found = straight(100, lambda k: 1000.0, restart=(50,))
+    assert found[50] == 0.0
+    assert found[51:] == pytest.approx([0.2] * 49)
+
+
+def test_a_twist_that_is_repaired_is_used_again():
+    twist, found = straight(2000, lambda k: 1000.0 if k < 500 else 1.0)
+    assert found[12:] == pytest.approx([0.2] * len(found[12:]))
+    assert not twist.replaced
+    twist, found = straight(9000, lambda k: 1.2 if k < 1500 else 1.0)
+    assert [found[1000], found[-1]] == pytest.approx([0.2, 0.2])
+    assert not twist.replaced
+
+
+def test_messages_that_are_missing_are_not_compared():
+    """Across a gap twist and pose say nothing of each other."""
+    twist, _ = straight(2000, lambda k: 1.0, range(0, 2000, 20), lambda k: k % 20 >= 2)
+    assert not twist.replaced
+
+
+def turning(time):
+    return 0.1 + 0.08 * math.sin(2.5 * time), 0.7 + 0.5 * math.sin(0.9 * time)
+
+
+def delayed(steps):
+    def changed(k, pose, history):
+        return history[max(k - steps, 0)]
+
+    return changed
+
+
+WRONG = {
+    'offset': (lambda k, pose, h: (h[k][0] + 0.01, h[k][1] + 0.05), 'velocity is +0.0'),
+    'one velocity too large': (
+        lambda k, pose, h: (1.1 * h[k][0], h[k][1]),
+        'linear velocity is 1.',
+    ),
+    'one period late': (delayed(1), 's behind'),
+    '50 ms late': (delayed(5), '0.05'),
+    'of every fifth message': (lambda k, pose, h: h[k - k % 5], 's behind'),
+    'of every second message': (
+        lambda k, pose, h: h[k] if k % 2 else (0.0, 0.0),
+        'does not follow',
+    ),
+    'of the world': (
+        lambda k, pose, h: (h[k][0] * math.cos(pose.yaw), h[k][1]),
+        'does not follow',
+    ),
+    'no yaw rate': (lambda k, pose, h: (h[k][0], 0.0), 'angular velocity is'),
+    'reversed': (lambda k, pose, h: (-h[k][0], -h[k][1]), 'linear velocity is -'),
+}
+
+
+def contradicted(changed, *, seed=1, seconds=20.0, noise=(0.005, 0.06), moved=None):
+    """Return twist monitor and the errors of the used twists, of a drive with a false twist."""
+    generator, twist, errors = np.random.default_rng(seed), OdometryTwist(), []
+    pose, history = START, []
+    for k in range(round(100 * seconds)):
+        history.append(turning(0.01 * k))
+        pose = advance_pose(pose, BodyTwist(*history[-1]), 0.01)
+        given = np.array(changed(k, pose, history))
+        given = given + noise * generator.standard_normal(2) * (given != 0.0)
+        seen = pose if moved is None else moved(k, pose, generator)
+        used = twist.measured(
+            State(k * 10 * MS, seen, BodyTwist(*given.tolist())), restart=k == 0
+        ).twist
+        errors.append(np.array(used) - history[-1])
+    return twist, np.array(errors)
+
+
+@pytest.mark.parametrize('fault', WRONG)
+@pytest.mark.parametrize('seed', range(3))
+def test_a_twist_that_the_pose_contradicts_is_replaced(fault, seed):
+    """Dead time and gains were learnt from it: up to 107 times the error of a simple method."""
+    changed, text = WRONG[fault]
+    twist, errors = contradicted(changed, seed=seed)
+    assert text in twist.problem()
+    assert twist.problem().startswith('the twist in odom is wrong: its ')
+    assert np.abs(errors[-500:]).max(axis=0) == pytest.approx([0.0, 0.0], abs=0.01)
+
+
+SEEN = {
+    'as it is': lambda k, pose, generator: pose,
+    '100 ms later': lambda k, pose, generator: pose,
+    'noise': lambda k, pose, generator: Pose(
+        *(np.array(pose) + generator.standard_normal(3) * (0.005, 0.005, 0.01)).tolist()
+    ),
+    'ten times a second': None,
+    'corrected twice a second': lambda k, pose, generator: Pose(
+        pose.x + 0.008 * (k // 50 % 2), pose.y - 0.01 * (k // 50 % 3), pose.yaw + 0.02 * (k // 100)
+    ),
+    'of a gyro with 3 % and a bias': lambda k, pose, generator: pose._replace(
+        yaw=1.03 * pose.yaw + 0.0005 * k
+    ),
+}
+
+
+@pytest.mark.parametrize('seen', SEEN)
+@pytest.mark.parametrize('seed', range(3))
+def test_a_pose_that_is_late_or_rough_replaces_no_twist(seen, seed):
+    """Of the two the earlier and the smoother one is used, and gyros are left to the body."""
+    poses, change = [], SEEN[seen]
+
+    def moved(k, pose, generator):
+        poses.append(pose)
+        if change is None:
+            return poses[k - k % 10]
+        late = 10 if seen.startswith('100 ms') else 0
+        return change(k, poses[max(k - late, 0)], generator)
+
+    twist, _ = contradicted(delayed(0), seed=seed, seconds=30.0, moved=moved)
+    assert not twist.replaced
+    assert twist.problem() == ''
+
+
+def test_a_twist_that_was_wrong_is_used_again():
+    """After ten seconds of driving in which it fits."""
+    twist, errors = contradicted(
+        lambda k, pose, h: (h[k][0] + 0.02 * (k < 1000), h[k][1]), seconds=60.0
+    )
+    assert np.abs(errors[500:1000]).max() < 0.01
+    assert not twist.replaced
