@@ -37,7 +37,7 @@ CONTENTS = {
     'text': b'hello',
     'a list': b'- 1\n- 2\n',
     'tabs': b'a:\t- b\n\t c',
-    'brackets': b'[' * 1500,
+    'brackets': b'[' * 700,
     'a date': b'/**: {ros__parameters: {link: 2024-99-99}}',
     'nothing below': b'/**:\n',
     'a list below': b'/**: {ros__parameters: {link: [1, 2]}}\n/robot_board: [3]\n',

@@ -29,7 +29,7 @@ BAD = {
     b'name: \x07': 'is not YAML: ',
     b'name: 2026-13-45': 'is not YAML: month must be in 1..12',
     b'name: !!int ""': 'is not YAML: ',
-    b'name: ' + 5000 * b'[': 'is not YAML: maximum recursion depth exceeded',
+    b'name: ' + 700 * b'[': 'is not YAML: maximum recursion depth exceeded',
     b'!!python/object:os.system {}': 'is not YAML: line 1: could not determine a constructor',
     b'walls: !!map [1]': 'is not YAML: line 1: expected a mapping node',
     b'- at: 1\n  for: 2\n  at: 3\n': 'line 3: at is given twice in one entry; a new entry of a ',
