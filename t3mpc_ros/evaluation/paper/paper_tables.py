@@ -21,7 +21,7 @@ from t3mpc_ros.evaluation.confidence_intervals import format_interval, interval,
 from t3mpc_ros.evaluation.experiment import ResultTable
 from t3mpc_ros.evaluation.methods import FULL
 from t3mpc_ros.evaluation.paper.study import PAPER_NOISE, STAGES, WITHOUT
-from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, columns_of
+from t3mpc_ros.evaluation.reporting import EMPTY_CELL, Table, columns_of, finite
 from t3mpc_ros.evaluation.result_file import Row
 
 SITUATION = ('drive', 'noise', 'case')
@@ -102,13 +102,10 @@ def label(row: Row) -> str:
 
 def csv_columns(rows: Sequence[Row]) -> dict[str, list[object]]:
     """Return the columns of the CSV file, by the keys of the JSON; empty if not finite."""
-    return {name: list(map(_csv_cell, values)) for name, values in columns_of(rows).items()}
-
-
-def _csv_cell(value: object) -> object:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value).lower() if isinstance(value, bool) else value
+    return {
+        name: [str(each).lower() if isinstance(each, bool) else finite(each) for each in values]
+        for name, values in columns_of(rows).items()
+    }
 
 
 def comparison(results: Results, drive: str, *, settled: bool = False) -> Table:
