@@ -41,7 +41,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from t3mpc_ros.control.controller import Controller
-from t3mpc_ros.control.odometry_plausibility import InputMonitor
+from t3mpc_ros.control.odometry_monitor import OdometryMonitor
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import loop
 from t3mpc_ros.evaluation.cases import NO_FAULTS, LinkFaults
@@ -259,7 +259,7 @@ class WatchedDriver(NodeDriver):
         super().__init__(inner, scenario.true_robot().geometry, scenario.reference().speeds)
         self._controller = Controller(parameters)
         self._controller.warm_up()
-        self._monitor = InputMonitor(parameters.rate)
+        self._monitor = OdometryMonitor(parameters.rate)
         self._command: BodyTwist | None = None
         self._now_ns, self._ignored = 0, 0
         self.said: list[tuple[float, str]] = []

@@ -35,7 +35,7 @@ from t3mpc_ros.control.controller import (
     Status,
     StepperControllerParameters,
 )
-from t3mpc_ros.control.odometry_plausibility import NAMES, InputMonitor
+from t3mpc_ros.control.odometry_monitor import NAMES, OdometryMonitor
 from t3mpc_ros.control.watchdog import TRIALS, Reason, StopHistory
 from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, STANDSTILL, BodyTwist
@@ -149,7 +149,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         self._load_model()
         self._last_odometry_ns: int | None = None
         self._received_ns = self._stamp_ns = 0
-        self._input_monitor = InputMonitor(self.parameters.rate)
+        self._odometry_monitor = OdometryMonitor(self.parameters.rate)
         self._last_command: BodyTwist | None = None
         self._steps = 0
         self._rejected_references = 0
@@ -267,7 +267,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         known = None if self._controller.odometry_twist.replaced else self._last_command
         following = status.reason is Reason.TRACKING
         if not self._controller.doubts_odometry:
-            self._input_monitor.update(measured, self.now_ns(), known, following=following)
+            self._odometry_monitor.update(measured, self.now_ns(), known, following=following)
         self._last_command = command if status.reason.moves else None
         self._publish_journal(self._journal.step(measured.stamp_ns))
         self._initial_odometry.republish(message)
@@ -446,7 +446,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
 
     def _input_values(self) -> dict[str, object]:
         """Return the gaps and jumps of the odometry, and the gains of the response."""
-        monitor = self._input_monitor
+        monitor = self._odometry_monitor
         gaps = monitor.gaps
         values: dict[str, object] = {
             'odometry_rate_hz': gaps.rate,
@@ -467,7 +467,7 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
     def warnings(self) -> list[str]:
         """Return what does not fit in the odometry or in its response to the commands."""
         simulated = self.get_clock().ros_time_is_active
-        found = self._input_monitor.warnings(
+        found = self._odometry_monitor.warnings(
             simulated_time=simulated,
             tolerated_gap=0.5 * self.parameters.watchdog.odometry_timeout,
             geometry=self.parameters.geometry,

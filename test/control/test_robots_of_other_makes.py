@@ -42,7 +42,7 @@ from t3mpc_ros.control.actuation import (
 )
 from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.jump_transition import CommandLimit
-from t3mpc_ros.control.odometry_plausibility import InputMonitor
+from t3mpc_ros.control.odometry_monitor import OdometryMonitor
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation.process_replay.controller_replay import load_inputs, replay_controller
 from t3mpc_ros.geometry.kinematics import wheels_from_twist
@@ -259,7 +259,7 @@ def follow(file, rate, lag, dead_time):
     given = {'rate': rate, 'seed': 1, 'amplitude': amplitude}
     generator = ChaoticReference(ReferenceParameters.from_dict(given), geometry)
     robot = VelocityRobot(geometry.wheel_radius, 2 * geometry.half_separation, lag, dead_time)
-    monitor = InputMonitor(controller.parameters.rate)
+    monitor = OdometryMonitor(controller.parameters.rate)
     half = geometry.half_separation
     wheels = np.array([[1.0, half], [1.0, -half]]) / geometry.wheel_radius
     references, speeds, reasons, command = [], [], set(), None

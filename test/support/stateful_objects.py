@@ -923,7 +923,14 @@ NEVER_RESET = {
     **dict.fromkeys(('RadioChannel', 'Medium', '_Exchange'), 'one emulator, never reset'),
     **dict.fromkeys(('PtyPort', '_ConsolePort', 'StopTimeMonitor'), 'one process, never reset'),
     **dict.fromkeys(
-        ('InputMonitor', 'Gaps', 'ResponseGain', 'GivenPathSource', 'SmoothedPath', 'PauseRamp'),
+        (
+            'OdometryMonitor',
+            'Gaps',
+            'ResponseGain',
+            'GivenPathSource',
+            'SmoothedPath',
+            'PauseRamp',
+        ),
         'made anew for each run or path',
     ),
     **dict.fromkeys(

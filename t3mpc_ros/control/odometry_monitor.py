@@ -11,7 +11,7 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Whether odometry, clock and response fit: gaps, late messages, jumps, rate, gain."""
+"""Monitor of the odometry: gaps, late messages, jumps, rate, clock, and gain of the response."""
 
 from collections import deque
 import math
@@ -225,7 +225,7 @@ class Gaps:
         return ((self._last_ns or stamp_ns) - stamp_ns) / NANOSECONDS
 
 
-class InputMonitor:
+class OdometryMonitor:
     """Collects stamps of the odometry, and measured velocities with their commands.
 
     The results are for diagnostics only; they change no command. ``rate``: set rate, Hz.

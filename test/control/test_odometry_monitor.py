@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from support.long_tests import few_of
 
-from t3mpc_ros.control.odometry_plausibility import MANY_JUMPS, RECENT, Gaps, InputMonitor
+from t3mpc_ros.control.odometry_monitor import MANY_JUMPS, RECENT, Gaps, OdometryMonitor
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import (
     NANOSECONDS,
@@ -39,7 +39,7 @@ class Drive:
     """A robot with dead time, lag, gains and noise, and a monitor of its odometry."""
 
     def __init__(self, rate=100.0, seed=1, gains=(1.0, 1.0), dead_time=0.03, lag=0.05, **more):
-        self.monitor = InputMonitor(rate)
+        self.monitor = OdometryMonitor(rate)
         self._random = np.random.default_rng(seed)
         self._gains, self._delay = gains, round(dead_time * 1000)
         self._period = round(1000 / more.pop('real_rate', rate))
@@ -305,7 +305,7 @@ def test_without_a_twist_a_turn_on_the_spot_is_no_jump(period):
 
 def test_a_robot_that_only_stands_and_noise_say_nothing():
     """With commands of zero the prior remains, and no warning."""
-    made, random = InputMonitor(100.0), np.random.default_rng(3)
+    made, random = OdometryMonitor(100.0), np.random.default_rng(3)
     for step in range(3000):
         twist = BodyTwist(*(0.01 * random.standard_normal(2)).tolist())
         state = State(step * 10_000_000, Pose(0.0, 0.0, 0.0), twist)
