@@ -90,6 +90,13 @@ NEW_FOR, JUST_SEEN = 2.0, 0.3
 """Time for which a thing has come, and may move on (s), and time for which floor around it that
 was seen to be free is so (s)."""
 CLEARINGS = 4  # rays that must pass over an occupied cell to clear it
+ALONE = 100
+"""That number for a cell that one reading alone has marked on free floor: the next ray over it
+clears it."""
+SUPPORTED_FOR, SUPPORTED_WITHIN = 0.3, 0.1
+"""Time (s) for which the last hit of a sensor supports the next one, and their difference without
+the errors of both (m): of one who walks, or of an edge that a beam sweeps over; at the end of its
+range a sensor sees a leg in one reading of three."""
 DIRECTIONS = 48  # directions among which a detour is chosen
 TURNING_SPEED = 0.02  # speed below which the robot may turn in any direction, m/s
 SECTORS = 16  # sectors around the robot, each with its nearest unsafe cell
@@ -192,6 +199,7 @@ class FreeSpaceMap:
         self.now = 0.0  # time since then, s
         self.last_come = -math.inf
         """Time of the last reading of a thing that had come, s; see :func:`has_come`."""
+        self._hits = [(0.0, -math.inf)] * len(self._mounts)  # last hit of each sensor, m and s
         self.grid.cells[:] = UNKNOWN
         self.grid.cleared[:] = 0
         self.grid.seen[:] = 0.0
@@ -226,9 +234,10 @@ class FreeSpaceMap:
             for axis in (1, 0)
         )
         cells, oldest = grid.cells[rows, columns], self.now - self.parameters.memory + ENDING
+        alone = (cells == OCCUPIED) & (grid.cleared[rows, columns] >= ALONE)
         found = np.full(cells.shape, -1, dtype=np.int8)
-        found[(cells == FREE) & (grid.seen[rows, columns] >= oldest)] = 0
-        found[cells >= OCCUPIED] = 100
+        found[((cells == FREE) | alone) & (grid.seen[rows, columns] >= oldest)] = 0
+        found[(cells >= OCCUPIED) & ~alone] = 100
         low, size = grid.low, grid.size
         return OccupancyGrid(found, size, low + size * columns.start, low + size * rows.start)
 
@@ -298,6 +307,12 @@ class FreeSpaceMap:
         near = reading == -math.inf
         hit = 0.0 if near else min(reading, limit)
         error = parameters.error_floor + parameters.error_growth * hit * hit
+        last, at = self._hits[sensor]
+        supported = (
+            self.now - at < SUPPORTED_FOR and abs(hit - last) < SUPPORTED_WITHIN + 2.0 * error
+        )
+        if near or reading < limit:
+            self._hits[sensor] = hit, self.now
         come = self._add_ray(
             self.grid,
             self.now,
@@ -306,6 +321,7 @@ class FreeSpaceMap:
             0.09 if near else (hit if reading < limit else -1.0),
             parameters.beam_half_width,
             sensor,
+            supported,
         )
         if come:
             self.last_come = self.now
@@ -372,10 +388,12 @@ def add_ray(
     hit: float,
     half_width: float,
     sensor: int,
+    supported: bool,
 ) -> bool:
     """Mark the cells along a ray as free up to ``free`` m, and the one at ``hit`` m as occupied.
 
     Return whether what it met has come, see :func:`has_come`; ``hit`` is below zero for nothing.
+    What one reading alone says has not: no other is near, nor is it ``supported`` by the last.
     """
     low, size = grid.low, grid.size
     count = grid.cells.shape[0]
@@ -414,17 +432,19 @@ def add_ray(
     # Nearer than the sensor measures: only if nothing is known to be there already.
     if hit < 0.1 and has_obstacle(grid.cells, row, column, 4):
         return False
-    come = has_come(grid, now - NEW_FOR, row, column, int(NEW_APART / size))
+    reach = int(NEW_APART / size)
+    new = has_come(grid, now - NEW_FOR, row, column, reach)
+    come = new and (supported or has_obstacle(grid.cells, row, column, reach))
     if come and hit < NEW_WITHIN:
         forget_around(grid, now - JUST_SEEN, row, column, int(NEW_EXTENT / size))
     if grid.cells[row, column] != OCCUPIED:
         grid.author[row, column] = sensor
-        if come and grid.seen[row, column] < now - NEW_FOR:
+        if new and grid.seen[row, column] < now - NEW_FOR:
             grid.seen[row, column] = now  # it has come now: nothing near it is old for that
     elif grid.author[row, column] != sensor and grid.seen[row, column] < now - NEW_FOR:
         grid.author[row, column] = SEVERAL
     grid.cells[row, column] = OCCUPIED
-    grid.cleared[row, column] = 0
+    grid.cleared[row, column] = ALONE if new and not come else 0
     return come
 
 
