@@ -208,6 +208,7 @@ def test_a_bias_and_wrong_wheels_are_told_apart():
     assert abs(body.correction.estimate[BIAS] - 0.1) < 0.01
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('late', [-0.02, 0.03])
 def test_a_wrong_delay_is_no_geometry(late):
     body = Body(exact, noise=0.01)
@@ -413,6 +414,7 @@ def test_microsteps_are_no_rough_yaw_rate():
         assert ('is rough' in body.correction.response_problem()) is named
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('noise', [0.1])
 def test_noise_of_the_yaw_is_no_scale_of_the_gyro(noise):
     """A patrol by the map turned 4 % too far after 200 s: corrections of its pose are noise.
@@ -429,6 +431,7 @@ def test_noise_of_the_yaw_is_no_scale_of_the_gyro(noise):
     assert 'scale of the gyro' not in body.correction.problem()
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('seed', [1, 4, 5])
 def test_noise_of_the_gyro_is_neither_bias_nor_geometry(seed):
     """With 0.1 rad/s in each sample the robot was corrected by noise: 3.5 times the error."""

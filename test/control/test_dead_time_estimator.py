@@ -146,6 +146,7 @@ def test_dead_time_and_lag_are_identified_as_a_sum():
     np.testing.assert_allclose(sums, 0.05, atol=0.002)
 
 
+@pytest.mark.compiled
 def test_evidence_is_that_of_the_deviations_between():
     """2 log of the likelihood ratio is the square of the number of standard deviations."""
     for seed in range(3):
@@ -217,6 +218,7 @@ def test_more_noise_than_assumed_is_learnt(assumed, variance):
     assert np.mean(others) < 0.1
 
 
+@pytest.mark.compiled
 def test_noise_is_learnt_as_fast_after_an_exact_standstill():
     """Nothing changes while the robot stands; the median was ever smaller, and 0 after 6 min."""
     drive = simulate(smooth_commands(20.0, 1, 2.0), 0.01, 1)
@@ -265,6 +267,7 @@ def test_a_change_is_adopted_within_8_s(change, sign):
         assert not record[at(39.0) :, 2].any()
 
 
+@pytest.mark.compiled
 def test_gaps_in_the_odometry_are_no_disturbance():
     """The robot keeps its command while a message is lost, and the model does, too."""
     drive = simulate(smooth_commands(40.0, 70), 0.0, 70)
