@@ -61,7 +61,7 @@ from t3mpc_ros.evaluation.record import RATE, measure, stamp_of
 from t3mpc_ros.evaluation.reporting import replace_section
 from t3mpc_ros.evaluation.result_file import Row
 from t3mpc_ros.evaluation.scenario import OwnParts, Scenario
-from t3mpc_ros.geometry.types import STANDSTILL, BodyTwist
+from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, BodyTwist, State
 from t3mpc_ros.robot.interface import RobotState
 from t3mpc_ros.simulation.fault_injection import FaultEvent
 
@@ -107,14 +107,31 @@ class Fault:
     """Simple methods that get the same false information."""
 
 
-def with_twist(change: Callable[[BodyTwist], BodyTwist]) -> Send:
-    """Return a fault of the twist in each report."""
+def with_odometry(changed: Callable[[int, State], Mapping[str, Any]]) -> Send:
+    """Return a fault of the odometry in each report, by its number."""
 
     def send(link: Any, k: int, state: RobotState) -> list[RobotState]:
         odometry = state.odometry
-        return [state._replace(odometry=odometry._replace(twist=change(odometry.twist)))]
+        return [state._replace(odometry=odometry._replace(**changed(k, odometry)))]
 
     return send
+
+
+def with_twist(change: Callable[[BodyTwist], BodyTwist]) -> Send:
+    """Return a fault of the twist in each report."""
+    return with_odometry(lambda k, odometry: {'twist': change(odometry.twist)})
+
+
+def jittering(k: int, odometry: State) -> Mapping[str, int]:
+    """Return a stamp that is up to 3 ms off."""
+    off = np.random.default_rng(k).uniform(-0.003, 0.003)
+    return {'stamp_ns': odometry.stamp_ns + round(off * NANOSECONDS)}
+
+
+def of_the_world(k: int, odometry: State) -> Mapping[str, BodyTwist]:
+    """Return the velocity along the x axis of the world for that along the robot's."""
+    linear, angular = odometry.twist
+    return {'twist': BodyTwist(linear * math.cos(odometry.pose.yaw), angular)}
 
 
 def with_pose(changed: Callable[[Any, int, Any], Mapping[str, float]]) -> Send:
@@ -159,6 +176,7 @@ FAULTS: Mapping[str, Fault] = {
     ),
     '30 % of the odometry lost': Fault(links=LinkFaults(odometry_loss=0.3)),
     'odometry up to 40 ms late': Fault(links=LinkFaults(odometry_delay=(0.0, 0.04))),
+    'stamps of the odometry off by up to 3 ms': Fault(send=with_odometry(jittering)),
     'odometry 50 ms late': Fault(links=late(0.05)),
     'odometry 100 ms late': Fault(links=late(0.1)),
     'odometry 200 ms late': Fault(links=late(0.2)),
@@ -172,6 +190,19 @@ FAULTS: Mapping[str, Fault] = {
     ),
     'twist of the odometry in degrees/s': Fault(
         send=with_twist(lambda twist: BodyTwist(twist.linear, math.degrees(twist.angular)))
+    ),
+    'twist of the odometry + 0.01 m/s, + 0.05 rad/s': Fault(
+        send=with_twist(lambda twist: BodyTwist(twist.linear + 0.01, twist.angular + 0.05))
+    ),
+    'linear velocity of the odometry + 10 %': Fault(
+        send=with_twist(lambda twist: BodyTwist(1.1 * twist.linear, twist.angular))
+    ),
+    'no yaw rate in the odometry': Fault(
+        send=with_twist(lambda twist: BodyTwist(twist.linear, 0.0))
+    ),
+    'twist of the odometry of the world': Fault(send=with_odometry(of_the_world)),
+    'no twist in every second message': Fault(
+        send=with_odometry(lambda k, odometry: {'twist': STANDSTILL} if k % 2 else {})
     ),
     'yaw rate of the odometry reversed': Fault(
         send=with_twist(lambda twist: BodyTwist(twist.linear, -twist.angular))

@@ -44,7 +44,7 @@ from t3mpc_ros.control.dead_time_estimator import DeadTimeEstimator
 from t3mpc_ros.control.input_shaper import EARLY, HIGHEST, InputShaper, InputShaperParameters
 from t3mpc_ros.control.jump_transition import CommandLimit, JumpTransition, MotorLimit
 from t3mpc_ros.control.keep_out import KeepOut, KeepOutParameters
-from t3mpc_ros.control.odometry_repair import OdometryTwist
+from t3mpc_ros.control.odometry_repair import OdometryTwist, StampFilter
 from t3mpc_ros.control.pose_controller import PoseController, PoseLoopParameters, PoseReference
 from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.control.watchdog import (
@@ -347,6 +347,7 @@ class Controller:
         )
         """Pauses of the commands."""
         self.odometry_twist = OdometryTwist()  # whether the odometry has a twist
+        self.stamp_filter = StampFilter()  # whether its stamps jitter
         self.odometry_used = True
         """Whether the last message was used: not repeated or overtaken, and its stamp no leap."""
         self.status = self._make_status(0, Reason.NO_ODOMETRY)
@@ -386,7 +387,7 @@ class Controller:
             found.append(self._watchdog.divergence())
         if self.keep_out is not None and self._last_stamp_ns is not None:
             found.append(self.keep_out.ranges.problem())
-        found.append(self.odometry_twist.problem())
+        found += [self.stamp_filter.problem(), self.odometry_twist.problem()]
         configured = self.parameters.speed_filter.dead_time
         in_use, lag = self._dead_time, self.parameters.speed_filter.lag
         if self._excess_lag > 0.0 and in_use < -NO_DEAD_TIME:
@@ -412,7 +413,9 @@ class Controller:
                 f'command_shaper.turning_frequency is {frequency:g} Hz: commands are shaped for '
                 'the measured one; set both frequencies'
             )
-        found += [self.body.problem(), self.body.response_problem()]
+        found.append(self.body.problem())
+        if not self.stamp_filter.jitters:  # what is left of it is rough, too
+            found.append(self.body.response_problem())
         return [text for text in found if text]
 
     def get_weights(self) -> dict[str, Array]:
@@ -520,12 +523,14 @@ class Controller:
                 self._stop()
                 self.status = self._make_status(stamp, Reason.DISABLED, self.status.error)
             return self.actuation.twist, self.status
+        stamped, stamp = stamp, self.stamp_filter.time(odometry)
+        odometry = odometry._replace(stamp_ns=stamp)
         last, step_ns = self._last_stamp_ns, self._step_ns
         if last is not None and last < stamp < step_ns + EARLY * self._period_ns:
             return self._wait(odometry)
         restarted = last is not None and stamp < last
         self._last_stamp_ns = self._step_ns = stamp
-        elapsed = self._watchdog.elapsed(stamp)
+        elapsed = self._watchdog.elapsed(stamped)
         twist = self.odometry_twist
         believed = not twist.replaced
         odometry = twist.measured(odometry, restart=elapsed is None)

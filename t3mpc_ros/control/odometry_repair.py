@@ -11,9 +11,10 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""What is wrong with the twist of the odometry, and what is used in its place."""
+"""What is wrong with stamps and twist of the odometry, and what is used in their place."""
 
 import math
+from statistics import median
 
 import numpy as np
 
@@ -28,6 +29,114 @@ from t3mpc_ros.geometry.types import (
     has_moved,
     motion_between,
 )
+
+STAMP_SHARE = 0.05
+"""Share by which a regular time follows each stamp: the mean of jitter over 0.4 s."""
+STAMP_FIRST, STAMP_SETTLING, STAMP_GAP = 15, 60, 20.5
+"""Intervals whose median is the first period, messages until the times are regular, and the
+interval, in periods, from which they begin anew: any number of messages may be missing."""
+STAMP_LATE = 0.3
+"""Part of a period beyond half of it by which a stamp may be late before a message is missing."""
+STAMP_MOTION, STAMP_ARM = 0.05, 0.1
+"""Speed (m/s) from which the motion between two messages tells its duration, and the distance (m)
+from the middle of the robot by which a turn counts."""
+STAMP_MEMORY, STAMP_ROWS = 0.998, 100
+"""Forgetting factor of a comparison (5 s at 100 Hz), and the number that is needed."""
+JITTER, STAMPS_WORSE = 0.0004, (4.0, 2.0)
+"""Jitter of the intervals (s, rms) that counts; how many times as far as the regular times stamps
+must be from what the motion says (mean squares) to be replaced, and to stay it."""
+
+
+def _duration(last: State, new: State) -> float:
+    """Return the time which the motion between two messages took, ns; 0 where it says little."""
+    if not (last.is_finite() and new.is_finite()):
+        return 0.0
+    ahead, _, turn = motion_between(last.pose, new.pose)
+    speed = 0.5 * (last.twist.linear + new.twist.linear)
+    arm_speed = 0.5 * STAMP_ARM * (last.twist.angular + new.twist.angular)
+    square = speed**2 + arm_speed**2
+    if not square > STAMP_MOTION**2:
+        return 0.0
+    return NANOSECONDS * (ahead * speed + STAMP_ARM * turn * arm_speed) / square
+
+
+class StampFilter:
+    """Regular times in place of stamps that jitter, where the motion of the robot says so.
+
+    A message that is stamped when it is handled, not when it was measured, is some milliseconds
+    late, each by another time. How far the pose went, at the speed of the twist, tells the true
+    interval: that of a robot which measures at irregular times is that of its stamps.
+    """
+
+    def __init__(self) -> None:
+        self.jitters = False
+        """Whether the stamps are replaced."""
+        self.jitter = 0.0  # root mean square of what is wrong with an interval, s
+        self._rows = self._stamps = self._times = self._apart = 0.0
+        self._last: State | None = None
+        self._origin_ns = self._returned = self._settling = 0
+        self._intervals: list[float] = []
+        self._regular = self._period = 0.0
+        """Regular time of the last message since the origin, and the interval, ns."""
+
+    def time(self, odometry: State) -> int:
+        """Return the time of an odometry, ns."""
+        last, stamp = self._last, odometry.stamp_ns
+        self._last = odometry
+        interval = 0.0 if last is None else float(stamp - last.stamp_ns)
+        periods = (stamp - self._origin_ns - self._regular) / self._period if self._period else 1.0
+        if last is None or interval <= 0.0 or periods > STAMP_GAP:
+            self._origin_ns = self._returned = stamp
+            self._regular = self._period = 0.0
+            self._intervals, self._settling = [], STAMP_SETTLING
+            return stamp
+        if not self._period:
+            self._intervals.append(interval)
+            self._returned, self._regular = stamp, float(stamp - self._origin_ns)
+            if len(self._intervals) == STAMP_FIRST:
+                self._period = median(self._intervals)
+            return stamp
+        took = _duration(last, odometry)
+        number = round(took / self._period)
+        if number < 1 or abs(number - periods) > 0.5 + STAMP_LATE:
+            # Messages may be missing; one that is late is not.
+            number = max(round(periods - STAMP_LATE), int(periods > STAMP_LATE))
+        before = self._regular
+        predicted = before + number * self._period
+        error = stamp - self._origin_ns - predicted
+        self._regular = predicted + STAMP_SHARE * error
+        self._period += STAMP_SHARE**2 / (2.0 - STAMP_SHARE) * error
+        self._settling -= 1
+        if self._settling < 0 and took and number == 1:
+            self._compare(took, interval, self._regular - before)
+        if not self.jitters:
+            self._returned = max(stamp, self._returned + 1)
+            return self._returned
+        time = self._origin_ns + round(self._regular)
+        self._returned = max(time, self._returned + round(0.1 * self._period))
+        return self._returned
+
+    def _compare(self, took: float, by_stamps: float, by_times: float) -> None:
+        """Compare both intervals with the time which the motion took, ns."""
+        kept = STAMP_MEMORY
+        self._rows = kept * self._rows + 1.0
+        self._stamps = kept * self._stamps + (took - by_stamps) ** 2
+        self._times = kept * self._times + (took - by_times) ** 2
+        self._apart = kept * self._apart + (by_stamps - by_times) ** 2
+        self.jitter = math.sqrt(self._apart / self._rows) / NANOSECONDS
+        worse = self._stamps > STAMPS_WORSE[self.jitters] * self._times
+        self.jitters = bool(worse and self.jitter > JITTER and self._rows > STAMP_ROWS)
+
+    def problem(self) -> str:
+        """Return what is wrong with the stamps, and the remedy; '' if nothing is."""
+        if not self.jitters:
+            return ''
+        return (
+            f'the stamps of odom jitter: their intervals are {1000.0 * self.jitter:.1f} ms (rms) '
+            'off what its poses say, regular times are used in their place: stamp odom with the '
+            'time of its measurement'
+        )
+
 
 MOVED, TURNED = 0.01, 0.05
 """Change of the pose (m, rad) with a twist of zero after which the odometry has no twist."""

@@ -42,6 +42,7 @@ def test_each_fault_fits_the_robot_and_the_controller():
     [
         ('no twist in the odometry', 'odom has no twist', 2001),
         ('twist reversed', 'the twist in odom is wrong', 2001),
+        ('stamps of the odometry off by up to 3 ms', 'the stamps of odom jitter', 2001),
         ('twist of the odometry + 10 %', 'times the change of its pose', 2001),
         ('twist of the odometry in mm/s', 'cannot be in m/s and rad/s', 2001),
         ('rate set to 50, odometry has 100 Hz', 'odom has 100 Hz, but rate is 50 Hz', 2001),
