@@ -82,7 +82,7 @@ class Toy:
     reset: float = math.inf
     """Time between two resets of the pose, s."""
     old: float = 0.0
-    """Age of the odometry when it is stamped, s."""
+    """Age of its twist when the odometry is stamped, s."""
 
 
 TOYS = (
@@ -98,7 +98,7 @@ TOYS = (
     Toy('30 % of the odometry lost', loss=0.3),
     Toy('no odometry for 0.5 s, every 5 s', dropout=0.5),
     Toy('slower than asked: wheels at most 1.2 rad/s', robot={'fastest': 1.2}),
-    Toy('odometry is 0.1 s old when it is stamped', old=0.1),
+    Toy('twist is 0.1 s older than its pose', old=0.1),
 )
 
 

@@ -228,8 +228,7 @@ def test_the_page_has_what_is_measured_and_none_is_worse():
     for toy in other_robots.TOYS:
         row = other_robots.measure(toy, other_robots.SEEDS)
         rows.append(other_robots.format_row(toy, row))
-        if not toy.old:  # no controller can tell it from a robot that responds late
-            assert row.difference.mean <= row.difference.half, toy.name
+        assert row.difference.mean <= row.difference.half, toy.name
     table = '\n'.join((*other_robots.TABLE.head, *rows))
     assert table in PAGE.read_text(), 'run bench/other_robots.py --page docs/your_robot.md'
 
