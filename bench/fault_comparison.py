@@ -107,28 +107,28 @@ class Fault:
     """Simple methods that get the same false information."""
 
 
-def with_odometry(changed: Callable[[int, State], Mapping[str, Any]]) -> Send:
-    """Return a fault of the odometry in each report, by its number."""
+def with_odometry(changed: Callable[[Any, int, State], Mapping[str, Any]]) -> Send:
+    """Return a fault of the odometry in each report, by its link and number."""
 
     def send(link: Any, k: int, state: RobotState) -> list[RobotState]:
         odometry = state.odometry
-        return [state._replace(odometry=odometry._replace(**changed(k, odometry)))]
+        return [state._replace(odometry=odometry._replace(**changed(link, k, odometry)))]
 
     return send
 
 
 def with_twist(change: Callable[[BodyTwist], BodyTwist]) -> Send:
     """Return a fault of the twist in each report."""
-    return with_odometry(lambda k, odometry: {'twist': change(odometry.twist)})
+    return with_odometry(lambda link, k, odometry: {'twist': change(odometry.twist)})
 
 
-def jittering(k: int, odometry: State) -> Mapping[str, int]:
+def jittering(link: Any, k: int, odometry: State) -> Mapping[str, int]:
     """Return a stamp that is up to 3 ms off."""
     off = np.random.default_rng(k).uniform(-0.003, 0.003)
     return {'stamp_ns': odometry.stamp_ns + round(off * NANOSECONDS)}
 
 
-def of_the_world(k: int, odometry: State) -> Mapping[str, BodyTwist]:
+def of_the_world(link: Any, k: int, odometry: State) -> Mapping[str, BodyTwist]:
     """Return the velocity along the x axis of the world for that along the robot's."""
     linear, angular = odometry.twist
     return {'twist': BodyTwist(linear * math.cos(odometry.pose.yaw), angular)}
@@ -136,13 +136,11 @@ def of_the_world(k: int, odometry: State) -> Mapping[str, BodyTwist]:
 
 def with_pose(changed: Callable[[Any, int, Any], Mapping[str, float]]) -> Send:
     """Return a fault of the pose in each report."""
-
-    def send(link: Any, k: int, state: RobotState) -> list[RobotState]:
-        odometry = state.odometry
-        pose = odometry.pose._replace(**changed(link, k, odometry.pose))
-        return [state._replace(odometry=odometry._replace(pose=pose))]
-
-    return send
+    return with_odometry(
+        lambda link, k, odometry: {
+            'pose': odometry.pose._replace(**changed(link, k, odometry.pose))
+        }
+    )
 
 
 def frozen_yaw(link: Any, k: int, pose: Any) -> Mapping[str, float]:
@@ -202,7 +200,7 @@ FAULTS: Mapping[str, Fault] = {
     ),
     'twist of the odometry of the world': Fault(send=with_odometry(of_the_world)),
     'no twist in every second message': Fault(
-        send=with_odometry(lambda k, odometry: {'twist': STANDSTILL} if k % 2 else {})
+        send=with_odometry(lambda link, k, odometry: {'twist': STANDSTILL} if k % 2 else {})
     ),
     'yaw rate of the odometry reversed': Fault(
         send=with_twist(lambda twist: BodyTwist(twist.linear, -twist.angular))

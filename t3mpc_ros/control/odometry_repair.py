@@ -273,7 +273,7 @@ class TwistFit:
         self.wrong = ''
         """What is wrong with the twist otherwise; '' if nothing is."""
         self.uses_pose = [False, False]
-        """Whether a velocity is then that by the pose."""
+        """Whether a velocity by the pose is the better one, to be used where something is."""
         self._late = False  # whether it was at the last comparison
         self._fits = [
             VelocityFit(prior, noise) for prior, noise in zip(FIT_PRIOR, FIT_NOISE, strict=True)
@@ -288,7 +288,7 @@ class TwistFit:
         self._last: list[float] = []
         self._from: State | None = None
 
-    def update(self, new: State) -> None:
+    def update(self, new: State, motion: tuple[float, float, float]) -> None:
         """Compare the twist of a message with the motion since the last one."""
         last, self._from = self._from, new
         if last is None:
@@ -302,7 +302,7 @@ class TwistFit:
         if new.pose.yaw == last.pose.yaw and abs(new.twist.angular) > FIT_MOTION[1]:
             self.interrupt()  # a yaw that is frozen, or coarse, says nothing of the way either
             return
-        ahead, left, turn = (each / elapsed for each in motion_between(last.pose, new.pose))
+        ahead, left, turn = (each / elapsed for each in motion)
         given = [ahead, turn, new.twist.linear, new.twist.angular, left]
         apart = [abs(given[i] - given[i + 2]) for i in range(2)]
         typical = min(self._interval or elapsed, 2.0 * elapsed)
@@ -358,14 +358,14 @@ class TwistFit:
         self._aside = kept * self._aside + means[4][1] ** 2
         self._age += FIT_ROW
         if self._fits[0].rows >= FIT_ROWS:
+            self.uses_pose = [
+                fit.prefers_pose(least) for fit, least in zip(self._fits, POSE_NOISE, strict=True)
+            ]
             wrong, factor = self._find()
             if wrong or factor != 1.0 or self._age > FIT_MEMORY:
                 self.wrong, self.factor, self._age = wrong, factor, 0.0
-            self.uses_pose = [
-                bool(self.wrong) and fit.prefers_pose(least)
-                for fit, least in zip(self._fits, POSE_NOISE, strict=True)
-            ]
-            self.wrong = self.wrong if any(self.uses_pose) else ''
+            if not any(self.uses_pose):
+                self.wrong = ''
 
     def _find(self) -> tuple[str, float]:
         """Return what is wrong with the twist, or the factor of both velocities."""
@@ -397,7 +397,7 @@ class TwistFit:
             wrong = f'its linear velocity is {factor:.3f} times'
         if not wrong and not least < turns < most and angular.is_certain(0, TWIST_CERTAIN):
             wrong = f'its angular velocity is {turns:.3f} times'
-        if wrong and any(f.prefers_pose(n) for f, n in zip(self._fits, POSE_NOISE, strict=True)):
+        if wrong and any(self.uses_pose):
             return wrong, 1.0
         return '', common
 
@@ -406,7 +406,7 @@ class TwistFit:
         linear, angular = self._fits
         half, uncertain = 0.5 * abs(factor - 1.0), TWIST_CERTAIN * angular.deviations[0]
         known = uncertain < half or angular.motion < FIT_MOTION[1] ** 2
-        known = known or self.factor != 1.0 or not linear.prefers_pose(POSE_NOISE[0])
+        known = known or self.factor != 1.0 or not self.uses_pose[0]
         return known and abs(angular.values[0] - factor) < half + uncertain
 
 
@@ -460,10 +460,12 @@ class PoseSpeeds:
         self._from: State | None = None
         self._speeds = STANDSTILL
 
-    def update(self, new: State, elapsed: float | None) -> BodyTwist:
-        """Return the speeds, ``elapsed`` s after the last message; None: it is the first one."""
+    def update(
+        self, new: State, elapsed: float | None, motion: tuple[float, float, float] | None
+    ) -> BodyTwist:
+        """Return the speeds, by time (s) and motion since the last message; None for the first."""
         last = self._from
-        if elapsed is None or last is None:
+        if elapsed is None or motion is None or last is None:
             self._from, self._speeds = new, STANDSTILL
             return STANDSTILL
         time = (new.stamp_ns - last.stamp_ns) / NANOSECONDS
@@ -480,7 +482,7 @@ class PoseSpeeds:
             time = self.held
         if not self.holds:
             time = elapsed
-        ahead, _, turn = motion_between(last.pose, new.pose)
+        ahead, _, turn = motion
         self._from, self._speeds = new, BodyTwist(ahead / time, turn / time)
         return self._speeds
 
@@ -548,7 +550,7 @@ class OdometryTwist:
             last = None
         motion = None if last is None else motion_between(last.pose, pose)
         elapsed = None if last is None else (odometry.stamp_ns - last.stamp_ns) / NANOSECONDS
-        by_pose = self._by_pose.update(odometry, elapsed)
+        by_pose = self._by_pose.update(odometry, elapsed, motion)
         if odometry.twist != (0.0, 0.0):
             self.missing, self._anchor, self.known = False, None, True
             if last is not None and motion is not None:
@@ -566,7 +568,7 @@ class OdometryTwist:
         if last is None or motion is None or self.missing or self._units.wrong:
             self._fit.interrupt()
         elif self.known:
-            self._fit.update(odometry)
+            self._fit.update(odometry, motion)
         replaces = [self.missing or self._units.wrong] * 2
         if not any(replaces) and self._fit.wrong:
             replaces = self._fit.uses_pose
