@@ -113,11 +113,13 @@ def lag_behind(u: Array, keep: Array, out: Array) -> None:
 
 
 def fit_response(command: Series, motion: Series, name: str) -> ResponseFit | None:
-    """Return the dead time, lag and gain that fit the measured speed best, by least squares.
+    """Return the dead time, lag and gain that fit the measured speed best.
 
-    Over a grid of lags and dead times, refined once; which delays fit as well is widened by those
-    of the halves of the run that contradict it. None for too short an overlap or a constant
-    command.
+    Least squares of the output error, with an offset, over a grid of lags and dead times, refined
+    once. The sum of dead time and lag is better determined than either; which sums fit as well is
+    said by the fit, widened by those of the halves of the run that contradict it. In a closed
+    loop, noise fed back through the command biases the delay slightly upwards. None when the two
+    series overlap too briefly or the command does not vary.
     """
     if min(len(command), len(motion)) < 3:
         return None

@@ -95,8 +95,9 @@ class NodeDriver:
 class ObservedReference:
     """Reference of a run of ``steps`` periods as a method observes it in each of them.
 
-    With preview ``rows`` of it after the dead time (s), also beyond the run. Without, r is
-    extrapolated over the dead time by its slope: a switch is seen when it happens.
+    With preview of ``rows`` periods these are rows of the reference after the dead time (s), and
+    go on beyond the run. Without, r is extrapolated over the dead time by the slope it has now: a
+    switch is seen when it happens, and not before.
     """
 
     def __init__(
@@ -135,8 +136,10 @@ DEAD_TIME_HYSTERESIS = 0.75
 class MethodDriver:
     """Drives a robot with a method, behind the state estimate and the limits of all methods.
 
-    A lost report is bridged by the estimator. With a torque drive, u is cut where the motors would
-    not give its torque. The dead time in use is the estimated one, in whole periods, if asked for.
+    It has no watchdog: a lost report is bridged by the estimator, as in the controller. With a
+    torque drive, u is cut where its torque would be beyond what the motors have, so that estimator
+    and method get the limited u. A method that estimates the dead time gets state estimate and
+    reference for the estimated one, in whole periods.
     """
 
     def __init__(

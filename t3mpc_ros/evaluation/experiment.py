@@ -141,9 +141,13 @@ def run_experiment(
 ) -> ResultTable:
     """Return one row for each run, in their order.
 
-    Those that the file ``store`` holds are not made again. ``task``, a function of a module, makes
-    the numbers of a job; ``workers`` are those of :func:`.workers_for`; without ``report`` there
-    is no progress line either.
+    Numbers depend neither on who works nor on what the file holds: a run that it holds is not
+    made again, and each that is made is added to it at once, so that an experiment that was
+    interrupted goes on where it was.
+
+    ``task``, a function of a module, makes the numbers of a job, plain data by name; ``workers``
+    are those of :func:`.workers_for`; ``store`` is the file, with ``fresh`` emptied before;
+    ``report`` receives messages, with None there is no progress line either.
     """
     if store is None:
         jobs = [run.job for run in runs]
@@ -362,8 +366,8 @@ def workers_for(executor: Any, jobs: Sequence[Any]) -> int | Executor:
     """Return who makes runs: a number of processes, or an executor.
 
     ``executor`` is one, a Dask client, a number of processes, or None for one on each processor.
-    One run, and runs of an interactive session, are made in this process unless an executor is
-    given.
+    One run, and runs of an interactive session, which other processes cannot import, are made
+    in this process unless an executor is given.
     """
     if callable(make := getattr(executor, 'get_executor', None)):  # a Dask client
         executor = make(pure=False)

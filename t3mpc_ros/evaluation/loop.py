@@ -142,8 +142,10 @@ def reports_of(
 ) -> Loop:
     """Yield each report that arrives at the driver, take the command, and return the record.
 
-    The driver is disabled until ``start``, and in the ``pauses`` (s) of a person; ``links`` and
-    ``seed`` are those of the reports; ``latency_ns`` is from a report to its command.
+    Equal arguments and commands give equal records, bit for bit. Robot and driver are new; the
+    columns of the reference are the caller's. The driver is disabled until ``start``, and in the
+    ``pauses`` (s) of a person. ``links`` and their ``seed`` are those of the reports;
+    ``latency_ns`` is from the arrival of a report to the departure of the command.
     """
     reports = ReportLink(links, seed, periods / RATE)
     paused = [(0.0, start), *pauses]

@@ -30,12 +30,17 @@ def lyapunov_exponents(
     settle: float = 20.0,
     interval: int = 50,
 ) -> Array:
-    """Return the exponents (1/s), the largest first, shape (d,), of a system of order 1.
+    """Return the exponents (1/s), the largest first, shape (d,).
 
-    Tangent vectors are made orthonormal every ``interval`` steps by a QR factorisation; an
-    exponent is the mean growth of its diagonal entry of R over ``duration`` after ``settle``, s.
-    For (85) with E6 400 s give the first two within 0.1 and 0.2; 10 000 s give 2.29, 0.62, 0.00
-    and -40.92.
+    State and tangent vectors are integrated together by the classical Runge-Kutta method. Every
+    ``interval`` steps the tangent vectors are made orthonormal by a QR factorisation; an exponent
+    is the mean logarithmic growth of its diagonal entry of R. Their sum is the mean divergence of
+    the flow: for (85) with E6 at order 1 the trace -38.
+
+    Every order must be 1: a fractional system has no flow on its state alone. ``initial``, shape
+    (d,), is ones by default; the average is over ``duration`` after ``settle``, to land on the
+    attractor, with steps of ``step``, all in s. For (85) 400 s give the first exponent within 0.1
+    and the second within 0.2; 10 000 s give 2.29, 0.62, 0.00 and -40.92.
     """
     if any(order != 1.0 for order in system.orders):
         raise ValueError(f'orders must all be 1: got {system.orders}')

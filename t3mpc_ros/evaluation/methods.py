@@ -348,9 +348,11 @@ def feed_forward_parameters(robot: str) -> FeedForwardParameters:
 def _twin_methods(
     table: Mapping[str, MethodSpec], forward: MethodSpec
 ) -> Mapping[str, MethodSpec | NodeMethod]:
-    """Return the methods on the twin, where the full controller has the defaults of the node.
+    """Return the methods on the twin.
 
-    Baselines have the parameters tuned for the twin, or those of :func:`twin_start`.
+    The full controller has the defaults of the node, whatever is stored as tuned for it.
+    Baselines have the parameters tuned for the twin; those of a baseline that was not are its
+    :func:`twin_start`.
     """
     tuned, twin = TunedParameters.load(), KINDS['twin'].tuned_for
     in_time = feed_forward_on_the_twin(FeedForwardParameters)

@@ -76,8 +76,9 @@ class OpenLoopRun:
 def excitation(time: Array, seed: int) -> Array:
     """Return a bounded push u (rad/s²) of both wheels, shape (n, 2), at ``time`` (s).
 
-    The derivative of five sines of 2 rad/s with random frequencies and phases: without friction
-    the wheels would turn at 3 rad/s rms, as the chaotic reference makes them.
+    The derivative of five sines of 2 rad/s with random frequencies of 0.03 to 0.4 Hz, evenly
+    spread in their logarithm, and random phases: without friction the wheels would turn at
+    3 rad/s rms, as the chaotic reference makes them, and never beyond 10 rad/s from their mean.
     """
     generator = np.random.default_rng((seed, 86))
     rates = 2.0 * np.pi * np.exp(generator.uniform(math.log(0.03), math.log(0.4), (2, 5)))
@@ -145,10 +146,11 @@ def estimate(
 
 
 def estimator(kind: str, noise_variance: float, normalised_gain: float) -> FuzzyEstimator:
-    """Return a fuzzy system of one kind without adaptation, with inputs as fuzzy as the noise.
+    """Return a fuzzy system of one kind without adaptation.
 
-    gamma |Phi|² is ``normalised_gain`` (1/s²) on average: at equal gamma the kinds would learn at
-    different speeds, and nothing else would be compared.
+    Whatever the kind, its inputs are as fuzzy as the noise is wide, and gamma |Phi|² is
+    ``normalised_gain`` (1/s²) on average: at equal gamma the kinds would learn at different
+    speeds, and nothing else would be compared.
     """
     parameters = FuzzyParameters(kind=kind, input_fuzziness=math.sqrt(2.0 * noise_variance))
     return FuzzyEstimator(
@@ -166,9 +168,9 @@ def compare(
 ) -> ResultTable:
     """Return the errors in (86), on equal runs: a row for each kind, noise and seed.
 
-    ``speed`` is the RMSE of chi_hat, rad/s, ``unknown`` that of g against chi' - u, rad/s², after
-    :data:`SETTLE`; ``variances`` are those of the noise, ``normalised_gain`` as of
-    :func:`estimator`.
+    ``speed`` is the RMSE of chi_hat against the true chi, rad/s, ``unknown`` that of g against
+    chi' - u, rad/s², both wheels after :data:`SETTLE`. ``variances`` are those of the measured
+    wheel speeds, (rad/s)²; ``normalised_gain`` is the mean of gamma |Phi|² for every kind, 1/s².
     """
     if duration <= SETTLE:
         raise ValueError(f'duration must be more than {SETTLE:g} s: got {duration}')

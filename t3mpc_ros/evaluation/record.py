@@ -97,7 +97,8 @@ class Record:
     """Record of one run, one row per control period; wheels are right first.
 
     Row k holds what was known and decided at ``time[k]``, and the state of the robot then. From a
-    row on with a number that is not finite, all are NaN but time, reference and mode.
+    row on at which the driver answered with a number that is not finite, or the robot has such a
+    speed, all numbers are NaN but time, reference and mode: the run ended there.
     """
 
     columns: Mapping[str, NDArray[np.generic]]
@@ -222,10 +223,11 @@ def counted_rows(
     end: float,
     window: tuple[float, float] = EVERYTHING,
 ) -> NDArray[np.bool_]:
-    """Return which samples count: from ``after`` to ``end``, outside ``window`` about switches, s.
+    """Return which samples count: from ``after`` to ``end``, outside ``window`` about switches.
 
-    Those of a crossing that the run does not contain whole never count: what preview costs before
-    it would, and not what it gains.
+    All in s. With the :class:`SettlingWindow` of the robot these are the *settled* samples. Those
+    from a switch on whose crossing the run does not contain whole never count, nor those before it
+    in which preview leaves the old reference: what that costs would count, and not what it gains.
     """
     rows: NDArray[np.bool_] = (time >= after) & (time <= end)
     before, behind = window

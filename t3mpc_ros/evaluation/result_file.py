@@ -33,8 +33,9 @@ KEY = 'run'
 class ResultFile:
     """Finished runs by key in a file of JSON lines; a context that one writer has at a time.
 
-    Of a writer that is killed one line may be torn: reading skips it, and the next writer begins
-    on a line of its own. With ``fresh`` the file is emptied on first entry.
+    A line is written as a whole and flushed. Should a writer be killed within one, what is torn
+    is that line alone: reading skips it, and the next writer begins on a line of its own. With
+    ``fresh``, what the file holds is thrown away on first entry.
     """
 
     def __init__(self, path: Path, *, fresh: bool = False) -> None:

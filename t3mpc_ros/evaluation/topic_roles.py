@@ -185,8 +185,9 @@ def find_topics(
 ) -> tuple[dict[str, str], tuple[str, ...]]:
     """Return full names by relative names, and the namespaces, the chosen one first.
 
-    A topic belongs to the longest known name it ends with. Without ``namespace`` the one with the
-    most known topics is chosen.
+    A topic belongs to the longest known name it ends with, so ``/a/ground_truth/odom`` is never
+    taken for the ``odom`` of ``/a/ground_truth``. Without ``namespace`` the one with the most
+    known topics is chosen.
     """
     found: dict[str, dict[str, str]] = {}
     for full in names:

@@ -150,7 +150,9 @@ def find_incidents(run: Run) -> Incidents:
 def driving(run: Run) -> Span:
     """Return start and end of the drive, s: the first and the last command other than zero.
 
-    (inf, -inf) when every command is zero; (-inf, inf) when the bag has no commands.
+    Before, the controller does not follow the reference yet; afterwards it has stopped while the
+    reference, stamped ahead, continues. (inf, -inf) when every command is zero; (-inf, inf) when
+    the bag has no commands.
     """
     command = run.motions.get(COMMAND)
     if command is None:
@@ -257,8 +259,10 @@ def merged(spans: Sequence[Span], nearer: float = 0.0) -> list[Span]:
 def find_stops(run: Run) -> tuple[Stop, ...]:
     """Return the times in which the robot stood although it was to move.
 
-    It stands for :data:`PAUSE` while the reference, or without one the command, asks for motion,
-    or for less where the commands are those of a stop; after the last command with a reason only.
+    What counts is the motion: the robot stands for :data:`PAUSE`, while the reference asks for
+    motion, or the command where there is no reference; or for less, where the commands are those
+    of a stop. After the last command to move it counts only if the nodes gave a
+    reason, and only up to the end of the reference: a drive that is over is no stop.
     """
     motion, wanted = run.motion, run.motions.get(REFERENCE)
     command = run.motions.get(COMMAND)
@@ -343,8 +347,10 @@ def find_blocked_wheels(run: Run) -> tuple[tuple[float, float, str], ...]:
 def find_stalls(run: Run) -> list[Span]:
     """Return the pauses of the loop that are longer than :data:`STALL_PERIODS` periods.
 
-    Between two receipts of odometry or two commands, or from odometry to its command. If commands,
-    or the reference of a robot behind a radio, go on meanwhile, it is a lost packet.
+    A pause is between two receipts of odometry without a command in between, between two commands
+    of our controller although odometry comes, or from odometry to its command. Commands that
+    go on are those of a machine that does, and so is the reference of a robot behind a radio:
+    there, a packet was lost.
     """
     odometry, timing = run.receipts.get(ODOMETRY), run.timing.get(ODOMETRY)
     if odometry is None or timing is None or not timing.period > 0.0 or run.other_clock:

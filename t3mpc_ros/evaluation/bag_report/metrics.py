@@ -65,8 +65,10 @@ def latencies(run: Run, *, first: bool = False) -> Series | None:
 def estimation_target(run: Run, wheel: str) -> Series | None:
     r"""Return the target of the estimate g of one wheel: :math:`\dot\chi - u` (64), rad/s².
 
-    Both are smoothed alike over :data:`WINDOW` seconds, by a straight line; NaN around switches,
-    where u jumps between two of its sparse samples. None when either is absent.
+    The derivative is the slope of a straight line fitted to :data:`WINDOW` seconds of the
+    measured wheel speed; the applied u is averaged with the weights that this slope has on the
+    derivative, so that both see the same smoothing. It is NaN around switches, where u jumps
+    between two of its sparse samples. None when either is absent.
     """
     motion = run.motion
     applied = run.numbers.get(f'controller/terms/applied/{wheel}')

@@ -96,8 +96,9 @@ def announce_jumps(
 ) -> int:
     """Announce the jumps of a known future that begins in period ``effect``; return up to where.
 
-    Those up to period ``announced`` are announced already. A jump is what exceeds the change
-    before it; after a change that exceeds :data:`JUMP` itself nothing is one.
+    Those up to period ``announced`` are announced already. Lost measurements or a longer dead time
+    reveal several periods at once. A jump is what exceeds the change before it; after a change
+    that exceeds :data:`JUMP` itself nothing is one.
     """
     period_ns, last = round(period * NANOSECONDS), effect + len(future) - 2
     for instant in range(max(announced, effect) + 1, last + 1):
@@ -252,7 +253,8 @@ class BaselineController(ABC):
 class PlannedReference:
     """Reachable reference ``ahead`` periods after the answer begins to act.
 
-    It announces the jumps of the known future. ``lag`` (s) is that of the servo by which the ramps
+    It announces the jumps of the known future to a :class:`JumpTransition`, and goes on along it
+    through periods without an observation. ``lag`` (s) is that of the servo by which the ramps
     are early; 0 where the reference is ahead of it already.
     """
 

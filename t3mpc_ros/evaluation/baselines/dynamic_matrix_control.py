@@ -97,8 +97,9 @@ def identify_step_responses(
 ) -> tuple[Array, Array]:
     """Return the step responses of a wheel from two simulations of ``model``, until settled.
 
-    s_j, to the command c, and h_j, to an acceleration on the wheel; ``inner_gain`` is K0 of the
-    loop closed around it first, 1/s, 0 for none; at least ``least`` periods.
+    s_j, to the command c, (rad/s)/(rad/s), and h_j, to an acceleration that acts on the wheel,
+    (rad/s)/(rad/s²), 1, 2, ... periods after a unit step. ``inner_gain`` is K0 of the loop that is
+    closed around it first, 1/s, 0 when it settles by itself; at least ``least`` periods.
     """
     responses = np.empty((2, MAX_RESPONSE_LENGTH))
     for response, (command, load) in zip(responses, ((1.0, 0.0), (0.0, 1.0)), strict=True):

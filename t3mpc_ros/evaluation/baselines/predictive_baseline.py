@@ -122,8 +122,9 @@ def torque_units(nominal_model: NominalModel) -> Array:
 def move_weight(nominal_model: NominalModel, move_time: float) -> float:
     """Return the weight rho that makes a plan smooth over about ``move_time`` (s).
 
-    Without bounds it is a filter symmetric in time and of this width, of second order for a
-    lagging servo, of fourth order for an integrator.
+    Without bounds and in the limit of a short period, the plan is the reference seen through a
+    filter symmetric in time: of second order and width move_time for a lagging servo, of fourth
+    order for an integrator.
     """
     if nominal_model.drive == 'torque':
         return (move_time**2 / nominal_model.period) ** 2
@@ -140,10 +141,13 @@ def response_matrix(steps: Array, moves: int) -> Array:
 
 
 def predict_reference(known: Array, fade: float, rows: int, *, preview: bool) -> Array:
-    """Return the reference expected 0 ... N = ``rows`` - 1 periods after the answer acts, rad/s.
+    """Return the reference expected 0 ... N periods after the answer begins to act, rad/s.
 
-    ``known`` are the first rows, shape (n, 2), n >= 2, continued by their last slope, of which
-    ``fade`` is left after a period; with preview by the flatter of two: the last may be a jump.
+    known : the first rows, shape (n, 2), n >= 2. With preview, in which they may contain jumps,
+        they are continued by their last slope, or by the one before where that is flatter, so that
+        a jump in the last row is not taken for a slope
+    fade : share of the slope that is left after a period, beyond what is known
+    rows : N + 1
     """
     missing = rows - len(known)
     if missing <= 0:

@@ -122,8 +122,9 @@ def all_claims(runs: ResultTable, estimated: ResultTable) -> list[Claim]:
 def _decided(claim: Claim, query: Query, runs: ResultTable, *, complete: bool) -> Claim:
     """Return the claim with its verdict.
 
-    With ``complete`` its criterion decides. Otherwise it is inconclusive, unless all its parts are
-    satisfied beyond doubt, one of them is not, or a run diverged.
+    With ``complete``, where as much was measured as the claim is about, its criterion decides.
+    Otherwise the claim is inconclusive, unless all its parts are satisfied beyond doubt, one
+    of them is not, or a run diverged.
     """
     try:
         held, text, numbers, margins = query(runs)

@@ -31,9 +31,12 @@ _GROUP = ('controller', 'baseline', 'preview', *SITUATION)
 class Results:
     """Means and paired differences of the runs of a study.
 
-    ``means`` has a row for each method and situation, NaN where a run diverged; ``added`` and
-    ``lost`` are what RMSE each stage adds to the one before, and each part left out to the full
-    one.
+    ``runs`` has one row a run: what it is, see :func:`.study_runs`, and its :data:`.NUMBERS`;
+    ``means`` one for each method and situation: means over the seeds with half their 95 %
+    intervals, the largest error of all seeds, and whether every number is finite; NaN where a run
+    diverged. ``added`` and ``lost`` are what RMSE each stage adds to the one before, and each part
+    left out to the full controller: mean with half its 95 % interval of ``first`` less ``second``
+    on the same seeds.
     """
 
     def __init__(self, runs: ResultTable) -> None:

@@ -47,8 +47,13 @@ def reproduce(
 ) -> tuple[str, dict[str, object]]:
     """Return a summary in a few lines and the numbers; write everything into the output folder.
 
-    ``fresh`` throws away the runs that are there. ``seeds`` are held-out ones of each run, by
-    default all, or three with ``quick``; ``estimation_seeds`` those of the comparison (86).
+    ``results.json``, ``results.csv`` (means), ``runs.csv`` (a row for each run), ``tables.md``,
+    ``paper.html`` and ``figures/*.png``. None of them depends on how many processes worked, or on
+    which runs were there already; ``fresh`` throws these away. ``report`` receives a line for each
+    step; with None there is no progress line either.
+
+    ``seeds`` are held-out ones of each run, by default all, or three with ``quick``;
+    ``estimation_seeds`` the same of the comparison (86).
     """
     write = report or (lambda text: None)
     extent = study.chosen_extent(quick=quick, seeds=seeds)

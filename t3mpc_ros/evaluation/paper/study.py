@@ -100,7 +100,9 @@ def chosen_extent(*, quick: bool = False, seeds: Sequence[int] | None = None) ->
 def study_runs(extent: Extent) -> list[Run]:
     """Return all runs, seed by seed, so that fast and slow methods stay mixed.
 
-    Which methods run in which cases, and at which noises, is said by :func:`_noises`.
+    Every baseline and every stage of the controller in the nominal case at every noise; the stages
+    in every other case at ``perturbed_noises``; at the paper's noise the controller with one part
+    left out in the cases that part is for, and baselines with preview in ``baseline_cases``.
     """
     made = {
         (drive, method.name): digest(method, measure)

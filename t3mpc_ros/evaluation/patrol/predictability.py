@@ -137,9 +137,11 @@ def ordinal_shares(series: Array, order: int) -> Array:
 def permutation_entropy(series: Array, order: int = 4) -> float:
     """Return the entropy of the ordinal patterns, from 0 (monotone) to 1 (white noise).
 
-    Bandt and Pompe, Phys. Rev. Lett. 88, 2002 (doi 10.1103/PhysRevLett.88.174102), over
-    ln(order!), of uniform samples, shape (n,); N patterns of white noise miss 1 by (order!-1)/(2 N
-    ln(order!)).
+    Bandt and Pompe, Phys. Rev. Lett. 88, 2002 (doi 10.1103/PhysRevLett.88.174102), divided by
+    ln(order!). From N patterns white noise gives about (order! - 1) / (2 N ln(order!)) less
+    than 1.
+
+    ``series`` are uniform samples, shape (n,); ``order`` is the number of values in a pattern.
     """
     return normalised_entropy(ordinal_shares(series, order))
 
@@ -182,12 +184,18 @@ def divergence(points: Array, step: float, apart: int, horizon: int) -> float:
     """Return the largest exponent (1/s) by the method of Rosenstein, Collins and De Luca.
 
     Physica D 65, 1993 (doi 10.1016/0167-2789(93)90009-P): the slope of the mean logarithmic
-    distance of nearest neighbours, fitted over the first part of the way to that of two random
-    points. Within 6 % for the logistic map, the Hénon map and the Lorenz system from 3000 points.
-    Any data give a number: that of noise grows with the density of the samples.
+    distance of each point from its nearest neighbour, both followed in time. The slope is that
+    of a straight line, by least squares, over the first part of the way of the distance, in
+    logarithms, to that of two random points: beyond it the size of the attractor bounds the
+    distance. It is within 6 % for the logistic map, the Hénon map and the Lorenz system from 3000
+    to 5000 points.
 
-    ``points`` are delay vectors ``step`` (s) apart, shape (n, d); neighbours are more than
-    ``apart`` samples from each other in time, and followed for ``horizon`` samples.
+    Any data give a number. Noise has no exponent: there the number grows without bound as the
+    samples become denser, and compares only with that of other paths of the same sampling.
+
+    ``points`` are delay vectors or states at times ``step`` (s) apart, shape (n, d); neighbours
+    are more than ``apart`` samples from each other in time, about a mean period, and are followed
+    for ``horizon`` samples. ValueError: there are too few points, or no point has a neighbour.
     """
     count = len(points) - horizon
     if horizon < 2 or count <= apart + 1:

@@ -459,8 +459,9 @@ def match(rows: Integers, odometry_ns: Integers, reference_ns: Integers) -> Cons
 def commands_of(rows: Integers, published: Integers, sent: Integers) -> Integers:
     """Return the recorded command of each row of the journal, -1 without one, shape (n,).
 
-    ``published`` and ``sent`` are the times of rows and commands by the controller's clock, ns: a
-    command comes before its row. That of a killed process is none of the first row of the next.
+    The controller publishes a command and then its journal row: ``published`` and ``sent`` are
+    these times by its clock, ns. A process that is killed in between leaves a command without a
+    row, which is none of the first row of the next process if that is more than a second later.
     """
     found = np.full(len(rows), -1, dtype=np.int64)
     commanding = np.isin(rows[:, 1], COMMAND_EVENTS)
@@ -500,11 +501,13 @@ def _rows_by_stamp(recorded: Integers) -> dict[int, list[int]]:
 def _reference_ranges(
     handed: Integers, newest: Integers, recorded: Integers
 ) -> tuple[Integers, Integers, Integers, Flags]:
-    """Return begin and end of the references passed before each row, and those lost or late.
+    """Return begin and end of the references passed before each row, and how many are lost.
 
-    ``handed`` is their number since the start, ``newest`` the stamp of the last one, 0 where the
-    row has none: its lead over ``handed`` is then that of the rows around it, unknown if these
-    differ.
+    ``handed`` is their number since the start of the controller, ``newest`` the stamp of the last
+    one, 0 where the row does not hold it. By its stamp a row shows the lead of the recording over
+    this number; a row without one has that of the rows around it. Where theirs differ, references
+    were lost, or only the recorder received them, and it is unknown which of them the row passes:
+    they are passed later, as the last result marks.
     """
     rows_of_stamp = _rows_by_stamp(recorded)
     stamped = np.flatnonzero((newest != 0) & (handed > 0))

@@ -274,8 +274,12 @@ def periods(
 ) -> tuple[Array, Array]:
     """Return errors (rad/s) and moves (rad/s²) of each predictive period, oldest first, (N, 2).
 
-    They are sampled as by the predictive controller. A row of NaN stands wherever v_p is unknown
-    or runs are not contiguous; v_p is NaN in periods in which limits mostly cut u.
+    They are sampled as by the predictive controller: an error is the mean of the newest
+    ``average`` ones at the step that takes the sample, and v_p holds from that step on.
+
+    A row of NaN stands wherever v_p is unknown or runs are not contiguous; v_p is NaN in periods
+    in which limits mostly cut u. Nothing is fitted across such a gap, nor to an error whose lags
+    reach into one; all other rows count.
     """
     decimation, average = parameters.decimation, parameters.average
     gap = np.full((1, 2), math.nan)
@@ -379,8 +383,9 @@ def skills(
 ) -> Array:
     """Return the skill of weights on a run: next step and middle of the horizon, (2, m).
 
-    1 is perfect, 0 equals persistence; NaN without one of the ``parts``, see :func:`stretches`.
-    ``span`` is the predictive period, s.
+    1 is perfect; 0 equals persistence, the prediction that the error stays constant. The squared
+    errors of all ``parts``, see :func:`stretches`, are summed. NaN without one. ``span`` is the
+    predictive period, s.
     """
     learning = learning_constants(parameters, span)
     outputs = len(weights['scales'])

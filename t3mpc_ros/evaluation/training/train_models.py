@@ -201,11 +201,13 @@ class FittedModel:
 def fit_bags(
     folders: Sequence[Path], *, keep_predictor: bool = False, count: int = FOLDS
 ) -> FittedModel:
-    """Return the model of all bags, and its skill by cross-validation over the bags.
+    """Return the model of all bags, and its cross-validated skill.
 
-    A single bag is cut into ``count`` blocks. With ``keep_predictor`` the predictor stays
-    pre-trained on the nominal loop. TrainingError: a bag cannot be used, or they do not belong
-    together.
+    Of several bags each is a fold. A single bag is cut into ``count`` consecutive blocks: they are
+    less independent than bags, so the skill is slightly optimistic. With ``keep_predictor`` the
+    predictor stays pre-trained on the nominal loop: for bags in which v_p moved too little.
+
+    TrainingError: a bag cannot be used, or the bags do not belong together.
     """
     runs: dict[str, TrainingData] = {}
     origins, lines = [], []

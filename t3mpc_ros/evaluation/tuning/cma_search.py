@@ -86,10 +86,16 @@ def search_best(
     resume: bool = False,
     about: Mapping[str, object] | None = None,
 ) -> SearchResult:
-    """Return the best of exactly ``evaluations`` points by a small objective, the first ``start``.
+    """Return the best of exactly ``evaluations`` points, the first of which is ``start``.
 
-    The last point is the mean of the distribution, if it has moved. ``path`` is the file of the
-    evaluations, with ``resume`` gone on with; ``about`` tells this objective from others in it.
+    The last point is the mean of the distribution, where the search believes the optimum to be,
+    unless no generation was completed before. Equal arguments give equal results, bit for bit,
+    however often the search was interrupted and resumed. ``objective`` is to be made small.
+
+    ``path`` is the file of the evaluations, one a line; without ``resume`` what it holds is thrown
+    away. ``about`` is plain data that tells this objective from others, whose lines in the file
+    are left alone. ValueError: too few evaluations, or an objective that returns another number of
+    values.
     """
     if evaluations < 1:
         raise ValueError(f'evaluations must be at least 1: got {evaluations}')

@@ -63,10 +63,11 @@ def objective(job: Job) -> float:
 
 
 class ClosedLoopObjective:
-    """Mean objective of parameters in the closed loop, by processes that stay warm in a ``with``.
+    """Mean objective of parameters in the closed loop; several are evaluated at the same time.
 
-    ``report`` receives the error of parameters with which a run failed; ``cost`` is the objective
-    of one run, a function of a module.
+    To be used in a ``with`` statement: the processes stay warm between generations. ``report``
+    receives the error text of parameters with which a run raised an exception; ``cost`` is the
+    objective of one run, a function of a module.
     """
 
     def __init__(
@@ -148,10 +149,17 @@ def tune_methods(
     resume: bool = False,
     evaluate: Evaluate | None = None,
 ) -> TunedParameters:
-    """Return the best parameters of each method in each of its drives, or on the twin.
+    """Return the best parameters of each method in each of its drives.
 
-    Each pair has a search of its own with the same budget, gone on with by ``resume``. The file
-    ``path`` is written after each; what it holds of other methods stays.
+    Each pair has a search of its own with the same budget; ``resume`` goes on with searches that
+    were interrupted. The file ``path`` is written after each, and the history of each search
+    beside it; what the file holds of other methods stays.
+
+    ``drives`` are keys of the start parameters: ``'torque'``, ``'velocity'``, or ``'twin'`` with
+    its own ``evaluate`` in place of the closed loop. Without ``report`` there is no progress line
+    either. ValueError: methods of one name, a drive that no method is meant for, or a file with
+    other methods tuned in the same drive with another budget. RuntimeError: for some method no
+    parameters gave a finite objective; all others are kept.
     """
     names = [method.short for method in methods]
     if len({*names}) < len(names):
@@ -295,8 +303,9 @@ def twin_definitions(known: Iterable[MethodDefinition]) -> list[MethodDefinition
 def twin_objective(job: Job) -> float:
     """Return RMSE + rho times the variation of a run, rad/s; infinite if it is not finite.
 
-    Where the baselines have the gyro, the error is that of wheels rolling without slip: a method
-    that corrects the body must not lose by it.
+    On the default twin the error is that of the rotors. Where the baselines have the gyro it is
+    that of wheels rolling without slip under the true motion of the body: a method that corrects
+    the body must not lose by it.
     """
     scenario, method = job
     record = run(scenario, method)
