@@ -84,9 +84,9 @@ class NodeHarness:
         self._foreign_nodes.append(Node('foreign', context=context))
         return self._foreign_nodes[-1]
 
-    def add_foreign(self, node):
-        """Spin a node that is not one of the package's executables."""
-        self._executor.add_node(node)
+    def add_foreign(self, node, executor=None):
+        """Spin a node that is not one of the package's executables; the test spins an executor."""
+        (executor or self._executor).add_node(node)
         self._foreign_nodes.append(node)
 
     def _spin_once(self) -> None:
