@@ -27,6 +27,8 @@ from std_msgs.msg import Int32MultiArray
 from std_srvs.srv import SetBool, Trigger
 from support.ros_graph import LATCHED, diagnostic, odometry, on_grid, reason, speed, stamp, twist
 
+from t3mpc_ros.chaos.path_replanning import NOWHERE_TIME
+from t3mpc_ros.evaluation.bag_report.diagnostic_history import cause_of
 from t3mpc_ros.geometry.arena import OccupancyGrid as Cells
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.conversions import occupancy_message
@@ -471,6 +473,9 @@ def test_a_planned_path_waits_for_a_map_and_leads_to_a_goal(harness):
         return 'no way to the goal at (50.00, -1.45) m is known' in ' '.join(reference.warnings())
 
     harness.spin_until(is_named)
+    reference._planned._nowhere = NOWHERE_TIME
+    event = 1.0, 'warning', 'reference_generator', reference.warnings()[-1]
+    assert cause_of(event, stops=False).name == 'Boxed in'
 
 
 @pytest.mark.parametrize('source', ['portrait', 'twist'])

@@ -76,6 +76,8 @@ class Story:
     """Whether the reference is a path with poses."""
     detour: tuple = ()
     """Span in which the robot makes a detour of 0.3 m, s."""
+    rests: float = math.inf
+    """Time from which the reference rests, s."""
     names: dict = field(default_factory=dict)
     """Other names of topics."""
     second_robot: bool = False
@@ -138,6 +140,8 @@ class Story:
         return write_with_records(folder, self.rows(), self.records)
 
     def _reference(self, t):
+        if t >= self.rests:
+            return 0.0, 0.0
         mode = sum(switch <= t + 1e-9 for switch in self.switches)
         return 0.18 - 0.08 * (mode % 2) + 0.04 * math.sin(1.3 * t), 0.5 * math.sin(0.7 * t)
 
@@ -237,6 +241,20 @@ STORIES = {
         r'Good run: within 50 mm of its path for 8\d % of the drive, path error 1\d\d\.\d mm '
         r'\(RMS\); the rest were detours around obstacles and the ways back\.', 'good',
         records=PATROL, path=True, detour=(8.0, 11.0),
+    ),
+    'boxed in': Story(
+        r'Boxed in from 14\.5 s on \(reference_generator: the robot is boxed in: .* or set the '
+        r'robot down elsewhere\); within 50 mm of its path for 100 % of the drive, path error '
+        r'\d\.\d mm \(RMS\)\.', 'open', records=PATROL, path=True, rests=6.0,
+        reports=(
+            (0.0, 'reference_generator', OK, 'running'),
+            (
+                14.0, 'reference_generator', WARNING,
+                'the robot is boxed in: for 20 s and more no way that keeps plan.distance '
+                '(0.195 m) from obstacles has led on; clear a passage of 0.39 m, or set the robot '
+                'down elsewhere',
+            ),
+        ),
     ),
     'path without keep-out': Story(
         r'Good run: within 50 mm of its path for 8\d % of the drive, path error 1\d\d\.\d mm '

@@ -301,6 +301,12 @@ PATTERNS = (
     Pattern(
         'inertial sensor does not answer', 'Inertial sensor silent', 'See its wiring.', stops=False
     ),
+    Pattern(
+        'the robot is boxed in',
+        'Boxed in',
+        'With nothing around the robot, see the readings of its range sensors.',
+        stops=False,
+    ),
     Pattern(SLIP, 'A wheel slipped', 'See the floor, the tyres and the load.', stops=False),
     Pattern('processor overloaded', OVERLOADED, END_PROGRAMS, stops=False),
     Pattern('real-time factor', OVERLOADED, END_PROGRAMS, stops=False),
