@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from t3mpc_ros.evaluation.api.chaos_generator import ChaosSolution, chaos
     from t3mpc_ros.evaluation.api.comparison_runs import Comparison, compare
     from t3mpc_ros.evaluation.api.fuzzy_system import FuzzySystem, fuzzy
+    from t3mpc_ros.evaluation.api.own_reference import Waypoints
     from t3mpc_ros.evaluation.api.parameter_sweep import Sweep, sweep
     from t3mpc_ros.evaluation.api.plants import NoiseLaw, OdePlant, Robot, StateSpace
-    from t3mpc_ros.evaluation.api.references import Waypoints
     from t3mpc_ros.evaluation.api.script_parts import Controller
     from t3mpc_ros.evaluation.api.single_run import RunResult, simulate
     from t3mpc_ros.evaluation.baselines.baseline_controller import NominalModel, Observation
@@ -76,7 +76,7 @@ _HOMES = {
     'evaluation.api.fuzzy_system': ('FuzzySystem', 'fuzzy'),
     'evaluation.api.parameter_sweep': ('Sweep', 'sweep'),
     'evaluation.api.plants': ('NoiseLaw', 'OdePlant', 'Robot', 'StateSpace'),
-    'evaluation.api.references': ('Waypoints',),
+    'evaluation.api.own_reference': ('Waypoints',),
     'evaluation.api.script_parts': ('Controller',),
     'script_error': ('ScriptError',),
     'evaluation.api.single_run': ('RunResult', 'simulate'),

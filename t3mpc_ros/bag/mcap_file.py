@@ -38,7 +38,7 @@ from mcap.reader import NonSeekingReader
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 from mcap.summary import Summary
 
-from t3mpc_ros.bag.message_definitions import BagError
+from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.metadata import NO_START_NS, BagMetadata, FileInformation, TopicInformation
 from t3mpc_ros.bag.qos import QosError, QosProfile, profiles_from_yaml
 
@@ -53,16 +53,6 @@ END_NS = 2**64
 MESSAGE_OVERHEAD = 256
 """Memory of a message in addition to its data, bytes."""
 
-LOSSES = 'losses'
-"""Name of the metadata record of :func:`message_loss_record`."""
-UNDISCOVERED = 'undiscovered'
-"""Cause of the messages that a recorder misses while it starts."""
-LOSS_CAUSES = {
-    'dropped': 'dropped because the disk was too slow',
-    'lost': 'lost by the middleware',
-    UNDISCOVERED: 'published before the recorder had discovered their publisher',
-}
-"""Why messages are missing in a bag, by key of its loss record."""
 
 _MESSAGE = struct.Struct('<BQHIQQ')  # head of a record and of its message
 
@@ -404,36 +394,6 @@ def collect_metadata(folder: Path) -> tuple[BagMetadata, tuple[str, ...]]:
             key = (topic.name, topic.type_name, topic.offered_qos_profiles, topic.type_hash)
             topics[key] = topics[key].merged(topic) if key in topics else topic
     return BagMetadata(tuple(files), tuple(topics.values())), incomplete
-
-
-def message_loss_record(
-    dropped: Mapping[str, int], lost: Mapping[str, int], undiscovered: Mapping[str, int]
-) -> dict[str, str]:
-    """Return the metadata record of missing messages, by cause (:data:`LOSS_CAUSES`) and topic."""
-    causes = dict(zip(LOSS_CAUSES, (dropped, lost, undiscovered), strict=True))
-    table = {cause: str(sum(counts.values())) for cause, counts in causes.items()}
-    for cause, counts in causes.items():
-        table |= {f'{cause} {topic}': str(count) for topic, count in sorted(counts.items())}
-    return table
-
-
-def message_losses(tables: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, int]]:
-    """Return the number of missing messages by cause and topic, by the records of a bag."""
-    found: dict[str, dict[str, int]] = {cause: {} for cause in LOSS_CAUSES}
-    for key, count in tables.get(LOSSES, {}).items():
-        cause, _, topic = key.partition(' ')
-        if topic and cause in found and count.isdecimal():
-            found[cause][topic] = int(count)
-    return found
-
-
-def message_loss_notes(tables: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """Return a sentence for each topic and cause of :func:`message_losses`."""
-    return [
-        f'{count} messages of {topic} are missing: {LOSS_CAUSES[cause]}.'
-        for cause, topics in message_losses(tables).items()
-        for topic, count in topics.items()
-    ]
 
 
 @contextmanager

@@ -27,27 +27,13 @@ from typing import Any
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from t3mpc_ros.bag.errors import UnknownTypeError
+
 SEPARATOR = '=' * 80
 """Line before each dependency in ``ros2msg`` text."""
 
 _TYPE = re.compile(r'(?P<package>[A-Za-z]\w*)/(?:msg/)?(?P<name>[A-Za-z]\w*)')
 _PRIMITIVES = re.compile(r'bool|byte|char|float(32|64)|u?int(8|16|32|64)|w?string')
-
-
-class BagError(RuntimeError):
-    """Base class of all errors of this package."""
-
-
-class UnknownTypeError(BagError):
-    """No definition of a message type is available."""
-
-
-class UnknownTopicError(BagError):
-    """The topic was not added to, or is not in, the bag."""
-
-
-class DataError(BagError):
-    """A message, stamp or metadata record is invalid."""
 
 
 class MessageDefinitions:

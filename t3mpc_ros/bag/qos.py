@@ -28,7 +28,7 @@ from typing import Any
 
 import yaml
 
-from t3mpc_ros.bag.message_definitions import BagError
+from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.parameters.yaml_checks import PlainDumper, file_errors, read_yaml, shortened
 

@@ -21,8 +21,8 @@ import queue
 import threading
 from typing import TypeVar
 
+from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.mcap_file import SerializedMessage
-from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.writer import BagWriter
 
 T = TypeVar('T')

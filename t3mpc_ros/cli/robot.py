@@ -41,6 +41,7 @@ from t3mpc_ros.radio.link.link_parameters import LinkParameters
 from t3mpc_ros.radio.protocol import frames
 from t3mpc_ros.radio.protocol.authentication import KeyFileError, key_check, read_key
 from t3mpc_ros.radio.tool import (
+    channel_scan,
     eeprom_records,
     key_provisioning,
     link_test,
@@ -211,10 +212,12 @@ def _scan(options: argparse.Namespace, stop: StopSignal) -> int:
             file = sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout
             print(f'\r{result}' if interactive else result, file=file, flush=True)
 
-    results = _run_at_dongle(link_test.scan_channels(parameters, rates, progress), options, stop)
+    results = _run_at_dongle(
+        channel_scan.scan_channels(parameters, rates, progress), options, stop
+    )
     if interactive:
         print('\r' + 24 * ' ' + '\r', end='', file=sys.stderr)
-    good, advice = link_test.recommend(results, parameters)
+    good, advice = channel_scan.recommend(results, parameters)
     print_result(options, lambda: advice, lambda: {'advice': advice, 'channels': results})
     return EXIT_OK if good else EXIT_POOR
 

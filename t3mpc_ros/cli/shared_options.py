@@ -37,6 +37,8 @@ Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 ROBOTS = ('twin', 'servo', 'torque')
 FULL, NOMINAL = 'full', 'nominal'
 STANDARD_OUTPUT = Path('-')
+SECONDS = bounded_float(1.0, 86_400.0, 'seconds')
+"""Type of a duration."""
 
 
 def add_setting(parser: argparse.ArgumentParser) -> None:

@@ -55,13 +55,13 @@ from t3mpc_ros.control.watchdog import (
     WatchdogParameters,
 )
 from t3mpc_ros.geometry import kinematics
-from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.kinematics import (
     WheelGeometry,
     advance_pose,
     twist_from_wheels,
     wheels_from_twist,
 )
+from t3mpc_ros.geometry.obstacles import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.trajectory import Jump, ReferenceTrajectory, TrajectorySamples, interpolate
 from t3mpc_ros.geometry.types import (
     NANOSECONDS,

@@ -50,8 +50,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t3mpc_ros.control.range_fault_detection import RangeMonitor
-from t3mpc_ros.geometry.arena import OCCUPIED_PERCENT, Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.kinematics import advance_pose
+from t3mpc_ros.geometry.obstacles import OCCUPIED_PERCENT, Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.types import (
     ORIGIN,
     STANDSTILL,

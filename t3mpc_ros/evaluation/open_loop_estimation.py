@@ -37,8 +37,9 @@ from t3mpc_ros.evaluation.reporting import progress_bar
 from t3mpc_ros.fuzzy.estimator import AdaptationParameters, FuzzyEstimator, gamma_for
 from t3mpc_ros.fuzzy.inference import FuzzyParameters
 from t3mpc_ros.geometry.types import Array
+from t3mpc_ros.simulation.paper_robot import PaperRobot
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
-from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 KINDS = ('type3', 'interval_type2', 'type1')
 """Fuzzy systems compared; sets, centres, widths and adaptation rate are equal."""

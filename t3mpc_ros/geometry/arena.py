@@ -11,10 +11,9 @@
 # WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
 # See the License for the specific language governing permissions and
 # limitations under the License.
-"""Arena: the convex polygon in which a path lies, its map from the unit square; obstacles."""
+"""Arena: the convex polygon in which a path lies, and its map from the unit square."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,32 +21,8 @@ from numpy.typing import NDArray
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters.table import ParameterError
 
-OCCUPIED_PERCENT = 65
-"""Occupancy from which on a cell is an obstacle."""
 _SLICES = 257
 """Vertical lines at which area and height of the arena are tabulated."""
-
-
-class Obstacles(NamedTuple):
-    """Known obstacles in the frame of the odometry."""
-
-    segments: Array = np.empty((0, 4))
-    """Walls: ax, ay, bx, by, m, shape (n, 4)."""
-    circles: Array = np.empty((0, 3))
-    """Pillars: x, y, radius, m, shape (m, 3)."""
-
-
-class OccupancyGrid(NamedTuple):
-    """State of the floor in cells, as of ``nav_msgs/OccupancyGrid``."""
-
-    cells: NDArray[np.int8]
-    """0 (free) to 100 (occupied) percent, -1 unknown, shape (rows, columns), row by y."""
-    resolution: float
-    """Side of a cell, m."""
-    x: float
-    """Of the corner of the first cell, m."""
-    y: float
-    """Of the corner of the first cell, m."""
 
 
 class Arena:

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from t3mpc_ros.geometry.arena import OccupancyGrid
+from t3mpc_ros.geometry.obstacles import OccupancyGrid
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.parameters import yaml_checks
 

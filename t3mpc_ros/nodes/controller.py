@@ -37,7 +37,7 @@ from t3mpc_ros.control.controller import (
 )
 from t3mpc_ros.control.odometry_monitor import NAMES, OdometryMonitor
 from t3mpc_ros.control.watchdog import TRIALS, Reason, StopHistory
-from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
+from t3mpc_ros.geometry.obstacles import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.types import NANOSECONDS, RANGE_SENSORS, STANDSTILL, BodyTwist
 from t3mpc_ros.model_file import ModelError, find_model, load_model, save_model
 from t3mpc_ros.nodes import conversions, qos

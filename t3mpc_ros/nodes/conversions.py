@@ -39,7 +39,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-from t3mpc_ros.geometry.arena import OccupancyGrid
+from t3mpc_ros.geometry.obstacles import OccupancyGrid
 from t3mpc_ros.geometry.types import NANOSECONDS, Array, BodyTwist, Pose, State
 from t3mpc_ros.parameters.table import Parameters, parameter
 

@@ -28,7 +28,7 @@ from rclpy.qos import (
     ReliabilityPolicy,
 )
 
-from t3mpc_ros.bag.message_definitions import BagError
+from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.player import VELOCITY_TYPES, MergedReader, velocity_command_risk
 from t3mpc_ros.bag.qos import UNLIMITED, QosProfile, adapt_offer_to_recorded_offers
 from t3mpc_ros.geometry.types import NANOSECONDS

@@ -41,6 +41,7 @@ from t3mpc_ros.simulation.fault_injection import (
     load_schedule,
 )
 from t3mpc_ros.simulation.fixed_step_robot import FixedStepRobot
+from t3mpc_ros.simulation.paper_robot import PaperRobot
 from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
 from t3mpc_ros.simulation.plant.disturbances import Disturbance, MeasurementNoise, SpeedNoise
 from t3mpc_ros.simulation.plant.drivetrain import Drivetrain, Load, TyreParameters, max_rate
@@ -48,7 +49,6 @@ from t3mpc_ros.simulation.plant.dynamics import BodyParameters
 from t3mpc_ros.simulation.plant.paper_plant import (
     STABILITY_LIMIT,
     DriveParameters,
-    PaperRobot,
     PaperRobotParameters,
 )
 from t3mpc_ros.simulation.plant.stepper_motor import StepperMotorParameters

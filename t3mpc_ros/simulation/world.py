@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from t3mpc_ros.geometry.arena import Obstacles
+from t3mpc_ros.geometry.obstacles import Obstacles
 from t3mpc_ros.geometry.path_timing import lengths_along
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.kernels import kernel

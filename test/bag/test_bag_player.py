@@ -23,8 +23,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.rosbag2.metadata import parse_qos
 from support.bag_messages import STORE, TYPES, serialised
 
+from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.mcap_file import SerializedMessage
-from t3mpc_ros.bag.message_definitions import BagError
 from t3mpc_ros.bag.player import (
     MIN_LOOP_NS,
     MergedReader,

@@ -18,13 +18,8 @@ from pathlib import Path
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from t3mpc_ros.bag.message_definitions import (
-    SEPARATOR,
-    BagError,
-    MessageDefinitions,
-    UnknownTypeError,
-    installation_prefixes,
-)
+from t3mpc_ros.bag.errors import BagError, UnknownTypeError
+from t3mpc_ros.bag.message_definitions import SEPARATOR, MessageDefinitions, installation_prefixes
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 

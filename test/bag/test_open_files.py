@@ -32,8 +32,9 @@ from support.file_watch import Disk, no_file_left_open
 
 from t3mpc_ros.atomic_file import write_atomically
 from t3mpc_ros.bag import writer as writer_module
+from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.mcap_file import Attachment, has_mcap_magic, read_mcap_file
-from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions
+from t3mpc_ros.bag.message_definitions import MessageDefinitions
 from t3mpc_ros.bag.metadata import BagMetadata, read_origin, write_metadata
 from t3mpc_ros.bag.player import MergedReader, PlaybackParameters, PlaybackTimeline, ReadAheadQueue
 from t3mpc_ros.bag.qos import QosError, read_qos_overrides

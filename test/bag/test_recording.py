@@ -23,15 +23,10 @@ from rosbags.rosbag2 import Reader
 from support.bag_files import kept_messages, messages_of, metadata_of
 
 from t3mpc_ros.bag import writer
-from t3mpc_ros.bag.mcap_file import (
-    MESSAGE_OVERHEAD,
-    Attachment,
-    SerializedMessage,
-    message_loss_notes,
-    message_loss_record,
-    read_mcap_file,
-)
-from t3mpc_ros.bag.message_definitions import BagError, MessageDefinitions
+from t3mpc_ros.bag.errors import BagError
+from t3mpc_ros.bag.mcap_file import MESSAGE_OVERHEAD, Attachment, SerializedMessage, read_mcap_file
+from t3mpc_ros.bag.message_definitions import MessageDefinitions
+from t3mpc_ros.bag.message_losses import message_loss_notes, message_loss_record
 from t3mpc_ros.bag.metadata import TopicInformation
 from t3mpc_ros.bag.player import PlaybackParameters
 from t3mpc_ros.bag.reader import open_bag

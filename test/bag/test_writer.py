@@ -32,13 +32,8 @@ from support.bag_messages import START, STORE, number, odometry_message, seriali
 import yaml
 
 from t3mpc_ros.bag import writer
+from t3mpc_ros.bag.errors import BagError, DataError, UnknownTopicError, UnknownTypeError
 from t3mpc_ros.bag.mcap_file import read_mcap_file
-from t3mpc_ros.bag.message_definitions import (
-    BagError,
-    DataError,
-    UnknownTopicError,
-    UnknownTypeError,
-)
 from t3mpc_ros.bag.qos import QosProfile, profiles_from_yaml
 from t3mpc_ros.bag.reader import missing_sample_ratio, open_bag
 from t3mpc_ros.bag.writer import BagWriter, DiskError, FolderError, FolderInUseError

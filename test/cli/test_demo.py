@@ -32,7 +32,8 @@ from support.signals import attend
 from support.waiting import communicate, run, wait_until
 
 from t3mpc_ros.cli import process_group
-from t3mpc_ros.cli.main import DEMO_EXIT_CODES, _new_run, main
+from t3mpc_ros.cli.demo import DEMO_EXIT_CODES, _new_run
+from t3mpc_ros.cli.main import main
 from t3mpc_ros.cli.process_group import DOMAINS, NoDomainError, PrivateGraph, used_domains
 
 pytestmark = pytest.mark.slow
@@ -266,7 +267,9 @@ def test_the_exit_code_says_what_became_of_the_run(
     if unfinished:
         (tmp_path / 'recorded' / 'bag_1.mcap').write_bytes(b'\x89MCAP0\r\n')
     monkeypatch.setenv('AMENT_PREFIX_PATH', stand_ins(tmp_path, ends=ends)['AMENT_PREFIX_PATH'])
-    monkeypatch.setattr('t3mpc_ros.cli.demo._watch', lambda processes, options: processes.check())
+    monkeypatch.setattr(
+        't3mpc_ros.cli.demo_run._watch', lambda processes, options: processes.check()
+    )
     assert main(['demo', '--headless', '--output', str(tmp_path / 'run')]) == code
     output = capsys.readouterr()
     assert words in output.out + output.err
@@ -324,7 +327,7 @@ def test_every_demo_of_the_ci_is_such_a_one():
 def test_the_link_latest_leads_to_the_last_run(tmp_path, monkeypatch):
     """So that every command of the documentation can be pasted, after each demo."""
     times = (datetime(2026, 1, 2, 3, 4, second) for second in range(60))
-    monkeypatch.setattr('t3mpc_ros.cli.main.datetime', SimpleNamespace(now=lambda: next(times)))
+    monkeypatch.setattr('t3mpc_ros.cli.demo.datetime', SimpleNamespace(now=lambda: next(times)))
     runs = tmp_path / 'runs'
     latest = runs / 'latest'
     found = []

@@ -24,7 +24,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from t3mpc_ros.bag.message_definitions import BagError
+from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.recovery import Damage, FileResult, RecoveryOutputError, RecoveryResult
 from t3mpc_ros.cli import process_group
 from t3mpc_ros.cli.main import main
@@ -64,7 +64,7 @@ def checked(*verdicts):
 
 
 def answered(good):
-    return {RUN: 'result', 'radio.tool.link_test.recommend': (good, 'advice')}
+    return {RUN: 'result', 'radio.tool.channel_scan.recommend': (good, 'advice')}
 
 
 def jogged(error=''):

@@ -176,8 +176,8 @@ TUNE = {
     'evaluation.tuning.tune_methods.tune_methods': SimpleNamespace(table=text, to_dict=dict),
     'evaluation.tuning.tune_methods.tune_twin': SimpleNamespace(table=text, to_dict=dict),
     'evaluation.tuning.drive_identification.identify_bag': ('drive', 'paper'),
-    'evaluation.tuning.drive_identification.drive_file': 'a: 1\n',
-    'evaluation.tuning.drive_identification.drive_record': {},
+    'evaluation.tuning.controller_for_drive.drive_file': 'a: 1\n',
+    'evaluation.tuning.controller_for_drive.drive_record': {},
 }
 MODEL = SimpleNamespace(
     text='', learnt={}, parameters=SimpleNamespace(to_dict=dict), origin={}, to_dict=dict
@@ -258,8 +258,8 @@ ROBOT = {
     'radio.tool.link_test.run_link_test': 'result',
     'radio.tool.link_test.evaluate': [],
     'radio.tool.link_test.format_report': '',
-    'radio.tool.link_test.scan_channels': 'result',
-    'radio.tool.link_test.recommend': (True, ''),
+    'radio.tool.channel_scan.scan_channels': 'result',
+    'radio.tool.channel_scan.recommend': (True, ''),
     'radio.tool.robot_info.read_robot_info': 'result',
     'radio.tool.robot_info.format_robot_info': '',
     'radio.tool.manoeuvre.Jog': SimpleNamespace(result=None, error=''),
@@ -887,10 +887,10 @@ def test_an_option_of_the_demo_reaches_its_node(words, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(webbrowser, 'open', opened.append)
     for name, instead in (
-        ('cli.demo.ProcessGroup', Processes),
-        ('cli.demo.PrivateGraph', lambda: nullcontext(MagicMock(domain=1))),
-        ('cli.demo.time.monotonic', lambda: clock[0]),
-        ('cli.demo.time.sleep', lambda seconds: clock.append(clock.pop() + seconds)),
+        ('cli.demo_run.ProcessGroup', Processes),
+        ('cli.demo_run.PrivateGraph', lambda: nullcontext(MagicMock(domain=1))),
+        ('cli.demo_run.time.monotonic', lambda: clock[0]),
+        ('cli.demo_run.time.sleep', lambda seconds: clock.append(clock.pop() + seconds)),
         ('evaluation.bag_report.report_page.write_report', lambda *_: report),
     ):
         monkeypatch.setattr(f't3mpc_ros.{name}', instead)

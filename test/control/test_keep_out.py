@@ -36,8 +36,8 @@ from t3mpc_ros.control.keep_out import (
     nearest_permitted,
 )
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.kinematics import advance_pose
+from t3mpc_ros.geometry.obstacles import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.types import ORIGIN, STANDSTILL, BodyTwist, Pose, State
 
 LIMITS = BodyTwist(0.35, 4.5)

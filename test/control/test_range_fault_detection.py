@@ -23,8 +23,8 @@ from t3mpc_ros.control.controller import Controller, StepperControllerParameters
 from t3mpc_ros.control.keep_out import CAUTIOUS_SPEED, OCCUPIED, KeepOut, KeepOutParameters
 from t3mpc_ros.control.range_fault_detection import NOTHING_SEEN, RangeFault, RangeMonitor
 from t3mpc_ros.control.watchdog import Reason
-from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import advance_pose
+from t3mpc_ros.geometry.obstacles import Obstacles
 from t3mpc_ros.geometry.types import ORIGIN, RANGE_SENSORS, STANDSTILL, BodyTwist, Pose, State
 from t3mpc_ros.simulation.world import cast_rays
 

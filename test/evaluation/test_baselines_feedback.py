@@ -30,9 +30,10 @@ from t3mpc_ros.evaluation.baselines.feedback_control import (
 )
 from t3mpc_ros.fuzzy.inference import build_sets, compute_basis
 from t3mpc_ros.geometry.types import WheelSpeeds
+from t3mpc_ros.simulation.paper_robot import PaperRobot
 from t3mpc_ros.simulation.plant.disturbances import friction_torque
 from t3mpc_ros.simulation.plant.dynamics import dynamics_vector, wheel_acceleration, wheel_inertia
-from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 T = 0.01
 ADAPTIVE = [AdaptiveType1, AdaptiveIntervalType2]

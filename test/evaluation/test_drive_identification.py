@@ -27,16 +27,16 @@ from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.controller import StepperControllerParameters
 from t3mpc_ros.control.dead_time_estimator import IDENTIFIED_DEVIATION
 from t3mpc_ros.evaluation.topic_roles import ReportOptions
+from t3mpc_ros.evaluation.tuning.controller_for_drive import drive_file, fitting_parameters
 from t3mpc_ros.evaluation.tuning.drive_identification import (
     MAX_RELATIVE_DEVIATION,
     IdentificationError,
-    drive_file,
-    fitting_parameters,
     identify_bag,
 )
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, State, WheelSpeeds
-from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
+from t3mpc_ros.simulation.paper_robot import PaperRobot
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 pytestmark = pytest.mark.slow
 

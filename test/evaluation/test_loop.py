@@ -40,8 +40,9 @@ from t3mpc_ros.evaluation.scenario import (
 )
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import Parameters, parameter
+from t3mpc_ros.simulation.paper_robot import PaperRobot
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
-from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobot, PaperRobotParameters
+from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParameters
 
 pytestmark = pytest.mark.slow
 

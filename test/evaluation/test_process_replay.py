@@ -39,7 +39,7 @@ from t3mpc_ros.bag.controller_journal import (
     Journal,
     parameters_from_json,
 )
-from t3mpc_ros.bag.message_definitions import BagError
+from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.reader import open_bag, read_columns
 from t3mpc_ros.bag.writer import BagWriter, DataError
 from t3mpc_ros.cli.bag import program_parser

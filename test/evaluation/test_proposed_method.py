@@ -34,7 +34,7 @@ from t3mpc_ros.evaluation.scenario import LEAD, Scenario
 from t3mpc_ros.evaluation.tuning.tuned_parameter_file import StoreError, TunedParameters
 from t3mpc_ros.geometry.kinematics import twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, State, WheelSpeeds
-from t3mpc_ros.simulation.plant.paper_plant import PaperRobot
+from t3mpc_ros.simulation.paper_robot import PaperRobot
 
 pytestmark = pytest.mark.slow
 

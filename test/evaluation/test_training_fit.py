@@ -22,7 +22,7 @@ from support.checkout import ROOT
 from support.training_runs import GEOMETRY, TrainingRun
 
 from t3mpc_ros import model_file
-from t3mpc_ros.bag.message_definitions import BagError
+from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.cli.main import main
 from t3mpc_ros.control.actuation import LimitParameters, VelocityActuation
 from t3mpc_ros.control.controller import Controller, ControllerParameters
@@ -30,19 +30,21 @@ from t3mpc_ros.control.speed_kalman_filter import SpeedFilterParameters
 from t3mpc_ros.evaluation.proposed_method import ProposedParameters
 from t3mpc_ros.evaluation.scenario import HELD_OUT_SEEDS, PRETRAINING_SEEDS, Scenario
 from t3mpc_ros.evaluation.training import train_models
-from t3mpc_ros.evaluation.training.fit import (
-    TrainingData,
-    TrainingError,
+from t3mpc_ros.evaluation.training.model_fit import (
     estimate_move_effect,
     explained,
     fit_coefficients,
     fit_predictor,
-    load_training_data,
     periods,
     skills,
     stretches,
 )
 from t3mpc_ros.evaluation.training.train_models import blocks, fit_bags
+from t3mpc_ros.evaluation.training.training_data import (
+    TrainingData,
+    TrainingError,
+    load_training_data,
+)
 from t3mpc_ros.fuzzy.estimator import FuzzyEstimator
 from t3mpc_ros.model_file import (
     ModelError,

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from support.long_tests import few_of
 
-from t3mpc_ros.geometry.arena import OccupancyGrid
+from t3mpc_ros.geometry.obstacles import OccupancyGrid
 from t3mpc_ros.geometry.route_planning import (
     NEAR_COST,
     UNSEEN_COST,

@@ -37,7 +37,7 @@ from std_srvs.srv import Trigger
 from support.ros_graph import LATCHED, diagnostic, diagnostic_level, odometry, reason, twist
 from support.waiting import wait_until
 
-from t3mpc_ros.bag.message_definitions import BagError
+from t3mpc_ros.bag.errors import BagError
 from t3mpc_ros.bag.player import MergedReader
 from t3mpc_ros.bag.qos import QosProfile
 from t3mpc_ros.bag.reader import open_bag

@@ -29,7 +29,7 @@ from support.ros_graph import LATCHED, diagnostic, odometry, on_grid, reason, sp
 
 from t3mpc_ros.chaos.path_replanning import NOWHERE_TIME
 from t3mpc_ros.evaluation.bag_report.diagnostic_history import cause_of
-from t3mpc_ros.geometry.arena import OccupancyGrid as Cells
+from t3mpc_ros.geometry.obstacles import OccupancyGrid as Cells
 from t3mpc_ros.geometry.types import NANOSECONDS
 from t3mpc_ros.nodes.conversions import occupancy_message
 from t3mpc_ros.nodes.reference_generator import ReferenceGeneratorNode

@@ -31,14 +31,15 @@ from t3mpc_ros.radio.protocol.codec import decode_from_dongle
 from t3mpc_ros.radio.protocol.frames import CommandFlag, StatusFlag
 from t3mpc_ros.radio.protocol.framing import FrameDecoder
 from t3mpc_ros.radio.tool import (
+    channel_scan,
     eeprom_records,
     key_provisioning,
     link_test,
     manoeuvre,
     robot_info,
 )
+from t3mpc_ros.radio.tool.channel_scan import ChannelResult
 from t3mpc_ros.radio.tool.eeprom_records import SENSORS, RobotSettings
-from t3mpc_ros.radio.tool.link_test import ChannelResult
 from t3mpc_ros.radio.tool.procedure import ROBOT_BOARD, Procedure, ProcedureError
 from t3mpc_ros.radio.tool.robot_info import LogEntry, LogKind, format_log
 
@@ -317,25 +318,25 @@ def test_the_wrong_port_and_a_dead_chip_are_reported():
 def test_the_scan_finds_the_robot_and_restores_the_radio(channel, rate):
     bench = ToolBench(channel=channel, rate=rate)
     before, seen = bench.radio(), []
-    script = link_test.scan_channels(
+    script = channel_scan.scan_channels(
         LinkParameters(), ('250k', '1M', '2M'), lambda *report: seen.append(report)
     )
     (result,) = bench.at_dongle(script)
     assert (result.channel, result.rate) == (channel, rate)
     assert result.answered == result.packets == 20
     assert [report[:2] for report in seen] == [(number + 1, 378) for number in range(378)]
-    assert [text for _, _, text in seen if text] == [link_test.format_channel(result)]
+    assert [text for _, _, text in seen if text] == [channel_scan.format_channel(result)]
     assert bench.radio() == before
-    good, advice = link_test.recommend([result], LinkParameters())
+    good, advice = channel_scan.recommend([result], LinkParameters())
     assert not good
     assert f'link.channel to {channel} and' in advice
-    assert link_test.recommend([result], LinkParameters(channel=channel, rate=rate))[0]
+    assert channel_scan.recommend([result], LinkParameters(channel=channel, rate=rate))[0]
 
 
 @pytest.mark.parametrize(
     'script',
     [
-        lambda: link_test.scan_channels(LinkParameters(), ('2M',), lambda *report: None),
+        lambda: channel_scan.scan_channels(LinkParameters(), ('2M',), lambda *report: None),
         lambda: link_test.run_link_test(LinkParameters(channel=40), 50),
     ],
 )
@@ -373,7 +374,9 @@ def test_unplugging_the_dongle_ends_the_scan():
 
     bench.each = pull
     with pytest.raises(ProcedureError, match='not there'):
-        bench.at_dongle(link_test.scan_channels(LinkParameters(), ('1M',), lambda *report: None))
+        bench.at_dongle(
+            channel_scan.scan_channels(LinkParameters(), ('1M',), lambda *report: None)
+        )
 
 
 def test_each_entry_of_the_log_in_words():
@@ -400,17 +403,17 @@ def test_each_entry_of_the_log_in_words():
 def test_the_recommended_channel_is_the_best():
     answers = {5: 9, 6: 19, 7: 3}
     found = [ChannelResult(k, '1M', count, 20, 0.0) for k, count in answers.items()]
-    good, advice = link_test.recommend(found, LinkParameters())
+    good, advice = channel_scan.recommend(found, LinkParameters())
     assert not good
     assert advice == (
         'the robot is on another channel or rate than configured: set link.channel to 6 and '
         "link.rate to '1M', or build its firmware for 82 at 1M"
     )
     best = LinkParameters(channel=6)
-    assert link_test.recommend(found, best)[1].endswith('ping measures the link quality')
+    assert channel_scan.recommend(found, best)[1].endswith('ping measures the link quality')
     whole = [found[1]._replace(answered=20)]
-    assert link_test.recommend(whole, best) == (True, 'the robot answers as configured')
-    good, advice = link_test.recommend([], best)
+    assert channel_scan.recommend(whole, best) == (True, 'the robot answers as configured')
+    good, advice = channel_scan.recommend([], best)
     assert not good
     assert 'robot switched on' in advice
 

@@ -31,7 +31,7 @@ from t3mpc_ros.simulation.digital_twin import (
     DigitalTwinParameters,
     make_robot,
 )
-from t3mpc_ros.simulation.plant.paper_plant import PaperRobot
+from t3mpc_ros.simulation.paper_robot import PaperRobot
 from t3mpc_ros.simulation.sensors.imu import SimulatedImuParameters
 
 PERIOD = 10_000_000

@@ -28,6 +28,7 @@ from t3mpc_ros.emulator.plant import Plant
 from t3mpc_ros.geometry.types import NANOSECONDS, WheelSpeeds
 from t3mpc_ros.robot.interface import RobotCommand
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters, TransportDelay
+from t3mpc_ros.simulation.paper_robot import PaperRobot
 from t3mpc_ros.simulation.plant.disturbances import (
     Disturbance,
     DisturbanceParameters,
@@ -36,7 +37,7 @@ from t3mpc_ros.simulation.plant.disturbances import (
     friction_torque,
     reflect,
 )
-from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 from t3mpc_ros.simulation.sensors.imu import SimulatedImu
 from t3mpc_ros.simulation.sensors.range_sensor import SimulatedRangeSensors
 

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 from support.constants import with_constants
 
-from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.obstacles import Obstacles
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.simulation.plant.bumper_contact import BumperParameters
 from t3mpc_ros.simulation.plant.disturbances import (

@@ -23,14 +23,10 @@ from support.equations import wheel_coriolis
 from t3mpc_ros.geometry.types import WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.command_limiter import ramp_towards
+from t3mpc_ros.simulation.paper_robot import PaperRobot
 from t3mpc_ros.simulation.plant.disturbances import Disturbance, DisturbanceParameters
 from t3mpc_ros.simulation.plant.dynamics import wheel_inertia
-from t3mpc_ros.simulation.plant.paper_plant import (
-    PaperPlant,
-    PaperRobot,
-    PaperRobotParameters,
-    delay_command,
-)
+from t3mpc_ros.simulation.plant.paper_plant import PaperPlant, PaperRobotParameters, delay_command
 
 IDEAL: dict[str, object] = {
     'friction.viscous': 0.0,

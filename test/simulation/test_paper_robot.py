@@ -22,7 +22,8 @@ from t3mpc_ros.geometry.sample_scheduler import SampleScheduler
 from t3mpc_ros.geometry.types import Pose, WheelSpeeds
 from t3mpc_ros.parameters.table import ParameterError
 from t3mpc_ros.robot.interface import RobotCommand, RobotState
-from t3mpc_ros.simulation.plant.paper_plant import PaperRobot, PaperRobotParameters
+from t3mpc_ros.simulation.paper_robot import PaperRobot
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 
 MS = 1_000_000
 PERIOD = 10 * MS

@@ -51,8 +51,8 @@ from t3mpc_ros.emulator.event_queue import EventQueue
 from t3mpc_ros.emulator.fault_injection import FAULT_KINDS, Fault, FaultInjection
 from t3mpc_ros.emulator.plant import Plant
 from t3mpc_ros.emulator.serial_line import SerialLine
-from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.obstacles import Obstacles
 from t3mpc_ros.geometry.sample_scheduler import RealTimeFactor, SampleScheduler, SimulatedTime
 from t3mpc_ros.geometry.types import ORIGIN, BodyTwist, Pose, State, WheelSpeeds
 from t3mpc_ros.mpc.predictive_controller import PredictiveController, PredictiveParameters
@@ -60,10 +60,8 @@ from t3mpc_ros.robot.command_limiter import CommandLimiter, CommandLimiterParame
 from t3mpc_ros.robot.gyro_odometry import GyroOdometry, GyroOdometryParameters
 from t3mpc_ros.robot.interface import RobotCommand
 from t3mpc_ros.simulation.digital_twin import DigitalTwin, DigitalTwinParameters
-from t3mpc_ros.simulation.plant.paper_plant import (
-    PaperRobot,
-    PaperRobotParameters,
-)
+from t3mpc_ros.simulation.paper_robot import PaperRobot
+from t3mpc_ros.simulation.plant.paper_plant import PaperRobotParameters
 from t3mpc_ros.simulation.sensors.battery import SimulatedBattery, SimulatedBatteryParameters
 from t3mpc_ros.simulation.sensors.imu import SimulatedImu, SimulatedImuParameters
 from t3mpc_ros.simulation.sensors.range_sensor import (

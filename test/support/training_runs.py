@@ -23,7 +23,7 @@ from t3mpc_ros.evaluation.process_replay.replay_writer import TYPES as RECORDED
 from t3mpc_ros.evaluation.scenario import Scenario
 from t3mpc_ros.geometry.kinematics import WheelGeometry, twist_from_wheels, wheels_from_twist
 from t3mpc_ros.geometry.types import ORIGIN, State, WheelSpeeds
-from t3mpc_ros.simulation.plant.paper_plant import PaperRobot
+from t3mpc_ros.simulation.paper_robot import PaperRobot
 
 STEP = 10_000_000
 LEAD = 40

@@ -27,7 +27,7 @@ from t3mpc_ros.chaos.reference import ReferenceParameters
 from t3mpc_ros.chaos.solver import FractionalSolver
 from t3mpc_ros.chaos.system import QuadraticSystem, hyperchaotic_system
 from t3mpc_ros.evaluation.api.error_messages import one_sentence
-from t3mpc_ros.evaluation.api.references import numbers
+from t3mpc_ros.evaluation.api.own_reference import numbers
 from t3mpc_ros.evaluation.api.result_tables import drawn, writable
 from t3mpc_ros.evaluation.reporting import write_columns
 from t3mpc_ros.geometry.types import Array, read_only

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from t3mpc_ros.control.actuation import LimitParameters
 from t3mpc_ros.evaluation.api.error_messages import described, one_sentence
-from t3mpc_ros.evaluation.api.references import numbers
+from t3mpc_ros.evaluation.api.own_reference import numbers
 from t3mpc_ros.geometry.types import Array, WheelSpeeds, read_only
 from t3mpc_ros.mpc.pretraining import matrix_exponential
 from t3mpc_ros.script_error import ScriptError

@@ -36,8 +36,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from t3mpc_ros.evaluation.api.error_messages import described, one_sentence
+from t3mpc_ros.evaluation.api.own_reference import sampled
 from t3mpc_ros.evaluation.api.plants import NoiseLaw, OdePlant, Robot, StateSpace, gaussian_noise
-from t3mpc_ros.evaluation.api.references import sampled
 from t3mpc_ros.evaluation.baselines.baseline_controller import (
     BaselineController,
     NominalModel,

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t3mpc_ros.bag.message_definitions import DataError
+from t3mpc_ros.bag.errors import DataError
 from t3mpc_ros.bag.reader import (
     CDR_LAYOUTS,
     BagReader,

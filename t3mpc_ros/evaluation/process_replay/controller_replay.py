@@ -32,14 +32,14 @@ from t3mpc_ros.bag.controller_journal import (
     parameters_from_json,
     reading_from_value,
 )
-from t3mpc_ros.bag.mcap_file import message_loss_notes
+from t3mpc_ros.bag.message_losses import message_loss_notes
 from t3mpc_ros.bag.reader import BagReader, TopicColumns, open_bag, read_columns
 from t3mpc_ros.control.controller import SCALAR_NAMES, Controller, ControllerParameters, Status
 from t3mpc_ros.control.watchdog import Reason
 from t3mpc_ros.evaluation import topic_roles
 from t3mpc_ros.evaluation.topic_roles import COMMAND, JOURNAL, ODOMETRY, REFERENCE
-from t3mpc_ros.geometry.arena import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.map_file import MapError, load_map
+from t3mpc_ros.geometry.obstacles import Obstacles, OccupancyGrid
 from t3mpc_ros.geometry.types import NANOSECONDS, STANDSTILL, Array, BodyTwist, StateArray
 from t3mpc_ros.model_file import load_model
 from t3mpc_ros.parameters.command_line import parse_assignments

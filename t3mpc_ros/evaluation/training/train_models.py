@@ -47,17 +47,19 @@ from t3mpc_ros.evaluation.scenario import (
     held_out,
 )
 from t3mpc_ros.evaluation.topic_roles import bag_display_name
-from t3mpc_ros.evaluation.training.fit import (
-    TrainingData,
-    TrainingError,
-    check_compatible,
+from t3mpc_ros.evaluation.training.model_fit import (
     explained,
     fit_coefficients,
     fit_predictor,
-    load_training_data,
     periods,
     skills,
     stretches,
+)
+from t3mpc_ros.evaluation.training.training_data import (
+    TrainingData,
+    TrainingError,
+    check_compatible,
+    load_training_data,
 )
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.mpc.predictive_controller import PredictiveController

@@ -33,8 +33,8 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from t3mpc_ros.geometry.arena import Obstacles
 from t3mpc_ros.geometry.kinematics import WheelGeometry
+from t3mpc_ros.geometry.obstacles import Obstacles
 from t3mpc_ros.geometry.types import Array, Pose, WheelSpeeds, wrap_angle
 from t3mpc_ros.kernels import TypedKernel, kernel
 from t3mpc_ros.parameters.table import Parameters, parameter

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 import t3mpc_ros as t3
-from t3mpc_ros.evaluation.api.references import sampled
+from t3mpc_ros.evaluation.api.own_reference import sampled
 from t3mpc_ros.evaluation.api.script_parts import loaded
 
 PERIOD = 0.01
