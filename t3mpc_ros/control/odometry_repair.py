@@ -145,6 +145,9 @@ FIT_FILTER, FIT_ROW, FIT_MEMORY = 0.1, 0.2, 10.0
 their memory, s."""
 FIT_SETTLING, FIT_ROWS = 0.6, 8
 """Time after which the filter has forgotten an interruption (s); comparisons that are needed."""
+REVERSED_ROWS, REVERSED = 3, 0.05
+"""Comparisons after which a velocity of the other sign is one, and the part of their difference
+(mean squares) that it may leave: one that is late by less than them leaves a third."""
 FIT_GAP, FIT_INTERVALS = 5.0, 0.05
 """Interval between two messages, as a multiple of the usual one, that is a gap; share by which the
 usual one follows each of them."""
@@ -215,6 +218,8 @@ class VelocityFit:
         self._apart = kept * self._apart + (twist - row[0]) ** 2
         self._rough = [kept * old + new for old, new in zip(self._rough, rough, strict=True)]
         if self.rows < FIT_ROWS:
+            if self.is_reversed:
+                self.values[0], self.deviations[0] = -1.0, 0.0
             return
         # It is 1 times the rate where nothing is known.
         rest = self._product - self._normal[:, 0]
@@ -237,6 +242,12 @@ class VelocityFit:
     def is_certain(self, index: int, times: float) -> bool:
         """Whether a value is not the one of a twist that fits."""
         return abs(self.values[index] - (index == 0)) > times * self.deviations[index]
+
+    @property
+    def is_reversed(self) -> bool:
+        """Whether the twist is the negative of the rate of the pose, from few comparisons."""
+        left = self._apart + 4.0 * float(self._product[0])
+        return round(self.rows) >= REVERSED_ROWS and left < REVERSED * self._apart
 
     @property
     def motion(self) -> float:
@@ -357,7 +368,7 @@ class TwistFit:
         kept = 1.0 - FIT_ROW / FIT_MEMORY
         self._aside = kept * self._aside + means[4][1] ** 2
         self._age += FIT_ROW
-        if self._fits[0].rows >= FIT_ROWS:
+        if self._fits[0].rows >= FIT_ROWS or any(fit.is_reversed for fit in self._fits):
             self.uses_pose = [
                 fit.prefers_pose(least) for fit, least in zip(self._fits, POSE_NOISE, strict=True)
             ]
