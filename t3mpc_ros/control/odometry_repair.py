@@ -172,6 +172,14 @@ ANGULAR_FACTORS = 0.5, 2.0
 LATE, LATE_PERIODS = 0.005, 0.6
 """Time by which the linear velocity is behind the pose that counts: s, and share of the interval
 of the messages, as the mean over two of them is half of it late."""
+REPEATS_SHARE, REPEATS_MEMORY, REPEATS_ROWS = 0.2, 0.98, 20
+"""Share by which the usual number of repetitions of a twist follows each one, forgetting factor of
+what is known of its changes, and how many must follow equal numbers of repetitions: 1 s at 20 Hz.
+"""
+REPEATS_ROUND, REPEATS_APART, REPEATS_BEHIND = 1.5, 0.35, -2.0
+"""Least mean of the fourth power of a change over that of its square: a twist that is rounded has
+1, noise 3; least square between pose and old twist over that of the change: noise has a half, a
+motion that changes with the twist none; and standard deviations the pose may be behind it."""
 UNLIKE, ROUGH = (0.1, 0.6), 0.3
 """Share of the velocity that factor, lag and offset do not explain from which they are no true
 description of a twist that is certainly wrong, and from which it is wrong without them; the same
@@ -270,6 +278,51 @@ class VelocityFit:
         return pose < twist + self._apart + self.rows * least**2
 
 
+class HeldTwist:
+    """Whether the twist is that of a slower stream: messages repeat it to the last digit.
+
+    So they do on a robot at constant speed, or whose twist is rounded; then its changes are small
+    beside those of the pose, or all the same, or come at any time.
+    """
+
+    def __init__(self) -> None:
+        self.repeats = 0.0  # usual number of repetitions
+        self._repeats = self._regular = 0
+        self._sums = [[0.0] * 6 for _ in range(2)]
+
+    def update(self, last: list[float], new: list[float]) -> None:
+        """Add a message: velocities (m/s, rad/s) by the pose, and by the twist."""
+        if new[2:4] == last[2:4]:
+            self._repeats += 1
+            return
+        repeats, self._repeats = self._repeats, 0
+        if not repeats and not self._regular:
+            return
+        usual = abs(repeats - self.repeats) <= 1.0
+        self._regular = self._regular + 1 if usual else self._regular // 2
+        self.repeats += REPEATS_SHARE * (repeats - self.repeats)
+        for i, sums in enumerate(self._sums):
+            change = new[i + 2] - last[i + 2]
+            ahead = change * (new[i] + last[i] - new[i + 2] - last[i + 2])
+            apart = last[i] - last[i + 2]
+            each = 1.0, change**2, change**4, apart**2, ahead, ahead**2
+            sums[:] = (REPEATS_MEMORY * old + add for old, add in zip(sums, each, strict=True))
+
+    def is_late(self, interval: float) -> bool:
+        """Whether it is late by what counts; ``interval``: that of the messages, s."""
+        late = self.late(interval) > max(LATE, LATE_PERIODS * interval)
+        return (late and self._regular >= REPEATS_ROWS) and any(
+            rows * fourth > REPEATS_ROUND * square**2
+            and apart > REPEATS_APART * square
+            and ahead > REPEATS_BEHIND * math.sqrt(aheads)
+            for rows, square, fourth, apart, ahead, aheads in self._sums
+        )
+
+    def late(self, interval: float) -> float:
+        """Return the mean time by which it is late, s."""
+        return 0.5 * self.repeats * interval
+
+
 class TwistFit:
     """Whether the twist of the odometry is what the pose in the same messages says.
 
@@ -289,6 +342,7 @@ class TwistFit:
         self._fits = [
             VelocityFit(prior, noise) for prior, noise in zip(FIT_PRIOR, FIT_NOISE, strict=True)
         ]
+        self._held = HeldTwist()
         self._aside = self._interval = 0.0
         self._age = 0.0  # driving time since something was wrong, s
         self.interrupt()
@@ -338,6 +392,7 @@ class TwistFit:
             sums[1] += elapsed * stages[1]
         for i in range(4):
             self._rough[i] += 0.5 * (given[i] - self._last[i]) ** 2
+        self._held.update(self._last, given)
         self._last = given
         self._time += elapsed
         self._since += elapsed
@@ -368,7 +423,8 @@ class TwistFit:
         kept = 1.0 - FIT_ROW / FIT_MEMORY
         self._aside = kept * self._aside + means[4][1] ** 2
         self._age += FIT_ROW
-        if self._fits[0].rows >= FIT_ROWS or any(fit.is_reversed for fit in self._fits):
+        known = self._fits[0].rows >= FIT_ROWS or any(fit.is_reversed for fit in self._fits)
+        if known or self._held.is_late(self._interval):
             self.uses_pose = [
                 fit.prefers_pose(least) for fit, least in zip(self._fits, POSE_NOISE, strict=True)
             ]
@@ -390,9 +446,13 @@ class TwistFit:
         late = late and linear.is_certain(1, LATE_CERTAIN)
         late, self._late = late and self._late, late  # twice: of many decisions one may be wrong
         follows = linear.unexplained < UNLIKE[0] ** 2 * way and linear.roughness < ROUGH**2 * way
-        wrong, common = '', 1.0
+        wrong, common, interval = '', 1.0, self._interval
+        if self._held.is_late(interval):
+            behind = self._held.late(interval)
+            held = 2.0 * behind + interval
+            wrong = f'its velocities are held for {held:.2g} s, {behind:.3f} s behind'
         # After the yaw was set, the robot goes aside by its pose, and its way ahead is shorter.
-        if self._aside > SIDEWAYS**2 * linear.rows * linear.motion:
+        elif self._aside > SIDEWAYS**2 * linear.rows * linear.motion:
             pass
         elif linear.unexplained > UNLIKE[1] ** 2 * way or (
             not follows and (scaled or shifted or late)
