@@ -318,12 +318,16 @@ class WatchedDriver(NodeDriver):
     def step(self, state: RobotState) -> Any:
         """Return the command, and watch the inputs as the node does."""
         command = super().step(state)
-        odometry, status = state.odometry, self._controller.status
-        known = None if self._controller.odometry_twist.replaced else self._command
+        controller, odometry = self._controller, state.odometry
+        status = controller.status
+        known = None if controller.odometry_twist.replaced else self._command
         following = status.reason is Reason.TRACKING
-        if not self._controller.doubts_odometry:
-            self._monitor.update(odometry, self._now_ns, known, following=following)
-        self._command = self._controller.actuation.twist if status.reason.moves else None
+        if not controller.doubts_odometry:
+            periods = controller.stamp_filter.periods
+            self._monitor.update(
+                odometry, self._now_ns, known, following=following, periods=periods
+            )
+        self._command = controller.actuation.twist if status.reason.moves else None
         return command
 
 

@@ -34,8 +34,9 @@ MAX_SIMULATED_OFFSET = 5.0
 NO_STAMP = 1e8  # offset of a stamp that is no time of today, s: three years
 RATE_TOLERANCE = 0.2  # relative difference between measured and set rate that is reported
 
-GAP = 1.7
-"""Interval from which a message is missing, in periods: with a jitter of 30 % none reaches it."""
+GAP, GAP_OF_THREE = 1.7, 3.5
+"""Interval from which a message is missing, in periods: with a jitter of 30 % none reaches it, and
+that of three: a stamp that is late, between one and the next that are not, is no gap."""
 RECENT = 10.0  # time for which gaps and jumps are reported, s
 MANY_JUMPS = 3
 """Jumps of the pose in that time from which they are: a localisation makes one now and then."""
@@ -167,8 +168,11 @@ class Gaps:
         self.longest = 0.0  # longest gap, s
         self.restarts = 0  # stamps that were older than the one before
 
-    def update(self, stamp_ns: int) -> float | None:
-        """Add a message; return the time since the one before, s, None at a restart."""
+    def update(self, stamp_ns: int, periods: int | None = None) -> float | None:
+        """Add a message; return the time since the one before, s, None at a restart.
+
+        ``periods`` since the one before, where the motion tells them: then stamps jitter.
+        """
         last, self._last_ns = self._last_ns, stamp_ns
         if last is None:
             return None
@@ -180,15 +184,25 @@ class Gaps:
         self._intervals.append(elapsed)
         if len(self._intervals) % 5 == 0 or elapsed > GAP * self._period:
             self._period = median(self._intervals)
-        if elapsed > GAP * self._period and len(self._intervals) >= 5:
-            missing = max(1, round(elapsed / self._period) - 1)
-            self.number += 1
-            self.missing += missing
-            self.longest = max(self.longest, elapsed)
-            self._recent.append((stamp_ns, elapsed, missing))
+        if periods is not None:
+            self._add(stamp_ns, elapsed, periods - 1)
+        elif len(self._intervals) >= 5:
+            before, gap = self._intervals[-3], self._intervals[-2]
+            if gap > GAP * self._period and before + gap + elapsed > GAP_OF_THREE * self._period:
+                self._add(last, gap, max(1, round(gap / self._period) - 1))
         while self._recent and stamp_ns - self._recent[0][0] > RECENT * NANOSECONDS:
             self._recent.popleft()
         return elapsed
+
+    def _add(self, end_ns: int, gap: float, missing: int) -> None:
+        if missing > 0:
+            self.number += 1
+            self.missing += missing
+            self.longest = max(self.longest, gap)
+            self._recent.append((end_ns, gap, missing))
+        elif missing < 0 and self._recent:  # the message before was only late
+            self.number -= 1
+            self.missing -= self._recent.pop()[2]
 
     @property
     def rate(self) -> float:
@@ -248,13 +262,20 @@ class OdometryMonitor:
         self._product = [0.0, 0.0]
 
     def update(
-        self, odometry: State, now_ns: int, command: BodyTwist | None, *, following: bool = True
+        self,
+        odometry: State,
+        now_ns: int,
+        command: BodyTwist | None,
+        *,
+        following: bool = True,
+        periods: int | None = None,
     ) -> None:
         """Add one odometry message and the command before it; None after a standstill command.
 
-        ``following``: whether the robot follows commands, as far as is known.
+        ``following``: whether the robot follows commands, as far as is known; ``periods`` since
+        the message before, where stamps jitter.
         """
-        elapsed = self.gaps.update(odometry.stamp_ns)
+        elapsed = self.gaps.update(odometry.stamp_ns, periods)
         offset = (now_ns - odometry.stamp_ns) / NANOSECONDS
         self.late += len(self._offsets) > 5 and offset > self._typical + LATE
         self._offsets.append(offset)

@@ -72,6 +72,8 @@ class StampFilter:
         self.jitters = False
         """Whether the stamps are replaced."""
         self.jitter = 0.0  # root mean square of what is wrong with an interval, s
+        self.periods: int | None = None
+        """Periods since the message before; None where the stamps tell it, as they are used."""
         self._rows = self._stamps = self._times = self._apart = 0.0
         self._last: State | None = None
         self._origin_ns = self._returned = self._settling = 0
@@ -82,7 +84,7 @@ class StampFilter:
     def time(self, odometry: State) -> int:
         """Return the time of an odometry, ns."""
         last, stamp = self._last, odometry.stamp_ns
-        self._last = odometry
+        self._last, self.periods = odometry, None
         interval = 0.0 if last is None else float(stamp - last.stamp_ns)
         periods = (stamp - self._origin_ns - self._regular) / self._period if self._period else 1.0
         if last is None or interval <= 0.0 or periods > STAMP_GAP:
@@ -112,6 +114,7 @@ class StampFilter:
         if not self.jitters:
             self._returned = max(stamp, self._returned + 1)
             return self._returned
+        self.periods = number
         time = self._origin_ns + round(self._regular)
         self._returned = max(time, self._returned + round(0.1 * self._period))
         return self._returned

@@ -267,7 +267,10 @@ class ControllerNode(BaseNode[ControllerNodeParameters]):
         known = None if self._controller.odometry_twist.replaced else self._last_command
         following = status.reason is Reason.TRACKING
         if not self._controller.doubts_odometry:
-            self._odometry_monitor.update(measured, self.now_ns(), known, following=following)
+            periods = self._controller.stamp_filter.periods
+            self._odometry_monitor.update(
+                measured, self.now_ns(), known, following=following, periods=periods
+            )
         self._last_command = command if status.reason.moves else None
         self._publish_journal(self._journal.step(measured.stamp_ns))
         self._initial_odometry.republish(message)
