@@ -15,7 +15,6 @@
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-import math
 import os
 from pathlib import Path
 import sys
@@ -272,10 +271,22 @@ def _doctor(options: argparse.Namespace, stop: StopSignal) -> int:
     command_line.check_writable(options.report)
     check_two_ports(options.port, options.robot_port)
     if not options.no_questions and not sys.stdin.isatty():
-        raise ProcedureError('the checklist asks questions at a terminal: or use --no-questions')
+        raise ProcedureError(
+            'the checklist asks questions, and the standard input is no terminal: use one, or use '
+            '--no-questions'
+        )
 
     def answer(question: str) -> str:
-        return 'skip' if options.no_questions else _choose(question, ('yes', 'no', 'skip'), stop)
+        if options.no_questions:
+            return 'skip'
+        question += ' [yes/no/skip] '
+        while True:
+            word = ask_line(question, stop).strip().lower() or 'skip'
+            if stop():
+                raise ProcedureError('interrupted')
+            for each in ('yes', 'no', 'skip'):
+                if word in (each, each[0]):
+                    return each
 
     parameters, key = _link_parameters(options), _key_option(options)
     checks = robot_doctor.run_doctor(options, parameters, key, answer, stop)
@@ -286,13 +297,7 @@ def _ask(question: str, stop: StopSignal) -> bool:
     """Return whether the user answers yes at a terminal."""
     if not sys.stdin.isatty():
         raise ProcedureError('this needs a confirmation at a terminal, or --yes')
-    return _choose(question, ('yes', 'no'), stop) == 'yes'
-
-
-def _choose(question: str, choices: tuple[str, ...], stop: StopSignal) -> str:
-    """Return one of the choices, or of their first letters; the last one otherwise."""
-    word = ask_line(f'{question} [{"/".join(choices)}] ', stop).strip().lower()
-    return next((each for each in choices if word in (each, each[0])), choices[-1])
+    return ask_line(f'{question} [yes/no] ', stop).strip().lower() in ('yes', 'y')
 
 
 def _run_at_dongle(script: Script[Value], options: argparse.Namespace, stop: StopSignal) -> Value:
@@ -361,10 +366,11 @@ def _sensors(text: str) -> tuple[str, ...]:
 
 
 def _revolutions(text: str) -> float:
-    value = float(text)
-    if not 0.01 <= math.fabs(value) <= 100.0:
-        raise argparse.ArgumentTypeError(f'must be from 0.01 to 100, or negative: got {text}')
-    return value
+    command_line.bounded_float(0.01, 100.0, 'turns, or negative')(text.removeprefix('-'))
+    return float(text)
+
+
+_revolutions.__name__ = 'number'  # argparse: "invalid number value: 'x'"
 
 
 def program_parser() -> argparse.ArgumentParser:
@@ -411,7 +417,7 @@ def program_parser() -> argparse.ArgumentParser:
     add('wheel', choices=(manoeuvre.LEFT, manoeuvre.RIGHT))
     add('revolutions', type=_revolutions, metavar='REVOLUTIONS', help='negative: backward')
     text = 'wheel speed, rad/s (default 2)'
-    add('--speed', type=command_line.bounded_float(0.2, 10.0), default=2.0, help=text)
+    add('--speed', type=command_line.bounded_float(0.2, 10.0, 'rad/s'), default=2.0, help=text)
     add('--yes', action='store_true', help='do not ask whether the wheels are in the air')
 
     add_json(link_command('parameters', _show_parameters, 'list the board parameters', True))

@@ -108,6 +108,8 @@ def _drive(
             continue
         task = manoeuvre.Jog(parameters, key, os.urandom, wheel, 1.0, _SPEED, print)
         procedure.run_at_port(task, options.port, interrupted)
+        if interrupted():
+            raise ProcedureError('interrupted')
         if task.error:
             add([Check(question.step, question.name, FAIL, 'did not turn', task.error)])
         else:

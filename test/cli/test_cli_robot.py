@@ -13,11 +13,13 @@
 # limitations under the License.
 """``t3mpc robot`` as a command: exit codes, messages, and one run over pseudo terminals."""
 
+import argparse
 import os
 import signal
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,9 +27,10 @@ from support.missing_tools import needs
 from support.waiting import communicate
 
 from t3mpc_ros.cli import robot as cli
-from t3mpc_ros.cli import robot_calibrate
+from t3mpc_ros.cli import robot_calibrate, robot_doctor
 from t3mpc_ros.radio.serial_port import SerialPort
-from t3mpc_ros.radio.tool import procedure
+from t3mpc_ros.radio.tool import manoeuvre, procedure
+from t3mpc_ros.radio.tool.procedure import ProcedureError
 from t3mpc_ros.robot.calibration import Recording
 
 
@@ -117,6 +120,60 @@ def test_an_interrupted_calibration_keeps_what_it_found(capsys, monkeypatch, tmp
     assert 'interrupted' in output.err
     bias = robot_calibrate.read_parameter_file(path)[0].gyro_bias
     assert bias.value == pytest.approx(0.01, abs=1e-4)
+
+
+def doctor_at_terminal(typed, ask, monkeypatch):
+    """Return the exit code of a doctor that only asks; Ctrl-C follows the first line typed."""
+    read, write = os.pipe()
+    os.write(write, typed)
+    os.close(write)
+    monkeypatch.setattr(robot_doctor, 'run_doctor', lambda *given: ask(*given[3:]))
+    with os.fdopen(read) as terminal:
+        monkeypatch.setattr(sys, 'stdin', Terminal(terminal))
+        return cli.main(['doctor', '--port', 'x', '--robot-port', 'y', '--drive'])
+
+
+def test_ctrl_c_at_a_question_ends_the_checklist(monkeypatch, capsys):
+    """It showed all further questions, skipped them, and had exit code 0."""
+
+    def ask(answer, stop):
+        answer('Both wheels in the air?')
+        pytest.fail('a second question was asked')
+
+    assert doctor_at_terminal(b'yes\nyes\n', ask, monkeypatch) == 130
+    assert capsys.readouterr().err == 't3mpc robot: interrupted\n'
+
+
+def test_ctrl_c_while_a_wheel_turns_fails_no_check(monkeypatch, tmp_path):
+    """It was *left wheel: did not turn, try: interrupted* in a report, and exit code 1."""
+    task = SimpleNamespace(error='interrupted')
+    monkeypatch.setattr(manoeuvre, 'Jog', lambda *given: task)
+    turned = []
+    monkeypatch.setattr(procedure, 'run_at_port', lambda *given: turned.append(given))
+    monkeypatch.setattr(procedure, 'run_script', failing)
+    options = argparse.Namespace(
+        port='x', robot_port='y', count=10, drive=True, report=tmp_path / 'doctor.html'
+    )
+    with pytest.raises(ProcedureError, match='^interrupted$'):
+        robot_doctor.run_doctor(options, None, b'', lambda text: 'yes', lambda: bool(turned))
+    assert not options.report.exists()
+
+
+def failing(*given):
+    raise ProcedureError('no board')
+
+
+def test_a_misspelt_answer_is_asked_for_again(monkeypatch, capsys):
+    """*yse* counted as *skip*: the check was lost."""
+    lines = iter(['yse', 'Y'])
+    monkeypatch.setattr(cli, 'ask_line', lambda question, stop: next(lines))
+    monkeypatch.setattr(sys, 'stdin', SimpleNamespace(isatty=lambda: True))
+    chosen = []
+    monkeypatch.setattr(
+        robot_doctor, 'run_doctor', lambda *given: chosen.append(given[3]('Free?')) or []
+    )
+    assert cli.main(['doctor', '--port', 'x', '--robot-port', 'y']) == 0
+    assert chosen == ['yes']
 
 
 class Terminal:

@@ -30,7 +30,10 @@ ROBOT_USB = (
 )
 """Where a dongle is needed, or the firmware of the robot is older than 2.1."""
 RADIO_NOT_CONFIGURED = 'the dongle rejects the radio configuration'
-HOST_KEY_MISSING = 'the robot requires signed commands: give the host the key'
+HOST_KEY_MISSING = (
+    'the robot requires signed commands: give the host the key, by key_file of radio_bridge or '
+    '--key of t3mpc robot'
+)
 ROBOT_KEY_MISSING = (
     'the robot has no key to verify signatures: store the key in it, or use none on the host'
 )
