@@ -44,7 +44,7 @@ import yaml
 
 from t3mpc_ros.nodes import qos
 from t3mpc_ros.nodes.conversions import message_class
-from t3mpc_ros.nodes.node_main import own_context
+from t3mpc_ros.nodes.node_main import isolation, own_context
 from t3mpc_ros.nodes.remote_parameters import (
     parameter_message,
     parameter_row,
@@ -211,10 +211,13 @@ class Graph:
         self.discover()
         if not self._others():
             domain = os.environ.get('ROS_DOMAIN_ID', '0')
-            raise GraphError(
-                f'no node was discovered within {DISCOVERY:g} s: is ROS_DOMAIN_ID, {domain} here, '
-                'that of the nodes, and is the network up?'
+            server = os.environ.get('ROS_DISCOVERY_SERVER', '')
+            reason = isolation(os.environ) or (
+                f'is ROS_DOMAIN_ID, {domain} here, that of the nodes, '
+                + f'does ROS_DISCOVERY_SERVER, {server} here, run, ' * bool(server)
+                + 'and is the network up?'
             )
+            raise GraphError(f'no node was discovered within {DISCOVERY:g} s: {reason}')
         return sorted(self._others())
 
     def parameter_names(self, node: str) -> Sequence[str]:

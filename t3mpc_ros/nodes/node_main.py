@@ -15,8 +15,11 @@
 
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
+import fcntl
 import os
 from pathlib import Path
+import socket
+import struct
 import sys
 import tempfile
 from typing import TYPE_CHECKING, NoReturn, TypeVar
@@ -39,6 +42,8 @@ USAGE_ERROR = 2
 """Exit code for an unusable parameter, parameter file or command line."""
 MAX_DOMAIN = 232
 """Largest domain: the ports of DDS end there."""
+_SIOCGIFFLAGS, _IFF_UP = 0x8913, 1
+"""Request for the flags of a network interface, and one of them (netdevice(7))."""
 PROFILES = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 """Variable with the settings of Fast DDS, which goes on without a word if the file is missing."""
 
@@ -103,7 +108,8 @@ def run(name: str, stop: StopSignal, argv: Sequence[str]) -> int:
     try:
         nodes = kind.make(cli_args=list(argv))
         names = [node.get_fully_qualified_name() for node in nodes]
-        for problem in arguments.unmatched_files(argv, names):
+        alone = isolation(os.environ)
+        for problem in arguments.unmatched_files(argv, names) + [alone] * bool(alone):
             for node in nodes:
                 node.get_logger().warning(problem)
                 node.start_warnings.append(problem)
@@ -210,6 +216,33 @@ def environment_problem(environment: Mapping[str, str]) -> str:
     if not wanted or not known or wanted in known:
         return ''
     return f'RMW_IMPLEMENTATION must be one that is installed, {", ".join(known)}: got {wanted}'
+
+
+def isolation(environment: Mapping[str, str]) -> str:
+    """Return why no node finds one of another process; '' if nothing is known to prevent it."""
+    name = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+    if environment.get(name) == 'OFF' and environment.get('ROS_LOCALHOST_ONLY') != '1':
+        return f'no node of another process is found, because {name} is OFF: unset it'
+    if not _network_is_up():
+        return (
+            'no node of another process is found, because no network interface is up: '
+            '`ip link set lo up` is enough on one machine'
+        )
+    return ''
+
+
+def _network_is_up() -> bool:
+    """Return whether a network interface is up; also True where the kernel does not say."""
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+            for _, name in socket.if_nameindex():
+                request = struct.pack('16s24x', name.encode())
+                answer = fcntl.ioctl(asked, _SIOCGIFFLAGS, request)
+                if struct.unpack_from('H', answer, 16)[0] & _IFF_UP:
+                    return True
+    except OSError:
+        return True
+    return False
 
 
 def uses_fast_dds(environment: Mapping[str, str]) -> bool:

@@ -23,8 +23,9 @@ import pytest
 
 import t3mpc_ros
 from t3mpc_ros.cli.process_group import executable
+from t3mpc_ros.nodes import node_main
 from t3mpc_ros.nodes.arguments import Origin, parameter_origins, unmatched_files
-from t3mpc_ros.nodes.node_main import environment_problem, provide_log_directory
+from t3mpc_ros.nodes.node_main import environment_problem, isolation, provide_log_directory
 from t3mpc_ros.nodes.registry import INTERFACES, NODES, parameter_class
 
 
@@ -209,6 +210,25 @@ def test_a_domain_that_cannot_be_is_named(text):
     assert environment_problem({'ROS_DOMAIN_ID': text}).endswith(f'from 0 to 232: got {text}')
     assert all(not environment_problem({'ROS_DOMAIN_ID': each}) for each in ('', '0', '232'))
     assert not environment_problem({})
+
+
+def test_a_node_that_nobody_can_find_says_so(monkeypatch):
+    """It said *ready*, with every network interface down or with discovery switched off."""
+    off = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'}
+    assert isolation(off).endswith('ROS_AUTOMATIC_DISCOVERY_RANGE is OFF: unset it')
+    assert not isolation(off | {'ROS_LOCALHOST_ONLY': '1'})  # which rcl prefers
+    flags = {'up': b'\x49\x00', 'down': b'\x48\x00'}  # of lo, the least bit is IFF_UP
+    for state, text in (('up', ''), ('down', 'no network interface is up: `ip link set lo up`')):
+        answer = bytes(16) + flags[state] + bytes(22)
+        monkeypatch.setattr(node_main.fcntl, 'ioctl', lambda *asked, answer=answer: answer)
+        assert text in isolation({})
+        assert bool(isolation({})) == bool(text)
+    monkeypatch.setattr(node_main.socket, 'if_nameindex', refused)
+    assert not isolation({})  # where the kernel does not say
+
+
+def refused():
+    raise PermissionError
 
 
 def test_a_profile_that_does_not_exist_is_named(tmp_path):
