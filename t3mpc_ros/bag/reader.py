@@ -275,7 +275,11 @@ def open_bag(path: Path | str) -> BagReader:
             f'; incomplete: {", ".join(incomplete)}: `t3mpc bag recover {path}` writes their '
             'messages to a new bag'
         )
-        raise BagError(f'no complete bag file in {path}{advice if incomplete else ""}')
+        if not incomplete:
+            advice = f', which holds no {mcap_file.MCAP_SUFFIX} and no {SQLITE_SUFFIX} file'
+            below = sorted(each.parent for each in path.glob('*/metadata.yaml'))
+            advice += f'; a bag is {below[0]}' if below else ''
+        raise BagError(f'no complete bag file in {path}{advice}')
     return BagReader(path, files, incomplete)
 
 

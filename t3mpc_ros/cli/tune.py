@@ -112,6 +112,8 @@ def _identify(options: argparse.Namespace) -> None:
         )
     if options.methods or options.evaluations or options.resume:
         raise ValueError('methods, --evaluations and --resume are for simulated robots: got a bag')
+    if options.output:
+        shared_options.prepare_file(options.output)
     found = identify_bag(bag, shared_options.report_options(options))
     text = drive_file(*found, bag_display_name(bag))
     shared_options.print_result(options, lambda: text.rstrip('\n'), lambda: drive_record(*found))

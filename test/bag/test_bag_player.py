@@ -192,13 +192,16 @@ def test_path_without_a_bag_is_rejected(tmp_path):
     (tmp_path / 'none.mcap').touch()
     (tmp_path / 'begun.mcap').write_bytes(b'\x89MCAP0\r\n')
     (tmp_path / 'empty').mkdir()
+    (tmp_path / 'above' / 'run2').mkdir(parents=True)
+    (tmp_path / 'above' / 'run2' / 'metadata.yaml').touch()
     (tmp_path / 'broken.db3').write_bytes(b'no database' * 100)
     for path, words in (
         ('none.mcap', 'is empty: it has no byte'),
         ('begun.mcap', 't3mpc bag recover .*begun.mcap'),
         ('nowhere', 'there is no bag'),
         ('notes.txt', 'is no MCAP file and no sqlite3 bag'),
-        ('empty', 'no complete bag file'),
+        ('empty', 'empty, which holds no .mcap and no .db3 file$'),
+        ('above', 'file; a bag is .*above/run2$'),
         ('broken.db3', 'cannot be read'),
     ):
         with pytest.raises(BagError, match=words):

@@ -250,8 +250,11 @@ def without(lost):
             slow, r'deviation of the .* at most \d+\.\d ms: got \d+\.\d ms', marks=pytest.mark.long
         ),
         (in_millimetres, 'twist of /odom cannot be in m/s and rad/s: .*Correct the units'),
-        (without('/odom'), 'cmd_vel and odom: no odom$'),
-        (without('/cmd_vel'), 'cmd_vel and odom: no cmd_vel$'),
+        (without('/odom'), 'cmd_vel and odom: no odom, a topic of nav_msgs/msg/Odometry with'),
+        (
+            without('/cmd_vel'),
+            'cmd_vel and odom: no cmd_vel, a topic of geometry_msgs/msg/Twist or',
+        ),
     ],
 )
 def test_a_bag_that_does_not_determine_the_drive_is_refused(tape_of, words, driven, tmp_path):
@@ -260,6 +263,16 @@ def test_a_bag_that_does_not_determine_the_drive_is_refused(tape_of, words, driv
 
 
 # The command line
+
+
+def test_an_output_that_cannot_be_written_is_said_first(tmp_path, driven, capsys):
+    """The file was identified and printed, then: [Errno 21] Is a directory."""
+    folder = driven.write(tmp_path / 'drive')
+    assert main(['tune', '--robot', str(folder), '--output', str(tmp_path)]) == 1
+    assert capsys.readouterr() == (
+        '',
+        f'error: {tmp_path} cannot be written: give a file in a folder that exists\n',
+    )
 
 
 def test_the_command_prints_and_writes_the_file(tmp_path, driven, capsys):

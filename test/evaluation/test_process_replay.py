@@ -273,7 +273,7 @@ def test_a_tolerance_that_cannot_be_used_is_refused(arguments, words):
     ('lost', 'words'),
     [
         (JOURNAL, 'no journal of the controller .* record it, as the'),
-        ('/cmd_vel', 'not in the bag: cmd_vel'),
+        ('/cmd_vel', 'not in the bag: cmd_vel; .*t3mpc tune --robot BAG take a bag of any robot'),
     ],
 )
 def test_a_bag_without_what_a_replay_needs_is_refused(lost, words, bag, tmp_path):

@@ -165,7 +165,11 @@ def inputs_of(
     names = {REFERENCE, ODOMETRY, COMMAND, *topic_roles.SCALARS}
     topics = {name: full for name, full in choice.topics.items() if name in names}
     if missing := [name for name in (REFERENCE, ODOMETRY, COMMAND) if name not in topics]:
-        raise ReplayError(f'{bag}: these topics are not in the bag: {", ".join(missing)}')
+        raise ReplayError(
+            f'{bag}: these topics are not in the bag: {", ".join(missing)}; a run of the '
+            'controller of this package, with its journal, is needed. t3mpc bag report and t3mpc '
+            'tune --robot BAG take a bag of any robot'
+        )
     recorded_topics = {name for name, topic in recording.topics.items() if topic.message_count}
     topics[JOURNAL] = f'{prefix}/{JOURNAL}'
     if topics[JOURNAL] not in recorded_topics:

@@ -38,7 +38,7 @@ from t3mpc_ros.evaluation.drive_response import (
     fit_response,
     fit_wheels,
 )
-from t3mpc_ros.evaluation.topic_roles import COMMAND, ODOMETRY, ReportOptions
+from t3mpc_ros.evaluation.topic_roles import COMMAND, KINDS, ODOMETRY, ReportOptions
 from t3mpc_ros.geometry.kinematics import WheelGeometry
 from t3mpc_ros.geometry.types import Array
 from t3mpc_ros.robot.calibration import Estimate
@@ -106,7 +106,10 @@ def identify_drive(run: Run) -> IdentifiedDrive:
     """Return the drive of the robot in a recorded run."""
     for name in (COMMAND, ODOMETRY):
         if name not in run.motions or len(run.motions[name]) < 3:
-            raise IdentificationError(f'the bag must hold {COMMAND} and {ODOMETRY}: no {name}')
+            raise IdentificationError(
+                f'the bag must hold {COMMAND} and {ODOMETRY}: no {name}, a topic of '
+                f'{" or ".join(KINDS[name])} with at least 3 messages'
+            )
     if ODOMETRY in run.untrusted:
         raise IdentificationError('. '.join(text for item in run.damage.items() for text in item))
     if run.geometry is None:
