@@ -65,6 +65,9 @@ def run(options: argparse.Namespace) -> int:
     if options.patrol and options.robot != 'twin':
         print(f'error: --patrol needs --robot twin: got {options.robot}', file=sys.stderr)
         return 2
+    if options.loss and options.robot != 'emulator':
+        print(f'error: --loss needs --robot emulator: got {options.robot}', file=sys.stderr)
+        return 2
     names = {each.name for each in fields(DemoOptions)} - {'output'}
     wanted = DemoOptions(**{name: getattr(options, name) for name in names & {*vars(options)}})
     if options.set:

@@ -22,6 +22,7 @@ import time
 from typing import TYPE_CHECKING, Any
 import webbrowser
 
+from t3mpc_ros.cli.shared_options import new_folder
 from t3mpc_ros.parameters.command_line import bounded_int
 from t3mpc_ros.stop_signal import StopSignal
 
@@ -49,7 +50,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument('--port', type=bounded_int(0, 65535), default=DEFAULT_PORT, help=text)
     parser.add_argument('--read-only', action='store_true', help='show only, take no commands')
     text = 'folder for what the page records (default: runs)'
-    parser.add_argument('--runs', type=Path, default=Path('runs'), help=text)
+    parser.add_argument('--runs', type=new_folder, default=Path('runs'), help=text)
     parser.add_argument('--headless', action='store_true', help='open no browser')
     parser.set_defaults(run=_view)
 

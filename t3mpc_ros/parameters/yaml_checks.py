@@ -85,7 +85,8 @@ def parse_yaml(text: str) -> object:
         return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         line = f'line {error.problem_mark.line + 1}: ' if error.problem_mark else ''
-        raise YamlError(f'is not YAML: {line}{error.problem}') from error
+        hint = '; indent with spaces' if "'\\t'" in str(error.problem) else ''
+        raise YamlError(f'is not YAML: {line}{error.problem}{hint}') from error
     except _ERRORS as error:
         raise YamlError(f'is not YAML: {" ".join(str(error).split())}') from error
 

@@ -26,6 +26,7 @@ from t3mpc_ros.parameters.yaml_checks import (
 BAD = {
     b'walls: [': 'is not YAML: line 1: ',
     b'a: 1\nb: {c: 1\n': 'is not YAML: line 3: ',
+    b'a:\n\tb: 1\n': 'that cannot start any token; indent with spaces',
     b'name: \x07': 'is not YAML: ',
     b'name: 2026-13-45': 'is not YAML: month must be in 1..12',
     b'name: !!int ""': 'is not YAML: ',
