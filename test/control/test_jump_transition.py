@@ -107,6 +107,7 @@ def test_with_servo_lag_the_command_respects_the_acceleration():
     assert energy == pytest.approx(6.0**3 / (12.0 * A), rel=0.05)
 
 
+@pytest.mark.compiled
 @pytest.mark.parametrize('interval', [0.62, 0.9, 1.3, 2.4])
 @pytest.mark.parametrize('lag', [0.003, 0.02])
 def test_a_ramp_is_the_same_whatever_the_interval(interval, lag):
